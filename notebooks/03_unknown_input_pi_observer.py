@@ -131,7 +131,7 @@ print("five times -4: characteristic polynomial", np.poly(pair - five.K @ output
 
 # %%
 from obsynth.methods.ui_pi_observer.conditions import existence
-from obsynth.plants.exosystems import exosystem
+from obsynth.plants.fault_models import exosystem
 
 for condition in existence(plant, exosystem("ramp", plant.fault_names, 0.0)).conditions:
     print(f"{condition.name:26s} {'holds' if condition.holds else 'FAILS'}  {condition.detail}")

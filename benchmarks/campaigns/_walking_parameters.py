@@ -16,7 +16,7 @@ import numpy as np
 from obsynth.methods.adaptive_observer.public import adaptive_observer
 from obsynth.methods.dae_adaptive_observer.public import dae_adaptive_observer
 from obsynth.numerics.arrays import FloatArray
-from obsynth.observers.dae.batch import run_dae_batch
+from obsynth.observers.batches import run_dae_batch
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.simulation.dae import simulate_dae

@@ -15,8 +15,8 @@ import numpy as np
 from benchmarks.campaigns.frame import Outcome
 
 from obsynth import DescriptorSystem
-from obsynth.analysis.diagnosis.columns import Question
-from obsynth.analysis.diagnosis.exact import PencilColumn, exact_decoupled
+from obsynth.analysis.diagnosis.exact import ExactQuestion, ReducedQuestion
+from obsynth.analysis.diagnosis.fault_columns import Question
 
 CASES = 500
 LIMIT = 60.0
@@ -30,12 +30,12 @@ def case(seed: int) -> Outcome:
     verdicts, wrong = [], []
     for fault in range(plant.nf):
         for removed in ((), tuple(j for j in range(plant.nf) if j != fault)):
-            exact = exact_decoupled(plant, removed, [fault]).column(0)
-            pencil = PencilColumn(plant, removed, fault)
+            exact = ReducedQuestion(plant, removed, fault)
+            pencil = ExactQuestion(plant, removed, fault)
             if exact.polynomial not in (pencil.polynomial, -pencil.polynomial):
                 wrong.append(f"{removed}, {fault}: polynomials differ")
-            rounded = Question(other, removed, fault, False)
-            facts, found = _facts(exact, exact.plant.order), _facts(rounded, rounded.order)
+            rounded = Question(other, removed, fault)
+            facts, found = _facts(exact, exact.order), _facts(rounded, rounded.order)
             if facts != found:
                 wrong.append(f"{removed}, {fault}: {facts} exactly, {found} in other units")
         verdicts.append("estimable" if exact.visible and not exact.blocking.size else

@@ -1,8 +1,4 @@
-"""The errors of obsynth: one type per kind of bad news, each with its exit code.
-
-Every message says what failed, where, and what to do about it.  The attributes hold the same facts
-for programs.
-"""
+"""The errors of obsynth: one type per kind of bad news, each with its exit code, and its facts for programs."""
 
 from __future__ import annotations
 
@@ -21,6 +17,17 @@ class Report(Protocol):
         """Return the report as plain data."""
 
 
+def _plain(value: Any) -> Any:
+    """Return an attribute of an error as plain data."""
+    if isinstance(value, complex):
+        return [value.real, value.imag]
+    if isinstance(value, Mapping):
+        return {key: str(item) for key, item in value.items()}
+    if isinstance(value, tuple):
+        return [_plain(item) for item in value]
+    return value.as_dict() if hasattr(value, "as_dict") else value
+
+
 class ObsynthError(Exception):
     """Base class of every error that obsynth raises on purpose.
 
@@ -36,13 +43,15 @@ class ObsynthError(Exception):
     """
 
     exit_code = 1
+    _told: tuple[str, ...] = ()
 
     def __init__(self, *args: object) -> None:
         super().__init__(*args)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the error as plain data, for ``--json``."""
-        return {"error": type(self).__name__, "exit_code": self.exit_code, "message": str(self)}
+        facts = {name: _plain(getattr(self, name)) for name in self._told}
+        return {"error": type(self).__name__, "exit_code": self.exit_code, "message": str(self), **facts}
 
 
 class SpecError(ObsynthError):
@@ -61,6 +70,7 @@ class SpecError(ObsynthError):
     """
 
     exit_code = 2
+    _told = ("path", "problems", "code")
 
     def __init__(self, message: str, *, path: str | None = None, problems: Sequence[str] = (), code: str = "") -> None:
         self.path = path
@@ -68,10 +78,6 @@ class SpecError(ObsynthError):
         self.problems = tuple(problems)
         lines = [message, *(f"  - {problem}" for problem in self.problems)]
         super().__init__("\n".join(lines))
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the error as plain data, for ``--json``."""
-        return {**super().as_dict(), "path": self.path, "problems": list(self.problems), "code": self.code}
 
 
 class PreconditionError(ObsynthError):
@@ -92,6 +98,7 @@ class PreconditionError(ObsynthError):
     """
 
     exit_code = 3
+    _told = ("condition", "code", "mode", "signals", "add")
 
     def __init__(
         self,
@@ -104,17 +111,9 @@ class PreconditionError(ObsynthError):
     ) -> None:
         self.add = tuple(tuple(names) for names in add)
         self.condition = self.code = condition
-        self.mode = mode
+        self.mode = None if mode is None else complex(mode)
         self.signals = tuple(signals)
         super().__init__(message)
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the error as plain data, for ``--json``."""
-        mode = None if self.mode is None else [complex(self.mode).real, complex(self.mode).imag]
-        return {
-            **super().as_dict(), "condition": self.condition, "code": self.code, "mode": mode,
-            "signals": list(self.signals), "add": [list(names) for names in self.add],
-        }  # fmt: skip
 
 
 class InfeasibleError(ObsynthError):
@@ -132,15 +131,12 @@ class InfeasibleError(ObsynthError):
     """
 
     exit_code = 4
+    _told = ("necessary", "lower_bound")
 
     def __init__(self, message: str, *, necessary: bool, lower_bound: float | None = None) -> None:
         self.necessary = necessary
         self.lower_bound = lower_bound
         super().__init__(message)
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the error as plain data, for ``--json``."""
-        return {**super().as_dict(), "necessary": self.necessary, "lower_bound": self.lower_bound}
 
 
 class SolverError(ObsynthError):
@@ -155,14 +151,11 @@ class SolverError(ObsynthError):
     """
 
     exit_code = 5
+    _told = ("record",)
 
     def __init__(self, message: str, *, record: Mapping[str, Any] | None = None) -> None:
         self.record = dict(record or {})
         super().__init__(message)
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the error as plain data, for ``--json``."""
-        return {**super().as_dict(), "record": {key: str(value) for key, value in self.record.items()}}
 
 
 class VerificationError(ObsynthError):
@@ -177,11 +170,8 @@ class VerificationError(ObsynthError):
     """
 
     exit_code = 6
+    _told = ("report",)
 
     def __init__(self, message: str, *, report: Report) -> None:
         self.report = report
         super().__init__(message)
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the error as plain data, for ``--json``."""
-        return {**super().as_dict(), "report": self.report.as_dict()}

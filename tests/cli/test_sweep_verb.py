@@ -55,3 +55,24 @@ def test_bad_arguments(spec, tmp_path, capsys, extra, path):
 
 def test_the_folder_is_a_file(spec, tmp_path):
     assert main(["sweep", "--system", spec, "--out", spec]) == 2
+
+
+def test_an_unknown_claim_is_refused_before_anything_is_designed(spec, tmp_path, capsys):
+    out = tmp_path / "many"
+    assert main(["sweep", "--system", spec, "--out", str(out), "--claim", "decay", "--json", "--quiet"]) == 2
+    told = json.loads(capsys.readouterr().out)
+    assert told["path"] == "--claim"
+    assert "'decay'" in told["message"]
+    assert "gamma" in told["message"]
+    assert not out.exists()
+
+
+def test_a_claim_of_any_method_is_taken_where_the_method_is_chosen_or_varied(spec, tmp_path, capsys):
+    arguments = ["sweep", "--system", spec, "--claim", "decay", "--quiet"]
+    varied = ["--set", "method.id=[fault-estimation-filter, ui-pi-observer]"]
+    assert main([*arguments, *varied, "--out", str(tmp_path / "varied")]) == 0
+    assert main([*arguments, "--set", "method.id=[pd-observer]", "--out", str(tmp_path / "other")]) == 0
+    # No design makes the claim: the table is written all the same, and a sentence says why there is no picture.
+    assert "no design claims 'decay'" in capsys.readouterr().err
+    assert (tmp_path / "other" / "table.csv").is_file()
+    assert not (tmp_path / "other" / "sweep.png").exists()

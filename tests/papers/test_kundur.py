@@ -11,7 +11,7 @@ from exact_runs import Together, ramp_and_sine
 
 import obsynth
 from obsynth.methods.ui_pi_observer.conditions import decoupling_rank, existence
-from obsynth.plants.exosystems import exosystem
+from obsynth.plants.fault_models import exosystem
 from obsynth.simulation import simulate_plant
 from obsynth.spec import load_spec
 from obsynth.spec.documents import read_yaml

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from plants import Recipe, build, random_recipe, well_conditioned, with_conjugates
 
 import obsynth
-from obsynth.analysis import fault_zeros
+from obsynth.analysis.zeros import fault_zeros
 from obsynth.methods.designing import check
 
 SEEDS = st.integers(0, 2**32 - 1)

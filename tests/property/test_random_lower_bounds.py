@@ -9,7 +9,7 @@ from obsynth.methods.fault_estimation_filter.inequality_search import search_lea
 from obsynth.methods.fault_estimation_filter.least_gain_proof import ALONE, LAST, PAIRS, InvisiblePairs
 from obsynth.methods.fault_estimation_filter.prepared_plant import prepare
 from obsynth.methods.fault_estimation_filter.synthesis import gain_problem
-from obsynth.proofs.written_numbers import stored_matrix
+from obsynth.proofs.exact_arithmetic import stored_matrix
 
 
 def random_plant(seed: int, units: float) -> obsynth.DescriptorSystem:

@@ -11,7 +11,7 @@ from ui_pi_plants import KINDS, Case, brute_force, exosystem_of, random_case
 
 from obsynth import PreconditionError, SolverError, VerificationError, ui_pi_observer
 from obsynth.methods.ui_pi_observer.conditions import existence
-from obsynth.plants.exosystems import exosystem
+from obsynth.plants.fault_models import exosystem
 
 BATCHES, SIZE = 16, 24
 ALL = range(BATCHES * SIZE)

@@ -13,7 +13,7 @@ from uncertain_plants import DRIVE, drive, wang
 
 import obsynth
 from obsynth.errors import PreconditionError, SpecError
-from obsynth.experiments.batch_simulation import make_bench
+from obsynth.experiments.benches import make_bench
 from obsynth.experiments.monitors.adaptive_monitor import adaptive_plan
 from obsynth.experiments.monitors.adaptive_record import thresholds_of_records
 from obsynth.experiments.monitors.adaptive_rule import AdaptiveState, adaptive_step, record_columns

@@ -18,8 +18,8 @@ from obsynth.experiments.monitors.between_samples import BetweenSamples
 from obsynth.experiments.monitors.residual_model import residual_model
 from obsynth.proofs.balls import Ball
 from obsynth.proofs.contraction import prove_contraction
-from obsynth.proofs.exponentials import energy, exponential
 from obsynth.proofs.peak_sums import absolute_gains, gathered, interval_pieces, peak_sums
+from obsynth.proofs.products import energy, exponential
 
 
 def held_input(a: np.ndarray, b: np.ndarray, time: float) -> Ball:

@@ -32,7 +32,7 @@ from obsynth import (
     fault_estimation_filter_from_gains,
     verify,
 )
-from obsynth.analysis.transformations import StateRecovery
+from obsynth.analysis.transformations.recovery import StateRecovery
 from obsynth.methods.fault_estimation_filter.least_gain_proof import WITNESSES
 from obsynth.spec.loader import load_spec
 from obsynth.verification.claims import WITNESS_CLAIMS

@@ -232,6 +232,9 @@ TABLE: dict[str, tuple[str, Callable[[ObserverDesign], ObserverDesign], tuple[st
     "coordinates that cost digits": ("paper", lambda d: in_other_coordinates(d, 3e4), (POLES, DIGITS)),
     "coordinates that cost digits, discrete": ("direct", lambda d: in_other_coordinates(d, 5e5),
         (POLES, DECAY, DIGITS, NOISE)),
+    "fewer digits claimed than needed": (
+        "paper", lambda d: with_certificate(in_other_coordinates(d, 3e4), claims={"digits": 9.0}),
+        (POLES, "stable with the claimed digits")),
     # The certificate.
     "tracking": ("paper", certificate("tracking", 1, 0, 0.4), (SYLVESTER, IN_ERROR, STATE, RESIDUAL)),
     "tracking of the fault model": ("fixed", certificate("tracking", 3, 3, 1.1), (SYLVESTER, FAULT)),

@@ -13,11 +13,11 @@ from test_dae_observer import BALANCES, drive, linear_observer, observer, record
 
 import obsynth
 from obsynth import DAEModel, DAEObserver, SolverError, SpecError, run_batch, simulate_dae
-from obsynth.numerics.symbolic_solve import SMALL, solved
+from obsynth.numerics.newton import SMALL, solved
+from obsynth.observers import batches as dae_batch
 from obsynth.observers import progress
-from obsynth.observers.dae import batch as dae_batch
-from obsynth.observers.dae import compiled_library as dae_library
-from obsynth.observers.dae import records as dae_records
+from obsynth.observers.dae import c_code as dae_library
+from obsynth.observers.dae import observer as dae_records
 from obsynth.plants.dae.functions import Compiled, DAEFunctions
 from obsynth.plants.dae.step import ImplicitStep
 

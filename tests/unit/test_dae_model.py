@@ -9,7 +9,7 @@ import pytest
 from dae_plants import ROD, diode, exchanger, pendulum
 
 from obsynth import DAEModel, SpecError, identifiability
-from obsynth.analysis.dae_index import index_report
+from obsynth.analysis.dae_structure import index_report
 from obsynth.methods.designing import check
 from obsynth.plants.dae.functions import DAEFunctions
 from obsynth.plants.dae.step import ImplicitStep

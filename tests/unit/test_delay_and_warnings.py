@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import obsynth
-from obsynth.methods.functional_filter.delay_curve import delay_curve
-from obsynth.report.warnings import design_warnings
+from obsynth.methods.functional_filter.rates import delay_curve
+from obsynth.report.designs import design_warnings
 from obsynth.spec.loader import load_spec
 
 DESIGNS = Path(__file__).parents[2] / "designs"

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import obsynth
-from obsynth.analysis.diagnosis.columns import Question
+from obsynth.analysis.diagnosis.exact import question
 
 CASES = Path(__file__).parents[1] / "data" / "cases"
 
@@ -174,7 +174,7 @@ def test_exact_and_rounded_agree_on_random_integer_plants() -> None:
         )  # fmt: skip
         for fault in range(nf):
             removed = tuple(j for j in range(nf) if j != fault)
-            exact, rounded = (Question(plant, removed, fault, way) for way in (True, False))
+            exact, rounded = (question(plant, removed, fault, way) for way in (True, False))
             assert exact.visible == rounded.visible
             if exact.visible:
                 assert (len(exact.zeros), len(exact.blocking)) == (len(rounded.zeros), len(rounded.blocking))

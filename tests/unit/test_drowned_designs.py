@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from obsynth import DescriptorSystem, PreconditionError, ui_pi_observer
-from obsynth.methods.drowned_designs import last_digits, require_above_rounding
-from obsynth.proofs.written_numbers import stored_matrix
+from obsynth.methods.refusals import last_digits, require_above_rounding
+from obsynth.proofs.exact_arithmetic import stored_matrix
 
 PLANT = DescriptorSystem(None, [[-1.0, 0.5], [0.0, -2.0]], C=np.eye(2), Bf=[[1], [0]])
 

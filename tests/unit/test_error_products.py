@@ -6,7 +6,7 @@ import pytest
 
 from obsynth.proofs.balls import Ball
 from obsynth.proofs.contraction import proved_rate
-from obsynth.proofs.error_products import AT_ONCE, logarithm_of_product, product_of_stack, stacked_product
+from obsynth.proofs.products import AT_ONCE, logarithm_of_product, product_of_stack, stacked_product
 
 
 def true_logarithm(factors: np.ndarray) -> float:

@@ -25,8 +25,8 @@ from obsynth.methods.registry import REGISTRY, method_spec
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.estimates import Estimates
 from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.recursive.gain_schedule import steady_observer
 from obsynth.observers.recursive.observer import RecursiveObserver
-from obsynth.observers.recursive.steady_state import steady_observer
 
 SAMPLES = 24
 #: The methods of obsynth, and one that a test registers: it has a folder and one line of the registry, no more.
@@ -61,7 +61,7 @@ CORRUPTED = {LinearObserver: "Az", RecursiveObserver: "initial_covariance", DAEO
 
 @pytest.fixture(autouse=True)
 def registered(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(REGISTRY, ADDED, "luenberger_method.method")
+    monkeypatch.setitem(REGISTRY, ADDED, "luenberger_method")
 
 
 @cache

@@ -7,9 +7,17 @@ import numpy as np
 import pytest
 from flint import fmpq, fmpq_mat, fmpz_poly
 
-from obsynth.proofs.exact_pencils import ExactPencil, blocks, null_basis, pivot_columns
-from obsynth.proofs.root_location import locate_roots
-from obsynth.proofs.written_numbers import is_computed, nearest_doubles, written_fraction, written_matrix
+from obsynth.proofs.exact_arithmetic import (
+    blocks,
+    is_computed,
+    locate_roots,
+    nearest_doubles,
+    null_basis,
+    pivot_columns,
+    written_fraction,
+    written_matrix,
+)
+from obsynth.proofs.exact_pencils import ExactPencil
 
 
 def mixed(E, A, seed):

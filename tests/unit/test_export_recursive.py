@@ -8,7 +8,7 @@ from test_export import digest, through_c
 
 import obsynth
 from obsynth import PreconditionError, SolverError, SpecError, TimeVaryingDescriptorSystem
-from obsynth.observers.recursive.steady_state import steady_observer
+from obsynth.observers.recursive.gain_schedule import steady_observer
 
 PLANT = TimeVaryingDescriptorSystem(
     E=[[1, 0, 0], [0, 1, 0], [0, 0, 0]], A=[[0.9, 0.1, 0], [-0.2, 0.7, 0.1], [1, 0.5, -1]], B=[[0], [1], [0.3]],

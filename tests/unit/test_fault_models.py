@@ -7,8 +7,7 @@ import pytest
 import scipy.linalg
 
 from obsynth import FaultModel, SpecError, fault_model
-from obsynth.plants.exosystems import exosystem
-from obsynth.plants.fault_models import stated_eigenvalues, summed
+from obsynth.plants.fault_models import exosystem, stated_eigenvalues, summed
 
 
 def course(data: object, start: list[float], times: np.ndarray) -> np.ndarray:

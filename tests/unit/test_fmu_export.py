@@ -11,7 +11,7 @@ import pytest
 
 import obsynth
 from obsynth import SpecError
-from obsynth.observers.dae import compiled_library
+from obsynth.observers.dae import c_code
 
 fmpy = pytest.importorskip("fmpy", reason="fmpy is not installed (obsynth[fmu])")
 # Its parts are modules of their own.
@@ -35,7 +35,7 @@ def design() -> obsynth.ObserverDesign:
 
 @pytest.fixture
 def compiler() -> list[str]:
-    command = compiled_library.compiler()
+    command = c_code.compiler()
     if command is None:
         pytest.skip("no C compiler")
     return command

@@ -218,7 +218,7 @@ def test_chi_square_of_a_sampled_continuous_design(machine):
         horizon=8, sample_time=0.02, noise=1, disturbances={"load": obsynth.Gaussian(deviation=0.5)}
     )
     watched = obsynth.monitor(machine, scenario, "chi-square", window=3)
-    from obsynth.experiments.batch_simulation import make_bench
+    from obsynth.experiments.benches import make_bench
 
     bench = make_bench(machine, scenario)
     rows = bench.run(range(500)).rows
@@ -325,7 +325,7 @@ def test_noise_of_the_worst_signs_keeps_the_bound_at_any_stamps(spacing, kind):
     response, back = np.zeros(len(times)), observer.Cz[observer.residual_rows]
     response[-1] = observer.Dy[observer.residual_rows][0, 0]
     for k in range(len(times) - 1, 0, -1):
-        transition, constant, ramp = obsynth.observers.linear.sampling.first_order_hold(
+        transition, constant, ramp = obsynth.observers.linear.derived.first_order_hold(
             observer.Az, observer.By, float(times[k] - times[k - 1])
         )
         response[k] += (back @ ramp).item()

@@ -27,7 +27,7 @@ from obsynth import (
     smooth,
     verify,
 )
-from obsynth.observers.state_bounds import projected
+from obsynth.observers.outliers import projected
 
 SENSORS = {"y1": {"every": 3, "delay": 2}, "y2": {"delay": 4}}
 

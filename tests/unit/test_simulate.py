@@ -14,7 +14,6 @@ from scipy.integrate import solve_ivp
 import obsynth
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.simulation.linear import make_stepper, simulate_plant
-from obsynth.simulation.profiles import sampled
 from obsynth.simulation.scenario_signals import resolve
 from obsynth.spec import load_spec
 
@@ -66,7 +65,7 @@ T = 0.5 * np.arange(9)
     ids=lambda value: type(value).__name__ if isinstance(value, obsynth.Step) else "",
 )
 def test_profiles_have_their_formulas(profile, values, ends) -> None:
-    left, right = sampled(profile, 8, 0.5)
+    left, right = profile.sampled(8, 0.5)
     np.testing.assert_allclose(left, values, rtol=0, atol=1e-15)
     np.testing.assert_allclose(right, ends, rtol=0, atol=1e-15)
 

@@ -23,7 +23,7 @@ from obsynth import (
     smooth,
 )
 from obsynth.cli.main import main
-from obsynth.observers.recursive.building import observer_from_options
+from obsynth.observers.recursive.observer import observer_from_options
 from obsynth.observers.smoothing.keeping import smoothed_record
 
 E = np.diag([1.0, 1.0, 0.0])

@@ -8,8 +8,8 @@ import pytest
 import scipy.io
 from scipy.linalg import block_diag
 
-from obsynth.analysis import analyse_structure
-from obsynth.plants import DescriptorSystem
+from obsynth.analysis.structure import analyse_structure
+from obsynth.plants.descriptor import DescriptorSystem
 
 SMIB = Path(__file__).parents[2] / "designs" / "smib"
 

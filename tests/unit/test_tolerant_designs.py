@@ -8,7 +8,7 @@ from uncertain_plants import drive
 import obsynth
 from obsynth.errors import SpecError
 from obsynth.experiments.tolerant_designs import mean_thresholds
-from obsynth.tolerances.directions import told_from_faults
+from obsynth.tolerances.exact_plant import told_from_faults
 
 
 @pytest.fixture(scope="module")

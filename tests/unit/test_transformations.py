@@ -11,16 +11,13 @@ from scipy.linalg import block_diag, expm
 from scipy.signal import cont2discrete
 
 import obsynth
-from obsynth.analysis import (
-    analyse_structure,
-    augment_faults,
-    discretise,
-    eliminate_algebraic_states,
-    fault_zeros,
-    sampling_zero_warnings,
-)
+from obsynth.analysis.structure import analyse_structure
+from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
+from obsynth.analysis.transformations.recovery import augment_faults
+from obsynth.analysis.transformations.sampling import discretise, sampling_zero_warnings
+from obsynth.analysis.zeros import fault_zeros
 from obsynth.errors import PreconditionError, SpecError
-from obsynth.plants import DescriptorSystem
+from obsynth.plants.descriptor import DescriptorSystem
 
 SMIB = Path(__file__).parents[2] / "designs" / "smib"
 

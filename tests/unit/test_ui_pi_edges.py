@@ -152,3 +152,23 @@ def test_a_pseudoinverse_that_loses_an_equation_is_refused_for_it(size: float) -
     with pytest.raises(PreconditionError, match="fixed and not stable: U has lost rank"):
         ui_pi_observer(plant, **given)
     assert ui_pi_observer(plant).report.passed
+
+
+def test_coordinates_that_need_more_digits_than_are_printed_are_told() -> None:
+    shear = np.array([[1.0, 1e3, 1e3], [0, 1, 1e3], [0, 0, 1]])
+    back = np.linalg.inv(shear)
+    a = np.array([[0.9, 0.3, 0], [0, 0.8, 0.2], [0.1, 0, 0.7]])
+    plant = DescriptorSystem(
+        np.eye(3), shear @ a @ back, C=np.eye(3)[[0, 2]] @ back, Bf=shear @ [[0.0], [1], [0]], dt=1.0
+    )
+    design = ui_pi_observer(plant)
+    digits = design.certificate.claims["digits"]
+    assert digits > 9
+    assert any(f"stable with {digits:.0f} significant digits" in note for note in design.notes)
+
+    def radius(printed: int) -> float:
+        entries = [[float(f"{value:.{printed - 1}e}") for value in row] for row in design.observer.Az]
+        return float(np.max(np.abs(np.linalg.eigvals(entries))))
+
+    assert all(radius(printed) < 1.0 for printed in range(int(digits), 18))
+    assert radius(int(digits) - 1) >= 1.0

@@ -15,7 +15,7 @@ from test_linearise import tanks
 
 import obsynth
 from obsynth import DAEModel, PreconditionError, SpecError, linearise
-from obsynth.analysis.transformations.equations_at_a_point import local_equations
+from obsynth.plants.dae.functions import local_equations
 from obsynth.plants.uncertainty import matrices_of
 from obsynth.spec import load_spec
 

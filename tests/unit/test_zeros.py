@@ -7,10 +7,10 @@ import pytest
 import slycot
 from scipy.linalg import block_diag, eigvals
 
-from obsynth.analysis import are_outside, fault_zeros, invariant_zeros, is_outside
+from obsynth.analysis.zeros import are_outside, fault_zeros, invariant_zeros, is_outside
 from obsynth.methods.fault_estimation_filter.conditions import fault_filter_conditions
 from obsynth.numerics.pencils import finite_zeros
-from obsynth.plants import DescriptorSystem
+from obsynth.plants.descriptor import DescriptorSystem
 
 PAPER_A = [[0.9, 0.005, -0.095, 0], [0.005, 0.995, 0.0997, 0], [0.095, -0.0997, 0.99, 0], [1, 0, 1, 1]]
 PAPER_C = [[0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]

@@ -13,13 +13,10 @@ from obsynth.plants.descriptor import DescriptorSystem
 
 @dataclass(frozen=True)
 class Condition:
-    """One existence condition and whether the plant meets it.
+    """One existence condition, as in its ``source``: whether ``value`` meets ``bound``, and the evidence (``detail``).
 
-    Fields: name: Short name, as in the paper where it has one; claim: What must hold, in words; holds: The verdict;
-    value, bound: The deciding number and what it is compared with; source: Paper and equation, or the finding it rests
-    on; detail: The evidence (singular-value gap, the eigenvalue) and, when it fails, what to do; mode: The eigenvalue
-    or zero at which it fails; signals: Names of the signals
-    involved; unclear: Why it does not hold only as far as the data can tell, where that is so: told in the detail.
+    ``mode``: the eigenvalue or zero at which it fails; ``unclear``: why it holds or fails only as far as the data can
+    tell, where that is so.
     """
 
     name: str
@@ -41,12 +38,12 @@ class Condition:
                 if self.unclear
                 else f"No observer of this kind exists: the condition {self.name!r} fails ({self.source}). "
             )
+            missing = [repr(name) for name in self.signals if repr(name) not in self.detail]
+            involved = f" Signals involved: {', '.join(missing)}." if missing else ""
             raise PreconditionError(
-                f"{opening}Needed: {self.claim}. Found: {self.detail}{_involved(self.signals, self.detail)}",
-                condition=self.name,
-                mode=self.mode,
-                signals=self.signals,
-            )
+                f"{opening}Needed: {self.claim}. Found: {self.detail}{involved}",
+                condition=self.name, mode=self.mode, signals=self.signals,
+            )  # fmt: skip
 
     def in_doubt(self, found: Unclear, plant: DescriptorSystem) -> Condition:
         """Return the condition as one that rounding of the data could change, with what tells so in its detail."""
@@ -64,12 +61,6 @@ def is_doubted(conditions: Iterable[Condition]) -> bool:
     return bool(failed) and all(condition.unclear is not None for condition in failed)
 
 
-def _involved(signals: tuple[str, ...], detail: str) -> str:
-    """Name the signals that the detail does not name already."""
-    missing = [repr(name) for name in signals if repr(name) not in detail]
-    return f" Signals involved: {', '.join(missing)}." if missing else ""
-
-
 def require_all(conditions: Iterable[Condition]) -> None:
     """Raise `PreconditionError` for the first condition that fails."""
     for condition in conditions:
@@ -81,12 +72,6 @@ def rank_condition(
 ) -> Condition:
     """Return the condition that a rank is full."""
     return Condition(
-        name,
-        f"{name} = {decision.expected}",
-        decision.full,
-        float(decision.rank),
-        float(decision.expected),
-        source,
-        decision.describe() + ("" if decision.full else f": {remedy}"),
-        signals=() if decision.full else signals,
-    )
+        name, f"{name} = {decision.expected}", decision.full, float(decision.rank), float(decision.expected), source,
+        decision.describe() + ("" if decision.full else f": {remedy}"), signals=() if decision.full else signals,
+    )  # fmt: skip

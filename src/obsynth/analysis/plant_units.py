@@ -15,11 +15,11 @@ from itertools import pairwise
 
 import numpy as np
 
-from obsynth.numerics.arrays import ComplexArray, FloatArray, read_only
+from obsynth.numerics.arrays import ComplexArray, FloatArray, read_only, remembered
 from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.numerics.scaling import LogBalance
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.exosystems import Exosystem
+from obsynth.plants.fault_models import Exosystem
 from obsynth.plants.origin import origin_of
 
 #: Given units in which the natural factors differ by more than this are no units to design in.
@@ -27,15 +27,15 @@ FAR_UNITS = 256.0
 #: Weight of inputs and outputs beside equations and states, which they scale only where A and E leave that open.
 SIGNALS_WEIGHT = 1e-3
 
+_KINDS = ("equations", "states", "outputs", "faults", "disturbances", "model")
+
 
 @dataclass(frozen=True, eq=False)
 class PlantUnits:
     """Factors between a plant as given and the scaled one.
 
-    Fields: time: The unit of time: tau, or the sample time; equations, states, outputs, faults, disturbances, model:
-    ``(nx,)``, ``(nx,)``, ``(ny,)``, ``(nf,)``, ``(nd,)``, ``(nw,)``: equations and outputs are multiplied by theirs; a
-    state, fault, disturbance or state of the fault model is its factor times the scaled one; discrete: Whether the
-    plant is sampled: its matrices have no unit of time then.
+    Equations ``(nx,)`` and outputs ``(ny,)`` are multiplied by theirs; a state ``(nx,)``, fault ``(nf,)``, disturbance
+    ``(nd,)`` or state of the fault model ``(nw,)`` is its factor times the scaled one; ``time``: tau or ``dt``.
     """
 
     time: float
@@ -50,6 +50,10 @@ class PlantUnits:
     @classmethod
     def of(cls, plant: DescriptorSystem, model: Exosystem | None = None) -> PlantUnits:
         """Return the units that suit a plant and the model of its faults."""
+        return _units_of(plant) if model is None else cls._found(plant, model)
+
+    @classmethod
+    def _found(cls, plant: DescriptorSystem, model: Exosystem | None) -> PlantUnits:
         nx, ny, order = plant.nx, plant.ny, 0 if model is None else model.order
         ends = np.cumsum([1, nx, nx, ny, plant.nf, plant.nd, order])
         equations, states, outputs, faults, disturbances, fault_model = (
@@ -77,10 +81,9 @@ class PlantUnits:
             for inner, direct in ((plant.Bf, plant.Df), (plant.Bd, plant.Dd))
         ]
         courses = _model_units(model, factors[fault_model], entering[0])
-        return cls(
-            plant.dt or float(factors[0]), read_only(factors[equations]), read_only(own), read_only(shown),
-            read_only(entering[0]), read_only(entering[1]), read_only(courses), plant.is_discrete,
-        )  # fmt: skip
+        found = (factors[equations], own, shown, *entering, courses)
+        parts = {kind: read_only(part) for kind, part in zip(_KINDS, found, strict=True)}
+        return cls(time=plant.dt or float(factors[0]), discrete=plant.is_discrete, **parts)
 
     @property
     def spread(self) -> float:
@@ -106,14 +109,9 @@ class PlantUnits:
     def rounded(self) -> PlantUnits:
         """Return the same with powers of two, with which scaling is exact."""
 
-        def nearest(factors: FloatArray) -> FloatArray:
-            return read_only(np.exp2(np.round(np.log2(factors))))
-
+        powers = {kind: read_only(np.exp2(np.round(np.log2(getattr(self, kind))))) for kind in _KINDS}
         time = self.time if self.discrete else float(np.exp2(np.round(np.log2(self.time))))
-        return PlantUnits(
-            time, nearest(self.equations), nearest(self.states), nearest(self.outputs), nearest(self.faults),
-            nearest(self.disturbances), nearest(self.model), self.discrete,
-        )  # fmt: skip
+        return PlantUnits(time=time, discrete=self.discrete, **powers)
 
     def for_decoupling(self, plant: DescriptorSystem) -> PlantUnits:
         """Return the same with each equation that holds a derivative scaled by its row of E.
@@ -161,6 +159,11 @@ class PlantUnits:
     def eigenvalues(self, scaled: ComplexArray) -> ComplexArray:
         """Return eigenvalues or zeros in the plant's own time."""
         return np.asarray(scaled / self.rate, dtype=np.complex128)
+
+
+@remembered
+def _units_of(plant: DescriptorSystem) -> PlantUnits:
+    return PlantUnits._found(plant, None)
 
 
 def sized_plant(plant: DescriptorSystem) -> DescriptorSystem | None:

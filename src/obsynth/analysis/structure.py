@@ -1,11 +1,8 @@
-"""Structure of a plant: regularity, index, eigenvalues, observability, each with its evidence.
-
-Questions about a plant that may not be what was meant; nothing is refused because of them.
-"""
+"""Structure of a plant with its evidence, and questions about one that may not be what was meant."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from types import MappingProxyType
@@ -15,28 +12,21 @@ import numpy as np
 from obsynth.analysis.existence.verdicts import hidden_modes
 from obsynth.analysis.transformations.recovery import Transformation, linear_plant
 from obsynth.analysis.zeros import are_outside
-from obsynth.numerics.arrays import ComplexArray, FloatArray
+from obsynth.numerics.arrays import ComplexArray
+from obsynth.numerics.libraries import on_one_thread_if_small
 from obsynth.numerics.pencils import FiniteZeros, pencil_structure
 from obsynth.numerics.ranks import RankDecision, decide_rank
 from obsynth.numerics.scaling import equilibrate_pencil
-from obsynth.numerics.threads import on_one_thread_if_small
 from obsynth.plants.descriptor import DescriptorSystem
 
 
 @dataclass(frozen=True, eq=False)
 class Structure:
-    """What kind of plant this is.
+    """What kind of plant this is, with the evidence: every rank decided on the way is among the ``decisions``.
 
-    Fields: regular: ``det (A - z E)`` is not identically zero: inputs and initial state determine the trajectory;
-    index: Size of the largest block at infinity, 0 for nonsingular ``E``; None when not regular; finite_eigenvalues:
-    ``(k,)``, finite zeros of ``A - z E``; infinite_block_sizes: Sizes of the blocks at infinity, largest first;
-    impulse_free: Regular with index at most 1 (causal, for a sampled plant); stable: Regular, and every finite
-    eigenvalue is strictly inside the stability region; admissible: Regular, impulse-free and stable;
-    observability_normal_rank: Rank of ``[A - z E; C]`` at almost every ``z``; below ``nx`` the plant hides a whole
-    trajectory; unobservable_modes: Points where ``[A - z E; C]`` loses rank; undetectable_modes: Those of them on or
-    outside the boundary of stability; finitely_observable, detectable: No unobservable, or no undetectable, mode (and
-    full normal rank); impulse_observable: ``rank [E A; 0 E; 0 C] = nx + rank E``; causally_observable: ``rank [E; C] =
-    nx``; rank_of_E: The number of dynamic states; decisions: Every rank decided on the way, by name, read-only.
+    ``index``: size of the largest block at infinity, None unless regular; ``admissible``: regular, impulse-free (at
+    most 1) and stable; ``observability_normal_rank``: of ``[A - z E; C]`` at almost every z; ``impulse_observable``:
+    ``rank [E A; 0 E; 0 C] = nx + rank E``; ``causally_observable``: ``rank [E; C] = nx``.
     """
 
     regular: bool
@@ -90,22 +80,22 @@ def analyse_structure(plant: DescriptorSystem | Transformation) -> Structure:
     E, A, C = plant.E, plant.A, plant.C
     pencil = pencil_structure(E, A)
     poles = FiniteZeros(pencil.finite_eigenvalues, pencil.normal_rank, pencil.decisions)
-    unstable = _selected(poles.values, are_outside(E, A, poles, plant.dt))
+    outside = are_outside(E, A, poles, plant.dt)
+    unstable = tuple(complex(value) for value, out in zip(poles.values, outside, strict=True) if out)
     stable = pencil.regular and not unstable
     impulse_free = pencil.index is not None and pencil.index <= 1
 
-    tall_e, tall_a = np.vstack([E, np.zeros_like(C)]), np.vstack([A, C])
     hidden = hidden_modes(plant)
-    modes, undetectable = hidden.modes, hidden.undetectable
     seen = hidden.normal_rank == plant.nx
 
     rank_e = decide_rank(E, expected=plant.nx)
-    impulse = decide_rank(_impulse_matrix(E, A, C), expected=plant.nx + rank_e.rank)
+    zero, none = np.zeros_like(E), np.zeros_like(C)
+    impulse = decide_rank(np.block([[E, A], [zero, E], [none, C]]), expected=plant.nx + rank_e.rank)
     causal = decide_rank(np.vstack([E, C]), expected=plant.nx)
     decisions = {"rank E": rank_e, "rank [E; C]": causal, "rank [E A; 0 E; 0 C]": impulse}
     decisions |= {f"pencil A - zE, step {i + 1}": decision for i, decision in enumerate(pencil.decisions)}
     decisions |= {f"pencil [A - zE; C], step {i + 1}": decision for i, decision in enumerate(hidden.decisions)}
-    tall = equilibrate_pencil(tall_e, tall_a)
+    tall = equilibrate_pencil(np.vstack([E, none]), np.vstack([A, C]))
     decisions |= {
         f"rank [A - zE; C] at z = {mode:.6g}": decide_rank(tall.A - mode * tall.E, expected=plant.nx)
         for mode in unstable
@@ -120,24 +110,15 @@ def analyse_structure(plant: DescriptorSystem | Transformation) -> Structure:
         stable=stable,
         admissible=stable and impulse_free,
         observability_normal_rank=hidden.normal_rank,
-        unobservable_modes=modes,
-        undetectable_modes=undetectable,
-        finitely_observable=seen and not modes,
-        detectable=seen and not undetectable,
+        unobservable_modes=hidden.modes,
+        undetectable_modes=hidden.undetectable,
+        finitely_observable=seen and not hidden.modes,
+        detectable=seen and not hidden.undetectable,
         impulse_observable=impulse.full,
         causally_observable=causal.full,
         rank_of_E=rank_e,
         decisions=MappingProxyType(decisions),
     )
-
-
-def _selected(values: Iterable[complex], chosen: Iterable[bool]) -> tuple[complex, ...]:
-    return tuple(complex(value) for value, keep in zip(values, chosen, strict=True) if keep)
-
-
-def _impulse_matrix(E: FloatArray, A: FloatArray, C: FloatArray) -> FloatArray:
-    zero = np.zeros_like(E)
-    return np.block([[E, A], [zero, E], [np.zeros_like(C), C]])
 
 
 #: A sampled plant with an eigenvalue this far from zero grows so fast that it is hardly one.
@@ -150,9 +131,7 @@ _MOST_NAMES = 5
 
 def questions(plant: DescriptorSystem) -> tuple[str, ...]:
     """Return what to ask about a linear plant: half an operating point, or matrices of another time than ``dt``."""
-    if plant.nx > _MOST_STATES:
-        return _half_a_point(plant)
-    return (*_half_a_point(plant), *_other_time(plant))
+    return (*_half_a_point(plant), *(_other_time(plant) if plant.nx <= _MOST_STATES else ()))
 
 
 def _half_a_point(plant: DescriptorSystem) -> tuple[str, ...]:
@@ -161,13 +140,11 @@ def _half_a_point(plant: DescriptorSystem) -> tuple[str, ...]:
     missing = [name for name in measured if name not in point]
     if not missing or not any(point.values()):
         return ()
-    listed = ", ".join(missing[:_MOST_NAMES]) + (
-        f" and {len(missing) - _MOST_NAMES} more" if len(missing) > _MOST_NAMES else ""
-    )
-    told = _rest(plant, missing)
+    listed = ", ".join(missing[:_MOST_NAMES])
+    more = f" and {len(missing) - _MOST_NAMES} more" if len(missing) > _MOST_NAMES else ""
     return (
-        f"operating_point has {', '.join(list(point)[:_MOST_NAMES])}, but not {listed}: what a log holds of these is "
-        f"taken as a deviation. Give their values at that point as well{told}.",
+        f"operating_point has {', '.join(list(point)[:_MOST_NAMES])}, but not {listed}{more}: what a log holds of "
+        f"these is taken as a deviation. Give their values at that point as well{_rest(plant, missing)}.",
     )
 
 
@@ -195,19 +172,14 @@ def _other_time(plant: DescriptorSystem) -> tuple[str, ...]:
     plain = plant.dense()
     values = np.asarray(pencil_structure(plain.E, plain.A).finite_eigenvalues)
     values = values[np.isfinite(values)]
-    if not values.size:
-        return ()
-    if plant.is_discrete:
-        far = int(np.sum(np.abs(values) > _FAR))
-        if far and np.sum(values.real < 0.0) >= values.size / 2.0:
-            return (
-                f"dt is {plant.dt:g} s, but {far} of {values.size} eigenvalues lie far outside the unit circle (up to "
-                f"{np.abs(values).max():.3g}): are these the matrices of a plant in continuous time? Then give dt: 0, "
-                "and let transform.sample_time sample it.",
-            )
-        return ()
-    close = (np.abs(values) < 1.0) & (values.real > 0.0)
-    if values.size > 1 and bool(close.all()):
+    far, close = int(np.sum(np.abs(values) > _FAR)), (np.abs(values) < 1.0) & (values.real > 0.0)
+    if plant.is_discrete and far and np.sum(values.real < 0.0) >= values.size / 2.0:
+        return (
+            f"dt is {plant.dt:g} s, but {far} of {values.size} eigenvalues lie far outside the unit circle (up to "
+            f"{np.abs(values).max():.3g}): are these the matrices of a plant in continuous time? Then give dt: 0, "
+            "and let transform.sample_time sample it.",
+        )
+    if not plant.is_discrete and values.size > 1 and bool(close.all()):
         return (
             "dt is 0, but all eigenvalues lie in the right half of the unit circle: are these the matrices of a "
             "sampled plant? Then give dt in seconds.",

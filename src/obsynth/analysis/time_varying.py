@@ -26,8 +26,7 @@ IntArray: TypeAlias = NDArray[np.intp]
 class StepBlocks(NamedTuple):
     """The matrices of one step as a filter uses them, without noise and inputs.
 
-    Fields: E, A, Phi: ``(rows, nx)``, ``(rows, nx)`` and ``(rows, nq)``: the equations that lead to x(k + 1); C, Psi:
-    ``(outputs, nx)`` and ``(outputs, nq)``: with early constraints the algebraic equations of step k + 1 too.
+    ``E, A (rows, nx)``, ``Phi (rows, nq)``: the equations of x(k + 1); ``C (outputs, nx)``, ``Psi (outputs, nq)``.
     """
 
     E: FloatArray
@@ -52,14 +51,10 @@ def step_blocks(plant: TimeVaryingDescriptorSystem, k: int, late: IntArray) -> S
 
 @dataclass(frozen=True, eq=False)
 class HorizonRanks:
-    """Rank and condition of ``H_k = [E_k; C_k]``, and the residual directions of (18), where they are worst.
+    """Where rank and condition of ``H_k = [E_k; C_k]``, and the residual directions of (18), are worst on a horizon.
 
-    With early constraints H_k holds them among the outputs.
-
-    Fields: steps: How many steps were looked at; worst: Of the H_k with the lowest rank, or the smallest singular
-    values; worst_k: Where that is; condition: The largest condition number of H_k, as given (the units of equations and
-    outputs matter); condition_k: Where that is; directions: The least ``rank E_k + ny - nx``, early constraints being
-    outputs; directions_k: Where that is.
+    With early constraints H_k holds them among the outputs.  ``condition``: as given, in the units of the data;
+    ``directions``: the least ``rank E_k + ny - nx``.
     """
 
     steps: int
@@ -85,25 +80,18 @@ def horizon_ranks(plant: TimeVaryingDescriptorSystem, *, early: bool = False) ->
         steps = 1
     elif late.size:
         steps = max(steps - 1, 1)
-    worst, worst_k, condition, condition_k, directions, directions_k = None, 1, 0.0, 1, None, 1
+    looked_at = []
     for k in range(1, steps + 1):
         E, C = plant.E.at(k), plant.C.at(k)
         if late.size:
             E, _, _, C, _ = step_blocks(plant, k - 1, late)
         H = np.vstack([E, C])
-        decision = decide_rank(H, expected=plant.nx)
-        if worst is None or (decision.rank, decision.smallest_kept) < (worst.rank, worst.smallest_kept):
-            worst, worst_k = decision, k
         values = np.linalg.svd(H, compute_uv=False)
-        found = float(values[0] / values[-1]) if len(H) >= plant.nx and values[-1] > 0.0 else float("inf")
-        if found > condition:
-            condition, condition_k = found, k
-        here = decide_rank(E).rank + len(C) - plant.nx
-        if directions is None or here < directions:
-            directions, directions_k = here, k
-    if worst is None or directions is None:
-        raise SpecError("The plant has no steps.", path="horizon")
-    return HorizonRanks(steps, worst, worst_k, condition, condition_k, directions, directions_k)
+        condition = float(values[0] / values[-1]) if len(H) >= plant.nx and values[-1] > 0.0 else float("inf")
+        looked_at.append((k, decide_rank(H, expected=plant.nx), condition, decide_rank(E).rank + len(C) - plant.nx))
+    worst = min(looked_at, key=lambda step: (step[1].rank, step[1].smallest_kept))
+    hardest, fewest = max(looked_at, key=lambda step: step[2]), min(looked_at, key=lambda step: step[3])
+    return HorizonRanks(steps, worst[1], worst[0], hardest[2], hardest[0], fewest[3], fewest[0])
 
 
 def as_time_varying(

@@ -1,18 +1,17 @@
-"""Invariant zeros with their directions, and whether they lie outside the stability region."""
+"""Invariant zeros with their directions, whether they lie outside the stability region, and far out which are zeros."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.analysis.far_zeros import equilibrated_at, system_zeros
-from obsynth.numerics.arrays import ComplexArray, FloatArray
+from obsynth.numerics.arrays import ComplexArray, FloatArray, read_only
 from obsynth.numerics.pencil_points import FEW_COLUMNS, MOST_DIRECTIONS, PencilPoints, smallest_singular
-from obsynth.numerics.pencils import FiniteZeros
+from obsynth.numerics.pencils import FiniteZeros, finite_zeros
 from obsynth.numerics.ranks import (
     BOUNDARY_NEIGHBOURHOOD,
     BOUNDARY_RANK_TOLERANCE,
@@ -23,8 +22,70 @@ from obsynth.numerics.ranks import (
     RANK_TOLERANCE,
     RankDecision,
 )
-from obsynth.numerics.scaling import EquilibratedPencil, equilibrate_pencil
+from obsynth.numerics.scaling import EquilibratedPencil, equilibrate_pencil, power_of_two_below
 from obsynth.plants.descriptor import DescriptorSystem
+
+#: Steps in which a computed zero is improved before the pencil there is judged.
+NEWTON_STEPS = 4
+
+
+def system_zeros(E: FloatArray, A: FloatArray, *, nx: int) -> FiniteZeros:
+    """Return the finite zeros of a system pencil ``(nx + ny, nx + nu)`` without those that are only nearly infinite.
+
+    Far out a pencil with zeros at infinity is nearly singular everywhere, beside ``z E``: a chain of k states shows
+    with ``z^-k``.  A candidate there counts only when the pencil is singular to rounding in units that suit its size.
+    """
+    found = finite_zeros(E, A, to_the_end=False)
+    if not found.values.size:
+        return found
+    # Both of a pair are judged by the upper one.
+    upper = [complex(z.real, abs(z.imag)) for z in found.values]
+    kept = np.array([abs(z) <= 1.0 or _is_singular(E, A, z, found.normal_rank, nx=nx) for z in upper], dtype=bool)
+    values = found.values[kept]
+    values.setflags(write=False)
+    return replace(found, values=values)
+
+
+def _is_singular(E: FloatArray, A: FloatArray, value: complex, normal_rank: int, *, nx: int) -> bool:
+    """Whether the rank drops at, or within the accuracy of, a computed zero."""
+    pencil = equilibrated_at(E, A, value, nx=nx)
+    point, best = value, np.inf
+    for _ in range(NEWTON_STEPS):
+        matrix = pencil.A - point * pencil.E
+        if matrix.shape[0] >= matrix.shape[1] == normal_rank >= FEW_COLUMNS:
+            found = smallest_singular(matrix)
+            largest, smallest, v = found.largest, float(found.values[0]), found.right[:, 0]
+            u = (matrix @ v).conj()
+            u = u / (float(np.linalg.norm(u)) or 1.0)
+        else:
+            left, sizes, right = np.linalg.svd(matrix)
+            largest, smallest = float(sizes[0]), float(sizes[normal_rank - 1])
+            u, v = left[:, normal_rank - 1].conj(), right[normal_rank - 1].conj()
+        if largest == 0.0:
+            return True
+        best = min(best, smallest / largest)
+        if best <= BOUNDARY_RANK_TOLERANCE:
+            return True
+        slope = u @ pencil.E @ v
+        # A zero far out is known only to the rounding of the largest: Newton's method on u' (A - z E) v finds the rest.
+        step = (u @ (pencil.A - point * pencil.E) @ v) / slope if slope != 0.0 else 0.0
+        if abs(point + step - value) > CLUSTER_TOLERANCE * abs(value):
+            break
+        point = point + step
+    return False
+
+
+def equilibrated_at(E: FloatArray, A: FloatArray, value: complex, *, nx: int) -> EquilibratedPencil:
+    """Return the pencil with states, equations and outputs in units that suit a point of this modulus.
+
+    Beside a large ``z E`` the inputs and outputs would vanish: the states are measured in the units that ``z x`` has.
+    """
+    size = float(power_of_two_below(np.array(max(1.0, abs(value)))))
+    columns = np.where(np.arange(E.shape[1]) < nx, 1.0 / size, 1.0)
+    # Scaled with the modulus at that point, then taken apart again, so that the factors are those of A - z E.
+    scaled = equilibrate_pencil(size * columns * E, columns * A)
+    return EquilibratedPencil(scaled.E / size, scaled.A, scaled.rows, read_only(scaled.columns * columns))
+
 
 #: Points without meaning, tried as generic ones; the clearest of them is used.
 _GENERIC_POINTS = (0.7391, -1.3247, 1.9561, -0.4142)
@@ -34,11 +95,9 @@ _PATH_TO_BOUNDARY = (1.0, 0.75, 0.5, 0.25)
 
 @dataclass(frozen=True, eq=False)
 class Zero:
-    """An invariant zero and the direction that stays invisible there.
+    """An invariant zero and the direction ``(nx,)``, ``(nu,)``, of unit norm, that stays invisible there.
 
-    Fields: value: The point where the pencil loses rank; state_direction, input_direction: ``(nx,)`` and ``(nu,)``:
-    together of unit norm and in the null space of the pencil at ``value``; input_share: Size of the input part when the
-    pencil is equilibrated, so that units do not matter.
+    ``input_share``: size of the input part when the pencil is equilibrated, so that units do not matter.
     """
 
     value: complex
@@ -56,11 +115,8 @@ class Zero:
 class FaultZeros:
     """What faults a plant can hide from its outputs.
 
-    Fields: zeros: Invariant zeros of ``[A - z E, Bf; C, Df]``; outside: Those on or outside the boundary of stability:
-    such a fault grows or persists unseen; normal_rank_full: Whether the pencil has rank ``nx + nf`` at almost every
-    ``z``; if not, some combination of faults never shows at all; hidden_direction: ``(nf,)``, the fault part of the
-    never-visible direction at a generic point, where there is one; hidden_faults: Names of the faults that take part in
-    such directions; decisions: Every rank decided on the way.
+    ``zeros`` of ``[A - z E, Bf; C, Df]``; ``outside``: those not strictly stable; ``normal_rank_full``: rank nx + nf at
+    almost every z; if not, ``hidden_direction (nf,)`` of ``hidden_faults`` never shows.
     """
 
     zeros: tuple[Zero, ...]
@@ -72,11 +128,7 @@ class FaultZeros:
 
 
 def is_outside(value: complex, dt: float) -> bool:
-    """Whether an eigenvalue or zero counts as not strictly stable, by its distance alone.
-
-    True when its modulus is at least ``1 - BOUNDARY_TOLERANCE`` (``dt > 0``) or its real part at least
-    ``-BOUNDARY_TOLERANCE max(1, abs(value))`` (``dt == 0``).
-    """
+    """Whether an eigenvalue or zero counts as not strictly stable, by its distance from the boundary alone."""
     if dt > 0.0:
         return bool(abs(value) >= 1.0 - BOUNDARY_TOLERANCE)
     return bool(complex(value).real >= -BOUNDARY_TOLERANCE * max(1.0, abs(value)))
@@ -88,19 +140,22 @@ def are_outside(E: FloatArray, A: FloatArray, zeros: FiniteZeros, dt: float) -> 
     A zero of multiplicity k moves by ``eps^(1/k)`` under rounding, so distance alone may put a double
     zero on the boundary safely inside.  Near the boundary a zero therefore also counts as outside when
     the pencil itself is singular to working precision all the way to the nearest boundary point.
-
-    Shapes: ``E (m, n)``, ``A (m, n)``.
     """
     judged: PencilPoints | EquilibratedPencil | None = None
     found: dict[complex, bool] = {}
     for value in map(complex, zeros.values):
+        distance = abs(abs(value) - 1.0) if dt > 0.0 else abs(value.real)
         # Of a pair both are where the one before was found to be: the pencil is real.
         if (other := value.conjugate()) in found:
             found[value] = found[other]
-        elif is_outside(value, dt) or not _is_near_boundary(value, dt):
+        elif is_outside(value, dt) or distance > BOUNDARY_NEIGHBOURHOOD * max(1.0, abs(value)):
             found[value] = is_outside(value, dt)
         else:
-            judged = _judged(E, A, zeros.normal_rank) if judged is None else judged
+            if judged is None:
+                judged = pencil = equilibrate_pencil(E, A)
+                # A large one of full column rank is made ready for many points.
+                if min(E.shape[0], zeros.normal_rank) >= E.shape[1] >= FEW_COLUMNS:
+                    judged = PencilPoints(pencil.E, pencil.A, (1.0, 1.0))
             found[value] = _reaches_boundary(judged, value, dt, zeros.normal_rank)
     return tuple(found[value] for value in map(complex, zeros.values))
 
@@ -108,10 +163,7 @@ def are_outside(E: FloatArray, A: FloatArray, zeros: FiniteZeros, dt: float) -> 
 def invariant_zeros(
     E: FloatArray, A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray | None = None
 ) -> tuple[Zero, ...]:
-    """Return the finite zeros of ``[A - z E, B; C, D]`` with multiplicity, each with its direction.
-
-    Shapes: ``E (nx, nx)``, ``A (nx, nx)``, ``B (nx, nu)``, ``C (ny, nx)``, ``D (ny, nu)``.
-    """
+    """Return the finite zeros of ``[A - z E, B; C, D]`` with multiplicity, each with its direction."""
     wide_e, wide_a = system_pencil(E, A, B, C, D)
     return _with_directions(wide_e, wide_a, system_zeros(wide_e, wide_a, nx=E.shape[0]), nx=E.shape[0])
 
@@ -120,9 +172,8 @@ def fault_zeros(plant: DescriptorSystem) -> FaultZeros:
     """Return the invariant zeros from the faults of ``plant`` to its outputs."""
     plant = plant.dense()
     found, zeros, outside = zeros_of_system(plant.E, plant.A, plant.Bf, plant.C, plant.Df, dt=plant.dt)
-    e, a = system_pencil(plant.E, plant.A, plant.Bf, plant.C, plant.Df)
     missing = plant.nx + plant.nf - found.normal_rank
-    direction, names = _hidden(e, a, plant, missing=missing) if missing else (None, ())
+    direction, names = hidden_direction(plant, missing=missing) if missing else (None, ())
     return FaultZeros(zeros, outside, missing == 0, direction, names, found.decisions)
 
 
@@ -136,9 +187,21 @@ def zero_at(E: FloatArray, A: FloatArray, value: complex, B: FloatArray, C: Floa
 
 
 def hidden_direction(plant: DescriptorSystem, *, missing: int) -> tuple[FloatArray, tuple[str, ...]]:
-    """Return the faults that never show, for a pencil from faults to outputs of which ``missing`` ranks are lost."""
-    e, a = system_pencil(plant.E, plant.A, plant.Bf, plant.C, plant.Df)
-    return _hidden(e, a, plant, missing=missing)
+    """Return the faults that never show, for a pencil from faults to outputs of which ``missing`` ranks are lost.
+
+    The direction ``(nf,)`` is the one in the null space at a generic point with the largest fault part.
+    """
+    pencil = equilibrate_pencil(*system_pencil(plant.E, plant.A, plant.Bf, plant.C, plant.Df))
+    kernels = []
+    for point in _GENERIC_POINTS:
+        _, singular_values, right = np.linalg.svd(pencil.A - point * pencil.E)
+        kernels.append((float(singular_values[plant.nx + plant.nf - missing - 1]), right[-missing:].T))
+    _, kernel = max(kernels, key=lambda pair: pair[0])
+    ordered = _smallest_part_first(kernel, slice(plant.nx, None))
+    direction = pencil.columns[plant.nx :] * ordered[plant.nx :, -1]
+    size = float(np.linalg.norm(direction))
+    names = leading_names(np.linalg.norm(ordered[plant.nx :], axis=1), plant.fault_names)
+    return read_only(direction / size if size > 0.0 else direction), names
 
 
 def zeros_of_system(
@@ -162,19 +225,6 @@ def system_pencil(
     return padded, np.block([[A, B], [C, feedthrough]])
 
 
-def _is_near_boundary(value: complex, dt: float) -> bool:
-    distance = abs(abs(value) - 1.0) if dt > 0.0 else abs(value.real)
-    return distance <= BOUNDARY_NEIGHBOURHOOD * max(1.0, abs(value))
-
-
-def _judged(E: FloatArray, A: FloatArray, normal_rank: int) -> PencilPoints | EquilibratedPencil:
-    """Return the equilibrated pencil; a large one of full column rank ready for many points."""
-    pencil, columns = equilibrate_pencil(E, A), E.shape[1]
-    if columns < FEW_COLUMNS or normal_rank < columns or E.shape[0] < columns:
-        return pencil
-    return PencilPoints(pencil.E, pencil.A, (1.0, 1.0))
-
-
 def _reaches_boundary(pencil: PencilPoints | EquilibratedPencil, value: complex, dt: float, normal_rank: int) -> bool:
     point = value / abs(value) if dt > 0.0 else complex(0.0, value.imag)
     # All the way to the boundary: another zero that lies there is no evidence about this one.
@@ -196,7 +246,9 @@ def _with_directions(E: FloatArray, A: FloatArray, found: FiniteZeros, *, nx: in
     zeros: list[Zero] = []
     for i, value in enumerate(values):
         if value.imag < 0.0:
-            zeros.append(_conjugate(zeros[-1]))  # pairs follow each other and are exact
+            # Pairs follow each other and are exact.
+            state, driving = (_frozen(part.conj()) for part in (zeros[-1].state_direction, zeros[-1].input_direction))
+            zeros.append(Zero(value, state, driving, zeros[-1].input_share))
             continue
         pencil = equilibrated_at(E, A, value, nx=nx)
         kernel = _kernel(pencil, value, least=pencil.A.shape[1] - found.normal_rank + 1)
@@ -234,38 +286,10 @@ def _zero_along(direction: NDArray[Any], value: complex, scale: FloatArray, *, n
     return Zero(value, _frozen(original[:nx]), _frozen(original[nx:]), share)
 
 
-def _conjugate(zero: Zero) -> Zero:
-    return Zero(
-        zero.value.conjugate(),
-        _frozen(zero.state_direction.conj()),
-        _frozen(zero.input_direction.conj()),
-        zero.input_share,
-    )
-
-
 def _frozen(vector: NDArray[Any]) -> ComplexArray:
     copy = np.array(vector, dtype=np.complex128)
     copy.setflags(write=False)
     return copy
-
-
-def _hidden(
-    E: FloatArray, A: FloatArray, plant: DescriptorSystem, *, missing: int
-) -> tuple[FloatArray, tuple[str, ...]]:
-    """Return the direction in the null space at a generic point with the largest fault part."""
-    pencil = equilibrate_pencil(E, A)
-    kernels = []
-    for point in _GENERIC_POINTS:
-        _, singular_values, right = np.linalg.svd(pencil.A - point * pencil.E)
-        kernels.append((float(singular_values[plant.nx + plant.nf - missing - 1]), right[-missing:].T))
-    _, kernel = max(kernels, key=lambda pair: pair[0])
-    ordered = _smallest_part_first(kernel, slice(plant.nx, None))
-    direction = pencil.columns[plant.nx :] * ordered[plant.nx :, -1]
-    size = float(np.linalg.norm(direction))
-    names = leading_names(np.linalg.norm(ordered[plant.nx :], axis=1), plant.fault_names)
-    result = np.array(direction / size if size > 0.0 else direction)
-    result.setflags(write=False)
-    return result, names
 
 
 def leading_names(shares: FloatArray, names: Sequence[str], *, most: int | None = None) -> tuple[str, ...]:

@@ -11,21 +11,15 @@ from numpy.typing import ArrayLike
 
 from obsynth.calibration.diagnostics import wrong_samples
 from obsynth.calibration.innovations_fit import InnovationsFit, Timing, chosen_timing, innovations_fit
-from obsynth.calibration.linear_plants import EXACT, LinearPlant, plant_as_written
+from obsynth.calibration.linear_plants import LinearPlant, plant_as_written
 from obsynth.calibration.logs import LogData, read_log
 from obsynth.calibration.plants import NonlinearPlant
 from obsynth.calibration.problem import Problem, calibration_problem, require_variation
 from obsynth.calibration.reporting import IntegrationError, integration_error, reported
 from obsynth.calibration.result import Calibration
-from obsynth.calibration.simulation_error import (
-    FIRST_ROWS,
-    Fit,
-    SimulationError,
-    simulation_fits,
-    with_seen_start,
-)
-from obsynth.errors import SolverError, SpecError
-from obsynth.numerics.arguments import is_whole
+from obsynth.calibration.simulation_error import FIRST_ROWS, Fit, SimulationError, simulation_fits, with_seen_start
+from obsynth.errors import SpecError
+from obsynth.numerics.arguments import chosen, is_whole, whole_number
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
@@ -146,7 +140,13 @@ def calibrate(
        Psychometrika 78, 2013: the weight that keeps variances from zero, which we give only to those that the log
        cannot tell from it.
     """
-    _check_options(method, integration, level, starts, input_delay)
+    chosen(method, "method", METHODS)
+    chosen(integration, "integration", INTEGRATIONS)
+    if not isinstance(level, (int, float)) or not 0.0 < level < 1.0:
+        raise SpecError(f"level is {level!r}: give a probability, such as 0.95.", path="level")
+    starts = whole_number(starts, "starts")
+    if input_delay != "auto" and not is_whole(input_delay):
+        raise SpecError(f"input_delay is {input_delay!r}: give whole rows, or 'auto'.", path="input_delay")
     note = progress or (lambda text: None)
     model = require_plant(model)
     factors = dict(getattr(model, "scales", {})) | dict(scales or {})
@@ -158,7 +158,7 @@ def calibrate(
     plant = NonlinearPlant(model) if isinstance(model, DAEModel) else LinearPlant(model, whole)
     problem = calibration_problem(
         plant, whole, unknown=unknown, priors=priors, noisy=noisy, Q=Q, R=R, initial_state=initial_state,
-        initial_covariance=initial_covariance, substeps=substeps, integration=_first_integration(plant, integration),
+        initial_covariance=initial_covariance, substeps=substeps, integration=plant.integration(integration),
     )  # fmt: skip
     require_variation(problem)
     fits = simulation_fits(problem, starts, seed, note)
@@ -166,7 +166,7 @@ def calibrate(
         problem, fits = seen, simulation_fits(seen, 1, seed, note, start=fits[0].t)
     error = None
     if integration == "auto" and isinstance(plant, NonlinearPlant):
-        error = _step_error(problem, fits[0])
+        error = _step_error(problem, plant, fits[0])
         if error is not None and error.matters:
             note("integrating by Radau")
             problem = problem.integrated("radau", substeps)
@@ -184,6 +184,17 @@ def calibrate(
                 fits = simulation_fits(seen, 1, seed, note, start=fits[0].t)
                 problem, fit, error = _innovations(seen, fits, level, note, before[1])
     return reported(problem, fits[0], fit, level=level, timing=timing, error=error, digest=digest)
+
+
+def _step_error(problem: Problem, plant: NonlinearPlant, fit: Fit) -> IntegrationError | None:
+    """Return what backward Euler errs along the best simulation."""
+    states, theta = (
+        SimulationError(problem).states(fit),
+        np.array(plant.theta(problem.unknown, fit.t), dtype=np.float64),
+    )
+    return integration_error(
+        plant.promoted(problem.unknown), states, problem.u, theta, fit.deviations, problem.log.dt
+    )  # fmt: skip
 
 
 def _innovations(
@@ -221,39 +232,3 @@ def _sample_time(model: Any, dt: float | None, substeps: int) -> float | None:
         raise SpecError("substeps divides the steps of continuous plants, and this one is discrete: leave it out.",
                         path="substeps")  # fmt: skip
     return own
-
-
-def _first_integration(plant: NonlinearPlant | LinearPlant, asked: str) -> str:
-    if isinstance(plant, NonlinearPlant):
-        return "backward-euler" if asked == "auto" else asked
-    if plant.integrations == (EXACT,):
-        return EXACT
-    return "radau" if asked == "auto" else asked
-
-
-def _step_error(problem: Problem, fit: Fit) -> IntegrationError | None:
-    """Return what backward Euler errs along the best simulation; nothing where it cannot be told."""
-    states, plant = SimulationError(problem).states(fit), problem.plant
-    if not isinstance(plant, NonlinearPlant):
-        return None
-    theta = np.array(plant.theta(problem.unknown, fit.t), dtype=np.float64)
-    try:
-        return integration_error(
-            plant.promoted(problem.unknown), states, problem.u, theta, fit.deviations, problem.log.dt
-        )
-    except SolverError:
-        # Where Radau has no solution there is nothing to choose.
-        return None
-
-
-def _check_options(method: Any, integration: Any, level: Any, starts: Any, input_delay: Any) -> None:
-    if method not in METHODS:
-        raise SpecError(f"method is {method!r}: use one of {', '.join(METHODS)}.", path="method")
-    if integration not in INTEGRATIONS:
-        raise SpecError(f"integration is {integration!r}: use one of {', '.join(INTEGRATIONS)}.", path="integration")
-    if not isinstance(level, (int, float)) or not 0.0 < level < 1.0:
-        raise SpecError(f"level is {level!r}: give a probability, such as 0.95.", path="level")
-    if not is_whole(starts) or starts < 1:
-        raise SpecError(f"starts is {starts!r}: give a whole number, at least 1.", path="starts")
-    if input_delay != "auto" and (not is_whole(input_delay)):
-        raise SpecError(f"input_delay is {input_delay!r}: give whole rows, or 'auto'.", path="input_delay")

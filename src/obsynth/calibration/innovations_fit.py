@@ -10,21 +10,12 @@ from numpy.typing import NDArray
 
 from obsynth.calibration.intervals import Information, Side, information, profile_box, quantile, upper_limit
 from obsynth.calibration.likelihood import IMPOSSIBLE
-from obsynth.calibration.maximum import (
-    Maximum,
-    Objective,
-    at_bounds,
-    collapsed,
-    descent,
-    greatest_likelihood,
-    without_collapse,
-)
+from obsynth.calibration.maximum import Maximum, Objective, at_bounds, collapsed, greatest_likelihood, without_collapse
 from obsynth.calibration.problem import Problem
 from obsynth.calibration.simulation_error import Fit, simulation_fits
 from obsynth.numerics.arrays import FloatArray
 
 BoolArray = NDArray[np.bool_]
-
 #: Nats by which another timing of the inputs must be better to be taken: a likelihood ratio of about 150.
 TIMING_NATS = 5.0
 #: A likeliest variance below this share of its upper limit counts as zero.
@@ -68,12 +59,12 @@ def chosen_timing(
 ) -> tuple[Problem, list[Fit], Timing]:
     """Return the problem with the inputs as the likelihood wants them."""
     objective = Objective(problem, fits[0])
-    value, z = descent(objective, objective.start(fits[0].t), objective.low, objective.high, objective.scale)
+    value, z = objective.descent(objective.start(fits[0].t))
     values = {0: value}
     for delay in TRIED_DELAYS:
         note(f"inputs {delay:+d} row")
         moved = Objective(problem.with_log(problem.log.shifted(delay)), fits[0])
-        values[delay] = descent(moved, np.clip(z, moved.low, moved.high), moved.low, moved.high, moved.scale)[0]
+        values[delay] = moved.descent(z)[0]
     best = min(values.values())
     delay = 1 if values[0] - values[1] > TIMING_NATS and values[1] == best else 0
     losses = {rows: found - best for rows, found in sorted(values.items())}
@@ -110,8 +101,7 @@ def moved_by(exact: Problem, start: Fit, maximum: Maximum, avoided: FloatArray, 
     """Return by how much constants move with exact steps: the most, in their deviations."""
     objective = Objective(exact, start)
     objective.avoided[:] = avoided
-    begin = np.clip(maximum.z, objective.low, objective.high)
-    value, z = descent(objective, begin, objective.low, objective.high, objective.scale)
+    value, z = objective.descent(maximum.z)
     if value >= IMPOSSIBLE:
         return 0.0
     moves = np.abs(objective.constants(z) - objective.constants(maximum.z))
@@ -119,17 +109,10 @@ def moved_by(exact: Problem, start: Fit, maximum: Maximum, avoided: FloatArray, 
 
 
 def innovations_fit(
-    problem: Problem,
-    fits: list[Fit],
-    level: float,
-    note: Callable[[str], object],
-    *,
-    exact: Problem | None = None,
+    problem: Problem, fits: list[Fit], level: float, note: Callable[[str], object], *, exact: Problem | None = None
 ) -> tuple[InnovationsFit | None, float]:
-    """Return the fit of the innovations, from fits of the simulation.
-
-    With an ``exact`` problem also by how much its constants would move; there is no fit where that matters.
-    """
+    """Return the fit of the innovations, from fits of the simulation. With an ``exact`` problem also by how much its
+    constants would move; there is no fit where that matters."""
     objective = Objective(problem, fits[0])
     maximum, found = guarded_maximum(objective, fits, note)
     moved = 0.0 if exact is None else moved_by(exact, fits[0], maximum, objective.avoided, found)

@@ -83,21 +83,16 @@ def covariance_of(found: FloatArray, widths: FloatArray, names: tuple[str, ...])
 
 
 def quantile(level: float, constants: int, samples: int, variances: int) -> float:
-    """Return the root of the deviance that bounds every constant at once with probability ``level``.
-
-    Bonferroni's share of the level each; Student's distribution for variances that are found; widened for short logs.
-    """
+    """Return the root of the deviance that bounds every constant at once with probability ``level``. Bonferroni's share
+    of the level each; Student's distribution for variances that are found; widened for short logs."""
     from scipy.stats import norm, t
 
     each = 1.0 - (1.0 - level) / (2.0 * max(constants, 1))
     if not variances:
         return float(norm.ppf(each))
-    return float(t.ppf(each, max(samples - constants - 2, 3))) * widening(samples)
-
-
-def widening(samples: int) -> float:
-    """Return by how much boxes of few rows are wider than Student's distribution says."""
-    return 1.0 + (SHORT_WIDENING - 1.0) * min(1.0, SHORT / samples)
+    return float(t.ppf(each, max(samples - constants - 2, 3))) * (
+        1.0 + (SHORT_WIDENING - 1.0) * min(1.0, SHORT / samples)
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,12 +128,7 @@ def upper_limit(objective: Objective, maximum: Maximum, i: int) -> float:
     return side.value
 
 
-def deviance_root(objective: Objective, maximum: Maximum, i: int, value: float) -> float:
-    """Return the root of the profile's deviance at a value of a constant."""
-    return _Profile(objective, maximum, i).root(value / float(objective.problem.widths[i]))
-
-
-class _Profile:
+class Profile:
     """The least value of the objective as a function of one variable, the others led along."""
 
     def __init__(self, objective: Objective, maximum: Maximum, i: int) -> None:
@@ -180,7 +170,7 @@ class _Profile:
 
 def _side(objective: Objective, maximum: Maximum, i: int, sign: float, target: float) -> Side:
     """Return where the root of the profile's deviance reaches a target; open where a bound comes first."""
-    profile, begin = _Profile(objective, maximum, i), float(maximum.z[i])
+    profile, begin = Profile(objective, maximum, i), float(maximum.z[i])
     end = float(objective.low[i] if sign < 0 else objective.high[i])
     if abs(end - begin) < AT_BOUND:
         return Side(end, True)
@@ -214,10 +204,8 @@ def _side(objective: Objective, maximum: Maximum, i: int, sign: float, target: f
 
 
 def _side_along_valley(objective: Objective, maximum: Maximum, i: int, sign: float, target: float) -> Side:
-    """Return the end of a constant that the log hardly determines: along a valley that bends, in short steps.
-
-    The others are led on from the last two places, and set right by Newton's steps at each.
-    """
+    """Return the end of a constant that the log hardly determines: along a valley that bends, in short steps. The
+    others are led on from the last two places, and set right by Newton's steps at each."""
     others = [j for j in range(len(maximum.z)) if j != i]
     place, rest = float(maximum.z[i]), maximum.z[others].copy()
     end = float(objective.low[i] if sign < 0 else objective.high[i])

@@ -26,23 +26,18 @@ IMPOSSIBLE = 1e12
 
 
 class Likelihood:
-    """Negative log likelihood of a record as a function of ``v = [t, log q, log r]``.
-
-    ``u (n, nu)``, ``y (n, ny)`` with NaN for what is missing, ``noisy`` numbers of equations, ``x0 (nx,)``,
-    ``P0 (nx, nx)``.
-    """
+    """Negative log likelihood of a record as a function of ``v = [t, log q, log r]``. ``u (n, nu)``, ``y (n, ny)`` with
+    NaN for what is missing, ``noisy`` numbers of equations, ``x0 (nx,)``, ``P0 (nx, nx)``."""
 
     def __init__(
         self, graphs: SampleGraphs, u: FloatArray, y: FloatArray, *, noisy: Sequence[int], x0: FloatArray,
         P0: FloatArray,
     ) -> None:  # fmt: skip
         self.graphs, self.samples, self.size = graphs, len(y), graphs.nt + len(noisy) + graphs.ny
-        self.evaluations = 0
         self._both = Compiled(_whole(graphs, u, y, noisy, x0, P0))
 
     def __call__(self, v: FloatArray) -> tuple[float, FloatArray]:
         """Return the value and its gradient ``(nt + len(noisy) + ny,)``."""
-        self.evaluations += 1
         total, gradient, rows = self._both(v)
         left = rows[-1]
         good = np.isfinite(total).all() and np.isfinite(gradient).all() and np.abs(left).max() <= LARGEST_RESIDUAL
@@ -98,24 +93,11 @@ def _update(graphs: SampleGraphs, x: Any, P: Any, u: Any, t: Any, log_r: Any, y:
     e = seen * (y - predicted)
     S = H @ P @ H.T + ca.diag(seen * ca.exp(log_r) + (1.0 - seen))
     root = ca.chol(ca.densify(S)).T
-    whitened = _forward_substituted(root, ca.horzcat(e, H @ P))
+    whitened = ca.solve(root, ca.horzcat(e, H @ P))
     w, V = whitened[:, 0], whitened[:, 1:]
     after = P - V.T @ V
     value = 0.5 * ca.sumsqr(w) + ca.sum1(ca.log(ca.diag(root))) + 0.5 * math.log(2.0 * math.pi) * ca.sum1(seen)
     return ca.vertcat(x + V.T @ w, ca.vec(0.5 * (after + after.T))), ca.vertcat(value, w, e, ca.diag(S))
-
-
-def _forward_substituted(root: Any, right: Any) -> Any:
-    """Return ``root^-1 right`` for a lower triangle."""
-    import casadi as ca
-
-    found: list[Any] = []
-    for i in range(root.shape[0]):
-        rest = right[i, :]
-        for j in range(i):
-            rest = rest - root[i, j] * found[j]
-        found.append(rest / root[i, i])
-    return ca.vertcat(*found)
 
 
 def _symbols(graphs: SampleGraphs, noisy: Sequence[int]) -> tuple[Any, ...]:

@@ -34,23 +34,13 @@ def refused(code: str, message: str, *, signals: Sequence[str] = ()) -> Precondi
 
 
 LogData: TypeAlias = "str | Path | pd.DataFrame | Mapping[str, Any] | Log"
-
-
 #: Stamps further off the grid than this share of a step are refused, and further than the second are told.
 LARGEST_JITTER = 0.2
-
-
 NOTED_JITTER = 0.02
-
-
 #: What counts as one quantum between values of a column: all differences are whole multiples within this.
 QUANTUM_SLACK = 0.02
-
-
 #: Share of distinct values above which a column shows no quantum that limits its noise: a ramp has none twice.
 REPEATED = 0.7
-
-
 #: Rows of wrong values that are named.
 TOLD_ROWS = 5
 #: Decimals to which values of a column are compared, and the share of the largest below which a step is rounding.
@@ -61,11 +51,9 @@ EVEN = 12.0
 
 @dataclass(frozen=True, eq=False)
 class Log:
-    """Inputs and outputs on a regular grid.
-
-    time : ``(n,)`` seconds; u : ``(n, nu)``; y : ``(n, ny)`` with NaN for what is missing; dt : seconds.
-    rows : first row and one past the last, of the data that were given; notes : what was noticed and repaired.
-    """
+    """Inputs and outputs on a regular grid. time : ``(n,)`` seconds; u : ``(n, nu)``; y : ``(n, ny)`` with NaN for what
+    is missing; dt : seconds. rows : first row and one past the last, of the data that were given; notes : what was
+    noticed and repaired."""
 
     time: FloatArray
     u: FloatArray
@@ -89,6 +77,12 @@ class Log:
         names = "\n".join((*self.input_names, "", *self.output_names)).encode()
         return hashlib.sha256(names + b"\0" + np.where(np.isnan(seen), np.nan, seen).tobytes()).hexdigest()
 
+    @property
+    def described(self) -> dict[str, Any]:
+        """What a report says of the log."""
+        return {"source": self.source, "rows": list(self.rows), "digest": self.digest, "samples": self.samples,
+                "dt": self.dt}  # fmt: skip
+
     def shifted(self, rows: int) -> Log:
         """Return the log with its inputs later by whole rows: what row k says acts from row k on for ``rows = 1``."""
         if abs(rows) >= len(self.u):
@@ -99,8 +93,7 @@ class Log:
             u[:rows] = self.u[0]
         elif rows < 0:
             u[rows:] = self.u[-1]
-        return Log(self.time, read_only(u), self.y, self.dt, self.input_names, self.output_names, self.rows,
-                   self.source, self.notes)  # fmt: skip
+        return replace(self, u=read_only(u))
 
     def without(self, wrong: NDArray[np.bool_]) -> Log:
         """Return the log without single outputs ``(n, ny)`` that are no measurements, with a note for each sensor."""
@@ -141,17 +134,15 @@ def read_log(
     rows: str | slice | Sequence[int] | None = None, columns: Mapping[str, str] | None = None,
     scales: Mapping[str, float] | None = None, dt: float | None = None,
 ) -> Log:  # fmt: skip
-    """Return the rows of a log as inputs and outputs on a grid.
-
-    A log is a CSV or Parquet file, a data frame, or a mapping from names to columns; ``columns`` says which column a
-    signal (or ``time``) is in where the names differ, ``scales`` what its values are multiplied by.
-    """
+    """Return the rows of a log as inputs and outputs on a grid. A log is a CSV or Parquet file, a data frame, or a
+    mapping from names to columns; ``columns`` says which column a signal (or ``time``) is in where the names differ,
+    ``scales`` what its values are multiplied by."""
     if isinstance(log, Log):
         if (log.input_names, log.output_names) != (tuple(input_names), tuple(output_names)):
             raise SpecError("The log is of another plant: its signals differ.", path="log")
         first, last = parsed_rows(rows, log.samples)
-        return Log(log.time[first:last], log.u[first:last], log.y[first:last], log.dt, log.input_names,
-                   log.output_names, (log.rows[0] + first, log.rows[0] + last), log.source, log.notes)  # fmt: skip
+        return replace(log, time=log.time[first:last], u=log.u[first:last], y=log.y[first:last],
+                       rows=(log.rows[0] + first, log.rows[0] + last))  # fmt: skip
     table, source = _table(log)
     signals = ("time", *input_names, *output_names)
     for what, given in (("columns", columns or {}), ("scales", scales or {})):
@@ -211,11 +202,8 @@ def _on_grid(
 ) -> Log:  # fmt: skip
     """Return the log on its grid; missing rows become rows without outputs whose inputs are those that follow."""
     if not np.isfinite(time).all() or (np.diff(time) <= 0).any():
-        bad = (
-            int(np.argmax(~np.isfinite(time)))
-            if not np.isfinite(time).all()
-            else int(np.argmax(np.diff(time) <= 0)) + 1
-        )
+        wrong = ~np.isfinite(time) if not np.isfinite(time).all() else np.diff(time, prepend=-np.inf) <= 0
+        bad = int(np.argmax(wrong))
         raise bad_log("time", f"Stamps must rise and be finite, but that of row {rows[0] + bad} is {time[bad]:g} s.",
                       path="log.time")  # fmt: skip
     gaps = np.diff(time)

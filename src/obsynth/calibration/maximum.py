@@ -15,7 +15,6 @@ from obsynth.calibration.simulation_error import Fit
 from obsynth.numerics.arrays import FloatArray
 
 BoolArray = NDArray[np.bool_]
-
 #: Where the search for the variances begins: process noise and sensor noise as logarithms of factors of a first guess.
 #: With one start alone the result was 3.6 nats above the best on the measured tanks.
 NOISE_STARTS = ((0.0, 0.0), (3.0, -2.0), (-5.0, 0.0), (0.0, -4.0))
@@ -49,10 +48,8 @@ AT_BOUND = 1e-6
 
 
 class Objective:
-    """Negative log of likelihood and prior, and its gradient, of free variables ``z``.
-
-    ``z`` holds the constants in widths of their bounds, then the logarithms of the variances that are not known.
-    """
+    """Negative log of likelihood and prior, and its gradient, of free variables ``z``. ``z`` holds the constants in
+    widths of their bounds, then the logarithms of the variances that are not known."""
 
     def __init__(self, problem: Problem, fit: Fit) -> None:
         p, g = problem, problem.graphs
@@ -106,6 +103,10 @@ class Objective:
         value += 0.5 * float(p.prior_weights @ away**2) - 0.5 * float(self.avoided @ z)
         return value, gradient[self.free] - 0.5 * self.avoided
 
+    def descent(self, start: FloatArray) -> tuple[float, FloatArray]:
+        """Return a minimum within the bounds near a start, and where it is."""
+        return descent(self, np.clip(start, self.low, self.high), self.low, self.high, self.scale)
+
     def plain(self, z: FloatArray) -> float:
         """Return the negative log likelihood alone."""
         return self.likelihood(self.full(z))[0]
@@ -123,14 +124,11 @@ class Objective:
 @dataclass(frozen=True, eq=False)
 class Maximum:
     """Where the likelihood is greatest: free variables, value, Hessian, and the value that each start reached.
-
-    ``likeliest`` are the free variables before any variance was kept from zero.
-    """
+    ``likeliest`` are the free variables before any variance was kept from zero."""
 
     z: FloatArray
     value: float
     hessian: FloatArray
-    starts: tuple[float, ...]
     likeliest: FloatArray
 
 
@@ -168,34 +166,30 @@ def descent(
 
 def greatest_likelihood(objective: Objective, fits: Sequence[Fit], note: Callable[[str], object]) -> Maximum:
     """Return the best of several searches, polished."""
-    starts: list[float] = []
-    best, value = None, np.inf
+    count, best, value = 0, None, np.inf
     for i, fit in enumerate(fits):
         if i and fit.cost - fits[0].cost < SAME_MINIMUM * abs(fits[0].cost):
             continue
         for process, sensor in NOISE_STARTS if i == 0 else NOISE_STARTS[:1]:
-            note(f"likelihood, start {len(starts) + 1}")
+            count += 1
+            note(f"likelihood, start {count}")
             start = objective.start(fit.t) + process * objective.is_q + sensor * objective.is_r
-            start = np.clip(start, objective.low, objective.high)
-            reached, z = descent(objective, start, objective.low, objective.high, objective.scale)
-            starts.append(reached)
+            reached, z = objective.descent(start)
             if reached < value:
                 best, value = z, reached
     if best is None or value >= IMPOSSIBLE:
         raise refused("cannot-simulate", "The filter has no finite likelihood from any start: check units, bounds and "
                       "the initial covariance.", signals=list(objective.problem.unknown))  # fmt: skip
     value, best, curvature = polished(objective, best)
-    return Maximum(best, value, curvature, tuple(starts), best)
+    return Maximum(best, value, curvature, best)
 
 
 def polished(
     objective: Objective, z: FloatArray, *, fixed: int | None = None, most: int = MOST_NEWTON_STEPS,
     tolerance: float = NEWTON_TOLERANCE, near: FloatArray | None = None,
 ) -> tuple[float, FloatArray, FloatArray]:  # fmt: skip
-    """Return value, place and Hessian after Newton steps: a quiet log makes valleys that other searches end beside.
-
-    One variable may be fixed; the Hessian is then that of a place nearby.  ``near`` is a Hessian to begin with.
-    """
+    """Return value, place and Hessian after Newton steps: a quiet log makes valleys that other searches end beside. One
+    variable may be fixed; the Hessian is then that of a place nearby. ``near`` is a Hessian to begin with."""
     value, gradient = objective(z)
     curvature = hessian(objective, z) if near is None else near
     for _ in range(most):
@@ -264,11 +258,9 @@ def collapsed(objective: Objective, maximum: Maximum) -> BoolArray:
 
 
 def without_collapse(objective: Objective, maximum: Maximum, note: Callable[[str], object]) -> Maximum:
-    """Return the maximum with variances kept away from zero where the log cannot tell them from it.
-
-    The weight sqrt(q) of a boundary-avoiding prior (Chung et al. 2013) is given to those variances alone: a variance
-    that a short log makes zero by chance would make every box too small.
-    """
+    """Return the maximum with variances kept away from zero where the log cannot tell them from it. The weight sqrt(q)
+    of a boundary-avoiding prior (Chung et al. 2013) is given to those variances alone: a variance that a short log
+    makes zero by chance would make every box too small."""
     for _ in range(len(objective.problem.noisy) + 1):
         new = collapsed(objective, maximum) & (objective.avoided == 0.0)
         if not new.any():
@@ -279,11 +271,11 @@ def without_collapse(objective: Objective, maximum: Maximum, note: Callable[[str
         for raised in RAISED:
             start = maximum.z.copy()
             start[new] = np.clip(objective.first[new] + raised, objective.low[new], objective.high[new])
-            reached, z = descent(objective, start, objective.low, objective.high, objective.scale)
+            reached, z = objective.descent(start)
             if reached < value:
                 best, value = z, reached
         value, best, curvature = polished(objective, best)
-        maximum = Maximum(best, value, curvature, maximum.starts, maximum.likeliest)
+        maximum = Maximum(best, value, curvature, maximum.likeliest)
     return maximum
 
 

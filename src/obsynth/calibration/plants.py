@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -13,83 +14,46 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.dae.functions import DAEFunctions
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.dae.symbols import symbols_of
-from obsynth.plants.names import index_of
+from obsynth.plants.validation import index_of
 
 #: Deviation of an initial state that is not stated, as a share of its nominal size.
 DEFAULT_STATE_SHARE = 0.1
 
 
-class CalibrationPlant(Protocol):
+class CalibrationPlant(ABC):
     """A plant whose constants are to be found."""
 
-    @property
-    def state_names(self) -> tuple[str, ...]:
-        """The states."""
-        ...
+    state_names: tuple[str, ...]
+    equation_names: tuple[str, ...]  # to whose right sides noise may be added
+    values: Mapping[str, float]  # nominal value of all that may be unknown
+    unstated: frozenset[str] = frozenset()  # those of them without a value that is stated
+    units: Mapping[str, str]
+    nominal_state: FloatArray  # ``(nx,)``
+    state_scales: FloatArray  # sizes of the states ``(nx,)``
+    state_deviations: FloatArray  # what an initial state may differ by ``(nx,)``
+    nominal_signals: FloatArray  # ``(ns,)``
+    notes: tuple[str, ...] = ()  # sentences of every verdict
+    has_levels: bool = True  # whether signals are values, and no deviations from an operating point
 
-    @property
-    def equation_names(self) -> tuple[str, ...]:
-        """The equations, to whose right sides noise may be added."""
-        ...
+    @abstractmethod
+    def integration(self, asked: str) -> str:
+        """Return how the plant is integrated at first."""
 
-    @property
-    def values(self) -> Mapping[str, float]:
-        """Nominal value of all that may be unknown."""
-        ...
-
-    @property
-    def unstated(self) -> frozenset[str]:
-        """Those of them without a value that is stated."""
-        ...
-
-    @property
-    def units(self) -> Mapping[str, str]:
-        """Units by name."""
-        ...
-
-    @property
-    def nominal_state(self) -> FloatArray:
-        """``(nx,)``."""
-        ...
-
-    @property
-    def state_scales(self) -> FloatArray:
-        """Sizes of the states ``(nx,)``."""
-        ...
-
-    @property
-    def state_deviations(self) -> FloatArray:
-        """What an initial state may differ by ``(nx,)``."""
-        ...
-
-    @property
-    def nominal_signals(self) -> FloatArray:
-        """``(ns,)``."""
-        ...
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Sentences of every verdict."""
-        ...
-
+    @abstractmethod
     def signals(self, log: Log) -> FloatArray:
         """Return what steps and outputs take of each row ``(n, ns)``."""
-        ...
 
+    @abstractmethod
     def step(self, unknown: Sequence[str], integration: str) -> tuple[int, Any]:
         """Return stages, and the function from stages, state before, signals, constants and dt to equations."""
-        ...
 
+    @abstractmethod
     def outputs(self, unknown: Sequence[str]) -> Any:
         """Return the function from state, signals and constants to y, H and L."""
-        ...
 
 
-class NonlinearPlant:
+class NonlinearPlant(CalibrationPlant):
     """A `DAEModel`; its signals are its inputs."""
-
-    unstated: frozenset[str] = frozenset()
-    notes: tuple[str, ...] = ()
 
     def __init__(self, model: DAEModel) -> None:
         self.model = model
@@ -100,6 +64,10 @@ class NonlinearPlant:
         self.state_deviations = DEFAULT_STATE_SHARE * self.state_scales
         self.nominal_signals = np.array(model.nominal_input)
         self._promoted: dict[tuple[str, ...], DAEModel] = {}
+
+    def integration(self, asked: str) -> str:
+        """Return backward Euler unless something else is asked for."""
+        return "backward-euler" if asked == "auto" else asked
 
     def signals(self, log: Log) -> FloatArray:
         """Return the inputs ``(n, nu)``."""

@@ -12,11 +12,11 @@ from obsynth.calibration.logs import EVEN, Log, bad_log, quantum, refused, repea
 from obsynth.calibration.plants import CalibrationPlant
 from obsynth.calibration.step_graphs import SampleGraphs, sample_graphs
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import is_number, is_whole
-from obsynth.numerics.arrays import FloatArray, as_matrix
-from obsynth.numerics.covariances import covariance_factor
-from obsynth.plants.dae.checks import finite_vector
-from obsynth.plants.names import index_of
+from obsynth.numerics.arguments import is_number, whole_number
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.ranks import covariance_factor
+from obsynth.observers.records import named_covariance, named_vector
+from obsynth.plants.validation import index_of
 
 #: Measured values for each unknown constant and variance that are needed at least.
 VALUES_PER_UNKNOWN = 5
@@ -26,10 +26,8 @@ LEAST_NOISE = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """A plant with its log; arrays by unknown ``(nt,)``, by sensor ``(ny,)``, by noisy equation.
-
-    ``u (n, ns)``: the signals that the plant takes of each row.
-    """
+    """A plant with its log; arrays by unknown ``(nt,)``, by sensor ``(ny,)``, by noisy equation. ``u (n, ns)``: the
+    signals that the plant takes of each row."""
 
     plant: CalibrationPlant
     log: Log
@@ -95,8 +93,7 @@ def calibration_problem(
     initial_state: Any, initial_covariance: Any, integration: str, substeps: int,
 ) -> Problem:  # fmt: skip
     """Return the problem, or say what is wrong with what is asked."""
-    if not is_whole(substeps) or substeps < 1:
-        raise SpecError(f"substeps is {substeps!r}: give a whole number, at least 1.", path="substeps")
+    substeps = whole_number(substeps, "substeps")
     if not log.samples > 1:
         raise bad_log("too-short", f"The log has {log.samples} row(s): a calibration needs more.")
     if not isinstance(unknown, Mapping):
@@ -127,12 +124,12 @@ def calibration_problem(
         raise bad_log("too-short", f"The log is too short: {seen} measured values for {len(names)} constants and "
                       f"{variances} variances; at least {needed} are needed. Take more rows, fewer unknowns, or state "
                       "Q and R.")  # fmt: skip
-    x0 = initial_state_of(plant, initial_state)
+    x0 = named_vector(initial_state, plant.state_names, plant.nominal_state, "initial_state")
     graphs = sample_graphs(plant, names, log.dt, integration=integration, substeps=substeps, samples=log.samples)
     return Problem(
         plant, log, plant.signals(log), names, np.array([values[name] for name in names]), low, high, means, weights,
         equations, known_Q,
-        known_R, x0, _covariance(plant, initial_covariance), quanta, floors, graphs, integration, int(substeps),
+        known_R, x0, _covariance(plant, initial_covariance), quanta, floors, graphs, integration, substeps,
     )  # fmt: skip
 
 
@@ -193,29 +190,9 @@ def _variances(given: Mapping[str, float | None] | None, names: Sequence[str], w
     return found
 
 
-def initial_state_of(plant: CalibrationPlant, value: Any) -> FloatArray:
-    """Return a state ``(nx,)`` from an array or from values by name; nominal where nothing is said."""
-    if not isinstance(value, Mapping):
-        return finite_vector(value, plant.state_names, plant.nominal_state, "initial_state")
-    x = np.array(plant.nominal_state)
-    for name, entry in value.items():
-        x[index_of(name, plant.state_names, what="initial_state")] = float(entry)
-    return finite_vector(x, plant.state_names, x, "initial_state")
-
-
 def _covariance(plant: CalibrationPlant, value: Any) -> FloatArray:
     default, nx = plant.state_deviations**2, len(plant.state_names)
-    if value is None:
-        return np.diag(default)
-    if isinstance(value, Mapping):
-        variances = np.array(default)
-        for name, entry in value.items():
-            variances[index_of(name, plant.state_names, what="initial_covariance")] = float(entry)
-        matrix = np.diag(variances)
-    elif np.ndim(value) == 0:
-        matrix = float(value) * np.eye(nx)
-    else:
-        matrix = as_matrix(value, "initial_covariance")
+    matrix = named_covariance(value, plant.state_names, "initial_covariance", default, others=default)
     if matrix.shape != (nx, nx):
         raise SpecError(f"initial_covariance is {matrix.shape}, but {(nx, nx)} is needed.", path="initial_covariance")
     covariance_factor(matrix, "initial_covariance")

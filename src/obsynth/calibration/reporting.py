@@ -5,6 +5,7 @@ How a model is to be integrated on a log: what a step of backward Euler errs, ag
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,11 +21,12 @@ from obsynth.calibration.diagnostics import (
     whiteness,
 )
 from obsynth.calibration.innovations_fit import InnovationsFit, Timing
-from obsynth.calibration.intervals import covariance_of, quantile
+from obsynth.calibration.intervals import Side, covariance_of, quantile
 from obsynth.calibration.logs import EVEN, TOLD_ROWS
 from obsynth.calibration.problem import Problem
 from obsynth.calibration.result import CalibratedBox, Calibration
 from obsynth.calibration.simulation_error import Fit, SimulationError, unexplained
+from obsynth.errors import SolverError
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.plants.dae.functions import DAEFunctions
 from obsynth.plants.dae.model import DAEModel
@@ -38,10 +40,8 @@ COMPARED = 100
 
 @dataclass(frozen=True)
 class IntegrationError:
-    """Largest difference of one step of backward Euler from Radau, in deviations of a sensor, and where it is.
-
-    moved : by how much it moves a constant, in deviations of that, where it was asked.
-    """
+    """Largest difference of one step of backward Euler from Radau, in deviations of a sensor, and where it is. moved :
+    by how much it moves a constant, in deviations of that, where it was asked."""
 
     largest: float
     sensor: str
@@ -56,14 +56,20 @@ class IntegrationError:
 
 def integration_error(
     model: DAEModel, states: FloatArray, u: FloatArray, theta: FloatArray, deviations: FloatArray, dt: float
-) -> IntegrationError:
-    """Compare one step from each state ``(n, nx)`` with the input that leads on, ``u (n, nu)``, k + 1 for state k."""
+) -> IntegrationError | None:
+    """Compare one step from each state ``(n, nx)`` with the input that leads on, ``u (n, nu)``, k + 1 for state k.
+
+    Where Radau has no solution there is nothing to compare.
+    """
     steps = [ImplicitStep(DAEFunctions(model, method), dt) for method in ("backward-euler", "radau")]
     worst = IntegrationError(0.0, model.output_names[0], 0)
     for k in np.unique(np.linspace(0, max(len(states) - 2, 0), min(COMPARED, max(len(states) - 1, 1))).astype(int)):
         after = min(k + 1, len(u) - 1)
-        seen = [step.functions.outputs(step.solve(states[k], u[after], theta, before=u[k], k=int(k)).x, theta)[0]
-                for step in steps]  # fmt: skip
+        try:
+            seen = [step.functions.outputs(step.solve(states[k], u[after], theta, before=u[k], k=int(k)).x, theta)[0]
+                    for step in steps]  # fmt: skip
+        except SolverError:
+            return None
         errors = np.abs(seen[0] - seen[1]) / deviations
         i = int(np.argmax(errors))
         if not errors[i] <= worst.largest:
@@ -94,7 +100,7 @@ def reported(
     whitened = np.where(seen, found.whitened, np.nan)
     colours = {name: whiteness(column) for name, column in zip(problem.output_names, whitened.T, strict=True)}
     change = change_of_mean(whitened)
-    nis = consistency(np.where(seen, found.whitened, 0.0), seen)
+    nis = consistency(float((found.whitened[seen] ** 2).sum()), int(seen.sum()))
     sides = dict(zip(names, found.sides, strict=True))
     open_sides = tuple((name, side) for name, pair in sides.items()
                        for side, end in zip(("low", "high"), pair, strict=True) if end.is_open)  # fmt: skip
@@ -118,16 +124,13 @@ def reported(
         dict(zip(problem.output_names, problem.quanta.tolist(), strict=True)), at_end, problem.integration,
         problem.substeps, "innovations" if fit is not None else "simulation", -found.value, tuple(verdict),
         read_only(whitened), read_only(problem.y - found.innovations), read_only(np.sqrt(found.variances)),
-        {"source": problem.log.source, "rows": list(problem.log.rows), "digest": digest,
-         "samples": problem.log.samples, "dt": problem.log.dt},
+        problem.log.described | {"digest": digest},
         {name: problem.plant.units.get(name, "1") for name in names}, problem.output_names,
     )  # fmt: skip
 
 
 def _of_simulation(problem: Problem, start: Fit, level: float) -> InnovationsFit:
     """Return what the fit of a simulation says, in the form of a fit of innovations; its boxes are Wald's."""
-    from obsynth.calibration.intervals import Side
-
     error = SimulationError(problem)
     nt, scale = error.nt, error.scale
     inner = start.information
@@ -158,20 +161,17 @@ def _fitted(
         told = ", ".join(f"{name} {share:+.2g}" for name, share in direction.items())
         found.append(f"This log does not determine the direction ({told}), in widths of the bounds: move "
                      "what excites it, state a prior, or fix one of them.")  # fmt: skip
-    for name, side in box.open_sides:
-        found.append(f"The box of {name} is open on its {side} side: the bound stands there, not the log.")
+    found += [f"The box of {name} is open on its {side} side: the bound stands there, not the log."
+              for name, side in box.open_sides]  # fmt: skip
     found += [f"{name} is at a bound: widen it if the constant may lie beyond." for name in at_end]
-    free = [name for name in box.nominal if not any(name in direction for direction in fit.information.undetermined)]
-    for i, first in enumerate(problem.unknown):
-        for j in range(i + 1, len(problem.unknown)):
-            second = problem.unknown[j]
-            if first in free and second in free and abs(correlation[i, j]) > CORRELATED:
-                found.append(f"{first} and {second} are correlated by {correlation[i, j]:+.2f}: their combination "
-                             "is known better than either.")  # fmt: skip
-    for name in limited:
-        value = {**Q, **R}[name]
-        found.append(f"The variance of {name} cannot be told from zero: its upper limit {value:.3g} is used.")
-    return found
+    free = [i for i, name in enumerate(problem.unknown)
+            if not any(name in direction for direction in fit.information.undetermined)]  # fmt: skip
+    found += [f"{problem.unknown[i]} and {problem.unknown[j]} are correlated by {correlation[i, j]:+.2f}: their "
+              "combination is known better than either."
+              for i, j in itertools.combinations(free, 2) if abs(correlation[i, j]) > CORRELATED]  # fmt: skip
+    values = {**Q, **R}
+    return found + [f"The variance of {name} cannot be told from zero: its upper limit {values[name]:.3g} is used."
+                    for name in limited]  # fmt: skip
 
 
 def _misfits(problem: Problem, start: Fit, whitened: FloatArray) -> list[str]:
@@ -194,13 +194,10 @@ def _misfits(problem: Problem, start: Fit, whitened: FloatArray) -> list[str]:
 
 
 def _checked(nis: Consistency, colours: dict[str, Whiteness], row: int | None, simulated: bool) -> list[str]:
-    found = []
-    coloured = [name for name, test in colours.items() if test.probability < SIGNIFICANT]
-    for name in coloured:
-        test = colours[name]
-        found.append(f"The innovations of {name} are not white (p = {test.probability:.2g}, first autocorrelation "
-                     f"{test.first:+.2f}): something that moves {name} is not in the model.")  # fmt: skip
-    if simulated and coloured:
+    found = [f"The innovations of {name} are not white (p = {test.probability:.2g}, first autocorrelation "
+             f"{test.first:+.2f}): something that moves {name} is not in the model."
+             for name, test in colours.items() if test.probability < SIGNIFICANT]  # fmt: skip
+    if simulated and found:
         found.append("The residuals of a simulation that are not white make boxes too small: use method='innovations'.")
     if not simulated and not nis.holds:
         found.append(f"NIS per degree of freedom is {nis.value:.2f}, outside {nis.low:.2f} to {nis.high:.2f}.")

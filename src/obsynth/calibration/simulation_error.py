@@ -11,13 +11,11 @@ from numpy.typing import NDArray
 
 from obsynth.calibration.likelihood import LARGEST_RESIDUAL
 from obsynth.calibration.logs import refused
-from obsynth.calibration.plants import NonlinearPlant
 from obsynth.calibration.problem import Problem
 from obsynth.numerics.arrays import SMALLEST, FloatArray
 from obsynth.plants.dae.functions import Compiled
 
 BoolArray = NDArray[np.bool_]
-
 #: Rounds in which the sensors' weights are estimated again; the first is robust against single wrong values.
 ROUNDS = 3
 MOST_EVALUATIONS = 60
@@ -152,11 +150,9 @@ def simulation_fits(
 
 
 def with_seen_start(problem: Problem, fit: Fit, *, first: FloatArray | None = None) -> Problem:
-    """Return the problem with a wider covariance of the initial state, where the log begins elsewhere.
-
-    A start that nobody stated would else look like a fault in the first rows.  It is seen in the fit, or in the
-    ``first`` whitened innovations ``(rows, ny)``: then a fit that hardly knows it says where it is.
-    """
+    """Return the problem with a wider covariance of the initial state, where the log begins elsewhere. A start that
+    nobody stated would else look like a fault in the first rows. It is seen in the fit, or in the ``first`` whitened
+    innovations ``(rows, ny)``: then a fit that hardly knows it says where it is."""
     deviations, limit = np.sqrt(np.diag(problem.P0)), START_LIMIT
     if first is not None:
         if not np.abs(np.nan_to_num(first)).max() > FIRST_LIMIT:
@@ -206,13 +202,13 @@ def _require_explained(problem: Problem, left: FloatArray) -> None:
 def _require_levels(problem: Problem, fit: Fit, error: SimulationError) -> None:
     """Refuse a single sensor in other units: the best fit leaves nearly all of it, on another level altogether."""
     simulated, y = error.simulated(np.concatenate([fit.t, fit.x0]) / error.scale)[0], problem.y
-    if not isinstance(problem.plant, NonlinearPlant):
+    if not problem.plant.has_levels:
         # Deviations from an operating point have no level, but a size.
         simulated, y = simulated - simulated.mean(axis=0), y - np.nanmean(y, axis=0)
     levels = np.sqrt(np.nanmean(simulated**2, axis=0)) / np.maximum(np.sqrt(np.nanmean(y**2, axis=0)), SMALLEST)
     far = (levels > OTHER_LEVEL) | (levels < 1.0 / OTHER_LEVEL)
     far &= fit.deviations > UNEXPLAINED * np.nanstd(y, axis=0)
-    far &= isinstance(problem.plant, NonlinearPlant) | _shares(problem, fit.deviations)[1]
+    far &= problem.plant.has_levels | _shares(problem, fit.deviations)[1]
     if far.any():
         names = [name for name, wrong in zip(problem.output_names, far, strict=True) if wrong]
         told = ", ".join(f"{problem.output_names[i]}: {1.0 / levels[i]:.3g} times what the model says"

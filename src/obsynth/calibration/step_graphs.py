@@ -19,8 +19,8 @@ import numpy as np
 
 from obsynth.calibration.plants import CalibrationPlant
 from obsynth.numerics.arrays import SMALLEST, FloatArray
-from obsynth.numerics.symbolic_solve import largest_entries
-from obsynth.observers.dae.compiled_library import compiler
+from obsynth.numerics.newton import largest_entries
+from obsynth.observers.dae.c_code import compiler
 
 #: Optimisation costs more than it gains on straight code of thousands of lines.
 FLAGS = ("-std=c99", "-O1", "-ffp-contract=off", "-shared", "-fPIC")
@@ -57,14 +57,11 @@ COMPILED_OPERATIONS = 200_000
 
 @dataclass(frozen=True, eq=False)
 class SampleGraphs:
-    """The functions of one sample; ``u (nu,)`` are the signals, ``t (nt,)`` the unknown constants.
-
-    solve : from x, u, t to the stages of all substeps and the scaled residual that is left.
-    sensitivities : from x, u, t, stages to what `local` takes as numbers: stages and their derivatives.
-    local : from x, u, t and those numbers (with x itself) to the state after, F, G by t, and the noise's way.
-    outputs : from x, u, t to y, H and L by t.
-    fast : `local`, to be evaluated and not to be differentiated; in_c : whether functions are machine code.
-    """
+    """The functions of one sample; ``u (nu,)`` are the signals, ``t (nt,)`` the unknown constants. solve : from x, u, t
+    to the stages of all substeps and the scaled residual that is left. sensitivities : from x, u, t, stages to what
+    `local` takes as numbers: stages and their derivatives. local : from x, u, t and those numbers (with x itself) to
+    the state after, F, G by t, and the noise's way. outputs : from x, u, t to y, H and L by t. fast : `local`, to be
+    evaluated and not to be differentiated; in_c : whether functions are machine code."""
 
     solve: Any
     sensitivities: Any
@@ -148,7 +145,7 @@ class _Substep:
         X, x = ca.SX.sym("X", self.size), ca.SX.sym("x", self.nx)
         u, t = ca.SX.sym("u", len(plant.nominal_signals)), ca.SX.sym("t", len(unknown))
         sizes = ca.DM(np.tile(plant.state_scales, self.stages))
-        equations = self._equations(X, x, u, t)
+        equations = self.function(X, x, u, t, self.dt)
         J = ca.jacobian(equations, X)
         values = np.array([plant.values[name] for name in unknown])
         self.order = _pivots(ca.Function("J", [X, x, u, t], [ca.densify(J)]), plant, self.stages, values)
@@ -180,15 +177,12 @@ class _Substep:
         after, rest = choice(unsolved, X, *before)
         return ca.Function("solution", start, [after, ca.if_else(unsolved, rest, left)])
 
-    def _equations(self, X: Any, x: Any, u: Any, t: Any) -> Any:
-        return self.function(X, x, u, t, self.dt)
-
     def symbolic(self, X: Any, x: Any, u: Any, t: Any) -> tuple[Any, Any, Any]:
         """Return the derivatives of the stages by x and by t, and of the state after by what is added."""
         import casadi as ca
 
         Xs, xs, us, ts = (ca.SX.sym(name, part.numel()) for name, part in zip("Xxut", (X, x, u, t), strict=True))
-        equations, nx, nt = self._equations(Xs, xs, us, ts), self.nx, ts.numel()
+        equations, nx, nt = self.function(Xs, xs, us, ts, self.dt), self.nx, ts.numel()
         right = ca.horzcat(-ca.jacobian(equations, xs), -ca.jacobian(equations, ts),
                            ca.repmat(ca.SX.eye(nx), self.stages, 1))  # fmt: skip
         found = eliminated(ca.jacobian(equations, Xs), right, self.order)

@@ -1,9 +1,4 @@
-"""Comparing a recorded, fault-free log with a design: the public function.
-
-Which variances of a design a log contradicts: likeliest ones beside those that were designed with.
-
-The innovations of a design along a log, with what the design expects of them.
-"""
+"""Comparing a recorded, fault-free log with a design: its innovations, the variances that the log contradicts."""
 
 from __future__ import annotations
 
@@ -14,9 +9,10 @@ import numpy as np
 
 from obsynth.calibration.diagnostics import (
     SIGNIFICANT,
+    SensorValidation,
+    Validation,
     change_of_mean,
     consistency,
-    consistency_of,
     whiteness,
     wrong_samples,
 )
@@ -27,24 +23,21 @@ from obsynth.calibration.problem import Problem
 from obsynth.calibration.reporting import IntegrationError, integration_error
 from obsynth.calibration.simulation_error import Fit
 from obsynth.calibration.step_graphs import sample_graphs
-from obsynth.calibration.validation import SensorValidation, Validation
-from obsynth.errors import PreconditionError, SolverError, SpecError
+from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.estimates import Estimates
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.recursive.observer import RecursiveObserver
-from obsynth.observers.robustness import with_all_sensors
+from obsynth.observers.running import changed
 from obsynth.results.design import ObserverDesign
 
 
 @dataclass(frozen=True, eq=False)
 class RecordedInnovations:
-    """Innovations ``(n, ny)`` and their deviations; sum of NIS and of its degrees; each parameter ``(n, 2)``.
-
-    error : What a step of backward Euler errs along the log, of a nonlinear observer that takes such steps.
-    """
+    """Innovations ``(n, ny)`` and their deviations; sum of NIS and of its degrees; each parameter ``(n, 2)``. error :
+    What a step of backward Euler errs along the log, of a nonlinear observer that takes such steps."""
 
     innovations: FloatArray
     deviations: FloatArray
@@ -66,34 +59,19 @@ def recorded_innovations(design: ObserverDesign, log: Log) -> RecordedInnovation
         # Afterwards every value is known at its own time.
         log = replace(log, y=observer.timing.in_order(log.y))
     if isinstance(observer, DAEObserver):
-        return _nonlinear(with_all_sensors(observer), log)
+        return _nonlinear(changed(observer, sensors=None), log)
     if isinstance(observer, RecursiveObserver):
-        return _recursive(with_all_sensors(observer), log, dict(getattr(design.plant, "operating_point", {})))
+        return _recursive(changed(observer, sensors=None), log, dict(getattr(design.plant, "operating_point", {})))
     raise TypeError(f"{type(observer).__name__} has no innovations with a covariance")
 
 
 def _nonlinear(observer: DAEObserver, log: Log) -> RecordedInnovations:
-    found = observer.run(log.y, log.u, progress=False)
+    found, error = observer.run(log.y, log.u, progress=False), None
+    if observer.integration == "backward-euler":
+        error = integration_error(observer.model, np.array(found.states), log.u, np.array(found.parameters[-1]),
+                                  np.sqrt(np.diag(observer.R)), observer.dt)  # fmt: skip
     deviations = np.sqrt(np.einsum("kii->ki", found.innovation_covariances))
-    return RecordedInnovations(
-        found.innovations, deviations, float(found.nis.sum()), int(found.nis_degrees.sum()),
-        _estimates(found.parameter_names, found.parameters, found.parameter_covariances),
-        _step_error(observer, log, found),
-    )  # fmt: skip
-
-
-def _step_error(observer: DAEObserver, log: Log, found: Estimates) -> IntegrationError | None:
-    """Return what a step of backward Euler errs from the estimates on, in deviations of the sensors."""
-    if observer.integration != "backward-euler":
-        return None
-    try:
-        return integration_error(
-            observer.model, np.array(found.states), log.u, np.array(found.parameters[-1]),
-            np.sqrt(np.diag(observer.R)), observer.dt,
-        )  # fmt: skip
-    except SolverError:
-        # Where Radau has no solution there is nothing to compare.
-        return None
+    return _recorded(found, found.innovations, deviations, error)
 
 
 def _recursive(observer: RecursiveObserver, log: Log, point: Mapping[str, float]) -> RecordedInnovations:
@@ -109,21 +87,20 @@ def _recursive(observer: RecursiveObserver, log: Log, point: Mapping[str, float]
             e[k], deviations[k] = np.where(np.isfinite(spread), y[k] - mean, np.nan), spread
         state, _ = observer.advance(state, y[k], u[k])
     found = observer.run(y, u)
-    return RecordedInnovations(
-        e, deviations, float(found.nis.sum()), int(found.nis_degrees.sum()),
-        _estimates(found.parameter_names, found.parameters, found.parameter_covariances),
-    )  # fmt: skip
+    return _recorded(found, e, deviations)
 
 
-def _estimates(names: tuple[str, ...], values: FloatArray, covariances: FloatArray) -> dict[str, FloatArray]:
-    deviations = np.sqrt(np.einsum("kii->ki", covariances))
-    return {name: read_only(np.column_stack([values[:, i], deviations[:, i]])) for i, name in enumerate(names)}
+def _recorded(
+    found: Estimates, innovations: FloatArray, deviations: FloatArray, error: IntegrationError | None = None
+) -> RecordedInnovations:
+    columns = np.stack([found.parameters, found.parameter_deviations], axis=2)
+    estimates = {name: read_only(columns[:, i]) for i, name in enumerate(found.parameter_names)}
+    return RecordedInnovations(innovations, deviations, float(found.nis.sum()), int(found.nis_degrees.sum()), estimates,
+                               error)  # fmt: skip
 
 
 #: Nats that a variance of the design must cost, the others being free, before its ratio is told.
 CLEAR_NATS = 3.0
-
-
 #: Ratios nearer to one than this factor are not told: nobody knows a variance better.
 TOLD_FACTOR = 1.5
 
@@ -164,8 +141,6 @@ def noise_ratios(observer: DAEObserver, log: Log) -> Mapping[str, float]:
 
 #: A mean of innovations, or a parameter's deviation from its start, beyond so many standard deviations is told.
 OFFSET = 3.0
-
-
 #: Rows that a log must have at least.
 LEAST_ROWS = 20
 #: A sensor's variance that a log may say, at least, as a share of what the design says.
@@ -224,11 +199,11 @@ def validate(
     found = found.without(wrong_samples(found.y))
     record = recorded_innovations(design, found)
     sensors = _sensors(record, plant.output_names)
-    whole = consistency_of(record.squares, record.degrees)
+    whole = consistency(record.squares, record.degrees)
     place = change_of_mean(record.standardised)
     change = None if place is None else found.rows[0] + place
     ratios = noise_ratios(design.observer, found) if isinstance(design.observer, DAEObserver) else {}
-    verdict = [*found.notes, *_sentences(sensors, ratios, whole.value, change, record, design)]
+    verdict = [*found.notes, *_sentences(sensors, ratios, change, record, design)]
     passed = not verdict[len(found.notes) :] and whole.holds
     if not passed and not whole.holds and not ratios:
         far = "small" if whole.value > whole.high else "large"
@@ -243,7 +218,7 @@ def validate(
     return Validation(
         passed, design.name, whole, sensors, ratios, change, tuple(verdict), read_only(record.innovations),
         read_only(record.deviations), read_only(np.array(found.y)), read_only(found.y - record.innovations),
-        record.estimates, _described(found),
+        record.estimates, found.described,
     )  # fmt: skip
 
 
@@ -252,22 +227,18 @@ def states_innovations(design: ObserverDesign) -> bool:
     return not isinstance(design.observer, LinearObserver)
 
 
-def _described(log: Log) -> dict[str, object]:
-    return {"source": log.source, "rows": list(log.rows), "digest": log.digest, "samples": log.samples, "dt": log.dt}
-
-
 def _sensors(record: RecordedInnovations, names: Sequence[str]) -> dict[str, SensorValidation]:
     found = {}
     for name, column in zip(names, record.standardised.T, strict=True):
         seen = np.isfinite(column)
         count = int(seen.sum())
         mean = float(column[seen].mean() * np.sqrt(count)) if count else 0.0
-        found[name] = SensorValidation(consistency(column, seen), mean, whiteness(column))
+        found[name] = SensorValidation(consistency(float((column[seen] ** 2).sum()), count), mean, whiteness(column))
     return found
 
 
 def _sentences(
-    sensors: Mapping[str, SensorValidation], ratios: Mapping[str, float], nis: float, change: int | None,
+    sensors: Mapping[str, SensorValidation], ratios: Mapping[str, float], change: int | None,
     record: RecordedInnovations, design: ObserverDesign,
 ) -> list[str]:  # fmt: skip
     found = []

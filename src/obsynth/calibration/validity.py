@@ -12,11 +12,10 @@ from numpy.typing import ArrayLike
 
 from obsynth.analysis.transformations.linearisation import DRIFT
 from obsynth.calibration.logs import EVEN, Log, LogData, quantum, read_log
-from obsynth.calibration.plants import NonlinearPlant
-from obsynth.calibration.problem import initial_state_of
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.observers.records import named_vector
 from obsynth.plants.dae.functions import BUTCHER
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
@@ -125,7 +124,11 @@ def validity(
     found = read_log(log, model.input_names, model.output_names, rows=rows, columns=columns, scales=scales, dt=dt)
     point = linear.operating_point
     center = np.array([point[name] for name in linear.state_names])
-    start = center if initial_state is None else initial_state_of(NonlinearPlant(model), initial_state)
+    start = (
+        center
+        if initial_state is None
+        else named_vector(initial_state, model.state_names, np.array(model.nominal_state), "initial_state")
+    )
     theta = [point.get(name, value) for name, value in model.parameters.items()]
     true = simulate_dae(model, found.u, dt=found.dt, parameters=theta, initial_state=start).outputs
     seen = _linear_outputs(linear, found, start - center) + np.array([point[name] for name in linear.output_names])

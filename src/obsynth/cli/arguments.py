@@ -1,66 +1,117 @@
-"""Arguments that several verbs have, and the check of where they write to before any work is done."""
+"""Arguments that several verbs have, as data: each is spelled once."""
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from obsynth.files.outputs import FileKind, check_output, check_replaceable
-
-
-def spec_verb(verbs: Any, name: str, told: str) -> argparse.ArgumentParser:
-    """Return the parser of a new verb that reads a spec."""
-    parser: argparse.ArgumentParser = verbs.add_parser(name, help=told, description=told)
-    parser.set_defaults(verb=name)
-    add_system(parser)
-    return parser
+#: Probability of a false alarm in the whole run, where none is given.
+FALSE_ALARMS = 0.01
 
 
-def add_spec_gains(parser: argparse.ArgumentParser) -> None:
-    """Add the gain set that a spec's scenario is run with."""
-    parser.add_argument(
-        "--gains", type=Path, metavar="FILE", help="a gain set for the spec's plant: nothing is designed"
-    )
+class Argument(NamedTuple):
+    """An argument: its names, and the settings that argparse takes."""
+
+    names: tuple[str, ...]
+    settings: dict[str, Any]
 
 
-def add_system(parser: argparse.ArgumentParser) -> None:
-    """Add the spec."""
-    parser.add_argument("--system", type=Path, required=True, metavar="FILE", help="the spec (YAML)")
+class Group(NamedTuple):
+    """Arguments under a title in the help; without a title, only one of them may be given."""
+
+    title: str
+    arguments: tuple[Argument, ...]
 
 
-def add_gains(parser: argparse.ArgumentParser) -> None:
-    """Add the gain set that a verb works on."""
-    parser.add_argument("--gains", type=Path, required=True, metavar="FILE", help="a gain set (JSON) that design wrote")
+def add_arguments(parser: Any, arguments: Iterable[Argument | Group]) -> None:
+    """Add arguments to a parser, or to a group of one."""
+    for item in arguments:
+        if isinstance(item, Group):
+            group = parser.add_argument_group(item.title) if item.title else parser.add_mutually_exclusive_group()
+            add_arguments(group, item.arguments)
+        else:
+            parser.add_argument(*item.names, **item.settings)
 
 
-def add_json(parser: argparse.ArgumentParser) -> None:
-    """Add ``--json``."""
-    parser.add_argument("--json", action="store_true", help="print JSON on stdout, for programs; errors too")
+def option(name: str, metavar: str | None, told: str, **settings: Any) -> Argument:
+    """Return an argument with a value; one of the form ``NAME=VALUE`` may be given several times."""
+    pairs = {"type": pair, "action": "append", "default": []} if "=" in (metavar or "") and not settings else {}
+    return Argument((name,), {"metavar": metavar, "help": told, **pairs, **settings})
 
 
-def add_verbose(parser: argparse.ArgumentParser, what: str) -> None:
-    """Add ``-v``."""
-    parser.add_argument("-v", "--verbose", action="store_true", help=f"print {what} as well")
+def flag(name: str, told: str) -> Argument:
+    """Return an argument without a value."""
+    return Argument((name,), {"action": "store_true", "help": told})
 
 
-def add_quiet(parser: argparse.ArgumentParser, what: str = "no progress") -> None:
-    """Add ``--quiet``."""
-    parser.add_argument("--quiet", action="store_true", help=f"print {what}")
+def verbose(what: str) -> Argument:
+    """Return ``-v``."""
+    return Argument(("-v", "--verbose"), {"action": "store_true", "help": f"print {what} as well"})
 
 
-def add_force(parser: argparse.ArgumentParser) -> None:
-    """Add ``--force`` to a verb that writes files."""
-    parser.add_argument("--force", action="store_true", help="replace an existing file whatever it is; never an input")
+def pair(text: str) -> tuple[str, str]:
+    """Return the two sides of NAME=VALUE."""
+    # A column of the output, such as fhat[a=b], may hold an equals sign; a number or a plain column does not.
+    name, mark, value = text.rpartition("=")
+    if not mark or not name or not value:
+        raise argparse.ArgumentTypeError(f"{text!r} is not of the form NAME=VALUE")
+    return name, value
 
 
-def output_file(path: str | Path, kind: FileKind | None, options: argparse.Namespace, *, option: str = "--out") -> Path:
-    """Return where to write a file of some kind, or raise `SpecError` before any work is done.
+def digits(text: str) -> int:
+    """Return a count of decimals."""
+    count = int(text)
+    if not 1 <= count <= 15:
+        raise argparse.ArgumentTypeError(f"{count} is not between 1 and 15")
+    return count
 
-    A file that the command has read, under whatever name, is never written; what is read later is checked again when
-    the file is put in its place.  An existing file of another kind (of any, if that is `None`) needs ``--force``.
-    """
-    target = check_output(path, option=option)
-    if not options.force:
-        check_replaceable(target, kind)
-    return target
+
+def delay(text: str) -> int | str:
+    """Return a delay in rows, or ``auto``."""
+    return text if text == "auto" else int(text)
+
+
+SYSTEM = option("--system", "FILE", "the spec (YAML)", type=Path, required=True)
+GAINS = option("--gains", "FILE", "a gain set (JSON) that design wrote", type=Path, required=True)
+SPEC_GAINS = option("--gains", "FILE", "a gain set for the spec's plant: nothing is designed", type=Path)
+JSON = flag("--json", "print JSON on stdout, for programs; errors too")
+FORCE = flag("--force", "replace an existing file whatever it is; never an input")
+QUIET = flag("--quiet", "print no progress")
+JOBS = option("--jobs", "N", "processes (default: 1)", type=int, default=1)
+CLUSTER = option("--cluster", "ADDRESS", "of the scheduler of a Dask cluster, instead of --jobs")
+MAP = option("--map", "SIGNAL=COLUMN", "column of a signal (or of time) where the names differ; may be repeated")
+SCALE = option("--scale", "SIGNAL=FACTOR", "the column's value times the factor is in the signal's unit; may be "
+               "repeated")  # fmt: skip
+#: How a log without faults is read.
+LOG_OPTIONS = (
+    option("--rows", "A:B", "rows of the log without faults, as Python counts (default: all)"), MAP, SCALE,
+)  # fmt: skip
+#: What a monitor is made of.
+MONITOR = Group("monitor", (
+    option("--monitor", "KIND", "watch the residual (or the parameters) by a threshold"),
+    option("--disturbance", "NAME=BOUND", "largest absolute value of a disturbance; may be repeated"),
+    option("--noise-bound", "N", "standard deviations that no noise exceeds", type=float),
+    option("--initial", "STATE=BOUND", "pointwise, discrete designs: bound of a state of the plant at the start (or "
+           "LOW:HIGH); may be repeated"),
+    option("--initial-error", "E", "bound on the norm of the error at the start", type=float),
+    option("--false-alarms", "P", "statistical kinds: probability of a false alarm in the whole run (default: "
+           "%(default)s)", type=float, default=FALSE_ALARMS),
+    option("--window", "N", "samples looked back (default: 20)", type=int, default=20),
+    option("--change", "X", "cusum: change to be found, in deviations of the residual, or in parameter units (default: "
+           "1)", type=float, default=1.0),
+))  # fmt: skip
+#: How a log is read, and what is watched in it.
+DATA_OPTIONS = (
+    MAP,
+    option("--time-column", "COLUMN", "column of the time, in seconds or as dates (ISO 8601); default: time"),
+    SCALE,
+    option("--threshold", "COLUMN=LEVEL", "alarm when the absolute value of a column of the output passes a level; may "
+           "be repeated"),
+    MONITOR,
+    option("--nominal", "NAME=VALUE", "monitor of a recursive design: nominal value of a parameter; may be repeated"),
+    option("--sample-time", "SECONDS", "monitor of a continuous design: between the rows", type=float),
+    option("--gap", "SECONDS", "continuous designs: longer intervals are gaps", type=float),
+    option("--warm-up", "SECONDS", "how long to mark the start, and after gaps", type=float),
+)  # fmt: skip

@@ -3,96 +3,21 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from obsynth.cli.arguments import add_force, add_gains, add_json, add_quiet, add_system, output_file
-from obsynth.cli.data_arguments import add_map, pair
-from obsynth.cli.output import print_json, progress
-from obsynth.errors import SpecError
+from obsynth.cli.arguments import pair
+from obsynth.cli.data_run import numbers_of
+from obsynth.cli.output import answer, output_file, progress
+from obsynth.errors import SpecError, VerificationError
 from obsynth.files.inputs import protect
 from obsynth.files.outputs import FileKind, write_atomically
 
 if TYPE_CHECKING:
     from obsynth.spec.loader import Spec
 
-_LINEARISE = "Linearise the nonlinear plant of a spec: exact matrices at rest, or the reason why it never rests."
-_CALIBRATE = "Fit constants and noise of a plant to a log of rows without faults, with boxes and a verdict."
-_VALIDATE = "Ask whether a recorded log without faults agrees with a design."
 #: Written by ``linearise`` and ``calibrate``.
 PLANT = FileKind("a plant that obsynth has linearised", rb"\A# Linearised by obsynth")
 CALIBRATION = FileKind("a calibration of obsynth", rb'\A\s*\{\s*"kind":\s*"obsynth calibration"')
-
-
-def add_calibration_verbs(verbs: Any) -> None:
-    """Add the parsers."""
-    _add_linearise(verbs.add_parser("linearise", help=_LINEARISE, description=_LINEARISE))
-    calibrate = verbs.add_parser("calibrate", help=_CALIBRATE, description=_CALIBRATE)
-    add_system(calibrate)
-    _add_log(calibrate, required=False)
-    calibrate.add_argument(
-        "--unknown", type=pair, action="append", default=[], metavar="NAME=LOW:HIGH",
-        help="a constant that is to be found, with its bounds, beside those of the spec; may be repeated",
-    )  # fmt: skip
-    calibrate.add_argument(
-        "--input-delay", type=_delay, metavar="ROWS",
-        help="rows by which inputs act later than they are written, or 'auto' (default)",
-    )  # fmt: skip
-    calibrate.add_argument("--level", type=float, metavar="P", help="probability of the box (default: 0.95)")
-    calibrate.add_argument("--out", type=Path, metavar="FILE", help="write the result to this file (JSON)")
-    _finish(calibrate, "calibrate")
-    validate = verbs.add_parser("validate", help=_VALIDATE, description=_VALIDATE)
-    add_gains(validate)
-    _add_log(validate, required=True)
-    add_json(validate)
-    add_quiet(validate)
-    validate.set_defaults(verb="validate")
-
-
-def _add_linearise(parser: argparse.ArgumentParser) -> None:
-    add_system(parser)
-    parser.add_argument("--at", choices=("equilibrium", "point"), help="where (default: equilibrium)")
-    parser.add_argument(
-        "--given", type=pair, action="append", default=[], metavar="NAME=VALUE",
-        help="value of a state, input, parameter or output there; may be repeated",
-    )  # fmt: skip
-    parser.add_argument(
-        "--free", action="append", default=[], metavar="NAME[=LOW:HIGH]",
-        help="an input or parameter that is solved for, within bounds; may be repeated",
-    )  # fmt: skip
-    parser.add_argument("--fault", action="append", metavar="NAME", help="a parameter that is a fault (default: all)")
-    parser.add_argument(
-        "--disturbance", action="append", default=[], metavar="NAME", help="an input that is not known; may be repeated"
-    )
-    parser.add_argument("--drift", action="store_true", help="take a moving point, with an input 'drift'")
-    _add_log(parser, required=False)
-    parser.add_argument(
-        "--out", type=Path, metavar="FILE",
-        help="write the linear plant to this file (YAML), at nominal values: for designs that know tolerances, give "
-        "the equations and transform.linearise in the spec",
-    )  # fmt: skip
-    _finish(parser, "linearise")
-
-
-def _add_log(parser: argparse.ArgumentParser, *, required: bool) -> None:
-    parser.add_argument("--data", type=Path, required=required, metavar="FILE", help="the log (CSV or Parquet)")
-    parser.add_argument("--rows", metavar="A:B", help="rows of the log without faults, as Python counts (default: all)")
-    add_map(parser)
-    parser.add_argument(
-        "--scale", type=pair, action="append", default=[], metavar="SIGNAL=FACTOR",
-        help="the column's value times the factor is in the signal's unit; may be repeated",
-    )  # fmt: skip
-
-
-def _finish(parser: argparse.ArgumentParser, verb: str) -> None:
-    add_json(parser)
-    add_force(parser)
-    add_quiet(parser)
-    parser.set_defaults(verb=verb)
-
-
-def _delay(text: str) -> int | str:
-    return text if text == "auto" else int(text)
 
 
 def _range(name: str, text: str) -> tuple[float, float]:
@@ -104,8 +29,6 @@ def _range(name: str, text: str) -> tuple[float, float]:
 
 
 def _log_arguments(options: argparse.Namespace) -> dict[str, Any]:
-    from obsynth.cli.data_run import numbers_of
-
     given = {"rows": options.rows, "columns": dict(options.map), "scales": dict(numbers_of(options.scale))}
     return {name: value for name, value in given.items() if value}
 
@@ -113,7 +36,6 @@ def _log_arguments(options: argparse.Namespace) -> dict[str, Any]:
 def run_linearise(options: argparse.Namespace) -> int:
     """Run ``linearise``: spec or plant in, matrices and operating point out."""
     from obsynth.analysis.transformations.linearisation import linearise
-    from obsynth.cli.data_run import numbers_of
     from obsynth.report.plants import linear_plant_text, plant_document
     from obsynth.spec.loader import load_model
 
@@ -137,20 +59,14 @@ def run_linearise(options: argparse.Namespace) -> int:
         found = validity(model, linear, options.data, **_log_arguments(options))
     if target is not None:
         write_atomically(target, plant_document(linear, options.system.name))
-    if options.json:
-        print_json({
-            "command": "linearise", "system": str(options.system), "file": None if target is None else str(target),
-            "operating_point": dict(linear.operating_point), "validity": None if found is None else found.to_dict(),
-            **{name: getattr(linear, name) for name in ("E", "A", "B", "C", "Bf", "Df", "Bd")},
-            **{name: list(getattr(linear, name)) for name in (
-                "state_names", "input_names", "output_names", "fault_names", "disturbance_names")},
-        })  # fmt: skip
-    else:
-        print(linear_plant_text(linear))
-        if found is not None:
-            print(found)
-        if target is not None:
-            print(f"Written: {target}")
+    told = linear_plant_text(linear) if found is None else f"{linear_plant_text(linear)}\n{found}"
+    answer(options, {
+        "system": str(options.system), "file": None if target is None else str(target),
+        "operating_point": dict(linear.operating_point), "validity": None if found is None else found.to_dict(),
+        **{name: getattr(linear, name) for name in ("E", "A", "B", "C", "Bf", "Df", "Bd")},
+        **{name: list(getattr(linear, name)) for name in (
+            "state_names", "input_names", "output_names", "fault_names", "disturbance_names")},
+    }, told, [target] if target else [])  # fmt: skip
     return 0
 
 
@@ -181,13 +97,8 @@ def run_calibrate(options: argparse.Namespace) -> int:
         from obsynth.results.gain_sets import plain
 
         write_atomically(target, json.dumps(plain(data), indent=1, allow_nan=False) + "\n")
-    if options.json:
-        print_json({"command": "calibrate", "file": None if target is None else str(target), **data})
-    else:
-        print(found)
-        print(f"  digest of the log: {found.box.digest}")
-        if target is not None:
-            print(f"Written: {target}")
+    answer(options, {"file": None if target is None else str(target), **data},
+           f"{found}\n  digest of the log: {found.box.digest}", [target] if target else [])  # fmt: skip
     return 0
 
 
@@ -208,8 +119,7 @@ def _asked(spec: Spec | None, options: argparse.Namespace) -> dict[str, Any]:
     if options.data is not None:
         asked["log"] = options.data
     asked |= _log_arguments(options)
-    unknown = dict(asked.get("unknown", {})) | {name: _range(name, text) for name, text in options.unknown}
-    asked["unknown"] = unknown
+    asked["unknown"] = dict(asked.get("unknown", {})) | {name: _range(name, text) for name, text in options.unknown}
     for name in ("input_delay", "level"):
         if getattr(options, name) is not None:
             asked[name] = getattr(options, name)
@@ -219,7 +129,6 @@ def _asked(spec: Spec | None, options: argparse.Namespace) -> dict[str, Any]:
 def run_validate(options: argparse.Namespace) -> int:
     """Run ``validate``: gain set and log in, verdict out; the exit code is 6 where they do not agree."""
     from obsynth.calibration.validating import validate
-    from obsynth.errors import VerificationError
     from obsynth.results.gain_sets import load
 
     design = load(options.gains)
@@ -227,8 +136,5 @@ def run_validate(options: argparse.Namespace) -> int:
     with progress(quiet=options.quiet) as report_stage:
         report_stage(f"running {options.gains} over {options.data}")
         found = validate(design, options.data, **_log_arguments(options))
-    if options.json:
-        print_json({"command": "validate", "gains": str(options.gains), "data": str(options.data), **found.to_dict()})
-    else:
-        print(found)
+    answer(options, {"gains": str(options.gains), "data": str(options.data), **found.to_dict()}, str(found))
     return 0 if found.passed else VerificationError.exit_code

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from obsynth.cli.arguments import output_file
-from obsynth.cli.output import print_json, progress, stdout_console
+from obsynth.cli.output import answer, output_file, print_json, progress, stdout_console
 from obsynth.errors import PreconditionError, SpecError, VerificationError
 from obsynth.files.outputs import write_atomically
 
@@ -51,16 +50,16 @@ def run_design(options: argparse.Namespace) -> int:
 
 def _print_design(design: ObserverDesign, file: Path, *, verbose: bool) -> None:
     """Print the answer first; every claim and check if asked for, and what fails in any case."""
-    from obsynth.report import design_report
+    from obsynth.report.designs import design_report
     from obsynth.report.summary import print_summary, summary
-    from obsynth.results.checks_table import checks_table
+    from obsynth.results.layout import checks_table
 
     console = stdout_console()
     if verbose:
         design_report(design, console=console)
         console.print()
     print_summary(summary(design, file=file, everything=verbose), console=console)
-    if not verbose and "delta_scan" in design.solver:
+    if "delta_scan" in design.solver:
         from obsynth.report.designs import delta_scan_table
         from obsynth.results.delta_scan import DeltaScan
         from obsynth.results.layout import print_section
@@ -115,7 +114,7 @@ def require_same_signals(design: ObserverDesign, gains: Path, spec: Spec) -> Non
         raise SpecError(f"{gains} is for a plant with other signals than that of {spec.path}.", path=str(gains))
 
 
-def spec_output(wanted: Path, kind: FileKind, spec: Spec, options: argparse.Namespace, *, option: str) -> Path:
+def spec_output(wanted: Path, kind: FileKind | None, spec: Spec, options: argparse.Namespace, *, option: str) -> Path:
     """Return where to write what a spec asks for; refuse a hopeless place before any work is done."""
     if wanted.exists() and wanted.samefile(spec.path):
         raise SpecError(f"{wanted} is the spec itself: give another file to {option}.", path=str(wanted))
@@ -146,16 +145,9 @@ def run_check(options: argparse.Namespace) -> int:
     methods = check(spec.plant, {} if spec.method == AUTO else {spec.method: spec.options})
     own = methods.values() if spec.method == AUTO else [methods[spec.method]]
     passed = any(report.passed for report in own)
-    if options.json:
-        print_json({
-            "command": "check", "spec": str(spec.path), "method": spec.method, "passed": passed,
-            "transformation": done, "diagnosis": None if diagnosis is None else diagnosis.to_dict(),
-            "structure": {name.replace(" ", "_"): _structure_as_dict(found) for name, found in structures.items()},
-            "methods": {name: report.as_dict() for name, report in methods.items()},
-        })  # fmt: skip
-    else:
-        from obsynth.report import check_report
-        from obsynth.report.plants import diagnosis_report, print_methods
+
+    def told() -> None:
+        from obsynth.report.plants import check_report, diagnosis_report, print_methods
 
         console = stdout_console()
         if diagnosis is not None:
@@ -165,6 +157,13 @@ def run_check(options: argparse.Namespace) -> int:
             check_report(spec.plant, structures, methods, console=console, transformation=done)
             console.print()
         print_methods(methods, own=spec.method, console=console)
+
+    answer(options, {
+        "spec": str(spec.path), "method": spec.method, "passed": passed,
+        "transformation": done, "diagnosis": None if diagnosis is None else diagnosis.to_dict(),
+        "structure": {name.replace(" ", "_"): _structure_as_dict(found) for name, found in structures.items()},
+        "methods": {name: report.as_dict() for name, report in methods.items()},
+    }, told)  # fmt: skip
     return 0 if passed else PreconditionError.exit_code
 
 
@@ -203,35 +202,23 @@ def _is_alarm(path: Path) -> bool:
         return False
 
 
-def _verify_alarm(options: argparse.Namespace) -> int:
-    """Recheck the certificate of an alarm without a solver."""
-    from obsynth.experiments.alarm_proofs.certificate import verify_alarm
-    from obsynth.results.checks_table import print_checks
-
-    report = verify_alarm(options.gains)
-    if options.json:
-        print_json({
-            "command": "verify", "file": str(options.gains), "passed": report.passed, "report": report.as_dict()
-        })  # fmt: skip
-    else:
-        print_checks(report.checks, console=stdout_console())
-    return 0 if report.passed else VerificationError.exit_code
-
-
 def run_verify(options: argparse.Namespace) -> int:
-    """Run ``verify``: recheck a saved gain set without a solver."""
-    from obsynth.methods.verifying import verify
-    from obsynth.results.gain_sets import load
-
+    """Run ``verify``: recheck a saved gain set, or the certificate of an alarm, without a solver."""
     if _is_alarm(options.gains):
-        return _verify_alarm(options)
-    design = load(options.gains)
-    report = verify(design, printed_digits=options.printed_digits)
-    if options.json:
-        print_json({
-            "command": "verify", "file": str(options.gains), "name": design.name, "method": design.method,
-            "passed": report.passed, "report": report.as_dict(),
-        })  # fmt: skip
+        from obsynth.experiments.alarm_proofs.certificate import verify_alarm
+        from obsynth.results.layout import print_checks
+
+        report = verify_alarm(options.gains)
+        answer(options, {"file": str(options.gains), "passed": report.passed, "report": report.as_dict()},
+               lambda: print_checks(report.checks, console=stdout_console()))  # fmt: skip
     else:
-        _print_design(design.replace(report=report), options.gains, verbose=options.verbose)
+        from obsynth.methods.verifying import verify
+        from obsynth.results.gain_sets import load
+
+        design = load(options.gains)
+        report = verify(design, printed_digits=options.printed_digits)
+        answer(options, {
+            "file": str(options.gains), "name": design.name, "method": design.method, "passed": report.passed,
+            "report": report.as_dict(),
+        }, lambda: _print_design(design.replace(report=report), options.gains, verbose=options.verbose))  # fmt: skip
     return 0 if report.passed else VerificationError.exit_code

@@ -1,7 +1,4 @@
-"""The verbs that take a gain set further: run it on data, hand it on, show it.
-
-The verb ``plot``, and a run on data that is held in memory, as pictures need it.
-"""
+"""The verbs that take a gain set further: run on data, proved alarms, exports, pictures and pages."""
 
 from __future__ import annotations
 
@@ -12,21 +9,21 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
-from obsynth.cli.arguments import output_file
 from obsynth.cli.data_run import (
     STREAM,
+    alarm_of_run,
+    certificate_target,
     monitor_of,
     numbers_of,
+    proof_of,
     protect_inputs,
-    rows_done,
-    run_in_memory,
+    required_scenario,
+    run_of,
     summary_of_run,
 )
-from obsynth.cli.output import print_json
-from obsynth.cli.prove_alarm import alarm_of_run, certificate_target
+from obsynth.cli.output import answer, output_file, print_json
 from obsynth.errors import SpecError, VerificationError
-from obsynth.files.inputs import protect, protect_stream
-from obsynth.files.outputs import FileKind, require_distinct
+from obsynth.files.outputs import FileKind, require_distinct, write_atomically
 
 if TYPE_CHECKING:
     from obsynth.data.run import DataRun
@@ -47,31 +44,15 @@ def run_run(options: argparse.Namespace) -> int:
     certificate = certificate_target(options)
     design = load(options.gains)
     watched = monitor_of(design, options)
-    from obsynth.data.run import run_on_data
-
-    with rows_done(options.data, quiet=options.quiet or out is sys.stdout) as progress:
-        found = run_on_data(
-            design, sys.stdin if options.data == STREAM else Path(options.data), out,
-            columns=dict(options.map), time_column=options.time_column, scales=numbers_of(options.scale),
-            thresholds=numbers_of(options.threshold), monitor=watched, gap=options.gap, warm_up=options.warm_up,
-            recovered=_recovered(options.recovered),
-            outliers=options.outliers, smooth=options.smooth, lag=options.lag,
-            state=options.state, progress=progress,
-        )  # fmt: skip
-    for text in found.warnings:
-        print(f"Warning: {text}", file=sys.stderr)
+    found = run_of(design, options, watched, out, recovered=_recovered(options.recovered), outliers=options.outliers,
+                   smooth=options.smooth, lag=options.lag, state=options.state)  # fmt: skip
     proof = None if certificate is None else alarm_of_run(design, options, found, certificate)
     if options.json:
-        print_json(
-            {
-                "command": "run",
-                **({} if proof is None else {"proof": proof}),
-                "gains": str(options.gains),
-                "file": str(out),
-                **found.as_dict(),
-                "monitor": None if watched is None else {"kind": watched.kind, "statement": watched.statement},
-            }
-        )
+        print_json({
+            "command": "run", **({} if proof is None else {"proof": proof}), "gains": str(options.gains),
+            "file": str(out), **found.as_dict(),
+            "monitor": None if watched is None else {"kind": watched.kind, "statement": watched.statement},
+        })  # fmt: skip
     elif not options.quiet:
         # The estimates themselves may be on stdout.
         stream = sys.stderr if out is sys.stdout else sys.stdout
@@ -97,10 +78,23 @@ def run_export(options: argparse.Namespace) -> int:
         design, options.to, sample_time=options.sample_time, fmi=options.fmi,
         thresholds=numbers_of(options.threshold) or None, warm_up=options.warm_up,
     )  # fmt: skip
-    if options.json:
-        print_json({"command": "export", "gains": str(options.gains), "files": [str(file) for file in files]})
-    else:
-        print(f"Written: {', '.join(map(str, files))}")
+    answer(options, {"gains": str(options.gains), "files": [str(file) for file in files]}, "", files)
+    return 0
+
+
+def run_prove_alarm(options: argparse.Namespace) -> int:
+    """Run ``prove-alarm``: 0 whether there is a proof or not; every failure is an error."""
+    from obsynth.experiments.alarm_proofs.proof import CERTIFICATE
+    from obsynth.results.gain_sets import load
+
+    design = load(options.gains)
+    target = None if options.out is None else output_file(options.out, CERTIFICATE, options)
+    found = proof_of(design, options, options.row, state_bounds=numbers_of(options.state_bound) or None)
+    file = str(found.save(target)) if found.proved and target is not None else None
+    answer(options, {
+        "gains": str(options.gains), "proved": found.proved, "row": found.row, "window": found.window,
+        "margin": found.margin, "statement": found.statement, "origin": found.origin, "file": file,
+    }, found.statement + (f"\nCertificate: {file}" if file else ""))  # fmt: skip
     return 0
 
 
@@ -111,7 +105,6 @@ def run_report(options: argparse.Namespace) -> int:
 
     require_distinct({"--gains": options.gains, "--system": options.system, "--out": options.out})
     design = load(options.gains)
-    from obsynth.cli.data_run import required_scenario
     from obsynth.report.page import PAGE, html_report
     from obsynth.spec import load_spec
 
@@ -123,32 +116,26 @@ def run_report(options: argparse.Namespace) -> int:
     if options.data is not None:
         protect_inputs(options)
         output_file(options.out, PAGE, options)
-        run, watched = run_in_memory(design, options)
+        watched = monitor_of(design, options, has_scenario=True)
+        run = run_of(design, options, watched)
     file = html_report(
         design, options.out, report=report, gains_file=options.gains.name, scenario=scenario, system_file=system,
         run=run, data_file=options.data, statement="" if watched is None else watched.statement, rows=options.rows,
     )  # fmt: skip
-    if options.json:
-        print_json({"command": "report", "gains": str(options.gains), "file": str(file), "passed": report.passed})
-    else:
-        print(f"Written: {file}")
+    answer(options, {"gains": str(options.gains), "file": str(file), "passed": report.passed}, "", [file])
     return 0 if report.passed else VerificationError.exit_code
 
 
 def _target(options: argparse.Namespace) -> Path | TextIO:
     """Return where estimates go; refuse a hopeless place before any work is done."""
-    from obsynth.data.saved_state import STATE
+    from obsynth.data.job import STATE
     from obsynth.data.sinks import ESTIMATES
     from obsynth.data.sources import check_suffix
 
     named = {"--gains": options.gains, "--system": options.system, "--state": options.state}
     streams = {"--data": options.data, "--out": options.out}
     require_distinct({**named, **{name: file for name, file in streams.items() if file != STREAM}})
-    for file in (options.gains, options.system, None if options.data == STREAM else Path(options.data)):
-        if file is not None:
-            protect(file)
-    if options.data == STREAM:
-        protect_stream(sys.stdin)
+    protect_inputs(options)
     if options.state is not None:
         output_file(options.state, STATE, options, option="--state")
     if options.out == STREAM:
@@ -175,15 +162,12 @@ def run_plot(options: argparse.Namespace) -> int:
         output_file(target, kind, options)
     parts = [part.strip() for part in options.show.split(",") if part.strip()]
     design = load(options.gains)
-    found, watched = run_in_memory(design, options)
+    watched = monitor_of(design, options, has_scenario=True)
+    found = run_of(design, options, watched)
     _draw(found, design, parts, target)
-    if options.json:
-        print_json({"command": "plot", "gains": str(options.gains), "file": None if target is None else str(target),
-                    **found.as_dict()})  # fmt: skip
-    elif not options.quiet:
-        print(summary_of_run(found, watched))
-        if target is not None:
-            print(f"Written: {target}")
+    if options.json or not options.quiet:
+        answer(options, {"gains": str(options.gains), "file": None if target is None else str(target),
+                         **found.as_dict()}, summary_of_run(found, watched), [target] if target else [])  # fmt: skip
     return 0
 
 
@@ -215,7 +199,6 @@ def written_picture(target: Path, count: int, draw: Callable[[list[Any]], Any]) 
     """Write a picture of so many panels, one above the other; ``draw`` fills them."""
     from matplotlib.figure import Figure
 
-    from obsynth.files.outputs import write_atomically
     from obsynth.plotting.panels import PANEL_HEIGHT, WIDTH
 
     figure = Figure(figsize=(WIDTH, PANEL_HEIGHT * max(count, 1) + 0.6), layout="constrained")

@@ -1,4 +1,4 @@
-"""A run on data from the command line: what its arguments say, its progress, and its summary."""
+"""A run on data from the command line: its arguments, its progress, its summary, and the proof of its alarm."""
 
 from __future__ import annotations
 
@@ -8,13 +8,15 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TextIO
 
+from obsynth.cli.output import output_file
 from obsynth.errors import SpecError
 from obsynth.files.inputs import protect, protect_stream
 
 if TYPE_CHECKING:
     from obsynth.data.run import DataRun
+    from obsynth.experiments.alarm_proofs.proof import AlarmProof
     from obsynth.experiments.monitors.online import OnlineMonitor
     from obsynth.plants.uncertainty import Uncertainty
     from obsynth.results.design import ObserverDesign
@@ -33,39 +35,50 @@ def protect_inputs(options: argparse.Namespace) -> None:
         protect_stream(sys.stdin)
 
 
-def run_in_memory(design: ObserverDesign, options: argparse.Namespace) -> tuple[DataRun, OnlineMonitor | None]:
-    """Return a run of a design on the data of the command line, with its table, and its monitor."""
+def run_of(
+    design: ObserverDesign, options: argparse.Namespace, watched: OnlineMonitor | None,
+    out: Path | TextIO | None = None, **more: Any,
+) -> DataRun:  # fmt: skip
+    """Return a run of a design on the data of the command line, with its table where it is not written to ``out``."""
     from obsynth.data.run import run_on_data
 
-    watched = monitor_of(design, options, has_scenario=True)
-    with rows_done(options.data, quiet=getattr(options, "quiet", True)) as progress:
+    with rows_done(options.data, quiet=getattr(options, "quiet", True) or out is sys.stdout) as progress:
         found = run_on_data(
-            design, sys.stdin if options.data == STREAM else Path(options.data), columns=dict(options.map),
+            design, sys.stdin if options.data == STREAM else Path(options.data), out, columns=dict(options.map),
             time_column=options.time_column, scales=numbers_of(options.scale),
             thresholds=numbers_of(options.threshold), monitor=watched, gap=options.gap, warm_up=options.warm_up,
-            progress=progress,
+            progress=progress, **more,
         )  # fmt: skip
     for text in found.warnings:
         print(f"Warning: {text}", file=sys.stderr)
-    return found, watched
+    return found
+
+
+def number_of(name: str, text: str) -> float:
+    """Return the value of an argument of the form NAME=VALUE."""
+    try:
+        return float(text)
+    except ValueError:
+        raise SpecError(f"{name}={text}: {text!r} is no number.", path=name) from None
 
 
 def numbers_of(pairs: list[tuple[str, str]]) -> Mapping[str, float]:
     """Return values by name, from arguments of the form NAME=VALUE."""
-    found = {}
+    return {name: number_of(name, text) for name, text in pairs}
+
+
+def ranges_of(pairs: list[tuple[str, str]]) -> dict[str, float | tuple[float, float]]:
+    """Return bounds by name, from arguments of the form NAME=BOUND or NAME=LOW:HIGH."""
+    found: dict[str, float | tuple[float, float]] = {}
     for name, text in pairs:
-        try:
-            found[name] = float(text)
-        except ValueError:
-            raise SpecError(f"{name}={text}: {text!r} is no number.", path=name) from None
+        low, colon, high = text.partition(":")
+        found[name] = (number_of(name, low), number_of(name, high)) if colon else number_of(name, text)
     return found
 
 
 def own_tolerances(design: ObserverDesign, kind: str | None) -> Uncertainty | None:
-    """Return the tolerances of a design's plant, which its pointwise threshold holds for.
-
-    Continuous designs with known inputs must be asked for it: the inputs have to be held between rows.
-    """
+    """Return the tolerances of a design's plant, which its pointwise threshold holds for."""
+    # Continuous designs with known inputs must be asked for it: the inputs have to be held between rows.
     from obsynth.observers.linear.observer import LinearObserver
     from obsynth.plants.descriptor import DescriptorSystem
 
@@ -75,14 +88,14 @@ def own_tolerances(design: ObserverDesign, kind: str | None) -> Uncertainty | No
     return plant.uncertainty if isinstance(design.observer, LinearObserver) else None
 
 
-def ranges_of(pairs: list[tuple[str, str]]) -> dict[str, float | tuple[float, float]]:
-    """Return bounds by name, from arguments of the form NAME=BOUND or NAME=LOW:HIGH."""
-    found: dict[str, float | tuple[float, float]] = {}
-    for name, text in pairs:
-        low, colon, high = text.partition(":")
-        ends = numbers_of([(name, low), (name, high)] if colon else [])
-        found[name] = (numbers_of([(name, low)])[name], ends[name]) if colon else numbers_of([(name, text)])[name]
-    return found
+def monitor_settings(design: ObserverDesign, options: argparse.Namespace) -> dict[str, Any]:
+    """Return what any monitor of a design is made of, by the names of the arguments of `obsynth.monitor`."""
+    return {
+        "disturbance_bounds": numbers_of(options.disturbance), "noise_bound": options.noise_bound,
+        "initial_error": options.initial_error, "window": options.window, "false_alarms": options.false_alarms,
+        "change": options.change, "initial_set": ranges_of(options.initial) or None,
+        "constants": own_tolerances(design, options.monitor),
+    }  # fmt: skip
 
 
 def monitor_of(
@@ -90,12 +103,9 @@ def monitor_of(
 ) -> OnlineMonitor | None:
     """Return the monitor that is asked for."""
     if options.monitor is None:
-        asked = [
-            name
-            for name in (*(() if has_scenario else ("system",)), "noise_bound", "initial_error", "sample_time")
-            if getattr(options, name)
-        ]
-        asked += [name for name in ("disturbance", "nominal", "initial") if getattr(options, name)]
+        of_monitors = (*(() if has_scenario else ("system",)), "noise_bound", "initial_error", "sample_time",
+                       "disturbance", "nominal", "initial")  # fmt: skip
+        asked = [name for name in of_monitors if getattr(options, name)]
         if asked:
             flag = f"--{asked[0].replace('_', '-')}"
             raise SpecError(f"{flag} is for a monitor: say which one by --monitor.", path=flag)
@@ -111,11 +121,8 @@ def monitor_of(
         require_same_signals(design, options.gains, spec)
         scenario = required_scenario(spec)
     return online_monitor(
-        design, options.monitor, scenario=scenario, disturbance_bounds=numbers_of(options.disturbance),
-        noise_bound=options.noise_bound, initial_error=options.initial_error, window=options.window,
-        false_alarms=options.false_alarms, change=options.change, nominal=numbers_of(options.nominal),
-        sample_time=options.sample_time, initial_set=ranges_of(options.initial) or None,
-        constants=own_tolerances(design, options.monitor),
+        design, options.monitor, scenario=scenario, nominal=numbers_of(options.nominal),
+        sample_time=options.sample_time, **monitor_settings(design, options),
     )  # fmt: skip
 
 
@@ -156,11 +163,11 @@ def rows_done(data: str, *, quiet: bool) -> Iterator[Callable[[int], None] | Non
 
     columns = (TextColumn("rows"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("rows", total=None if data == STREAM else rows_in(Path(data)))
+        task = bar.add_task("rows", total=None if data == STREAM else _rows_in(Path(data)))
         yield lambda rows: bar.update(task, completed=rows)
 
 
-def rows_in(path: Path) -> int | None:
+def _rows_in(path: Path) -> int | None:
     """Return how many rows a file of data has, about; `None` where that cannot be told without reading it whole."""
     try:
         if path.suffix.lower() == ".parquet":
@@ -183,3 +190,45 @@ def required_scenario(spec: Spec) -> Scenario:
             f"{spec.path} has no scenario: add one, for example scenario: {{horizon: 100}}.", path="scenario"
         )
     return spec.scenario
+
+
+#: Rows from the alarm on at whose windows a proof is tried, in windows.
+_LATER = (0.0, 0.1, 0.25, 0.5, 0.95)
+
+
+def certificate_target(options: argparse.Namespace) -> Path | None:
+    """Return where ``run --prove`` writes its certificate; refuse what cannot be proved before any work is done."""
+    if options.prove is None:
+        return None
+    from obsynth.experiments.alarm_proofs.proof import CERTIFICATE
+
+    if options.monitor != "pointwise":
+        raise SpecError("--prove is for alarms of --monitor pointwise.", path="--prove")
+    if options.data == STREAM or options.state is not None:
+        raise SpecError("--prove reads the data again from their first row on: give --data a file, and no --state.",
+                        path="--prove")  # fmt: skip
+    return output_file(options.prove, CERTIFICATE, options, option="--prove")
+
+
+def alarm_of_run(design: ObserverDesign, options: argparse.Namespace, found: DataRun, target: Path) -> dict[str, Any]:
+    """Return whether the first alarm of a run is proved, in words, and the certificate's file."""
+    row = found.alarm_rows.get("pointwise")
+    if row is None:
+        return {"proved": False, "row": None, "statement": "No alarm: there is nothing to prove.", "file": None}
+    tried = [min(row + int(share * options.window), found.rows) for share in _LATER]
+    for last in dict.fromkeys(max(number, 2) for number in tried):
+        proof = proof_of(design, options, last)
+        if proof.proved:
+            return {"proved": True, "row": last, "statement": proof.statement, "file": str(proof.save(target))}
+    return {"proved": False, "row": row, "statement": proof.statement, "file": None}
+
+
+def proof_of(design: ObserverDesign, options: argparse.Namespace, row: int, **more: Any) -> AlarmProof:
+    """Return the proof, or why there is none, that the window up to a row of the data is not free of faults."""
+    from obsynth.data.alarm_proof import prove_alarm
+
+    return prove_alarm(
+        design, Path(options.data), row, window=options.window, columns=dict(options.map),
+        scales=numbers_of(options.scale), disturbance_bounds=numbers_of(options.disturbance),
+        noise_bound=options.noise_bound, initial_set=ranges_of(options.initial) or None, **more,
+    )  # fmt: skip

@@ -1,8 +1,6 @@
-"""The commands ``design`` and ``obsynth``: arguments in, exit code out.
+"""The commands ``design`` and ``obsynth``: arguments in, exit code out; streams may be closed or full.
 
 Nothing heavy is imported here, so that ``--help`` answers at once.
-
-The process around a verb: standard streams that may be closed or full, and what numbers can do to a computation.
 """
 
 from __future__ import annotations
@@ -14,18 +12,11 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from importlib import import_module
-from pathlib import Path
 
-from obsynth.cli.arguments import add_force, add_json, add_quiet, add_system, add_verbose, spec_verb
-from obsynth.cli.calibration import add_calibration_verbs
-from obsynth.cli.data_arguments import add_data_verbs
 from obsynth.cli.output import print_error, print_json
-from obsynth.cli.prove_alarm import add_prove_alarm_verb
-from obsynth.cli.scenarios import add_compare_verb, add_evaluate_verb, add_simulate_verb
-from obsynth.cli.sweep import add_sweep_verb
+from obsynth.cli.verbs import VERBS, design_parser, obsynth_parser
 from obsynth.errors import ObsynthError, SolverError, SpecError
 from obsynth.files.inputs import protected_inputs
-from obsynth.version import __version__
 
 #: Exit code of a program whose reader has left, as shells give it.
 BROKEN_PIPE = 141
@@ -75,116 +66,19 @@ def told_error(error: Exception) -> ObsynthError | None:
         is_ours = (error.name or "").startswith("obsynth")
         text = f"This needs the library {error.name or error}, which cannot be loaded: install it with pip."
         return None if is_ours else SpecError(text)
-    from obsynth.numerics.failures import failure_of
+    from obsynth.numerics.libraries import failure_of
 
     return failure_of(error)
 
 
-_EXIT_CODES = """\
-exit codes:
-  0  success
-  2  wrong arguments, or a malformed spec, plant or file
-  3  an existence condition fails: no design of this kind exists for this plant
-  4  the matrix inequalities have no solution, and that is proved
-  5  a solver gave up: nothing is known
-  6  a check of the shipped gains failed
-"""
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``obsynth``."""
-    return _run(_parser(), arguments)
+    return _run(obsynth_parser(), arguments)
 
 
 def design_command(arguments: Sequence[str] | None = None) -> int:
     """Run ``design``, which is ``obsynth design``."""
-    parser = argparse.ArgumentParser(
-        prog="design", description=_DESIGN, epilog=_EXIT_CODES, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    _add_version(parser)
-    _add_design_arguments(parser)
-    return _run(parser, arguments)
-
-
-_DESIGN = "Design an observer from a spec, prove it, print a report and write the gain set."
-_CHECK = "Analyse the plant of a spec, and check for every method whether a design can exist."
-_VERIFY = "Verify a saved gain set again, from the plant and the shipped realisation alone."
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="obsynth", epilog=_EXIT_CODES, formatter_class=argparse.RawDescriptionHelpFormatter,
-        description="Observers and fault-estimation filters for descriptor systems: designed, proved again, and run.",
-    )  # fmt: skip
-    _add_version(parser)
-    verbs = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    _add_design_arguments(verbs.add_parser("design", help=_DESIGN, description=_DESIGN))
-
-    check = spec_verb(verbs, "check", _CHECK)
-    add_verbose(check, "the structure of the plant and every condition")
-    add_json(check)
-
-    verify = verbs.add_parser("verify", help=_VERIFY, description=_VERIFY)
-    verify.add_argument(
-        "gains", type=Path, metavar="FILE", help="a gain set that design wrote, or an alarm's certificate"
-    )
-    verify.add_argument(
-        "--printed-digits", type=_digits, metavar="N",
-        help="judge the gains as numbers that were printed with N decimals",
-    )  # fmt: skip
-    add_verbose(verify, "every claim and every check")
-    add_json(verify)
-    verify.set_defaults(verb="verify")
-
-    add_simulate_verb(verbs)
-    add_compare_verb(verbs)
-    add_evaluate_verb(verbs)
-    add_sweep_verb(verbs)
-    add_data_verbs(verbs)
-    add_calibration_verbs(verbs)
-    add_prove_alarm_verb(verbs)
-    return parser
-
-
-def _add_design_arguments(parser: argparse.ArgumentParser) -> None:
-    add_system(parser)
-    parser.add_argument(
-        "--output", type=Path, metavar="FILE",
-        help="where to write the gain set (default: <name of the spec>.gains.json in the current folder)",
-    )  # fmt: skip
-    add_verbose(parser, "every claim and every check")
-    add_json(parser)
-    add_force(parser)
-    add_quiet(parser)
-    parser.set_defaults(verb="design")
-
-
-def _add_version(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--version", action="version", version=f"obsynth {__version__}")
-
-
-def _digits(text: str) -> int:
-    digits = int(text)
-    if not 1 <= digits <= 15:
-        raise argparse.ArgumentTypeError(f"{digits} is not between 1 and 15")
-    return digits
-
-
-#: Verb -> module of `obsynth.cli` and function; only the one that is asked for is loaded.
-_VERBS = {
-    "design": "commands:run_design", "check": "commands:run_check", "verify": "commands:run_verify",
-    "simulate": "scenarios:run_simulate", "compare": "scenarios:run_compare", "evaluate": "scenarios:run_evaluate",
-    "sweep": "sweep:run_sweep", "run": "data_commands:run_run", "export": "data_commands:run_export",
-    "plot": "data_commands:run_plot", "report": "data_commands:run_report", "linearise": "calibration:run_linearise",
-    "calibrate": "calibration:run_calibrate", "validate": "calibration:run_validate",
-    "prove-alarm": "prove_alarm:run_prove_alarm",
-}  # fmt: skip
-
-
-def _verb(name: str) -> Callable[[argparse.Namespace], int]:
-    module, _, function = _VERBS[name].partition(":")
-    found: Callable[[argparse.Namespace], int] = getattr(import_module(f"obsynth.cli.{module}"), function)
-    return found
+    return _run(design_parser(), arguments)
 
 
 def _run(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> int:
@@ -205,7 +99,9 @@ def _run(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> in
 def _outcome(options: argparse.Namespace) -> int:
     """Run the verb; return its exit code, or that of its error after telling it."""
     try:
-        return _verb(options.verb)(options)
+        module, _, function = VERBS[options.verb].run.partition(":")
+        run: Callable[[argparse.Namespace], int] = getattr(import_module(f"obsynth.cli.{module}"), function)
+        return run(options)
     except ObsynthError as error:
         told = error
     except (ImportError, MemoryError, RecursionError, ArithmeticError, ValueError) as error:

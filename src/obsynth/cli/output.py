@@ -1,19 +1,20 @@
-"""What goes to the terminal: reports on stdout, progress and errors on stderr, JSON for programs."""
+"""What goes to the terminal and into files: reports on stdout, progress and errors on stderr, JSON for programs."""
 
 from __future__ import annotations
 
+import argparse
 import json
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from obsynth.errors import ObsynthError, VerificationError
+from obsynth.files.outputs import FileKind, check_output, check_replaceable
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from rich.console import Console
 
 
@@ -24,6 +25,33 @@ _TITLES = {
     "SolverError": "The solver gave up",
     "VerificationError": "Verification failed",
 }
+
+
+def output_file(path: str | Path, kind: FileKind | None, options: argparse.Namespace, *, option: str = "--out") -> Path:
+    """Return where to write a file of some kind, or raise `SpecError` before any work is done.
+
+    A file that the command has read, under whatever name, is never written; what is read later is checked again when
+    the file is put in its place.  An existing file of another kind (of any, if that is `None`) needs ``--force``.
+    """
+    target = check_output(path, option=option)
+    if not options.force:
+        check_replaceable(target, kind)
+    return target
+
+
+def answer(
+    options: argparse.Namespace, data: Mapping[str, Any], told: Callable[[], Any] | str, files: Sequence[Path] = ()
+) -> None:
+    """Print the result of a verb: as JSON if asked for, else as a text or by a function, with the files written."""
+    if options.json:
+        print_json({"command": options.verb, **data})
+        return
+    if not isinstance(told, str):
+        told()
+    elif told:
+        print(told)
+    if files:
+        print(f"Written: {', '.join(map(str, files))}")
 
 
 def print_json(data: Any, *, is_plain: bool = False) -> None:
@@ -39,7 +67,7 @@ def print_error(error: ObsynthError) -> None:
     if isinstance(error, VerificationError):
         from rich.console import Console
 
-        from obsynth.results.checks_table import checks_table
+        from obsynth.results.layout import checks_table
 
         console = Console(stderr=True, markup=False, highlight=False, emoji=False)
         console.print(checks_table(error.report.failures, width=console.width))

@@ -1,57 +1,22 @@
-"""The verb ``sweep``: specs and lists of values in, designs, one table and one picture out."""
+"""The verb ``sweep``, and ``run`` for many gain sets: many cases in, one table and one picture out."""
 
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Callable, Iterator
+from concurrent.futures import Executor
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from obsynth.cli.arguments import add_force, add_json, add_quiet, output_file
-from obsynth.cli.output import print_json, progress, stdout_console
+from obsynth.cli.data_run import STREAM, numbers_of
+from obsynth.cli.output import output_file, print_json, progress, stdout_console
 from obsynth.errors import SpecError
 from obsynth.files.inputs import input_file
 from obsynth.files.outputs import FileKind, made_folder, write_together
 
-if TYPE_CHECKING:
-    from concurrent.futures import Executor
-
-_SWEEP = "Design and verify for every combination of specs and values; what fails is a row of the table."
-_HELP = """\
-A value list is a YAML list: --set gamma='[0.1, 0.2]' --set plant.transform.sample_time='[0.01, 0.02]'
---set plant.C.outputs='[[omega 1], [omega 1, omega 2]]'.  A name that begins with no section of a spec is an option of
-its method.  The folder keeps every gain set and result: the same command goes on where another was stopped.
-"""
-TABLE = FileKind("the table of a sweep", rb"\Acase,")
-RUNS_TABLE = FileKind("the table of many runs", rb"\Arun,status,")
 PICTURE = FileKind("a picture", rb"\A\x89PNG")
-
-
-def add_sweep_verb(verbs: Any) -> None:
-    """Add the parser."""
-    parser = verbs.add_parser(
-        "sweep", help=_SWEEP, description=_SWEEP, epilog=_HELP, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument(
-        "--system", type=Path, required=True, nargs="+", metavar="FILE", help="a spec (YAML), or several"
-    )
-    parser.add_argument(
-        "--set", action="append", default=[], metavar="PATH=LIST", help="an entry of the specs and its values"
-    )
-    parser.add_argument("--out", type=Path, required=True, metavar="FOLDER", help="for gain sets, results, table.csv")
-    parser.add_argument("--claim", metavar="NAME", help="what the picture shows (default: the most frequent claim)")
-    add_executors(parser)
-    add_json(parser)
-    add_force(parser)
-    add_quiet(parser)
-    parser.set_defaults(verb="sweep")
-
-
-def add_executors(parser: argparse.ArgumentParser) -> None:
-    """Add ``--jobs`` and ``--cluster``."""
-    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes (default: 1)")
-    parser.add_argument("--cluster", metavar="ADDRESS", help="of the scheduler of a Dask cluster, instead of --jobs")
 
 
 def run_sweep(options: argparse.Namespace) -> int:
@@ -64,36 +29,43 @@ def run_sweep(options: argparse.Namespace) -> int:
         raise SpecError("Two lists of values (--set) are of the same entry: put them into one.", path="--set")
     for spec in options.system:
         input_file(Path(spec))  # what is designed for hours is not refused in the end
-    with made_folder(options.out):
-        return _swept(options, parameters)
-
-
-def _swept(options: argparse.Namespace, parameters: dict[str, list[Any]]) -> int:
-    """Run ``sweep`` in its folder."""
+    _require_claim(options, parameters)
     from obsynth.sweeps.sweep import sweep
 
-    table = output_file(options.out / "table.csv", TABLE, options)
-    picture = output_file(options.out / "sweep.png", PICTURE, options)
-    with progress(quiet=options.quiet) as report_stage, chosen_executor(options.jobs, options.cluster) as executor:
-        found = sweep(
-            options.system, parameters, executor=executor, folder=options.out,
-            progress=lambda done, total: report_stage(f"{done} of {total} designs"),
-        )  # fmt: skip
-        contents: dict[Path, str | bytes] = {table: found.csv()}
-        if any(result.claims for result in found.results):
-            contents[picture] = _png_of(lambda: found.plot(options.claim))
-        files = write_together(contents)
-    if options.json:
-        header, rows = found.rows()
-        print_json({
-            "command": "sweep", "counts": found.counts, "cases": [dict(zip(header, row, strict=True)) for row in rows],
-            "files": [str(file) for file in files],
-        })  # fmt: skip
-        return 0
-    console = stdout_console()
-    console.print(_shown(found))
-    console.print(f"Written: {', '.join(map(str, files))}", soft_wrap=True)
+    def work(executor: Executor | None, done: Callable[[int, int], None]) -> Any:
+        return sweep(options.system, parameters, executor=executor, folder=options.out, progress=done)
+
+    def draw(found: Any) -> Any:
+        claims = {name for result in found.results for name in result.claims}
+        if options.claim is not None and options.claim not in claims:
+            known = ", ".join(sorted(claims)) or "none"
+            print(f"Warning: no picture is written, as no design claims {options.claim!r}; there are: {known}.",
+                  file=sys.stderr)  # fmt: skip
+            return None
+        return found.plot(options.claim) if claims else None
+
+    table = FileKind("the table of a sweep", rb"\Acase,")
+    found, files = _carried_out(options, options.out, ("designs", table, "sweep.png"), work, draw)
+    _tell(options, found, files, "cases")
     return 0
+
+
+def _require_claim(options: argparse.Namespace, parameters: dict[str, list[Any]]) -> None:
+    """Refuse a claim that no method of a sweep can make before anything is designed."""
+    if options.claim is None:
+        return
+    from obsynth.methods.registry import REGISTRY, method_spec
+    from obsynth.spec.documents import read_yaml
+
+    methods = list(parameters.get("method.id", ()))
+    for section in parameters.get("method", [read_yaml(Path(spec)).get("method") for spec in options.system]):
+        methods.append(section.get("id") if isinstance(section, dict) else None)
+    # What chooses its method may come to any.
+    known = REGISTRY if any(method not in REGISTRY for method in methods) else methods
+    claims = sorted({claim for method in known for claim in method_spec(method).claims})
+    if options.claim not in claims:
+        raise SpecError(f"No method of this sweep claims {options.claim!r}: give --claim one of {', '.join(claims)}.",
+                        path="--claim")  # fmt: skip
 
 
 def run_many(options: argparse.Namespace) -> int:
@@ -104,45 +76,61 @@ def run_many(options: argparse.Namespace) -> int:
         names = ", ".join(f"--{name}" for name in given)
         raise SpecError(f"{names}: for one gain set; --gains is a folder of many.", path=f"--{given[0]}")
     folder = Path(options.out)
-    if options.out == "-" or (folder.exists() and not folder.is_dir()):
+    if options.out == STREAM or (folder.exists() and not folder.is_dir()):
         raise SpecError("Many designs need a folder for their estimates: give one to --out.", path="--out")
-    with made_folder(folder):
-        return _run_in(folder, options)
-
-
-def _run_in(folder: Path, options: argparse.Namespace) -> int:
-    """Run ``run`` for a folder of gain sets into a folder."""
-    from obsynth.cli.data_run import numbers_of
     from obsynth.sweeps.fleet import run_fleet
 
     for path in (Path(options.gains), Path(options.data)):
         if path.is_file():
             input_file(path)  # what is read is never written, by force or not
-    table = output_file(folder / "table.csv", RUNS_TABLE, options)
-    picture = output_file(folder / "fleet.png", PICTURE, options)
     asked = {
         "columns": dict(options.map) or None, "time_column": options.time_column, "outliers": options.outliers,
         "scales": numbers_of(options.scale) or None, "thresholds": numbers_of(options.threshold) or None,
         "gap": options.gap, "warm_up": options.warm_up, "recovered": options.recovered,
     }  # fmt: skip
-    with progress(quiet=options.quiet) as report_stage, chosen_executor(options.jobs, options.cluster) as executor:
-        found = run_fleet(
-            options.gains, options.data, folder, executor=executor,
-            progress=lambda done, total: report_stage(f"{done} of {total} runs"),
-            **{name: value for name, value in asked.items() if value is not None},
-        )  # fmt: skip
-        contents: dict[Path, str | bytes] = {table: found.csv()}
-        if "run" in found.counts:
-            contents[picture] = _png_of(found.plot)
-        files = write_together(contents)
-    if options.json:
-        header, rows = found.rows()
-        cases = [dict(zip(header, row, strict=True)) for row in rows]
-        print_json({"command": "run", "counts": found.counts, "runs": cases, "files": [str(file) for file in files]})
-    elif not options.quiet:
-        stdout_console().print(_shown_runs(found))
-        print(f"Written: {', '.join(map(str, files))}")
+
+    def work(executor: Executor | None, done: Callable[[int, int], None]) -> Any:
+        stated = {name: value for name, value in asked.items() if value is not None}
+        return run_fleet(options.gains, options.data, folder, executor=executor, progress=done, **stated)
+
+    table = FileKind("the table of many runs", rb"\Arun,status,")
+    found, files = _carried_out(
+        options, folder, ("runs", table, "fleet.png"), work,
+        lambda found: found.plot() if "run" in found.counts else None,
+    )  # fmt: skip
+    if options.json or not options.quiet:
+        _tell(options, found, files, "runs")
     return 0
+
+
+def _carried_out(
+    options: argparse.Namespace, folder: Path, named: tuple[str, FileKind, str],
+    work: Callable[[Executor | None, Callable[[int, int], None]], Any], draw: Callable[[Any], Any],
+) -> tuple[Any, tuple[Path, ...]]:  # fmt: skip
+    """Return what ``work`` comes to, and the files of its table and picture; nothing is left of a folder in vain."""
+    what, kind, picture_name = named
+    with made_folder(folder):
+        table = output_file(folder / "table.csv", kind, options)
+        picture = output_file(folder / picture_name, PICTURE, options)
+        with progress(quiet=options.quiet) as report_stage, chosen_executor(options.jobs, options.cluster) as executor:
+            found = work(executor, lambda done, total: report_stage(f"{done} of {total} {what}"))
+            contents: dict[Path, str | bytes] = {table: found.csv()}
+            image = _png_of(lambda: draw(found))
+            if image is not None:
+                contents[picture] = image
+            return found, write_together(contents)
+
+
+def _tell(options: argparse.Namespace, found: Any, files: tuple[Path, ...], what: str) -> None:
+    """Print the table of a sweep or of many runs, and the files."""
+    header, rows = found.rows()
+    if options.json:
+        cases = [dict(zip(header, row, strict=True)) for row in rows]
+        print_json({"command": options.verb, "counts": found.counts, what: cases, "files": [str(f) for f in files]})
+        return
+    console = stdout_console()
+    console.print(_shown(found) if what == "cases" else _shown_runs(found))
+    console.print(f"Written: {', '.join(map(str, files))}", soft_wrap=True)
 
 
 @contextmanager
@@ -190,7 +178,7 @@ def _value_list(text: str) -> tuple[str, list[Any]]:
     return name.strip(), values
 
 
-def _png_of(plot: Callable[[], Any]) -> bytes:
+def _png_of(plot: Callable[[], Any]) -> bytes | None:
     import io
 
     import matplotlib
@@ -199,6 +187,8 @@ def _png_of(plot: Callable[[], Any]) -> bytes:
     import matplotlib.pyplot as plt
 
     figure, stream = plot(), io.BytesIO()
+    if figure is None:
+        return None
     figure.savefig(stream, format="png", dpi=150)
     plt.close(figure)
     return stream.getvalue()

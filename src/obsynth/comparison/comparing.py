@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -12,9 +12,9 @@ from obsynth.analysis.transformations.recovery import Transformation, linear_pla
 from obsynth.comparison.result import ComparedMethod, Comparison, FaultComparison
 from obsynth.comparison.scenario_runs import DrawnRuns, alarms, drawn_runs, estimates, rms
 from obsynth.errors import SpecError
-from obsynth.methods.choosing.candidates import Candidate, candidate, linear_methods
-from obsynth.methods.choosing.figures import DECOUPLED, Held, held, on_the_clock, step_responses
+from obsynth.methods.automatic import Candidate, candidate, linear_methods
 from obsynth.methods.designing import design
+from obsynth.methods.fault_figures import DECOUPLED, Held, held, on_the_clock, step_responses
 from obsynth.methods.functional_filter.rates import settling_time
 from obsynth.numerics.arguments import (
     Count,
@@ -26,9 +26,8 @@ from obsynth.numerics.arguments import (
     require_kind,
 )
 from obsynth.numerics.arrays import FloatArray, read_only
-from obsynth.numerics.threads import on_one_thread_if_small
+from obsynth.numerics.libraries import on_one_thread_if_small
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.results.design import ObserverDesign
 from obsynth.simulation.profiles import Sine, Step
 from obsynth.simulation.scenario import Scenario
 
@@ -113,7 +112,8 @@ def compare(
             checked_value(value, name, Positive)
     report_stage = progress or (lambda _: None)
     plant = plant.dense() if plant.is_sparse else plant
-    dt = plant.dt or sample_time or _step_of(scenario) or settling_time(plant) / SAMPLES
+    stated = None if scenario is None else scenario.sample_time
+    dt = plant.dt or sample_time or stated or settling_time(plant) / SAMPLES
     sampled = on_the_clock(plant, dt)
     happening = _scenario(plant, scenario, dt, disturbance)
     steps = int(min(happening.horizon / dt, MOST_STEPS)) + 1
@@ -124,7 +124,8 @@ def compare(
     found = []
     for method in ids:
         report_stage(f"designing by {method}")
-        found.append(candidate(method, plant, sampled, steps, _maker, (options or {}).get(method, {})))
+        chosen = (options or {}).get(method, {})
+        found.append(candidate(method, plant, sampled, steps, lambda p, m, given: design(p, m, **given), chosen))
     report_stage("running the scenario")
     drawn = drawn_runs(
         plant, sampled, happening, runs=runs, tolerance=float(tolerance), seed=SEED, feedback=kept.feedback
@@ -140,23 +141,13 @@ def compare(
         + (", a state feedback holds the unstable plant" if kept.feedback.any() else "")
         + f"; 90 % of a step wanted within {limit:.3g} s"
     )
-    times: FloatArray = (
-        np.asarray(np.arange(len(drawn.faults)) * float(dt), dtype=np.float64) if log is None else log.times
-    )
+    times = np.arange(len(drawn.faults)) * float(dt) if log is None else log.times
     truth = drawn.faults if log is None else log.truth
     best = next((entry for entry in compared if not entry.refused), None)
     return Comparison(
         tuple(compared), "" if best is None else best.method, _reason(best, compared, sampled), dt, read_only(times),
         read_only(truth), plant.fault_names, setting,
     )  # fmt: skip
-
-
-def _maker(plant: DescriptorSystem, method: str, options: Mapping[str, Any]) -> ObserverDesign:
-    return design(plant, method, **options)
-
-
-def _step_of(scenario: Scenario | None) -> float | None:
-    return None if scenario is None else scenario.sample_time
 
 
 def _checked_methods(methods: Sequence[str] | None) -> list[str]:
@@ -188,11 +179,14 @@ def _scenario(plant: DescriptorSystem, given: Scenario | None, dt: float, distur
     )  # fmt: skip
 
 
-class _Log:
+class _Log(NamedTuple):
     """A log on the clock: known inputs, outputs, faults where it has them."""
 
-    def __init__(self, times: FloatArray, u: FloatArray, y: FloatArray, truth: FloatArray, known: bool) -> None:
-        self.times, self.u, self.y, self.truth, self.known = times, u, y, truth, known
+    times: FloatArray
+    u: FloatArray
+    y: FloatArray
+    truth: FloatArray
+    known: bool
 
 
 def _log(data: Any, plant: DescriptorSystem) -> _Log:
@@ -226,8 +220,13 @@ def _log(data: Any, plant: DescriptorSystem) -> _Log:
     truth = np.zeros((len(frame), plant.nf))
     for name in there:
         truth[:, plant.fault_names.index(name)] = _numbers(frame, [name])[:, 0]
-    times: FloatArray = np.asarray(np.arange(len(frame)) * float(plant.dt), dtype=np.float64)
-    return _Log(times, columns(plant.input_names), columns(plant.output_names), truth, bool(there))
+    return _Log(
+        np.arange(len(frame)) * float(plant.dt),
+        columns(plant.input_names),
+        columns(plant.output_names),
+        truth,
+        bool(there),
+    )
 
 
 def _numbers(frame: Any, names: list[str]) -> FloatArray:

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from obsynth.files.outputs import FileKind
-from obsynth.files.tables import html_table
-from obsynth.methods.choosing.figures import FaultFigures
+from obsynth.files.tables import html_table, text_table
+from obsynth.methods.fault_figures import FaultFigures
 from obsynth.numerics.arrays import FloatArray
 from obsynth.results.design import ObserverDesign
 
@@ -213,13 +213,7 @@ class Comparison:
         return figure
 
     def __str__(self) -> str:
-        rows = self.rows()
-        widths = [max(len(row[j]) for row in rows) for j in range(len(rows[0]))]
-        lines = [
-            "  ".join(t.rjust(w) if j > 1 else t.ljust(w) for j, (t, w) in enumerate(zip(row, widths, strict=True)))
-            for row in rows
-        ]
-        return "\n".join([self.setting, *lines, *self.refusals, self.advice])
+        return "\n".join([self.setting, *text_table(self.rows(), left=2), *self.refusals, self.advice])
 
     @property
     def advice(self) -> str:
@@ -242,8 +236,7 @@ class Comparison:
         style = "body{font-family:sans-serif;margin:2em;max-width:75em}td,th{padding:.2em .6em;text-align:right}"
         return (
             "<!DOCTYPE html><html lang='en'><head><meta charset='utf-8'>"
-            '<meta name="generator" content="obsynth compare">'
-            "<title>Comparison of methods</title>"
+            '<meta name="generator" content="obsynth compare"><title>Comparison of methods</title>'
             f"<style>{style}</style></head><body><h1>{escape(self.advice)}</h1>{self._repr_html_()}"
             f"<img alt='Estimates of each method' style='max-width:100%' src='data:image/png;base64,{encoded}'></body>"
             "</html>\n"

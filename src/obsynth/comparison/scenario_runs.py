@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.holds import driven
+from obsynth.numerics.continuous import driven
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.simulation.scenario import Scenario
@@ -21,10 +21,7 @@ EXACT = (0.0, 1.0, -1.0)
 
 @dataclass(frozen=True, eq=False)
 class DrawnRuns:
-    """Outputs of drawn plants: with the scenario's faults and without any, for the same draws otherwise.
-
-    Fields: faulty, healthy ``(runs, steps, ny)`` with their known inputs ``(runs, steps, nu)``; faults ``(steps, nf)``.
-    """
+    """Outputs ``(runs, steps, ny)`` of drawn plants with the scenario's faults and without any, and known inputs."""
 
     faulty: FloatArray
     faulty_u: FloatArray
@@ -44,11 +41,8 @@ def drawn_runs(
     seed: int,
     feedback: FloatArray,
 ) -> DrawnRuns:
-    """Return the runs; plants are drawn before they are sampled, and disturbances by a factor between -1 and 1.
-
-    Plants that state tolerances of their constants are drawn within these; an unstable one is held by ``feedback``.
-    """
-    from obsynth.methods.choosing.figures import on_the_clock
+    """Return the runs; plants are drawn before they are sampled, and disturbances by a factor between -1 and 1."""
+    from obsynth.methods.fault_figures import on_the_clock
 
     drive = resolve(sampled, scenario)
     nu, nf = sampled.nu, sampled.nf
@@ -93,10 +87,7 @@ def _outputs(
 
 
 def _drawn(plant: DescriptorSystem, tolerance: float, rng: np.random.Generator) -> DescriptorSystem:
-    """Return a plant whose parameters are off by up to the tolerance, each by itself; equal entries stay equal.
-
-    Constants with stated tolerances are drawn within these.
-    """
+    """Return a plant with its constants within their tolerances, and parameters off by up to one; equal stay equal."""
     if plant.uncertainty is not None:
         box = plant.uncertainty.box
         plant = plant_at(plant, box.values(rng.uniform(-1.0, 1.0, size=len(box.names))))
@@ -118,10 +109,9 @@ def _drawn(plant: DescriptorSystem, tolerance: float, rng: np.random.Generator) 
 def alarms(
     found: FloatArray, quiet: FloatArray, fault: FloatArray, response: FloatArray, false_alarms: float, dt: float
 ) -> tuple[float, float, float]:
-    """Return threshold, median detection delay (s) and smallest fault found in half of the runs.
+    """Return threshold (passed in a share of the fault-free runs), median detection delay (s) and smallest fault found.
 
-    ``found``, ``quiet`` ``(runs, steps)``: estimates with and without the fault; ``response (steps,)``: to a unit step.
-    The threshold is passed in a share ``false_alarms`` of the fault-free runs.
+    ``found, quiet (runs, steps)``: estimates with and without the fault; ``response (steps,)``: to a unit step.
     """
     level = float(np.quantile(np.max(np.abs(quiet), axis=1), 1.0 - false_alarms))
     acts = np.flatnonzero(fault)

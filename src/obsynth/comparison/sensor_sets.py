@@ -9,14 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.analysis.diagnosis.additions import Sensor, state_sensors
 from obsynth.analysis.diagnosis.decoupled import fault_numbers
+from obsynth.analysis.diagnosis.explanations import Sensor, state_sensors
 from obsynth.analysis.diagnosis.sensor_search import GOALS, SensorSearch, Task, reached
 from obsynth.analysis.transformations.recovery import Transformation, linear_plant
 from obsynth.errors import ObsynthError, PreconditionError, SpecError
+from obsynth.files.tables import html_table, text_table
 from obsynth.methods.functional_filter.public import functional_filter
 from obsynth.numerics.arguments import is_finite_number
-from obsynth.numerics.threads import on_one_thread_if_small
+from obsynth.numerics.libraries import on_one_thread_if_small
 from obsynth.plants.descriptor import DescriptorSystem
 
 #: So many sets are returned at most by default, and so many of them designed for.
@@ -101,9 +102,7 @@ class SensorSets:
         }  # fmt: skip
 
     def __str__(self) -> str:
-        rows = self.rows()
-        widths = [max(len(row[j]) for row in rows) for j in range(3)]
-        lines = ["  ".join(text.ljust(w) for text, w in zip(row, widths, strict=True)).rstrip() for row in rows]
+        lines = [line.rstrip() for line in text_table(self.rows())]
         return "\n".join([f"Sensors to {self.goal}:", *lines, *self.out_of_reach, *self.failures(), *self.notes])
 
     def failures(self) -> tuple[str, ...]:
@@ -113,11 +112,8 @@ class SensorSets:
         return (*lost, *([f"May fail, one at a time, without losing any fault: {', '.join(free)}."] if free else []))
 
     def _repr_html_(self) -> str:
-        rows = self.rows()
-        body = "".join("<tr>" + "".join(f"<td>{escape(text)}</td>" for text in row) + "</tr>" for row in rows[1:])
-        head = "".join(f"<th>{escape(text)}</th>" for text in rows[0])
         texts = "".join(f"<p>{escape(text)}</p>" for text in (*self.out_of_reach, *self.failures(), *self.notes))
-        return f"<table><tr>{head}</tr>{body}</table>{texts}"
+        return html_table(self.rows()) + texts
 
 
 @on_one_thread_if_small
@@ -192,7 +188,8 @@ def sensor_sets(
     if not chosen:
         raise SpecError("The plant has no faults to place sensors for.", path="faults")
     sensors = _candidates(plant, candidates, noise)
-    costs = _costs(sensors, cost or {})
+    _require_positive(cost or {}, sensors, "cost", whole=False)
+    costs = [float((cost or {}).get(sensor.name, 1.0)) for sensor in sensors]
     search = SensorSearch(plant, sensors, goal, chosen, may_fail, copies)
     report_stage("asking what all candidates together reach")
     wanted = search.reachable()
@@ -241,16 +238,12 @@ def _candidates(
     if noise is None:
         return sensors
     levels = noise if isinstance(noise, Mapping) else {sensor.name: noise for sensor in sensors}
-    _require_positive(levels, [sensor.name for sensor in sensors], "noise", whole=True)
+    _require_positive(levels, sensors, "noise", whole=True)
     return tuple(replace(sensor, deviation=float(levels[sensor.name])) for sensor in sensors)
 
 
-def _costs(sensors: Sequence[Sensor], given: Mapping[str, float]) -> list[float]:
-    _require_positive(given, [sensor.name for sensor in sensors], "cost", whole=False)
-    return [float(given.get(sensor.name, 1.0)) for sensor in sensors]
-
-
-def _require_positive(given: Mapping[str, Any], names: Sequence[str], what: str, *, whole: bool) -> None:
+def _require_positive(given: Mapping[str, Any], sensors: Sequence[Sensor], what: str, *, whole: bool) -> None:
+    names = [sensor.name for sensor in sensors]
     unknown = [name for name in given if name not in names]
     missing = [name for name in names if name not in given] if whole else []
     wrong = [name for name, value in given.items() if not (is_finite_number(value) and value > 0.0)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 from typing import Any
 
@@ -9,15 +10,11 @@ import numpy as np
 
 from obsynth.data.linear_log import DataObserver
 from obsynth.data.signals import Signals
-from obsynth.data.sources import Data, chunks
-from obsynth.data.stamps import Stamps
+from obsynth.data.sources import Data, samples
 from obsynth.errors import SpecError
 from obsynth.experiments.alarm_proofs.proof import WINDOW, AlarmProof, proved_alarm
 from obsynth.numerics.arguments import is_whole, require_kind, require_mapping
 from obsynth.results.design import ObserverDesign
-
-#: Rows that are read at a time.
-_CHUNK = 10_000
 
 
 def prove_alarm(
@@ -76,22 +73,15 @@ def prove_alarm(
     reader = DataObserver(design)
     signals = Signals.of(reader, columns, scales)
     found: list[np.ndarray] = []
-    for chunk in chunks(data, signals, Stamps(), _CHUNK):
-        for line, values in zip(chunk, signals.deviations(chunk), strict=True):
-            seconds, missing = reader.clock.advance(float(line[0]), len(found) + 1)
-            del seconds
-            if (len(found) and missing) or not np.isfinite(values).all():
-                raise SpecError(f"Row {len(found) + 1} has a gap before it or misses a sample: give complete rows.",
-                                path="data")  # fmt: skip
-            found.append(values)
-            if len(found) == row:
-                break
-        if len(found) == row:
-            break
+    for time, values in itertools.islice(samples(data, signals), row):
+        _, missing = reader.clock.advance(time, len(found) + 1)
+        if (len(found) and missing) or not np.isfinite(values).all():
+            raise SpecError(f"Row {len(found) + 1} has a gap before it or misses a sample: give complete rows.",
+                            path="data")  # fmt: skip
+        found.append(values)
     if len(found) < row:
         raise SpecError(f"The data have {len(found)} rows: row {row} is not among them.", path="row")
-    values = np.array(found)
-    nu = len(design.linear[1].input_names)
+    values, nu = np.array(found), reader.nu
     return proved_alarm(
         design, values[:, :nu], values[:, nu:], window=window, disturbance_bounds=disturbance_bounds,
         noise_bound=noise_bound, initial_set=initial_set, state_bounds=state_bounds,

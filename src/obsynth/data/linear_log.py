@@ -4,25 +4,83 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from functools import partial
+from collections.abc import Sequence
+from functools import lru_cache, partial
 from typing import Any, TypeVar
 
 import numpy as np
 
-from obsynth.data.gap_model import GapModel, KeptHolds
 from obsynth.data.log_estimator import GAP, LONGEST_BRIDGE, OK, RECOVERING, WARM_UP, Engine, Row, estimate_columns
-from obsynth.data.signals import LinearSignalNames
-from obsynth.data.stamps import Clock
-from obsynth.errors import ObsynthError, SpecError
+from obsynth.errors import ObsynthError, PreconditionError, SpecError
 from obsynth.experiments.monitors.online import LinearSample
 from obsynth.numerics.arguments import is_finite_number
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.holds import first_order_hold
+from obsynth.numerics.continuous import first_order_hold
+from obsynth.observers.linear.derived import transient
 from obsynth.observers.linear.observer import LinearObserver
-from obsynth.observers.linear.warm_up import checked_warm_up, transient
+from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
 
+#: How many lengths of an interval are kept discretised.
+KEPT_INTERVALS = 64
+SAMPLED_GAP = "gap is for continuous-time designs: a sampled one knows which rows are missing."
 _Part = TypeVar("_Part")
+
+
+class GapModel:
+    """The plant model that stands in for the sensors during a gap: faults held, unknown inputs zero, ``E = I``.
+
+    ``into (nx, nx_source)``: the dynamic states in an estimate of all states.
+    """
+
+    def __init__(self, plant: DescriptorSystem, into: FloatArray) -> None:
+        self.plant, self.into = plant, into
+        self._hold = lru_cache(KEPT_INTERVALS)(partial(first_order_hold, plant.A, np.hstack([plant.B, plant.Bf])))
+
+    @classmethod
+    def of(cls, plant: DescriptorSystem) -> GapModel | None:
+        """Return the model of a plant; ``None`` where the plant cannot be propagated (index 2 or more)."""
+        if np.array_equal(plant.E, np.eye(plant.nx)):
+            return cls(plant, np.eye(plant.nx))
+        from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
+
+        try:
+            done = eliminate_algebraic_states(plant)
+        except PreconditionError:
+            return None
+        moving = plant.E @ done.recovery.from_state
+        return cls(done.plant, np.asarray(np.linalg.pinv(moving) @ plant.E))
+
+    def start(self, estimate: FloatArray, inputs: Sequence[FloatArray], fault: FloatArray) -> FloatArray:
+        """Return the dynamic states now from an estimate ``(nx_source,)`` and the inputs of the samples since."""
+        state = self.into @ estimate
+        for u in inputs:
+            state = self.after(state, 0.0, u, u, fault)
+        return np.asarray(state)
+
+    def after(
+        self, state: FloatArray, seconds: float, before: FloatArray, u: FloatArray, fault: FloatArray
+    ) -> FloatArray:
+        """Return the state a sample later, or after an interval along which inputs go from ``before`` to ``u``."""
+        plant = self.plant
+        if plant.dt > 0.0:
+            return np.asarray(plant.A @ state + plant.B @ before + plant.Bf @ fault)
+        if seconds <= 0.0:
+            return state
+        transition, constant, ramp = self._hold(seconds)
+        rise = np.concatenate([u - before, np.zeros(len(fault))])
+        return np.asarray(transition @ state + constant @ np.concatenate([before, fault]) + ramp @ rise)
+
+    def outputs(self, state: FloatArray, u: FloatArray, fault: FloatArray) -> FloatArray:
+        """Return the outputs ``(ny,)`` of a state."""
+        return np.asarray(self.plant.C @ state + self.plant.D @ u + self.plant.Df @ fault)
+
+    def miss(self, v: FloatArray, state: FloatArray | None = None, fault: FloatArray | None = None) -> float:
+        """Return the distance between measured outputs and those of a state; of rest and no fault by default."""
+        plant = self.plant
+        at = np.zeros(plant.nx) if state is None else state
+        f = np.zeros(plant.nf) if fault is None else fault
+        return float(np.linalg.norm(v[plant.nu :] - self.outputs(at, v[: plant.nu], f)))
 
 
 def _running(part: _Part | None) -> _Part:
@@ -32,41 +90,32 @@ def _running(part: _Part | None) -> _Part:
     return part
 
 
-class DataObserver(LinearSignalNames):
-    """A running linear observer on measured data.
-
-    Fields: design: A linear design; gap: Continuous time: intervals longer than this are gaps, in seconds; warm_up:
-    Seconds that are marked after a start and after a gap; by default until the slowest mode has shrunk to 2 %.
-    """
+class DataObserver(Engine):
+    """A running linear observer on measured data; ``gap`` and ``warm_up`` in seconds, see `run_on_data`."""
 
     def __init__(self, design: ObserverDesign, *, gap: float | None = None, warm_up: float | None = None) -> None:
-        super().__init__(design)
+        self.plant, self.observer = design.linear
         if gap is not None and not (is_finite_number(gap) and gap > 0.0):
             raise SpecError(f"gap is {gap!r}: give seconds, a positive number.", path="gap")
         if gap is not None and self.observer.dt > 0.0:
-            raise SpecError(
-                "gap is for continuous-time designs: a sampled one knows which rows are missing.", path="gap"
-            )
-        self.warm_up = checked_warm_up(warm_up, transient(self.observer))
+            raise SpecError(SAMPLED_GAP, path="gap")
+        super().__init__(self.observer, gap, warm_up, transient(self.observer))
+        self.options["gap"] = gap
+        self.input_names, self.output_names = self.observer.input_names, self.observer.output_names
+        self.point, self.scales = self.plant.operating_point, self.plant.scales
         self.columns = estimate_columns(self.state_names, self.fault_names, self.observer.residual_names)
-        self.notes: tuple[str, ...] = ()
-        self.clock = Clock(self.observer.dt, gap)
-        self.gap_model = GapModel.of(self.plant)
         lags = set(self.observer.state_delays) or {0}
-        if len(lags) > 1:
-            self.gap_model = None
-        self.nu = len(self.observer.input_names)
+        self.gap_model = None if len(lags) > 1 else GapModel.of(self.plant)
+        self.nu = len(self.input_names)
         self.b = np.hstack([self.observer.Bu, self.observer.By])
-        self.observer_hold = KeptHolds(partial(first_order_hold, self.observer.Az, self.b))
-        self.plant_hold = None if self.gap_model is None else KeptHolds(self.gap_model.held)
         self.d = np.hstack([self.observer.Du, self.observer.Dy])
+        self._hold = lru_cache(KEPT_INTERVALS)(partial(first_order_hold, self.observer.Az, self.b))
         self.z: FloatArray | None = None
         self.v = np.zeros(self.b.shape[1])
         self.row = np.full(len(self.observer.Cz), np.nan)
         self.model: FloatArray | None = None
-        self.fault = np.zeros(len(self.observer.fault_names))
+        self.fault = np.zeros(len(self.fault_names))
         self.measured = self.v
-        self.settled_at, self.phase = math.inf, WARM_UP
         self.inputs: deque[FloatArray] = deque(maxlen=max(lags) + 1)
 
     def step(self, time: float, values: FloatArray, row: int) -> Row:
@@ -126,7 +175,7 @@ class DataObserver(LinearSignalNames):
     def _flow(self, seconds: float, v: FloatArray) -> None:
         """Bring z of a continuous observer to the time of ``v``, which is reached along a straight line."""
         if seconds > 0.0:
-            transition, constant, ramp = self.observer_hold.at(seconds)
+            transition, constant, ramp = self._hold(seconds)
             self.z = np.asarray(transition @ _running(self.z) + constant @ self.v + ramp @ (v - self.v))
 
     def _bridge_interval(self, seconds: float, missing: int, u: FloatArray) -> None:
@@ -172,13 +221,7 @@ class DataObserver(LinearSignalNames):
 
     def _propagate(self, seconds: float, u: FloatArray) -> None:
         before, model = self.v[: self.nu], _running(self.model)
-        if self.observer.dt > 0.0:
-            self.model = _running(self.gap_model).sampled(model, before, self.fault)
-        elif seconds > 0.0:
-            transition, constant, ramp = _running(self.plant_hold).at(seconds)
-            rise = np.concatenate([u - before, np.zeros(len(self.fault))])
-            start = np.concatenate([before, self.fault])
-            self.model = np.asarray(transition @ model + constant @ start + ramp @ rise)
+        self.model = _running(self.gap_model).after(model, seconds, before, u, self.fault)
 
     def _restart(self) -> None:
         self.z = self.model = None
@@ -191,25 +234,15 @@ class DataObserver(LinearSignalNames):
         row[self.observer.fault_rows] = self.fault
         return row
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return the state that goes from row to row, as data."""
+    def _own_data(self) -> dict[str, Any]:
         return {
-            "last": self.clock.last, "longest": self.clock.longest, "z": self.z, "v": self.v, "row": self.row,
-            "model": self.model, "fault": self.fault, "settled_at": self.settled_at, "phase": self.phase,
+            "z": self.z, "v": self.v, "row": self.row, "model": self.model, "fault": self.fault,
             "inputs": np.array(list(self.inputs)).reshape(len(self.inputs), self.nu), "measured": self.measured,
-            "warm_up": self.warm_up, "gap": self.clock.gap,
         }  # fmt: skip
 
-    def resume(self, data: dict[str, Any]) -> None:
-        """Go on from what `as_dict` returned."""
-        if (data["warm_up"], data["gap"]) != (self.warm_up, self.clock.gap):
-            raise SpecError(
-                "The saved state is of a run with another gap or warm-up: use the same options.", path="state"
-            )
-        self.clock.last, self.clock.longest = data["last"], data["longest"]
+    def _resume_own(self, data: dict[str, Any]) -> None:
         self.z, self.v, self.row, self.model = data["z"], data["v"], data["row"], data["model"]
-        self.fault, self.settled_at, self.phase = data["fault"], data["settled_at"], data["phase"]
-        self.measured = data["measured"]
+        self.fault, self.measured = data["fault"], data["measured"]
         self.inputs.clear()
         self.inputs.extend(data["inputs"])
 
@@ -224,7 +257,7 @@ def engine_of(
                             "its prediction.", path="outliers")  # fmt: skip
         return DataObserver(design, gap=gap, warm_up=warm_up)
     if gap is not None:
-        raise SpecError("gap is for continuous-time designs: a sampled one knows which rows are missing.", path="gap")
+        raise SpecError(SAMPLED_GAP, path="gap")
     # What most logs do not need is loaded only where it is used: a run starts in a fraction of a second.
     from obsynth.data.step_log import SteppingEngine
 

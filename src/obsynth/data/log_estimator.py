@@ -1,12 +1,18 @@
-"""What runs on rows of data: the same questions and answers for every kind of design."""
+"""What runs on rows of data: rows and their status, the clock, and what every kind of running design has."""
 
 from __future__ import annotations
 
+import math
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol
 
+from obsynth.errors import SpecError
 from obsynth.experiments.monitors.online import Evidence, LinearSample
 from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.linear.derived import checked_warm_up
+from obsynth.plants.descriptor import DescriptorSystem
 
 #: What a row of estimates is.
 OK, WARM_UP, PARTIAL, GAP, RECOVERING = "ok", "warm-up", "partial", "gap", "recovering"
@@ -14,32 +20,29 @@ OK, WARM_UP, PARTIAL, GAP, RECOVERING = "ok", "warm-up", "partial", "gap", "reco
 DECIDING = (OK, PARTIAL)
 #: Gaps longer than this many samples are not bridged: the observer starts again.
 LONGEST_BRIDGE = 10_000
+#: A sampled design accepts intervals that differ from a multiple of dt by this share of dt.
+FITTING_SHARE = 0.01
+#: Without another word, an interval is a gap when it is longer than this many times the longest one before.
+GAP_FACTOR = 10.0
+#: A gap of more samples than this cannot be counted in double precision.
+MOST_SAMPLES = 2.0**53
 
 
 class Row(NamedTuple):
-    """Estimates at one row of data.
+    """Estimates at one row of data."""
 
-    Fields: status: ``ok``, ``warm-up``, ``partial``, ``gap`` or ``recovering``; values: One for each column of the
-    engine, state estimates first, then fault estimates; deviations; NaN where nothing is known; skipped: How many rows
-    were missing before this one; evidence: What a recursive observer learnt from this row, for decisions; `None` for
-    others.
-    """
-
-    status: str
-    values: FloatArray
-    skipped: int = 0
-    evidence: Evidence | LinearSample | None = None
+    status: str  # ``ok``, ``warm-up``, ``partial``, ``gap`` or ``recovering``
+    values: FloatArray  # one for each column of the engine; deviations, NaN where nothing is known
+    skipped: int = 0  # how many rows were missing before this one
+    evidence: Evidence | LinearSample | None = None  # what was learnt from this row, for decisions
 
 
 class Entry(NamedTuple):
-    """A row of a log.
+    """A row of a log."""
 
-    Fields: time: In seconds; deviations: ``(nu + ny,)`` as read; row: Of the filter, and in time smoothed.
-    """
-
-    time: float
-    deviations: FloatArray
-    row: Row
+    time: float  # in seconds
+    deviations: FloatArray  # ``(nu + ny,)`` as read
+    row: Row  # of the filter, and in time smoothed
 
 
 class Later(Protocol):
@@ -54,82 +57,119 @@ class Later(Protocol):
         ...
 
 
-class Engine(Protocol):
-    """A running design on measured data.
+class Clock:
+    """Checks one time stamp after the other; ``dt`` is 0 in continuous time, with gaps longer than ``gap`` seconds."""
 
-    Fields: input_names, output_names: What is read from each row, in order; state_names, fault_names: What is
-    estimated: the first columns; columns: Names of the columns of estimates; state_delays, fault_delays: Samples by
-    which each estimate lags; dt: Seconds between samples; 0 for continuous time; point: Operating point by name of the
-    signal; scales: Factor of inputs and outputs by name, where the plant states one; notes: What a user should know
-    before anything is run.
-    """
+    def __init__(self, dt: float, gap: float | None) -> None:
+        self.dt, self.gap = dt, gap
+        self.last: float | None = None
+        self.longest = 0.0
 
-    @property
-    def input_names(self) -> tuple[str, ...]:
-        """Known inputs."""
-        ...
+    def advance(self, time: float, row: int) -> tuple[float, int]:
+        """Take the stamp of the next row."""
+        if not math.isfinite(time):
+            raise SpecError(f"Row {row} has no time: each row needs a finite number of seconds.", path=f"row {row}")
+        last = self.last
+        if last is None:
+            self.last = time
+            return 0.0, 0
+        if time == last:
+            raise SpecError(f"Row {row} repeats the time {time:.17g} s of the row before.", path=f"row {row}")
+        if time < last:
+            raise SpecError(f"Row {row}: the time falls from {last:.17g} to {time:.17g} s.", path=f"row {row}")
+        step = interval(last, time)
+        missing = self._sampled(step, row) if self.dt > 0.0 else self._continuous(step, row)
+        self.last = time
+        if not missing:
+            self.longest = max(self.longest, step)
+        return step, missing
 
-    @property
-    def output_names(self) -> tuple[str, ...]:
-        """Outputs of the plant."""
-        ...
+    def _sampled(self, step: float, row: int) -> int:
+        count = _counted(step / self.dt, step, row)
+        if count < 1 or abs(step - count * self.dt) > FITTING_SHARE * self.dt:
+            raise SpecError(
+                f"Row {row} comes {step:.10g} s after the row before, but the design has dt = {self.dt:.10g} s: "
+                "irregular time stamps need a continuous-time design.", path=f"row {row}",
+            )  # fmt: skip
+        if count > 1 and self.longest == 0.0:
+            raise SpecError(
+                f"Row {row}: the data begin with an interval of {step:.10g} s, but the design has dt = "
+                f"{self.dt:.10g} s: the sampling time does not fit.", path=f"row {row}",
+            )  # fmt: skip
+        return count - 1
 
-    @property
-    def state_names(self) -> tuple[str, ...]:
-        """States that are estimated."""
-        ...
+    def _continuous(self, step: float, row: int) -> int:
+        typical = self.longest or step
+        if step <= (GAP_FACTOR * typical if self.gap is None else self.gap):
+            return 0
+        unit = typical if self.longest else min(step, self.gap or step)
+        _counted(step / unit, step, row)
+        return max(math.ceil(step / unit * (1.0 - FITTING_SHARE)) - 1, 1)
 
-    @property
-    def fault_names(self) -> tuple[str, ...]:
-        """Faults or parameters that are estimated."""
-        ...
 
-    @property
-    def columns(self) -> tuple[str, ...]:
-        """Names of the columns of estimates."""
-        ...
+def _counted(samples: float, step: float, row: int) -> int:
+    """Return a whole number of samples; more than can be counted are no gap but a mistake."""
+    if not samples < MOST_SAMPLES:
+        raise SpecError(
+            f"Row {row} comes {step:.10g} s after the row before, {samples:.3g} samples: are the times in seconds?",
+            path=f"row {row}",
+        )
+    return round(samples)
 
-    @property
-    def state_delays(self) -> tuple[int, ...]:
-        """Samples by which each state estimate lags."""
-        ...
 
-    @property
-    def fault_delays(self) -> tuple[int, ...]:
-        """Samples by which each fault estimate lags."""
-        ...
+def interval(before: float, after: float) -> float:
+    """Return ``after - before``, rounded to what the two stamps can resolve, so that equal intervals are equal."""
+    resolution = 2.0 * max(math.ulp(before), math.ulp(after))
+    digits = -math.ceil(math.log10(resolution))
+    rounded = round(after - before, digits)
+    return rounded if rounded > 0.0 else after - before
 
-    @property
-    def dt(self) -> float:
-        """Seconds between samples; 0 for continuous time."""
-        ...
 
-    @property
-    def point(self) -> Mapping[str, float]:
-        """Operating point by name of the signal."""
-        ...
+class Engine(ABC):
+    """A running design on measured data: what it reads and estimates, its clock, its state from row to row."""
 
-    @property
-    def scales(self) -> Mapping[str, float]:
-        """Factor of inputs and outputs by name, where the plant states one."""
-        ...
+    input_names: tuple[str, ...]  # what is read from each row, in order
+    output_names: tuple[str, ...]
+    columns: tuple[str, ...]  # of estimates: states and faults first
+    point: Mapping[str, float] = MappingProxyType({})  # operating point by name of the signal
+    scales: Mapping[str, float] = MappingProxyType({})  # factor of inputs and outputs by name
+    notes: tuple[str, ...] = ()  # what a user should know before anything is run
+    plant: DescriptorSystem | None = None  # of a linear design
 
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """What a user should know before anything is run."""
-        ...
+    def __init__(self, observer: Any, gap: float | None, warm_up: float | None, default_warm_up: float) -> None:
+        self.state_names, self.fault_names = observer.state_names, observer.fault_names
+        self.state_delays, self.fault_delays = observer.state_delays, observer.fault_delays
+        self.dt: float = observer.dt
+        self.clock = Clock(self.dt, gap)
+        self.warm_up = checked_warm_up(warm_up, default_warm_up)
+        self.settled_at, self.phase = math.inf, WARM_UP
+        self.options: dict[str, float | None] = {"warm_up": self.warm_up}
 
+    @abstractmethod
     def step(self, time: float, values: FloatArray, row: int) -> Row:
-        """Take one row of data; see `obsynth.data.linear_log.DataObserver.step`."""
-        ...
+        """Take one row of data: its time, deviations ``(nu + ny,)``, and its number."""
 
     def as_dict(self) -> dict[str, Any]:
         """Return the state that goes from row to row, as data."""
-        ...
+        return {"last": self.clock.last, "longest": self.clock.longest, "settled_at": self.settled_at,
+                "phase": self.phase, **self.options, **self._own_data()}  # fmt: skip
 
     def resume(self, data: dict[str, Any]) -> None:
         """Go on from what `as_dict` returned."""
-        ...
+        if any(data[name] != value for name, value in self.options.items()):
+            told = " or ".join(name.replace("_", "-") for name in sorted(self.options))
+            raise SpecError(f"The saved state is of a run with another {told}: use the same options.", path="state")
+        self.clock.last, self.clock.longest = data["last"], data["longest"]
+        self.settled_at, self.phase = data["settled_at"], data["phase"]
+        self._resume_own(data)
+
+    @abstractmethod
+    def _own_data(self) -> dict[str, Any]:
+        """Return the state of the observer, as data."""
+
+    @abstractmethod
+    def _resume_own(self, data: dict[str, Any]) -> None:
+        """Go on from what `_own_data` returned."""
 
 
 def estimate_columns(

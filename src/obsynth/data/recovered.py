@@ -11,7 +11,7 @@ import numpy as np
 from obsynth.analysis.transformations.recovery import StateRecovery
 from obsynth.data.log_estimator import Engine, Row
 from obsynth.numerics.arrays import FloatArray
-from obsynth.plants.names import index_of
+from obsynth.plants.validation import index_of
 
 #: Of plants with more states as written none is recovered unless asked for: each row would take too long.
 MOST_RECOVERED = 300
@@ -22,10 +22,6 @@ LATE = "recovered states"
 class RecoveredStates:
     """Estimates of the states that a transformation took away, all of one moment.
 
-    Fields: recovery: Of the design; engine: Whose estimates are used.
-
-    Notes
-    -----
     ``x_source = from_state x + from_input u + from_fault f``: what disturbances and noise add is not known.  Where the
     fault estimate lags more than that of the state, both are taken of the older moment.  Faults that the observer does
     not estimate count as zero.
@@ -61,16 +57,16 @@ class RecoveredStates:
         if recovery is None:
             return None
         names = _asked_for(recovery, asked)
-        if not names or _states_of(recovery) != len(engine.state_names):
+        # Of a large map its operator knows the number of states from which the others follow.
+        operator = recovery.by_operator
+        states = recovery.from_state.shape[1] if operator is None else operator.state_count
+        if not names or states != len(engine.state_names):
             return None
         found = cls(recovery, engine, names)
         return found if found.names else None
 
     def take(self, row: Row, inputs: FloatArray) -> FloatArray:
-        """Return the recovered states, deviations; NaN where they are not known.
-
-        Shapes: ``inputs (nu,)``.
-        """
+        """Return the recovered states, deviations; NaN where they are not known: ``inputs (nu,)``."""
         if row.skipped:
             self._rows.clear()
         self._known = np.where(np.isfinite(inputs), inputs, self._known)
@@ -91,12 +87,6 @@ class RecoveredStates:
         self._rows.clear()
         self._rows.extend(data["rows"])
         self._known = data["known"]
-
-
-def _states_of(recovery: StateRecovery) -> int:
-    """Return the number of states from which the others follow, without forming a large map."""
-    operator = recovery.by_operator
-    return int(recovery.from_state.shape[1]) if operator is None else operator.state_count
 
 
 def _asked_for(recovery: StateRecovery, asked: str | Sequence[str] | None) -> tuple[str, ...]:

@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
-from obsynth.data.job import Job
+from obsynth.data.job import Job, resume_state, save_state
 from obsynth.data.linear_log import engine_of
 from obsynth.data.log_estimator import Engine, Later
-from obsynth.data.saved_state import resume_state, save_state
-from obsynth.data.signals import TIME, Signals
-from obsynth.data.sinks import FrameSink, Sink, TextSink, file_sink, measured_frame
-from obsynth.data.sources import Data, chunks
-from obsynth.data.stamps import Stamps
+from obsynth.data.signals import TIME, Signals, Stamps
+from obsynth.data.sinks import FrameSink, Sink, measured_frame, sink_for
+from obsynth.data.sources import CHUNK_ROWS, Data, chunks
 from obsynth.errors import ObsynthError, SpecError
 from obsynth.experiments.monitors.online import OnlineMonitor
 from obsynth.files.outputs import check_output, require_distinct
@@ -28,9 +26,6 @@ from obsynth.results.gain_sets import gain_set_digest
 
 if TYPE_CHECKING:
     import pandas as pd
-
-#: Rows that are held in memory at a time.
-CHUNK_ROWS = 10_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,12 +223,12 @@ def run_on_data(
     if state is not None and Path(state).exists():
         resume_state(Path(state), job, digest, design.file_digest)
     kept: list[FloatArray] | None = [] if out is None else None
-    rows = _kept(chunks(data, job.signals, stamps, chunk_rows), kept)
-    with _sink(out, job.header, stamps) as sink:
-        if state is None or out is None or isinstance(out, str | Path):
-            _run_rows(job, rows, sink, progress)
-        else:
-            _run_stream(job, rows, sink, progress, lambda: save_state(Path(state), job, digest))
+    # What has left a stream cannot be taken back: there the state is saved however the run ends.
+    save = None
+    if not (state is None or out is None or isinstance(out, str | Path)):
+        save = partial(save_state, Path(state), job, digest)
+    with sink_for(out, job.header, stamps) as sink:
+        _run_rows(job, chunks(data, job.signals, stamps, chunk_rows), sink, kept, save, progress or bool)
     if state is not None:
         save_state(Path(state), job, digest)
     table = sink.frame() if isinstance(sink, FrameSink) else None
@@ -262,26 +257,20 @@ def _later_rows(engine: Engine, data: Data, *, smooth: bool, lag: int | None, st
     return LaterRows(engine, lag)
 
 
-def _kept(rows: Iterator[FloatArray], kept: list[FloatArray] | None) -> Iterator[FloatArray]:
-    for chunk in rows:
-        if kept is not None:
-            kept.append(chunk)
-        yield chunk
-
-
-def _run_rows(job: Job, rows: Iterator[FloatArray], sink: Sink, progress: Callable[[int], None] | None) -> None:
-    for chunk in rows:
-        sink.write(job.take(chunk))
-        if progress is not None:
-            progress(job.rows)
-    sink.write(job.finish())
-
-
-def _run_stream(
-    job: Job, rows: Iterator[FloatArray], sink: Sink, progress: Callable[[int], None] | None, save: Callable[[], None]
-) -> None:
-    """Take rows one by one; what has left cannot be taken back, so the state is saved however the run ends."""
+def _run_rows(
+    job: Job, rows: Iterator[FloatArray], sink: Sink, kept: list[FloatArray] | None, save: Callable[[], None] | None,
+    progress: Callable[[int], object],
+) -> None:  # fmt: skip
+    """Run over all rows: in chunks, or one by one where the state is to be saved after a stream."""
     held, is_whole = HeldSignals(), True
+    if save is None:
+        for chunk in rows:
+            if kept is not None:
+                kept.append(chunk)
+            sink.write(job.take(chunk))
+            progress(job.rows)
+        sink.write(job.finish())
+        return
     with ending_signals(), held.installed():
         try:
             for chunk in rows:
@@ -291,8 +280,7 @@ def _run_stream(
                         found = job.take(row[None])
                         is_whole = True
                         sink.write(found)
-                if progress is not None:
-                    progress(job.rows)
+                progress(job.rows)
         except ObsynthError:
             # A refused row has changed nothing.
             is_whole = True
@@ -301,14 +289,3 @@ def _run_stream(
             if is_whole and job.rows:
                 save()
                 sink.write(job.finish())
-
-
-@contextmanager
-def _sink(out: str | Path | TextIO | None, header: tuple[str, ...], stamps: Stamps) -> Iterator[Sink]:
-    if isinstance(out, str | Path):
-        with file_sink(Path(out), header, {"status", "alarm"}, stamps) as sink:
-            yield sink
-    elif out is None:
-        yield FrameSink(header, stamps)
-    else:
-        yield TextSink(out, header, stamps)

@@ -1,12 +1,12 @@
-"""From the columns of a log to deviations from the operating point, and back.
-
-The names of what a linear design reads and estimates, as an engine has them.
-"""
+"""The columns of a log: time stamps as seconds or dates, and signals as deviations from the operating point."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta, tzinfo
+from typing import Any
 
 import numpy as np
 
@@ -14,7 +14,95 @@ from obsynth.data.log_estimator import Engine
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import is_finite_number
 from obsynth.numerics.arrays import FloatArray, read_only
-from obsynth.results.design import ObserverDesign
+
+#: What a missing sample may look like in a log.
+MISSING = frozenset({"", "nan", "na", "n/a", "null", "none"})
+_ZERO = datetime(1970, 1, 1, tzinfo=UTC)
+_EXPECTED = "seconds, such as 12.5, or a date and a time, such as 2026-05-01T08:30:00.5+02:00"
+_MICROSECOND = timedelta(microseconds=1)
+#: Seconds in a nanosecond, a microsecond and a day; microseconds in a second.
+_NANO, _MICRO, _DAY, _MICROSECONDS = 1e-9, 1e-6, 86400.0, 1e6
+
+
+class Stamps:
+    """Which kind of stamps a log has, decided by its first one, and the zone in which they are written back.
+    Attributes: is_dated: Dates and times; zone: Of the first stamp, `None` where it names none (taken as UTC)."""
+
+    def __init__(self) -> None:
+        self.is_dated: bool | None = None
+        self.zone: tzinfo | None = None
+
+    def read(self, text: str, row: int, column: str, *, comma: bool = False) -> float:
+        """Return the seconds of one cell; ``comma`` takes a decimal comma."""
+        cell = text.strip()
+        if cell.lower() in MISSING:
+            return math.nan
+        if self.is_dated is not True:
+            try:
+                seconds = float(cell.replace(",", ".") if comma else cell)
+            except ValueError:
+                seconds = None
+            if seconds is not None:
+                self.is_dated = False
+                return seconds
+        if self.is_dated is not False:
+            try:
+                found = datetime.fromisoformat(cell)
+            except ValueError:
+                found = None
+            if found is not None:
+                return self._seconds(found, row, column)
+        raise SpecError(
+            f"Row {row}, column {column!r}: {text!r} is no time stamp: {self._expected()}.", path=f"row {row}"
+        )
+
+    def read_column(self, column: Any) -> FloatArray | None:
+        """Return the seconds of a column of a data frame that holds dates; `None` where it holds none."""
+        kind = getattr(column.dtype, "kind", "O")
+        if kind not in "Mm" and not hasattr(column.dtype, "tz"):
+            return None
+        missing = np.asarray(column.isna())
+        if kind == "m":
+            self.is_dated = False
+            seconds = np.asarray(column.dt.total_seconds(), dtype=np.float64)
+        else:
+            if self.is_dated is None:
+                self.is_dated, self.zone = True, getattr(column.dtype, "tz", None)
+            plain = column.dt.tz_convert("UTC").dt.tz_localize(None) if hasattr(column.dtype, "tz") else column
+            counts = plain.to_numpy().astype("datetime64[ns]").astype(np.int64)
+            # Apart, so that the fraction keeps its digits.
+            seconds = (counts // 1_000_000_000).astype(np.float64) + (counts % 1_000_000_000) * _NANO
+        return np.where(missing, np.nan, seconds)
+
+    def shown(self, seconds: float) -> str:
+        """Return a time as the log writes it."""
+        if not self.is_dated or not math.isfinite(seconds):
+            return f"{seconds:g} s"
+        return self.date(seconds)
+
+    def date(self, seconds: float) -> str:
+        """Return the date and time of some seconds, ISO 8601, in the zone of the log."""
+        return self.moment(seconds).isoformat()
+
+    def moment(self, seconds: float) -> datetime:
+        """Return the date and time of some seconds, to the microsecond, with the log's zone if it names one."""
+        found = _ZERO + timedelta(seconds=math.floor(seconds)) + round((seconds % 1.0) * _MICROSECONDS) * _MICROSECOND
+        return found.replace(tzinfo=None) if self.zone is None else found.astimezone(self.zone)
+
+    def _seconds(self, found: datetime, row: int, column: str) -> float:
+        if self.is_dated is None:
+            self.is_dated, self.zone = True, found.tzinfo
+        if (found.tzinfo is None) != (self.zone is None):
+            raise SpecError(f"Row {row}, column {column!r}: stamps with a time zone and without one stand in one log.",
+                            path=f"row {row}")  # fmt: skip
+        past = (found if found.tzinfo is not None else found.replace(tzinfo=UTC)) - _ZERO
+        return past.days * _DAY + past.seconds + past.microseconds * _MICRO
+
+    def _expected(self) -> str:
+        if self.is_dated is None:
+            return f"give {_EXPECTED}"
+        return "the rows before hold dates and times" if self.is_dated else "the rows before hold seconds"
+
 
 #: The column of time stamps, in seconds.
 TIME = "time"
@@ -22,27 +110,17 @@ TIME = "time"
 
 @dataclass(frozen=True, eq=False)
 class Signals:
-    """Which column holds which measured signal, and how its values become deviations.
+    """Which column holds which measured signal, and how its values become deviations."""
 
-    Fields: names: Signals: known inputs, then outputs; columns: The columns that are read: time, then one for each
-    signal; scale, offset: ``(nu + ny,)``: deviation = scale times the value in the column, minus offset; point: The
-    operating point; one: Number of the signal that is one in every row and has no column, if there is such a one.
-    """
-
-    names: tuple[str, ...]
-    columns: tuple[str, ...]
-    scale: FloatArray
+    names: tuple[str, ...]  # signals: known inputs, then outputs
+    columns: tuple[str, ...]  # the columns that are read: time, then one for each signal
+    scale: FloatArray  # scale, offset: ``(nu + ny,)``: deviation = scale times the value in the column, minus offset
     offset: FloatArray
-    point: Mapping[str, float]
-    one: int | None = None
+    point: Mapping[str, float]  # the operating point
+    one: int | None = None  # number of the signal that is one in every row and has no column, if there is such a one
 
     @classmethod
-    def of(
-        cls,
-        engine: Engine,
-        columns: Mapping[str, str] | None,
-        scales: Mapping[str, float] | None,
-    ) -> Signals:
+    def of(cls, engine: Engine, columns: Mapping[str, str] | None, scales: Mapping[str, float] | None) -> Signals:
         """Return the signals that a running design reads."""
         names = engine.input_names + engine.output_names
         renamed, factors = dict(columns or {}), dict(scales or {})
@@ -108,58 +186,3 @@ def _advice(header: tuple[str, ...], missing: list[str]) -> str:
     if TIME in missing and found is not None:
         return f"If {found!r} is the time: --time-column {found!r}, or columns={{'time': {found!r}}}."
     return "Map signals to columns where their names differ."
-
-
-class LinearSignalNames:
-    """Names, delays, operating point and scales of a linear design.
-
-    Fields: design: Linear.
-    """
-
-    def __init__(self, design: ObserverDesign) -> None:
-        self.plant, self.observer = design.linear
-
-    @property
-    def input_names(self) -> tuple[str, ...]:
-        """Known inputs."""
-        return self.observer.input_names
-
-    @property
-    def output_names(self) -> tuple[str, ...]:
-        """Outputs of the plant."""
-        return self.observer.output_names
-
-    @property
-    def state_names(self) -> tuple[str, ...]:
-        """States that are estimated."""
-        return self.observer.state_names
-
-    @property
-    def fault_names(self) -> tuple[str, ...]:
-        """Faults that are estimated."""
-        return self.observer.fault_names
-
-    @property
-    def state_delays(self) -> tuple[int, ...]:
-        """Samples by which each state estimate lags."""
-        return self.observer.state_delays
-
-    @property
-    def fault_delays(self) -> tuple[int, ...]:
-        """Samples by which each fault estimate lags."""
-        return self.observer.fault_delays
-
-    @property
-    def dt(self) -> float:
-        """Seconds between samples; 0 for continuous time."""
-        return self.observer.dt
-
-    @property
-    def scales(self) -> Mapping[str, float]:
-        """Factor of inputs and outputs by name."""
-        return self.plant.scales
-
-    @property
-    def point(self) -> Mapping[str, float]:
-        """Operating point by name of the signal."""
-        return self.plant.operating_point

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, TextIO
 
 import numpy as np
 
-from obsynth.data.signals import TIME, Signals
+from obsynth.data.signals import TIME, Signals, Stamps
 from obsynth.data.sources import check_suffix
-from obsynth.data.stamps import Stamps
 from obsynth.files.outputs import FileKind, replacement_of
 from obsynth.files.tables import TableWriter
 from obsynth.numerics.arrays import FloatArray
@@ -22,6 +21,8 @@ if TYPE_CHECKING:
 
 #: A table that a run on measured data has written, as CSV or as Parquet.
 ESTIMATES = FileKind("a table of estimates of obsynth", rb"\Atime,status,|\APAR1(?s:.*)status(?s:.*)hat\[")
+#: Columns of a table that hold text.
+TEXTS = ("status", "alarm")
 
 
 def time_columns(header: Sequence[str]) -> tuple[int, ...]:
@@ -47,10 +48,7 @@ class Sink(Protocol):
 
 
 class TextSink:
-    """CSV to a text stream, flushed after each call.
-
-    Fields: stream: Where to; header: Names of the columns; stamps: Dates are written back as such.
-    """
+    """CSV to a text stream, flushed after each call; dates are written back as such."""
 
     def __init__(self, stream: TextIO, header: Sequence[str], stamps: Stamps) -> None:
         self._stream, self._writer, self._stamps = stream, TableWriter(stream, header), stamps
@@ -63,10 +61,7 @@ class TextSink:
 
 
 class FrameSink:
-    """Rows to a data frame.
-
-    Fields: header: Names of the columns; stamps: Dates stay dates.
-    """
+    """Rows to a data frame, in which dates stay dates."""
 
     def __init__(self, header: Sequence[str], stamps: Stamps) -> None:
         self._header, self._rows, self._stamps = list(header), list[Sequence[Any]](), stamps
@@ -84,16 +79,13 @@ class FrameSink:
 
 
 class ParquetSink:
-    """Rows to a Parquet file, one row group for each call.
+    """Rows to a Parquet file, one row group for each call."""
 
-    Fields: path: The file; header: Names of the columns; texts: The columns that hold text.
-    """
-
-    def __init__(self, path: str, header: Sequence[str], texts: set[str]) -> None:
+    def __init__(self, path: str, header: Sequence[str]) -> None:
         import pyarrow as pa
         import pyarrow.parquet as pq
 
-        self._schema = pa.schema([(name, pa.string() if name in texts else pa.float64()) for name in header])
+        self._schema = pa.schema([(name, pa.string() if name in TEXTS else pa.float64()) for name in header])
         self._writer = pq.ParquetWriter(path, self._schema)
 
     def write(self, rows: Sequence[Sequence[Any]]) -> None:
@@ -112,20 +104,24 @@ class ParquetSink:
 
 
 @contextmanager
-def file_sink(path: Path, header: Sequence[str], texts: set[str], stamps: Stamps) -> Iterator[Sink]:
-    """Give a sink for a file that replaces ``path`` when all went well, and leaves nothing behind otherwise.
+def sink_for(out: str | Path | TextIO | None, header: Sequence[str], stamps: Stamps) -> Iterator[Sink]:
+    """Give a sink for a data frame, a stream, or a file that replaces ``out`` when all went well, and not at all else.
 
     In a Parquet file times are seconds, since 1970 where the log has dates.
     """
+    if out is None:
+        yield FrameSink(header, stamps)
+        return
+    if not isinstance(out, str | Path):
+        yield TextSink(out, header, stamps)
+        return
+    path = Path(out)
     check_suffix(path)
     with replacement_of(path) as (handle, temporary):
         if path.suffix.lower() == ".parquet":
             os.close(handle)
-            sink = ParquetSink(temporary, header, texts)
-            try:
+            with closing(ParquetSink(temporary, header)) as sink:
                 yield sink
-            finally:
-                sink.close()
         else:
             with os.fdopen(handle, "w", encoding="utf-8", newline="") as stream:
                 yield TextSink(stream, header, stamps)

@@ -12,15 +12,14 @@ from numpy.typing import ArrayLike
 from obsynth.data.linear_log import engine_of
 from obsynth.data.log_estimator import Engine, Entry
 from obsynth.data.signals import TIME, Signals
-from obsynth.data.sources import chunks
-from obsynth.data.stamps import Stamps
+from obsynth.data.sources import samples
 from obsynth.data.step_log import SteppingEngine
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import read_only
 from obsynth.observers.estimates import Estimates
 from obsynth.observers.linear.observer import LinearObserver
-from obsynth.observers.robustness import with_outliers
+from obsynth.observers.running import changed
 from obsynth.observers.smoothing.chain import Smoothed, deviations_in
 from obsynth.observers.smoothing.keeping import (
     Chain,
@@ -32,9 +31,6 @@ from obsynth.observers.smoothing.keeping import (
 )
 from obsynth.results.design import ObserverDesign
 
-#: Rows of a log that are read at a time.
-CHUNK_ROWS = 10_000
-
 
 class _Waiting(NamedTuple):
     entry: Entry
@@ -43,10 +39,7 @@ class _Waiting(NamedTuple):
 
 
 class LaterRows:
-    """Rows of a log that wait for those after them.
-
-    Fields: engine: Of a recursive or nonlinear design; lag: How many samples they wait; ``None`` for the end.
-    """
+    """Rows of a log that wait ``lag`` samples for those after them; ``None``: until the end."""
 
     def __init__(self, engine: Engine, lag: int | None) -> None:
         if not isinstance(engine, SteppingEngine):
@@ -176,7 +169,7 @@ def smooth(
     if isinstance(design.observer, LinearObserver):
         # The same refusal as on logs.
         LaterRows(engine_of(design), waited)
-    if _is_log(data):
+    if isinstance(data, str) or any(hasattr(data, name) for name in ("__fspath__", "readline", "columns")):
         if u is not None:
             raise SpecError("u is for arrays: a log has the inputs in its columns.", path="u")
         if waited is None and hasattr(data, "readline"):
@@ -190,25 +183,17 @@ def smooth(
                         path="columns")  # fmt: skip
     observer: Any = design.observer
     if outliers is not None:
-        observer = with_outliers(observer, outliers)
+        observer = changed(observer, outliers=outliers)
     if isinstance(data, tuple) and len(data) == 2 and u is None and np.ndim(data[0]) == 2:
         data, u = data
     return smoothed_record(observer, data, u, waited)
 
 
-def _is_log(data: Any) -> bool:
-    return isinstance(data, str) or hasattr(data, "__fspath__") or hasattr(data, "readline") or hasattr(data, "columns")
-
-
 def _smoothed_log(engine: Any, data: Any, lag: int | None, signals: Signals) -> Estimates:
     later, observer = LaterRows(engine, lag), engine.observer.observer
     found: list[tuple[Entry, Any, Smoothed]] = []
-    count = 0
-    for chunk in chunks(data, signals, Stamps(), CHUNK_ROWS):
-        values = signals.deviations(chunk)
-        for time, deviations in zip(chunk[:, 0].tolist(), values, strict=True):
-            count += 1
-            found.extend(later.take(Entry(time, deviations, engine.step(time, deviations, count))))
+    for row, (time, deviations) in enumerate(samples(data, signals), 1):
+        found.extend(later.take(Entry(time, deviations, engine.step(time, deviations, row))))
     found.extend(later.flush())
     known = smoothed_estimates(observer, [row for _, row, _ in found], [sample for _, _, sample in found])
     point = signals.estimates_point(engine)

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any, TextIO, TypeAlias
 
 import numpy as np
 
-from obsynth.data.signals import TIME, Signals
-from obsynth.data.stamps import Stamps
+from obsynth.data.signals import TIME, Signals, Stamps
 from obsynth.data.text_logs import Dialect, stream_rows, text_chunks
 from obsynth.errors import SpecError
 from obsynth.files.inputs import input_file
@@ -28,9 +27,10 @@ PACKAGES = {
     ".parquet": ("pyarrow", "parquet"), ".tdms": ("nptdms", "tdms"), ".mf4": ("asammdf", "mdf"),
     ".mdf": ("asammdf", "mdf"), ".dat": ("asammdf", "mdf"),
 }  # fmt: skip
+#: Rows that are held in memory at a time.
+CHUNK_ROWS = 10_000
 #: Files that estimates are written to.
 SUFFIXES = (".csv", ".parquet")
-
 Data: TypeAlias = "str | Path | TextIO | pd.DataFrame"
 
 
@@ -52,6 +52,12 @@ def chunks(data: Data, signals: Signals, stamps: Stamps, rows: int) -> Iterator[
 
         require_kind(data, pd.DataFrame, "data", "the name of a file, a text stream or a pandas.DataFrame")
         yield from _converted(iter([_with_time(data, signals)]), signals, stamps)
+
+
+def samples(data: Data, signals: Signals) -> Iterator[tuple[float, FloatArray]]:
+    """Yield time and deviations ``(nu + ny,)`` of each row."""
+    for chunk in chunks(data, signals, Stamps(), CHUNK_ROWS):
+        yield from zip(chunk[:, 0].tolist(), signals.deviations(chunk), strict=True)
 
 
 def is_stream(data: TextIO | pd.DataFrame) -> TypeIs[TextIO]:
@@ -197,7 +203,7 @@ def _times(column: pd.Series, done: int, stamps: Stamps) -> FloatArray:
     """Return a column of time stamps as seconds."""
     import pandas as pd
 
-    found = stamps.read_column(column, done)
+    found = stamps.read_column(column)
     if found is not None:
         return found
     if pd.api.types.is_numeric_dtype(column):

@@ -2,61 +2,68 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
-from obsynth.data.log_estimator import GAP, LONGEST_BRIDGE, OK, PARTIAL, RECOVERING, WARM_UP, Row, estimate_columns
-from obsynth.data.stamps import Clock
+from obsynth.data.log_estimator import (
+    GAP,
+    LONGEST_BRIDGE,
+    OK,
+    PARTIAL,
+    RECOVERING,
+    WARM_UP,
+    Engine,
+    Row,
+    estimate_columns,
+)
 from obsynth.errors import ObsynthError, PreconditionError, SolverError, SpecError
 from obsynth.experiments.monitors.online import Evidence
 from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.dae.estimates import DAERow
 from obsynth.observers.dae.observer import DAEObserver
-from obsynth.observers.linear.warm_up import checked_warm_up
+from obsynth.observers.recursive.estimates import RawEstimate
 from obsynth.observers.recursive.observer import RecursiveObserver
-from obsynth.observers.robustness import with_outliers
-from obsynth.observers.running import ParameterRow, state_as_data, state_from_data
+from obsynth.observers.running import changed, state_as_data, state_from_data
 from obsynth.results.design import ObserverDesign
 
+#: What an observer with deviations knows at one sample.
+StepRow: TypeAlias = RawEstimate | DAERow
 
-class SteppingEngine:
+
+class SteppingEngine(Engine):
     """A running observer with deviations on measured data; the first row is k = 0.
 
-    Signals of a nonlinear plant are absolute values, as its model's.
-
-    Fields: design: Recursive or nonlinear; warm_up: Seconds that are marked after a start, and after rows with unknown
-    inputs, none by default: the covariances of the start say how uncertain the estimates are; outliers: What is done
-    with them, by default what the observer says, or a gate.
+    Signals of a nonlinear plant are absolute values, as its model's.  By default there is no warm-up, as covariances
+    of the start say how uncertain the estimates are, and a gate for outliers where the observer says nothing of them.
     """
 
     def __init__(self, design: ObserverDesign, *, warm_up: float | None = None, outliers: str | None = None) -> None:
-        self.observer, plant = _with_gate(design.observer, outliers), design.plant
+        observer: Any = design.observer
+        wanted = outliers or ("gate" if observer.outliers == "none" else observer.outliers)
+        self.observer: RecursiveObserver | DAEObserver = observer
+        if wanted != observer.outliers:
+            self.observer = changed(observer, outliers=wanted)
+        plant = design.plant
+        super().__init__(self.observer, None, warm_up, 0.0)
         self.input_names, self.output_names = plant.input_names, plant.output_names
-        self.state_names, self.fault_names = self.observer.state_names, self.observer.fault_names
-        self.state_delays, self.fault_delays = self.observer.state_delays, self.observer.fault_delays
-        self.point: Mapping[str, float] = {}
-        self.scales: Mapping[str, float] = {}
         self.is_recursive, self.may_restart = isinstance(self.observer, RecursiveObserver), True
         residuals: tuple[str, ...] = plant.output_names
         if isinstance(self.observer, RecursiveObserver):
-            plant, Q, R = self.observer.plant, self.observer.Q, self.observer.R
-            self.point, self.scales = plant.operating_point, plant.scales
+            model, Q, R = self.observer.plant, self.observer.Q, self.observer.R
+            self.point, self.scales = model.operating_point, model.scales
             # H_k has as many directions beside the state as there are parity innovations.
-            residuals = tuple(f"innovation {i + 1}" for i in range(plant.ne + plant.ny - plant.nx))
-            constant = plant.is_time_invariant and Q.is_constant and R.is_constant
-            self.may_restart = constant and plant.horizon is None
+            residuals = tuple(f"innovation {i + 1}" for i in range(self.observer.innovation_count))
+            constant = model.is_time_invariant and Q.is_constant and R.is_constant
+            self.may_restart = constant and model.horizon is None
         self.columns = estimate_columns(self.state_names, self.fault_names, residuals, deviations=True)
         self.directions = len(residuals)
-        self.dt, self.warm_up = self.observer.dt, checked_warm_up(warm_up, 0.0)
         late = ", ".join(name for name, entry in (self.observer.sensors or {}).items() if entry["delay"])
-        told = "their innovations stand in no row, so that monitors see them in the estimates only."
-        self.notes: tuple[str, ...] = (f"Values of {late} arrive late: {told}",) if late else ()
-        self.clock = Clock(self.dt, None)
+        if late:
+            self.notes = (f"Values of {late} arrive late: their innovations stand in no row, so that monitors see them "
+                          "in the estimates only.",)  # fmt: skip
         self.state: Any = self.observer.init()
         self.u: FloatArray | None = None
-        self.settled_at, self.phase = math.inf, WARM_UP
 
     @property
     def outliers(self) -> dict[str, int]:
@@ -75,21 +82,26 @@ class SteppingEngine:
             )  # fmt: skip
         return values
 
-    def _taken(self, y: FloatArray, u: FloatArray, row: int) -> ParameterRow | SolverError | None:
-        """Take one sample, or return why the sample cannot be taken; `None` if numbers are not finite."""
+    def _taken(self, y: FloatArray, u: FloatArray, row: int) -> StepRow | None:
+        """Take one sample, or none of it: `None` where numbers are no finite ones any more."""
+        before = self.state
         try:
-            self.state, found = self.observer.accept(self.state, y, u)
+            with np.errstate(all="ignore"):
+                self.state, found = self.observer.accept(self.state, y, u)
         except SolverError as error:
-            return SolverError(f"Row {row}: {error}")
+            raise SolverError(f"Row {row}: {error}") from error
         except SpecError as error:
             raise SpecError(f"Row {row}: {error}", path=f"row {row}") from error
         except PreconditionError as error:
             raise PreconditionError(f"Row {row}: {error}", condition=error.condition) from error
         except (np.linalg.LinAlgError, ValueError):
             return None
-        return found if found.is_finite else None
+        if found.is_finite:
+            return found
+        self.state = before
+        return None
 
-    def _values(self, found: ParameterRow) -> FloatArray:
+    def _values(self, found: StepRow) -> FloatArray:
         """Return a row: estimates, standard deviations, innovation at the parameters of one sample before."""
         residual = np.full(self.directions, np.nan)
         # The correction of the start by early constraints has no more directions, but may have fewer.
@@ -151,7 +163,7 @@ class SteppingEngine:
                 return True
         return False
 
-    def _found(self, y: FloatArray, u: FloatArray, row: int, *, may_restart: bool) -> tuple[ParameterRow, bool, bool]:
+    def _found(self, y: FloatArray, u: FloatArray, row: int, *, may_restart: bool) -> tuple[StepRow, bool, bool]:
         """Take one sample; return also whether its outputs were left out, and whether the observer started again."""
         found = self._safe(y, u, row)
         if found is not None:
@@ -174,22 +186,16 @@ class SteppingEngine:
         self.phase = OK
         return OK if outputs.all() else PARTIAL
 
-    def _safe(self, y: FloatArray, u: FloatArray, row: int) -> ParameterRow | None:
-        """Take one sample, or none of it: what overflows leaves the state as it was."""
-        before = self.state
-        with np.errstate(all="ignore"):
-            found = self._taken(y, u, row)
-        if found is None or isinstance(found, SolverError):
-            self.state = before
+    def _safe(self, y: FloatArray, u: FloatArray, row: int) -> StepRow | None:
+        """Take one sample, or none of it where there is no solution either."""
+        try:
+            return self._taken(y, u, row)
+        except SolverError:
             return None
-        return found
 
-    def _required(self, u: FloatArray, row: int) -> ParameterRow:
+    def _required(self, u: FloatArray, row: int) -> StepRow:
         """Take one sample without outputs."""
-        with np.errstate(all="ignore"):
-            found = self._taken(np.full(len(self.output_names), np.nan), u, row)
-        if isinstance(found, SolverError):
-            raise found
+        found = self._taken(np.full(len(self.output_names), np.nan), u, row)
         if found is None:
             raise SpecError(
                 f"Row {row}: the estimates are no finite numbers any more: the model is unstable, or the inputs are "
@@ -197,25 +203,8 @@ class SteppingEngine:
             )  # fmt: skip
         return found
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return the state that goes from row to row, as data."""
-        return {
-            "last": self.clock.last, "longest": self.clock.longest, "observer": state_as_data(self.state),
-            "u": self.u, "settled_at": self.settled_at, "phase": self.phase, "warm_up": self.warm_up,
-        }  # fmt: skip
+    def _own_data(self) -> dict[str, Any]:
+        return {"observer": state_as_data(self.state), "u": self.u}
 
-    def resume(self, data: dict[str, Any]) -> None:
-        """Go on from what `as_dict` returned."""
-        if data["warm_up"] != self.warm_up:
-            raise SpecError("The saved state is of a run with another warm-up: use the same option.", path="state")
-        self.clock.last, self.clock.longest = data["last"], data["longest"]
-        self.state = state_from_data(self.state, data["observer"])
-        self.u, self.settled_at, self.phase = data["u"], data["settled_at"], data["phase"]
-
-
-def _with_gate(observer: Any, outliers: str | None) -> RecursiveObserver | DAEObserver:
-    """Return an observer for logs: with a gate, unless it or ``outliers`` says otherwise."""
-    wanted = outliers or ("gate" if observer.outliers == "none" else observer.outliers)
-    found: RecursiveObserver | DAEObserver
-    found = observer if wanted == observer.outliers else with_outliers(observer, wanted)
-    return found
+    def _resume_own(self, data: dict[str, Any]) -> None:
+        self.state, self.u = state_from_data(self.state, data["observer"]), data["u"]

@@ -12,8 +12,7 @@ from typing import TextIO
 
 import numpy as np
 
-from obsynth.data.signals import Signals
-from obsynth.data.stamps import MISSING, Stamps
+from obsynth.data.signals import MISSING, Signals, Stamps
 from obsynth.errors import SpecError
 from obsynth.files.tables import as_meant
 from obsynth.numerics.arrays import FloatArray

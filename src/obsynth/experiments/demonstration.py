@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from obsynth.analysis.transformations import eliminate_algebraic_states
+from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
 from obsynth.numerics.spectra import decay_rates, eigenvalues
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.linear.observer import LinearObserver

@@ -2,26 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Executor, as_completed
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from concurrent.futures import Executor
+from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.experiments.batch_simulation import Bench, LinearBench, Runs, make_bench
-from obsynth.experiments.benches import bench_of
-from obsynth.experiments.intervals import Interval, mean, share
+from obsynth.experiments.benches import Bench, LinearBench, Runs, bench_of, make_bench
+from obsynth.experiments.evaluation import Evaluation, Interval, mean, share
 from obsynth.experiments.monitors.monitor import Monitor
 from obsynth.experiments.simulation import aligned_errors
-from obsynth.numerics.arguments import is_finite_number, is_whole, require_kind
+from obsynth.numerics.arguments import OpenUnitInterval, checked_value, require_kind, whole_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.decisions import ParameterMonitor
 from obsynth.observers.estimates import Estimates
-from obsynth.observers.progress import RunsProgress, progress_of_runs
+from obsynth.observers.progress import RunsProgress, as_they_come, progress_of_runs
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.scenario import Scenario
@@ -29,50 +28,6 @@ from obsynth.tolerances.exact_plant import drawn_points, plant_at
 
 #: Numbers that a batch of runs may hold at once, per signal: what keeps memory small and one task worth sending.
 BATCH_SAMPLES = 100_000
-
-
-@dataclass(frozen=True, eq=False)
-class Evaluation:
-    """What many runs of a scenario say, each number with its confidence interval.
-
-    Parameters
-    ----------
-    runs : int
-        Run i has the scenario's seed plus i.
-    confidence : float
-        Of the intervals.
-    false_alarm_rate : Interval
-        Share of the runs with an alarm before the first fault; of all runs where the scenario has none.
-    missed_detection_rate : Interval
-        Share of the runs without an alarm from the first fault on; of no runs without a fault.
-    detection_delay : Interval
-        Seconds from the first fault to the first alarm after it, mean over the runs that have one.
-    isolation_error_rate : Interval
-        Share of the detections that name a fault which did not act until then; of no runs where no fault of the plant
-        acts.
-    fault_rmse, state_rmse : mapping of str to Interval
-        Root mean square error after warm-up of each estimate, mean over runs; of recursive designs, which state how
-        uncertain they are from the start, over the whole record but its first row.
-    """
-
-    runs: int
-    confidence: float
-    false_alarm_rate: Interval
-    missed_detection_rate: Interval
-    detection_delay: Interval
-    isolation_error_rate: Interval
-    fault_rmse: Mapping[str, Interval]
-    state_rmse: Mapping[str, Interval]
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return everything as plain data."""
-        found: dict[str, Any] = {}
-        for name, value in vars(self).items():
-            if isinstance(value, Mapping):
-                found[name] = {signal: asdict(item) for signal, item in value.items()}
-            else:
-                found[name] = asdict(value) if isinstance(value, Interval) else value
-        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,25 +39,26 @@ class _Task:
     warm_ups: tuple[int, int]
     seeds: tuple[int, ...]
 
-    def __call__(self) -> dict[str, FloatArray]:
-        """Return what counts of a batch of runs, one row per run; NaN for what did not happen."""
-        runs, observer = self.bench.run(self.seeds), self.bench.observer
-        found, nx = dict[str, FloatArray](), len(observer.state_names)
-        for name, rows, truth, delays, warm_up in (
-            ("states", slice(0, nx), runs.states, observer.state_delays, self.warm_ups[0]),
-            ("faults", slice(nx, nx + len(observer.fault_names)), runs.faults[:, :, list(self.bench.estimated)],
-             observer.fault_delays, self.warm_ups[1]),
-        ):  # fmt: skip
-            errors = aligned_errors(runs.rows[:, :, rows], truth, delays)[max(warm_up, *delays, 0) :]
-            # A record no longer than the delays has no error to speak of.
-            found[name] = np.sqrt(np.mean(errors**2, axis=0)) if len(errors) else np.full(errors.shape[1:], np.nan)
-        judged = np.full((3, len(self.seeds)), np.nan)
-        if isinstance(self.watched, Monitor):
-            judged = _judged_residuals(self.watched, self.bench, runs)
-        elif self.watched is not None:
-            decided = [_judged_parameters(self.watched, self.bench, estimates) for estimates in runs.estimates]
-            judged = np.array(decided).T
-        return {**found, "false": judged[0], "found": judged[1], "wrong": judged[2]}
+
+def _run(task: _Task) -> dict[str, FloatArray]:
+    """Return what counts of a batch of runs, one row per run; NaN for what did not happen."""
+    runs, observer = task.bench.run(task.seeds), task.bench.observer
+    found, nx = dict[str, FloatArray](), len(observer.state_names)
+    for name, rows, truth, delays, warm_up in (
+        ("states", slice(0, nx), runs.states, observer.state_delays, task.warm_ups[0]),
+        ("faults", slice(nx, nx + len(observer.fault_names)), runs.faults[:, :, list(task.bench.estimated)],
+         observer.fault_delays, task.warm_ups[1]),
+    ):  # fmt: skip
+        errors = aligned_errors(runs.rows[:, :, rows], truth, delays)[max(warm_up, *delays, 0) :]
+        # A record no longer than the delays has no error to speak of.
+        found[name] = np.sqrt(np.mean(errors**2, axis=0)) if len(errors) else np.full(errors.shape[1:], np.nan)
+    judged = np.full((3, len(task.seeds)), np.nan)
+    if isinstance(task.watched, Monitor):
+        judged = _judged_residuals(task.watched, task.bench, runs)
+    elif task.watched is not None:
+        decided = [_judged_parameters(task.watched, task.bench, estimates) for estimates in runs.estimates]
+        judged = np.array(decided).T
+    return {**found, "false": judged[0], "found": judged[1], "wrong": judged[2]}
 
 
 def evaluate(
@@ -153,13 +109,8 @@ def evaluate(
     """
     require_kind(design, ObserverDesign, "design", "an ObserverDesign, such as obsynth.load(path)")
     require_kind(scenario, Scenario, "scenario", "an obsynth.Scenario")
-    if not is_whole(runs) or runs < 1:
-        raise SpecError(f"runs is {runs!r}: give a whole number, 1 or more.", path="runs")
-    if not (is_finite_number(confidence) and 0.0 < confidence < 1.0):
-        raise SpecError(f"confidence is {confidence!r}: give a number between 0 and 1.", path="confidence")
-    if plants is not None and (not is_whole(plants) or plants < 1):
-        raise SpecError(f"plants is {plants!r}: give a whole number, 1 or more.", path="plants")
-    runs = runs if plants is None else max(runs, plants)
+    checked_value(confidence, "confidence", OpenUnitInterval)
+    runs = max(whole_number(runs, "runs"), 1 if plants is None else whole_number(plants, "plants"))
     seeds = range(scenario.seed, scenario.seed + runs)
     bench = bench_of(design, scenario)
     _require_fit(bench, monitor, plants)
@@ -172,8 +123,14 @@ def evaluate(
         for number, one in enumerate(benches)
         for i in range(number * share, min((number + 1) * share, len(seeds)), size)
     ]
+    results: list[dict[str, FloatArray]] = [{} for _ in tasks]
+    finished = 0
     with progress_of_runs(progress) as told:
-        parts = _done(tasks, executor, told, runs)
+        for i, found in as_they_come(_run, tasks, executor):
+            results[i], finished = found, finished + len(found["false"])
+            if told is not None:
+                told(finished, runs)
+    parts = {name: np.concatenate([part[name] for part in results]) for name in results[0]}
     return _summed(parts, design, bench.onset, bench.drive.dt, watched=monitor is not None, level=confidence)
 
 
@@ -200,26 +157,6 @@ def _drawn_benches(design: ObserverDesign, scenario: Scenario, plants: int) -> l
     box = plant.uncertainty.box
     points = drawn_points(len(box.names), plants, scenario.seed)
     return [make_bench(design.replace(plant=plant_at(plant, box.values(q))), scenario) for q in points]
-
-
-def _done(
-    tasks: Sequence[Callable[[], dict[str, FloatArray]]],
-    executor: Executor | None,
-    progress: RunsProgress | None,
-    runs: int,
-) -> dict[str, FloatArray]:
-    """Return the numbers of all runs in the order of their seeds."""
-    results: list[dict[str, FloatArray]] = [{} for _ in tasks]
-    waiting = {} if executor is None else {executor.submit(task): i for i, task in enumerate(tasks)}
-    finished = 0
-    order = as_completed(waiting) if executor is not None else iter(range(len(tasks)))
-    for item in order:
-        i = item if isinstance(item, int) else waiting[item]
-        results[i] = tasks[i]() if isinstance(item, int) else item.result()
-        finished += len(results[i]["false"])
-        if progress is not None:
-            progress(finished, runs)
-    return {name: np.concatenate([part[name] for part in results]) for name in results[0]}
 
 
 def _judged_residuals(watched: Monitor, bench: Bench, runs: Runs) -> FloatArray:

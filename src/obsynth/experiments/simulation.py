@@ -1,7 +1,8 @@
-"""A design on a scenario: the plant simulated, the observer beside it, and how far its estimates are off."""
+"""A design on a scenario: the plant simulated, the observer beside it, how far its estimates are off, as a table."""
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -11,9 +12,9 @@ import numpy as np
 
 from obsynth.analysis.transformations.recovery import Transformation, plant_and_recovery
 from obsynth.errors import SpecError
-from obsynth.experiments.batch_simulation import CONSISTENCY_TOLERANCE
-from obsynth.experiments.benches import bench_of
-from obsynth.experiments.columns import named_columns, root_mean_square, write_columns
+from obsynth.experiments.benches import CONSISTENCY_TOLERANCE, bench_of
+from obsynth.files.outputs import FileKind, write_atomically
+from obsynth.files.tables import TableWriter
 from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.observers.estimates import BAND_WIDTH, Estimates
@@ -27,6 +28,9 @@ from obsynth.simulation.linear import simulate_plant
 from obsynth.simulation.scenario import Scenario
 from obsynth.simulation.time_varying import simulate_time_varying
 from obsynth.simulation.trajectory import Trajectory
+
+#: A table that `Simulation.write_csv` has written: signals of the plant beside time, and no status of rows.
+SIGNALS = FileKind("a table of simulated signals", rb"\Atime,(?!status,)[^\n]*x(hat)?\[")
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,19 +133,21 @@ class Simulation:
         An output with the name of an input is ``y[..]``.  Estimates ``xhat[..]``, ``fhat[..]``, standard deviations
         ``std xhat[..]``, ``std fhat[..]`` and residuals ``r[..]`` stand where the observer gave them.
         """
-        shown = self.estimates
+        shown, spread = self.estimates, self.estimates.has_deviations
         x, f = shown.state_names, shown.fault_names
-        truth = (
+        found = {"time": self.time}
+        for form, names, values in (
             ("u[{}]", self.input_names, self.inputs), ("y[{}]", self.output_names, self.outputs),
             ("x[{}]", x, self.states), ("f[{}]", f, self.faults[:, list(self.fault_columns)]),
-            ("d[{}]", self.disturbance_names, self.disturbances),
-        )  # fmt: skip
-        states, faults = ("xhat[{}]", x, shown.states), ("fhat[{}]", f, shown.faults)
-        if not shown.has_deviations:
-            residuals = ("r[{}]", shown.residual_names, shown.residuals)
-            return named_columns(self.time, (*truth, states, faults, residuals))
-        spreads = ("std xhat[{}]", x, shown.state_deviations), ("std fhat[{}]", f, shown.fault_deviations)
-        return named_columns(self.time, (*truth, states, spreads[0], faults, spreads[1]))
+            ("d[{}]", self.disturbance_names, self.disturbances), ("xhat[{}]", x, shown.states),
+            *([("std xhat[{}]", x, shown.state_deviations)] if spread else []), ("fhat[{}]", f, shown.faults),
+            ("std fhat[{}]", f, shown.fault_deviations) if spread else ("r[{}]", shown.residual_names, shown.residuals),
+        ):  # fmt: skip
+            for i, name in enumerate(names):
+                # Inputs and outputs go by their own names, unless those are taken.
+                plain = form[0] in "uy" and name not in found
+                found[name if plain else form.format(name)] = values[:, i]
+        return found
 
     def write_csv(self, path: str | Path) -> Path:
         """Write `columns` as comma-separated text, atomically, floats with all their digits.
@@ -151,15 +157,21 @@ class Simulation:
         path : path
             Of the file.
         """
-        return write_columns(self.columns(), path)
+        table, text = self.columns(), io.StringIO()
+        TableWriter(text, table).write(zip(*(column.tolist() for column in table.values()), strict=True))
+        return write_atomically(path, text.getvalue())
 
 
 @overload
 def simulate(design: ObserverDesign, scenario: Scenario) -> Simulation: ...
+
+
 @overload
 def simulate(
     design: DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel | Transformation, **signals: Any
 ) -> Trajectory: ...
+
+
 def simulate(
     design: ObserverDesign | DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel | Transformation,
     scenario: Scenario | None = None,
@@ -245,10 +257,7 @@ def _simulated(design: ObserverDesign, scenario: Scenario) -> Simulation:
 
 
 def aligned_errors(estimates: FloatArray, truth: FloatArray, delays: tuple[int, ...]) -> FloatArray:
-    """Return estimate(k) less truth(k - delay); NaN where there is no truth yet.
-
-    Shapes: ``estimates (steps, ..., n)``, ``truth (steps, ..., n)``.
-    """
+    """Return ``estimates(k) - truth(k - delay)``, ``(steps, ..., n)``; NaN where there is no truth yet."""
     errors = np.full(estimates.shape, np.nan)
     for i, delay in enumerate(delays):
         errors[delay:, ..., i] = estimates[delay:, ..., i] - truth[: len(truth) - delay, ..., i]
@@ -256,5 +265,8 @@ def aligned_errors(estimates: FloatArray, truth: FloatArray, delays: tuple[int, 
 
 
 def _sizes(errors: FloatArray) -> dict[str, float]:
+    """Return root mean square and largest absolute value of what is not NaN."""
     known = errors[~np.isnan(errors)]
-    return {"rmse": root_mean_square(errors), "largest": float(np.max(np.abs(known))) if known.size else float("nan")}
+    if not known.size:
+        return {"rmse": float("nan"), "largest": float("nan")}
+    return {"rmse": float(np.sqrt(np.mean(known**2))), "largest": float(np.max(np.abs(known)))}

@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.experiments.batch_simulation import Runs, make_bench
+from obsynth.experiments.benches import Runs, make_bench
 from obsynth.experiments.monitors.monitor import Monitor
 from obsynth.experiments.monitors.residual_monitor import monitor
-from obsynth.numerics.arguments import is_whole, require_kind
+from obsynth.files.tables import text_table
+from obsynth.numerics.arguments import require_kind, whole_number
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.plants.constants import tolerance_share
 from obsynth.plants.descriptor import DescriptorSystem
@@ -83,9 +84,7 @@ class ToleranceStudy:
         }  # fmt: skip
 
     def __str__(self) -> str:
-        table = self.rows()
-        widths = [max(len(row[i]) for row in table) for i in range(len(table[0]))]
-        return "\n".join("  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in table)
+        return "\n".join(text_table(self.rows(), left=0))
 
 
 def tolerance_study(
@@ -127,8 +126,7 @@ def tolerance_study(
     """
     require_kind(design, ObserverDesign, "design", "an ObserverDesign, such as obsynth.load(path)")
     require_kind(scenario, Scenario, "scenario", "an obsynth.Scenario")
-    if not is_whole(runs) or runs < 1:
-        raise SpecError(f"runs is {runs!r}: give a whole number, 1 or more.", path="runs")
+    whole_number(runs, "runs")
     plant, observer = design.linear
     known = _tolerance_of(plant)
     names = observer.fault_names
@@ -187,11 +185,9 @@ def _both(design: ObserverDesign, scenario: Scenario, fault: str, runs: int) -> 
 
 
 def _together(found: list[Runs]) -> Runs:
-    def joined(name: str) -> FloatArray:
-        return np.concatenate([getattr(run, name) for run in found], axis=1)
-
-    return Runs(joined("states"), joined("outputs"), joined("inputs"), joined("faults"), joined("disturbances"),
-                joined("rows"), found[0].observer)  # fmt: skip
+    signals = ("states", "outputs", "inputs", "faults", "disturbances", "rows")
+    joined = {name: np.concatenate([getattr(run, name) for run in found], axis=1) for name in signals}
+    return Runs(**joined, observer=found[0].observer)
 
 
 def _counted(watched: Monitor, without: Runs, with_one: Runs) -> tuple[float, float]:
@@ -201,16 +197,12 @@ def _counted(watched: Monitor, without: Runs, with_one: Runs) -> tuple[float, fl
     false = watched.passed_in(without, rows)
 
     def told(size: float) -> bool:
-        def moved(one: FloatArray, other: FloatArray) -> FloatArray:
-            return np.asarray(one + size * (other - one))
-
         # Plant and observer are linear: what the fault does goes with its size.
-        changed = replace(
-            without, states=moved(without.states, with_one.states), outputs=moved(without.outputs, with_one.outputs),
-            inputs=moved(without.inputs, with_one.inputs), faults=moved(without.faults, with_one.faults),
-            rows=moved(without.rows, with_one.rows),
-        )  # fmt: skip
-        passed = watched.passed_in(changed, rows)
+        moved = {}
+        for name in ("states", "outputs", "inputs", "faults", "rows"):
+            quiet = getattr(without, name)
+            moved[name] = quiet + size * (getattr(with_one, name) - quiet)
+        passed = watched.passed_in(replace(without, **moved), rows)
         return bool((passed & ~false).any(axis=0).all())
 
     level = np.abs(watched.threshold[np.isfinite(watched.threshold)])

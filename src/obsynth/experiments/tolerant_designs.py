@@ -1,9 +1,7 @@
 """Designs that know their tolerances: what a model's error does counts as noise, where thresholds get smaller by it.
 
-The directions that are to blame for the loop through the tolerances, rows of the plant and constants, are tried as
-noise of several weights, and as unknown inputs where those can be told from the faults.  What is shipped has the
-smallest mean threshold over a scenario without its faults; the plant of the design, and all that is claimed of it, stay
-the same.
+Directions to blame, rows of the plant and constants, are tried as noise, and as unknown inputs where the faults can be
+told from them; the smallest mean threshold over a scenario without its faults is shipped, for the plant itself.
 """
 
 from __future__ import annotations
@@ -15,7 +13,7 @@ import numpy as np
 
 from obsynth.analysis.transformations.uncertain_plant import AffinePlant, affine_plant
 from obsynth.errors import ObsynthError, SpecError
-from obsynth.experiments.batch_simulation import make_bench
+from obsynth.experiments.benches import make_bench
 from obsynth.experiments.monitors.residual_monitor import monitor
 from obsynth.methods.verifying import verify
 from obsynth.numerics.arrays import SMALLEST, FloatArray
@@ -23,7 +21,7 @@ from obsynth.numerics.ranks import ACTING_TOLERANCE
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.scenario import Scenario
-from obsynth.tolerances.directions import told_from_faults
+from obsynth.tolerances.exact_plant import told_from_faults
 from obsynth.tolerances.robustness import robustness
 
 #: Rows of the plant and constants whose directions are tried, those most to blame.

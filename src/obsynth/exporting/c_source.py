@@ -1,13 +1,10 @@
-"""A sampled observer as C99: one header, one source, no allocation, no library.
-
-Words of C: names, comments and paths that a compiler takes, whatever they are made of.
-"""
+"""A sampled observer as C99: one header, one source, no allocation, no library."""
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
@@ -88,51 +85,49 @@ def source_text(found: Realisation, prefix: str, header: str) -> str:
     """Return the source."""
     observer = found.observer
     sizes = {"z": observer.order, "u": len(observer.input_names), "y": len(observer.output_names)}
-    groups = (
-        ("states", observer.state_rows), ("faults", observer.fault_rows), ("residuals", observer.residual_rows),
-    )  # fmt: skip
-    blocks: list[tuple[str, str, dict[str, FloatArray]]] = [
-        (target, f"{target}[i]", {"z": observer.Cz[rows], "u": observer.Du[rows], "y": observer.Dy[rows]})
-        for target, rows in groups
+    groups = {"states": observer.state_rows, "faults": observer.fault_rows, "residuals": observer.residual_rows}
+    blocks: dict[str, dict[str, FloatArray]] = {
+        target: {"z": observer.Cz[rows], "u": observer.Du[rows], "y": observer.Dy[rows]}
+        for target, rows in groups.items()
         if rows.stop > rows.start
-    ]
-    blocks.append(("next", "next[i]", {"z": observer.Az, "u": observer.Bu, "y": observer.By}))
+    }
+    blocks["next"] = {"z": observer.Az, "u": observer.Bu, "y": observer.By}
     tables = [
-        line for target, _, parts in blocks for signal, matrix in parts.items() if matrix.size
+        line for target, parts in blocks.items() for signal, matrix in parts.items() if matrix.size
         for line in _tables(f"{target}_{signal}", matrix)
     ]  # fmt: skip
-    large = any(_form(matrix) != PLAIN for _, _, parts in blocks for matrix in parts.values())
-    advice = [comment(ADVICE), ""] if large else []
-    body = [line for target, _, parts in blocks for line in _product(target, parts)]
-    copy = [f"    for (i = 0; i < {sizes['z']}; i++) {{", "        state->z[i] = next[i];", "    }"]
+    large = any(_form(matrix) != PLAIN for parts in blocks.values() for matrix in parts.values())
+    body = ["int i;", *(["int j;"] if any(sizes.values()) else []),
+            f"double next[{sizes['z']}];" if sizes["z"] else "(void)state;"]  # fmt: skip
+    for signal in "uy":
+        if sizes[signal]:
+            body += _loop("i", sizes[signal], [f"if (!isfinite({signal}[i])) {{", "    return 1;", "}"])
+    for target, parts in blocks.items():
+        body += _product(target, parts)
+    body += _loop("i", sizes["z"], ["state->z[i] = next[i];"]) if sizes["z"] else []
     return "\n".join([
         comment(f"sha256 of the gain set: {found.digest}"), f'#include "{included(header)}"', "", "#include <math.h>",
-        "", *advice, *tables, *_reset(found, prefix),
-        _step_signature(found, prefix), "{", "    int i;", *(["    int j;"] if any(sizes.values()) else []),
-        *([f"    double next[{sizes['z']}];"] if sizes["z"] else []),
-        *([] if sizes["z"] else ["    (void)state;"]),
-        *_guards(sizes), *body, *(copy if sizes["z"] else []), "    return 0;", "}",
+        "", *([comment(ADVICE), ""] if large else []), *tables, *_reset(found, prefix),
+        *_function(_step_signature(found, prefix), [*body, "return 0;"]),
     ]) + "\n"  # fmt: skip
 
 
-def _reset(found: Realisation, prefix: str) -> Iterator[str]:
-    start = "0.0"
+def _reset(found: Realisation, prefix: str) -> list[str]:
+    table, start = [], "0.0"
     if found.start.any():
-        yield from table_lines("start", found.start.reshape(1, -1))
-        start = "start[0][i]"
-    yield f"void {prefix}_reset({prefix}_state *state)"
-    yield from ("{", "    int i;", f"    for (i = 0; i < {max(found.observer.order, 1)}; i++) {{")
-    yield from (f"        state->z[i] = {start};", "    }", "}", "")
+        table, start = [*table_lines("start", found.start.reshape(1, -1))], "start[0][i]"
+    body = ["int i;", *_loop("i", max(found.observer.order, 1), [f"state->z[i] = {start};"])]
+    return [*table, *_function(f"void {prefix}_reset({prefix}_state *state)", body), ""]
 
 
-def _guards(sizes: dict[str, int]) -> Iterator[str]:
-    for signal in "uy":
-        if sizes[signal]:
-            yield f"    for (i = 0; i < {sizes[signal]}; i++) {{"
-            yield f"        if (!isfinite({signal}[i])) {{"
-            yield "            return 1;"
-            yield "        }"
-            yield "    }"
+def _function(signature: str, body: Iterable[str]) -> list[str]:
+    return [signature, "{", *(f"    {line}" for line in body), "}"]
+
+
+def _loop(index: str, end: int | str, body: Iterable[str], *, start: int | str = 0, step: int = 1) -> list[str]:
+    """Return the lines of a loop."""
+    advance = f"{index}++" if step == 1 else f"{index} += {step}"
+    return [f"for ({index} = {start}; {index} < {end}; {advance}) {{", *(f"    {line}" for line in body), "}"]
 
 
 def _form(matrix: FloatArray) -> str:
@@ -142,66 +137,49 @@ def _form(matrix: FloatArray) -> str:
     return ENTRIES if np.count_nonzero(matrix) <= SPARSE_SHARE * matrix.size else COLUMNS
 
 
-def _product(target: str, parts: dict[str, FloatArray]) -> Iterator[str]:
+def _product(target: str, parts: dict[str, FloatArray]) -> list[str]:
+    """Return the product of the rows of a target: small ones row by row.
+
+    Large ones column by column, so that rows are independent and a compiler can use vectors; sums keep their order.
+    """
     rows = next(iter(parts.values())).shape[0]
     if not rows:
-        return
-    if any(_form(matrix) != PLAIN for matrix in parts.values()):
-        yield from _large_product(target, parts, rows)
-        return
-    yield f"    for (i = 0; i < {rows}; i++) {{"
-    yield "        double sum = 0.0;"
+        return []
+    if all(_form(matrix) == PLAIN for matrix in parts.values()):
+        sums = [line for signal, matrix in parts.items() if matrix.size
+                for line in _row_sum("sum", f"{target}_{signal}", _vector(signal), matrix.shape[1])]  # fmt: skip
+        return _loop("i", rows, ["double sum = 0.0;", *sums, f"{target}[i] = sum;"])
+    lines = [f"double sum[{rows}];", *_loop("i", rows, ["sum[i] = 0.0;"])]
     for signal, matrix in parts.items():
         if matrix.size:
-            yield f"        for (j = 0; j < {matrix.shape[1]}; j++) {{"
-            yield f"            sum += {target}_{signal}[i][j] * {_vector(signal)}[j];"
-            yield "        }"
-    yield f"        {target}[i] = sum;"
-    yield "    }"
+            lines += _added(f"{target}_{signal}", _vector(signal), matrix)
+    lines += _loop("i", rows, [f"{target}[i] = sum[i];"])
+    return ["{", *(f"    {line}" for line in lines), "}"]
 
 
 def _vector(signal: str) -> str:
     return "state->z" if signal == "z" else signal
 
 
-def _large_product(target: str, parts: dict[str, FloatArray], rows: int) -> Iterator[str]:
-    """Add column by column, so that rows are independent and a compiler can use vectors; the sums keep their order."""
-    yield "    {"
-    yield f"        double sum[{rows}];"
-    yield f"        for (i = 0; i < {rows}; i++) {{"
-    yield "            sum[i] = 0.0;"
-    yield "        }"
-    for signal, matrix in parts.items():
-        if not matrix.size:
-            continue
-        name, vector, columns = f"{target}_{signal}", _vector(signal), matrix.shape[1]
-        form = _form(matrix)
-        if form == ENTRIES:
-            yield f"        for (i = 0; i < {rows}; i++) {{"
-            yield f"            for (j = {name}_start[i]; j < {name}_start[i + 1]; j++) {{"
-            yield f"                sum[i] += {name}_value[j] * {vector}[{name}_column[j]];"
-            yield "            }"
-            yield "        }"
-        elif form == PLAIN:
-            yield f"        for (i = 0; i < {rows}; i++) {{"
-            yield f"            for (j = 0; j < {columns}; j++) {{"
-            yield f"                sum[i] += {name}[i][j] * {vector}[j];"
-            yield "            }"
-            yield "        }"
-        else:
-            whole = columns - columns % UNROLLED
-            yield f"        for (j = 0; j < {whole}; j += {UNROLLED}) {{"
-            terms = " + ".join(f"{name}[j + {k}][i] * {vector}[j + {k}]" for k in range(UNROLLED))
-            yield from (f"            for (i = 0; i < {rows}; i++) {{", f"                sum[i] = sum[i] + {terms};")
-            yield from ("            }", "        }")
-            if whole < columns:
-                yield f"        for (j = {whole}; j < {columns}; j++) {{"
-                yield f"            for (i = 0; i < {rows}; i++) {{"
-                yield f"                sum[i] += {name}[j][i] * {vector}[j];"
-                yield from ("            }", "        }")
-    yield f"        for (i = 0; i < {rows}; i++) {{"
-    yield f"            {target}[i] = sum[i];"
-    yield from ("        }", "    }")
+def _row_sum(total: str, name: str, vector: str, columns: int) -> list[str]:
+    return _loop("j", columns, [f"{total} += {name}[i][j] * {vector}[j];"])
+
+
+def _added(name: str, vector: str, matrix: FloatArray) -> list[str]:
+    """Return the lines that add a matrix times a vector to the sums of all rows."""
+    rows, columns = matrix.shape
+    form = _form(matrix)
+    if form == PLAIN:
+        return _loop("i", rows, _row_sum("sum[i]", name, vector, columns))
+    if form == ENTRIES:
+        entry = f"sum[i] += {name}_value[j] * {vector}[{name}_column[j]];"
+        return _loop("i", rows, _loop("j", f"{name}_start[i + 1]", [entry], start=f"{name}_start[i]"))
+    whole = columns - columns % UNROLLED
+    terms = " + ".join(f"{name}[j + {k}][i] * {vector}[j + {k}]" for k in range(UNROLLED))
+    lines = _loop("j", whole, _loop("i", rows, [f"sum[i] = sum[i] + {terms};"]), step=UNROLLED)
+    if whole < columns:
+        lines += _loop("j", columns, _loop("i", rows, [f"sum[i] += {name}[j][i] * {vector}[j];"]), start=whole)
+    return lines
 
 
 def _tables(name: str, matrix: FloatArray) -> Iterator[str]:
@@ -224,9 +202,8 @@ def _tables(name: str, matrix: FloatArray) -> Iterator[str]:
 
 
 def _list(kind: str, name: str, texts: list[str]) -> Iterator[str]:
-    lines = [", ".join(texts[i : i + _NUMBERS_PER_LINE]) for i in range(0, len(texts), _NUMBERS_PER_LINE)]
     yield f"static const {kind} {name}[{len(texts)}] = {{"
-    yield "    " + ",\n    ".join(lines)
+    yield "    " + ",\n    ".join(_in_lines(texts))
     yield from ("};", "")
 
 
@@ -235,11 +212,12 @@ def table_lines(name: str, matrix: FloatArray) -> Iterator[str]:
     yield f"static const double {name}[{matrix.shape[0]}][{matrix.shape[1]}] = {{"
     for row in matrix.tolist():
         # repr gives the shortest text that is read back bit for bit.
-        texts = [repr(value) for value in row]
-        lines = [", ".join(texts[i : i + _NUMBERS_PER_LINE]) for i in range(0, len(texts), _NUMBERS_PER_LINE)]
-        yield "    {" + ",\n     ".join(lines) + "},"
-    yield "};"
-    yield ""
+        yield "    {" + ",\n     ".join(_in_lines([repr(value) for value in row])) + "},"
+    yield from ("};", "")
+
+
+def _in_lines(texts: list[str]) -> list[str]:
+    return [", ".join(texts[i : i + _NUMBERS_PER_LINE]) for i in range(0, len(texts), _NUMBERS_PER_LINE)]
 
 
 def _step_signature(found: Realisation, prefix: str) -> str:

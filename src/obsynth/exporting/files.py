@@ -11,7 +11,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.exporting.c_source import c_identifier, header_text, source_text
-from obsynth.exporting.dae_c_source import write_dae_c
+from obsynth.exporting.c_templates import threshold_header, threshold_source, write_dae_c
 from obsynth.exporting.realisation import Realisation
 from obsynth.files.outputs import FileKind, write_atomically, write_together
 from obsynth.numerics.arguments import require_kind
@@ -160,8 +160,6 @@ def _write_c(found: Realisation, target: Path, bound: AdaptiveBound | None = Non
     header = target.with_suffix(".h")
     source, declared = source_text(found, prefix, header.name), header_text(found, prefix)
     if bound is not None:
-        from obsynth.exporting.c_thresholds import threshold_header, threshold_source
-
         begin, end = declared.rsplit("#endif", 1)
         declared = begin + threshold_header(bound, prefix) + "#endif" + end
         source += threshold_source(bound, prefix)

@@ -11,10 +11,10 @@ from obsynth.errors import SpecError
 from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.dae.observer import DAEObserver
+from obsynth.observers.linear.derived import sample_observer
 from obsynth.observers.linear.observer import LinearObserver
-from obsynth.observers.linear.sampling import sample_observer
+from obsynth.observers.recursive.gain_schedule import steady_observer
 from obsynth.observers.recursive.observer import RecursiveObserver
-from obsynth.observers.recursive.steady_state import steady_observer
 from obsynth.plants.dae.model import DAEModel
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import gain_set_digest
@@ -36,12 +36,7 @@ STEADY = (
 
 @dataclass(frozen=True, eq=False)
 class Realisation:
-    """The observer of a design, ready to be handed on.
-
-    Fields: design: Linear, or recursive for a time-invariant plant; observer: Its observer, sampled if that was asked
-    for, or the steady state of its recursion; digest: sha256 of the gain set; start: ``z(0)``; note: What a reader must
-    know; may be empty.
-    """
+    """The observer of a design, sampled if that was asked for, or the steady state of its recursion; from ``z(0)``."""
 
     design: ObserverDesign
     observer: LinearObserver
@@ -83,9 +78,7 @@ class Realisation:
     @property
     def outputs(self) -> tuple[str, ...]:
         """Names of the outputs, ``xhat[...]``, ``fhat[...]``, ``r[...]``."""
-        observer = self.observer
-        kinds = (("xhat", observer.state_names), ("fhat", observer.fault_names), ("r", observer.residual_names))
-        return tuple(f"{kind}[{name}]" for kind, names in kinds for name in names)
+        return self.observer.row_names
 
     @property
     def operating_point(self) -> tuple[FloatArray, FloatArray]:

@@ -1,4 +1,4 @@
-"""Tables as comma-separated text that is harmless in spreadsheets, and as HTML."""
+"""Tables as comma-separated text that is harmless in spreadsheets, as aligned text, and as HTML."""
 
 from __future__ import annotations
 
@@ -43,6 +43,17 @@ def _cell(value: Any) -> Any:
     if isinstance(value, str):
         return harmless(value)
     return "" if value != value else value
+
+
+def text_table(rows: Sequence[Sequence[str]], *, left: int | None = None) -> list[str]:
+    """Return the lines of a table; its columns, or the first ``left`` of them, begin at the left, others end right."""
+    widths = [max(len(row[j]) for row in rows) for j in range(len(rows[0]))]
+    count = len(widths) if left is None else left
+    aligned = (
+        [cell.ljust(w) if j < count else cell.rjust(w) for j, (cell, w) in enumerate(zip(row, widths, strict=True))]
+        for row in rows
+    )
+    return ["  ".join(cells).rstrip() for cells in aligned]
 
 
 def html_table(rows: Sequence[Sequence[str]]) -> str:

@@ -11,9 +11,9 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.extras import imported
+from obsynth.numerics.libraries import imported
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.names import checked_names
+from obsynth.plants.validation import checked_names
 
 #: Names of variables, or the variables of each device: ``{"GENCLS 1": ["omega"], "Bus 1": ["a", "v"]}``.
 Picked: TypeAlias = "Sequence[str] | Mapping[str, Sequence[str]]"

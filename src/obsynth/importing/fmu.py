@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import shutil
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -14,12 +13,13 @@ from xml.etree import ElementTree
 import numpy as np
 
 from obsynth.errors import PreconditionError, SpecError
-from obsynth.importing.fmu_instance import Instance, instance_of
+from obsynth.importing.fmu_instance import Instance
 from obsynth.importing.roles import plant_of
 from obsynth.numerics.arguments import is_finite_number, require_mapping
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.extras import imported
+from obsynth.numerics.libraries import imported
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.validation import suggestion
 
 #: Newton steps towards an equilibrium.
 _STEPS = 50
@@ -34,10 +34,6 @@ def from_fmu(
     equilibrium: bool = False,
     inputs: Sequence[str] | None = None,
     outputs: Sequence[str] | None = None,
-    faults: Sequence[str] = (),
-    disturbances: Sequence[str] = (),
-    actuator_faults: Sequence[str] = (),
-    sensor_faults: Sequence[str] = (),
     **plant: Any,
 ) -> DescriptorSystem:
     """Return the plant of an FMU, linearised at an operating point by its own directional derivatives.
@@ -52,14 +48,10 @@ def from_fmu(
         Search the states at which the FMU is at rest with these inputs, from those of ``at``.
     inputs, outputs : list of str, optional
         Which of the FMU's inputs and outputs are used; all real ones by default.
-    faults, disturbances : list of str
-        Inputs of the FMU that are faults, or unknown; the others are known inputs.
-    actuator_faults : list of str
-        Known inputs on which a fault acts: adds ``fault of <input>``.
-    sensor_faults : list of str
-        Outputs with a bias: adds ``bias of <output>``.
     **plant
-        Any other argument of `DescriptorSystem`.
+        Roles, as lists of names: ``faults`` and ``disturbances`` (inputs that are faults, or unknown; the others are
+        known inputs), ``actuator_faults`` (known inputs on which a fault acts: adds ``fault of <input>``) and
+        ``sensor_faults`` (outputs with a bias: adds ``bias of <output>``).  Any other argument of `DescriptorSystem`.
 
     Returns
     -------
@@ -91,16 +83,10 @@ def from_fmu(
         point = dict(zip(instance.state_names, states.tolist(), strict=True))
         point |= {name: instance.value(name) for names in used for name in names}
         units = {name: unit for name in point if (unit := instance.unit(name))}
-    stated = {**point, **(plant.pop("operating_point", None) or {})}
-    units |= plant.pop("units", None) or {}
     if not len(a):
         raise SpecError(f"{path} has no continuous states: there is nothing to observe.", path=str(path))
-    return plant_of(
-        {"A": a, "B": b, "C": c, "D": d},
-        labels={"state_names": instance.state_names, "input_names": used[0], "output_names": used[1]},
-        faults=faults, disturbances=disturbances, actuator_faults=actuator_faults, sensor_faults=sensor_faults,
-        more={"dt": 0.0, "operating_point": stated, "units": units, **plant},
-    )  # fmt: skip
+    labels = {"state_names": instance.state_names, "input_names": used[0], "output_names": used[1]}
+    return plant_of({"A": a, "B": b, "C": c, "D": d}, plant, labels=labels, dt=0.0, point=point, units=units)
 
 
 @contextmanager
@@ -110,7 +96,7 @@ def _instance(path: Path) -> Iterator[Instance]:
     description = _read(lambda: fmpy.read_model_description(str(path)), path)
     folder = _read(lambda: fmpy.extract(str(path)), path)
     try:
-        instance = _read(lambda: instance_of(fmpy, description, folder), path)
+        instance = _read(lambda: Instance(description, folder), path)
         try:
             yield instance
         finally:
@@ -166,20 +152,15 @@ def _used(known: Sequence[str], picked: Sequence[str] | None, what: str) -> list
         raise SpecError(f"{what} is {picked!r}: give a list of names.", path=what)
     for name in picked:
         if name not in known:
-            raise SpecError(f"{what}: the FMU has no {name!r} among its {what}.{_close(name, known)}", path=what)
+            raise SpecError(f"{what}: the FMU has no {name!r} among its {what}.{suggestion(name, known)}", path=what)
     return list(picked)
 
 
 def _require_known(at: Mapping[str, float], instance: Instance) -> None:
     for name in at:
         if name not in instance.settable:
-            close = _close(name, instance.settable)
+            close = suggestion(name, instance.settable)
             raise SpecError(f"at: the FMU has no real variable {name!r} that can be set.{close}", path="at")
-
-
-def _close(name: str, known: Sequence[str]) -> str:
-    close = difflib.get_close_matches(name, list(known), n=2)
-    return f" Did you mean {' or '.join(map(repr, close))}?" if close else ""
 
 
 def _equilibrium(instance: Instance, states: FloatArray) -> FloatArray:

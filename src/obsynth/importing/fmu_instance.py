@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -11,13 +11,20 @@ import numpy as np
 from obsynth.numerics.arrays import FloatArray
 
 _REAL = ("Real", "Float64")
+#: By version of FMI: fmpy's class, and how it gets and sets real variables and updates the discrete states.
+_SPELLED = {
+    "2": ("FMU2Model", "getReal", "setReal", "newDiscreteStates"),
+    "3": ("FMU3Model", "getFloat64", "setFloat64", "updateDiscreteStates"),
+}
+_GET, _SET, _UPDATE = 1, 2, 3
 
 
-class Instance(ABC):
-    """States, values and Jacobians of an FMU at one point; subclasses know the version of FMI."""
+class Instance:
+    """States, values and Jacobians of an unpacked FMU at one point."""
 
-    def __init__(self, fmpy: Any, description: Any, folder: str) -> None:
-        self.fmpy, self.description = fmpy, description
+    def __init__(self, description: Any, folder: str) -> None:
+        self.description = description
+        self.version = "2" if description.fmiVersion.startswith("2") else "3"
         variables = [v for v in description.modelVariables if v.type in _REAL and not getattr(v, "dimensions", None)]
         self.variables = {v.name: v for v in variables}
         derivatives = [unknown.variable for unknown in description.derivatives]
@@ -32,51 +39,39 @@ class Instance(ABC):
         ]  # fmt: skip
         self.model = self._instantiate(folder)
 
-    #: Causalities of what may be set before the initialisation.
-    settable_first: tuple[str, ...] = ("parameter", "local", "output", "input")
-
-    @abstractmethod
-    def _kind(self) -> Any:
-        """Return the class of fmpy for this version."""
-
-    @abstractmethod
-    def _reals(self, references: Sequence[int]) -> Sequence[float]:
-        """Return values of real variables."""
-
-    @abstractmethod
-    def _set_reals(self, references: Sequence[int], values: Sequence[float]) -> None:
-        """Set real variables."""
-
-    @abstractmethod
-    def _discrete_states_change(self) -> bool:
-        """Update the discrete states once; return whether that has to be done again."""
-
     def _instantiate(self, folder: str) -> Any:
-        model = self._kind()(
+        kind = getattr(import_module(f"fmpy.fmi{self.version[0]}"), _SPELLED[self.version][0])
+        model = kind(
             guid=self.description.guid, unzipDirectory=folder, instanceName="linearised",
             modelIdentifier=self.description.modelExchange.modelIdentifier,
         )  # fmt: skip
         model.instantiate()
         return model
 
+    def _call(self, position: int, *arguments: Any) -> Any:
+        """Call what the version of FMI calls the function at a position of `_SPELLED`."""
+        return getattr(self.model, _SPELLED[self.version][position])(*arguments)
+
     def begin(self, at: Mapping[str, float]) -> None:
         """Initialise at the given values and enter continuous time."""
-        self._set(at, self.settable_first)
+        if self.version == "2":
+            self.model.setupExperiment(startTime=0.0)
+        self._set(at, ("parameter", "structuralParameter", "local", "output", "input"))
         self.model.enterInitializationMode()
         self._set(at, ("input",))
         self.model.exitInitializationMode()
-        while self._discrete_states_change():
+        while self._call(_UPDATE)[0]:
             pass
         self.model.enterContinuousTimeMode()
         self._set(at, ("input",))
 
     def _get(self, references: Sequence[int]) -> FloatArray:
-        return np.array(self._reals(list(references)), dtype=np.float64) if references else np.zeros(0)
+        return np.array(self._call(_GET, list(references)), dtype=np.float64) if references else np.zeros(0)
 
     def _set(self, at: Mapping[str, float], causalities: Sequence[str]) -> None:
         for name, value in at.items():
             if self.variables[name].causality in causalities:
-                self._set_reals([self.variables[name].valueReference], [float(value)])
+                self._call(_SET, [self.variables[name].valueReference], [float(value)])
 
     def _derivative(self, unknowns: Sequence[int], known: int) -> FloatArray:
         return np.array(self.model.getDirectionalDerivative(list(unknowns), [known], [1.0]))
@@ -123,52 +118,3 @@ class Instance(ABC):
         """Free the instance."""
         self.model.terminate()
         self.model.freeInstance()
-
-
-class InstanceOfFMI2(Instance):
-    """FMI 2.0."""
-
-    def _kind(self) -> Any:
-        from fmpy.fmi2 import FMU2Model
-
-        return FMU2Model
-
-    def begin(self, at: Mapping[str, float]) -> None:
-        """Initialise at the given values and enter continuous time."""
-        self.model.setupExperiment(startTime=0.0)
-        super().begin(at)
-
-    def _reals(self, references: Sequence[int]) -> Sequence[float]:
-        return list(self.model.getReal(references))
-
-    def _set_reals(self, references: Sequence[int], values: Sequence[float]) -> None:
-        self.model.setReal(references, values)
-
-    def _discrete_states_change(self) -> bool:
-        return bool(self.model.newDiscreteStates()[0])
-
-
-class InstanceOfFMI3(Instance):
-    """FMI 3.0."""
-
-    settable_first = ("parameter", "structuralParameter", "local", "output", "input")
-
-    def _kind(self) -> Any:
-        from fmpy.fmi3 import FMU3Model
-
-        return FMU3Model
-
-    def _reals(self, references: Sequence[int]) -> Sequence[float]:
-        return list(self.model.getFloat64(references))
-
-    def _set_reals(self, references: Sequence[int], values: Sequence[float]) -> None:
-        self.model.setFloat64(references, values)
-
-    def _discrete_states_change(self) -> bool:
-        return bool(self.model.updateDiscreteStates()[0])
-
-
-def instance_of(fmpy: Any, description: Any, folder: str) -> Instance:
-    """Return an instance of an unpacked FMU."""
-    kind = InstanceOfFMI2 if description.fmiVersion.startswith("2") else InstanceOfFMI3
-    return kind(fmpy, description, folder)

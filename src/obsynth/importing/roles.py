@@ -11,23 +11,26 @@ from numpy.typing import ArrayLike
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.names import checked_names, index_of
+from obsynth.plants.validation import checked_names, index_of
+
+_ROLES = ("faults", "disturbances", "actuator_faults", "sensor_faults")
 
 
 def plant_of(
-    matrices: Mapping[str, ArrayLike | None],
-    *,
-    labels: Mapping[str, Sequence[str] | None],
-    faults: Sequence[str] = (),
-    disturbances: Sequence[str] = (),
-    actuator_faults: Sequence[str] = (),
-    sensor_faults: Sequence[str] = (),
-    more: Mapping[str, Any],
-) -> DescriptorSystem:
+    matrices: Mapping[str, ArrayLike | None], plant: Mapping[str, Any], *, dt: float,
+    labels: Mapping[str, Sequence[str] | None], point: Mapping[str, float] | None = None,
+    units: Mapping[str, str] | None = None,
+) -> DescriptorSystem:  # fmt: skip
     """Return the plant of matrices ``E, A, B, C, D`` whose inputs are shared out among known, faults and unknown.
 
-    ``labels`` holds ``state_names``, ``input_names``, ``output_names``; ``more`` goes to `DescriptorSystem` as it is.
+    ``labels`` holds ``state_names``, ``input_names``, ``output_names``; ``plant`` the roles and arguments of
+    `DescriptorSystem`, which go before ``dt``, and entry by entry before operating point and units.
     """
+    more = {"dt": dt, **plant}
+    for name, stated in (("operating_point", point), ("units", units)):
+        if stated is not None:
+            more[name] = {**stated, **(more.get(name) or {})}
+    faults, disturbances, actuator_faults, sensor_faults = _role_lists(more)
     a = as_matrix(matrices["A"], "A")
     given = {name: None if value is None else as_matrix(value, name) for name, value in matrices.items()}
     c = given.get("C")
@@ -36,8 +39,6 @@ def plant_of(
     inputs = checked_names(labels.get("input_names"), nu, prefix="u", what="input_names")
     outputs = checked_names(labels.get("output_names"), c.shape[0], prefix="y", what="output_names")
     b, d = _full(given.get("B"), a.shape[0], nu, "B"), _full(given.get("D"), c.shape[0], nu, "D")
-    _require_lists(faults=faults, disturbances=disturbances, actuator_faults=actuator_faults,
-                   sensor_faults=sensor_faults)  # fmt: skip
     both = sorted(set(faults) & set(disturbances))
     if both:
         raise SpecError(f"Input {both[0]!r} is given as a fault and as a disturbance: keep one.", path="faults")
@@ -80,13 +81,16 @@ def _full(matrix: FloatArray | None, rows: int, columns: int, name: str) -> Floa
     return matrix
 
 
-def _require_lists(**given: Sequence[str]) -> None:
-    for what, names in given.items():
+def _role_lists(more: dict[str, Any]) -> list[Sequence[str]]:
+    """Take the names of each role out of the arguments of a plant."""
+    lists = [more.pop(role, ()) for role in _ROLES]
+    for role, names in zip(_ROLES, lists, strict=True):
         if isinstance(names, str) or not all(isinstance(name, str) for name in names):
-            raise SpecError(f"{what} is {names!r}: give a list of names.", path=what)
+            raise SpecError(f"{role} is {names!r}: give a list of names.", path=role)
         repeated = [name for name in names if list(names).count(name) > 1]
         if repeated:
-            raise SpecError(f"{what} repeats {repeated[0]!r}.", path=what)
+            raise SpecError(f"{role} repeats {repeated[0]!r}.", path=role)
+    return lists
 
 
 def _places(names: Sequence[str], known: Sequence[str], what: str) -> list[int]:

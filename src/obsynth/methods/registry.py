@@ -11,13 +11,13 @@ from obsynth.methods.method_spec import MethodSpec, PlantKind
 AUTO = "auto"
 #: Method id -> where its declaration is; a method is its own folder and a line here.
 REGISTRY: dict[str, str] = {
-    "fault-estimation-filter": "obsynth.methods.fault_estimation_filter.method",
-    "pd-observer": "obsynth.methods.pd_observer.method",
-    "ui-pi-observer": "obsynth.methods.ui_pi_observer.method",
-    "functional-filter": "obsynth.methods.functional_filter.method",
-    "descriptor-kalman": "obsynth.methods.descriptor_kalman.method",
-    "adaptive-observer": "obsynth.methods.adaptive_observer.method",
-    "dae-adaptive-observer": "obsynth.methods.dae_adaptive_observer.method",
+    "fault-estimation-filter": "obsynth.methods.fault_estimation_filter",
+    "pd-observer": "obsynth.methods.pd_observer",
+    "ui-pi-observer": "obsynth.methods.ui_pi_observer",
+    "functional-filter": "obsynth.methods.functional_filter",
+    "descriptor-kalman": "obsynth.methods.descriptor_kalman",
+    "adaptive-observer": "obsynth.methods.adaptive_observer",
+    "dae-adaptive-observer": "obsynth.methods.dae_adaptive_observer",
 }
 
 

@@ -8,13 +8,11 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.methods.registry import REGISTRY, method_spec
-from obsynth.numerics.failures import failed_computations
-from obsynth.numerics.threads import one_thread_if_small
+from obsynth.numerics.libraries import failed_computations, one_thread_if_small
+from obsynth.results.checks import VerificationReport
 from obsynth.results.plant_source import remembering
-from obsynth.results.report import VerificationReport
-from obsynth.verification.claims import closed_claims
-from obsynth.verification.derivation import derivation_rows
-from obsynth.verification.means import before_the_mean, mean_noise_rows
+from obsynth.verification.claims import before_the_mean, closed_claims, mean_noise_rows
+from obsynth.verification.plant import derivation_rows
 from obsynth.verification.stored_numbers import stored_number_rows
 
 if TYPE_CHECKING:

@@ -17,6 +17,8 @@ SAME_POLE = 1e-3
 DEAD_BEAT = 1e-6
 #: Relative difference of two ways of computing a variance up to which it counts as known.
 AGREEMENT = 1e-2
+#: Significant digits with which gains are commonly printed in full, and those with which a double is kept as it is.
+PRINTED_DIGITS, DOUBLE_DIGITS = 9, 17
 
 
 def eigenvalues(matrix: FloatArray) -> ComplexArray:
@@ -82,6 +84,18 @@ def abscissa(matrix: FloatArray, dt: float) -> float:
         return np.inf
     values = eigenvalues(matrix)
     return float(np.max(np.abs(values))) if dt > 0.0 else float(np.max(values.real))
+
+
+def as_printed(matrix: FloatArray, digits: int) -> FloatArray:
+    """Return each entry as it is when printed with so many significant digits."""
+    return np.asarray(np.char.mod(f"%.{digits - 1}e", matrix).astype(np.float64))
+
+
+def digits_needed(matrix: FloatArray, dt: float) -> int:
+    """Return the least number of significant digits with which, and with more than which, a matrix is stable."""
+    bound, all_digits = 1.0 if dt > 0.0 else 0.0, range(DOUBLE_DIGITS - 1, 0, -1)
+    unstable = (digits for digits in all_digits if not abscissa(as_printed(matrix, digits), dt) < bound)
+    return next(unstable, 0) + 1
 
 
 def decay_rates(values: ComplexArray | Sequence[complex], dt: float) -> FloatArray:

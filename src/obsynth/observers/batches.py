@@ -1,20 +1,101 @@
-"""Batches of trials, for every observer that has one."""
+"""Batches of trials, for every observer that has one.
+
+Batches of trials with one observer of a DAE.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from obsynth.errors import SpecError
-from obsynth.numerics.arrays import read_only
-from obsynth.observers.dae.batch import run_dae_batch
-from obsynth.observers.dae.observer import DAEObserver
+from obsynth.errors import SolverError, SpecError
+from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.observers.dae.c_code import BATCH_PARTS, compiler
+from obsynth.observers.dae.estimates import DAERow
+from obsynth.observers.dae.observer import DAEObserver, advanced
 from obsynth.observers.estimates import Estimates
+from obsynth.observers.progress import shown_progress
+from obsynth.observers.records import batch_record
 from obsynth.observers.recursive import gain_schedule
 from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.observers.running import named_estimates
+
+#: Samples in one call of the library: a second or less, so that progress shows and an interrupt is heard.
+SAMPLES_PER_CALL = 100_000
+#: Steps from which it pays to compile unasked: compiling takes about a second, and the rest thirty microseconds a step.
+WORTH_COMPILING = 50_000
+
+
+def run_dae_batch(
+    observer: DAEObserver, y: ArrayLike, u: ArrayLike | None = None, *, compiled: bool | None = None,
+    progress: bool | Callable[[int], None] | None = None,
+) -> Estimates:  # fmt: skip
+    """Run many trials; see `obsynth.run_batch`: ``y (trials, samples, ny)``."""
+    outputs, inputs = batch_record(y, u, observer.model.ny, observer.model.input_names)
+    trials, samples = outputs.shape[:2]
+    alone = observer.outside_graph
+    if alone and compiled:
+        raise SpecError(f"The C knows no {alone}: leave compiled=True out, or leave {alone} out.", path="compiled")
+    if compiled is None and not alone:
+        compiled = trials * samples >= WORTH_COMPILING and compiler() is not None
+    take = _in_c if compiled else _in_casadi
+    with shown_progress(progress, trials, "trials") as note:
+        parts = take(observer, outputs, inputs, note)
+    received = ~np.isnan(outputs)
+    return named_estimates(
+        observer, states=parts["posterior"], faults=parts["theta"], residuals=parts["residual"],
+        fault_covariances=parts["spread"], innovations=np.where(received, parts["innovation"], np.nan),
+        nis=parts["nis"][..., 0], nis_degrees=received.sum(axis=2).astype(np.float64), received=received,
+    )  # fmt: skip
+
+
+def _of_trial(inputs: FloatArray, trials: slice | int) -> FloatArray:
+    return inputs if inputs.ndim == 2 else inputs[trials]
+
+
+def _in_c(observer: DAEObserver, y: FloatArray, u: FloatArray, note: Callable[[int], object]) -> dict[str, FloatArray]:
+    library, begin = observer.library, 0
+    found: list[dict[str, FloatArray]] = []
+    while begin < len(y):
+        trials = slice(begin, min(begin + max(1, SAMPLES_PER_CALL // y.shape[1]), len(y)))
+        taken, parts = library.batch(y[trials], _of_trial(u, trials))
+        found.append({name: part[:taken] for name, part in parts.items()})
+        begin += taken
+        if begin < trials.stop:
+            # The message is written there.
+            found.append({name: part[None] for name, part in _one(observer, y, u, begin).items()})
+            begin += 1
+        note(begin)
+    return {name: np.concatenate([parts[name] for parts in found]) for name in BATCH_PARTS}
+
+
+def _in_casadi(
+    observer: DAEObserver, y: FloatArray, u: FloatArray, note: Callable[[int], object]
+) -> dict[str, FloatArray]:
+    found = []
+    for trial in range(len(y)):
+        found.append(_one(observer, y, u, trial))
+        note(trial + 1)
+    return {name: np.array([parts[name] for parts in found]) for name in BATCH_PARTS}
+
+
+def _one(observer: DAEObserver, y: FloatArray, u: FloatArray, trial: int) -> dict[str, FloatArray]:
+    rows: list[DAERow] = []
+    try:
+        if observer.outside_graph:
+            state = observer.steps.first
+            for outputs, inputs in zip(y[trial], _of_trial(u, trial), strict=True):
+                state, row = observer.steps.advance(state, outputs, inputs)
+                rows.append(row)
+        else:
+            advanced(observer.steps, y[trial], _of_trial(u, trial), rows.append)
+    except SolverError as error:
+        raise SolverError(f"Trial {trial}: {error}", record={**error.record, "trial": trial}) from error
+    return {name: np.concatenate([row.several.part(name) for row in rows]) for name in BATCH_PARTS}
 
 
 def run_batch(
@@ -62,15 +143,8 @@ def run_batch(
 
 def _one_by_one(observer: RecursiveObserver | DAEObserver, y: ArrayLike, u: ArrayLike | None) -> Estimates:
     """Run trials one after another: sensors of their own times, bounds on states and judged samples need it."""
-    outputs, inputs = np.asarray(y, dtype=np.float64), None if u is None else np.asarray(u, dtype=np.float64)
-    if outputs.ndim != 3 or not len(outputs):
-        raise SpecError(f"y has shape {outputs.shape}, but (trials, samples, ny) is needed.", path="y")
-    if inputs is not None and inputs.ndim == 3 and len(inputs) != len(outputs):
-        raise SpecError(f"u has {len(inputs)} trials and y has {len(outputs)}: give the same number.", path="u")
-    found = [
-        observer.run(outputs[i], inputs if inputs is None or inputs.ndim == 2 else inputs[i])
-        for i in range(len(outputs))
-    ]
+    outputs, inputs = batch_record(y, u, observer.plant.ny, observer.plant.input_names)
+    found = [observer.run(outputs[i], _of_trial(inputs, i)) for i in range(len(outputs))]
     names = ("states", "faults", "fault_covariances", "state_deviations", "nis", "nis_degrees", "residuals")
     stacked = {name: read_only(np.stack([getattr(each, name) for each in found])) for name in names}
     width = max(each.innovations.shape[1] for each in found)

@@ -14,10 +14,9 @@ from numpy.typing import ArrayLike
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import chosen, real_array, real_number, real_vector
 from obsynth.numerics.arrays import FloatArray, read_only
-from obsynth.observers.alarms import Alarm, Decision, alone, quantile, tail
+from obsynth.observers.alarms import Alarm, Decision, alone, likelihood_ratio, pull_of_the_start, quantile, tail
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.estimates import Estimates
-from obsynth.observers.recursive.likelihood_ratio import likelihood_ratio, pull_of_the_start
 from obsynth.observers.recursive.observer import RecursiveObserver
 
 STATISTICS = ("chi-square", "cusum", "glr", "nis")
@@ -140,8 +139,7 @@ class ParameterMonitor:
     change: float | tuple[float, ...] = 0.1
 
     def __post_init__(self) -> None:
-        if self.statistic not in STATISTICS:
-            raise SpecError(f"statistic is {self.statistic!r}: use one of {', '.join(STATISTICS)}.", path="statistic")
+        chosen(self.statistic, "statistic", STATISTICS)
 
     def watch(self, observer: RecursiveObserver | DAEObserver, estimates: Estimates) -> Decision:
         """Return the decision on one run.
@@ -175,7 +173,7 @@ def _chi_square(
             raise SpecError("chi-square of a nonlinear observer asks about the parameters that it starts from: design "
                             "it with initial_parameters at what is nominal.", path="nominal")  # fmt: skip
         gaps = gaps - pull_of_the_start(observer, estimates, start)
-    values = np.einsum("ki,kij,kj->k", gaps, _inverses(estimates.parameter_covariances), gaps)
+    values = np.einsum("ki,kij,kj->k", gaps, np.linalg.pinv(estimates.parameter_covariances, hermitian=True), gaps)
     looks = len(values)
     thresholds = np.full(looks, float(quantile(np.array(float(nq)), false_alarms / looks)))
     hits = np.flatnonzero(values > thresholds)
@@ -191,13 +189,6 @@ def _chi_square(
         k, estimates.parameter_names[alone(weights @ gaps[k], np.diag(weights))], onset, confidence, float(values[k])
     )
     return Decision("chi-square", read_only(values), read_only(thresholds), alarm)
-
-
-def _inverses(covariances: FloatArray) -> FloatArray:
-    """Return pseudo-inverses ``(samples, nq, nq)``."""
-    if not covariances.shape[1]:
-        return covariances
-    return np.asarray(np.linalg.pinv(covariances, hermitian=True))
 
 
 def _nis(estimates: Estimates, squares: FloatArray, false_alarms: float) -> Decision:
@@ -222,10 +213,7 @@ def _nis(estimates: Estimates, squares: FloatArray, false_alarms: float) -> Deci
 def _cusum(
     estimates: Estimates, along: FloatArray, squares: FloatArray, change: FloatArray, false_alarms: float
 ) -> Decision:
-    """Decide by sums of log likelihood ratios.
-
-    Shapes: ``along (samples, nq)``: scores at the nominal parameters; ``squares (samples, nq)``: their variances.
-    """
+    """Decide by sums of log likelihood ratios, from scores at the nominal parameters and their variances."""
     samples, nq = along.shape
     signs = np.concatenate([change, -change])
     steps = np.hstack([along, along]) * signs - 0.5 * np.hstack([squares, squares]) * signs**2

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -154,37 +152,3 @@ class Estimates:
     def parameter_deviations(self) -> FloatArray:
         """The same as `fault_deviations`, ``(samples, nq)``."""
         return self.fault_deviations
-
-
-class Undelayed(ABC):
-    """An observer whose estimates are of the sample that it has just been given."""
-
-    @property
-    @abstractmethod
-    def state_names(self) -> tuple[str, ...]:
-        """The states that are estimated, in order."""
-
-    @property
-    @abstractmethod
-    def fault_names(self) -> tuple[str, ...]:
-        """The faults or parameters that are estimated, in order."""
-
-    @property
-    def state_delays(self) -> tuple[int, ...]:
-        """Samples by which each state estimate lags: none."""
-        return (0,) * len(self.state_names)
-
-    @property
-    def fault_delays(self) -> tuple[int, ...]:
-        """Samples by which each fault estimate lags: none."""
-        return (0,) * len(self.fault_names)
-
-
-def named_estimates(observer: Undelayed, *, states: FloatArray, faults: FloatArray, **known: Any) -> Estimates:
-    """Return the estimates of an observer without delays; arrays are made read-only."""
-    residuals = known.pop("residuals", np.zeros((*states.shape[:-1], 0)))
-    arrays: dict[str, Any] = {name: value if value.dtype == bool else read_only(value) for name, value in known.items()}
-    return Estimates(
-        read_only(states), read_only(faults), read_only(residuals), observer.state_names, observer.fault_names,
-        STEP_RESIDUAL[: residuals.shape[-1]], observer.state_delays, observer.fault_delays, **arrays,
-    )  # fmt: skip

@@ -1,21 +1,26 @@
-"""Single wrong samples: measurements that a prediction excludes are left out, or pulled to where they may be.
+"""What an observer does about samples that its prediction excludes, and about estimates beyond bounds of the states.
 
 A sensor whose sample is further from its prediction than `limit` standard deviations is left out (``gate``), but at
 most `LONGEST` times in a row: what stays away has changed, and is no outlier.  With ``huber`` the sample is taken at
 the limit instead, which is Huber's weight: its influence grows no further (Huber 1964; Masreliez 1975).
+
+With a truth inside the bounds, the projection brings the error nowhere further in that metric, so that the covariance
+stays an upper bound in the sense of the squared error it normalises (Simon, Chia 2002).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import lru_cache
 from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.errors import SolverError, SpecError
-from obsynth.numerics.arguments import is_finite_number
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arguments import chosen, is_finite_number
+from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.observers.records import named_bounds
 
 BoolArray = NDArray[np.bool_]
 Outliers = Literal["none", "gate", "huber"]
@@ -29,15 +34,15 @@ LONGEST = 2
 #: How many times further off than the limit a sample must be that nothing contradicts but the equations of the model;
 #: and what rounding makes of a prediction without noise.
 BLIND, ROUNDING = 10.0, 1e-6
-
+#: Samples whose squared innovations are summed up before a reset.
+RESET_WINDOW = 20
 State = TypeVar("State", bound=Any)
 Row = TypeVar("Row", bound=Any)
 
 
 def checked_limit(kind: str, limit: float | None) -> float:
     """Return the limit in standard deviations, infinite for ``none``."""
-    if kind not in KINDS:
-        raise SpecError(f"outliers is {kind!r}: use one of {', '.join(KINDS)}.", path="outliers")
+    chosen(kind, "outliers", KINDS)
     if limit is None:
         return LIMITS.get(kind, float("inf"))
     if not is_finite_number(limit) or not limit > 0.0:
@@ -57,11 +62,9 @@ def robust_advance(
     u: FloatArray, *, foreseen: Callable[[State, FloatArray], tuple[FloatArray, FloatArray]] | None = None,
 ) -> tuple[State, Row]:  # fmt: skip
     """Take a step; where its innovation is too long, ask each sensor and take the step again without the outliers.
-
     ``predicted(state, heard, u)`` returns mean and deviation of each output ``(ny,)`` from the samples that are heard.
     An output that a step needs to determine its state has no innovation there; ``foreseen(state, u)`` says what the
-    equations of the model expect of it, and what is `BLIND` times further off than the limit is left out as well.
-    """
+    equations of the model expect of it, and what is `BLIND` times further off than the limit is left out as well."""
     failed, mean, deviation, far = False, y, y, np.zeros(len(y), dtype=bool)
     try:
         with np.errstate(all="ignore"):
@@ -97,10 +100,8 @@ def _judged(
     limit: float, predicted: Callable[[State, FloatArray, FloatArray], tuple[FloatArray, FloatArray]], state: State,
     y: FloatArray, u: FloatArray,
 ) -> tuple[FloatArray, FloatArray, BoolArray]:  # fmt: skip
-    """Return mean and deviation of each output, and which are too far from them.
-
-    Where the model alone predicts nothing of an output, the others of the same sample do.
-    """
+    """Return mean and deviation of each output, and which are too far from them. Where the model alone predicts nothing
+    of an output, the others of the same sample do."""
     with np.errstate(all="ignore"):
         mean, deviation = predicted(state, np.full(len(y), np.nan), u)
         far = (np.abs(y - mean) > limit * deviation) | (np.abs(y) > OVERFLOW)
@@ -117,3 +118,57 @@ def _judged(
         worst = int(np.argmax(ratios))
         far[worst] |= bool(ratios[worst] > limit)
     return mean, deviation, far
+
+
+def checked_state_bounds(value: Any, names: Sequence[str]) -> FloatArray | None:
+    """Return lower and upper bounds ``(nx, 2)`` from rows or from pairs by name; ``None`` where there are none."""
+    found = named_bounds(value, names, "state_bounds")
+    return read_only(found) if np.isfinite(found).any() else None
+
+
+def projected(x: FloatArray, factor: FloatArray, bounds: FloatArray) -> FloatArray:
+    """Return the point within bounds nearest to ``x`` in the metric of the covariance ``factor factor'``. The shortest
+    e with ``low <= x + factor e <= high`` by nonnegative least squares (Lawson, Hanson, LDP), so that the covariance
+    may be singular. Shapes: ``x (n,)``, ``factor (n, any)``, ``bounds (n, 2)``."""
+    if ((bounds[:, 0] <= x) & (x <= bounds[:, 1])).all():
+        return x
+    from scipy.optimize import nnls
+
+    deviations = np.sqrt(np.einsum("ij,ij->i", factor, factor))
+    moving = deviations > 0.0
+    rows, gaps = [], []
+    for sign, ends in ((1.0, bounds[:, 0]), (-1.0, -bounds[:, 1])):
+        used = moving & np.isfinite(ends)
+        rows.append(sign * factor[used] / deviations[used, None])
+        gaps.append((ends[used] - sign * x[used]) / deviations[used])
+    sides, least = np.vstack(rows), np.concatenate(gaps)
+    target = np.zeros(factor.shape[1] + 1)
+    target[-1] = 1.0
+    weights, rest = nnls(np.vstack((sides.T, least)), target)
+    residual = np.vstack((sides.T, least)) @ weights - target
+    moved = x
+    # Without a rest no e keeps all of them: a state that is known exactly stands in the way.
+    if rest > 0.0 and residual[-1] < 0.0:
+        # The shortest e that reaches the ends that hold it, without the cancellation of the ratio of residuals.
+        held = weights > 0.0
+        moved = x + factor @ np.linalg.lstsq(sides[held], least[held], rcond=None)[0]
+    return np.asarray(np.clip(moved, bounds[:, 0], bounds[:, 1]))
+
+
+@lru_cache(maxsize=256)
+def chi_square_limit(degrees: int, probability: float) -> float:
+    """Return what a chi-square variable passes with a probability."""
+    from scipy.special import chdtri
+
+    return float(chdtri(degrees, probability))
+
+
+def with_surprise(surprises: FloatArray, nis: float, degrees: int) -> FloatArray:
+    """Return the latest normalised squares of innovations with their degrees of freedom ``(any, 2)``, this one last."""
+    return np.vstack([surprises, [nis, float(degrees)]])[-RESET_WINDOW:]
+
+
+def has_jumped(surprises: FloatArray, probability: float) -> bool:
+    """Return whether the latest innovations are too large for what is known of the parameters."""
+    total, degrees = surprises.sum(axis=0)
+    return bool(degrees > 0) and bool(total > chi_square_limit(int(degrees), probability))

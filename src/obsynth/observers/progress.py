@@ -1,18 +1,21 @@
-"""Bars on the terminal for runs that take long, and for many of them."""
+"""Runs that take long, and many of them: bars on the terminal, and work on any executor."""
 
 from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor, as_completed
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from obsynth.errors import SpecError
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
+_Item = TypeVar("_Item")
+_Outcome = TypeVar("_Outcome")
 #: Called with the number of runs done and their total.
 RunsProgress = Callable[[int, int], None]
 #: Seconds after which a bar appears.
@@ -86,3 +89,19 @@ def progress_of_runs(wanted: RunsProgress | bool | None) -> Iterator[RunsProgres
     with Progress(*columns, console=Console(stderr=True)) as bar:
         task = bar.add_task("runs", total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+def as_they_come(
+    work: Callable[[_Item], _Outcome], items: Sequence[_Item], executor: Executor | None
+) -> Iterator[tuple[int, _Outcome]]:
+    """Yield the place of each item with what comes of it, here one after another, or as an executor has them."""
+    if executor is None:
+        yield from ((place, work(item)) for place, item in enumerate(items))
+        return
+    waiting = {executor.submit(work, item): place for place, item in enumerate(items)}
+    try:
+        for future in as_completed(waiting):
+            yield waiting[future], future.result()
+    finally:
+        for future in waiting:
+            future.cancel()

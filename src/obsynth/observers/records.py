@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import is_whole, real_array
+from obsynth.numerics.arguments import is_number, real_array, real_number
 from obsynth.numerics.arrays import FloatArray, as_matrix, unmasked
+from obsynth.plants.dae.checks import finite_vector
+from obsynth.plants.validation import index_of
 
 #: The fields of an observer that hold names.
 NAME_FIELDS = ("input_names", "output_names", "state_names", "fault_names", "residual_names")
@@ -26,11 +29,6 @@ def require_names(names: Any, field: str) -> None:
         raise SpecError(
             f"{field} of the observer repeats {', '.join(map(repr, repeated))}: names must be unique.", path=field
         )
-
-
-def is_delay(delay: Any) -> bool:
-    """Whether ``delay`` is a whole number of samples, 0 or more."""
-    return is_whole(delay) and delay >= 0
 
 
 def require_horizon(horizon: int | None, samples: int, *, early: bool) -> None:
@@ -96,12 +94,82 @@ def checked_sample(value: Any, count: int, name: str) -> FloatArray:
 def whole_record(
     y: ArrayLike, u: ArrayLike | None, ny: int, nu: int, *, complete: bool = False
 ) -> tuple[FloatArray, FloatArray]:
-    """Return outputs ``(samples, ny)``, all there where ``complete``, and known inputs ``(samples, nu)``.
-
-    Inputs may be left out where there are none.
-    """
+    """Return outputs ``(samples, ny)``, all there where ``complete``, and known inputs ``(samples, nu)``. Inputs may be
+    left out where there are none."""
     outputs = checked_record(y, ny, "y") if complete else measured_record(y, ny)
     inputs = checked_record(np.zeros((len(outputs), 0)) if u is None and not nu else u, nu, "u")
     if len(inputs) != len(outputs):
         raise SpecError(f"u has {len(inputs)} samples and y has {len(outputs)}: give the same number.", path="u")
     return outputs, inputs
+
+
+def named_vector(value: Any, names: Sequence[str], default: FloatArray, what: str) -> FloatArray:
+    """Return numbers ``(len(names),)`` from an array or from values by name; the default where nothing is said."""
+    if not isinstance(value, Mapping):
+        return finite_vector(value, names, default, what)
+    vector = np.array(default)
+    for name, entry in value.items():
+        vector[index_of(name, names, what=what)] = real_number(entry, f"{what}.{name}")
+    return vector
+
+
+def named_covariance(
+    value: Any, names: Sequence[str], what: str, default: FloatArray | None, *, others: FloatArray | None = None
+) -> FloatArray:
+    """Return a covariance from a matrix, one variance, or variances by name, beside which ``others`` have theirs."""
+    if value is None:
+        if default is None:
+            raise SpecError(f"{what} is missing: give variances, for example by the names {', '.join(names)}.",
+                            path=what)  # fmt: skip
+        return np.diag(default)
+    if isinstance(value, Mapping):
+        variances = np.zeros(len(names)) if others is None else others
+        return np.diag(named_vector(value, names, variances, what))
+    empty = isinstance(value, (list, tuple, np.ndarray)) and not np.asarray(value, dtype=object).size
+    matrix = np.zeros((0, 0)) if empty else as_matrix(value, what)
+    return float(matrix[0, 0]) * np.eye(len(names)) if np.ndim(value) == 0 else matrix
+
+
+def named_bounds(value: Any, names: Sequence[str], what: str) -> FloatArray:
+    """Return lower and upper bounds ``(n, 2)`` from rows or from pairs by name; infinite where nothing is said."""
+    found = np.tile([-np.inf, np.inf], (len(names), 1))
+    if value is None:
+        return found
+    if isinstance(value, Mapping):
+        pairs = {index_of(name, names, what=what): pair for name, pair in value.items()}
+    else:
+        rows = np.asarray(value, dtype=object)
+        if rows.shape != found.shape:
+            raise SpecError(f"{what} must be {len(names)} pairs [low, high], or pairs by name.", path=what)
+        pairs = {i: list(row) for i, row in enumerate(rows)}
+    for i, pair in pairs.items():
+        path = f"{what}.{names[i]}"
+        if np.shape(pair) != (2,) or not all(map(is_number, pair)):
+            raise SpecError(f"{path} is {pair!r}: give [low, high].", path=path)
+        if not pair[0] < pair[1]:
+            raise SpecError(f"{path}: the lower bound ({pair[0]:g}) must be below the upper one ({pair[1]:g}).",
+                            path=path)  # fmt: skip
+        found[i] = pair
+    return found
+
+
+def batch_record(
+    y: ArrayLike, u: ArrayLike | None, ny: int, input_names: Sequence[str]
+) -> tuple[FloatArray, FloatArray]:
+    """Return outputs ``(trials, samples, ny)`` and inputs, ``(samples, nu)`` where they are those of all trials."""
+    outputs, nu = real_array(y, "y"), len(input_names)
+    if outputs.ndim != 3 or outputs.shape[2] != ny or not outputs.size:
+        raise SpecError(f"y has shape {outputs.shape}, but (trials, samples, {ny}) is needed.", path="y")
+    if np.isinf(outputs).any():
+        raise SpecError("y holds an infinity: mark a missing sample by NaN.", path="y")
+    trials, samples = outputs.shape[:2]
+    known = np.zeros((samples, 0)) if u is None and not nu else real_array(u, "u")
+    if known.shape not in ((samples, nu), (trials, samples, nu)):
+        raise SpecError(f"u has shape {known.shape}, but {(samples, nu)} or {(trials, samples, nu)} is needed.",
+                        path="u")  # fmt: skip
+    if not np.isfinite(known).all():
+        *trial, k, i = np.argwhere(~np.isfinite(known))[0]
+        where = f" of trial {trial[0]}" if trial else ""
+        raise SpecError(f"The input {input_names[i]!r}{where} is {known[*trial, k, i]} at k = {k}: inputs must be "
+                        "known.", path="u")  # fmt: skip
+    return outputs, known

@@ -2,29 +2,32 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import fields, replace
+from functools import cached_property
 from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from obsynth.numerics.arrays import FloatArray
-from obsynth.observers.estimates import Estimates, Undelayed
+from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.observers.estimates import STEP_RESIDUAL, Estimates
+from obsynth.observers.outliers import Outliers, checked_limit, checked_state_bounds
+from obsynth.observers.sensor_timing import SensorTiming, checked_sensors
 
 State = TypeVar("State")
 Row = TypeVar("Row", covariant=True)
 Known = TypeVar("Known")
 Kept = TypeVar("Kept", bound=tuple[Any, ...])
-
+Robust = TypeVar("Robust", bound=Any)
 #: Marks an array whose columns are contiguous: sums are rounded in another order there.
 BY_COLUMNS = "by columns"
 
 
 class Observer(Protocol[State, Row]):
-    """An observer: values alone, so that one serves any number of runs; a state is a tuple of plain arrays.
-
-    `advance` is `step` without checks of the sample, and returns the row of numbers that the estimates are made of.
-    """
+    """An observer: values alone, so that one serves any number of runs; a state is a tuple of plain arrays. `advance`
+    is `step` without checks of the sample, and returns the row of numbers that the estimates are made of."""
 
     def init(self) -> State:
         """Return the state before the first sample."""
@@ -39,85 +42,74 @@ class Observer(Protocol[State, Row]):
         ...
 
 
-class ParameterRow(Protocol):
-    """What an observer with deviations knows at one sample."""
+class StepSettings(ABC):
+    """What observers that take missing samples themselves have in common, besides a state."""
+
+    plant: Any  # what it runs on
+    outliers: Outliers
+    outlier_limit: float | None
+    sensors: Mapping[str, Mapping[str, int]] | None
+    state_bounds: FloatArray | None
+
+    def _check_options(self) -> None:
+        checked_limit(self.outliers, self.outlier_limit)
+        object.__setattr__(self, "sensors", checked_sensors(self.sensors, self.plant.output_names))
+        object.__setattr__(self, "state_bounds", checked_state_bounds(self.state_bounds, self.state_names))
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what makes it again in another process: what follows from it is made there anew."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}  # type: ignore[arg-type]
 
     @property
-    def x(self) -> FloatArray:
-        """The states ``(nx,)``."""
-        ...
+    def state_names(self) -> tuple[str, ...]:
+        """The states that are estimated, in order."""
+        names: tuple[str, ...] = self.plant.state_names
+        return names
 
     @property
-    def theta(self) -> FloatArray:
-        """The parameters ``(nq,)``."""
-        ...
+    @abstractmethod
+    def fault_names(self) -> tuple[str, ...]:
+        """The parameters that are estimated, in order."""
 
     @property
-    def state_deviations(self) -> FloatArray:
-        """Standard deviations of `x` ``(nx,)``."""
-        ...
+    def state_delays(self) -> tuple[int, ...]:
+        """Samples by which each state estimate lags: none."""
+        return (0,) * len(self.state_names)
 
     @property
-    def parameter_covariance(self) -> FloatArray:
-        """Covariance of `theta` ``(nq, nq)``."""
-        ...
+    def fault_delays(self) -> tuple[int, ...]:
+        """Samples by which each estimate of a parameter lags: none."""
+        return (0,) * len(self.fault_names)
 
     @property
-    def gap(self) -> FloatArray:
-        """The innovation at the parameters estimated one sample before ``(m,)``."""
-        ...
+    def order(self) -> int:
+        """Number of states and parameters in its state."""
+        return len(self.state_names) + len(self.fault_names)
+
+    @cached_property
+    def timing(self) -> SensorTiming:
+        """When each sensor is sampled, and how late its values are."""
+        return SensorTiming.of(self.sensors, self.plant.output_names, self.plant.nu)
 
     @property
-    def whitened(self) -> FloatArray:
-        """The innovation of the model without parameters, whitened ``(m,)``."""
-        ...
-
-    @property
-    def regressor(self) -> FloatArray:
-        """Its regressor ``(m, nq)``."""
-        ...
-
-    @property
-    def score(self) -> FloatArray:
-        """What the sample says of the parameters ``(nq,)``; less ``information`` times the true ones it is noise."""
-        ...
-
-    @property
-    def information(self) -> FloatArray:
-        """How much the sample says of the parameters ``(nq, nq)``: the covariance of that noise."""
-        ...
-
-    @property
-    def is_finite(self) -> bool:
-        """Whether no number has overflown."""
-        ...
+    def is_plain(self) -> bool:
+        """Whether every sensor is sampled at each row, at once, and no state has bounds."""
+        return self.timing.is_plain and self.state_bounds is None
 
 
-class Steps(Protocol[State, Row]):
-    """The steps of an observer: what follows from it alone, made once for all runs."""
-
-    first: State
-
-    def advance(self, state: State, y: FloatArray, u: FloatArray) -> tuple[State, Row]:
-        """Return the state after a sample, and what is known at it."""
-        ...
-
-
-class StepObserver(Undelayed, Generic[State, Known]):
+class StepObserver(StepSettings, Generic[State, Known]):
     """An observer of states and parameters, which takes missing samples itself and states deviations."""
 
     @property
     @abstractmethod
-    def _steps(self) -> Steps[State, Known]:
-        """What follows from the observer alone."""
+    def _steps(self) -> Any:
+        """What follows from the observer alone, made once for all runs: a state `first`, and `advance`."""
 
-    @abstractmethod
     def _allow(self, state: State) -> None:
         """Raise where no sample can follow."""
 
-    @abstractmethod
     def _trust(self, row: Known) -> None:
-        """Raise where a step cannot be trusted."""
+        """Raise where a step cannot be trusted, and does not say so itself."""
 
     @abstractmethod
     def _sample(self, state: State, y: ArrayLike, u: ArrayLike) -> tuple[FloatArray, FloatArray]:
@@ -126,11 +118,6 @@ class StepObserver(Undelayed, Generic[State, Known]):
     @abstractmethod
     def _estimates(self, state: State, row: Known) -> Estimates:
         """Return the estimates of one sample."""
-
-    @property
-    @abstractmethod
-    def timing(self) -> Any:
-        """When each sensor is sampled, and how late its values are: `obsynth.observers.sensor_timing.SensorTiming`."""
 
     def shown(self, row: Known) -> Known:
         """Return a row as it is shown, within the bounds of the states."""
@@ -142,36 +129,24 @@ class StepObserver(Undelayed, Generic[State, Known]):
         return found
 
     def advance(self, state: State, y: FloatArray, u: FloatArray) -> tuple[State, Known]:
-        """Return the next state and what is known at a sample, without checking it.
-
-        Shapes: ``y (ny,)``, ``u (nu,)``.
-        """
+        """Return the next state and what is known at a sample, without checking it: ``y (ny,)``, ``u (nu,)``."""
         after, row = self.timing.advance(self._steps.advance, state, y, u)
         return after, self.shown(row)
 
     def accept(self, state: State, y: FloatArray, u: FloatArray) -> tuple[State, Known]:
-        """Return the same as `advance`, where the step is one that can be trusted.
-
-        Shapes: ``y (ny,)``, ``u (nu,)``.
-        """
+        """Return the same as `advance`, where the step is one that can be trusted: ``y (ny,)``, ``u (nu,)``."""
         after, row = self.timing.advance(self.in_order, state, y, u)
         return after, self.shown(row)
 
     def in_order(self, state: State, y: FloatArray, u: FloatArray) -> tuple[State, Known]:
-        """Take a sample whose values are all of its own time, as `accept` takes it.
-
-        Shapes: ``y (ny,)``, ``u (nu,)``.
-        """
+        """Take a sample whose values are all of its own time, as `accept` takes it: ``y (ny,)``, ``u (nu,)``."""
         self._allow(state)
         after, row = self._steps.advance(state, y, u)
         self._trust(row)
         return after, row
 
     def step(self, state: State, y: ArrayLike, u: ArrayLike = ()) -> tuple[State, Estimates]:
-        """Return the state after a sample, and the estimates at it.
-
-        Shapes: ``y (ny,)``, ``u (nu,)``.
-        """
+        """Return the state after a sample, and the estimates at it: ``y (ny,)``, ``u (nu,)``."""
         after, row = self.accept(state, *self._sample(state, y, u))
         return after, self._estimates(getattr(after, "latest", after), row)
 
@@ -231,6 +206,30 @@ class RunningObserver(Generic[State, Row]):
         return row
 
 
+def named_estimates(observer: StepSettings, *, states: FloatArray, faults: FloatArray, **known: Any) -> Estimates:
+    """Return the estimates of an observer without delays; arrays are made read-only."""
+    residuals = known.pop("residuals", np.zeros((*states.shape[:-1], 0)))
+    arrays: dict[str, Any] = {name: value if value.dtype == bool else read_only(value) for name, value in known.items()}
+    return Estimates(
+        read_only(states), read_only(faults), read_only(residuals), observer.state_names, observer.fault_names,
+        STEP_RESIDUAL[: residuals.shape[-1]], observer.state_delays, observer.fault_delays, **arrays,
+    )  # fmt: skip
+
+
+def changed(observer: Robust, **options: Any) -> Robust:
+    """Return the observer with other options; the steps of a nonlinear one are built once."""
+    found = replace(observer, **options)
+    if "steps" in vars(observer):
+        # What these options do stands outside of the compiled steps.
+        vars(found)["steps"] = type(observer.steps)(found, observer.steps.graph)
+    return found
+
+
+def plain_recursion(observer: Robust) -> Robust:
+    """Return the recursion itself: every sensor at each row, at once, taken as it is, and no bounds on states."""
+    return changed(observer, outliers="none", sensors=None, state_bounds=None)
+
+
 def state_as_data(state: tuple[Any, ...]) -> dict[str, Any]:
     """Return a state as numbers, arrays, lists and mappings, to be written to a file."""
     return {name: _as_data(value) for name, value in state._asdict().items()}  # type: ignore[attr-defined]
@@ -239,7 +238,7 @@ def state_as_data(state: tuple[Any, ...]) -> dict[str, Any]:
 def state_from_data(like: Kept, data: dict[str, Any]) -> Kept:
     """Return the state of the same kind as ``like`` that `state_as_data` described."""
     if hasattr(like, "from_data"):
-        restored: Kept = like.from_data(data)
+        restored: Kept = like.from_data(data, state_from_data)
         return restored
     values = {name: _from_data(own, data[name]) for name, own in like._asdict().items()}  # type: ignore[attr-defined]
     return type(like)(**values)

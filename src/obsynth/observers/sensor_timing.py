@@ -14,13 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.errors import SpecError
+from obsynth.numerics.arguments import is_whole
 from obsynth.numerics.arrays import FloatArray
-from obsynth.observers.running import state_from_data
-from obsynth.plants.names import index_of
+from obsynth.plants.validation import index_of
 
 #: Rows that may be waited for: a delay in another unit is larger.
 LONGEST_DELAY = 10_000
-
 Inner = Callable[[Any, FloatArray, FloatArray], tuple[Any, Any]]
 
 
@@ -39,8 +38,7 @@ def checked_sensors(value: Any, names: Sequence[str]) -> dict[str, dict[str, int
         timing = {"every": entry.get("every", 1), "delay": entry.get("delay", 0)}
         for key, least in (("every", 1), ("delay", 0)):
             count = timing[key]
-            whole = isinstance(count, (int, np.integer)) and not isinstance(count, bool)
-            if not whole or not least <= count <= LONGEST_DELAY:
+            if not is_whole(count) or not least <= count <= LONGEST_DELAY:
                 raise SpecError(
                     f"sensors.{name}.{key} is {count!r}: give a whole number of rows from {least} to {LONGEST_DELAY}.",
                     path=f"sensors.{name}.{key}",
@@ -52,15 +50,11 @@ def checked_sensors(value: Any, names: Sequence[str]) -> dict[str, dict[str, int
 
 
 class WaitingState(NamedTuple):
-    """The state of an observer with late sensors.
+    """The state of an observer with late sensors."""
 
-    Fields: before: Its states before each of the latest samples; latest: After the last one; outputs, inputs: Of these
-    samples, as far as they have arrived.
-    """
-
-    before: tuple[Any, ...]
-    latest: Any
-    outputs: FloatArray
+    before: tuple[Any, ...]  # its states before each of the latest samples
+    latest: Any  # after the last one
+    outputs: FloatArray  # outputs, inputs: of these samples, as far as they have arrived
     inputs: FloatArray
 
     @property
@@ -73,25 +67,20 @@ class WaitingState(NamedTuple):
         """Outliers in a row, and at all, ``(2, ny)``."""
         return np.asarray(self.latest.refused)
 
-    def from_data(self, data: Mapping[str, Any]) -> WaitingState:
-        """Return the state that `state_as_data` described."""
-        return WaitingState(
-            tuple(state_from_data(self.latest, part) for part in data["before"]),
-            state_from_data(self.latest, data["latest"]), np.array(data["outputs"]), np.array(data["inputs"]),
-        )  # fmt: skip
+    def from_data(self, data: Mapping[str, Any], restored: Callable[[Any, Any], Any]) -> WaitingState:
+        """Return the state that data describe, by what restores that of an observer without late sensors."""
+        return WaitingState(tuple(restored(self.latest, part) for part in data["before"]),
+                            restored(self.latest, data["latest"]), np.array(data["outputs"]),
+                            np.array(data["inputs"]))  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
 class SensorTiming:
-    """When each sensor is sampled, and how late its values are.
+    """When each sensor is sampled, and how late its values are."""
 
-    Fields: every, delays: ``(ny,)``, in rows; inputs: How many there are.  A sensor is sampled at k = 0, every, 2
-    every, ...
-    """
-
-    every: NDArray[np.int_]
+    every: NDArray[np.int_]  # every, delays: ``(ny,)``, in rows
     delays: NDArray[np.int_]
-    inputs: int
+    inputs: int  # how many there are. A sensor is sampled at k = 0, every, 2 every,
 
     @classmethod
     def of(cls, sensors: Mapping[str, Mapping[str, int]] | None, names: Sequence[str], inputs: int) -> SensorTiming:
@@ -138,10 +127,7 @@ class SensorTiming:
         return WaitingState((), first, np.zeros((0, len(self.every))), np.zeros((0, self.inputs)))
 
     def advance(self, inner: Inner, state: Any, y: FloatArray, u: FloatArray) -> tuple[Any, Any]:
-        """Take a row as it arrives by the steps of an observer without delays.
-
-        Shapes: ``y (ny,)``, ``u (nu,)``.
-        """
+        """Take a row as it arrives by the steps of an observer without delays: ``y (ny,)``, ``u (nu,)``."""
         if self.is_plain:
             return inner(state, y, u)
         heard = np.where(self.expected(state.k), y, np.nan)

@@ -1,5 +1,1 @@
 """Plants: what is known about the process, with named signals."""
-
-from obsynth.plants.descriptor import DescriptorSystem
-
-__all__ = ["DescriptorSystem"]

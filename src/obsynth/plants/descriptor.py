@@ -15,12 +15,11 @@ from obsynth.numerics.sparse import dense, is_sparse
 from obsynth.plants.origin import carry_origin
 from obsynth.plants.reading import plant_fields
 from obsynth.plants.uncertainty import UNCERTAIN_MATRICES, Uncertainty, uncertainty_of
-from obsynth.plants.validation import expected_shapes
+from obsynth.plants.validation import MATRIX_LAYOUT
 
 MatrixOrNames = ArrayLike | Sequence[str] | None
-_NAMES = ("state_names", "input_names", "output_names", "fault_names", "disturbance_names", "noise_names")
-#: For `expected_shapes`, where only the names of the matrices matter.
-_NO_SIGNALS = dict.fromkeys("yufdw", 0)
+SIGNAL_NAMES = ("state_names", "input_names", "output_names", "fault_names", "disturbance_names", "noise_names")
+MATRICES = tuple(name for name, *_ in MATRIX_LAYOUT)
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -182,14 +181,13 @@ class DescriptorSystem:
     @property
     def is_sparse(self) -> bool:
         """Whether any matrix of the plant is a sparse one."""
-        return any(is_sparse(getattr(self, name)) for name in expected_shapes(0, _NO_SIGNALS))
+        return any(is_sparse(getattr(self, name)) for name in MATRICES)
 
     def dense(self) -> DescriptorSystem:
         """Return the same plant with arrays instead of sparse matrices; a plant without any is returned as it is."""
         if not self.is_sparse:
             return self
-        changes = {name: dense(getattr(self, name)) for name in expected_shapes(0, _NO_SIGNALS)}
-        return self.replace(**changes)
+        return self.replace(**{name: dense(getattr(self, name)) for name in MATRICES})
 
     @property
     def sensor_faults(self) -> tuple[str, ...]:
@@ -204,12 +202,8 @@ class DescriptorSystem:
 
     def as_dict(self) -> dict[str, Any]:
         """Return every field, as the constructor takes it; `uncertainty` only where there is one."""
-        found = {field.name: getattr(self, field.name) for field in fields(self)}
-        if self.uncertainty is None:
-            del found["uncertainty"]
-        else:
-            found["uncertainty"] = self.uncertainty.as_dict()
-        return found
+        found = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "uncertainty"}
+        return found if self.uncertainty is None else {**found, "uncertainty": self.uncertainty.as_dict()}
 
     def replace(self, **changes: Any) -> DescriptorSystem:
         """Return a plant with some fields changed, checked again as a whole.
@@ -225,8 +219,8 @@ class DescriptorSystem:
         kept = self.as_dict()
         if self.uncertainty is not None and changes.keys() & {*UNCERTAIN_MATRICES, "dt"}:
             del kept["uncertainty"]
-        gone = {name for field in _NAMES if field in changes for name in getattr(self, field)}
-        gone -= {name for field in _NAMES for name in (changes[field] or () if field in changes else kept[field])}
+        gone = {name for field in SIGNAL_NAMES if field in changes for name in getattr(self, field)}
+        gone -= {name for field in SIGNAL_NAMES for name in (changes[field] or () if field in changes else kept[field])}
         for label in ("operating_point", "scales", "units"):
             kept[label] = {name: value for name, value in kept[label].items() if name not in gone}
         return carry_origin(self, DescriptorSystem(**{**kept, **changes}))

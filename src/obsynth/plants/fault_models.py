@@ -1,10 +1,8 @@
-r"""What is known about the course of a fault: an exosystem ``w+ = Phi w, f = Cw w`` for each fault.
+"""What is known about the course of faults: an exosystem ``w+ = Phi w, f = Cw w`` for each, and all of them stacked.
 
 Source: Share Pasand, Aliyari, Taghirad, eqs. (2), (5), (6).  Differences: each fault has its own exosystem and the
 faults are stacked block-diagonally (the row of (6) would add them up); ``f = Cw w``, not ``f' = Phi f``; the states of
 a polynomial are f, f', f'', ... (so their initial values are ``i! f_i``, not ``f_i``).
-
-Eigenvalues of fault models, each once, although rounding scatters multiple ones.
 """
 
 from __future__ import annotations
@@ -16,10 +14,11 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import is_number, is_whole
+from obsynth.numerics.arguments import is_finite_number, is_whole
 from obsynth.numerics.arrays import ComplexArray, FloatArray, as_matrix, read_only
 from obsynth.numerics.ranks import decide_rank
 from obsynth.numerics.scaling import LogBalance
+from obsynth.plants.validation import index_of
 
 #: Distance, relative to the norm of a given matrix, below which computed eigenvalues count as one multiple eigenvalue:
 #: a triple one scatters by the cube root of the unit roundoff.
@@ -30,12 +29,12 @@ SAME_EIGENVALUE = 1e-9
 
 def stated_eigenvalues(phi: FloatArray) -> ComplexArray:
     """Return the distinct eigenvalues of a stacked transition ``(nw, nw)``, block by block where it falls apart."""
-    linked = (phi != 0.0) | (phi.T != 0.0) | np.eye(len(phi), dtype=bool)
-    for _ in range(len(phi)):
-        linked = (linked.astype(float) @ linked.astype(float)) > 0.0
+    from scipy.sparse.csgraph import connected_components
+
+    count, parts = connected_components(phi != 0.0, directed=False) if len(phi) else (0, np.zeros(0))
     values: list[complex] = []
-    for members in sorted({tuple(np.flatnonzero(row).tolist()) for row in linked}):
-        block = phi[np.ix_(members, members)]
+    for part in range(count):
+        block = phi[np.ix_(parts == part, parts == part)]
         triangular = not np.any(np.tril(block, -1))
         found = np.unique(np.diag(block)) if triangular else distinct_eigenvalues(block, MULTIPLE_EIGENVALUE)
         values += [complex(value) for value in found if complex(value) not in values]
@@ -58,10 +57,7 @@ def distinct_eigenvalues(matrix: FloatArray, tolerance: float) -> ComplexArray:
 
 
 def balanced_transition(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return a transition ``(n, n)`` with its states scaled by powers of two, and their factors ``(n,)``.
-
-    The states of a fault model, such as f, f', f'', have sizes of their own.
-    """
+    """Return a transition ``(n, n)`` with its states (f, f', ...) in powers of two as units, and these ``(n,)``."""
     n = len(matrix)
     problem = LogBalance(n + 1)
     # The unit of time is free: only the states are scaled.
@@ -137,20 +133,17 @@ class FaultModel:
 def polynomial(order: int) -> FaultModel:
     """Return the model of a polynomial in time: order 0 is a step, 1 a ramp."""
     if not is_whole(order) or not 0 <= order <= HIGHEST_ORDER:
-        raise SpecError(
-            f"A polynomial fault model has order {order!r}: give a whole number from 0 (step) to {HIGHEST_ORDER}.",
-            path="fault_model",
-        )
-    words = {number: word for word, number in POLYNOMIAL_WORDS.items()}
-    description = words.get(order, f"polynomial of order {order}")
-    return FaultModel(np.eye(order + 1, k=1), np.eye(1, order + 1), description)
+        raise _refused(f"A polynomial fault model has order {order!r}: give a whole number from 0 (step) to "
+                       f"{HIGHEST_ORDER}.")  # fmt: skip
+    words = [*POLYNOMIAL_WORDS, f"polynomial of order {order}"]
+    return FaultModel(np.eye(order + 1, k=1), np.eye(1, order + 1), words[min(order, len(POLYNOMIAL_WORDS))])
 
 
 def sinusoid(frequency: float) -> FaultModel:
     """Return the model of a sinusoid of known frequency, unknown amplitude and phase."""
     value = _number(frequency, "sinusoid")
     if value <= 0.0:
-        raise SpecError(f"The sinusoid has frequency {value}: give a positive number in rad/s.", path="fault_model")
+        raise _refused(f"The sinusoid has frequency {value}: give a positive number in rad/s.")
     return FaultModel(np.array([[0.0, value], [-value, 0.0]]), np.eye(1, 2), f"sinusoid of {value:g} rad/s")
 
 
@@ -161,20 +154,13 @@ def exponential(rate: float) -> FaultModel:
 
 
 def from_matrices(Phi: Any, Cw: Any) -> FaultModel:
-    """Return the model of any exosystem, in the time of the plant: ``w' = Phi w``, or ``w(k+1) = Phi w(k)``.
-
-    Shapes: ``Phi (n, n)``, ``Cw (1, n)``.
-    """
+    """Return the model of ``Phi (n, n)``, ``Cw (1, n)`` in the time of the plant: ``w' = Phi w``, or ``w(k+1)``."""
     transition, row = as_matrix(Phi, "Phi"), as_matrix(Cw, "Cw")
     count = transition.shape[0]
     if transition.shape != (count, count) or count == 0 or row.shape != (1, count):
-        raise SpecError(
-            f"A fault model has Phi {transition.shape} and Cw {row.shape}: Phi must be square and Cw one row of the "
-            "same length.",
-            path="fault_model",
-        )
-    model = FaultModel(transition, row, f"given exosystem of order {count}", sampled=True)
-    return _observable(model)
+        raise _refused(f"A fault model has Phi {transition.shape} and Cw {row.shape}: Phi must be square and Cw one "
+                       "row of the same length.")  # fmt: skip
+    return _observable(FaultModel(transition, row, f"given exosystem of order {count}", sampled=True))
 
 
 def summed(models: Sequence[FaultModel]) -> FaultModel:
@@ -182,18 +168,11 @@ def summed(models: Sequence[FaultModel]) -> FaultModel:
     from scipy.linalg import block_diag
 
     if not models or len({model.sampled for model in models}) > 1:
-        raise SpecError(
-            "A sum of fault models needs at least one part, and either built-in parts or given matrices, not both.",
-            path="fault_model",
-        )
+        raise _refused("A sum of fault models needs at least one part, and either built-in parts or given matrices, "
+                       "not both.")  # fmt: skip
     description = " plus ".join(model.description for model in models)
-    whole = FaultModel(
-        block_diag(*(model.Phi for model in models)),
-        np.hstack([model.Cw for model in models]),
-        description,
-        models[0].sampled,
-    )
-    return _observable(whole)
+    phi, row = block_diag(*(model.Phi for model in models)), np.hstack([model.Cw for model in models])
+    return _observable(FaultModel(phi, row, description, models[0].sampled))
 
 
 def fault_model(data: Any) -> FaultModel:
@@ -219,22 +198,17 @@ def fault_model(data: Any) -> FaultModel:
         return data
     if isinstance(data, str) and data in POLYNOMIAL_WORDS:
         return polynomial(POLYNOMIAL_WORDS[data])
-    if isinstance(data, Mapping):
-        keys = set(data)
-        if keys == {"Phi", "Cw"}:
-            return from_matrices(data["Phi"], data["Cw"])
+    if isinstance(data, Mapping) and set(data) == {"Phi", "Cw"}:
+        return from_matrices(data["Phi"], data["Cw"])
+    if isinstance(data, Mapping) and len(data) == 1:
+        ((key, value),) = data.items()
         makers = {"polynomial": polynomial, "sinusoid": sinusoid, "exponential": exponential}
-        if len(keys) == 1:
-            key, value = next(iter(data.items()))
-            if key in makers:
-                return makers[key](value)
-            if key == "sum" and isinstance(value, Sequence) and not isinstance(value, str):
-                return summed([fault_model(part) for part in value])
-    raise SpecError(
-        f"There is no fault model {data!r}: use {', '.join(POLYNOMIAL_WORDS)}, or one of {{polynomial: order}}, "
-        "{sinusoid: rad/s}, {exponential: 1/s}, {Phi: ..., Cw: ...}, {sum: [...]}.",
-        path="fault_model",
-    )
+        if key in makers:
+            return makers[key](value)
+        if key == "sum" and isinstance(value, Sequence) and not isinstance(value, str):
+            return summed([fault_model(part) for part in value])
+    raise _refused(f"There is no fault model {data!r}: use {', '.join(POLYNOMIAL_WORDS)}, or one of {{polynomial: "
+                   "order}, {sinusoid: rad/s}, {exponential: 1/s}, {Phi: ..., Cw: ...}, {sum: [...]}.")  # fmt: skip
 
 
 def _observable(model: FaultModel) -> FaultModel:
@@ -244,17 +218,79 @@ def _observable(model: FaultModel) -> FaultModel:
     for value in model.eigenvalues(0.0):
         tested = np.vstack([balanced - value * np.eye(model.order), (size or 1.0) * shown.astype(complex)])
         if not decide_rank(tested, expected=model.order, equilibrated=False).full:
-            raise SpecError(
-                f"Some state of the fault model ({model.description}) never shows in the fault, at the eigenvalue "
-                f"{value:.6g}: leave it out.",
-                path="fault_model",
-            )
+            raise _refused(f"Some state of the fault model ({model.description}) never shows in the fault, at the "
+                           f"eigenvalue {value:.6g}: leave it out.")  # fmt: skip
     return model
 
 
 def _number(value: Any, what: str) -> float:
-    if not is_number(value):
-        raise SpecError(f"The {what} model needs a number, not {value!r}.", path="fault_model")
-    if not np.isfinite(value):
-        raise SpecError(f"The {what} model needs a finite number, not {value}.", path="fault_model")
+    if not is_finite_number(value):
+        raise _refused(f"The {what} model needs a finite number, not {value!r}.")
     return float(value)
+
+
+def _refused(text: str) -> SpecError:
+    return SpecError(text, path="fault_model")
+
+
+@dataclass(frozen=True, eq=False)
+class Exosystem:
+    """The exosystems of all faults, stacked: ``Phi (nw, nw)``, block-diagonal, in the plant's time, ``Cw (nf, nw)``."""
+
+    Phi: FloatArray
+    Cw: FloatArray
+    names: tuple[str, ...]
+    eigenvalues: ComplexArray
+    descriptions: tuple[str, ...]
+
+    @property
+    def order(self) -> int:
+        """Number of states."""
+        return int(self.Phi.shape[0])
+
+
+def exosystem(data: Any, fault_names: Sequence[str], dt: float) -> Exosystem:
+    """Return the exosystem of all faults."""
+    models = _by_fault(data, fault_names)
+    _require_below_nyquist(fault_names, models, dt)
+    count = sum(model.order for model in models)
+    phi, cw = np.zeros((count, count)), np.zeros((len(models), count))
+    starts = np.cumsum([0, *(model.order for model in models)])
+    for row, model in enumerate(models):
+        place = slice(starts[row], starts[row + 1])
+        phi[place, place], cw[row, place] = model.transition(dt), model.Cw[0]
+    each = zip(fault_names, models, strict=True)
+    names = tuple(f"{name} model {i + 1}" for name, model in each for i in range(model.order))
+    values = list(dict.fromkeys(value for model in models for value in model.eigenvalues(dt).tolist()))
+    descriptions = tuple(model.description for model in models)
+    return Exosystem(read_only(phi), read_only(cw), names, np.array(values, dtype=np.complex128), descriptions)
+
+
+def _require_below_nyquist(names: Sequence[str], models: Sequence[FaultModel], dt: float) -> None:
+    """Raise for a course in continuous time that samples cannot tell from a slower one."""
+    if dt == 0.0:
+        return
+    problems = []
+    for name, model in zip(names, models, strict=True):
+        fastest = 0.0 if model.sampled else float(np.max(np.abs(model.eigenvalues(0.0).imag), initial=0.0))
+        if fastest * dt >= np.pi:
+            problems.append(
+                f"the model of {name!r} ({model.description}) oscillates with {fastest:.6g} rad/s, but samples every "
+                f"{dt:g} s show only what is slower than {np.pi / dt:.6g} rad/s (Nyquist): sample faster, or give the "
+                "frequency that the samples show."
+            )
+    if problems:
+        raise SpecError("fault_model:", path="fault_model", problems=problems)
+
+
+def _by_fault(data: Any, fault_names: Sequence[str]) -> list[FaultModel]:
+    if not isinstance(data, Mapping) or set(data) & set(MODEL_KEYS) - set(fault_names):
+        model = fault_model(data)
+        return [model for _ in fault_names]
+    for name in data:
+        index_of(name, fault_names, what="fault_model")
+    missing = [name for name in fault_names if name not in data]
+    if missing:
+        raise _refused(f"fault_model says nothing about {', '.join(map(repr, missing))}: give a model for each fault, "
+                       "or one for all.")  # fmt: skip
+    return [fault_model(data[name]) for name in fault_names]

@@ -27,14 +27,11 @@ DECISIVE = ("E", "A", "Bf", "Bd", "C", "Df", "Dd")
 
 @dataclass(frozen=True, eq=False)
 class PlantOrigin:
-    """Rational matrices of a plant in some coordinates of its states, or of the continuous plant that was sampled.
+    """Rational matrices (`DECISIVE`) of a plant in some coordinates, or of the continuous plant that was sampled.
 
-    Fields: exact: The `DECISIVE` matrices; sample_time: Where ``exact`` is a continuous plant and the plant itself is
-    that one sampled with a zero-order hold; computed: Whether some of the numbers behind them were computed in floating
-    point; sizes: Of the matrices of the plant itself, how large the terms are that each entry is a sum of (``A, Bf, Bd,
-    C, Df, Dd``): what rounding of the data behind it may change is relative to those; states: How many the plant as
-    written has, algebraic ones included; 0 where that is not known; uncleaned: Where data were computed and what
-    elimination left of them by their rounding alone was set to zero: the `DECISIVE` matrices before that.
+    ``computed``: whether some were computed in floating point; ``sizes``: of the terms that each entry is a sum of, to
+    which rounding of the data is relative; ``states``: of the plant as written, 0 where unknown; ``uncleaned``: the
+    matrices before what elimination left of computed data by rounding alone was set to zero.
     """
 
     exact: Mapping[str, tuple[tuple[Fraction, ...], ...]]

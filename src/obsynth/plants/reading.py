@@ -1,7 +1,4 @@
-"""From what a caller gives for a linear plant to its fields: frames, names for rows, noise of sensors.
-
-Labelled frames (pandas.DataFrame) as matrices: rows and columns in one order, labels as names.
-"""
+"""From what a caller gives for a linear plant to its fields: labelled frames, names for rows, noise of sensors."""
 
 from __future__ import annotations
 
@@ -14,44 +11,42 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.numerics.sparse import as_sparse_matrix, dense, is_sparse
-from obsynth.plants.names import checked_names, is_name_list, require_picked, rows_picking
 from obsynth.plants.validation import (
+    COUNTED_BY,
+    MATRIX_LAYOUT,
     Problems,
     any_matrix,
     checked_dt,
-    checked_point,
-    checked_scales,
-    checked_units,
-    expected_shapes,
+    checked_labels,
+    checked_names,
+    is_name_list,
     matrix_or_picks,
     picked_names,
+    require_picked,
+    rows_picking,
     signal_counts,
-    square,
-    uncounted_signals,
 )
 
-_ROWS = {"E": "state", "A": "state", "C": "output", "B": "state", "D": "output", "Bf": "state", "Df": "output",
-         "Bd": "state", "Dd": "output", "Bw": "state", "Dw": "output"}  # fmt: skip
-_COLUMNS = {"E": "state", "A": "state", "C": "state", "B": "input", "D": "input", "Bf": "fault", "Df": "fault",
-            "Bd": "disturbance", "Dd": "disturbance", "Bw": "noise", "Dw": "noise"}  # fmt: skip
-# A names the states, C the outputs; the first frame with a label decides on an order.
-_ORDER = ("A", "C", "E", "B", "D", "Bf", "Df", "Bd", "Dd", "Bw", "Dw")
+#: Names of the signals of each kind.
+_FIELDS = {"x": "state_names", "u": "input_names", "y": "output_names", "f": "fault_names", "d": "disturbance_names",
+           "w": "noise_names"}  # fmt: skip
 
 
-def without_frames(
+def _without_frames(
     matrices: Mapping[str, Any], names: Mapping[str, Sequence[str] | None]
 ) -> tuple[dict[str, Any], dict[str, Sequence[str] | None]]:
-    """Return matrices and names ``{"state_names": ...}`` in which the frames' labels are used, in one order.
+    """Return matrices and names ``{"state_names": ...}`` in which the labels of pandas' frames are used, in one order.
 
     The rows of the dynamics are the equations of the states of the same name.  Numbered labels are no names.
     """
     plain, labels = dict(matrices), dict(names)
-    for name in _ORDER:
+    # A names the states, C the outputs; the first frame with a label decides on an order.
+    for name, rows_of, columns_of in sorted(MATRIX_LAYOUT, key=lambda row: (row[0] != "A", row[0] != "C")):
         frame: Any = plain.get(name)
         if not (hasattr(frame, "columns") and hasattr(frame, "index") and hasattr(frame, "to_numpy")):
             continue
-        rows = _order(frame.index, f"{_ROWS[name]}_names", labels, f"the rows of {name}")
-        columns = _order(frame.columns, f"{_COLUMNS[name]}_names", labels, f"the columns of {name}")
+        rows = _order(frame.index, _FIELDS[rows_of], labels, f"the rows of {name}")
+        columns = _order(frame.columns, _FIELDS[columns_of], labels, f"the columns of {name}")
         plain[name] = frame.to_numpy()[rows][:, columns] if len(frame) else frame.to_numpy()
     return plain, labels
 
@@ -76,8 +71,6 @@ def _order(labels: Any, kind: str, known: dict[str, Sequence[str] | None], what:
     return [found.index(name) for name in wanted]
 
 
-#: Names of the signals of each kind, besides the states.
-_SIGNALS = {"input_names": "u", "output_names": "y", "fault_names": "f", "disturbance_names": "d", "noise_names": "w"}
 # Where a matrix picked by names names the signal as well.
 _NAMED_BY = {"output_names": "C", "fault_names": "Bf", "disturbance_names": "Bd"}
 
@@ -94,10 +87,12 @@ def plant_fields(
 ) -> dict[str, Any]:
     """Return every field of a `DescriptorSystem`; raise one `SpecError` with all problems."""
     problems = Problems()
-    matrices, labels = without_frames(asked, names)
-    a = problems.collect(lambda: square(any_matrix(matrices.pop("A"), "A"), "A"))
+    matrices, labels = _without_frames(asked, names)
+    a = problems.collect(lambda: any_matrix(matrices.pop("A"), "A"))
     problems.raise_if_any()
     nx = a.shape[0]
+    if nx == 0 or a.shape[1] != nx:
+        raise SpecError(f"A is {nx} by {a.shape[1]}, but it must be square (nx by nx, nx >= 1).", path="A")
     states = problems.collect(lambda: checked_names(labels["state_names"], nx, prefix="x", what="state_names"))
     problems.raise_if_any()
     given: dict[str, FloatArray | None] = {"A": a, "E": _identity_like(a) if matrices["E"] is None else None}
@@ -105,17 +100,18 @@ def plant_fields(
         if value is not None and not (name in SENSOR_PICKS and is_name_list(value)):
             given[name] = problems.collect(partial(matrix_or_picks, value, name, states))
     more = _appended(matrices, labels, given, sensor_noise, problems)
-    sizes = signal_counts(given)
+    sizes = {"x": nx, **signal_counts(given)}
     # What depends on a matrix that could not be read is not judged: its own message is enough.
     broken = {name for name, value in matrices.items() if value is not None and given.get(name) is None}
-    unknown = uncounted_signals(given, broken)
+    unknown = {signal for signal, telling in COUNTED_BY.items()
+               if broken.intersection(telling) and all(given.get(name) is None for name in telling)}  # fmt: skip
     values: dict[str, Any] = {
-        name: problems.shaped(given.get(name), name, shape)
-        for name, shape in expected_shapes(nx, sizes, unknown).items()
-    }
+        name: problems.shaped(given.get(name), name, (sizes[rows], sizes[columns]))
+        for name, rows, columns in MATRIX_LAYOUT if not unknown.intersection((rows, columns))
+    }  # fmt: skip
     values |= {"dt": problems.collect(lambda: checked_dt(dt)), "state_names": states}
-    for field, signal in _SIGNALS.items():
-        if signal in unknown:
+    for signal, field in _FIELDS.items():
+        if signal in unknown or signal == "x":
             continue
         stated = labels[field] or picked_names(matrices.get(_NAMED_BY.get(field, "")))
         extra = more.get(field, ())
@@ -123,14 +119,12 @@ def plant_fields(
             first = checked_names(stated, sizes[signal] - len(extra), prefix=signal, what=field)
             stated = (*first, *extra)
         values[field] = problems.collect(partial(checked_names, stated, sizes[signal], prefix=signal, what=field))
-    if any(values.get(field) is None for field in _SIGNALS):
+    if any(values.get(field) is None for field in _FIELDS.values()):
         # What refers to signals by name cannot be judged.
         problems.raise_if_any()
-    known = {name for field in ("state_names", *_SIGNALS) for name in values[field]}
-    values["operating_point"] = problems.collect(lambda: checked_point(operating_point, known))
-    measured = {*values["input_names"], *values["output_names"]}
-    values["scales"] = problems.collect(lambda: checked_scales(scales, measured))
-    values["units"] = problems.collect(lambda: checked_units(units, known))
+    known, measured = {name for field in _FIELDS.values() for name in values[field]}, set(values["input_names"])
+    measured |= set(values["output_names"])
+    values |= checked_labels(problems, known, measured, operating_point=operating_point, scales=scales, units=units)
     problems.raise_if_any()
     return values
 
@@ -161,8 +155,8 @@ def _appended(
         lambda: checked_names(stated, signal_counts(given)["y"], prefix="y", what="output_names")
     )
     problems.raise_if_any()
-    picked = problems.collect(lambda: with_sensor_picks(matrices, given, outputs)) or {}
-    noises = problems.collect(lambda: noise_of_sensors(sensor_noise, given, outputs)) or ()
+    picked = problems.collect(lambda: _with_sensor_picks(matrices, given, outputs)) or {}
+    noises = problems.collect(lambda: _noise_of_sensors(sensor_noise, given, outputs)) or ()
     return {"fault_names": picked.get("Df", ()), "disturbance_names": picked.get("Dd", ()), "noise_names": noises}
 
 
@@ -174,7 +168,7 @@ def _size(given: Mapping[str, Any]) -> int:
     return int(given["A"].shape[0])
 
 
-def with_sensor_picks(
+def _with_sensor_picks(
     asked: Mapping[str, Any], given: dict[str, FloatArray | None], outputs: Sequence[str]
 ) -> dict[str, tuple[str, ...]]:
     """Append one signal for each sensor that Df or Dd names; return the names of the sensors by matrix.
@@ -195,7 +189,9 @@ def with_sensor_picks(
     return found
 
 
-def noise_of_sensors(sensor_noise: Any, given: dict[str, FloatArray | None], outputs: Sequence[str]) -> tuple[str, ...]:
+def _noise_of_sensors(
+    sensor_noise: Any, given: dict[str, FloatArray | None], outputs: Sequence[str]
+) -> tuple[str, ...]:
     """Append one noise input for each sensor with a standard deviation; return the names of these.
 
     ``given`` is changed: ``Bw (nx, nw)`` and ``Dw (ny, nw)`` get a column for each, after those that are there.

@@ -1,4 +1,4 @@
-"""Matrices that change with k: callables, stacked arrays, or expressions; checked at every k they are asked for."""
+"""Matrices that change with k (callables, stacks, expressions), and checks of what a time-varying plant is made of."""
 
 from __future__ import annotations
 
@@ -11,11 +11,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
+from obsynth.numerics.arguments import is_finite_number, is_whole
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.numerics.expressions import CONSTANTS, Expression, parse_expression
+from obsynth.plants.validation import Problems, checked_dt
 
 #: A matrix, a stack of matrices, a function of k, or rows whose entries may be texts.
 MatrixLike: TypeAlias = ArrayLike | Callable[[int], ArrayLike] | Sequence[Sequence[float | str]] | None
+
 
 #: The name of the time index in expressions.
 INDEX_NAME = "k"
@@ -23,13 +26,10 @@ INDEX_NAME = "k"
 
 @dataclass(frozen=True, eq=False)
 class MatrixSequence:
-    """A matrix for each k.
+    """A matrix for each k = 0 ... length - 1, or for every k where ``length`` is None.
 
-    Fields: name: For messages, such as ``A``; shape: Rows and columns, the same for every k; length: Number of entries,
-    k = 0 ... length - 1; ``None`` when there is one for every k; values: ``(rows, columns)`` for a constant, ``(length,
-    rows, columns)`` for a stack; function: From k to a matrix; entries: Rows of expressions; constants: Values of the
-    names in the expressions; still: Of expressions, the entries that do not depend on k; moving: Row and column of
-    those that do.
+    ``values``: one matrix, or a stack ``(length, rows, columns)``; or ``function`` of k; or rows of ``entries`` with
+    ``constants``, of which ``still`` holds those that do not depend on k, and ``moving`` the places of the others.
     """
 
     name: str
@@ -112,17 +112,9 @@ class MatrixSequence:
     def as_data(self) -> Any:
         """Return an array or rows of texts."""
         if self.function is not None:
-            raise SpecError(
-                f"{self.name} is a Python function, and only data can be saved: give a stack of matrices, or "
-                f"expressions in {INDEX_NAME}.",
-                path=self.name,
-            )
+            raise SpecError(f"{self.name} is a Python function, and only data can be saved: give a stack of matrices, "
+                            f"or expressions in {INDEX_NAME}.", path=self.name)  # fmt: skip
         return self.values if self.entries is None else [[entry.text for entry in row] for row in self.entries]
-
-
-def zeros(name: str, shape: tuple[int, int]) -> MatrixSequence:
-    """Return a constant zero matrix as a sequence."""
-    return MatrixSequence(name, shape, None, values=read_only(np.zeros(shape)))
 
 
 def _named(make: Callable[[], FloatArray], name: str, k: int) -> FloatArray:
@@ -137,9 +129,7 @@ def _named(make: Callable[[], FloatArray], name: str, k: int) -> FloatArray:
 
 
 def _has_text(value: Any) -> bool:
-    if isinstance(value, str):
-        return True
-    return isinstance(value, (list, tuple)) and any(_has_text(item) for item in value)
+    return isinstance(value, str) or (isinstance(value, (list, tuple)) and any(map(_has_text, value)))
 
 
 def _array(value: Any, name: str) -> FloatArray:
@@ -193,3 +183,85 @@ def _split(
             else:
                 still[i, j] = entry(constants)
     return still, tuple(moving)
+
+
+#: Matrix, signal of its rows ("e" counts the equations), signal of its columns, first k at which it is needed.
+LAYOUT = (
+    ("E", "e", "x", 1), ("A", "e", "x", 0), ("C", "y", "x", 1),
+    ("B", "e", "u", 0), ("Phi", "e", "p", 0), ("Psi", "y", "p", 0),
+)  # fmt: skip
+#: E and C are needed at k = 1 ... N for N steps: as stacks they have N + 1 entries, of which the first is not used.
+_FIRST = {name: first for name, *_, first in LAYOUT}
+
+
+def positive_dt(dt: Any) -> float:
+    """Return a sampling time in seconds that is not zero."""
+    checked = checked_dt(dt)
+    if checked == 0.0:
+        raise SpecError("dt is 0: a time-varying plant is discrete in time, give the seconds between samples.",
+                        path="dt")  # fmt: skip
+    return checked
+
+
+def checked_constants(constants: Mapping[str, float] | None) -> dict[str, float]:
+    """Return names and finite values that expressions may use."""
+    checked: dict[str, float] = {}
+    if constants is not None and not isinstance(constants, Mapping):
+        raise SpecError(f"constants is a {type(constants).__name__}: give names and values.", path="constants")
+    for name, value in (constants or {}).items():
+        if not (isinstance(name, str) and name.isidentifier()) or name == "k" or name in CONSTANTS:
+            raise SpecError(f"constants names {name!r}: use letters, digits and '_', not k or pi.", path="constants")
+        if not is_finite_number(value):
+            raise SpecError(f"The constant {name!r} is {value!r}: give a finite number.", path=f"constants.{name}")
+        checked[name] = float(value)
+    return checked
+
+
+def completed(found: Mapping[str, MatrixSequence | None], problems: Problems) -> dict[str, MatrixSequence]:
+    """Return all matrices, zeros or the identity where none is given; note wrong shapes."""
+    a, c = found["A"], found["C"]
+    if a is None or c is None:
+        return {}
+    b, phi, psi = found.get("B"), found.get("Phi"), found.get("Psi")
+    columns = next((m.shape[1] for m in (phi, psi) if m is not None and 0 not in m.shape), 0)
+    sizes = {"e": a.shape[0], "x": a.shape[1], "y": c.shape[0], "u": 0 if b is None else b.shape[1], "p": columns}
+    if 0 in (sizes["e"], sizes["x"]):
+        problems.note(f"A is {a.shape[0]} by {a.shape[1]}, but at least 1 by 1 is needed.", "A")
+    completed = {}
+    for name, rows, cols, _ in LAYOUT:
+        shape, matrix = (sizes[rows], sizes[cols]), found.get(name)
+        if name == "E" and matrix is None:
+            matrix = MatrixSequence.of(np.eye(sizes["x"]), "E")
+        if matrix is None or (0 in matrix.shape and 0 in shape):
+            matrix = MatrixSequence(name, shape, None, values=read_only(np.zeros(shape)))
+        problems.require_shape(matrix.shape, name, shape)
+        completed[name] = matrix
+    return completed
+
+
+def checked_horizon(horizon: int | None, values: Mapping[str, MatrixSequence]) -> int | None:
+    """Return the number of steps that all stacks are good for, or ``None`` without any limit."""
+    if horizon is not None and (not is_whole(horizon) or horizon < 1):
+        raise SpecError(f"horizon is {horizon!r}: give the number of steps, at least 1.", path="horizon")
+    lengths = {name: m.length - _FIRST[name] for name, m in values.items() if m.length is not None}
+    if not lengths:
+        return None if horizon is None else int(horizon)
+    shortest = min(lengths, key=lambda name: lengths[name])
+    if horizon is None and len(set(lengths.values())) > 1:
+        listed = ", ".join(f"{name} for {steps}" for name, steps in lengths.items())
+        raise SpecError(
+            f"The stacks are good for different numbers of steps: {listed}. For N steps E and C need N + 1 matrices, "
+            "A, B, Phi and Psi need N; or give the horizon.", path="horizon",
+        )  # fmt: skip
+    if horizon is not None and horizon > lengths[shortest]:
+        raise SpecError(f"horizon is {horizon}, but the stack {shortest} is good for {lengths[shortest]} steps only.",
+                        path="horizon")  # fmt: skip
+    return lengths[shortest] if horizon is None else int(horizon)
+
+
+def check_every_k(values: Mapping[str, MatrixSequence], horizon: int | None) -> None:
+    """Evaluate callables and expressions along the horizon, so that a bad k is found before anything runs."""
+    for name, matrix in values.items():
+        if matrix.values is None and horizon is not None:
+            for k in range(_FIRST[name], horizon + _FIRST[name]):
+                matrix.at(k)

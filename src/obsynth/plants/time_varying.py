@@ -11,18 +11,17 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.names import checked_names
-from obsynth.plants.sequences import MatrixLike, MatrixSequence
-from obsynth.plants.time_varying_checks import (
+from obsynth.plants.sequences import (
     LAYOUT,
+    MatrixLike,
+    MatrixSequence,
     check_every_k,
     checked_constants,
     checked_horizon,
     completed,
-    missing,
     positive_dt,
 )
-from obsynth.plants.validation import Problems, checked_point, checked_scales, checked_units
+from obsynth.plants.validation import Problems, checked_labels, checked_names
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -127,7 +126,7 @@ class TimeVaryingDescriptorSystem:
                 make = partial(MatrixSequence.of, asked[name], name, first=first, constants=known)
                 found[name] = problems.collect(make)
             elif name in ("A", "C"):
-                problems.collect(partial(missing, name))
+                problems.note(f"{name} is missing: a plant needs A and C.", name)
         problems.raise_if_any()
         values = completed(found, problems)
         problems.raise_if_any()
@@ -142,10 +141,10 @@ class TimeVaryingDescriptorSystem:
             fields[field] = problems.collect(partial(checked_names, names, sizes[signal], prefix=signal, what=field))
         problems.raise_if_any()
         signals = {name for field in named for name in fields[field]}
-        fields["operating_point"] = problems.collect(lambda: checked_point(operating_point, signals))
         measured = {*fields["input_names"], *fields["output_names"]}
-        fields["scales"] = problems.collect(lambda: checked_scales(scales, measured))
-        fields["units"] = problems.collect(lambda: checked_units(units, signals))
+        fields |= checked_labels(
+            problems, signals, measured, operating_point=operating_point, scales=scales, units=units
+        )
         problems.collect(lambda: check_every_k(values, fields["horizon"]))
         problems.raise_if_any()
         for field, value in fields.items():
@@ -227,8 +226,7 @@ class TimeVaryingDescriptorSystem:
         SpecError
             A matrix is a callable.
         """
-        data = {name: matrix.as_data() for name, matrix in self.matrices.items()}
-        return {**data, **self._labels()}
+        return {**{name: matrix.as_data() for name, matrix in self.matrices.items()}, **self._labels()}
 
     def replace(self, **changes: Any) -> TimeVaryingDescriptorSystem:
         """Return a plant with some fields changed, checked again as a whole.

@@ -17,6 +17,7 @@ from obsynth.plants.uncertainty import (
     UNCERTAIN_MATRICES,
     Entry,
     Uncertainty,
+    as_written,
     expressions_in,
     matrices_of,
 )
@@ -166,7 +167,7 @@ def _with_tolerances(
     plant: DescriptorSystem, before: Uncertainty, constants: Any, tolerance: Any, options: Mapping[str, Any]
 ) -> DescriptorSystem:
     """Return a plant that has constants with new tolerances of these; nominal values may not move."""
-    written = matrices_of(plant) if before.written is None else before.written
+    written = as_written(plant, before)
     entries = {name: list(found) for name, found in before.entries.items()}
     stated = {key: value for key, value in options.items() if value is not None}
     given = {"variation": constants.variation if isinstance(constants, ConstantsBox) else before.box.variation}

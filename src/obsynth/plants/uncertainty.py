@@ -17,7 +17,6 @@ from obsynth.plants.constants import ConstantsBox, constants_box
 
 if TYPE_CHECKING:
     from obsynth.proofs.affine import AffineMatrix
-    from obsynth.proofs.affine_numbers import AffineNumber
 
 #: Matrices that may hold constants.
 UNCERTAIN_MATRICES = ("E", "A", "B", "C", "D", "Bf", "Df", "Bd", "Dd")
@@ -78,11 +77,8 @@ class Uncertainty:
         expression = self._parsed.setdefault(text, parse_expression(text))
         unknown = sorted(expression.names - known.keys())
         if unknown:
-            raise SpecError(
-                f"{place}: {text!r} has the unknown name {unknown[0]!r}; the constants are "
-                f"{', '.join(known) or 'none'}.",
-                path=matrix,
-            )  # fmt: skip
+            raise SpecError(f"{place}: {text!r} has the unknown name {unknown[0]!r}; the constants are "
+                            f"{', '.join(known) or 'none'}.", path=matrix)  # fmt: skip
 
     @cached_property
     def used(self) -> frozenset[str]:
@@ -177,44 +173,35 @@ class Uncertainty:
         from obsynth.proofs.affine import AffineMatrix
         from obsynth.proofs.affine_numbers import AffineNumber, affine_translation
 
-        unknowns = {name: i for i, name in enumerate(box.names)}
-        count, numbers = len(unknowns), {}
+        count, translation = len(box.names), affine_translation(len(box.names))
+        zero, numbers = AffineNumber(0.0, np.zeros(count), 0.0), dict[str, AffineNumber]()
         for name, item in box.constants.items():
-            parts = np.zeros(count)
-            if name in unknowns:
-                parts[unknowns[name]] = item.half
+            parts = item.half * np.array([unknown == name for unknown in box.names], dtype=np.float64)
             # The middle and the half are rounded.
             slack = 0.0 if item.certain else HALVING * max(abs(item.low), abs(item.high))
             numbers[name] = AffineNumber(item.nominal if item.certain else item.middle, parts, slack)
-        translation, known = affine_translation(count), dict[str, AffineNumber]()
+        known = dict(numbers)
         found = {name: AffineMatrix.exact(np.array(matrices[name]), count) for name in UNCERTAIN_MATRICES}
         for name, entries in self.entries.items():
             at = found[name]
-            parts, radius = at.parts.copy(), at.radius.copy()
             for row, column, text in entries:
                 if text not in known:
-                    known[text] = numbers[text] if text in numbers else self._number(text, numbers, translation, count)
-                value = known[text]
-                at.center[row, column], parts[:, row, column] = value.center, value.parts
-                radius[row, column] = value.radius
-            found[name] = AffineMatrix(at.center, parts, radius)
+                    known[text] = zero.lifted(self._parsed[text].translated(numbers, translation))
+                value, place = known[text], (row, column)
+                at.center[place], at.parts[:, row, column], at.radius[place] = value.center, value.parts, value.radius
         return found
-
-    def _number(self, text: str, numbers: Mapping[str, AffineNumber], translation: Any, count: int) -> AffineNumber:
-        from obsynth.proofs.affine_numbers import AffineNumber
-
-        value = self._parsed[text].translated(numbers, translation)
-        return value if isinstance(value, AffineNumber) else AffineNumber(float(value), np.zeros(count), 0.0)
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain data, as `uncertainty_of` reads it."""
-        return {
-            "box": self.box.as_dict(), "entries": {name: [list(item) for item in found]
-                                                   for name, found in self.entries.items()},
-            "written": None if self.written is None else dict(self.written),
-            "steps": [list(step) for step in self.steps],
-            **({} if self.shift is None else {"shift": self.shift}),
-        }  # fmt: skip
+        entries = {name: [list(item) for item in found] for name, found in self.entries.items()}
+        written = None if self.written is None else dict(self.written)
+        plain = {
+            "box": self.box.as_dict(),
+            "entries": entries,
+            "written": written,
+            "steps": list(map(list, self.steps)),
+        }
+        return plain if self.shift is None else {**plain, "shift": self.shift}
 
 
 def uncertainty_of(data: Any) -> Uncertainty | None:
@@ -238,3 +225,8 @@ def expressions_in(rows: Any) -> tuple[Any, list[Entry]]:
 def matrices_of(plant: Any) -> dict[str, FloatArray]:
     """Return the matrices of a plant that may hold constants, by name."""
     return {name: getattr(plant, name) for name in UNCERTAIN_MATRICES}
+
+
+def as_written(plant: Any, uncertain: Uncertainty) -> Mapping[str, FloatArray]:
+    """Return the matrices that may hold constants as they were written, before any transformation."""
+    return matrices_of(plant) if uncertain.written is None else uncertain.written

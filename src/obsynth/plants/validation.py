@@ -1,8 +1,11 @@
-"""Checking what a plant is made of, and collecting every problem before raising."""
+"""Checking what a plant is made of, collecting every problem before raising; names of signals, and picking by name."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Mapping, Sequence
+import difflib
+import unicodedata
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,22 +14,92 @@ from obsynth.errors import SpecError
 from obsynth.numerics.arguments import is_number
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.numerics.sparse import as_sparse_matrix, is_sparse
-from obsynth.plants.names import is_name_list, require_known, rows_picking
+
+#: Control characters, halves of pairs, separators of lines and paragraphs: no table can hold them in a name.
+_UNWRITABLE = frozenset({"Cc", "Cs", "Zl", "Zp"})
+
+
+def checked_names(names: Sequence[str] | None, count: int, *, prefix: str, what: str) -> tuple[str, ...]:
+    """Return ``count`` unique names; ``prefix1, prefix2, ...`` when none are given."""
+    if names is None:
+        return tuple(f"{prefix}{i + 1}" for i in range(count))
+    given = tuple(names) if isinstance(names, Iterable) else (names,)
+    if isinstance(names, str) or not all(isinstance(name, str) and name.strip() for name in given):
+        raise SpecError(f"{what} must be a list of non-empty texts.", path=what)
+    if len(given) != count:
+        raise SpecError(f"{what} has {len(given)} names, but there are {count} such signals.", path=what)
+    unwritable = [
+        name
+        for name in given
+        if not name.isprintable() and any(unicodedata.category(sign) in _UNWRITABLE for sign in name)
+    ]
+    if unwritable:
+        raise SpecError(f"{what} has the name {unwritable[0]!r}: use no line ends and no control characters.",
+                        path=what)  # fmt: skip
+    repeated = sorted(name for name, times in Counter(given).items() if times > 1)
+    if repeated:
+        raise SpecError(f"{what} repeats {', '.join(map(repr, repeated))}: names must be unique.", path=what)
+    return given
+
+
+def index_of(name: str, names: Sequence[str], *, what: str) -> int:
+    """Return the position of ``name``; the error suggests the closest names."""
+    if name in names:
+        return list(names).index(name)
+    raise SpecError(f"{what} has no signal named {name!r}.{suggestion(name, names)}", path=what)
+
+
+def suggestion(name: str, names: Iterable[str]) -> str:
+    """Return a question with the names closest to a wrong one, beginning with a space; empty where none is close."""
+    close = difflib.get_close_matches(name, list(names), n=3)
+    return f" Did you mean {' or '.join(map(repr, close))}?" if close else ""
+
+
+def require_known(given: Iterable[Any], known: Iterable[str], *, what: str, kind: str) -> None:
+    """Raise one `SpecError` that names every text which is no signal of ``kind``, each with what may be meant."""
+    listed = sorted(known)
+    told = [f"{what} names {name!r}, which is no {kind} of the plant.{suggestion(str(name), listed)}"
+            for name in given if name not in listed]  # fmt: skip
+    _raise(told, f"{what} names {len(told)} that are no {kind} of the plant:", what)
+
+
+def require_picked(picked: Iterable[str], names: Sequence[str], *, what: str) -> None:
+    """Raise one `SpecError` for all names that are not there, each with what may be meant."""
+    wrong = [f"{what} has no signal named {name!r}.{suggestion(name, names)}" for name in picked if name not in names]
+    _raise(wrong, f"{what} picks {len(wrong)} signals that do not exist:", what)
+
+
+def _raise(problems: Sequence[str], heading: str, path: str | None) -> None:
+    """Raise one `SpecError` with all problems, if there are any."""
+    if len(problems) == 1:
+        raise SpecError(problems[0], path=path)
+    if problems:
+        raise SpecError(heading, path=path, problems=problems)
+
+
+def is_name_list(value: Any) -> bool:
+    """Whether ``value`` is a non-empty list of texts: a pick by name, not a matrix."""
+    return (
+        isinstance(value, Sequence)
+        and not isinstance(value, str)
+        and len(value) > 0
+        and all(isinstance(item, str) for item in value)
+    )
+
+
+def rows_picking(picked: Sequence[str], names: Sequence[str], *, what: str) -> FloatArray:
+    """Return the selection matrix ``(len(picked), len(names))`` with a one for each picked name."""
+    require_picked(picked, names, what=what)
+    return np.eye(len(names))[[list(names).index(name) for name in picked]]
+
 
 #: Matrix, signal of its rows, signal of its columns.
 MATRIX_LAYOUT = (
-    ("E", "x", "x"),
-    ("A", "x", "x"),
-    ("C", "y", "x"),
-    ("B", "x", "u"),
-    ("D", "y", "u"),
-    ("Bf", "x", "f"),
-    ("Df", "y", "f"),
-    ("Bd", "x", "d"),
-    ("Dd", "y", "d"),
-    ("Bw", "x", "w"),
-    ("Dw", "y", "w"),
-)
+    ("E", "x", "x"), ("A", "x", "x"), ("C", "y", "x"), ("B", "x", "u"), ("D", "y", "u"), ("Bf", "x", "f"),
+    ("Df", "y", "f"), ("Bd", "x", "d"), ("Dd", "y", "d"), ("Bw", "x", "w"), ("Dw", "y", "w"),
+)  # fmt: skip
+#: Matrices that tell how many signals of a kind there are.
+COUNTED_BY = {"y": ("C",), "u": ("B", "D"), "f": ("Bf", "Df"), "d": ("Bd", "Dd"), "w": ("Bw", "Dw")}
 
 
 class Problems:
@@ -42,27 +115,29 @@ class Problems:
             return make()
         except SpecError as error:
             for problem in error.problems or (str(error),):
-                self._note(problem, error.path)
+                self.note(problem, error.path)
             return None
 
     def shaped(self, value: FloatArray | None, name: str, shape: tuple[int, int]) -> FloatArray:
         """Return ``value``, or zeros of ``shape`` where it is missing or empty; note a wrong shape."""
         if value is None or (0 in value.shape and 0 in shape):
             return np.zeros(shape)
-        if value.shape != shape:
-            turned = value.shape[1] == shape[0] != value.shape[0]
-            hint = " Is it transposed?" if turned or value.shape == shape[::-1] else ""
-            self._note(f"{name} is {_by(value.shape)}, but {_by(shape)} is needed.{hint}", name)
+        self.require_shape(value.shape, name, shape)
         return value
+
+    def require_shape(self, found: tuple[int, ...], name: str, shape: tuple[int, int]) -> None:
+        """Note a wrong shape."""
+        if found != shape:
+            turned = found[1] == shape[0] != found[0]
+            hint = " Is it transposed?" if turned or found == shape[::-1] else ""
+            self.note(f"{name} is {_by(found)}, but {_by(shape)} is needed.{hint}", name)
 
     def raise_if_any(self) -> None:
         """Raise one `SpecError` with all problems noted so far."""
-        if len(self.messages) == 1:
-            raise SpecError(self.messages[0], path=self.first_path)
-        if self.messages:
-            raise SpecError("The plant is not well formed:", path=self.first_path, problems=self.messages)
+        _raise(self.messages, "The plant is not well formed:", self.first_path)
 
-    def _note(self, message: str, path: str | None) -> None:
+    def note(self, message: str, path: str | None) -> None:
+        """Note one problem."""
         self.messages.append(message)
         self.first_path = self.first_path or path
 
@@ -70,13 +145,6 @@ class Problems:
 def any_matrix(value: Any, name: str) -> Any:
     """Return a checked read-only matrix: sparse where a sparse one was given, else an array."""
     return as_sparse_matrix(value, name) if is_sparse(value) else as_matrix(value, name)
-
-
-def square(matrix: FloatArray, name: str) -> FloatArray:
-    """Return a non-empty square matrix as it is; raise `SpecError` otherwise."""
-    if matrix.shape[0] == 0 or matrix.shape[0] != matrix.shape[1]:
-        raise SpecError(f"{name} is {_by(matrix.shape)}, but it must be square (nx by nx, nx >= 1).", path=name)
-    return matrix
 
 
 def matrix_or_picks(value: Any, name: str, states: Sequence[str]) -> Any:
@@ -100,33 +168,8 @@ def signal_counts(given: Mapping[str, FloatArray | None]) -> dict[str, int]:
         return next((m.shape[1] for m in found if m is not None and 0 not in m.shape), 0)
 
     outputs = given.get("C")
-    return {
-        "y": 0 if outputs is None else outputs.shape[0],
-        "u": columns("B", "D"),
-        "f": columns("Bf", "Df"),
-        "d": columns("Bd", "Dd"),
-        "w": columns("Bw", "Dw"),
-    }
-
-
-def uncounted_signals(given: Mapping[str, FloatArray | None], broken: Container[str]) -> set[str]:
-    """Return the kinds of signals whose number nothing tells, since a matrix that might is ``broken``."""
-    telling = {"y": ("C",), "u": ("B", "D"), "f": ("Bf", "Df"), "d": ("Bd", "Dd"), "w": ("Bw", "Dw")}
-    return {
-        signal
-        for signal, names in telling.items()
-        if any(name in broken for name in names) and not any(given.get(name) is not None for name in names)
-    }
-
-
-def expected_shapes(nx: int, counts: Mapping[str, int], unknown: Container[str] = ()) -> dict[str, tuple[int, int]]:
-    """Return the shape every matrix must have, of those whose signals have a known number."""
-    sizes = {"x": nx, **counts}
-    return {
-        name: (sizes[rows], sizes[columns])
-        for name, rows, columns in MATRIX_LAYOUT
-        if rows not in unknown and columns not in unknown
-    }
+    counts = {signal: columns(*names) for signal, names in COUNTED_BY.items()}
+    return counts | {"y": 0 if outputs is None else outputs.shape[0]}
 
 
 def _by(shape: tuple[int, ...]) -> str:
@@ -142,24 +185,24 @@ def checked_dt(dt: Any) -> float:
     return float(dt)
 
 
-def checked_point(point: Mapping[str, float] | None, known: set[str]) -> dict[str, float]:
-    """Return an operating point whose signals all exist."""
-    checked: dict[str, float] = {}
-    require_known(point or {}, known, what="operating_point", kind="signal")
-    for name, value in (point or {}).items():
-        checked[name] = float(as_matrix(value, f"operating_point[{name!r}]")[0, 0])
-    return checked
+def checked_labels(
+    problems: Problems, known: set[str], measured: set[str], *, operating_point: Any, scales: Any, units: Any
+) -> dict[str, Any]:
+    """Return operating point, factors of measured signals and units as fields of a plant; note what is wrong."""
+    return {
+        "operating_point": problems.collect(lambda: _values(operating_point, known, "operating_point", "signal")),
+        "scales": problems.collect(lambda: _values(scales, measured, "scales", "input or output")),
+        "units": problems.collect(lambda: checked_units(units, known)),
+    }
 
 
-def checked_scales(scales: Mapping[str, float] | None, known: set[str]) -> dict[str, float]:
-    """Return factors of measured signals, which all exist."""
-    checked: dict[str, float] = {}
-    require_known(scales or {}, known, what="scales", kind="input or output")
-    for name, value in (scales or {}).items():
-        factor = float(as_matrix(value, f"scales[{name!r}]")[0, 0])
-        if factor == 0.0:
+def _values(given: Mapping[str, float] | None, known: set[str], what: str, kind: str) -> dict[str, float]:
+    """Return numbers of signals, which all exist; a scale is not zero."""
+    require_known(given or {}, known, what=what, kind=kind)
+    checked = {name: float(as_matrix(value, f"{what}[{name!r}]")[0, 0]) for name, value in (given or {}).items()}
+    for name, value in checked.items():
+        if what == "scales" and value == 0.0:
             raise SpecError(f"The scale of {name!r} is 0: give a factor that is not zero.", path="scales")
-        checked[name] = factor
     return checked
 
 

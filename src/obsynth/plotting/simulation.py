@@ -1,7 +1,4 @@
-"""A simulation in one picture: faults against estimates, and what the monitors of its residual saw.
-
-Decisions of recursive observers with their thresholds.
-"""
+"""A simulation in one picture: faults against estimates, and what monitors and decisions saw."""
 
 from __future__ import annotations
 
@@ -14,9 +11,8 @@ from obsynth.experiments.monitors.monitor import Detection
 from obsynth.experiments.simulation import Simulation
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.alarms import Decision
-from obsynth.plotting.faults import plot_faults
-from obsynth.plotting.panels import MARK_STYLE, RESIDUAL_STYLE, THRESHOLD_STYLES, legend_above, new_panels, tidy
-from obsynth.plotting.states import plot_parameters
+from obsynth.plotting.estimates import plot_faults, plot_parameters
+from obsynth.plotting.panels import RESIDUAL_STYLE, THRESHOLD_STYLES, finish, legend_above, mark, new_panels
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -65,32 +61,18 @@ def plot_decision(decision: Decision, *, dt: float = 1.0, axes: Axes | None = No
     alarm = decision.alarm
     if alarm is not None:
         blamed = f": {alarm.parameter}" if alarm.parameter else ""
-        panel.plot(
-            [dt * alarm.k], [alarm.value], marker="o", color="black", label=f"alarm at {dt * alarm.k:g} s{blamed}",
-            **MARK_STYLE,
-        )  # fmt: skip
+        mark(panel, dt * alarm.k, alarm.value, f"alarm at {dt * alarm.k:g} s{blamed}")
         panel.axvline(dt * alarm.onset, color="0.4", linestyle=":", label=f"onset at {dt * alarm.onset:g} s")
-    panel.set_ylabel(_DECISION_LABELS.get(decision.statistic, decision.statistic))
-    panel.set_xlabel("time (s)")
-    legend_above(panel)
-    tidy(panel)
-    return panel
+    return finish(panel, _DECISION_LABELS.get(decision.statistic, decision.statistic))
 
 
-#: Names of the statistics on the vertical axis.
-_LABELS = {
-    "paper": "norm of r",
-    "pointwise": "norm of r",
-    "window": "window norm of r",
-    "chi-square": "chi-square",
-    "cusum": "CUSUM",
-}
-_THRESHOLDS = {
-    "paper": "(66): not a pointwise bound",
-    "pointwise": "pointwise bound",
-    "window": "bound over the window",
-    "chi-square": "threshold for Gaussian noise",
-    "cusum": "threshold for Gaussian noise",
+#: Of each kind of monitor: its statistic on the vertical axis, and its threshold.
+_DETECTIONS = {
+    "paper": ("norm of r", "(66): not a pointwise bound"),
+    "pointwise": ("norm of r", "pointwise bound"),
+    "window": ("window norm of r", "bound over the window"),
+    "chi-square": ("chi-square", "threshold for Gaussian noise"),
+    "cusum": ("CUSUM", "threshold for Gaussian noise"),
 }
 #: An estimate whose typical step from sample to sample is this share of its range is a band, not a line.
 NOISY_SHARE = 0.05
@@ -187,20 +169,14 @@ def plot_detection(detection: Detection, *, dt: float, axes: Axes | None = None)
     time = dt * np.arange(len(detection.values))
     deciding = np.isfinite(detection.threshold) & (detection.threshold > 0.0)
     shown = np.where(detection.values > 0.0, detection.values, np.nan)
-    panel.plot(time, shown, label="residual" if "norm" in _LABELS[detection.kind] else "statistic", **RESIDUAL_STYLE)
-    panel.plot(time, np.where(deciding, detection.threshold, np.nan), label=_THRESHOLDS[detection.kind],
-               **THRESHOLD_STYLES[0])  # fmt: skip
+    label, threshold = _DETECTIONS[detection.kind]
+    panel.plot(time, shown, label="residual" if "norm" in label else "statistic", **RESIDUAL_STYLE)
+    panel.plot(time, np.where(deciding, detection.threshold, np.nan), label=threshold, **THRESHOLD_STYLES[0])
     if np.any(~np.isnan(shown)):
         panel.set_yscale("log")
         if deciding.any():
             panel.set_ylim(bottom=float(np.min(detection.threshold[deciding])) * 10.0**-DECADES_BELOW)
     if detection.k is not None:
-        panel.plot(
-            time[detection.k], detection.values[detection.k], marker="o", color="black",
-            label=f"alarm at {detection.time:g} s" + (f": {detection.fault}" if detection.fault else ""), **MARK_STYLE,
-        )  # fmt: skip
-    panel.set_ylabel(_LABELS[detection.kind])
-    panel.set_xlabel("time (s)")
-    legend_above(panel)
-    tidy(panel)
-    return panel
+        blamed = f": {detection.fault}" if detection.fault else ""
+        mark(panel, time[detection.k], detection.values[detection.k], f"alarm at {detection.time:g} s{blamed}")
+    return finish(panel, label)

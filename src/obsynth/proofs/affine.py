@@ -133,12 +133,10 @@ class AffineMatrix:
 
 def affine_block(rows: Sequence[Sequence[AffineMatrix]]) -> AffineMatrix:
     """Return the matrix with the given rows of blocks."""
-    count = rows[0][0].count
-    center = np.block([[item.center for item in row] for row in rows])
-    parts = np.zeros((count, *center.shape))
-    for i in range(count):
-        parts[i] = np.block([[item.parts[i] for item in row] for row in rows])
-    return AffineMatrix(center, parts, np.block([[item.radius for item in row] for row in rows]))
+    # Blocks are joined along the last two axes, whatever is before these.
+    center, parts, radius = (np.block([[getattr(item, part) for item in row] for row in rows])
+                             for part in ("center", "parts", "radius"))  # fmt: skip
+    return AffineMatrix(center, parts, radius)
 
 
 def affine_inverse(matrix: AffineMatrix) -> AffineMatrix:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -109,18 +110,15 @@ class AffineNumber:
         """Return one over this; refused where it can be zero."""
         low, high = self.interval
         if low <= 0.0 <= high:
-            raise PreconditionError(
-                f"A divisor lies between {low:.4g} and {high:.4g} in the box and can be zero: the box leaves the "
-                "matrices unbounded. Give smaller tolerances.", condition="boundedness",
-            )  # fmt: skip
+            raise _unbounded(f"A divisor lies between {low:.4g} and {high:.4g} in the box and can be zero: the box "
+                             "leaves the matrices unbounded. Give smaller tolerances.")  # fmt: skip
         least = min(abs(low), abs(high))
         return self.through(1.0 / self.center, -1.0 / self.center**2, 2.0 / least**3)
 
     def through(self, value: float, slope: float, curvature: float) -> AffineNumber:
         """Return a smooth function of this: its value and slope at the centre, its second derivative at most."""
         if not all(map(math.isfinite, (value, slope, curvature))):
-            raise PreconditionError("An expression is not finite everywhere in the box: give smaller tolerances.",
-                                    condition="boundedness")  # fmt: skip
+            raise _unbounded("An expression is not finite everywhere in the box: give smaller tolerances.")
         second = 0.5 * curvature * self.spread**2 * (1.0 + 16.0 * UNIT_ROUNDOFF)
         rounding = FUNCTION_ROUNDINGS * UNIT_ROUNDOFF * (abs(value) + abs(slope) * self.spread)
         exact = value == round(value) and not self.spread and abs(value) in (0.0, 1.0)
@@ -141,14 +139,16 @@ class AffineNumber:
             return (self ** (-n)).reciprocal()
         low, high = self.interval
         if not low > 0.0:
-            raise PreconditionError(
-                f"The base of a power lies between {low:.4g} and {high:.4g} in the box: a power that is no whole "
-                "number needs a positive one.", condition="boundedness",
-            )  # fmt: skip
+            raise _unbounded(f"The base of a power lies between {low:.4g} and {high:.4g} in the box: a power that is "
+                             "no whole number needs a positive one.")  # fmt: skip
         if exponent.spread:
             return _exp(exponent * _log(self))
         steepest = max(abs(n * (n - 1.0)) * low ** (n - 2.0), abs(n * (n - 1.0)) * high ** (n - 2.0))
         return self.through(self.center**n, n * self.center ** (n - 1.0), steepest)
+
+
+def _unbounded(text: str) -> PreconditionError:
+    return PreconditionError(text, condition="boundedness")
 
 
 def _exp(x: AffineNumber) -> AffineNumber:
@@ -159,18 +159,14 @@ def _exp(x: AffineNumber) -> AffineNumber:
 def _positive(x: AffineNumber, name: str) -> float:
     low, high = x.interval
     if not low > 0.0:
-        raise PreconditionError(f"The argument of {name} lies between {low:.4g} and {high:.4g} in the box: it must be "
-                                "positive.", condition="boundedness")  # fmt: skip
+        raise _unbounded(f"The argument of {name} lies between {low:.4g} and {high:.4g} in the box: it must be "
+                         "positive.")  # fmt: skip
     return low
 
 
 def _log(x: AffineNumber) -> AffineNumber:
     low = _positive(x, "log")
     return x.through(math.log(x.center), 1.0 / x.center, 1.0 / low**2)
-
-
-def _log10(x: AffineNumber) -> AffineNumber:
-    return _log(x) * (1.0 / math.log(10.0))
 
 
 def _sqrt(x: AffineNumber) -> AffineNumber:
@@ -182,8 +178,7 @@ def _sqrt(x: AffineNumber) -> AffineNumber:
 def _tan(x: AffineNumber) -> AffineNumber:
     low, high = x.interval
     if math.floor(low / math.pi + 0.5) != math.floor(high / math.pi + 0.5):
-        raise PreconditionError(f"The argument of tan lies between {low:.4g} and {high:.4g} in the box and meets a "
-                                "pole.", condition="boundedness")  # fmt: skip
+        raise _unbounded(f"The argument of tan lies between {low:.4g} and {high:.4g} in the box and meets a pole.")
     steepest = max(abs(math.tan(low)), abs(math.tan(high)))
     t = math.tan(x.center)
     return x.through(t, 1.0 + t * t, 2.0 * steepest * (1.0 + steepest**2))
@@ -193,8 +188,7 @@ def _arc(function: Callable[[float], float], sign: float, name: str) -> Callable
     def taken(x: AffineNumber) -> AffineNumber:
         size = x.magnitude
         if not size < 1.0:
-            raise PreconditionError(f"The argument of {name} reaches {size:.4g} in the box: keep it inside -1 .. 1.",
-                                    condition="boundedness")  # fmt: skip
+            raise _unbounded(f"The argument of {name} reaches {size:.4g} in the box: keep it inside -1 .. 1.")
         slope = sign / math.sqrt(1.0 - x.center**2)
         return x.through(function(x.center), slope, size * (1.0 - size**2) ** -1.5)
 
@@ -212,21 +206,11 @@ def _finite(function: Callable[[float], float], value: float) -> float:
 ATAN_CURVATURE, TANH_CURVATURE = 0.65, 0.77
 
 
-def _atan(x: AffineNumber) -> AffineNumber:
-    return x.through(math.atan(x.center), 1.0 / (1.0 + x.center**2), ATAN_CURVATURE)
-
-
-def _tanh(x: AffineNumber) -> AffineNumber:
-    t = math.tanh(x.center)
-    return x.through(t, 1.0 - t * t, TANH_CURVATURE)
-
-
 def _jumps(function: Callable[[Any], Any], name: str) -> Callable[[AffineNumber], AffineNumber]:
     def taken(x: AffineNumber) -> AffineNumber:
         low, high = (float(function(end)) for end in x.interval)
         if low != high or (name == "sign" and x.interval[0] * x.interval[1] < 0.0):
-            raise PreconditionError(f"{name} of an expression jumps inside the box: give smaller tolerances.",
-                                    condition="boundedness")  # fmt: skip
+            raise _unbounded(f"{name} of an expression jumps inside the box: give smaller tolerances.")
         return x.lifted(low)
 
     return taken
@@ -241,26 +225,19 @@ def _absolute(x: AffineNumber) -> AffineNumber:
     return AffineNumber(half, 0.0 * x.parts, half * (1.0 + 4.0 * UNIT_ROUNDOFF))
 
 
-def _smallest(x: AffineNumber, y: AffineNumber) -> AffineNumber:
+def _extreme(x: AffineNumber, y: AffineNumber, *, largest: bool) -> AffineNumber:
     low, high = (x - y).interval
     if high <= 0.0 or low >= 0.0:
-        return x if high <= 0.0 else y
-    return (x + y - _absolute(x - y)) * 0.5
-
-
-def _largest(x: AffineNumber, y: AffineNumber) -> AffineNumber:
-    low, high = (x - y).interval
-    if high <= 0.0 or low >= 0.0:
-        return y if high <= 0.0 else x
-    return (x + y + _absolute(x - y)) * 0.5
+        return x if (high <= 0.0) != largest else y
+    apart = _absolute(x - y)
+    return (x + y + (apart if largest else -apart)) * 0.5
 
 
 def _definite(compare: Callable[[float, float], Any]) -> Callable[[AffineNumber, AffineNumber], bool]:
     def taken(x: AffineNumber, y: AffineNumber) -> bool:
         low, high = (x - y).interval
         if bool(compare(low, 0.0)) != bool(compare(high, 0.0)):
-            raise PreconditionError("A comparison (where) has both answers inside the box: give smaller tolerances.",
-                                    condition="boundedness")  # fmt: skip
+            raise _unbounded("A comparison (where) has both answers inside the box: give smaller tolerances.")
         return bool(compare(low, 0.0))
 
     return taken
@@ -276,14 +253,17 @@ _OF_ONE: dict[Callable[..., Any], Callable[[AffineNumber], AffineNumber]] = {
     np.cosh: lambda x: x.through(
         _finite(math.cosh, x.center), _finite(math.sinh, x.center), _finite(math.cosh, x.magnitude)
     ),
-    np.tan: _tan, np.arctan: _atan, np.tanh: _tanh, np.exp: _exp, np.log: _log, np.log10: _log10, np.sqrt: _sqrt,
+    np.tan: _tan, np.arctan: lambda x: x.through(math.atan(x.center), 1.0 / (1.0 + x.center**2), ATAN_CURVATURE),
+    np.tanh: lambda x: x.through(math.tanh(x.center), 1.0 - math.tanh(x.center) ** 2, TANH_CURVATURE),
+    np.exp: _exp, np.log: _log, np.log10: lambda x: _log(x) * (1.0 / math.log(10.0)), np.sqrt: _sqrt,
     np.arcsin: _arc(math.asin, 1.0, "asin"), np.arccos: _arc(math.acos, -1.0, "acos"), np.abs: _absolute,
     np.sign: _jumps(np.sign, "sign"), np.floor: _jumps(np.floor, "floor"), np.ceil: _jumps(np.ceil, "ceil"),
     step_function: _jumps(step_function, "step"),
 }  # fmt: skip
 _OF_TWO: dict[Callable[..., Any], Callable[[AffineNumber, AffineNumber], Any]] = {
     np.add: lambda x, y: x + y, np.subtract: lambda x, y: x - y, np.multiply: lambda x, y: x * y,
-    np.divide: lambda x, y: x / y, np.power: lambda x, y: x**y, np.minimum: _smallest, np.maximum: _largest,
+    np.divide: lambda x, y: x / y, np.power: lambda x, y: x**y,
+    np.minimum: partial(_extreme, largest=False), np.maximum: partial(_extreme, largest=True),
     np.less: _definite(np.less), np.less_equal: _definite(np.less_equal), np.greater: _definite(np.greater),
     np.greater_equal: _definite(np.greater_equal),
 }  # fmt: skip

@@ -12,10 +12,9 @@ any order, with or without fused multiply-add, differs from the exact one by at 
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol, Self, TypeVar
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,74 +37,9 @@ def rounded_up(value: FloatArray, operations: int) -> FloatArray:
     return value * (1.0 + 2.0 * (operations + 2) * UNIT_ROUNDOFF) + (operations + 1) * UNDERFLOW
 
 
-class Enclosure(ABC):
-    """A set of real matrices on which sums and products can be formed so that they hold those of all members.
-
-    `Ball` does so in double precision, `obsynth.proofs.extended_balls.ExtendedBall` in any other.
-    """
-
-    @classmethod
-    @abstractmethod
-    def exact(cls, matrix: FloatArray) -> Self:
-        """Return the set that holds ``matrix`` alone: floating-point numbers are exact data."""
-
-    @classmethod
-    @abstractmethod
-    def of(cls, ball: Ball) -> Self:
-        """Return a set that holds every member of ``ball``."""
-
-    @classmethod
-    @abstractmethod
-    def blocks(cls, rows: Sequence[Sequence[Self]]) -> Self:
-        """Return the set of block matrices with the given rows of blocks."""
-
-    @property
-    @abstractmethod
-    def shape(self) -> tuple[int, ...]:
-        """Rows and columns."""
-
-    @property
-    @abstractmethod
-    def T(self) -> Self:
-        """The transpose."""
-
-    @abstractmethod
-    def __add__(self, other: Self) -> Self:
-        """Return a set that holds all sums of members."""
-
-    @abstractmethod
-    def __neg__(self) -> Self:
-        """Return the set of the negative members."""
-
-    def __sub__(self, other: Self) -> Self:
-        """Return a set that holds all differences of members."""
-        return self + (-other)
-
-    @abstractmethod
-    def __matmul__(self, other: Self) -> Self:
-        """Return a set that holds all products of members."""
-
-    @abstractmethod
-    def scaled(self, factor: float) -> Self:
-        """Return a set that holds ``factor`` times every member."""
-
-
-Enclosed = TypeVar("Enclosed", bound=Enclosure)
-
-
-class Formula(Protocol):
-    """How a matrix is formed, in an arithmetic of whoever calls it: ``formula(Ball)`` for double precision."""
-
-    def __call__(self, kind: type[Enclosed], /) -> Enclosed:
-        """Return the matrix with what forming it may have cost."""
-
-
 @dataclass(frozen=True, eq=False)
-class Ball(Enclosure):
-    """All real matrices within ``radius`` of ``midpoint``, entry by entry.
-
-    Fields: midpoint, radius: ``(rows, cols)`` each; the radius is not negative.
-    """
+class Ball:
+    """All real matrices within ``radius`` (not negative) of ``midpoint``, entry by entry, ``(rows, cols)`` each."""
 
     midpoint: FloatArray
     radius: FloatArray
@@ -116,9 +50,9 @@ class Ball(Enclosure):
         return cls(np.asarray(matrix, dtype=np.float64), np.zeros(np.shape(matrix)))
 
     @classmethod
-    def of(cls, ball: Ball) -> Self:
-        """Return ``ball``."""
-        return cls(ball.midpoint, ball.radius)
+    def of(cls, matrix: Ball | FloatArray) -> Self:
+        """Return a ball as it is, or the one that holds a matrix alone."""
+        return cls(matrix.midpoint, matrix.radius) if isinstance(matrix, Ball) else cls.exact(matrix)
 
     @classmethod
     def blocks(cls, rows: Sequence[Sequence[Self]]) -> Self:
@@ -155,6 +89,10 @@ class Ball(Enclosure):
     def __neg__(self) -> Self:
         """Return the ball of the negative members; exact."""
         return type(self)(-self.midpoint, self.radius)
+
+    def __sub__(self, other: Self) -> Self:
+        """Return the ball of all differences of members."""
+        return self + (-other)
 
     def __matmul__(self, other: Self) -> Self:
         """Return the ball of all products of members."""
@@ -198,6 +136,11 @@ class Ball(Enclosure):
         return Ball(self.midpoint, rounded_up(self.radius + radius, 2))
 
     @property
+    def is_finite(self) -> bool:
+        """Whether anything is claimed: no entry overflowed."""
+        return bool(np.isfinite(self.midpoint).all() and np.isfinite(self.radius).all())
+
+    @property
     def is_exact(self) -> bool:
         """Whether there is one member alone."""
         return not np.any(self.radius)
@@ -207,8 +150,3 @@ class Ball(Enclosure):
         total = exponents[:, None] + exponents
         with np.errstate(over="ignore"):
             return Ball(np.ldexp(self.midpoint, total), np.ldexp(self.radius, total) + UNDERFLOW)
-
-
-def block(rows: Sequence[Sequence[Enclosed]]) -> Enclosed:
-    """Return the set of block matrices with the given rows of blocks."""
-    return type(rows[0][0]).blocks(rows)

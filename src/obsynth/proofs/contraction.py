@@ -21,8 +21,9 @@ import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.scaling import balanced_matrix
-from obsynth.proofs.balls import UNIT_ROUNDOFF, Ball, Enclosed, block, gamma, rounded_up
+from obsynth.proofs.balls import UNIT_ROUNDOFF, Ball, gamma, rounded_up
 from obsynth.proofs.definiteness import prove_positive_definite
+from obsynth.proofs.extended_balls import Enclosed, block
 
 #: Where between the spectral radius (0) and one (1) the rate is tried, in turn.
 RATES = (0.5, 0.2, 0.8, 0.95)
@@ -92,24 +93,20 @@ def prove_contraction(matrix: FloatArray | Ball, *, discrete: bool, rate: float 
 
     With ``rate`` (modulus per step, or decay in 1/s) that rate alone is tried.
     """
-    ball = matrix if isinstance(matrix, Ball) else Ball.exact(matrix)
+    ball = Ball.of(matrix)
     a = ball.midpoint
     if not a.size:
         return Contraction(a, a, 0.0, 0.0 if discrete else 1.0, discrete)
-    if not (np.all(np.isfinite(a)) and np.all(np.isfinite(ball.radius))):
+    if not ball.is_finite:
         return None
-    values = np.linalg.eigvals(a)
-    bound = float(np.max(np.abs(values))) if discrete else float(-np.max(values.real))
     if rate is not None:
         return _tried(ball, rate, discrete=discrete)
-    if (discrete and not bound < 1.0) or (not discrete and not bound > 0.0):
+    values = np.linalg.eigvals(a)
+    bound = float(np.max(np.abs(values))) if discrete else float(-np.max(values.real))
+    if not (bound < 1.0 if discrete else bound > 0.0):
         return None
-    for share in RATES:
-        tried = bound + share * (1.0 - bound) if discrete else (1.0 - share) * bound
-        found = _tried(ball, tried, discrete=discrete)
-        if found is not None:
-            return found
-    return None
+    rates = (bound + share * (1.0 - bound) if discrete else (1.0 - share) * bound for share in RATES)
+    return next((found for tried in rates if (found := _tried(ball, tried, discrete=discrete)) is not None), None)
 
 
 def proved_rate(matrix: FloatArray | Ball, known: Contraction | None = None) -> float | None:
@@ -117,7 +114,7 @@ def proved_rate(matrix: FloatArray | Ball, known: Contraction | None = None) -> 
 
     With ``known`` a contraction to fall back on is there already.
     """
-    ball = matrix if isinstance(matrix, Ball) else Ball.exact(matrix)
+    ball = Ball.of(matrix)
     if not ball.midpoint.size:
         return 0.0
     if not np.all(np.isfinite(ball.midpoint)):
@@ -132,9 +129,10 @@ def proved_rate(matrix: FloatArray | Ball, known: Contraction | None = None) -> 
 
 
 def _tried(ball: Ball, rate: float, *, discrete: bool) -> Contraction | None:
-    factor = _lyapunov_factor(ball.midpoint, rate, discrete=discrete)
-    if factor is None:
+    found = _lyapunov_factor(ball.midpoint, rate, discrete=discrete)
+    if found is None:
         return None
+    factor = found
     inverse = np.triu(np.linalg.inv(factor))
     if not np.all(np.isfinite(inverse)) or np.any(np.diag(inverse) == 0.0) or np.any(np.diag(factor) == 0.0):
         return None

@@ -29,20 +29,20 @@ symmetric perturbation within them.
 
 Where that is too much, a congruence brings the matrix near the identity and the same is tried again; and where the
 margin is below the rounding errors of double precision altogether, the matrix is formed and factored in more digits
-(`obsynth.proofs.extended_balls`), if python-flint is installed.
+(`obsynth.proofs.extended_balls`).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.numerics.arrays import FloatArray
-from obsynth.proofs.balls import UNDERFLOW, UNIT_ROUNDOFF, Ball, Enclosed, Formula, gamma, rounded_up
-from obsynth.proofs.extended_balls import MOST_ROWS, is_available, prove_by_ball_arithmetic
+from obsynth.proofs.balls import UNDERFLOW, UNIT_ROUNDOFF, Ball, gamma, rounded_up
+from obsynth.proofs.extended_balls import MOST_ROWS, Enclosed, Formula, prove_by_ball_arithmetic
 
 #: The first shift that is tried, relative to the error bound: as little as leaves a bound above zero.
 LEAST_SHIFT = 1.0 + 2.0**-5
@@ -56,13 +56,11 @@ Means = Literal["Cholesky", "preconditioned Cholesky", "ball arithmetic", "none"
 
 @dataclass(frozen=True)
 class DefinitenessProof:
-    """The outcome of an attempt to prove positive definiteness.
+    """The outcome of an attempt to prove that every symmetric member of a ball is positive definite.
 
-    Fields: proved: Whether every symmetric member of the ball is proved positive definite; lower_bound: Proved lower
-    bound on the smallest eigenvalue after a congruence: scaling the diagonal near one or, where that leaves too little,
-    preconditioning to near the identity.  Without a proof, the computed eigenvalue less the error bounds, or zero;
-    error_bound: What rounding and forming could have contributed in double precision, on the same scale; means: What
-    proved it; reason: With ball arithmetic, its precision; without a proof, why there is none.
+    ``lower_bound``: proved, on the smallest eigenvalue after a congruence (scaling, or preconditioning to near the
+    identity); without a proof, the computed one less the error bounds, or zero; ``error_bound``: of rounding in double
+    precision and forming; ``reason``: with ball arithmetic its precision, else why there is none.
     """
 
     proved: bool
@@ -73,7 +71,7 @@ class DefinitenessProof:
 
     @property
     def in_double_precision(self) -> bool:
-        """Whether it is proved without python-flint: a certificate to prefer, since everybody can check it."""
+        """Whether it is proved without more digits: a certificate to prefer, since everybody can check it."""
         return self.proved and self.means != "ball arithmetic"
 
     @property
@@ -98,7 +96,7 @@ def prove_positive_definite(matrix: Formula | Ball | FloatArray) -> Definiteness
     ball = formula(Ball)
     if ball.shape[0] == 0:
         return DefinitenessProof(True, float("inf"), 0.0, "Cholesky")
-    if not _is_finite(ball):
+    if not ball.is_finite:
         return unproved("an entry is not finite")
     diagonal = np.diag(ball.midpoint)
     if np.any(diagonal <= 0.0):
@@ -106,7 +104,7 @@ def prove_positive_definite(matrix: Formula | Ball | FloatArray) -> Definiteness
         return unproved(f"diagonal entry {place + 1} is {diagonal[place]:.3g}: not positive definite")
     exponents = -np.round(np.log2(diagonal) / 2.0).astype(np.int64)
     scaled = _symmetric(ball.congruent(exponents))
-    if not _is_finite(scaled):
+    if not scaled.is_finite:
         return unproved("an entry beside the diagonal is larger than the diagonal allows: not positive definite")
     first = _by_cholesky(scaled)
     if first.proved:
@@ -115,18 +113,14 @@ def prove_positive_definite(matrix: Formula | Ball | FloatArray) -> Definiteness
 
 
 def _as_formula(matrix: Formula | Ball | FloatArray) -> Formula:
-    if isinstance(matrix, (Ball, np.ndarray)):
-        ball = matrix if isinstance(matrix, Ball) else Ball.exact(matrix)
+    if not isinstance(matrix, (Ball, np.ndarray)):
+        return matrix
+    ball = Ball.of(matrix)
 
-        def given(kind: type[Enclosed]) -> Enclosed:
-            return kind.of(ball)
+    def given(kind: type[Enclosed]) -> Enclosed:
+        return kind.of(ball)
 
-        return given
-    return matrix
-
-
-def _is_finite(ball: Ball) -> bool:
-    return bool(np.all(np.isfinite(ball.midpoint)) and np.all(np.isfinite(ball.radius)))
+    return given
 
 
 def _symmetric(ball: Ball) -> Ball:
@@ -199,10 +193,8 @@ def _by_preconditioning(ball: Ball) -> DefinitenessProof | None:
         return None
     exact = Ball.exact(change)
     near_identity = _symmetric(exact.T @ ball @ exact)
-    if not _is_finite(near_identity):
-        return None
-    proof = _by_cholesky(near_identity, "preconditioned Cholesky")
-    return proof if proof.proved else None
+    proof = _by_cholesky(near_identity, "preconditioned Cholesky") if near_identity.is_finite else None
+    return proof if proof and proof.proved else None
 
 
 def _in_more_digits(formula: Formula, exponents: NDArray[np.int64], first: DefinitenessProof) -> DefinitenessProof:
@@ -210,11 +202,8 @@ def _in_more_digits(formula: Formula, exponents: NDArray[np.int64], first: Defin
     if first.lower_bound < -2.0 * first.error_bound:
         return first  # negative beyond all errors
     if len(exponents) > MOST_ROWS:
-        return _with(
-            first, f"{first.reason}; ball arithmetic is tried up to order {MOST_ROWS}, this is {len(exponents)}"
-        )
-    if not is_available():
-        return _with(first, f"{first.reason}; with python-flint (pip install 'obsynth[proof]') more digits are tried")
+        told = f"ball arithmetic is tried up to order {MOST_ROWS}, this is {len(exponents)}"
+        return replace(first, reason=f"{first.reason}; {told}")
     units = np.diag(np.ldexp(1.0, exponents))
 
     def scaled(kind: type[Enclosed]) -> Enclosed:
@@ -223,12 +212,8 @@ def _in_more_digits(formula: Formula, exponents: NDArray[np.int64], first: Defin
 
     found = prove_by_ball_arithmetic(scaled)
     if not found.proved:
-        return _with(first, f"{first.reason}; {found.reason}")
+        return replace(first, reason=f"{first.reason}; {found.reason}")
     return DefinitenessProof(True, found.lower_bound, first.error_bound, "ball arithmetic", f"{found.bits} bits")
-
-
-def _with(proof: DefinitenessProof, reason: str) -> DefinitenessProof:
-    return DefinitenessProof(False, proof.lower_bound, proof.error_bound, reason=reason)
 
 
 def _factorisation_bound(symmetric: FloatArray) -> float:
@@ -245,7 +230,7 @@ def _factorisation_bound(symmetric: FloatArray) -> float:
 
 def _cholesky_factor(matrix: FloatArray) -> FloatArray | None:
     try:
-        factor = np.linalg.cholesky(matrix)
+        factor = np.asarray(np.linalg.cholesky(matrix))
     except np.linalg.LinAlgError:
         return None
-    return np.asarray(factor) if np.all(np.isfinite(factor)) else None
+    return factor if np.isfinite(factor).all() else None

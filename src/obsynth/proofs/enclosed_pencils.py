@@ -52,16 +52,10 @@ def rank_to_digits(rows: Rows) -> int:
     rank, width = 0, len(work[0]) if work else 0
     free = list(range(width))
     while rank < len(work) and free:
-        size, i, j = max(
-            (
-                (float(work[i][j].abs_lower().log()) if not holds_zero(work[i][j]) else -np.inf, i, j)
-                for i in range(rank, len(work))
-                for j in free
-            ),
-            key=lambda triple: triple[0],
-        )
-        if size == -np.inf:
+        places = [(i, j) for i in range(rank, len(work)) for j in free if not holds_zero(work[i][j])]
+        if not places:
             break
+        i, j = max(places, key=lambda place: float(work[place[0]][place[1]].abs_lower().log()))
         work[rank], work[i] = work[i], work[rank]
         pivot = work[rank]
         free.remove(j)
@@ -76,10 +70,7 @@ def rank_to_digits(rows: Rows) -> int:
 
 @dataclass(frozen=True, eq=False)
 class EnclosedPencil:
-    """The pencil ``A - z E``; E is rational, A enclosed.
-
-    Fields: E: ``(m, n)``; A: ``(m, n)``; bits: Precision of A.
-    """
+    """The pencil ``A - z E (m, n)``; E is rational, A enclosed in a precision of ``bits``."""
 
     E: fmpq_mat
     A: Rows

@@ -19,16 +19,16 @@ from functools import cached_property
 from flint import fmpq, fmpq_mat, fmpq_poly, fmpz_mat, fmpz_poly, nmod_mat, nmod_poly
 
 from obsynth.numerics.arrays import FloatArray
-from obsynth.proofs.exact_matrices import (
+from obsynth.proofs.exact_arithmetic import (
+    RootLocation,
     blocks,
     identity,
-    null_basis,
-    pivot_columns,
+    locate_roots,
+    primitive,
     with_integer_entries,
+    written_matrix,
     zeros_matrix,
 )
-from obsynth.proofs.root_location import RootLocation, locate_roots, primitive
-from obsynth.proofs.written_numbers import written_matrix
 
 #: Primes for ranks that are only bounded from below.
 _PRIMES = ((1 << 61) - 1, 2305843009213693921, 2305843009213693907)
@@ -37,15 +37,11 @@ _COMPRESSION_SIZE = 1 << 12
 _SEED = 20150709
 #: Compressions after which a factor that all of them share is a factor of all minors.
 _MOST_COMPRESSIONS = 6
-__all__ = ["ExactPencil", "blocks", "identity", "null_basis", "pivot_columns", "system_pencil", "zeros_matrix"]
 
 
 @dataclass(frozen=True, eq=False)
 class ExactPencil:
-    """The pencil ``A - s E`` with rational matrices ``(m, n)``; its parts are computed once and kept.
-
-    Fields: E, A: ``(m, n)``.
-    """
+    """The pencil ``A - s E`` with rational matrices ``(m, n)``; its parts are computed once and kept."""
 
     E: fmpq_mat
     A: fmpq_mat
@@ -64,7 +60,8 @@ class ExactPencil:
     def normal_rank(self) -> int:
         """Rank of ``A - s E`` at almost every s."""
         e, a = self._integers
-        least = max((_rank_modulo(e, a, prime, self._rng) for prime in _PRIMES), default=0)
+        points = [(prime, self._rng.randrange(prime)) for prime in _PRIMES]
+        least = max(int((nmod_mat(a, prime) - nmod_mat(e, prime) * point).rank()) for prime, point in points)
         if least == min(self.shape):
             return least
         return max([least, *(_at(e, a, point).rank() for point in _points(self._degree + 1))])
@@ -73,9 +70,7 @@ class ExactPencil:
     def zero_polynomial(self) -> fmpz_poly:
         """Primitive polynomial whose roots, with multiplicity, are the finite zeros; 1 where there are none."""
         rank = self.normal_rank
-        if rank == 0 or self._degree == 0:
-            return fmpz_poly([1])
-        if self._has_no_zero_modulo(rank):
+        if rank == 0 or self._degree == 0 or self._has_no_zero_modulo(rank):
             return fmpz_poly([1])
         found = self._compressed_determinant(rank)
         if self.shape == (rank, rank):
@@ -102,6 +97,8 @@ class ExactPencil:
     def rank_at_root(self, polynomial: fmpz_poly) -> int:
         """Return the rank at a root of an irreducible polynomial: the same at all of them."""
         degree = polynomial.degree()
+        if 0 in self.shape:
+            return 0
         if degree == 1:
             constant, leading = (int(value) for value in polynomial.coeffs())
             return self.rank_at(Fraction(-constant, leading))
@@ -110,16 +107,8 @@ class ExactPencil:
             companion[row, degree - 1] = -fmpq(polynomial[row], polynomial[degree])
             if row:
                 companion[row, row - 1] = fmpq(1)
-        rows, columns = self.shape
-        whole = fmpq_mat(rows * degree, columns * degree)
-        for i in range(rows):
-            for j in range(columns):
-                for k in range(degree):
-                    whole[i * degree + k, j * degree + k] = self.A[i, j]
-                if self.E[i, j] != 0:
-                    for k in range(degree):
-                        for m in range(degree):
-                            whole[i * degree + k, j * degree + m] -= self.E[i, j] * companion[k, m]
+        one, pairs = identity(degree), zip(self.A.tolist(), self.E.tolist(), strict=True)
+        whole = blocks([[one * a - companion * e for a, e in zip(*pair, strict=True)] for pair in pairs])
         return int(whole.rank()) // degree
 
     @cached_property
@@ -191,17 +180,8 @@ class ExactPencil:
 
 def system_pencil(E: fmpq_mat, A: fmpq_mat, B: fmpq_mat, C: fmpq_mat, D: fmpq_mat) -> ExactPencil:
     """Return ``[A - s E, B; C, D]``."""
-    rows, columns = A.nrows() + C.nrows(), A.ncols() + B.ncols()
-    padded = fmpq_mat(rows, columns)
-    for i in range(E.nrows()):
-        for j in range(E.ncols()):
-            padded[i, j] = E[i, j]
-    return ExactPencil(padded, blocks([[A, B], [C, D]]))
-
-
-def _rank_modulo(e: fmpz_mat, a: fmpz_mat, prime: int, rng: random.Random) -> int:
-    point = rng.randrange(prime)
-    return int((nmod_mat(a, prime) - nmod_mat(e, prime) * point).rank())
+    nothing = [zeros_matrix(part.nrows(), part.ncols()) for part in (B, C, D)]
+    return ExactPencil(blocks([[E, nothing[0]], nothing[1:]]), blocks([[A, B], [C, D]]))
 
 
 def _at(e: fmpz_mat, a: fmpz_mat, point: int) -> fmpz_mat:

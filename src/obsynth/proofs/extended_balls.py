@@ -3,21 +3,36 @@ r"""Matrices of real balls in any precision, and the signs of a quadratic form d
 Where the margin of an inequality is below the rounding errors of double precision, the matrix is formed again from the
 same numbers with more digits, and factored as :math:`L D L^T`.  If every pivot is a ball to the right of zero, each
 symmetric member of the matrix is positive definite (Sylvester's law of inertia holds for every member, and each pivot
-of a member lies in the ball).  More digits are taken until the pivots are decided, or `MOST_BITS` are reached.
-
-python-flint is an optional extra (``pip install 'obsynth[proof]'``) and is loaded only here.
+of a member lies in the ball).  More digits are taken until the pivots are decided, or all `PRECISIONS` are tried.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any, NamedTuple, Protocol, Self, TypeVar
 
+import flint
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
-from obsynth.proofs.balls import Ball, Enclosure, Formula
+from obsynth.proofs.balls import Ball
+
+#: The arithmetics in which a matrix can be formed so that sums and products hold those of all members.
+Enclosed = TypeVar("Enclosed", Ball, "ExtendedBall")
+
+
+class Formula(Protocol):
+    """How a matrix is formed, in an arithmetic of whoever calls it: ``formula(Ball)`` for double precision."""
+
+    def __call__(self, kind: type[Enclosed], /) -> Enclosed:
+        """Return the matrix with what forming it may have cost."""
+
+
+def block(rows: Sequence[Sequence[Enclosed]]) -> Enclosed:
+    """Return the set of block matrices with the given rows of blocks."""
+    return type(rows[0][0]).blocks(rows)
+
 
 #: Digits to try, in bits.
 PRECISIONS = (128, 512, 2048)
@@ -27,12 +42,7 @@ MOST_ROWS = 128
 
 @dataclass(frozen=True)
 class ExtendedProof:
-    """What ball arithmetic found out.
-
-    Fields: proved: Whether every symmetric member is positive definite; lower_bound: Below the smallest eigenvalue of
-    every member; zero without a proof; bits: Precision that decided, or the last that was tried; reason: Why there is
-    no proof; empty with one.
-    """
+    """What ball arithmetic found out: ``bits`` decided, or are the last that were tried; ``lower_bound`` is proved."""
 
     proved: bool
     lower_bound: float
@@ -45,20 +55,8 @@ EIGENVALUE_BITS = (212, 848)
 MOST_ENCLOSED = 80
 
 
-def is_available() -> bool:
-    """Whether python-flint is installed."""
-    from importlib.util import find_spec
-
-    return find_spec("flint") is not None
-
-
 def prove_by_ball_arithmetic(formula: Formula) -> ExtendedProof:
-    """Try to prove that every symmetric member of a matrix is positive definite, with as many digits as it takes.
-
-    Shapes: ``formula (n, n)``.
-    """
-    import flint
-
+    """Try to prove that every symmetric member of a matrix is positive definite, with as many digits as it takes."""
     reason = ""
     for bits in PRECISIONS:
         # A local precision: the one in python-flint's context is for the whole process.
@@ -80,16 +78,13 @@ def enclosed_eigenvalues(matrix: FloatArray) -> tuple[Any, ...] | None:
 
     Stored numbers hardly ever have a multiple eigenvalue: what was placed as one is a tight cluster, and told apart.
     """
-    import flint
-
     order = len(matrix)
     if not 0 < order <= MOST_ENCLOSED or not np.all(np.isfinite(matrix)):
         return None
     for bits in EIGENVALUE_BITS:
         with flint.ctx.workprec(bits):
             try:
-                whole = flint.acb_mat(order, order, [flint.acb(value) for value in np.ravel(matrix).tolist()])
-                return tuple(whole.eig(multiple=True))
+                return tuple(flint.acb_mat(order, order, np.ravel(matrix).tolist()).eig(multiple=True))
             except ValueError:  # the enclosures found at this precision do not hold
                 continue
     return None
@@ -100,8 +95,7 @@ def middle_of(ball: Any) -> complex:
     return complex(float(ball.real.mid()), float(ball.imag.mid()))
 
 
-@dataclass(frozen=True)
-class _Pivot:
+class _Pivot(NamedTuple):
     """A pivot that is not known to be positive."""
 
     place: int
@@ -136,28 +130,26 @@ def _lower_bound(matrix: ExtendedBall) -> float:
     return max(float(np.nextafter(bound, 0.0)), float(np.nextafter(0.0, 1.0)))
 
 
-@dataclass(frozen=True, eq=False)
-class ExtendedBall(Enclosure):
-    """All real matrices within radii of midpoints that have the digits of python-flint's current precision.
+def arb_matrix(matrix: FloatArray) -> Any:
+    """Return a matrix as python-flint's, exactly."""
+    rows, columns = np.shape(matrix)
+    return flint.arb_mat(rows, columns, np.ravel(matrix).tolist())
 
-    Fields: content: ``(rows, cols)``.
-    """
+
+@dataclass(frozen=True, eq=False)
+class ExtendedBall:
+    """All real matrices within radii of midpoints that have the digits of python-flint's current precision."""
 
     content: Any
 
     @classmethod
     def exact(cls, matrix: FloatArray) -> Self:
         """Return the ball that holds ``matrix`` alone, whatever the precision."""
-        import flint
-
-        rows, columns = np.shape(matrix)
-        return cls(flint.arb_mat(rows, columns, [flint.arb(value) for value in np.ravel(matrix).tolist()]))
+        return cls(arb_matrix(matrix))
 
     @classmethod
     def of(cls, ball: Ball) -> Self:
         """Return the ball with the midpoint and radius of ``ball``."""
-        import flint
-
         rows, columns = ball.shape
         pairs = zip(np.ravel(ball.midpoint).tolist(), np.ravel(ball.radius).tolist(), strict=True)
         content = [flint.arb(middle, radius) if radius else flint.arb(middle) for middle, radius in pairs]
@@ -166,8 +158,6 @@ class ExtendedBall(Enclosure):
     @classmethod
     def blocks(cls, rows: Sequence[Sequence[Self]]) -> Self:
         """Return the ball of the block matrix with the given rows of blocks."""
-        import flint
-
         joined: list[Any] = []
         height = 0
         for row in rows:
@@ -179,8 +169,7 @@ class ExtendedBall(Enclosure):
 
     def entries(self) -> list[list[Any]]:
         """Return the entries as lists of ``flint.arb``."""
-        rows, columns = self.shape
-        return [[self.content[i, j] for j in range(columns)] for i in range(rows)]
+        return [list(row) for row in self.content.tolist()]
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -200,12 +189,14 @@ class ExtendedBall(Enclosure):
         """Return the ball of the negative members; exact."""
         return type(self)(-self.content)
 
+    def __sub__(self, other: Self) -> Self:
+        """Return the ball of all differences of members."""
+        return type(self)(self.content - other.content)
+
     def __matmul__(self, other: Self) -> Self:
         """Return the ball of all products of members."""
         return type(self)(self.content * other.content)
 
     def scaled(self, factor: float) -> Self:
         """Return the ball of ``factor`` times every member."""
-        import flint
-
         return type(self)(self.content * flint.arb(factor))

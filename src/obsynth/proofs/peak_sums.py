@@ -20,7 +20,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.scaling import balanced_matrix
 from obsynth.proofs.balls import UNDERFLOW, Ball, gamma, rounded_up
 from obsynth.proofs.contraction import Contraction
-from obsynth.proofs.exponentials import exponential
+from obsynth.proofs.products import exponential
 
 #: Most steps that are summed up one by one, and the share of the sum that the rest may then have.
 MOST_STEPS, LEFT = 65_536, 1e-3
@@ -36,10 +36,7 @@ LEFT_OF_GAINS, MOST_STEPS_OF_GAINS = 0.05, 1_024
 
 
 class PeakSums(NamedTuple):
-    """Upper bounds on partial and whole sums, one column for each input.
-
-    ``partial (steps, ..., m)`` holds the terms ``0 .. k``, ``whole (..., m)`` all of them.
-    """
+    """Upper bounds, a column per input: ``partial (steps, ..., m)`` on terms ``0 .. k``, ``whole (..., m)`` on all."""
 
     partial: FloatArray
     whole: FloatArray
@@ -110,10 +107,7 @@ def _norms(sizes: FloatArray) -> FloatArray:
 
 
 class Pieces(NamedTuple):
-    """Columns whose weighted norms, summed up, bound the integral over an interval of what inputs do.
-
-    ``columns (n, k)``, ``weights (k,)``, ``inputs (k,)``: to which input a column belongs.
-    """
+    """Columns ``(n, k)`` whose weighted norms bound the integral over an interval of what ``inputs (k,)`` do."""
 
     columns: Ball
     weights: FloatArray

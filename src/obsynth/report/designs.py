@@ -1,45 +1,31 @@
-"""A finished design for people: what it is, what it promises, and where it was written.
-
-What a design promises over the tolerances of its plant, for people.
-"""
+"""A finished design for people: what its plant is, what it promises, and what it may still not do."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from pathlib import Path
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass
 
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from obsynth.analysis.transformations import StateRecovery
-from obsynth.errors import PreconditionError
-from obsynth.methods.functional_filter.delay_curve import DelayCurve, delay_curve
+from obsynth.analysis.diagnosis.exact import question
+from obsynth.analysis.diagnosis.fault_columns import rest_point
+from obsynth.analysis.transformations.recovery import StateRecovery
+from obsynth.errors import ObsynthError, PreconditionError
+from obsynth.methods.automatic import SAMPLES
+from obsynth.methods.fault_figures import FaultFigures, fault_figures, on_the_clock
+from obsynth.methods.functional_filter.rates import DelayCurve, delay_curve, settling_time
 from obsynth.methods.registry import REGISTRY, method_spec
+from obsynth.observers.linear.derived import sample_observer
 from obsynth.observers.linear.observer import LinearObserver
-from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
-from obsynth.results.checks_table import print_checks
+from obsynth.plotting.frequency import FaultGains, fault_gains
 from obsynth.results.delta_scan import DeltaScan
 from obsynth.results.design import ObserverDesign
-from obsynth.results.layout import facts_table, headed_table, name_list, number, print_section
-from obsynth.results.report import VerificationReport
-
-
-def verification_report(report: VerificationReport, *, console: Console) -> None:
-    """Print a verification report."""
-    print_checks(report.checks, console=console)
-
-
-def tolerances_report(design: ObserverDesign, *, console: Console) -> None:
-    """Print what holds for every plant within its tolerances, or that the design assumes an exact model."""
-    facts = tolerance_facts(design)
-    if len(facts) == 1 and facts[0][0] == "model":
-        console.print(Text(f"Model: {facts[0][1]}"))
-    elif facts:
-        print_section(console, "Within the tolerances of the plant", facts_table(facts))
+from obsynth.results.layout import facts_table, headed_table, name_list, number, print_checks, print_section
 
 
 def tolerance_facts(design: ObserverDesign) -> list[tuple[str, str]]:
@@ -59,73 +45,59 @@ def tolerance_facts(design: ObserverDesign) -> list[tuple[str, str]]:
         return [("bounds", f"none: {error}")]
 
 
+#: Signals of any kind of plant, as they are called here.
+_SIGNALS = {
+    "states": "state_names", "known inputs": "input_names", "outputs": "output_names", "faults": "fault_names",
+    "disturbances": "disturbance_names", "noise": "noise_names", "parameters": "parameter_names",
+}  # fmt: skip
+
+
 def plant_facts(plant: DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel) -> Iterator[tuple[str, str]]:
     """Yield label and value of what is known about a plant."""
-    if isinstance(plant, TimeVaryingDescriptorSystem):
-        yield from _varying_facts(plant)
-        return
     if isinstance(plant, DAEModel):
-        yield from _nonlinear_facts(plant)
-        return
-    yield "time", f"discrete, {plant.dt:g} s between samples" if plant.is_discrete else "continuous"
-    signals = {
-        "states": plant.state_names, "known inputs": plant.input_names, "outputs": plant.output_names,
-        "faults": plant.fault_names, "disturbances": plant.disturbance_names, "noise": plant.noise_names,
-    }  # fmt: skip
-    for label, names in signals.items():
-        yield label, f"{len(names)}: {name_list(names)}" if names else "none"
+        yield "equations", f"{plant.nx}: {name_list(plant.equation_names)}"
+    elif isinstance(plant, TimeVaryingDescriptorSystem):
+        steps = "without end" if plant.horizon is None else f"{plant.horizon} steps"
+        yield "time", f"discrete, {plant.dt:g} s between samples, {steps}"
+        varying = [name for name, matrix in plant.matrices.items() if not matrix.is_constant]
+        yield "change with k", name_list(varying) if varying else "nothing"
+        yield "equations", str(plant.ne)
+    else:
+        yield "time", f"discrete, {plant.dt:g} s between samples" if plant.is_discrete else "continuous"
+    for label, attribute in _SIGNALS.items():
+        if (names := getattr(plant, attribute, None)) is not None:
+            yield label, f"{len(names)}: {name_list(names)}" if names else "none"
 
 
-def _varying_facts(plant: TimeVaryingDescriptorSystem) -> Iterator[tuple[str, str]]:
-    steps = "without end" if plant.horizon is None else f"{plant.horizon} steps"
-    yield "time", f"discrete, {plant.dt:g} s between samples, {steps}"
-    varying = [name for name, matrix in plant.matrices.items() if not matrix.is_constant]
-    yield "change with k", name_list(varying) if varying else "nothing"
-    yield "equations", str(plant.ne)
-    signals = {
-        "states": plant.state_names, "known inputs": plant.input_names, "outputs": plant.output_names,
-        "parameters": plant.parameter_names,
-    }  # fmt: skip
-    for label, names in signals.items():
-        yield label, f"{len(names)}: {name_list(names)}" if names else "none"
-
-
-def _nonlinear_facts(plant: DAEModel) -> Iterator[tuple[str, str]]:
-    yield "equations", f"{plant.nx}: {name_list(plant.equation_names)}"
-    signals = {
-        "states": plant.state_names, "known inputs": plant.input_names, "outputs": plant.output_names,
-        "parameters": plant.parameter_names,
-    }  # fmt: skip
-    for label, names in signals.items():
-        yield label, f"{len(names)}: {name_list(names)}" if names else "none"
-
-
-def design_report(design: ObserverDesign, *, console: Console, file: Path | None = None) -> None:
+def design_report(design: ObserverDesign, *, console: Console) -> None:
     """Print a design with its report."""
     print_section(console, f"Design '{design.name}' by {design.method}", facts_table(plant_facts(design.plant)))
     print_section(console, "What is promised", facts_table(promises(design)))
     if design.observer.fault_names:
-        print_section(console, *fault_estimates_table(design))
+        headings, rows = fault_estimates(design, gains_if_linear(design))
+        table = headed_table(*headings)
+        for row in rows:
+            table.add_row(*map(Text, row))
+        print_section(console, f"{headings[0].capitalize()} estimates", table)
     for curve in delay_curves(design):
         print_section(console, f"Deviation of {curve.fault} against delay", delay_table(curve))
         console.print(Text(curve.sentence))
         console.print()
-    if "delta_scan" in design.solver:
-        print_section(
-            console, "Other values of delta", delta_scan_table(DeltaScan.from_dict(design.solver["delta_scan"]))
-        )
     if design.recovery is not None:
         print_section(console, "States of the plant as written", facts_table(recovered_states(design.recovery)))
-    verification_report(design.report, console=console)
-    tolerances_report(design, console=console)
+    print_checks(design.report.checks, console=console)
+    facts = tolerance_facts(design)
+    if len(facts) == 1 and facts[0][0] == "model":
+        console.print(Text(f"Model: {facts[0][1]}"))
+    elif facts:
+        print_section(console, "Within the tolerances of the plant", facts_table(facts))
     for note in design.notes:
         console.print(Text(f"Note: {note}"))
-    if file is not None:
-        # A path must stay in one piece, so that it can be copied.
-        console.print(Text(f"Gain set: {file}"), soft_wrap=True)
 
 
-#: Curves of at most so many faults, of plants with at most so many states.
+#: The check without which observer and plant say nothing of one another.
+FITS = "fits the plant"
+#: Curves of at most so many faults; plants with more states have none, and no steps are followed there.
 MOST_CURVES, MOST_STATES = 3, 80
 
 
@@ -182,25 +154,106 @@ def promises(design: ObserverDesign) -> Iterator[tuple[str, str, str]]:
     yield "observer order", str(design.observer.order), "states of the shipped realisation"
 
 
-def fault_estimates_table(design: ObserverDesign) -> tuple[str, Table]:
-    """Return heading and table of delays and deviations of the estimates of faults or parameters."""
-    observer, units = design.observer, design.plant.units
+def gains_if_linear(design: ObserverDesign) -> FaultGains | None:
+    """Return the gains of a linear design that estimates faults of its plant; a broken one has none."""
+    if not isinstance(design.plant, DescriptorSystem) or not design.observer.fault_names:
+        return None
+    return None if any(check.name == FITS for check in design.report.failures) else fault_gains(design)
+
+
+def fault_estimates(design: ObserverDesign, gains: FaultGains | None) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    """Return headings and one row for each fault, or parameter: delay, deviation, and what else reaches it."""
+    observer, plant, units = design.observer, design.plant, design.plant.units
     deviations = {check.name: check.value for check in design.report.checks}
-    if not isinstance(observer, LinearObserver):
-        table = headed_table(
-            "parameter",
-            "std at the end of the horizon" if isinstance(observer, RecursiveObserver) else "std after the nominal run",
+
+    def deviation(name: str, missing: str) -> str:
+        value = deviations.get(f"noise in fhat[{name}]")
+        return missing if value is None else f"{number(value)} {units.get(name, '')}".strip()
+
+    if gains is None or not isinstance(plant, DescriptorSystem):
+        when = "after the nominal run" if isinstance(plant, DAEModel) else "at the end of the horizon"
+        return ("parameter", f"std {when}"), [(name, deviation(name, "-")) for name in observer.fault_names]
+    linear = design.linear[1]
+    none, noise = "by sampling" if plant.nw else "none stated", "deviation" if plant.is_discrete else "dev. at 1 s"
+    delays = ("samples late", "s late") if plant.is_discrete else ()
+    rows: list[tuple[str, ...]] = []
+    for name, late, leaks in zip(linear.fault_names, linear.fault_delays, gains.leaks, strict=True):
+        delay = (str(late), number(late * plant.dt)) if plant.is_discrete else ()
+        row = (name, *delay, deviation(name, none))
+        if plant.nd:
+            leak = float(leaks.max())
+            row += (f"{number(leak)} of {plant.disturbance_names[int(leaks.argmax())]}" if leak else "none",)
+        rows.append(row)
+    return ("fault", *delays, noise, *(("worst leak",) if plant.nd else ())), rows
+
+
+#: Without a scenario steps are followed for so many settling times of the plant, at most so many samples.
+SETTLING_TIMES, MOST_STEPS = 30, 6000
+
+
+@dataclass(frozen=True)
+class Followed:
+    """Steps of the faults, followed for so many seconds: figures by fault, none where they could not be followed."""
+
+    figures: Mapping[str, FaultFigures]
+    seconds: float
+
+
+def _estimating(design: ObserverDesign) -> tuple[DescriptorSystem, LinearObserver] | None:
+    """Return plant and observer of a linear design that estimates faults of a plant that is not too large."""
+    plant, observer = design.plant, design.observer
+    if not isinstance(plant, DescriptorSystem) or not isinstance(observer, LinearObserver) or plant.nx > MOST_STATES:
+        return None
+    return (plant, observer) if observer.fault_names and set(observer.fault_names) <= set(plant.fault_names) else None
+
+
+def followed_steps(design: ObserverDesign, horizon: float | None = None) -> Followed:
+    """Return what becomes of a unit step of each fault of a linear design; ``horizon`` in s."""
+    nothing, pair = Followed({}, 0.0), _estimating(design)
+    if pair is None:
+        return nothing
+    plant, observer = pair
+    if (observer.Bu.shape[1], observer.By.shape[1]) != (plant.nu, plant.ny):
+        return nothing
+    step = plant.dt if plant.dt > 0.0 else settling_time(plant) / SAMPLES
+    length = horizon if horizon is not None else SETTLING_TIMES * settling_time(plant)
+    steps = int(min(max(length / step, 20), MOST_STEPS))
+    try:
+        sampled = on_the_clock(plant, step)
+        clocked = observer if observer.dt > 0.0 else sample_observer(observer, step)
+    except ObsynthError:
+        return nothing
+    return Followed({found.fault: found for found in fault_figures(sampled, clocked, steps)}, steps * step)
+
+
+def design_warnings(
+    design: ObserverDesign, horizon: float | None = None, *, told: Collection[str] = (), steps: Followed | None = None
+) -> tuple[str, ...]:
+    """Return what a user should know before trusting the fault estimates; ``horizon`` in s, of the spec's scenario.
+
+    Of faults that are ``told`` of already, no step is; ``steps``: from `followed_steps`, where they are known.
+    """
+    pair = _estimating(design)
+    if pair is None:
+        return ()
+    found = followed_steps(design, horizon) if steps is None else steps
+    missed = (
+        f"A unit step of {name} reads {figures.at_horizon:.3g} after {found.seconds:.3g} s: the estimate does not "
+        "reach it by then."
+        for name, figures in found.figures.items() if not figures.reaches and name not in told
+    )  # fmt: skip
+    return (*_undetectable(*pair), *missed)
+
+
+def _undetectable(plant: DescriptorSystem, observer: LinearObserver) -> Iterator[str]:
+    rest = rest_point(plant.dt)
+    unknown = ", ".join(plant.disturbance_names)
+    for name in observer.fault_names if plant.nd else ():
+        asked = question(plant, (), plant.fault_names.index(name))
+        if asked.shows_at(rest):
+            continue
+        what = f"A constant {name}" if asked.visible else name
+        yield (
+            f"{what} cannot be told from {unknown}: what the estimate shows may as well be that. See obsynth check for "
+            "the sensors that would tell them apart."
         )
-        for name in observer.fault_names:
-            table.add_row(Text(name), f"{number(deviations[f'noise in fhat[{name}]'])} {units.get(name, '')}".strip())
-        return "Parameter estimates", table
-    sampled = observer.dt > 0.0
-    delays = ("delay in samples", "delay in s") if sampled else ()
-    noise = "std under the stated noise" + ("" if sampled else ", 1 s between samples")
-    table = headed_table("fault", *delays, noise)
-    for name, delay in zip(observer.fault_names, observer.fault_delays, strict=True):
-        deviation = deviations.get(f"noise in fhat[{name}]")
-        missing = "depends on the sampling" if design.linear[0].nw else "no noise stated"
-        shown = missing if deviation is None else f"{number(deviation)} {units.get(name, '')}".strip()
-        table.add_row(Text(name), *((str(delay), number(delay * observer.dt)) if sampled else ()), Text(shown))
-    return "Fault estimates", table

@@ -11,25 +11,26 @@ from obsynth.data.run import DataRun
 from obsynth.files.outputs import FileKind, write_atomically
 from obsynth.methods.registry import REGISTRY, method_spec
 from obsynth.report.designs import (
+    FITS,
     delay_curves,
-    fault_estimates_table,
+    delay_table,
+    fault_estimates,
+    gains_if_linear,
     plant_facts,
     promises,
     recovered_states,
     tolerance_facts,
 )
-from obsynth.report.log_agreement import agreement_section
-from obsynth.report.page_tables import check_rows, copied_table, fact_rows, matrix_rows, value_text
-from obsynth.report.pictures import data_section, pictures_of
+from obsynth.report.logs import agreement_section, data_section
+from obsynth.report.page_tables import check_rows, copied_table, fact_rows, matrix_rows, table_lines, value_text
+from obsynth.report.pictures import pictures_of
 from obsynth.report.summary import summary
-from obsynth.results.checks_table import verdict_line
+from obsynth.results.checks import VerificationReport
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import gain_set_digest
-from obsynth.results.report import VerificationReport
+from obsynth.results.layout import verdict_line
 from obsynth.simulation.scenario import Scenario
 
-#: The check without which observer and plant cannot be run together.
-FITS = "fits the plant"
 #: A page that `html_report` has written; the second mark is that of its first pages.
 PAGE = FileKind("a report of obsynth", rb'name="generator" content="obsynth|<p class="verdict (holds|fails)">')
 #: Gains with more entries are not printed: the gain set has them.
@@ -79,34 +80,34 @@ def html_report(
     PreconditionError
         The plant cannot be simulated on the scenario.
     """
-    shown = design.report if report is None else report
-    own = {}
+    digest, own = gain_set_digest(design), {}
     if run is not None:
         own = {"On your data": list(data_section(design, run, statement)),
                "Does your data agree": list(agreement_section(design, run, rows))}  # fmt: skip
-    return write_atomically(path, _page_text(design, shown, gains_file, scenario, system_file, own, data_file))
+    shown = design if report in (None, design.report) else design.replace(report=report)
+    reproduction = list(_reproduction(shown, digest, gains_file, system_file, data_file))
+    return write_atomically(path, _page_text(shown, scenario, own, reproduction))
 
 
 def _page_text(
-    design: ObserverDesign, report: VerificationReport, gains_file: str | None, scenario: Scenario | None,
-    system_file: str | None, own: Mapping[str, list[str]], data_file: str | None,
-) -> str:  # fmt: skip
-    digest = gain_set_digest(design)
+    design: ObserverDesign, scenario: Scenario | None, own: Mapping[str, list[str]], reproduction: list[str]
+) -> str:
+    report = design.report
     style = files("obsynth.report").joinpath("page.css").read_text(encoding="utf-8")
     title = escape(f"{design.name}: {design.method}")
     state = "holds" if report.passed else "fails"
     sections = {
         **own,
-        "In short": list(_in_short(design.replace(report=report))),
-        "Pictures": list(_pictures(design, scenario, report)),
+        "In short": list(_in_short(design)),
+        "Pictures": list(_pictures(design, scenario)),
         "What is promised": [*fact_rows(promises(design)), *_fault_estimates(design), *_recovered(design)],
-        "Within the tolerances of the plant": list(_tolerances(design, report)),
+        "Within the tolerances of the plant": list(_tolerances(design)),
         "What delay buys": list(_delay(design)),
         "Notes": list(_notes(design.notes)),
         "The plant": list(fact_rows(plant_facts(design.plant))),
         "Checks": list(check_rows(report.checks)) if report.checks else [],
         "Gains": list(_gains(design)),
-        "How to reproduce this": list(_reproduction(design, digest, gains_file, system_file, data_file)),
+        "How to reproduce this": reproduction,
     }
     shown = {heading: lines for heading, lines in sections.items() if lines}
     links = "".join(f'<a href="#{_anchor(heading)}">{heading}</a>' for heading in shown)
@@ -136,9 +137,9 @@ def _anchor(heading: str) -> str:
 
 def _fault_estimates(design: ObserverDesign) -> Iterator[str]:
     if design.observer.fault_names:
-        heading, table = fault_estimates_table(design)
-        yield f"<h3>{heading}</h3>"
-        yield from copied_table(table)
+        headings, rows = fault_estimates(design, gains_if_linear(design))
+        yield f"<h3>{headings[0].capitalize()} estimates</h3>"
+        yield from table_lines(headings, rows)
 
 
 def _recovered(design: ObserverDesign) -> Iterator[str]:
@@ -147,21 +148,21 @@ def _recovered(design: ObserverDesign) -> Iterator[str]:
         yield from fact_rows(recovered_states(design.recovery))
 
 
-def _tolerances(design: ObserverDesign, report: VerificationReport) -> Iterator[str]:
-    if any(check.name == FITS for check in report.failures):
-        return
-    if facts := tolerance_facts(design):
+def _tolerances(design: ObserverDesign) -> Iterator[str]:
+    if _fits(design) and (facts := tolerance_facts(design)):
         yield from fact_rows(facts)
+
+
+def _fits(design: ObserverDesign) -> bool:
+    """Whether observer and plant can be run together."""
+    return all(check.name != FITS for check in design.report.failures)
 
 
 def _delay(design: ObserverDesign) -> Iterator[str]:
     for curve in delay_curves(design):
-        head = "".join(f"<th>{text}</th>" for text in ("walk per sample", *(f"lag {lag}" for lag in curve.lags)))
         yield f"<h3>{escape(curve.fault)}</h3>"
-        yield f'<div class="scroll"><table class="facts"><thead><tr>{head}</tr></thead><tbody>'
-        for rate, row in zip(curve.rates, curve.deviations, strict=True):
-            yield f"<tr><td>{rate:.3g}</td>" + "".join(f"<td>{value:.3g}</td>" for value in row) + "</tr>"
-        yield f"</tbody></table></div><p>{escape(curve.sentence)}</p>"
+        yield from copied_table(delay_table(curve))
+        yield f"<p>{escape(curve.sentence)}</p>"
 
 
 def _notes(notes: Sequence[str]) -> Iterator[str]:
@@ -171,20 +172,12 @@ def _notes(notes: Sequence[str]) -> Iterator[str]:
         yield "</ul>"
 
 
-def _pictures(design: ObserverDesign, scenario: Scenario | None, report: VerificationReport) -> Iterator[str]:
-    if any(check.name == FITS for check in report.failures):
+def _pictures(design: ObserverDesign, scenario: Scenario | None) -> Iterator[str]:
+    if not _fits(design):
         yield "<p>None: the observer does not fit its plant.</p>"
         return
-    figures = [
-        f'<figure class="{"wide" if picture.wide else "half"}"><h3>{escape(picture.title)}</h3>'
-        f'<img alt="{escape(picture.text)}" src="{picture.source}">'
-        f"<figcaption>{escape(picture.text)}</figcaption></figure>"
-        for picture in pictures_of(design, scenario=scenario)
-    ]
-    if figures:
-        yield '<div class="pictures">'
-        yield from figures
-        yield "</div>"
+    if figures := [picture.html() for picture in pictures_of(design, scenario=scenario)]:
+        yield from ('<div class="pictures">', *figures, "</div>")
 
 
 def _gains(design: ObserverDesign) -> Iterator[str]:

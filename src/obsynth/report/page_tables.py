@@ -12,8 +12,7 @@ from rich.table import Table
 
 from obsynth.numerics.arrays import FloatArray
 from obsynth.results.checks import Check, CheckKind, Status
-from obsynth.results.checks_table import verdict
-from obsynth.results.layout import number
+from obsynth.results.layout import number, verdict
 
 #: Prefix of a check's name -> heading of its group; the others are about the shipped observer.
 _GROUPS = {"plant": "The plant", "exists": "Does such an observer exist?"}
@@ -49,16 +48,19 @@ def fact_rows(rows: Iterable[Sequence[str]]) -> Iterator[str]:
 
 def copied_table(table: Table) -> Iterator[str]:
     """Yield a terminal's table as one of the page."""
-    kinds = ["number" if column.justify == "right" else "" for column in table.columns]
+    rows = zip(*(map(str, column.cells) for column in table.columns), strict=True)
+    yield from table_lines([str(column.header) for column in table.columns], rows)
+
+
+def table_lines(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> Iterator[str]:
+    """Yield a table with headings; all columns but the first hold numbers."""
+    kinds = ["", *["number"] * (len(headings) - 1)]
     yield '<div class="scroll"><table class="copied"><thead><tr>'
-    yield "".join(
-        f'<th class="{kind}">{escape(str(column.header))}</th>'
-        for kind, column in zip(kinds, table.columns, strict=True)
-    )
+    yield "".join(f'<th class="{kind}">{escape(text)}</th>' for kind, text in zip(kinds, headings, strict=True))
     yield "</tr></thead><tbody>"
-    for cells in zip(*(column.cells for column in table.columns), strict=True):
-        row = (f'<td class="{kind}">{escape(str(cell))}</td>' for kind, cell in zip(kinds, cells, strict=True))
-        yield f"<tr>{''.join(row)}</tr>"
+    for row in rows:
+        cells = (f'<td class="{kind}">{escape(text)}</td>' for kind, text in zip(kinds, row, strict=True))
+        yield f"<tr>{''.join(cells)}</tr>"
     yield "</tbody></table></div>"
 
 
@@ -75,15 +77,12 @@ def check_rows(checks: Sequence[Check]) -> Iterator[str]:
         yield from map(_row, members)
         yield "</tbody>"
     yield "</table></div>"
-    found = {check.kind for check in checks}
-    yield '<h3>What each kind of check is worth</h3><div class="scroll"><table class="facts"><tbody>'
-    for kind, meaning in KINDS.items():
-        if kind in found:
-            yield f'<tr><th scope="row">{kind}</th><td>{meaning}</td></tr>'
-    for status, meaning in STATUSES.items():
-        if any(check.status == status for check in checks):
-            yield f'<tr><th scope="row">({status})</th><td>{meaning}</td></tr>'
-    yield "</tbody></table></div>"
+    yield "<h3>What each kind of check is worth</h3>"
+    yield from fact_rows([
+        *((kind, meaning) for kind, meaning in KINDS.items() if any(check.kind == kind for check in checks)),
+        *((f"({status})", meaning) for status, meaning in STATUSES.items()
+          if any(check.status == status for check in checks)),
+    ])  # fmt: skip
 
 
 def _group(check: Check) -> str:
@@ -111,10 +110,7 @@ def _row(check: Check) -> str:
 
 
 def matrix_rows(matrix: FloatArray) -> Iterator[str]:
-    """Yield a matrix; zeros are faint.
-
-    Shapes: ``matrix (rows, cols)``.
-    """
+    """Yield a matrix ``(rows, cols)``; zeros are faint."""
     if not matrix.size:
         yield '<p class="soft">empty</p>'
         return

@@ -1,7 +1,4 @@
-"""Pictures of a design for a page: drawn without a window, held as text.
-
-The section of a page about measured data: a picture first, then what was counted.
-"""
+"""Pictures of a design for a page: drawn without a window, held as text."""
 
 from __future__ import annotations
 
@@ -11,11 +8,6 @@ from collections.abc import Callable, Iterator, Sequence
 from html import escape
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import numpy as np
-from rich.text import Text
-
-from obsynth.data.log_estimator import DECIDING
-from obsynth.data.run import DataRun
 from obsynth.errors import ObsynthError, SpecError
 from obsynth.experiments.demonstration import demonstration_scenario
 from obsynth.experiments.monitors.monitor import Detection
@@ -25,15 +17,12 @@ from obsynth.observers.alarms import Decision
 from obsynth.observers.decisions import decide
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.recursive.observer import RecursiveObserver
-from obsynth.plotting.data import panel_count, plot_data
+from obsynth.plotting.estimates import plot_states
 from obsynth.plotting.frequency import plot_gains
 from obsynth.plotting.panels import names_as_they_are
 from obsynth.plotting.simulation import plot_simulation
 from obsynth.plotting.spectra import plot_poles
-from obsynth.plotting.states import plot_states
-from obsynth.report.page_tables import copied_table, fact_rows
 from obsynth.results.design import ObserverDesign
-from obsynth.results.layout import headed_table, number
 from obsynth.simulation.scenario import Scenario
 
 if TYPE_CHECKING:
@@ -51,16 +40,18 @@ MOST_STATES = 6
 
 
 class Picture(NamedTuple):
-    """A picture in a page.
-
-    Fields: title: What it shows; text: The same for who cannot see it, and as a caption; source: A data URL; wide:
-    Whether it takes a row of its own.
-    """
+    """A picture in a page: what it shows, in words for who cannot see it and as a caption, and a data URL."""
 
     title: str
     text: str
     source: str
     wide: bool = False
+
+    def html(self) -> str:
+        """Return the picture as a figure; a wide one takes a row of its own."""
+        title = f"<h3>{escape(self.title)}</h3>" if self.title else ""
+        return (f'<figure class="{"wide" if self.wide else "half"}">{title}<img alt="{escape(self.text)}" '
+                f'src="{self.source}"><figcaption>{escape(self.text)}</figcaption></figure>')  # fmt: skip
 
 
 def pictures_of(design: ObserverDesign, *, scenario: Scenario | None = None) -> Iterator[Picture]:
@@ -111,19 +102,16 @@ def _at_work(design: ObserverDesign, scenario: Scenario | None) -> Iterator[Pict
     faults, states = len(design.observer.fault_names), simulation.estimates.state_names
     units, dt = design.plant.units, float(simulation.time[1]) if len(simulation.time) > 1 else 1.0
     seen = [*_watched(design, shown, simulation)] if given else []
-    panels = faults + len(seen)
-    if panels:
-        yield Picture("The design at work", text, drawn(
-            (WIDE, PANEL * panels + MARGIN), panels,
-            lambda axes: plot_simulation(simulation, detections=seen, units=units, axes=axes),
-        ), wide=True)  # fmt: skip
+    if faults or seen:
+        yield stacked("The design at work", text, faults + len(seen),
+                      lambda axes: plot_simulation(simulation, detections=seen, units=units, axes=axes))  # fmt: skip
     if 0 < len(states) <= MOST_STATES:
-        run = "in the same run" if panels else "in a run with the stated noise"
+        run = "in the same run" if faults or seen else "in a run with the stated noise"
         bands = "" if linear else ", with 95 % bands"
-        yield Picture("States", f"States {run}, and their estimates{bands}.", drawn(
-            (WIDE, PANEL * len(states) + MARGIN), len(states),
+        yield stacked(
+            "States", f"States {run}, and their estimates{bands}.", len(states),
             lambda axes: plot_states(simulation.estimates, states=simulation.states, dt=dt, units=units, axes=axes),
-        ), wide=True)  # fmt: skip
+        )  # fmt: skip
 
 
 def _watched(design: ObserverDesign, scenario: Scenario, simulation: Simulation) -> Iterator[Detection | Decision]:
@@ -152,6 +140,11 @@ def _story(scenario: Scenario, *, given: bool, linear: bool) -> str:
     )
 
 
+def stacked(title: str, text: str, panels: int, draw: Callable[[Sequence[Axes]], Any]) -> Picture:
+    """Return a wide picture of so many panels."""
+    return Picture(title, text, drawn((WIDE, PANEL * panels + MARGIN), panels, draw), wide=True)
+
+
 def drawn(size: tuple[float, float], panels: int, draw: Callable[[Sequence[Axes]], Any]) -> str:
     """Return what ``draw`` puts on panels one above the other, as a data URL."""
     from matplotlib.figure import Figure
@@ -164,47 +157,3 @@ def drawn(size: tuple[float, float], panels: int, draw: Callable[[Sequence[Axes]
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=RESOLUTION)
     return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
-
-
-def data_section(design: ObserverDesign, run: DataRun, statement: str) -> Iterator[str]:
-    """Yield a picture of a run, what was counted, and statistics of estimates and residuals in decided rows."""
-    count = panel_count(run)
-    if count:
-        text = ("Measured outputs and their estimates, fault estimates, residuals and the monitor's statistic, as far "
-                "as there are any. Nothing is decided in grey rows; rows with an alarm are red.")  # fmt: skip
-        source = drawn((WIDE, PANEL * count + MARGIN), count, lambda axes: plot_data(run, design=design, axes=axes))
-        yield (f'<figure class="wide"><img alt="{escape(text)}" src="{source}"><figcaption>{escape(text)}</figcaption>'
-               "</figure>")  # fmt: skip
-    yield from fact_rows(_counts(run, statement))
-    yield from (f'<p class="warning">Warning: {escape(text)}</p>' for text in run.warnings)
-    yield from _statistics(design, run)
-
-
-def _counts(run: DataRun, statement: str) -> Iterator[tuple[str, str]]:
-    yield "rows", f"{run.rows}: " + ", ".join(f"{count} {status}" for status, count in run.statuses.items())
-    for name, time in run.alarms.items():
-        fault = f"; {run.isolated} stands out" if run.isolated and name not in run.thresholds else ""
-        yield "alarm", f"{name}, first at {run.stamps.shown(time)}{fault}"
-    if not run.alarms:
-        yield "alarm", "none"
-    if statement:
-        yield "threshold", statement
-
-
-def _statistics(design: ObserverDesign, run: DataRun) -> Iterator[str]:
-    if run.table is None:
-        return
-    decided = run.table[run.table["status"].isin(DECIDING)]
-    names = [name for name in run.table.columns if name.startswith(("fhat[", "r["))]
-    if not len(decided) or not names:
-        return
-    table = headed_table("in decided rows", "unit", "least", "mean", "largest", "deviation")
-    for name in names:
-        values = decided[name].to_numpy(dtype=np.float64)
-        values = values[np.isfinite(values)]
-        if values.size:
-            unit = design.plant.units.get(name[name.index("[") + 1 : -1], "")
-            found = (number(float(f(values))) for f in (np.min, np.mean, np.max, np.std))
-            table.add_row(Text(name), unit, *found)
-    yield "<h3>Statistics</h3>"
-    yield from copied_table(table)

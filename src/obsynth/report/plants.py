@@ -1,11 +1,4 @@
-"""The structure of a plant and the existence conditions of each method, for people.
-
-The diagnosis of a plant as tables.
-
-Whether each method can serve a plant: one line each, with the reason and what to add.
-
-A linear plant as text for people, and as a document that specs can name.
-"""
+"""A plant for people: its structure, what can be diagnosed on it, which methods can serve it, its matrices as text."""
 
 from __future__ import annotations
 
@@ -25,10 +18,8 @@ from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.report.designs import plant_facts
-from obsynth.results.checks import Check
-from obsynth.results.checks_table import checks_table
-from obsynth.results.layout import complex_numbers, facts_table, headed_table, name_list, print_section
-from obsynth.results.report import VerificationReport
+from obsynth.results.checks import Check, VerificationReport
+from obsynth.results.layout import checks_table, complex_numbers, facts_table, headed_table, name_list, print_section
 
 
 def check_report(

@@ -14,16 +14,16 @@ from rich.console import Console
 from rich.text import Text
 
 from obsynth.analysis.structure import questions
+from obsynth.files.tables import html_table
 from obsynth.methods.registry import REGISTRY, method_spec
-from obsynth.observers.linear.warm_up import FORGOTTEN, transient
+from obsynth.observers.linear.derived import FORGOTTEN, transient
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
-from obsynth.plotting.frequency import FaultGains, fault_gains
-from obsynth.report.warnings import Followed, design_warnings, followed_steps
-from obsynth.results.checks_table import verdict_line
+from obsynth.plotting.frequency import FaultGains
+from obsynth.report.designs import Followed, design_warnings, fault_estimates, followed_steps, gains_if_linear
 from obsynth.results.design import ObserverDesign
-from obsynth.results.layout import number
+from obsynth.results.layout import number, verdict_line
 
 #: Faults, warnings and notes that are listed; the others are counted.
 _MOST_FAULTS, _MOST_NOTES = 5, 1
@@ -32,8 +32,6 @@ NEAR_ONE = 0.5
 #: An estimate follows a step if in the end it misses it by no more than this share.
 FOLLOWS = 0.1
 _LABEL = 10
-#: The check without which observer and plant say nothing of one another.
-_FITS = "fits the plant"
 #: Claims that say what a design is worth; the others are for -v.
 _PROMISES = ("gamma", "decay")
 
@@ -78,11 +76,7 @@ class Summary:
         parts = [f'<p style="color:{colour};font-weight:600">{escape(self.verdict)}</p>', "<table>"]
         parts += [f'<tr><th style="text-align:left">{escape(label)}</th><td style="text-align:left">{escape(text)}</td>'
                   "</tr>" for label, text in self.facts]  # fmt: skip
-        parts.append("</table>")
-        if self.rows:
-            head = "".join(f"<th>{escape(text)}</th>" for text in self.headings)
-            body = "".join("<tr>" + "".join(f"<td>{escape(text)}</td>" for text in row) + "</tr>" for row in self.rows)
-            parts.append(f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>")
+        parts += ["</table>", *([html_table([self.headings, *self.rows])] if self.rows else [])]
         parts += [f"<p>{escape(self.more)}</p>"] if self.more else []
         parts += [f'<p style="color:#9a6700">Warning: {escape(text)}</p>' for text in self.warnings]
         parts += [f"<p>Note: {escape(text)}</p>" for text in self.notes]
@@ -99,9 +93,9 @@ class Summary:
 
 def summary(design: ObserverDesign, *, file: Path | None = None, everything: bool = False) -> Summary:
     """Return the summary of a design; with ``everything`` no fault and no note is left out."""
-    gains = _gains_if_linear(design)
+    gains = gains_if_linear(design)
     steps = followed_steps(design)
-    headings, rows = _estimates(design, gains)
+    headings, rows = fault_estimates(design, gains)
     warnings = tuple(_warnings(design, gains, steps))
     shown = len(rows) if everything else _MOST_FAULTS
     notes = design.notes if everything else design.notes[:_MOST_NOTES]
@@ -131,18 +125,16 @@ def _facts(design: ObserverDesign, steps: Followed) -> Iterator[tuple[str, str]]
 
 
 def _plant(plant: DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel) -> str:
+    counts = [(len(plant.state_names), "state"), (len(plant.output_names), "output")]
+    if isinstance(plant, DescriptorSystem):
+        time = f"{plant.dt:g} s between samples" if plant.is_discrete else "continuous in time"
+        return f"{time}; {_counted([*counts, (plant.nf, 'fault'), (plant.nd, 'unknown input')])}"
+    counts.append((len(plant.parameter_names), "parameter"))
     if isinstance(plant, DAEModel):
-        counts = ((plant.nx, "state"), (plant.ny, "output"), (plant.nq, "parameter"))
         return f"nonlinear; {_counted(counts)}"
-    if isinstance(plant, TimeVaryingDescriptorSystem):
-        counts = ((len(plant.state_names), "state"), (len(plant.output_names), "output"),
-                  (len(plant.parameter_names), "parameter"))  # fmt: skip
-        varying = [name for name, matrix in plant.matrices.items() if not matrix.is_constant]
-        change = f"change with k: {', '.join(varying)}" if varying else "constant matrices"
-        return f"{plant.dt:g} s between samples; {change}; {_counted(counts)}"
-    time = f"{plant.dt:g} s between samples" if plant.is_discrete else "continuous in time"
-    faults = ((plant.nf, "fault"), (plant.nd, "unknown input"))
-    return f"{time}; {_counted(((plant.nx, 'state'), (plant.ny, 'output'), *faults))}"
+    varying = [name for name, matrix in plant.matrices.items() if not matrix.is_constant]
+    change = f"change with k: {', '.join(varying)}" if varying else "constant matrices"
+    return f"{plant.dt:g} s between samples; {change}; {_counted(counts)}"
 
 
 def _counted(counts: Sequence[tuple[int, str]]) -> str:
@@ -194,43 +186,6 @@ def _assumptions(design: ObserverDesign) -> Iterator[str]:
     if isinstance(design.plant, DescriptorSystem):
         noisy = sum(bool(row.any()) for row in design.plant.Dw)
         yield f"white noise on {noisy} of {design.plant.ny} sensors" if noisy else "no sensor noise stated"
-
-
-def _gains_if_linear(design: ObserverDesign) -> FaultGains | None:
-    """Return the gains of a linear design that estimates faults of its plant; a broken one has none."""
-    if not isinstance(design.plant, DescriptorSystem) or not design.observer.fault_names:
-        return None
-    return None if any(check.name == _FITS for check in design.report.failures) else fault_gains(design)
-
-
-def _estimates(design: ObserverDesign, gains: FaultGains | None) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
-    """Return headings and one row for each fault, or parameter."""
-    observer, units = design.observer, design.plant.units
-    deviations = {check.name: check.value for check in design.report.checks}
-
-    def deviation(name: str, missing: str) -> str:
-        value = deviations.get(f"noise in fhat[{name}]")
-        return missing if value is None else f"{number(value)} {units.get(name, '')}".strip()
-
-    if gains is None or not isinstance(design.plant, DescriptorSystem):
-        when = "after the nominal run" if isinstance(design.plant, DAEModel) else "at the end of the horizon"
-        return ("parameter", f"std {when}"), [(name, deviation(name, "-")) for name in observer.fault_names]
-    plant, linear = design.linear
-    none = "none stated" if not plant.nw else "by sampling"
-    noise = "deviation" if plant.is_discrete else "dev. at 1 s"
-    delays = ("samples late", "s late") if plant.is_discrete else ()
-    headings = ("fault", *delays, noise, *(("worst leak",) if plant.nd else ()))
-    rows: list[tuple[str, ...]] = []
-    for i, name in enumerate(linear.fault_names):
-        late = linear.fault_delays[i]
-        delay = (str(late), number(late * plant.dt)) if plant.is_discrete else ()
-        leaks: tuple[str, ...] = ()
-        if plant.nd:
-            worst = int(gains.leaks[i].argmax())
-            leak = float(gains.leaks[i, worst])
-            leaks = (f"{number(leak)} of {plant.disturbance_names[worst]}" if leak else "none",)
-        rows.append((name, *delay, deviation(name, none), *leaks))
-    return headings, rows
 
 
 def _warnings(design: ObserverDesign, gains: FaultGains | None, steps: Followed) -> Iterator[str]:

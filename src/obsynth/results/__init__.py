@@ -1,7 +1,6 @@
 """Results: the design, its report, and files of them."""
 
-from obsynth.results.checks import Check
+from obsynth.results.checks import Check, VerificationReport
 from obsynth.results.design import Certificate, ObserverDesign
-from obsynth.results.report import VerificationReport
 
 __all__ = ["Certificate", "Check", "ObserverDesign", "VerificationReport"]

@@ -13,9 +13,9 @@ from obsynth.extensions import extension
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.results.checks import VerificationReport
 from obsynth.results.gain_set_writing import save
 from obsynth.results.plant_source import PlantSource
-from obsynth.results.report import VerificationReport
 
 if TYPE_CHECKING:
     import control
@@ -204,25 +204,14 @@ class ObserverDesign:
         import control
         import numpy as np
 
+        from obsynth.observers.recursive.gain_schedule import steady_observer
         from obsynth.observers.recursive.observer import RecursiveObserver
-        from obsynth.observers.recursive.steady_state import steady_observer
 
         observer = (
             steady_observer(self.observer).observer if isinstance(self.observer, RecursiveObserver) else self.linear[1]
         )
-        outputs = [
-            *(f"xhat[{name}]" for name in observer.state_names),
-            *(f"fhat[{name}]" for name in observer.fault_names),
-            *(f"r[{name}]" for name in observer.residual_names),
-        ]
         return control.ss(
-            observer.Az,
-            np.hstack([observer.Bu, observer.By]),
-            observer.Cz,
-            np.hstack([observer.Du, observer.Dy]),
-            observer.dt,
-            inputs=[*observer.input_names, *observer.output_names],
-            outputs=outputs,
-            states=[f"z[{i + 1}]" for i in range(observer.order)],
-            name=self.name,
-        )
+            observer.Az, np.hstack([observer.Bu, observer.By]), observer.Cz, np.hstack([observer.Du, observer.Dy]),
+            observer.dt, inputs=[*observer.input_names, *observer.output_names], outputs=list(observer.row_names),
+            states=[f"z[{i + 1}]" for i in range(observer.order)], name=self.name,
+        )  # fmt: skip

@@ -3,41 +3,44 @@
 from __future__ import annotations
 
 import errno
+import io
 import json
 import os
 import re
+import zipfile
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
+
+import numpy as np
 
 from obsynth.analysis.transformations.recovery import StateRecovery
 from obsynth.analysis.transformations.recovery_operator import RecoveryOperator
 from obsynth.errors import SpecError
 from obsynth.files.inputs import input_file, json_data, read_json
+from obsynth.numerics.arguments import is_number
+from obsynth.numerics.arrays import FloatArray
+from obsynth.results.checks import VerificationReport
 from obsynth.results.design import Certificate, ObserverDesign
-from obsynth.results.gain_set_parts import checked_parts, made
 from obsynth.results.gain_set_writing import (
+    ARRAYS,
+    DOCUMENT,
     GAIN_SET,
     KIND,
     KINDS,
+    MAXIMUM_BYTES,
     SCHEMA_VERSION,
     design_as_dict,
+    digest_of,
     gain_set_bytes,
     gain_set_digest,
     place_of,
+    plain,
+    restored,
     save,
     types_of,
 )
-from obsynth.results.plain_data import (
-    digest_of,
-    digest_of_both,
-    is_packed,
-    plain,
-    restored,
-    unpacked,
-    with_arrays,
-)
 from obsynth.results.plant_source import PlantSource
-from obsynth.results.report import VerificationReport
 
 __all__ = [
     "GAIN_SET", "SCHEMA_VERSION", "design_as_dict", "digest_of", "gain_set_bytes", "gain_set_digest", "load", "loaded",
@@ -88,6 +91,24 @@ def load(path: str | Path) -> ObserverDesign:
     return _design_of(document, arrays, str(source))
 
 
+def is_packed(start: bytes) -> bool:
+    """Whether a file that begins so is a zip."""
+    return start.startswith(b"PK\x03\x04")
+
+
+def unpacked(content: bytes) -> tuple[str, bytes]:
+    """Return the text of the document and the arrays; raise `ValueError` for any other zip."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            if sorted(archive.namelist()) != sorted([DOCUMENT, ARRAYS]):
+                raise ValueError("it does not hold the two members of a gain set")
+            if sum(item.file_size for item in archive.infolist()) > MAXIMUM_BYTES:
+                raise ValueError("it is too large")
+            return archive.read(DOCUMENT).decode("utf-8"), archive.read(ARRAYS)
+    except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, OSError) as error:
+        raise ValueError(f"it is damaged ({error})") from error
+
+
 def loaded(content: bytes, name: str = "the gain set") -> ObserverDesign:
     """Return the design in what `gain_set_bytes` returned."""
     try:
@@ -124,19 +145,25 @@ def _design_of(document: Any, arrays: bytes | None, source: str) -> ObserverDesi
         )
     body = document.get("design")
     try:
-        digest = (
-            None if not isinstance(body, dict) else digest_of(body) if arrays is None else digest_of_both(body, arrays)
-        )
-        intact = digest is not None and document.get("sha256") == digest
+        intact = isinstance(body, dict) and document.get("sha256") == digest_of(body, arrays)
     except (ValueError, RecursionError):  # a number too large for a float
         intact = False
     if not intact:
         raise SpecError(f"{source} was changed after it was written: its digest does not match.", path=source)
     try:
-        parts = checked_parts(restored(body if arrays is None else with_arrays(body, arrays)))
+        parts = _checked_parts(restored(body, None if arrays is None else _arrays_in(arrays)))
         return _design_from(parts, document["sha256"])
     except (SpecError, AttributeError, LookupError, TypeError, ValueError, ArithmeticError, RecursionError) as error:
         raise SpecError(f"{source} is incomplete: {str(error).rstrip('.')}.", path=source) from error
+
+
+def _arrays_in(content: bytes) -> dict[str, FloatArray]:
+    """Return arrays by name; raise `ValueError` where they are damaged."""
+    try:
+        with np.load(io.BytesIO(content), allow_pickle=False) as archive:
+            return {name: np.asarray(archive[name], dtype=np.float64) for name in archive.files}
+    except (zipfile.BadZipFile, EOFError, OSError) as error:
+        raise ValueError(f"its arrays are damaged ({error})") from error
 
 
 def _recovery_from(**data: Any) -> StateRecovery:
@@ -157,15 +184,81 @@ def _design_from(data: dict[str, Any], digest: str) -> ObserverDesign:
     return ObserverDesign(
         name=data["name"],
         method=data["method"],
-        plant=made("plant", plant, **data["plant"]),
+        plant=_made("plant", plant, **data["plant"]),
         options=data["options"],
         gains=data["gains"],
-        observer=made("observer", observer.from_dict, data["observer"]),
-        certificate=made("certificate", Certificate, **data["certificate"]),
+        observer=_made("observer", observer.from_dict, data["observer"]),
+        certificate=_made("certificate", Certificate, **data["certificate"]),
         solver=data["solver"],
         notes=tuple(data["notes"]),
-        recovery=None if recovery is None else made("recovery", _recovery_from, **recovery),
-        report=made("report", VerificationReport.from_dict, data["report"]),
-        source=None if data.get("source") is None else made("source", PlantSource.from_dict, data["source"]),
+        recovery=None if recovery is None else _made("recovery", _recovery_from, **recovery),
+        report=_made("report", VerificationReport.from_dict, data["report"]),
+        source=None if data.get("source") is None else _made("source", PlantSource.from_dict, data["source"]),
         file_digest=digest,
     )
+
+
+_Made = TypeVar("_Made")
+
+#: The type of every part that a gain set has, in words and as a test.
+_TYPES: Mapping[str, tuple[str, Callable[[Any], bool]]] = {
+    **dict.fromkeys(("name", "method"), ("a text", lambda value: isinstance(value, str))),
+    **dict.fromkeys(
+        ("plant", "options", "observer", "solver", "report"), ("a mapping", lambda value: isinstance(value, dict))
+    ),
+    "gains": ("a mapping to arrays of numbers", lambda value: _is_mapping_to(value, _is_array)),
+    "certificate": ("matrices and claims that are numbers", lambda value: _is_certificate(value)),
+    "notes": ("a list of texts", lambda value: _is_texts(value)),
+    "recovery": ("maps with the names of states, or nothing", lambda value: value is None or _is_recovery(value)),
+}
+
+
+def _checked_parts(body: Any) -> dict[str, Any]:
+    """Return the content of a gain set if it has every part, each of its type; raise `SpecError` for the first."""
+    if not isinstance(body, dict):
+        raise SpecError("it holds no design")
+    for name, (wanted, fits) in _TYPES.items():
+        if name not in body:
+            raise SpecError(f"{name!r} is missing")
+        if not fits(body[name]):
+            shown = f"{name} is {body[name]!r}, not" if name in ("name", "method") else f"its {name} must be"
+            raise SpecError(f"{shown} {wanted}")
+    return body
+
+
+def _made(part: str, make: Callable[..., _Made], *values: Any, **named: Any) -> _Made:
+    """Return what a part describes; what cannot be made of it is a `SpecError`."""
+    try:
+        return make(*values, **named)
+    except SpecError as error:
+        raise SpecError(f"its {part} is refused: {str(error).rstrip('.')}") from error
+    except KeyError as error:
+        raise SpecError(f"its {part} has no {error}") from error
+    except (AttributeError, IndexError, TypeError, ValueError, ArithmeticError) as error:
+        raise SpecError(f"its {part} is damaged") from error
+
+
+def _is_array(value: Any) -> bool:
+    return isinstance(value, np.ndarray)
+
+
+def _is_texts(value: Any) -> bool:
+    return isinstance(value, list) and all(isinstance(item, str) for item in value)
+
+
+def _is_mapping_to(value: Any, fits: Callable[[Any], bool]) -> bool:
+    return isinstance(value, dict) and all(fits(item) for item in value.values())
+
+
+def _is_certificate(value: Any) -> bool:
+    return (
+        isinstance(value, dict)
+        and _is_mapping_to(value.get("matrices"), _is_array)
+        and _is_mapping_to(value.get("claims"), is_number)
+    )
+
+
+def _is_recovery(value: Any) -> bool:
+    if not isinstance(value, dict) or not _is_texts(value.get("names")):
+        return False
+    return all(_is_array(item) and item.ndim == 2 for key, item in value.items() if key.startswith("from_"))

@@ -1,31 +1,27 @@
-"""Simulation of discrete linear descriptor systems of index 0 or 1.
-
-The algebraic equations are solved once, by `obsynth.eliminate_algebraic_states`; what is left is an ordinary
-recursion, and all states come back through the recovery of that elimination.
-
-Plants of index 0 or 1, many runs at once, and exact between samples.
+"""Simulation of linear descriptor systems of index 0 or 1: many runs at once, and exact between samples.
 
 The algebraic equations are solved first; what is left steps by a recursion (discrete plants) or by the matrix
-exponential over a sampling interval (continuous ones), which is exact for signals that are constant or linear between
-samples.  All arrays of runs are ``(steps, runs, signals)``.
+exponential (continuous ones), exact for signals that are constant or linear between samples.  Arrays of runs are
+``(steps, runs, signals)``.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from obsynth.analysis.transformations import StateRecovery, discretise, eliminate_algebraic_states
+from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
+from obsynth.analysis.transformations.recovery import StateRecovery
+from obsynth.analysis.transformations.sampling import discretise
 from obsynth.errors import PreconditionError, SpecError
-from obsynth.numerics.arguments import is_whole
-from obsynth.numerics.arrays import FloatArray, as_matrix
-from obsynth.numerics.holds import driven, first_order_hold
+from obsynth.numerics.arguments import real_vector, whole_number
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.continuous import driven, first_order_hold
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.simulation.scenario_signals import Drive
-from obsynth.simulation.trajectory import Trajectory
+from obsynth.simulation.trajectory import Trajectory, signal_of
 
 
 def simulate_plant(
@@ -38,62 +34,30 @@ def simulate_plant(
     w: ArrayLike | None = None,
     initial_state: ArrayLike | None = None,
 ) -> Trajectory:
-    """Simulate a discrete plant; every row satisfies its equations up to rounding.
-
-    Shapes: ``initial_state (nx,)``.
-    """
+    """Simulate a discrete plant from ``initial_state (nx,)``; every row satisfies its equations up to rounding."""
     if not plant.is_discrete:
         raise SpecError(
             "The plant is continuous: sample it first, with obsynth.discretise or transform: {sample_time: ...}.",
             path="dt",
         )
-    if not is_whole(steps) or steps < 1:
-        raise SpecError(f"steps is {steps!r}: give a whole number of samples, 1 or more.", path="steps")
+    steps = whole_number(steps, "steps", "a whole number of samples")
     sizes = {"u": plant.nu, "f": plant.nf, "d": plant.nd, "w": plant.nw}
     given = {"u": u, "f": f, "d": d, "w": w}
-    signals = {name: _signal(given[name], name, (int(steps), size)) for name, size in sizes.items()}
-    start = np.zeros(plant.nx) if initial_state is None else _initial_state(initial_state, plant.nx)
+    signals = {name: signal_of(given[name], name, (steps, size)) for name, size in sizes.items()}
+    start = np.zeros(plant.nx) if initial_state is None else real_vector(initial_state, plant.nx, "initial_state")
     elimination = eliminate_algebraic_states(plant)
     reduced, recovery = elimination.plant, elimination.recovery
     drive = _sum_of(signals, {"u": reduced.B, "f": reduced.Bf, "d": reduced.Bd, "w": reduced.Bw})
     dynamic = driven(reduced.A, dynamic_part(plant, recovery, start), drive)
     _require_finite(dynamic, "simulate fewer steps", "steps")
-    states = dynamic @ recovery.from_state.T + _sum_of(
-        signals,
-        {
-            "u": recovery.from_input, "f": recovery.from_fault, "d": recovery.from_disturbance,
-            "w": recovery.from_noise,
-        },
-    )  # fmt: skip
+    following = {"u": recovery.from_input, "f": recovery.from_fault, "d": recovery.from_disturbance}
+    states = dynamic @ recovery.from_state.T + _sum_of(signals, {**following, "w": recovery.from_noise})
     outputs = states @ plant.C.T + _sum_of(signals, {"u": plant.D, "f": plant.Df, "d": plant.Dd, "w": plant.Dw})
     inconsistency = 0.0 if initial_state is None else float(np.linalg.norm(states[0] - start))
     return Trajectory(
         states, outputs, signals["u"], signals["f"], signals["d"], signals["w"],
         time=plant.dt * np.arange(steps, dtype=np.float64), inconsistency=inconsistency,
     )  # fmt: skip
-
-
-def _signal(value: Any, name: str, shape: tuple[int, int]) -> FloatArray:
-    if value is None:
-        return np.zeros(shape)
-    array = np.asarray(value)
-    matrix = as_matrix(array.reshape(-1, 1) if array.ndim == 1 and shape[1] == 1 else array, name)
-    if matrix.shape != shape:
-        raise SpecError(
-            f"{name} is {matrix.shape[0]} by {matrix.shape[1]}, but {shape[0]} by {shape[1]} is needed "
-            "(samples by signals).",
-            path=name,
-        )
-    return matrix
-
-
-def _initial_state(value: Any, nx: int) -> FloatArray:
-    array = np.asarray(value)
-    state = as_matrix(array.reshape(1, -1) if array.ndim == 1 else array, "initial_state")
-    if state.shape != (1, nx):
-        raise SpecError(f"initial_state needs {nx} numbers, one for each state.", path="initial_state")
-    row: FloatArray = state[0]
-    return row
 
 
 def _sum_of(signals: dict[str, FloatArray], matrices: dict[str, FloatArray]) -> FloatArray:
@@ -124,11 +88,10 @@ def _require_finite(states: FloatArray, advice: str, path: str) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Stepper:
-    """A plant as what steps from sample to sample; plain arrays, so that it can go to another process.
+    """A plant that steps: ``x+ = transition x + held s + ramped (s_right - s_left) + noisy w``, s = [u; f; d].
 
-    Fields: transition, held, ramped, noisy: ``x+ = transition x + held s + ramped (s_right - s_left) + noisy w``, with
-    s = [u; f; d] and x the dynamic states; state_of, output_of: Plant states and outputs from x, s and w; start:
-    Dynamic states at the start; feedback: ``(nu, n)``: ``u = s_u - feedback x``, already inside the other matrices.
+    x are the dynamic states; ``state_of, output_of``: plant states and outputs from x, s and w; ``feedback (nu, n)``:
+    ``u = s_u - feedback x``, already inside the other matrices.
     """
 
     transition: FloatArray
@@ -143,11 +106,7 @@ class Stepper:
     def run(
         self, signals: FloatArray, differences: FloatArray, noise: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return states, outputs (free of sensor faults) and inputs' feedback part of all runs.
-
-        Shapes: ``signals (steps, runs, nu + nf + nd)``, ``differences (steps, runs, nu + nf + nd)``, ``noise (steps,
-        runs, nw)``.
-        """
+        """Return states, outputs (free of sensor faults) and inputs' feedback part of all runs."""
         drive = signals @ self.held.T + differences @ self.ramped.T + noise @ self.noisy.T
         x = driven(self.transition, self.start, drive)
         _require_finite(x, "shorten the horizon, or set stabilise", "horizon")
@@ -160,10 +119,7 @@ class Stepper:
 
 
 def make_stepper(plant: DescriptorSystem, drive: Drive, *, initial_state: FloatArray, stabilise: bool) -> Stepper:
-    """Return the stepper of ``plant`` for the sampling of ``drive``.
-
-    Shapes: ``initial_state (nx,)``.
-    """
+    """Return the stepper of ``plant`` for the sampling of ``drive``, from ``initial_state (nx,)``."""
     elimination = eliminate_algebraic_states(plant)
     reduced, recovery = elimination.plant, elimination.recovery
     start = dynamic_part(plant, recovery, initial_state)

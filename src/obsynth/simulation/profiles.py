@@ -1,4 +1,4 @@
-"""How one signal of a scenario goes with time: steps, ramps, drifts, failing actuators, noise.
+"""How one signal of a scenario goes with time: steps, ramps, drifts, failing actuators and sensors, random signals.
 
 A profile acts from the first sample at or after ``start`` until the last one before ``end``.  Between samples of a
 continuous plant it is held or linear, as its class says, so that a simulation of it is exact.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
-from typing import ClassVar, TypeAlias
+from typing import ClassVar
 
 import numpy as np
 
@@ -22,10 +22,7 @@ SAMPLE_SLACK = 1e-6
 
 @dataclass(frozen=True, kw_only=True)
 class Profile:
-    """What all profiles have.
-
-    Fields: start, end: When it acts; without end by default.
-    """
+    """What all profiles have: ``start`` and ``end``, seconds, between which they act; without end by default."""
 
     #: Whether the signal is held between samples; else it is linear there.
     held: ClassVar[bool] = True
@@ -37,8 +34,7 @@ class Profile:
             value = getattr(self, field.name)
             if value is None and field.name == "value":
                 continue
-            number = is_number(value)
-            if not number or math.isnan(value) or (math.isinf(value) and field.name != "end"):
+            if not is_number(value) or math.isnan(value) or (math.isinf(value) and field.name != "end"):
                 raise SpecError(f"{field.name} is {value!r}: give a finite number.", path=field.name)
         if not self.end > self.start:
             raise SpecError(f"end ({self.end:g} s) is not after start ({self.start:g} s).", path="end")
@@ -49,14 +45,44 @@ class Profile:
         return np.asarray((place >= self.start / dt) & (place < self.end / dt))
 
 
-def require(condition: bool, text: str, path: str) -> None:
-    """Raise `SpecError` unless the condition holds."""
+def _require(condition: bool, text: str, path: str) -> None:
     if not condition:
         raise SpecError(text, path=path)
 
 
+class Additive(Profile):
+    """A function of time, which is added to its signal."""
+
+    def at(self, time: FloatArray) -> FloatArray:
+        """Return its values.
+
+        Parameters
+        ----------
+        time : FloatArray, seconds
+            When.
+        """
+        return self._at(time)
+
+    def _at(self, time: FloatArray) -> FloatArray:
+        raise NotImplementedError
+
+    def sampled(self, steps: int, dt: float) -> tuple[FloatArray, FloatArray]:
+        """Return its values at the left and right end of each interval between samples, ``(steps,)`` each.
+
+        Parameters
+        ----------
+        steps : int
+            Number of samples.
+        dt : float, seconds
+            Between them.
+        """
+        acts, values = self.active(steps, dt), self.at(dt * np.arange(steps + 1, dtype=np.float64))
+        left = np.where(acts, values[:-1], 0.0)
+        return left, left.copy() if self.held else np.where(acts, values[1:], 0.0)
+
+
 @dataclass(frozen=True, kw_only=True)
-class Step(Profile):
+class Step(Additive):
     """A constant; on a sensor, its bias.
 
     Parameters
@@ -69,19 +95,12 @@ class Step(Profile):
 
     size: float
 
-    def at(self, time: FloatArray) -> FloatArray:
-        """Return its values.
-
-        Parameters
-        ----------
-        time : FloatArray, seconds
-            When.
-        """
+    def _at(self, time: FloatArray) -> FloatArray:
         return np.full(time.shape, float(self.size))
 
 
 @dataclass(frozen=True, kw_only=True)
-class Ramp(Profile):
+class Ramp(Additive):
     """A straight line from zero at ``start``; linear between samples.
 
     Parameters
@@ -95,19 +114,12 @@ class Ramp(Profile):
     held: ClassVar[bool] = False
     rate: float
 
-    def at(self, time: FloatArray) -> FloatArray:
-        """Return its values.
-
-        Parameters
-        ----------
-        time : FloatArray, seconds
-            When.
-        """
+    def _at(self, time: FloatArray) -> FloatArray:
         return np.asarray(self.rate * (time - self.start))
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sine(Profile):
+class Sine(Additive):
     """``amplitude sin(frequency t + phase)``, t the scenario's time; linear between samples.
 
     Parameters
@@ -127,19 +139,12 @@ class Sine(Profile):
     frequency: float
     phase: float = 0.0
 
-    def at(self, time: FloatArray) -> FloatArray:
-        """Return its values.
-
-        Parameters
-        ----------
-        time : FloatArray, seconds
-            When.
-        """
+    def _at(self, time: FloatArray) -> FloatArray:
         return np.asarray(self.amplitude * np.sin(self.frequency * time + self.phase))
 
 
 @dataclass(frozen=True, kw_only=True)
-class Drift(Profile):
+class Drift(Additive):
     """A slow approach to ``size``, with a time constant; linear between samples.
 
     Parameters
@@ -158,22 +163,15 @@ class Drift(Profile):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require(self.time_constant > 0.0, "time_constant must be greater than 0.", "time_constant")
+        _require(self.time_constant > 0.0, "time_constant must be greater than 0.", "time_constant")
 
-    def at(self, time: FloatArray) -> FloatArray:
-        """Return its values.
-
-        Parameters
-        ----------
-        time : FloatArray, seconds
-            When.
-        """
+    def _at(self, time: FloatArray) -> FloatArray:
         # Before the start it is masked; there the exponential must not overflow.
         return np.asarray(-self.size * np.expm1(-np.maximum(time - self.start, 0.0) / self.time_constant))
 
 
 @dataclass(frozen=True, kw_only=True)
-class Intermittent(Profile):
+class Intermittent(Additive):
     """A constant that comes and goes.
 
     Parameters
@@ -194,28 +192,133 @@ class Intermittent(Profile):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require(self.period > 0.0, "period must be greater than 0.", "period")
-        require(0.0 < self.duty < 1.0, "duty must lie between 0 and 1.", "duty")
+        _require(self.period > 0.0, "period must be greater than 0.", "period")
+        _require(0.0 < self.duty < 1.0, "duty must lie between 0 and 1.", "duty")
 
-    def at(self, time: FloatArray) -> FloatArray:
-        """Return its values.
-
-        Parameters
-        ----------
-        time : FloatArray, seconds
-            When.
-        """
+    def _at(self, time: FloatArray) -> FloatArray:
         turn = (time - self.start) / self.period + SAMPLE_SLACK
         return np.where(turn - np.floor(turn) < self.duty, float(self.size), 0.0)
 
 
-Additive: TypeAlias = Step | Ramp | Sine | Drift | Intermittent
-ADDITIVE = (Step, Ramp, Sine, Drift, Intermittent)
+class Failure(Profile):
+    """A failing actuator or sensor: no function of time, and a signal's only profile."""
 
 
-def sampled(profile: Additive, steps: int, dt: float) -> tuple[FloatArray, FloatArray]:
-    """Return its values at the left and right end of each interval between samples, ``(steps,)`` each."""
-    acts, time = profile.active(steps, dt), dt * np.arange(steps + 1, dtype=np.float64)
-    values = profile.at(time)
-    left = np.where(acts, values[:-1], 0.0)
-    return left, left.copy() if profile.held else np.where(acts, values[1:], 0.0)
+@dataclass(frozen=True, kw_only=True)
+class Stuck(Failure):
+    """An actuator or a sensor that stays where it is.
+
+    Parameters
+    ----------
+    value : float, optional
+        Where; by default where it is when this begins.
+    start, end : float, optional, seconds
+        When it acts.
+    """
+
+    value: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class LostEffectiveness(Failure):
+    """An actuator or a sensor that gives only a part.
+
+    Parameters
+    ----------
+    share : float
+        What is lost, between 0 (nothing) and 1 (all).
+    start, end : float, optional, seconds
+        When it acts.
+    """
+
+    share: float
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _require(0.0 < self.share <= 1.0, "share must be greater than 0 and at most 1.", "share")
+
+
+class Random(Profile):
+    """Independent samples, held between samples."""
+
+    def draw(self, rng: np.random.Generator, steps: int) -> FloatArray:
+        """Return its samples.
+
+        Parameters
+        ----------
+        rng : numpy.random.Generator
+            Source of the numbers.
+        steps : int
+            How many.
+        """
+        return self._draw(rng, steps)
+
+    def _draw(self, rng: np.random.Generator, steps: int) -> FloatArray:
+        raise NotImplementedError
+
+    def moments(self) -> tuple[float, float, float]:
+        """Return the largest absolute value (infinite if there is none), the mean and the variance."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True, kw_only=True)
+class Uniform(Random):
+    """Independent samples, uniform between two limits (a bias is their mean), held between samples.
+
+    Parameters
+    ----------
+    low, high : float
+        The limits.
+    start, end : float, optional, seconds
+        When it acts.
+    """
+
+    low: float
+    high: float
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _require(self.high > self.low, "high must be greater than low.", "high")
+
+    def _draw(self, rng: np.random.Generator, steps: int) -> FloatArray:
+        return np.asarray(rng.uniform(self.low, self.high, steps))
+
+    def moments(self) -> tuple[float, float, float]:
+        """Return the same as `Random.moments`."""
+        return max(abs(self.low), abs(self.high)), (self.low + self.high) / 2, (self.high - self.low) ** 2 / 12
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gaussian(Random):
+    """Independent normal samples, held between samples.
+
+    Parameters
+    ----------
+    deviation : float
+        Standard deviation.
+    mean : float, optional
+        Their mean.
+    start, end : float, optional, seconds
+        When it acts.
+    """
+
+    deviation: float
+    mean: float = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _require(self.deviation > 0.0, "deviation must be greater than 0.", "deviation")
+
+    def _draw(self, rng: np.random.Generator, steps: int) -> FloatArray:
+        return np.asarray(rng.normal(self.mean, self.deviation, steps))
+
+    def moments(self) -> tuple[float, float, float]:
+        """Return the same as `Random.moments`."""
+        return math.inf, self.mean, self.deviation**2
+
+
+#: The profiles by their names in a spec.
+KINDS: dict[str, type[Profile]] = {
+    "step": Step, "ramp": Ramp, "sine": Sine, "drift": Drift, "intermittent": Intermittent, "stuck": Stuck,
+    "lost-effectiveness": LostEffectiveness, "uniform": Uniform, "gaussian": Gaussian,
+}  # fmt: skip

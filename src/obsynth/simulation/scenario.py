@@ -10,17 +10,22 @@ from typing import Any
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import is_finite_number, is_whole
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.names import index_of
-from obsynth.simulation.failures import RANDOM, LostEffectiveness, Stuck
-from obsynth.simulation.profiles import ADDITIVE, Profile
+from obsynth.plants.validation import index_of
+from obsynth.simulation.profiles import KINDS, Additive, Failure, Profile, Random
 
-#: What each group of signals may do, and the names of the plant's signals it speaks of.
-_ALLOWED: dict[str, tuple[tuple[type[Profile], ...], str]] = {
-    "inputs": (ADDITIVE, "input_names"),
-    "faults": ((*ADDITIVE, Stuck, LostEffectiveness), "fault_names"),
-    "disturbances": ((*ADDITIVE, *RANDOM), "disturbance_names"),
-    "sensors": ((*ADDITIVE, Stuck, LostEffectiveness), "output_names"),
-}
+_ADDITIVE = tuple(kind for kind in KINDS.values() if issubclass(kind, Additive))
+_FAILING = tuple(kind for kind in KINDS.values() if issubclass(kind, Failure))
+_RANDOM = tuple(kind for kind in KINDS.values() if issubclass(kind, Random))
+#: What each group of signals may do.
+_ALLOWED: dict[str, tuple[type[Profile], ...]] = {
+    "inputs": _ADDITIVE, "faults": (*_ADDITIVE, *_FAILING), "disturbances": (*_ADDITIVE, *_RANDOM),
+    "sensors": (*_ADDITIVE, *_FAILING),
+}  # fmt: skip
+#: The names of a plant's signals that each group speaks of; the faults of a plant with parameters are these.
+_NAMES = {
+    "inputs": "input_names", "faults": "fault_names", "disturbances": "disturbance_names", "sensors": "output_names",
+    "sensor_noise": "output_names", "initial_state": "state_names",
+}  # fmt: skip
 Profiles = Mapping[str, Profile | Sequence[Profile]]
 
 
@@ -81,7 +86,7 @@ class Scenario:
             raise SpecError(f"noise is {self.noise!r}: give a factor, 0 or more.", path="noise")
         if not is_whole(self.seed) or self.seed < 0:
             raise SpecError(f"seed is {self.seed!r}: give a whole number, 0 or more.", path="seed")
-        for group, (kinds, _) in _ALLOWED.items():
+        for group, kinds in _ALLOWED.items():
             object.__setattr__(self, group, MappingProxyType(_checked_profiles(getattr(self, group), group, kinds)))
         for name in ("sensor_noise", "initial_state"):
             object.__setattr__(self, name, MappingProxyType(_checked_numbers(getattr(self, name), name)))
@@ -131,12 +136,12 @@ class Scenario:
             raise SpecError("The plant is continuous: the scenario needs a sample_time.", path="sample_time")
         return float(self.sample_time)
 
-    def check_names(self, plant: DescriptorSystem) -> None:
+    def check_names(self, plant: Any) -> None:
         """Raise where a name is no signal of ``plant``.
 
         Parameters
         ----------
-        plant : DescriptorSystem
+        plant : DescriptorSystem, TimeVaryingDescriptorSystem or DAEModel
             The plant that is to be simulated.
 
         Raises
@@ -144,13 +149,20 @@ class Scenario:
         SpecError
             An unknown name, with the closest ones; ``path`` says where.
         """
-        groups = {group: names for group, (_, names) in _ALLOWED.items()}
-        for group, names in {**groups, "sensor_noise": "output_names", "initial_state": "state_names"}.items():
-            for name in getattr(self, group):
+        for group, names in _NAMES.items():
+            if group == "faults" and not isinstance(plant, DescriptorSystem):
+                names = "parameter_names"
+            known = getattr(plant, names, None)
+            for name in getattr(self, group) if known is not None else ():
                 try:
-                    index_of(name, getattr(plant, names), what="The plant")
+                    index_of(name, known, what="The plant")
                 except SpecError as error:
                     raise SpecError(str(error), path=f"{group}.{name}") from None
+
+
+def profiles_of(scenario: Scenario, group: str) -> list[tuple[str, Profile]]:
+    """Return name and profile of everything that happens in a group of signals."""
+    return [(name, profile) for name, profiles in getattr(scenario, group).items() for profile in profiles]
 
 
 def _made(given: dict[str, Any]) -> Scenario:
@@ -172,7 +184,7 @@ def _checked_profiles(given: Any, group: str, kinds: tuple[type[Profile], ...]) 
                     f"{type(profile).__name__} has no meaning among the {group}: use "
                     f"{', '.join(kind.__name__ for kind in kinds)}.", path=where,
                 )  # fmt: skip
-        if len(profiles) > 1 and any(isinstance(profile, (Stuck, LostEffectiveness)) for profile in profiles):
+        if len(profiles) > 1 and any(isinstance(profile, Failure) for profile in profiles):
             raise SpecError("Stuck and LostEffectiveness must be a signal's only profile.", path=where)
         found[str(name)] = profiles
     return found

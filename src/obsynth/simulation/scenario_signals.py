@@ -11,29 +11,20 @@ from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.names import index_of
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
-from obsynth.simulation.failures import LostEffectiveness, Random, Stuck
-from obsynth.simulation.profiles import SAMPLE_SLACK, Profile, sampled
-from obsynth.simulation.scenario import Scenario
+from obsynth.plants.validation import index_of
+from obsynth.simulation.profiles import SAMPLE_SLACK, Additive, Failure, LostEffectiveness, Profile, Random, Stuck
+from obsynth.simulation.scenario import Scenario, profiles_of
 
 #: A simulation holds every sample in memory: a typing error in a horizon must not fill it.
 MAXIMUM_SAMPLES = 5_000_000
 
-#: What the names of each group are, of such a plant.
-_NAMES = {
-    "inputs": "input_names", "faults": "parameter_names", "sensors": "output_names", "sensor_noise": "output_names",
-    "initial_state": "state_names",
-}  # fmt: skip
-
 
 @dataclass(frozen=True, eq=False)
 class Drive:
-    """A scenario for one plant, in arrays, apart from its random numbers.
+    """A scenario for one plant, in arrays, apart from its random numbers: column and profile of each of those.
 
-    Fields: dt: Between samples; left, right: ``(steps, nu + nf + nd)``: [u, f, d] at both ends of each interval, linear
-    in between; random: Column of each random disturbance, and its profile; sensors: Output and profile of each sensor
-    fault; noise: Multiple of the plant's own noise; deviations: ``(ny,)``: further white noise of the sensors.
+    ``left, right (steps, nu + nf + nd)``: [u, f, d] at both ends of each interval; ``deviations (ny,)`` of more noise.
     """
 
     dt: float
@@ -74,8 +65,8 @@ class Drive:
             elif isinstance(profile, Stuck) and acts.any():
                 first = shown[int(np.argmax(acts)), :, column] if profile.value is None else profile.value
                 shown[acts, :, column] = first
-            elif not isinstance(profile, Stuck):
-                shown[:, :, column] += sampled(profile, self.steps, self.dt)[0][:, None]  # type: ignore[arg-type]
+            elif isinstance(profile, Additive):
+                shown[:, :, column] += profile.sampled(self.steps, self.dt)[0][:, None]
         return shown
 
     def first_fault(self, faults: slice) -> int | None:
@@ -89,35 +80,7 @@ class Drive:
 def resolve(plant: DescriptorSystem, scenario: Scenario) -> Drive:
     """Return the signals of ``scenario`` for ``plant``."""
     scenario.check_names(plant)
-    dt = scenario.step_of(plant)
-    steps = _steps(scenario, dt)
-    names = (*plant.input_names, *plant.fault_names, *plant.disturbance_names)
-    left, right = np.zeros((steps, len(names))), np.zeros((steps, len(names)))
-    offsets = {"inputs": 0, "faults": plant.nu, "disturbances": plant.nu + plant.nf}
-    known = {"inputs": plant.input_names, "faults": plant.fault_names, "disturbances": plant.disturbance_names}
-    random: list[tuple[int, Random]] = []
-    for group, offset in offsets.items():
-        for name, profiles in getattr(scenario, group).items():
-            column = offset + index_of(name, known[group], what=group)
-            for profile in profiles:
-                if isinstance(profile, Random):
-                    random.append((column, profile))
-                elif isinstance(profile, (Stuck, LostEffectiveness)):
-                    actuator = _actuator(plant, name, scenario)
-                    acts = profile.active(steps, dt)
-                    for ends, commanded in ((left, left), (right, right)):
-                        value = _failing(profile, commanded[:, actuator], acts, left[:, actuator])
-                        ends[:, column] += np.where(acts, value, 0.0)
-                else:
-                    for ends, values in zip((left, right), sampled(profile, steps, dt), strict=True):
-                        ends[:, column] += values
-    random.sort(key=lambda item: item[0])
-    shift = None if plant.uncertainty is None else plant.uncertainty.shift
-    if shift and shift not in scenario.inputs:
-        # What the equilibrium's motion enters through is one, always.
-        for ends in (left, right):
-            ends[:, plant.input_names.index(shift)] = 1.0
-    return Drive(dt, left, right, tuple(random), *_sensors(plant.output_names, scenario))
+    return _resolved(plant, scenario, scenario.step_of(plant), plant.fault_names, plant.disturbance_names)
 
 
 def resolve_parameters(plant: TimeVaryingDescriptorSystem | DAEModel, scenario: Scenario, *, dt: float) -> Drive:
@@ -128,30 +91,20 @@ def resolve_parameters(plant: TimeVaryingDescriptorSystem | DAEModel, scenario: 
             f"sample_time is {scenario.sample_time:g} s, but the observer has {dt:g} s: leave it out.",
             path="sample_time",
         )
-    steps = _steps(scenario, dt)
-    if isinstance(plant, TimeVaryingDescriptorSystem) and plant.horizon is not None and steps > plant.horizon:
+    drive = _resolved(plant, scenario, dt, plant.parameter_names, ())
+    if isinstance(plant, TimeVaryingDescriptorSystem) and plant.horizon is not None and drive.steps > plant.horizon:
         raise SpecError(
-            f"The scenario has {steps} samples, but the plant is known for {plant.horizon} steps: its horizon must be "
-            f"below {plant.horizon * dt:g} s.", path="horizon",
+            f"The scenario has {drive.steps} samples, but the plant is known for {plant.horizon} steps: its horizon "
+            f"must be below {plant.horizon * dt:g} s.", path="horizon",
         )  # fmt: skip
-    left = np.zeros((steps, plant.nu + plant.nq))
-    for group, offset, names in (("inputs", 0, plant.input_names), ("faults", plant.nu, plant.parameter_names)):
-        for name, profiles in getattr(scenario, group).items():
-            for profile in profiles:
-                left[:, offset + index_of(name, names, what=group)] += sampled(profile, steps, dt)[0]
-    return Drive(dt, left, left, (), *_sensors(plant.output_names, scenario))
+    return drive
 
 
 def check_parameters(plant: TimeVaryingDescriptorSystem | DAEModel, scenario: Scenario) -> None:
     """Raise where a scenario says what a plant with parameters does not have."""
-    for group, names in _NAMES.items():
-        for name in getattr(scenario, group):
-            try:
-                index_of(name, getattr(plant, names), what="The plant")
-            except SpecError as error:
-                raise SpecError(str(error), path=f"{group}.{name}") from None
-    for name, profiles in scenario.faults.items():
-        if any(isinstance(profile, (Stuck, LostEffectiveness)) for profile in profiles):  # type: ignore[union-attr]
+    scenario.check_names(plant)
+    for name, profile in profiles_of(scenario, "faults"):
+        if isinstance(profile, Failure):
             raise SpecError(
                 "A parameter neither sticks nor loses effectiveness: give a step or another profile, which is added to "
                 "it.", path=f"faults.{name}",
@@ -165,33 +118,52 @@ def check_parameters(plant: TimeVaryingDescriptorSystem | DAEModel, scenario: Sc
             raise SpecError(why, path=group)
 
 
-def _steps(scenario: Scenario, dt: float) -> int:
+def _resolved(
+    plant: DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel, scenario: Scenario, dt: float,
+    faults: tuple[str, ...], disturbances: tuple[str, ...],
+) -> Drive:  # fmt: skip
     if scenario.horizon / dt > MAXIMUM_SAMPLES:
         raise SpecError(
             f"{scenario.horizon:g} s are {scenario.horizon / dt:.3g} samples of {dt:g} s, more than "
             f"{MAXIMUM_SAMPLES:,}: shorten the horizon.", path="horizon",
         )  # fmt: skip
-    return int(scenario.horizon / dt + SAMPLE_SLACK) + 1
+    steps, before = int(scenario.horizon / dt + SAMPLE_SLACK) + 1, 0
+    groups = {"inputs": plant.input_names, "faults": faults, "disturbances": disturbances}
+    left, right = np.zeros((2, steps, sum(map(len, groups.values()))))
+    random: list[tuple[int, Random]] = []
+    for group, names in groups.items():
+        for name, profile in profiles_of(scenario, group):
+            column = before + index_of(name, names, what=group)
+            if isinstance(profile, Random):
+                random.append((column, profile))
+            elif isinstance(profile, Additive):
+                for ends, values in zip((left, right), profile.sampled(steps, dt), strict=True):
+                    ends[:, column] += values
+            elif isinstance(plant, DescriptorSystem):
+                actuator, acts = _actuator(plant, name, scenario), profile.active(steps, dt)
+                for ends in (left, right):
+                    added = _missing(profile, ends[:, actuator], acts, left[:, actuator])
+                    ends[:, column] += np.where(acts, added, 0.0)
+        before += len(names)
+    random.sort(key=lambda item: item[0])
+    uncertain = plant.uncertainty if isinstance(plant, DescriptorSystem) else None
+    if uncertain is not None and uncertain.shift and uncertain.shift not in scenario.inputs:
+        # What the equilibrium's motion enters through is one, always.
+        left[:, plant.input_names.index(uncertain.shift)] = right[:, plant.input_names.index(uncertain.shift)] = 1.0
+    sensors = [
+        (index_of(name, plant.output_names, what="sensors"), profile)
+        for name, profile in profiles_of(scenario, "sensors")
+    ]
+    deviations = np.array([scenario.sensor_noise.get(name, 0.0) for name in plant.output_names])
+    return Drive(dt, left, right, tuple(random), tuple(sensors), scenario.noise, deviations)
 
 
-def _sensors(names: tuple[str, ...], scenario: Scenario) -> tuple[tuple[tuple[int, Profile], ...], float, FloatArray]:
-    """Return faulty sensors, the multiple of the plant's noise, and further white noise ``(ny,)``."""
-    sensors = tuple(
-        (index_of(name, names, what="sensors"), profile)
-        for name, profiles in scenario.sensors.items()
-        for profile in profiles  # type: ignore[union-attr]
-    )
-    return sensors, scenario.noise, np.array([scenario.sensor_noise.get(name, 0.0) for name in names])
-
-
-def _failing(
-    profile: Stuck | LostEffectiveness, commanded: FloatArray, acts: np.ndarray, before: FloatArray
-) -> FloatArray:
+def _missing(profile: Profile, commanded: FloatArray, acts: np.ndarray, before: FloatArray) -> FloatArray:
     """Return what a failing actuator adds to the command."""
     if isinstance(profile, LostEffectiveness):
         return np.asarray(-profile.share * commanded)
-    held = before[int(np.argmax(acts))] if profile.value is None else profile.value
-    return np.asarray(held - commanded)
+    value = profile.value if isinstance(profile, Stuck) else None
+    return np.asarray((before[int(np.argmax(acts))] if value is None else value) - commanded)
 
 
 def _actuator(plant: DescriptorSystem, fault: str, scenario: Scenario) -> int:

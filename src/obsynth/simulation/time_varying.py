@@ -8,10 +8,10 @@ from numpy.typing import ArrayLike
 from obsynth.analysis.time_varying import algebraic_rows
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.arguments import real_array, real_vector, whole_number
-from obsynth.numerics.arrays import FloatArray, as_matrix
+from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import decide_rank
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
-from obsynth.simulation.trajectory import Trajectory
+from obsynth.simulation.trajectory import Trajectory, signal_of
 
 
 def simulate_time_varying(
@@ -59,18 +59,15 @@ def simulate_time_varying(
     nq, samples = plant.nq, whole_number(samples, "samples", "the length of the record")
     given = np.zeros(nq) if parameters is None else real_array(parameters, "parameters")
     whole = np.broadcast_to(given, (samples, nq)) if given.shape == (nq,) else given
-    theta = _record(whole, (samples, nq), "parameters")
-    inputs, mu = _record(u, (samples, plant.nu), "u"), _record(equation_noise, (samples, plant.ne), "equation_noise")
-    nu = _record(output_noise, (samples - 1, plant.ny), "output_noise")
+    theta = signal_of(whole, "parameters", (samples, nq))
+    inputs = signal_of(u, "u", (samples, plant.nu))
+    mu = signal_of(equation_noise, "equation_noise", (samples, plant.ne))
+    nu = signal_of(output_noise, "output_noise", (samples - 1, plant.ny))
     start = np.zeros(plant.nx) if initial_state is None else real_vector(initial_state, plant.nx, "initial_state")
     states, outputs = varying_runs(
-        plant,
-        parameters=theta,
-        inputs=inputs,
-        initial_state=start,
-        equation_noise=mu[:, None],
+        plant, parameters=theta, inputs=inputs, initial_state=start, equation_noise=mu[:, None],
         output_noise=nu[:, None],
-    )
+    )  # fmt: skip
     time = plant.dt * np.arange(samples, dtype=np.float64)
     return Trajectory(states[:, 0], outputs[:, 0], inputs, theta, time=time)
 
@@ -81,8 +78,7 @@ def varying_runs(
 ) -> tuple[FloatArray, FloatArray]:  # fmt: skip
     """Simulate many runs at once, which differ in their noise: one factorisation a step serves all of them.
 
-    Shapes: ``parameters (samples, nq)``, ``inputs (samples, nu)``, ``initial_state (nx,)``, ``equation_noise (samples,
-    runs, ne)``, ``output_noise (samples - 1, runs, ny)``.
+    ``equation_noise (samples, runs, ne)``, ``output_noise (samples - 1, runs, ny)``; the rest as one run has it.
     """
     if plant.ne != plant.nx:
         raise SpecError(f"{plant.ne} equations do not determine {plant.nx} states.", path="E")
@@ -117,10 +113,3 @@ def varying_runs(
         known = plant.Psi.at(k) @ parameters[k]
         outputs[k + 1] = (plant.C.at(k + 1) @ x + known[:, None]).T + output_noise[k]
     return states, outputs
-
-
-def _record(value: ArrayLike | None, shape: tuple[int, int], name: str) -> FloatArray:
-    array = np.zeros(shape) if value is None or 0 in shape else as_matrix(value, name)
-    if array.shape != shape:
-        raise SpecError(f"{name} has shape {array.shape}, but {shape} is needed.", path=name)
-    return array

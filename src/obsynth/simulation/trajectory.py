@@ -1,12 +1,14 @@
-"""What a plant of any kind did over a record."""
+"""What a plant of any kind did over a record, and the signals of one, checked."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.errors import SpecError
+from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 
 
 def _none() -> FloatArray:
@@ -48,3 +50,17 @@ class Trajectory:
         for item in fields(self):
             if isinstance(getattr(self, item.name), np.ndarray):
                 object.__setattr__(self, item.name, read_only(getattr(self, item.name)))
+
+
+def signal_of(value: ArrayLike | None, name: str, shape: tuple[int, int]) -> FloatArray:
+    """Return a signal over a record, zero where none is given; a list of numbers is a single one."""
+    if value is None or (0 in shape and not np.size(value)):
+        return np.zeros(shape)
+    array = np.asarray(value)
+    matrix = as_matrix(array.reshape(-1, 1) if array.ndim == 1 and shape[1] == 1 else array, name)
+    if matrix.shape != shape:
+        raise SpecError(
+            f"{name} is {matrix.shape[0]} by {matrix.shape[1]}, but {shape[0]} by {shape[1]} is needed (samples by "
+            "signals).", path=name,
+        )  # fmt: skip
+    return matrix

@@ -1,7 +1,4 @@
-"""From a spec file to a plant that a method can use.
-
-From the scenario of a document to one that can be simulated.
-"""
+"""From a spec file to a plant that a method can use, transformed as asked, and a scenario that can be simulated."""
 
 from __future__ import annotations
 
@@ -11,22 +8,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from obsynth.errors import SpecError
-from obsynth.numerics.threads import one_thread_if_small
+from obsynth.numerics.libraries import one_thread_if_small
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
-from obsynth.simulation.failures import KINDS
-from obsynth.simulation.profiles import Profile
+from obsynth.simulation.profiles import KINDS, Profile
 from obsynth.simulation.scenario import Scenario
 from obsynth.simulation.scenario_signals import check_parameters
-from obsynth.spec.checking import DocumentProblems, checked_plant, checked_spec
-from obsynth.spec.documents import read_yaml
-from obsynth.spec.plants import built_plant, linearised, matlab_plant, read_value, transformed
+from obsynth.spec.documents import DocumentProblems, checked_plant, checked_spec, read_yaml
+from obsynth.spec.plants import boxed_constants, built_plant, joined, matlab_plant, read_value
 
 if TYPE_CHECKING:
-    from obsynth.analysis.transformations import Transformation
-    from obsynth.simulation.scenario import Scenario
-    from obsynth.spec.schema import ProfileSection, ScenarioSection, TransformSection
+    from obsynth.analysis.transformations.recovery import Transformation
+    from obsynth.spec.schema import DAESection, ProfileSection, ScenarioSection, TransformSection
 
 
 _GROUPS = ("inputs", "faults", "disturbances", "sensors")
@@ -42,9 +36,10 @@ def built_scenario(
     given: dict[str, Any] = {name: getattr(section, name) for name in section.model_fields_set}
     for group in _GROUPS:
         given[group] = {
-            name: [_profile(item, f"scenario.{group}.{name}", problems) for item in _listed(value)]
+            name: [_profile(item, f"scenario.{group}.{name}", problems)
+                   for item in (value if isinstance(value, list) else [value])]
             for name, value in getattr(section, group).items()
-        }
+        }  # fmt: skip
     problems.raise_if_any()
     try:
         scenario = Scenario(**given)
@@ -57,10 +52,6 @@ def built_scenario(
         problems.add(f"scenario.{error.path}", str(error))
         problems.raise_if_any()
     return scenario
-
-
-def _listed(value: Any) -> list[ProfileSection]:
-    return value if isinstance(value, list) else [value]
 
 
 def _profile(section: ProfileSection, where: str, problems: DocumentProblems) -> Profile | None:
@@ -193,7 +184,7 @@ def spec_of(document: Mapping[str, Any], source: Path, *, plant_changes: Mapping
         asked = (reference.transform, source, "plant")
     model = plant if isinstance(plant, DAEModel) else None
     if model is not None:
-        linear = linearised(asked[0], model, section, plant_source.parent, *asked[1:])
+        linear = _linearised(asked[0], model, section, plant_source.parent, *asked[1:])
         plant = plant if linear is None else linear
     elif asked[0] is not None and asked[0].linearise is not None:
         raise SpecError(f"{asked[1]}: transform.linearise is for nonlinear plants (kind: dae): remove it.",
@@ -201,7 +192,7 @@ def spec_of(document: Mapping[str, Any], source: Path, *, plant_changes: Mapping
     if isinstance(plant, DescriptorSystem):
         if asked[0] is not None:
             with one_thread_if_small(plant.nx):
-                transformation = transformed(asked[0], plant, *asked[1:])
+                transformation = _transformed(asked[0], plant, *asked[1:])
         plant = plant if transformation is None else transformation.plant
     elif model is None and reference is not None and reference.transform is not None:
         raise SpecError(
@@ -214,6 +205,69 @@ def spec_of(document: Mapping[str, Any], source: Path, *, plant_changes: Mapping
         scenario=built_scenario(checked.scenario, plant, source), model=model,
         calibrate=None if checked.calibrate is None else checked.calibrate.model_dump(exclude_none=True),
     )  # fmt: skip
+
+
+def _linearised(
+    wanted: TransformSection | None, model: DAEModel, section: DAESection, folder: Path, source: Path, prefix: str
+) -> DescriptorSystem | None:
+    """Return the linear model of a nonlinear plant where a spec asks for one; ``folder``: of the plant's file."""
+    constants, box = boxed_constants(section, folder)
+    tolerances = {name: item for name, item in constants.items() if not isinstance(item, (int, float))}
+    if wanted is None:
+        if tolerances or section.variation is not None or section.box is not None:
+            raise SpecError(
+                f"{source}: {joined(prefix, 'constants')}: tolerances are for the linear model of a nonlinear plant: "
+                "add transform: {linearise: {at: equilibrium}}, or write numbers.", path=joined(prefix, "constants"),
+            )  # fmt: skip
+        return None
+    where = joined(prefix, "transform")
+    if wanted.linearise is None:
+        raise SpecError(
+            f"{source}: {where} is for linear plants: say where this one is linearised, such as linearise: {{at: "
+            "equilibrium}, or remove it.", path=where,
+        )  # fmt: skip
+    from obsynth.analysis.transformations.entries_in_constants import box_of_model
+    from obsynth.analysis.transformations.linearisation import linearise
+
+    arguments = wanted.linearise.model_dump(exclude_none=True)
+    tolerances |= arguments.pop("constants", {})
+    if not tolerances and (box or section.variation is not None):
+        raise SpecError(f"{source}: {joined(prefix, 'variation')} and box are for constants with tolerances: give "
+                        "some.", path=joined(prefix, "constants"))  # fmt: skip
+    try:
+        if tolerances:
+            given = arguments.get("given", {})
+            arguments["constants"] = box_of_model(model, tolerances, given, variation=section.variation, **box)
+        return linearise(model, **arguments)
+    except SpecError as error:
+        raise SpecError(f"{source}: {where}.linearise: {error}", path=f"{where}.linearise") from error
+
+
+def _transformed(
+    wanted: TransformSection | None, plant: DescriptorSystem, source: Path, prefix: str
+) -> Transformation | None:
+    """Return a plant without its algebraic states, sampled, or both, as asked; ``None`` where nothing is."""
+    if wanted is None or not (wanted.eliminate_algebraic_states or wanted.sample_time is not None):
+        return None
+    where = joined(prefix, "transform")
+    if wanted.sample_time is not None and plant.is_discrete:
+        raise SpecError(
+            f"{source}: {where}.sample_time is given, but the plant is discrete in time already "
+            f"(dt = {plant.dt:g} s): remove it, or set dt to 0.",
+            path=f"{where}.sample_time",
+        )
+    from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
+    from obsynth.analysis.transformations.sampling import discretise
+
+    try:
+        if wanted.sample_time is None:
+            return eliminate_algebraic_states(plant)
+        if not wanted.eliminate_algebraic_states:
+            return discretise(plant, wanted.sample_time)
+        reduced = eliminate_algebraic_states(plant)
+        return reduced.then(discretise(reduced.plant, wanted.sample_time))
+    except SpecError as error:
+        raise SpecError(f"{source}: {where}: {error}", path=where) from error
 
 
 def changed_document(document: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:

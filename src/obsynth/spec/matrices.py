@@ -1,8 +1,6 @@
 """Matrices in files beside a spec: ``.mtx``, ``.npz``, ``.mat`` and ``.csv``.
 
-A reader of Matrix Market files that ends in a `ValueError` for every damaged file.
-
-The one of scipy (1.17) crashes the interpreter on some truncated numbers and damaged headers.
+The reader of Matrix Market is ours, since that of scipy (1.17) crashes the interpreter on some damaged files.
 """
 
 from __future__ import annotations
@@ -71,8 +69,10 @@ def read_matrices(path: Path, *, variable: str | None = None, count: int | None 
 
 def _read_array(path: Path, *, variable: str | None, where: str, keep_sparse: bool = False) -> Any:
     """Return what a file holds as an array of any kind, or as a sparse one."""
-    market = partial(_matrix_market, keep_sparse=keep_sparse)
-    readers: dict[str, Callable[[Path], Any]] = {".mtx": market, ".csv": _comma_separated}
+    readers: dict[str, Callable[[Path], Any]] = {
+        ".mtx": partial(read_matrix_market, maximum_entries=MAXIMUM_ENTRIES, keep_sparse=keep_sparse),
+        ".csv": partial(np.loadtxt, delimiter=",", ndmin=2, encoding="utf-8-sig"),
+    }
     archives: dict[str, Callable[[Path], Mapping[str, Any]]] = {".npz": _numpy_archive, ".mat": _matlab_archive}
     suffix = path.suffix.lower()
     if suffix not in readers and suffix not in archives:
@@ -91,15 +91,6 @@ def _read_array(path: Path, *, variable: str | None, where: str, keep_sparse: bo
         raise SpecError(f"{path} cannot be read as a matrix: {_reason(error)}", path=where) from error
 
 
-def _matrix_market(path: Path, *, keep_sparse: bool) -> Any:
-
-    return read_matrix_market(path, maximum_entries=MAXIMUM_ENTRIES, keep_sparse=keep_sparse)
-
-
-def _comma_separated(path: Path) -> Any:
-    return np.loadtxt(path, delimiter=",", ndmin=2, encoding="utf-8-sig")
-
-
 def _numpy_archive(path: Path) -> dict[str, Any]:
     # Opened here, because numpy leaves a damaged file open.
     with path.open("rb") as stream:
@@ -111,16 +102,9 @@ def _numpy_archive(path: Path) -> dict[str, Any]:
 
 
 def _matlab_archive(path: Path) -> dict[str, Any]:
-    from scipy.io import loadmat
-    from scipy.io.matlab import MatReadError
+    from obsynth.importing.model_files import mat_arrays
 
-    try:
-        content = loadmat(path)
-    except NotImplementedError as error:
-        raise ValueError("MATLAB 7.3 files are not supported, save it with '-v7'") from error
-    except MatReadError as error:
-        raise ValueError(str(error)) from error
-    return {name: value for name, value in content.items() if not name.startswith("__")}
+    return mat_arrays(path)
 
 
 def _selected(content: Mapping[str, Any], variable: str | None, path: Path, where: str) -> Any:
@@ -210,8 +194,9 @@ def _from_array(tokens: list[str], rows: int, columns: int, symmetry: str) -> Fl
     column, row = np.triu_indices(rows, 1 if symmetry == "skew-symmetric" else 0)
     _require_count(len(values), len(row))
     matrix = np.zeros((rows, columns))
+    (row, column), values = _both_triangles([row, column], values, symmetry)
     matrix[row, column] = values
-    return _mirrored(matrix, symmetry)
+    return matrix
 
 
 def _from_coordinates(tokens: list[str], size: tuple[int, int, int], field: str, symmetry: str, *, sparse: bool) -> Any:
@@ -226,13 +211,10 @@ def _from_coordinates(tokens: list[str], size: tuple[int, int, int], field: str,
     if symmetry != "general":
         positions, values = _both_triangles(positions, values, symmetry)
     # Entries that are given twice are added, as the format says.
-    if sparse:
-        from scipy.sparse import coo_array
+    from scipy.sparse import coo_array
 
-        return coo_array((values, (positions[0], positions[1])), shape=(rows, columns)).tocsr()
-    matrix = np.zeros((rows, columns))
-    np.add.at(matrix, (positions[0], positions[1]), values)
-    return matrix
+    found = coo_array((values, (positions[0], positions[1])), shape=(rows, columns))
+    return found.tocsr() if sparse else found.toarray()
 
 
 def _both_triangles(positions: list[Any], values: FloatArray, symmetry: str) -> tuple[list[Any], FloatArray]:
@@ -243,13 +225,6 @@ def _both_triangles(positions: list[Any], values: FloatArray, symmetry: str) -> 
     sign, below = (-1.0 if symmetry == "skew-symmetric" else 1.0), row > column
     mirrored = [np.concatenate([row, column[below]]), np.concatenate([column, row[below]])]
     return mirrored, np.concatenate([values, sign * values[below]])
-
-
-def _mirrored(lower: FloatArray, symmetry: str) -> FloatArray:
-    if np.any(np.triu(lower, 1)):
-        raise ValueError(f"it is {symmetry}, but has entries above the diagonal")
-    sign = -1.0 if symmetry == "skew-symmetric" else 1.0
-    return lower + sign * np.tril(lower, -1).T
 
 
 def _numbers(tokens: list[str]) -> FloatArray:

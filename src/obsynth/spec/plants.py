@@ -1,32 +1,30 @@
-"""From the sections of a checked document to plants."""
+"""From the sections of a checked document to plants, with the tolerances of their constants."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
 from obsynth.errors import SpecError
+from obsynth.files.inputs import read_json
 from obsynth.plants.constants import constant_of
 from obsynth.plants.dae.model import DAEModel
-from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.descriptor import MATRICES, SIGNAL_NAMES, DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
-from obsynth.spec.checking import DocumentProblems
-from obsynth.spec.constants import boxed_constants, with_constants
-from obsynth.spec.documents import read_names
+from obsynth.plants.uncertain_system import with_expressions
+from obsynth.plants.uncertainty import UNCERTAIN_MATRICES, Entry
+from obsynth.plants.validation import index_of
+from obsynth.spec.documents import DocumentProblems, read_names
 from obsynth.spec.matrices import read_matrices, read_matrix
-from obsynth.spec.schema import PlantSection
 
 if TYPE_CHECKING:
-    from obsynth.analysis.transformations import Transformation
-    from obsynth.spec.schema import DAESection, PlantReference, PlantSection, TimeVaryingSection, TransformSection
+    from obsynth.spec.schema import DAESection, EntrySection, PlantReference, PlantSection, TimeVaryingSection
 
 
 _Plant = TypeVar("_Plant", DescriptorSystem, TimeVaryingDescriptorSystem, DAEModel)
-_MATRICES = ("E", "A", "B", "C", "D", "Bf", "Df", "Bd", "Dd", "Bw", "Dw")
-_NAME_LISTS = ("state_names", "input_names", "output_names", "fault_names", "disturbance_names", "noise_names")
 # Equations picked by name also name the signal that enters there.
 _SIGNAL_OF_PICK = {"B": "input_names", "Bw": "noise_names"}
 _LABELS = ("operating_point", "scales", "units")
@@ -49,21 +47,22 @@ def _placed(make: Callable[[], _Plant], source: Path, prefix: str) -> _Plant:
     except SpecError as error:
         raise SpecError(
             f"{source}: {error.args[0].splitlines()[0]}",
-            path=_joined(prefix, error.path or ""),
+            path=joined(prefix, error.path or ""),
             problems=error.problems,
         ) from error
 
 
-def _joined(prefix: str, name: str) -> str:
+def joined(prefix: str, name: str) -> str:
+    """Return the path of an entry of a document."""
     return f"{prefix}.{name}" if prefix and name else prefix or name
 
 
 def read_value(value: Any, folder: Path, where: str, problems: DocumentProblems, *, keep_sparse: bool = False) -> Any:
     """Return rows as an array, files read, picks as lists of names, sections as mappings, all else as it is."""
-    if isinstance(value, list) and any(isinstance(entry, str) for row in value for entry in _listed(row)):
-        return value
     if isinstance(value, list):
-        return np.array(value, dtype=np.float64) if all(isinstance(row, list) for row in value) else value
+        entries = (entry for row in value for entry in (row if isinstance(row, list) else [row]))
+        is_matrix = all(isinstance(row, list) for row in value) and not any(isinstance(entry, str) for entry in entries)
+        return np.array(value, dtype=np.float64) if is_matrix else value
     if hasattr(value, "file"):
         path = folder / value.file
         try:
@@ -90,19 +89,27 @@ def _names(value: Any, folder: Path, where: str, problems: DocumentProblems) -> 
     return None if value is None else list(value)
 
 
-def _listed(row: Any) -> list[Any]:
-    return row if isinstance(row, list) else [row]
+def _read(
+    section: Any, source: Path, prefix: str, kept: Sequence[str], matrices: Sequence[str], names: Sequence[str],
+    *, keep_sparse: bool = False,
+) -> dict[str, Any]:  # fmt: skip
+    """Return entries of a section by name: some as they are, matrices and lists of names with their files read."""
+    problems = DocumentProblems(source, what="plant" if not prefix else "spec")
+    arguments: dict[str, Any] = {name: getattr(section, name) for name in kept}
+    for name in matrices:
+        arguments[name] = read_value(
+            getattr(section, name), source.parent, joined(prefix, name), problems, keep_sparse=keep_sparse
+        )
+    for name in names:
+        arguments[name] = _names(getattr(section, name), source.parent, joined(prefix, name), problems)
+    problems.raise_if_any()
+    return arguments
 
 
 def _varying_plant(section: TimeVaryingSection, source: Path, prefix: str) -> TimeVaryingDescriptorSystem:
-    problems = DocumentProblems(source, what="plant" if not prefix else "spec")
-    kept = ("dt", "horizon", "constants", "operating_point", "scales", "units")
-    arguments: dict[str, Any] = {name: getattr(section, name) for name in kept}
-    for name in ("E", "A", "B", "C", "Phi", "Psi"):
-        arguments[name] = read_value(getattr(section, name), source.parent, _joined(prefix, name), problems)
-    for name in ("state_names", "input_names", "output_names", "parameter_names"):
-        arguments[name] = _names(getattr(section, name), source.parent, _joined(prefix, name), problems)
-    problems.raise_if_any()
+    names = ("state_names", "input_names", "output_names", "parameter_names")
+    arguments = _read(section, source, prefix, ("dt", "horizon", "constants", *_LABELS),
+                      ("E", "A", "B", "C", "Phi", "Psi"), names)  # fmt: skip
     return _placed(lambda: TimeVaryingDescriptorSystem(**arguments), source, prefix)
 
 
@@ -123,18 +130,11 @@ def _nonlinear_plant(section: DAESection, source: Path, prefix: str) -> DAEModel
 
 
 def _invariant_plant(section: PlantSection, source: Path, prefix: str) -> DescriptorSystem:
-    problems = DocumentProblems(source, what="plant" if not prefix else "spec")
-    arguments: dict[str, Any] = {name: getattr(section, name) for name in ("dt", "sensor_noise", *_LABELS)}
-    for name in _MATRICES:
-        value, where = getattr(section, name), _joined(prefix, name)
-        arguments[name] = read_value(value, source.parent, where, problems, keep_sparse=True)
-    for name in _NAME_LISTS:
-        arguments[name] = _names(getattr(section, name), source.parent, _joined(prefix, name), problems)
-    problems.raise_if_any()
+    arguments = _read(section, source, prefix, ("dt", "sensor_noise", *_LABELS), MATRICES, SIGNAL_NAMES,
+                      keep_sparse=True)  # fmt: skip
     for matrix, names in _SIGNAL_OF_PICK.items():
         if isinstance(arguments[matrix], list) and arguments[names] is None:
             arguments[names] = arguments[matrix]
-
     return _placed(lambda: with_constants(DescriptorSystem(**arguments), section, source.parent), source, prefix)
 
 
@@ -142,7 +142,7 @@ def matlab_plant(reference: PlantReference, spec: Path) -> DescriptorSystem | No
     """Return the plant in a ``.mat`` file that a spec refers to; `None` where it refers to another kind of file."""
     arguments = reference.model_dump(exclude={"file", "transform"}, exclude_none=True)
     if Path(reference.file).suffix.lower() == ".mat":
-        from obsynth.importing.matlab import from_matlab
+        from obsynth.importing.model_files import from_matlab
 
         return _placed(lambda: from_matlab(spec.parent / reference.file, **arguments), spec, "plant")
     if arguments:
@@ -153,63 +153,79 @@ def matlab_plant(reference: PlantReference, spec: Path) -> DescriptorSystem | No
     return None
 
 
-def linearised(
-    wanted: TransformSection | None, model: DAEModel, section: DAESection, folder: Path, source: Path, prefix: str
-) -> DescriptorSystem | None:
-    """Return the linear model of a nonlinear plant where a spec asks for one; ``folder``: of the plant's file."""
+#: Signals that name the columns of a matrix; rows are equations (states) or outputs.
+_COLUMNS = {"B": "input_names", "D": "input_names", "Bf": "fault_names", "Df": "fault_names",
+            "Bd": "disturbance_names", "Dd": "disturbance_names"}  # fmt: skip
+_OUTPUT_ROWS = ("C", "D", "Df", "Dd")
+
+
+def with_constants(plant: DescriptorSystem, section: PlantSection, folder: Path) -> DescriptorSystem:
+    """Return the plant of a section with its constants and tolerances, if it has any."""
+    if section.constants is None and section.tolerance is None:
+        for name in ("entries", "variation", "box"):
+            if getattr(section, name) is not None:
+                raise SpecError(f"{name} is for a plant with constants: give constants, or tolerance.", path=name)
+        return plant
     constants, box = boxed_constants(section, folder)
-    tolerances = {name: item for name, item in constants.items() if not isinstance(item, (int, float))}
-    if wanted is None:
-        if tolerances or section.variation is not None or section.box is not None:
-            raise SpecError(
-                f"{source}: {_joined(prefix, 'constants')}: tolerances are for the linear model of a nonlinear plant: "
-                "add transform: {linearise: {at: equilibrium}}, or write numbers.", path=_joined(prefix, "constants"),
-            )  # fmt: skip
-        return None
-    where = _joined(prefix, "transform")
-    if wanted.linearise is None:
+    entries = {name: [_entry(plant, name, item) for item in found] for name, found in (section.entries or {}).items()}
+    return with_expressions(
+        plant, entries, constants, tolerance=section.tolerance, variation=section.variation, **box
+    )  # fmt: skip
+
+
+def boxed_constants(section: PlantSection | DAESection, folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the constants of a section, those of a calibration put in place, and where their box comes from."""
+    constants = dict(section.constants or {})
+    if section.box is None:
+        return constants, {}
+    box = section.box.model_dump(exclude_none=True)
+    file = box.pop("file", None)
+    if file is None:
+        if "source" not in box:
+            raise SpecError("box has no source: give source (stated, set-membership or calibrated), or the file of a "
+                            "calibration.", path="box.source")  # fmt: skip
+        return constants, box
+    if box:
+        raise SpecError("box has a file, which says where it comes from: remove source, level and digest.", path="box")
+    found = read_json(folder / file, where="box.file")
+    if not isinstance(found, dict) or found.get("kind") != "obsynth calibration":
+        raise SpecError(f"{file} is no calibration: write one by obsynth calibrate --out {file}.", path="box.file")
+    try:
+        calibrated = {name: _calibrated(name, item) for name, item in found["constants"].items()}
+        options = {"source": "calibrated", "level": found["level"], "digest": found["log"]["digest"]}
+    except (KeyError, TypeError, AttributeError) as error:
+        raise SpecError(f"{file} is damaged: it has no {error}.", path="box.file") from error
+    for name in calibrated:
+        stated = constants.get(name)
+        if isinstance(stated, dict) and ("range" in stated or "tolerance" in stated):
+            raise SpecError(f"{name!r} has a tolerance here, and one in {file}: remove one of them.",
+                            path=f"constants.{name}")  # fmt: skip
+    return constants | calibrated, {**options, "calibrated": tuple(calibrated)}
+
+
+def _calibrated(name: str, item: Mapping[str, Any]) -> dict[str, Any]:
+    """Return nominal value, range and unit of a calibrated constant."""
+    if item["open"]:
         raise SpecError(
-            f"{source}: {where} is for linear plants: say where this one is linearised, such as linearise: {{at: "
-            "equilibrium}, or remove it.", path=where,
+            f"The box of {name!r} has an open {item['open'][0]} side: the log bounds nothing there. State its range, "
+            "or take a log that moves it.", path=f"constants.{name}",
         )  # fmt: skip
-    from obsynth.analysis.transformations.entries_in_constants import box_of_model
-    from obsynth.analysis.transformations.linearisation import linearise
-
-    arguments = wanted.linearise.model_dump(exclude_none=True)
-    tolerances |= arguments.pop("constants", {})
-    if not tolerances and (box or section.variation is not None):
-        raise SpecError(f"{source}: {_joined(prefix, 'variation')} and box are for constants with tolerances: give "
-                        "some.", path=_joined(prefix, "constants"))  # fmt: skip
-    try:
-        if tolerances:
-            given = arguments.get("given", {})
-            arguments["constants"] = box_of_model(model, tolerances, given, variation=section.variation, **box)
-        return linearise(model, **arguments)
-    except SpecError as error:
-        raise SpecError(f"{source}: {where}.linearise: {error}", path=f"{where}.linearise") from error
+    return {"nominal": item["nominal"], "range": list(item["range"]), "unit": item["unit"]}
 
 
-def transformed(
-    wanted: TransformSection | None, plant: DescriptorSystem, source: Path, prefix: str
-) -> Transformation | None:
-    """Return a plant without its algebraic states, sampled, or both, as asked; ``None`` where nothing is."""
-    if wanted is None or not (wanted.eliminate_algebraic_states or wanted.sample_time is not None):
-        return None
-    where = _joined(prefix, "transform")
-    if wanted.sample_time is not None and plant.is_discrete:
+def _entry(plant: DescriptorSystem, matrix: str, item: EntrySection) -> Entry:
+    if matrix not in UNCERTAIN_MATRICES:
         raise SpecError(
-            f"{source}: {where}.sample_time is given, but the plant is discrete in time already "
-            f"(dt = {plant.dt:g} s): remove it, or set dt to 0.",
-            path=f"{where}.sample_time",
+            f"{matrix!r} holds no constants: {', '.join(UNCERTAIN_MATRICES)} may.", path=f"entries.{matrix}"
         )
-    from obsynth.analysis.transformations import discretise, eliminate_algebraic_states
-
-    try:
-        if wanted.sample_time is None:
-            return eliminate_algebraic_states(plant)
-        if not wanted.eliminate_algebraic_states:
-            return discretise(plant, wanted.sample_time)
-        reduced = eliminate_algebraic_states(plant)
-        return reduced.then(discretise(reduced.plant, wanted.sample_time))
-    except SpecError as error:
-        raise SpecError(f"{source}: {where}: {error}", path=where) from error
+    rows = plant.output_names if matrix in _OUTPUT_ROWS else plant.state_names
+    columns = getattr(plant, _COLUMNS.get(matrix, "state_names"))
+    places = []
+    for key, value, names in (("row", item.row, rows), ("column", item.column, columns)):
+        if isinstance(value, str):
+            places.append(index_of(value, names, what=f"entries.{matrix}"))
+        elif 1 <= value <= len(names):
+            places.append(value - 1)
+        else:
+            raise SpecError(f"{matrix} has no {key} {value}: it has {len(names)}.", path=f"entries.{matrix}")
+    return places[0], places[1], str(item.value)

@@ -7,15 +7,16 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import Discriminator, Field, Tag, model_validator
+from pydantic import Discriminator, Field, Tag, create_model, model_validator
 
+from obsynth.numerics.arguments import Positive
 from obsynth.plants.uncertainty import UNCERTAIN_MATRICES, expressions_in
 from obsynth.spec.schema_values import (
     EquationMatrix,
     Matrix,
     Names,
     OutputMatrix,
-    Positive,
+    Range,
     Section,
     SensorMatrix,
     Text,
@@ -41,7 +42,7 @@ class LineariseSection(Section):
 
     at: Literal["equilibrium", "point"] | None = None
     given: dict[Text, float] | None = None
-    free: list[Text] | dict[Text, Annotated[list[float], Field(min_length=2, max_length=2)]] | None = None
+    free: list[Text] | dict[Text, Range] | None = None
     faults: list[Text] | None = None
     disturbances: list[Text] | None = None
     start: dict[Text, float] | None = None
@@ -125,12 +126,6 @@ class PlantSection(Section):
         return found
 
 
-class PlantDocument(PlantSection):
-    """A plant in a file of its own."""
-
-    schema_version: int
-
-
 class TimeVaryingSection(Section):
     """A plant whose matrices change with k: rows of numbers and expressions."""
 
@@ -153,12 +148,6 @@ class TimeVaryingSection(Section):
     units: dict[Text, str] | None = None
 
 
-class TimeVaryingDocument(TimeVaryingSection):
-    """A time-varying plant in a file of its own."""
-
-    schema_version: int
-
-
 class DAESection(Section):
     """A nonlinear plant: equations and outputs as texts, signals with nominal values and units."""
 
@@ -176,10 +165,11 @@ class DAESection(Section):
     transform: TransformSection | None = None
 
 
-class DAEDocument(DAESection):
-    """A nonlinear plant in a file of its own."""
-
-    schema_version: int
+#: A plant in a file of its own, by its kind.
+PLANT_DOCUMENTS: dict[object, type[Section]] = {
+    kind: create_model(f"{section.__name__}Document", __base__=section, schema_version=(int, ...))
+    for kind, section in ((None, PlantSection), ("time-varying", TimeVaryingSection), ("dae", DAESection))
+}
 
 
 class PlantReference(Section):
@@ -256,9 +246,6 @@ class ScenarioSection(Section):
     initial_state: dict[Text, float] = Field(default_factory=dict)
     observer_state: Annotated[list[float], Field(min_length=1)] | None = None
     stabilise: bool = False
-
-
-Range = Annotated[list[float], Field(min_length=2, max_length=2)]
 
 
 class CalibrateSection(Section):

@@ -1,4 +1,4 @@
-"""What a spec takes for numbers, names and matrices: written out, in a file, by name, or changing with k.
+"""What a spec takes for values: numbers, names and matrices, written out or in a file; and the options of every method.
 
 This module imports pydantic, so it is imported only when a spec is read.
 """
@@ -6,7 +6,10 @@ This module imports pydantic, so it is imported only when a spec is read.
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, get_args
+from collections.abc import Mapping
+from dataclasses import fields
+from functools import cache
+from typing import Annotated, Any, get_args, get_origin
 
 from pydantic import (
     BaseModel,
@@ -18,11 +21,14 @@ from pydantic import (
     ValidationError,
     ValidatorFunctionWrapHandler,
     WrapValidator,
+    create_model,
 )
 from pydantic_core import InitErrorDetails, PydanticCustomError
 from pydantic_core.core_schema import ErrorType
 
-from obsynth.numerics.arguments import is_number
+from obsynth.methods.method_spec import option_types
+from obsynth.methods.registry import method_spec
+from obsynth.numerics.arguments import Count, NonNegative, OpenUnitInterval, Positive, WrittenAs, is_number
 
 # Tags of unions appear in the locations of pydantic's errors; the bracket marks them for removal.
 _ROWS, _FILE, _PICK, _LIST, _STACK, _NUMBER = "<rows>", "<file>", "<pick>", "<list>", "<stack>", "<number>"
@@ -60,12 +66,8 @@ def _kind_of_matrix(value: Any) -> str:
     return _ROWS
 
 
-def _kind_without_pick(value: Any) -> str:
-    return _FILE if isinstance(value, dict) else _ROWS
-
-
-def _kind_of_names(value: Any) -> str:
-    return _FILE if isinstance(value, dict) else _LIST
+def _file_or(other: str) -> Discriminator:
+    return Discriminator(lambda value: _FILE if isinstance(value, dict) else other)
 
 
 class Section(BaseModel):
@@ -75,7 +77,7 @@ class Section(BaseModel):
 
 
 Text = Annotated[str, Field(min_length=1)]
-Positive = Annotated[float, Field(gt=0.0)]
+Range = Annotated[list[float], Field(min_length=2, max_length=2)]
 Rows = Annotated[
     list[Annotated[list[float], Field(min_length=1)]], Field(min_length=1), WrapValidator(_rectangular), Tag(_ROWS)
 ]
@@ -106,7 +108,7 @@ class StatePick(Section):
     states: Annotated[list[Text], Field(min_length=1)]
 
 
-Matrix = Annotated[Rows | Annotated[MatrixFile, Tag(_FILE)], Discriminator(_kind_without_pick)]
+Matrix = Annotated[Rows | Annotated[MatrixFile, Tag(_FILE)], _file_or(_ROWS)]
 EquationMatrix = Annotated[
     Rows | Annotated[MatrixFile, Tag(_FILE)] | Annotated[StatePick, Tag(_PICK)], Discriminator(_kind_of_matrix)
 ]
@@ -115,7 +117,7 @@ OutputMatrix = Annotated[
 ]
 #: A fault, or an unknown input, on each sensor that is named.
 SensorMatrix = OutputMatrix
-Names = Annotated[Annotated[list[Text], Tag(_LIST)] | Annotated[NamesFile, Tag(_FILE)], Discriminator(_kind_of_names)]
+Names = Annotated[Annotated[list[Text], Tag(_LIST)] | Annotated[NamesFile, Tag(_FILE)], _file_or(_LIST)]
 
 
 def _number_or_expression(value: Any) -> Any:
@@ -165,17 +167,77 @@ def _kind_of_varying(value: Any) -> str:
 VaryingMatrix = Annotated[VaryingRows | Stack | Annotated[VaryingFile, Tag(_FILE)], Discriminator(_kind_of_varying)]
 
 
-def _kind_of_covariance(value: Any) -> str:
-    return _NUMBER if is_number(value) else _kind_without_pick(value)
-
-
-def _kind_of_varying_covariance(value: Any) -> str:
-    return _NUMBER if is_number(value) else _kind_of_varying(value)
-
-
 Variance = Annotated[float, Field(ge=0.0), Tag(_NUMBER)]
 #: One variance stands for that multiple of the identity, as from Python.
-Covariance = Annotated[Variance | Rows | Annotated[MatrixFile, Tag(_FILE)], Discriminator(_kind_of_covariance)]
-VaryingCovariance = Annotated[
-    Variance | VaryingRows | Stack | Annotated[VaryingFile, Tag(_FILE)], Discriminator(_kind_of_varying_covariance)
+Covariance = Annotated[
+    Variance | Rows | Annotated[MatrixFile, Tag(_FILE)],
+    Discriminator(lambda value: _NUMBER if is_number(value) else _FILE if isinstance(value, dict) else _ROWS),
 ]
+VaryingCovariance = Annotated[
+    Variance | VaryingRows | Stack | Annotated[VaryingFile, Tag(_FILE)],
+    Discriminator(lambda value: _NUMBER if is_number(value) else _kind_of_varying(value)),
+]
+
+
+class PoleRegion(Section):
+    """Where all movable poles must lie."""
+
+    decay: NonNegative | None = None
+    radius: Positive | None = None
+    damping: OpenUnitInterval | None = None
+
+
+class NoiseSection(Section):
+    """What the Kalman filter believes."""
+
+    measurement: Positive | list[Positive] | dict[Text, Positive] | None = None
+    process: Positive = 1.0
+    fault: Positive = 1.0
+
+
+class SensorTimes(Section):
+    """When a sensor is sampled, and how late its values are, in rows."""
+
+    every: Count = 1
+    delay: Annotated[int, Field(ge=0)] = 0
+
+
+#: What a document may write for an option that is no plain number, text or truth.
+KINDS: Mapping[str, Any] = {
+    "matrix": Matrix | None,
+    "covariance": Covariance | None,
+    "varying covariance": VaryingCovariance | None,
+    "vector": list[float] | None,
+    "pair": Range | None,
+    "positive numbers": Annotated[list[Positive], Field(min_length=1)] | None,
+    "text": Text | None,
+    "texts": Annotated[list[Text], Field(min_length=1)] | None,
+    "fault model": Text | dict[Text, Any],
+    "fault sets": Text | list[Text | list[Text]] | None,
+    "poles": list[float | Range] | None,
+    "pole sets": list[float | Range] | list[list[float | Range]] | None,
+    "pole region": PoleRegion | None,
+    "noise weights": NoiseSection | None,
+    "named covariance": Positive | Matrix | dict[Text, NonNegative] | None,
+    "named numbers": Positive | dict[Text, Positive] | None,
+    "named vector": list[float] | dict[Text, float] | None,
+    "named pairs": dict[Text, Range] | None,
+    "sensor times": dict[Text, SensorTimes] | None,
+}
+
+
+@cache
+def options_schema(method: str) -> type[Section]:
+    """Return the schema of the options of a method, made from its typed options."""
+    options: Any = method_spec(method).options_type
+    types, defaults = option_types(options), {field.name: field.default for field in fields(options)}
+    entries: dict[str, Any] = {name: (_in_document(kind), defaults[name]) for name, kind in types.items()}
+    return create_model(options.__name__, __base__=Section, __doc__=options.__doc__, **entries)
+
+
+def _in_document(kind: Any) -> Any:
+    if get_origin(kind) is Annotated:
+        marks = [mark for mark in get_args(kind)[1:] if isinstance(mark, WrittenAs)]
+        if marks:
+            return KINDS[marks[0].kind]
+    return kind

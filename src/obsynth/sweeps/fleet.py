@@ -18,7 +18,7 @@ from obsynth.errors import ObsynthError, SpecError
 from obsynth.files.inputs import input_file
 from obsynth.files.outputs import write_atomically
 from obsynth.results.gain_sets import load
-from obsynth.sweeps.kept_work import STATUSES, ResultTable, all_of, carried_out, file_stem, folder_for, result_in
+from obsynth.sweeps.work import STATUSES, ResultTable, all_of, carried_out, file_stem, folder_for, result_in
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -23,8 +23,18 @@ from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import gain_set_bytes, load, loaded, plain, restored
 from obsynth.spec.loader import spec_of
-from obsynth.sweeps.cases import SweepCase, plant_cases, spec_cases
-from obsynth.sweeps.kept_work import STATUSES, ResultTable, all_of, carried_out, file_stem, folder_for, result_in
+from obsynth.sweeps.work import (
+    STATUSES,
+    ResultTable,
+    SweepCase,
+    all_of,
+    carried_out,
+    file_stem,
+    folder_for,
+    plant_cases,
+    result_in,
+    spec_cases,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -148,9 +158,9 @@ class Sweep(ResultTable):
         SpecError
             No design claims that, or no such parameter was varied.
         """
-        from obsynth.plotting.sweep import plot_sweep
+        from obsynth.plotting.trade_off import plot_sweep
 
-        return plot_sweep(self, claim, parameter=parameter)
+        return plot_sweep(self.results, claim, parameter=parameter)
 
 
 def sweep(

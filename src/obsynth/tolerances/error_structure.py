@@ -1,17 +1,15 @@
-r"""How an uncertain plant drives the error of a fixed observer: robust.md, sections 1, 2 and 8.
+"""How an uncertain plant drives the error of a fixed observer: robust.md, sections 1, 2 and 8.
 
-With ``eps = z - T E(q) x`` and the plant ``E x+ = A x + B u + Bd d``, ``y = C x + D u + Dd d``,
+With ``eps = z - T E(q) x`` and the plant ``E x+ = A x + B u + Bd d``, ``y = C x + D u + Dd d``, on every trajectory
 
     eps+ = Az eps + (Az T E + By C - T A) x + (Bu + By D - T B) u + (By Dd - T Bd) d
     xhat - x = Cx eps + (Cx T E + Dyx C + T0x A - I) x + ...      (fault estimates, residuals: without I)
 
-on every trajectory.  At the nominal plant the brackets vanish; over the box they are affine with remainders, and are
-driven by ``x = xhat - e``: by a signal that is known, and by the error itself through the channels collected here.
+The brackets vanish at the nominal plant; over the box ``x = xhat - e`` drives them: what is known, and the error.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,10 +31,10 @@ ROUNDING_SHARE = 1e-9
 class ErrorStructure:
     """The error system over a box, in rows ``[eps; e; outputs]`` (nz, n, no) and columns of the state and the inputs.
 
-    ``state, inputs``: what multiplies x and u; ``disturbances``: what multiplies d, each within its bound.  What is
-    uncertain acts through channels, ``|c e|`` of a row c: those of constants first (``owner`` says whose), then one for
-    each state with a remainder; rows after the first ``single`` share one channel, the largest of them.  ``effects
-    (nz + n + no, m)`` is what a channel does.  ``reading`` takes xhat (and fhat) from the rows of the observer.
+    What is uncertain acts through channels, ``|c e|`` of a row c: those of constants first (``owner`` says whose), then
+    one for each state with a remainder; rows after the first ``single`` share one channel, the largest of them.
+    ``effects (nz + n + no, m)`` is what a channel does.  ``reading`` takes xhat (and fhat) from the rows of the
+    observer.
     """
 
     Az: FloatArray
@@ -77,33 +75,25 @@ class ErrorStructure:
             return sizes
         return np.concatenate([sizes[: self.single], sizes[self.single :].max(axis=0, keepdims=True)])
 
-    def effect(self, rows: slice) -> FloatArray:
-        """Return rows of the effects."""
-        return self.effects[rows]
-
 
 def error_structure(
     observer: LinearObserver, affine: AffinePlant, tracking: Tracking, bounds: FloatArray, noise_bound: float, *,
     faults: bool = False, states: bool = False, reading: FloatArray | None = None, varying: bool = False,
 ) -> ErrorStructure:  # fmt: skip
-    """Return the error system of an observer over a box.
+    """Return the error system of an observer over a box; ``bounds (nd,)``, ``noise_bound`` in standard deviations.
 
-    With ``reading (n, states of the observer)`` the observer is that of a continuous design on samples: its identities
-    need not hold there, and what they miss counts as one more constant, the last one, whose value is known.
-
-    ``bounds (nd,)`` of the disturbances; ``noise_bound`` in standard deviations.  With ``faults``, faults are unknown
-    signals that are estimated like states, and the outputs are the errors of their estimates; else there is no fault,
-    and the outputs are fault estimates and residuals, or (``states``) the errors of the state estimates.  What a fault
-    that is estimated one sample late did in a plant whose constants are ``varying``, it did with those of that sample:
-    they count as further constants, after all others.
+    With ``faults`` these are unknown signals that are estimated like states, and outputs are the errors of their
+    estimates; else there is no fault, and outputs are fault estimates and residuals, or (``states``) errors of the
+    state estimates. ``reading (n, states of the observer)``: that of a continuous design on samples; what its
+    identities miss counts as one more constant, the last, of known value.  What a fault that is estimated late did in a
+    plant whose constants are ``varying``, it did with those of that sample: they count as further constants.
     """
     plant, count = affine.plant, affine.count
     t, t0 = tracking
     nz, n, nf = observer.order, plant.nx, plant.nf if faults else 0
     shown = observer.fault_rows
     back = 2.0 * np.eye(n) - affine.coordinates
-    watched = list(range(shown.start, shown.stop if faults else len(observer.Cz)))
-    watched = list(range(n)) if states else watched
+    watched = list(range(n) if states else range(shown.start, shown.stop if faults else len(observer.Cz)))
     picked = np.zeros((n + nf + len(watched), len(observer.Cz)))
     picked[:n, observer.state_rows] = back if reading is None else reading
     if faults:
@@ -124,7 +114,7 @@ def error_structure(
     sizes = _sizes(observer, affine, t, c, dy)
     offsets = affine.offsets
     if reading is None:
-        require_identities(state, known, sizes, offsets)
+        _require_identities(state, known, sizes, offsets)
     noise = AffineMatrix.exact(plant.Bw, count), AffineMatrix.exact(plant.Dw, count)
     disturbances = affine_block([[stacked(affine.Bd, affine.Dd), stacked(*noise)]])
     if faults:
@@ -158,13 +148,14 @@ def error_structure(
 
 def _sizes(observer: LinearObserver, affine: AffinePlant, t: FloatArray, c: FloatArray, dy: FloatArray) -> FloatArray:
     """Return the size of the terms of each row, ``(rows, 1)``."""
-    te, absolute = np.abs(t) @ affine.E.magnitude, np.abs
+    absolute = np.abs
+    te = absolute(t) @ affine.E.magnitude
     top = absolute(observer.Az) @ te + absolute(observer.By) @ affine.C.magnitude + absolute(t) @ affine.A.magnitude
     low = absolute(c) @ te + absolute(dy) @ affine.C.magnitude
     return np.asarray(np.vstack([top, low]).max(axis=1, initial=np.finfo(np.float64).tiny)[:, None])
 
 
-def require_identities(state: AffineMatrix, known: AffineMatrix, sizes: FloatArray, offsets: FloatArray) -> None:
+def _require_identities(state: AffineMatrix, known: AffineMatrix, sizes: FloatArray, offsets: FloatArray) -> None:
     """Raise `PreconditionError` where the observer is none of the nominal plant."""
     missed = float(np.max(_missed(state, offsets) / sizes, initial=0.0))
     missed = max(missed, float(np.max(_missed(known, offsets) / (sizes + known.magnitude), initial=0.0)))
@@ -176,10 +167,7 @@ def require_identities(state: AffineMatrix, known: AffineMatrix, sizes: FloatArr
 
 
 def _missed(matrix: AffineMatrix, offsets: FloatArray) -> FloatArray:
-    """Return what a matrix that should vanish at the nominal plant is there, at least.
-
-    Its affine part does not vanish there in a box whose middle is elsewhere: the remainder makes up for that.
-    """
+    """Return what a matrix that should vanish at the nominal plant is there, at least; its remainder may explain it."""
     return np.maximum(np.abs(matrix.at(offsets)) - matrix.radius, 0.0) if offsets.any() else np.abs(matrix.center)
 
 
@@ -188,8 +176,7 @@ def _fault_columns(
 ) -> AffineMatrix:
     """Return the columns of faults as signals that are estimated, each at its delay: robust.md, correction 8.1.
 
-    A fault that is estimated one sample late counts as a state of the sample after it: what it does to eps by then is
-    taken out of eps.
+    What a fault that is estimated one sample late does to eps by then is taken out of eps.
     """
     nz, nf = observer.order, direct.shape[1]
     target = np.zeros((nz + len(c), nf))
@@ -240,8 +227,7 @@ def _about_nominal(matrix: AffineMatrix, offsets: FloatArray) -> tuple[FloatArra
 def _channels(parts: FloatArray, offsets: FloatArray) -> tuple[FloatArray, FloatArray, list[int], FloatArray]:
     """Return rows c, effects b (times how far a constant is from nominal) and owners; and what was left out."""
     rows_count, n = parts.shape[1:]
-    rows, effects, owner = [np.zeros((0, n))], [np.zeros((rows_count, 0))], []
-    left = np.zeros((rows_count, n))
+    rows, effects, owner, left = [np.zeros((0, n))], [np.zeros((rows_count, 0))], [], np.zeros((rows_count, n))
     for i, part in enumerate(parts):
         columns = np.flatnonzero(np.abs(part).sum(axis=0) > 0.0)
         if not len(columns):
@@ -272,9 +258,3 @@ def _remainder_channels(rest: FloatArray, sizes: FloatArray) -> tuple[FloatArray
         rows.append(np.eye(n)[small] * share[small][:, None])
         effects.append(rounded_up((rest[:, small] / share[small]).sum(axis=1, keepdims=True), len(small) + 2))
     return np.vstack(rows), len(large), np.hstack(effects)
-
-
-def owners(structure: ErrorStructure) -> Sequence[int]:
-    """Return whose each channel is; remainders belong to nobody, which is the number of constants."""
-    count = structure.state.count
-    return [*structure.owner, *([count] * (structure.channels - len(structure.owner)))]

@@ -1,55 +1,61 @@
-"""The plant at one point of its box, transformed as the plant itself was."""
+"""Single plants of a box: their matrices, their gains at its vertices; and which constants act where a fault does."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from obsynth.analysis.transformations import discretise
 from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
+from obsynth.analysis.transformations.sampling import discretise
+from obsynth.analysis.transformations.uncertain_plant import AffinePlant, untouched_states
+from obsynth.analysis.zeros import zeros_of_system
+from obsynth.errors import ObsynthError
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.ranks import DIRECTION_SHARE
+from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.constants import ConstantsBox
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.uncertainty import SAMPLED, UNCERTAIN_MATRICES, Uncertainty, matrices_of
+from obsynth.results.design import ObserverDesign
+from obsynth.tolerances.tracking import Tracking
 
 
 def plant_at(plant: DescriptorSystem, values: Mapping[str, float]) -> DescriptorSystem:
-    """Return the plant for values of its constants: no family of matrices, but the one with these numbers.
-
-    Noise is that of the plant itself.
-    """
+    """Return the plant for values of its constants: no family of matrices, and with the noise of the plant itself."""
     uncertain = plant.uncertainty
     if uncertain is None:
         return plant
     if uncertain.written is None:
-        return _with_shift(plant.replace(**uncertain.filled(matrices_of(plant), values)), uncertain)
-    matrices = uncertain.filled(uncertain.written, values)
-    arguments: dict[str, Any] = {**matrices, "dt": 0.0 if is_sampled(uncertain.steps) else plant.dt}
-    bare = DescriptorSystem(**arguments)
-    for kind, size in uncertain.steps:
-        bare = discretise(bare, size).plant if kind == SAMPLED else eliminate_algebraic_states(bare).plant
-    return _with_shift(plant.replace(**{name: getattr(bare, name) for name in UNCERTAIN_MATRICES}), uncertain)
-
-
-def _with_shift(plant: DescriptorSystem, uncertain: Uncertainty) -> DescriptorSystem:
-    """Return a plant that is no family any more, but knows which of its inputs is one in every row, if one is."""
-    return (
-        plant.replace(uncertainty=Uncertainty(ConstantsBox({}), {}, shift=uncertain.shift))
-        if uncertain.shift
-        else plant
-    )
+        found = plant.replace(**uncertain.filled(matrices_of(plant), values))
+    else:
+        bare = _written_at(plant, uncertain, values)
+        for kind, size in uncertain.steps:
+            bare = discretise(bare, size).plant if kind == SAMPLED else eliminate_algebraic_states(bare).plant
+        found = plant.replace(**{name: getattr(bare, name) for name in UNCERTAIN_MATRICES})
+    # It is no family any more, but knows which of its inputs is one in every row, if one is.
+    shift = uncertain.shift
+    return found.replace(uncertainty=Uncertainty(ConstantsBox({}), {}, shift=shift)) if shift else found
 
 
 def moving_at(plant: DescriptorSystem, values: Mapping[str, float]) -> FloatArray:
     """Return A of the plant for values of its constants, reduced, and before it was sampled."""
-    uncertain = plant.uncertainty
-    if uncertain is None:
-        return eliminate_algebraic_states(plant).plant.A
-    matrices = uncertain.filled(matrices_of(plant) if uncertain.written is None else uncertain.written, values)
-    arguments: dict[str, Any] = {**matrices, "dt": 0.0 if is_sampled(uncertain.steps) else plant.dt}
-    return eliminate_algebraic_states(DescriptorSystem(**arguments)).plant.A
+    bare = plant if plant.uncertainty is None else _written_at(plant, plant.uncertainty, values)
+    return eliminate_algebraic_states(bare).plant.A
+
+
+def _written_at(plant: DescriptorSystem, uncertain: Uncertainty, values: Mapping[str, float]) -> DescriptorSystem:
+    """Return the plant as it was written, for values of its constants."""
+    matrices: dict[str, Any] = uncertain.filled(written_matrices(plant, uncertain), values)
+    return DescriptorSystem(**matrices, dt=0.0 if is_sampled(uncertain.steps) else plant.dt)
+
+
+def written_matrices(plant: DescriptorSystem, uncertain: Uncertainty) -> Mapping[str, FloatArray]:
+    """Return the matrices whose entries are written in the constants: the plant's own, unless it was transformed."""
+    return matrices_of(plant) if uncertain.written is None else uncertain.written
 
 
 def is_sampled(steps: tuple[tuple[str, float], ...]) -> bool:
@@ -64,3 +70,132 @@ def drawn_points(count: int, runs: int, seed: int, *, vertices: float = 0.5) -> 
     chosen = generator.random(runs) < vertices
     points[chosen] = generator.choice([-1.0, 1.0], (int(chosen.sum()), count))
     return points
+
+
+#: Vertices beyond this number are drawn at random.
+MOST_VERTICES = 32
+#: Samples over which the gain at a vertex is summed up, at most.
+MOST_GAIN_SAMPLES = 5_000
+#: What is left of a response when its sum ends.
+_GAIN_LEFT = 1e-6
+
+
+def vertex_gains(
+    design: ObserverDesign, plant: DescriptorSystem, affine: AffinePlant, tracking: Tracking
+) -> dict[str, float]:
+    """Return the largest peak (l1) gain from disturbances at the vertices; some drawn where there are too many."""
+    observer, uncertain = design.linear[1], plant.uncertainty
+    labels = labels_of(observer)
+    if uncertain is None or not plant.nd or not labels:
+        return {}
+    count = len(uncertain.box.names)
+    corners = np.array(list(itertools.product((-1.0, 1.0), repeat=count))) if 2**count <= MOST_VERTICES else (
+        np.random.default_rng(0).choice([-1.0, 1.0], (MOST_VERTICES, count))
+    )  # fmt: skip
+    followed, basis = tracking.T, affine.coordinates
+    nominal = eliminate_algebraic_states(plant)
+    if plant.nx != nominal.plant.nx:
+        followed, basis = followed @ plant.E @ nominal.recovery.from_state, np.eye(nominal.plant.nx)
+    worst = np.zeros(len(labels))
+    for corner in corners:
+        at = plant_at(plant, uncertain.box.values(corner))
+        worst = np.maximum(worst, _peak_gain(observer, at, followed, basis))
+    return {label: float(gain) for label, gain in zip(labels, worst, strict=True)}
+
+
+def _peak_gain(
+    observer: LinearObserver, plant: DescriptorSystem, followed: FloatArray, basis: FloatArray
+) -> FloatArray:
+    """Return the peak gain of plant and error in series, without states that reach neither error nor outputs."""
+    shown = slice(observer.fault_rows.start, len(observer.Cz))
+    try:
+        smooth = eliminate_algebraic_states(plant).plant
+    except ObsynthError:
+        return np.full(len(observer.Cz) - observer.fault_rows.start, np.inf)
+    back = 2.0 * np.eye(len(basis)) - basis
+    into = observer.Az @ followed + observer.By @ smooth.C - followed @ smooth.A
+    through = observer.Cz[shown] @ followed + observer.Dy[shown] @ smooth.C
+    seen = np.vstack([back @ smooth.A, into, through])
+    terms = np.concatenate([
+        np.abs(back @ smooth.A).sum(axis=1),
+        (np.abs(observer.Az @ followed) + np.abs(observer.By) @ np.abs(smooth.C)).sum(axis=1),
+        (np.abs(observer.Cz[shown]) @ np.abs(followed) + np.abs(observer.Dy[shown]) @ np.abs(smooth.C)).sum(axis=1),
+    ])  # fmt: skip
+    apart = untouched_states(seen @ basis, terms)
+    kept = [i for i in range(smooth.nx) if i not in apart]
+    nx, nz = len(kept), observer.order
+    a = np.block([[(back @ smooth.A @ basis)[np.ix_(kept, kept)], np.zeros((nx, nz))],
+                  [(into @ basis)[:, kept], observer.Az]])  # fmt: skip
+    b = np.vstack([(back @ smooth.Bd)[kept], observer.By @ smooth.Dd - followed @ smooth.Bd])
+    c = np.hstack([(through @ basis)[:, kept], observer.Cz[shown]])
+    total = np.abs(observer.Dy[shown] @ smooth.Dd).sum(axis=1)
+    if np.max(np.abs(np.linalg.eigvals(a)), initial=0.0) >= 1.0:
+        return np.full(len(c), np.inf)
+    column, size = b, float(np.abs(b).max(initial=0.0))
+    for _ in range(MOST_GAIN_SAMPLES):
+        total = total + np.abs(c @ column).sum(axis=1)
+        column = a @ column
+        if np.abs(column).max(initial=0.0) <= _GAIN_LEFT * size:
+            break
+    return np.asarray(total)
+
+
+def labels_of(observer: LinearObserver) -> tuple[str, ...]:
+    """Return what fault estimates and residuals are called in tables."""
+    return (*(f"fhat[{name}]" for name in observer.fault_names), *(f"r[{name}]" for name in observer.residual_names))
+
+
+@dataclass(frozen=True)
+class Told:
+    """Whether a constant acts where a fault does (``shares``), or an observer that it does not disturb exists."""
+
+    shares: bool
+    separable: bool
+    reason: str = ""
+
+
+def told_from_faults(plant: DescriptorSystem) -> dict[str, Told]:
+    """Return the verdict for each constant with a tolerance, from the plant as written; empty without faults.
+
+    Decoupling exists where the pencil from faults and directions to outputs has full normal rank and stable zeros.
+    """
+    uncertain = plant.uncertainty
+    if uncertain is None or not plant.nf:
+        return {}
+    numbers = written_matrices(plant, uncertain)
+    affine = uncertain.affine(numbers, uncertain.box)
+    dt = 0.0 if is_sampled(uncertain.steps) else plant.dt
+    found = {}
+    for i, name in enumerate(uncertain.box.names):
+        # What multiplies the same signal stands in one column: derivative of the state, state, u, f, d.
+        zero = np.zeros((plant.ny, len(numbers["A"])))
+        above = [affine[key].parts[i] for key in ("E", "A", "B", "Bf", "Bd")]
+        below = [zero, *(affine[key].parts[i] for key in ("C", "D", "Df", "Dd"))]
+        found[name] = _told(numbers, _range(np.vstack([np.hstack(above), np.hstack(below)])), dt)
+    return found
+
+
+def _told(matrices: Mapping[str, FloatArray], directions: FloatArray, dt: float) -> Told:
+    faults = np.vstack([matrices["Bf"], matrices["Df"]])
+    both = np.hstack([faults / np.linalg.norm(faults, axis=0), directions])
+    if np.linalg.matrix_rank(both, tol=DIRECTION_SHARE) < both.shape[1]:
+        return Told(True, False, "it acts where a fault acts")
+    n = len(matrices["A"])
+    try:
+        zeros, _, outside = zeros_of_system(
+            matrices["E"], matrices["A"], np.hstack([matrices["Bf"], directions[:n]]), matrices["C"],
+            np.hstack([matrices["Df"], directions[n:]]), dt=dt,
+        )  # fmt: skip
+    except ObsynthError as error:
+        return Told(False, False, str(error))
+    if zeros.normal_rank < n + both.shape[1]:
+        return Told(False, False, "the outputs are too few to tell it from the faults")
+    if outside:
+        return Told(False, False, f"there is a zero at {complex(outside[0].value):.4g}, which is not stable")
+    return Told(False, True)
+
+
+def _range(effects: FloatArray) -> FloatArray:
+    """Return unit columns that span what a constant does to equations and outputs."""
+    left, values, _ = np.linalg.svd(effects)
+    return np.asarray(left[:, : int(np.sum(values > DIRECTION_SHARE * max(values[0], np.finfo(np.float64).tiny)))])

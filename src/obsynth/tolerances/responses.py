@@ -1,7 +1,4 @@
-"""Responses of an observer's error to its channels: finite sums with a proved tail, and the loop that they close.
-
-The loop that an error closes through the tolerances: largest common tolerance, and whom to blame.
-"""
+"""Responses of an observer's error to its channels: finite sums with a proved tail, and the loop that they close."""
 
 from __future__ import annotations
 
@@ -14,7 +11,7 @@ from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.proofs.balls import gamma
 from obsynth.proofs.contraction import inverse_bound, positive_vector, spectral_radius_bound
-from obsynth.tolerances.error_structure import ErrorStructure, owners
+from obsynth.tolerances.error_structure import ErrorStructure
 
 #: A ring of L samples is long enough when ``|Az^L|`` is proved to contract this much.
 CONTRACTION = 1e-2
@@ -26,9 +23,8 @@ OUTWARD = 1.0 + 1e-12
 
 @dataclass(frozen=True, eq=False)
 class Responses:
-    """What channels do, sample by sample.
+    """What channels do: ``kernels (L, m, m + no + nz)`` to channels, outputs and eps, j + 1 samples later.
 
-    ``kernels (L, m, m + no + nz)``: what channel i adds to the channels, the outputs and eps, j + 1 samples later;
     ``same (m, m)`` and ``direct (no, m)``: at the same sample.  ``powers (L + 1, nz, nz)`` of Az.  What is older than L
     samples goes on through bounds of eps: ``tail_channels, tail_outputs, tail_eps``.
     """
@@ -51,9 +47,7 @@ class Responses:
     @property
     def loop(self) -> FloatArray:
         """``H``: what all channels at all times add to the channels, the tail included; see `loop_radius`."""
-        m = len(self.same)
-        no = len(self.direct)
-        gathered = self.kernels.sum(axis=0)
+        m, no, gathered = len(self.same), len(self.direct), self.kernels.sum(axis=0)
         older = self.tail_channels @ (self.repeated @ gathered[:, m + no :].T)
         return np.asarray((self.same + gathered[:, :m].T + older) * OUTWARD)
 
@@ -74,7 +68,7 @@ class Responses:
 
 
 def power_rounding(left: FloatArray, powers: FloatArray) -> FloatArray:
-    """Return a bound of what rounding of the computed powers changes in ``left Az^j``, the same for all j.
+    """Return a bound of what rounding of the computed powers changes in ``left Az^j``, for all j.
 
     With ``P(j+1) = Az P(j) + F(j)`` as computed, ``Az^j - P(j)`` is the sum of ``Az^(j-1-i) F(i)``.
     """
@@ -98,14 +92,12 @@ def ring_length(az: FloatArray) -> int:
 
 
 def responses_of(structure: ErrorStructure) -> Responses:
-    """Return the responses of an error system; the ring is as long as it must be, or as asked."""
-    az = structure.Az
-    wanted = ring_length(az)
-    nz = len(az)
-    powers = np.empty((wanted + 1, nz, nz))
+    """Return the responses of an error system; the ring is as long as it must be."""
+    az, nz = structure.Az, len(structure.Az)
+    powers = np.empty((ring_length(az) + 1, nz, nz))
     powers[0] = np.eye(nz)
-    for j in range(wanted):
-        powers[j + 1] = az @ powers[j]
+    for j in range(1, len(powers)):
+        powers[j] = az @ powers[j - 1]
     _, state, outputs = structure.rows
     rows = structure.channel_rows @ structure.Cx
     kernels = np.concatenate([_sizes(structure, rows, powers[:-1]), _plain(structure, structure.Co, powers[:-1]),
@@ -204,32 +196,33 @@ def largest_factor(structure_at: Callable[[float], ErrorStructure], radius: floa
 def blame(responses: Responses) -> FloatArray:
     """Return the share of each constant in the loop's radius, remainders last: its Perron vectors."""
     left, right = _perron(responses.loop)
-    count = responses.structure.state.count
-    shares = np.zeros(count + 1)
-    np.add.at(shares, list(owners(responses.structure)), (left @ responses.loop) * right)
-    total = float(shares.sum())
-    return np.asarray(shares / total if total > 0.0 else shares)
+    structure = responses.structure
+    shares = np.zeros(structure.state.count + 1)
+    owner = np.full(structure.channels, structure.state.count)
+    owner[: len(structure.owner)] = structure.owner
+    np.add.at(shares, owner, (left @ responses.loop) * right)
+    return _as_shares(shares)
 
 
 def blamed_rows(responses: Responses, tracking: FloatArray, parts: tuple[FloatArray, ...]) -> FloatArray:
-    """Return the share of each row of the plant ``(nx,)`` in the loop, by what the constants put into it.
-
-    ``parts``: affine parts ``(p, nx, n)`` of E and A.
-    """
+    """Return the share of each row of the plant ``(nx,)`` in the loop; ``parts (p, nx, n)`` of E and A."""
     structure = responses.structure
     left, right = _perron(responses.loop)
-    own = len(structure.owner)
     into = structure.seen(responses.gain(structure.channel_rows @ structure.Cx, tracking))
     shares = np.zeros(tracking.shape[1])
     for i in sorted(set(structure.owner)):
-        chosen = [j for j in range(own) if structure.owner[j] == i]
+        chosen = np.flatnonzero(np.equal(structure.owner, i))
         rows = structure.channel_rows[chosen]
         for part in parts:
             width = part[i].shape[1]
             effect = np.abs(part[i] @ np.linalg.pinv(rows[:, :width]))
             shares += (left @ into) * (effect @ right[chosen])
-    total = float(shares.sum())
-    return np.asarray(shares / total if total > 0.0 else shares)
+    return _as_shares(shares)
+
+
+def _as_shares(sizes: FloatArray) -> FloatArray:
+    total = float(sizes.sum())
+    return np.asarray(sizes / total if total > 0.0 else sizes)
 
 
 def _perron(loop: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -21,12 +21,18 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.constants import ConstantsBox
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.uncertain_system import uncertain_system
-from obsynth.plants.uncertainty import Uncertainty, matrices_of
+from obsynth.plants.uncertainty import Uncertainty
 from obsynth.proofs.affine import AffineMatrix
 from obsynth.results.design import ObserverDesign
-from obsynth.tolerances.directions import told_from_faults
 from obsynth.tolerances.error_structure import ErrorStructure, error_structure
-from obsynth.tolerances.exact_plant import is_sampled, moving_at
+from obsynth.tolerances.exact_plant import (
+    is_sampled,
+    labels_of,
+    moving_at,
+    told_from_faults,
+    vertex_gains,
+    written_matrices,
+)
 from obsynth.tolerances.responses import (
     Responses,
     blame,
@@ -39,7 +45,6 @@ from obsynth.tolerances.responses import (
 from obsynth.tolerances.result import EXACT_MODEL, Robustness
 from obsynth.tolerances.subdivision import MOST_BOXES, BoxVerdict, index_one_on_box, proved_stable, values_at
 from obsynth.tolerances.tracking import Tracking, tracking_of
-from obsynth.tolerances.vertex_gains import labels_of, vertex_gains
 
 #: Boxes for stability after which it is left open where most states are algebraic: each elimination takes long.
 FEW_BOXES = 40
@@ -54,16 +59,14 @@ def with_tolerances(design: ObserverDesign, constants: Any) -> tuple[ObserverDes
     if constants is None:
         return design, plant
     if isinstance(constants, DescriptorSystem):
-        return _of_plant(design, constants)
-    if isinstance(constants, Uncertainty):
-        constants = constants.box
-    changed = uncertain_system(plant, constants)
+        changed = _with_tolerances_of(plant, constants)
+    else:
+        changed = uncertain_system(plant, constants.box if isinstance(constants, Uncertainty) else constants)
     return design.replace(plant=changed), changed
 
 
-def _of_plant(design: ObserverDesign, given: DescriptorSystem) -> tuple[ObserverDesign, DescriptorSystem]:
-    """Take the tolerances of a plant that is the design's own but for these."""
-    plant, _ = design.linear
+def _with_tolerances_of(plant: DescriptorSystem, given: DescriptorSystem) -> DescriptorSystem:
+    """Return a plant with the tolerances of one that is the same but for these."""
     same = all(
         getattr(plant, name).shape == getattr(given, name).shape
         and np.allclose(getattr(plant, name), getattr(given, name), rtol=SAME_ENTRY, atol=SAME_ZERO)
@@ -72,16 +75,14 @@ def _of_plant(design: ObserverDesign, given: DescriptorSystem) -> tuple[Observer
     own, other = plant.uncertainty, given.uncertainty
     if not same and own is not None and other is not None and own.written is not None:
         # The design is for a plant that was made from the one that is given.
-        before = matrices_of(given) if other.written is None else other.written
+        before = written_matrices(given, other)
         if dict(own.entries) == dict(other.entries) and all(
             np.array_equal(own.written[name], before[name]) for name in own.written
         ):
-            changed = plant.replace(uncertainty=own.with_box(other.box))
-            return design.replace(plant=changed), changed
+            return plant.replace(uncertainty=own.with_box(other.box))
     if not same or plant.dt != given.dt:
         raise SpecError("constants is another plant than the design's: its nominal matrices differ.", path="constants")
-    changed = plant.replace(uncertainty=given.uncertainty)
-    return design.replace(plant=changed), changed
+    return plant.replace(uncertainty=given.uncertainty)
 
 
 def robustness(
@@ -131,21 +132,21 @@ def robustness(
         stable, untouched = _stability(plant, affine)
     except PreconditionError as error:
         affine, stable, untouched, reason = None, BoxVerdict("open", 0), (), str(error)
-    breaking = _values(uncertain.box, regular if regular.verdict == "refuted" else stable)
+    broken = regular if regular.verdict == "refuted" else stable
+    breaking = {} if broken.at is None or broken.verdict != "refuted" else values_at(uncertain.box, broken.at)
     radius = factor = None
-    shares, rows, gains, errors = (
-        dict[str, float](),
-        dict[str, float](),
-        dict[str, float](),
-        dict[str, dict[str, float]](),
-    )
+    shares, rows, gains, errors = dict[str, float](), dict[str, float](), dict[str, float](), dict[str, Any]()
     if affine is not None:
         try:
             told("loop over the box")
             tracking = tracking_of(design, affine)
             responses = responses_of(structure_of(design, affine, tracking))
             radius = loop_radius(responses)
-            reason = _no_bound(responses)
+            try:
+                same_sample_inverse(responses)
+            except PreconditionError as error:
+                # No bound holds at a sample, and all else is told.
+                reason = str(error)
             told("largest tolerances")
             factor = largest_factor(
                 lambda t: structure_of(design, affine_plant(plant, uncertain.box.scaled(t)), tracking), radius
@@ -184,30 +185,12 @@ def structure_of(
     )  # fmt: skip
 
 
-def _no_bound(responses: Responses) -> str:
-    """Return why no bound holds at a sample, or nothing where one does."""
-    try:
-        same_sample_inverse(responses)
-    except PreconditionError as error:
-        return str(error)
-    return ""
-
-
 def _named(names: tuple[str, ...], shares: FloatArray) -> dict[str, float]:
     return {name: float(share) for name, share in zip(names, shares, strict=True)}
 
 
-def _values(box: ConstantsBox, found: BoxVerdict) -> dict[str, float]:
-    if found.at is None or found.verdict != "refuted":
-        return {}
-    return values_at(box, found.at)
-
-
 def _stability(plant: DescriptorSystem, affine: AffinePlant) -> tuple[BoxVerdict, tuple[complex, ...]]:
-    """Return whether the plant is stable on the box, but for modes that no constant touches, and these.
-
-    For E that must be inverted, after that.
-    """
+    """Return whether the plant is stable on the box, but for modes that no constant touches, and these."""
     box, uncertain = affine.box, plant.uncertainty
     sampled = uncertain is not None and is_sampled(uncertain.steps)
     discrete = plant.is_discrete and not sampled
@@ -232,14 +215,10 @@ def _stability(plant: DescriptorSystem, affine: AffinePlant) -> tuple[BoxVerdict
     def build(lower: FloatArray, upper: FloatArray) -> AffineMatrix:
         return moving_family(plant, box.part(lower, upper), basis)[rest, rest]
 
-    most = MOST_BOXES if plant.uncertainty is None or len(basis) * 4 > len(_written(plant)) else FEW_BOXES
+    most = (
+        MOST_BOXES if uncertain is None or len(basis) * 4 > len(written_matrices(plant, uncertain)["A"]) else FEW_BOXES
+    )
     return proved_stable(build, affine.count, exactly, discrete=discrete, most=most), lasting
-
-
-def _written(plant: DescriptorSystem) -> FloatArray:
-    """Return A as written."""
-    uncertain = plant.uncertainty
-    return plant.A if uncertain is None or uncertain.written is None else np.asarray(uncertain.written["A"])
 
 
 def _error_per_unit(design: ObserverDesign, responses: Responses, affine: AffinePlant) -> dict[str, dict[str, float]]:

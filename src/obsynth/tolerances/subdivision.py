@@ -1,12 +1,12 @@
 """Statements about every matrix in a box, by cutting the box until each part is proved, or one point refutes it.
 
-Whether a plant is regular and of index 1 (or 0) at every point of its box: robust.md, 1 and correction 8.5.
+Whether a plant is stable, and of index 1 (or 0), at every point of its box: robust.md, 1 and correction 8.5.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -17,8 +17,8 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import ROUNDED_ZERO
 from obsynth.plants.constants import ConstantsBox
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.uncertainty import Uncertainty, matrices_of
 from obsynth.proofs.affine import AffineMatrix, affine_block, affine_inverse
+from obsynth.tolerances.exact_plant import written_matrices
 
 #: Boxes after which a statement is left open.
 MOST_BOXES = 150
@@ -49,8 +49,7 @@ def subdivided(
 ) -> BoxVerdict:  # fmt: skip
     """Cut the box along the constant that matters most.
 
-    ``build`` gives the matrix over a part of the box, made anew, so that its remainder shrinks with the part;
-    ``exact_at`` the true matrix at a point.
+    ``build``: the matrix over a part, made anew so that its remainder shrinks; ``exact_at``: the true one at a point.
     """
     if count <= MOST_VERTEX_CONSTANTS:
         for corner in itertools.product((-1.0, 1.0), repeat=count):
@@ -65,7 +64,10 @@ def subdivided(
         middle = (lower + upper) / 2.0
         if fails_at(exact_at(middle)):
             return BoxVerdict("refuted", done, middle)
-        part = _built(build, lower, upper)
+        try:
+            part = build(lower, upper)
+        except PreconditionError:
+            part = None
         if part is not None and holds_on(part):
             continue
         sizes = upper - lower if part is None else np.abs(part.parts).sum(axis=(1, 2))
@@ -76,13 +78,6 @@ def subdivided(
         cut_above[i], cut_below[i] = middle[i], middle[i]
         todo += [(lower, cut_below), (cut_above, upper)]
     return BoxVerdict("proved", done)
-
-
-def _built(build: Build, lower: FloatArray, upper: FloatArray) -> AffineMatrix | None:
-    try:
-        return build(lower, upper)
-    except PreconditionError:
-        return None
 
 
 def values_at(box: ConstantsBox, q: FloatArray) -> dict[str, float]:
@@ -107,22 +102,17 @@ def proved_regular(build: Build, count: int, exact_at: Callable[[FloatArray], Fl
         return True
 
     def singular(point: FloatArray) -> bool:
-        found = np.linalg.slogdet(point)[0]
-        return bool(found * sign <= 0.0)
+        return bool(np.linalg.slogdet(point)[0] * sign <= 0.0)
 
     found = subdivided(build, count, invertible, singular, exact_at)
     if found.at is None:
         return found
-    return BoxVerdict(found.verdict, found.boxes, _nearest_failure(found.at, lambda q: singular(exact_at(q))))
-
-
-def _nearest_failure(point: FloatArray, fails: Callable[[FloatArray], bool]) -> FloatArray:
-    """Return where, between the middle of the box and a point that fails, it begins to fail."""
+    # Where, between the middle of the box and the point that fails, it begins to fail.
     low, high = 0.0, 1.0
     for _ in range(BISECTIONS):
-        middle = (low + high) / 2.0
-        low, high = (low, middle) if fails(middle * point) else (middle, high)
-    return np.asarray(high * point)
+        between = (low + high) / 2.0
+        low, high = (low, between) if singular(exact_at(between * found.at)) else (between, high)
+    return BoxVerdict(found.verdict, found.boxes, np.asarray(high * found.at))
 
 
 def proved_stable(
@@ -198,7 +188,7 @@ def index_one_on_box(plant: DescriptorSystem) -> BoxVerdict:
 
         index = pencil_structure(plant.E, plant.A).index
         return BoxVerdict("proved" if index is not None and index <= 1 else "refuted", 0, np.zeros(0))
-    numbers = matrices_of(plant) if written.written is None else written.written
+    numbers = written_matrices(plant, written)
     affine = written.affine(numbers, written.box)
     dynamic, algebraic = compressed_rows(affine["E"].at(written.box.offsets))
     require_algebraic(affine["E"], algebraic)
@@ -207,17 +197,16 @@ def index_one_on_box(plant: DescriptorSystem) -> BoxVerdict:
         found = written.affine(numbers, written.box.part(lower, upper))
         return affine_block([[found["E"].after(dynamic)], [found["A"].after(algebraic)]])
 
-    return proved_regular(
-        build,
-        len(written.box.names),
-        _exactly(written, numbers, dynamic, algebraic),
-    )
+    def exactly(q: FloatArray) -> FloatArray:
+        found = written.filled(numbers, written.box.values(q))
+        return np.vstack([dynamic @ found["E"], algebraic @ found["A"]])
+
+    return proved_regular(build, len(written.box.names), exactly)
 
 
 def compressed_rows(e: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return ``R1, R2``: rows of E that have full rank, and a rational basis of ``R2 E = 0``; numbers as written."""
-    from obsynth.proofs.exact_matrices import null_basis, pivot_columns
-    from obsynth.proofs.written_numbers import nearest_doubles, written_matrix
+    from obsynth.proofs.exact_arithmetic import nearest_doubles, null_basis, pivot_columns, written_matrix
 
     n = len(e)
     exact = written_matrix(e.T)
@@ -237,13 +226,3 @@ def require_algebraic(e: AffineMatrix, algebraic: FloatArray) -> None:
             "the plant's order changes inside the box. Give these rows of E no tolerance of their own.",
             condition="algebraic rows",
         )  # fmt: skip
-
-
-def _exactly(
-    written: Uncertainty, numbers: Mapping[str, FloatArray], dynamic: FloatArray, algebraic: FloatArray
-) -> Callable[[FloatArray], FloatArray]:
-    def at(q: FloatArray) -> FloatArray:
-        found = written.filled(numbers, written.box.values(q))
-        return np.vstack([dynamic @ found["E"], algebraic @ found["A"]])
-
-    return at

@@ -17,10 +17,7 @@ IDENTITY_SHARE = 1e-7
 
 
 class Tracking(NamedTuple):
-    """``z`` follows ``T E x``; outputs may use algebraic rows: ``T0 (A x + B u + Bd d) = 0``.
-
-    ``T (nz, nx)`` and ``T0 (nx + nf + nr, nx)``, whose rows vanish on E.
-    """
+    """``z`` follows ``T E x``, ``T (nz, nx)``; outputs use ``T0 (nx + nf + nr, nx)``: ``T0 (A x + B u + Bd d) = 0``."""
 
     T: FloatArray
     T0: FloatArray

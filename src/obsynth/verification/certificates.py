@@ -1,24 +1,16 @@
-r"""The bounded real inequality of a shipped observer, formed with guaranteed error bounds and proved.
+r"""The bounded real inequality and the stability of a shipped observer, proved with bounds on every rounding error.
 
-With ``e+ = M e + B d`` and the fault error ``-C e + D d`` taken from the shipped realisation, and the certificate
-P = Q'Q, the gain d -> fault error is below g, and M is Schur stable, if
+With ``e+ = M e + B d``, the fault error ``-C e + D d`` and the certificate P = Q'Q, the gain d -> fault error is below
+g, and M is Schur stable, if
 
 .. math::
     \begin{bmatrix} P & 0 & (QM)^T & C^T \\ & g^2 I & (QB)^T & -D^T \\ & & I & 0 \\ & & & I \end{bmatrix} > 0 .
 
 This is the paper's (45) before its Schur complements (Wang 2015), with its P on the third diagonal block divided out,
-and extended by D.  The certificate is the triangular factor Q: P itself, rounded to double precision, would lose
-definiteness where its condition number nears 1e16, and its square root has half the digits to lose.  The first block is
-moved by S, close to the inverse of Q; S is triangular with a nonzero diagonal, so this congruence is one.
-
-Stability of a shipped matrix, proved with a Lyapunov factor and bounds on every rounding error.
-
-With P = Q'Q, Q triangular and nonsingular, and S close to the inverse of Q (a congruence with any nonsingular S keeps
-definiteness):
-
-.. math::
-    -S^T (A^T Q^T Q + Q^T Q A) S > 0 \quad (\dot z = A z), \qquad
-    \begin{bmatrix} (QS)^T QS & (QAS)^T \\ QAS & I \end{bmatrix} > 0 \quad (z^+ = A z).
+and extended by D.  Stable is a matrix A with ``-S^T (A^T Q^T Q + Q^T Q A) S > 0`` (``z' = A z``), or with
+``[[(QS)^T QS, (QAS)^T], [QAS, I]] > 0`` (``z+ = A z``).  The certificate is the triangular factor Q: P itself, rounded,
+would lose definiteness where its condition number nears 1e16.  S, triangular and close to the inverse of Q, is a
+congruence whatever it is.
 """
 
 from __future__ import annotations
@@ -31,10 +23,9 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.spectra import decay_rates, eigenvalues
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.proofs.balls import Enclosed, block
 from obsynth.proofs.contraction import prove_contraction
 from obsynth.proofs.definiteness import DefinitenessProof, prove_positive_definite, unproved
-from obsynth.proofs.extended_balls import enclosed_eigenvalues
+from obsynth.proofs.extended_balls import Enclosed, block, enclosed_eigenvalues
 from obsynth.results.checks import Check, CheckKind
 from obsynth.verification.error_system import LaggedPlant
 
@@ -48,27 +39,32 @@ def prove_bounded_real(
     *,
     lag: int,
 ) -> DefinitenessProof:
-    """Try to prove the bounded real inequality for the shipped observer.
-
-    Shapes: ``factor (core, core)``.
-    """
+    """Try to prove the bounded real inequality for the shipped observer; ``factor (core, core)``."""
     core = factor.shape[0]
     outside = (observer.Az[:core, core:], observer.Cz[observer.fault_rows, core:])
     # What follows the core must be a chain of delays: strictly lower triangular, hence stable.
     chain = np.triu(observer.Az[core:, core:])
-    triangular = np.all(np.tril(factor, -1) == 0.0) and np.all(np.diag(factor) != 0.0)
     if any(np.any(part != 0.0) for part in (*outside, chain)):
         return unproved("the states after the core are no chain of delays, or act on the core or the fault estimate")
-    if not triangular or not gain > 0.0:
+    if not _is_triangular(factor) or not gain > 0.0:
         return unproved("the certificate is not triangular and nonsingular, or the gain is not positive")
     inverse = np.triu(np.linalg.inv(factor))
-    if not np.all(np.isfinite(inverse)) or np.any(np.diag(inverse) == 0.0):
+    if not _is_invertible(inverse):
         return unproved("the certificate cannot be inverted")
 
     def formula(kind: type[Enclosed]) -> Enclosed:
         return _formed(kind, plant, observer, tracking, factor, inverse, gain, lag)
 
     return prove_positive_definite(formula)
+
+
+def _is_triangular(factor: FloatArray) -> bool:
+    """Whether a factor is upper triangular and nonsingular."""
+    return bool(np.all(np.tril(factor, -1) == 0.0) and np.all(np.diag(factor) != 0.0))
+
+
+def _is_invertible(inverse: FloatArray) -> bool:
+    return bool(np.all(np.isfinite(inverse)) and np.all(np.diag(inverse) != 0.0))
 
 
 def _formed(
@@ -111,18 +107,15 @@ RATE_TOLERANCE = 1e-4
 
 
 def prove_stable(a: FloatArray, factor: FloatArray, dt: float) -> DefinitenessProof:
-    """Try to prove that every mode of ``a`` dies out.
-
-    Shapes: ``a (n, n)``, ``factor (n, n)``.
-    """
+    """Try to prove that every mode of ``a (n, n)`` dies out; ``factor (n, n)``."""
     if factor.shape != a.shape or not np.all(np.isfinite(factor)) or not np.all(np.isfinite(a)):
         return unproved("the certificate does not fit, or a number is not finite")
     if a.shape[0] == 0:
         return DefinitenessProof(True, np.inf, 0.0, "Cholesky")
-    if np.any(np.tril(factor, -1) != 0.0) or np.any(np.diag(factor) == 0.0):
+    if not _is_triangular(factor):
         return unproved("the certificate is not triangular and nonsingular")
     inverse = np.triu(np.linalg.inv(factor))
-    if not np.all(np.isfinite(inverse)) or np.any(np.diag(inverse) == 0.0):
+    if not _is_invertible(inverse):
         return unproved("the certificate cannot be inverted")
 
     def formula(kind: type[Enclosed]) -> Enclosed:
@@ -137,12 +130,20 @@ def prove_stable(a: FloatArray, factor: FloatArray, dt: float) -> DefinitenessPr
     return prove_positive_definite(formula)
 
 
-def decay_row(a: FloatArray, dt: float, claimed: float) -> Check:
-    """Return the row on a claimed decay (1/s): proved for all but `RATE_TOLERANCE` of it, whatever poles there are.
+def stability_row(a: FloatArray, factor: FloatArray, dt: float, source: str) -> Check:
+    """Return the row that every mode of ``a (n, n)`` dies out, by a Lyapunov factor."""
+    claim = "every error dies out: the Lyapunov inequality is positive definite"
+    return proof_row("stability", claim, prove_stable(a, factor, dt), source)
 
-    By a Lyapunov inequality shifted by the rate, or where multiple poles leave none, by an enclosure of each eigenvalue
-    of the stored numbers.
-    """
+
+def proof_row(name: str, claim: str, proof: DefinitenessProof, source: str) -> Check:
+    """Return the row of a proof that a matrix is positive definite."""
+    bound = proof.lower_bound
+    return Check(name, claim, bound, 0.0, bound, proof.proved, source, "proved", proof.text)
+
+
+def decay_row(a: FloatArray, dt: float, claimed: float) -> Check:
+    """Return the row on a claimed decay (1/s): proved for all but `RATE_TOLERANCE` of it, whatever poles there are."""
     slowest = float(np.min(decay_rates(eigenvalues(a), dt), initial=np.inf))
     wanted = claimed - RATE_TOLERANCE * abs(claimed)
     source, passed = "recomputed eigenvalues", bool(slowest >= wanted)

@@ -1,6 +1,4 @@
-"""The claims of a certificate as such, and the recovery of states that a design carries along.
-
-The closed list of what each method may claim, and which row of the report covers each claim.
+"""Claims: a closed list, each covered by a row; the recovery of states; fault estimates that are means.
 
 A claim that is not on the list, or whose row is not in the report, fails: it would be printed, and nobody checked it.
 """
@@ -9,19 +7,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping
-from typing import TYPE_CHECKING, Any
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
-from obsynth.analysis.transformations import StateRecovery
+from obsynth.analysis.transformations.recovery import StateRecovery
 from obsynth.numerics.arguments import is_number
+from obsynth.numerics.spectra import certain_noise_covariance
+from obsynth.observers.linear.derived import unaveraged
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.checks import Check, information, upper_bound_check
+from obsynth.results.design import Certificate, ObserverDesign
 from obsynth.verification.identities import EQUALITY_TOLERANCE
-
-if TYPE_CHECKING:
-    from obsynth.results.design import ObserverDesign
-
 
 #: Every claim a fault-estimation filter can make.
 KNOWN_CLAIMS = ("gamma", "gamma_min", "gamma_bracket_low", "gamma_bracket_high", "state_lag")
@@ -40,32 +38,24 @@ def claimed(claims: Mapping[str, Any], name: str) -> float:
 def claim_rows(plant: DescriptorSystem, claims: Mapping[str, Any]) -> Iterator[Check]:
     """Yield the rows on what is claimed: known names, numbers, and gains in order."""
     needed = {"state_lag"} | ({"gamma"} if plant.nd else set())
+    # Both ends of a bracket, and what lies in it, or none of them.
+    bracketed = bool({"gamma_bracket_low", "gamma_bracket_high"} & claims.keys())
+    needed |= set(KNOWN_CLAIMS[:4]) if bracketed else set()
     wrong = [name for name in claims if name not in KNOWN_CLAIMS or not math.isfinite(claimed(claims, name))]
     wrong += sorted(needed - claims.keys())
-    # Both ends of a bracket, and what lies in it, or none of them.
-    bracket = {"gamma_bracket_low", "gamma_bracket_high"} & claims.keys()
-    wrong += (
-        sorted({"gamma", "gamma_min", "gamma_bracket_low", "gamma_bracket_high"} - claims.keys()) if bracket else []
-    )
     if "gamma" in claims and not claimed(claims, "gamma") > 0.0 and "gamma" not in wrong:
         wrong.append("gamma")
     yield upper_bound_check(
-        "claims",
-        "every claim is known and a finite number, and none is missing",
-        float(len(wrong)),
-        0.0,
-        source="certificate",
-        detail=f"wrong: {', '.join(map(str, dict.fromkeys(wrong)))}" if wrong else "",
-    )
-    if "gamma_min" in claims or bracket:
+        "claims", "every claim is known and a finite number, and none is missing", float(len(wrong)), 0.0,
+        source="certificate", detail=f"wrong: {', '.join(map(str, wrong))}" if wrong else "",
+    )  # fmt: skip
+    if "gamma_min" in claims or bracketed:
         yield upper_bound_check(
-            "claimed gains",
-            "0 <= bracket's lower end <= gamma_min <= its upper end, and gamma_min <= gamma",
-            _disorder(claims, bracketed=bool(bracket)),
-            ORDER_TOLERANCE,
+            "claimed gains", "0 <= bracket's lower end <= gamma_min <= its upper end, and gamma_min <= gamma",
+            _disorder(claims, bracketed=bracketed), ORDER_TOLERANCE,
             source="certificate; whether a filter reaches less is said by the row 'least gain'",
             detail="the largest step backwards, as a share of gamma",
-        )
+        )  # fmt: skip
 
 
 def _disorder(claims: Mapping[str, Any], *, bracketed: bool) -> float:
@@ -87,13 +77,9 @@ def recovery_rows(plant: DescriptorSystem, recovery: StateRecovery | None) -> It
     wrong = _misfits(plant, recovery)
     source = "the plant; the one before its transformation is not stored"
     yield upper_bound_check(
-        "recovery fits",
-        "the map back to the original states has unique names, the plant's signals and finite entries",
-        float(len(wrong)),
-        0.0,
-        source=source,
-        detail=f"wrong: {', '.join(wrong)}" if wrong else "",
-    )
+        "recovery fits", "the map back to the original states has unique names, the plant's signals and finite entries",
+        float(len(wrong)), 0.0, source=source, detail=f"wrong: {', '.join(wrong)}" if wrong else "",
+    )  # fmt: skip
     if wrong:
         return
     kept = [name for name in recovery.names if name in plant.state_names]
@@ -103,14 +89,10 @@ def recovery_rows(plant: DescriptorSystem, recovery: StateRecovery | None) -> It
     rows = [recovery.names.index(name) for name in kept]
     expected = np.eye(plant.nx, whole.shape[1])[[plant.state_names.index(name) for name in kept]]
     yield upper_bound_check(
-        "recovery of kept states",
-        "a state that the plant still has is recovered as itself",
-        float(np.max(np.abs(whole[rows] - expected), initial=0.0)),
-        EQUALITY_TOLERANCE,
-        source=source,
-        kind="equality",
+        "recovery of kept states", "a state that the plant still has is recovered as itself",
+        float(np.max(np.abs(whole[rows] - expected), initial=0.0)), EQUALITY_TOLERANCE, source=source, kind="equality",
         detail=f"{len(kept)} of {len(recovery.names)} states; how the others follow from these is not checked",
-    )
+    )  # fmt: skip
 
 
 def _misfits(plant: DescriptorSystem, recovery: StateRecovery) -> list[str]:
@@ -176,3 +158,41 @@ def closed_claims(
                 f"stated: {name}", f"{meanings[name]}; stated by the search, not recomputed", float(value),
                 source="certificate", status="assumed",
             )  # fmt: skip
+
+
+def before_the_mean(design: ObserverDesign) -> tuple[ObserverDesign, tuple[Check, ...]]:
+    """Return the design without its mean, and the row that says that nothing else was done to it."""
+    mean = design.options.get("mean", 1)
+    if mean == 1:
+        return design, ()
+    _, observer = design.linear
+    base = unaveraged(observer, mean) if isinstance(mean, int) and mean > 1 else None
+    tracking = design.certificate.matrices.get("tracking")
+    fitting = base is not None and tracking is not None and len(tracking) == observer.order
+    row = upper_bound_check(
+        "mean", f"each fault estimate is exactly the mean of the last {mean} of the filter that is checked below",
+        float(not fitting), 0.0, source="shipped realisation",
+    )  # fmt: skip
+    if base is None or tracking is None or not fitting:
+        return design, (row,)
+    matrices = {**design.certificate.matrices, "tracking": tracking[: base.order]}
+    return replace(
+        design, observer=base, certificate=Certificate(matrices, design.certificate.claims)
+    ), (row,)  # fmt: skip
+
+
+def mean_noise_rows(design: ObserverDesign) -> Iterator[Check]:
+    """Yield the deviation of each averaged estimate under the stated noise."""
+    plant, observer = design.linear
+    mean, tracking = design.options.get("mean", 1), design.certificate.matrices.get("tracking")
+    if mean == 1 or not plant.nw or tracking is None or len(tracking) != observer.order:
+        return
+    rows = observer.fault_rows
+    entering = observer.By @ plant.Dw - tracking[:, : plant.nx] @ plant.Bw
+    found = certain_noise_covariance(observer.Az, entering, observer.Cz[rows], observer.Dy[rows] @ plant.Dw, plant.dt)
+    for name, variance in zip(observer.fault_names, np.diag(found), strict=True):
+        yield information(
+            f"noise in the mean of fhat[{name}]",
+            f"standard deviation under the stated noise of what is shipped, a mean of {mean}",
+            float(np.sqrt(max(float(variance), 0.0))), source="recomputed, Lyapunov equation",
+        )  # fmt: skip

@@ -1,14 +1,26 @@
-"""Rows about the plant itself: information for the reader, and the existence conditions."""
+"""Rows about the plant: what it is, the existence conditions, and elimination and sampling done again as written."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 
+import numpy as np
+
 from obsynth.analysis.conditions import Condition
 from obsynth.analysis.zeros import are_outside
+from obsynth.errors import ObsynthError
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.norms import hinf_norm
 from obsynth.numerics.pencils import FiniteZeros, PencilStructure, pencil_structure
+from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.results.checks import Check, information
+from obsynth.proofs.balls import Ball
+from obsynth.proofs.contraction import column_norms, prove_contraction
+from obsynth.proofs.peak_sums import gathered, interval_pieces, peak_sums
+from obsynth.proofs.products import energy
+from obsynth.results.checks import Check, information, upper_bound_check
+from obsynth.results.design import ObserverDesign
+from obsynth.verification.error_system import TrackedPlant
 
 #: Imaginary parts below this are not shown.
 SHOWN_AS_REAL = 1e-12
@@ -19,39 +31,23 @@ MOST_SHOWN = 6
 def plant_information(plant: DescriptorSystem, structure: PencilStructure | None = None) -> Iterator[Check]:
     """Yield rows on regularity, index, eigenvalues and stability of the plant; they inform and never fail."""
     structure = pencil_structure(plant.E, plant.A) if structure is None else structure
-    source = "the plant"
-    yield information("plant: regular", "det(A - zE) is not identically zero", float(structure.regular), source=source)
-    if not structure.regular:
-        return
-    yield information(
-        "plant: index", "index of the pencil (0: E nonsingular)", float(structure.index or 0), source=source
-    )
-    count = len(structure.finite_eigenvalues)
-    yield information(
-        "plant: finite eigenvalues",
-        "number of dynamic modes",
-        float(count),
-        source=source,
-        detail=_eigenvalue_text(structure.finite_eigenvalues),
-    )
-    yield information(
-        "plant: infinite eigenvalues",
-        "number of infinite eigenvalues",
-        float(sum(structure.infinite_block_sizes)),
-        source=source,
-        detail=f"block sizes {list(structure.infinite_block_sizes)}" if structure.infinite_block_sizes else "",
-    )
-    poles = FiniteZeros(structure.finite_eigenvalues, structure.normal_rank, structure.decisions)
-    stable = not any(are_outside(plant.E, plant.A, poles, plant.dt))
-    admissible = stable and (structure.index or 0) <= 1
-    verdict = "admissible" if admissible else "not admissible: an observer may exist all the same"
-    yield information(
-        "plant: admissible",
-        "regular, impulse-free and stable",
-        float(admissible),
-        source=source,
-        detail=verdict,
-    )
+    blocks = structure.infinite_block_sizes
+    rows = [("regular", "det(A - zE) is not identically zero", float(structure.regular), "")]
+    if structure.regular:
+        poles = FiniteZeros(structure.finite_eigenvalues, structure.normal_rank, structure.decisions)
+        stable = not any(are_outside(plant.E, plant.A, poles, plant.dt))
+        admissible = stable and (structure.index or 0) <= 1
+        verdict = "admissible" if admissible else "not admissible: an observer may exist all the same"
+        rows += [
+            ("index", "index of the pencil (0: E nonsingular)", float(structure.index or 0), ""),
+            ("finite eigenvalues", "number of dynamic modes", float(len(structure.finite_eigenvalues)),
+             _eigenvalue_text(structure.finite_eigenvalues)),
+            ("infinite eigenvalues", "number of infinite eigenvalues", float(sum(blocks)),
+             f"block sizes {list(blocks)}" if blocks else ""),
+            ("admissible", "regular, impulse-free and stable", float(admissible), verdict),
+        ]  # fmt: skip
+    for name, claim, value, detail in rows:
+        yield information(f"plant: {name}", claim, value, source="the plant", detail=detail)
 
 
 def _eigenvalue_text(values: Iterable[complex]) -> str:
@@ -66,13 +62,120 @@ def condition_rows(conditions: Iterable[Condition]) -> Iterator[Check]:
     """Yield one row per existence condition."""
     for condition in conditions:
         yield Check(
-            f"exists: {condition.name}",
-            condition.claim,
-            condition.value,
-            condition.bound,
-            abs(condition.bound - condition.value),
-            condition.holds,
-            condition.source,
-            "condition",
+            f"exists: {condition.name}", condition.claim, condition.value, condition.bound,
+            abs(condition.bound - condition.value), condition.holds, condition.source, "condition",
             f"Unclear: {condition.detail}" if condition.unclear else condition.detail,
-        )
+        )  # fmt: skip
+
+
+#: Matrices found again may differ by this share of the largest entry of their row or column: another order of sums.
+DERIVED_TOLERANCE = 1e-9
+_MATRICES = ("E", "A", "B", "C", "D", "Bf", "Df", "Bd", "Dd")
+_MAPS = ("from_state", "from_input", "from_fault", "from_disturbance")
+_SOURCE = "the plant as written, eliminated and sampled again"
+
+
+def derivation_rows(design: ObserverDesign, tracked: TrackedPlant) -> Iterator[Check]:
+    """Yield the rows on the way from the plant as written to the one that the design is for."""
+    plant, observer = design.linear
+    source = design.source
+    if source is None:
+        if design.recovery is not None:
+            yield information(
+                "plant as written", "elimination, sampling and recovery are those of the plant as written: assumed, as "
+                "the gain set does not hold it", np.nan, source="gain set of schema 1, or given by hand",
+                status="assumed",
+            )  # fmt: skip
+        return
+    try:
+        found = source.derived()
+    except ObsynthError as error:
+        yield upper_bound_check("plant as written", "it can be eliminated and sampled again", 1.0, 0.0, source=_SOURCE,
+                                detail=str(error))  # fmt: skip
+        return
+    follows = upper_bound_check(
+        "plant as written", "the plant of the design follows from it", _difference(found.plant, plant, _MATRICES),
+        DERIVED_TOLERANCE, source=_SOURCE, kind="equality",
+        detail=found.description or "nothing had to be done",
+    )  # fmt: skip
+    yield follows
+    if not follows.passed:
+        return
+    if design.recovery is not None and design.recovery.names == found.recovery.names:
+        yield upper_bound_check(
+            "recovery as written", "the states as written follow from those of the design as its recovery says",
+            _difference(found.recovery, design.recovery, _MAPS), DERIVED_TOLERANCE, source=_SOURCE, kind="equality",
+        )  # fmt: skip
+    if source.sample_time is not None and observer.fault_names:
+        yield from _sampling_rows(source.plant, source.sample_time, plant, observer, tracked)
+
+
+def _difference(first: object, second: object, names: tuple[str, ...]) -> float:
+    """Return the largest relative difference between matrices of the same name; infinite for another shape."""
+    worst = 0.0
+    for name in names:
+        a, b = np.asarray(getattr(first, name)), np.asarray(getattr(second, name))
+        if a.shape != b.shape:
+            return np.inf
+        if not a.size:
+            continue
+        size = np.maximum(np.abs(a), np.abs(b))
+        scale = np.minimum(np.max(size, axis=1, keepdims=True), np.max(size, axis=0, keepdims=True))
+        missed = np.abs(a - b)
+        worst = max(worst, float(np.max(np.where(missed > 0.0, missed / np.where(scale > 0.0, scale, 1.0), 0.0))))
+    return worst if np.isfinite(worst) else np.nan
+
+
+def _sampling_rows(
+    written: DescriptorSystem, dt: float, plant: DescriptorSystem, observer: LinearObserver, tracked: TrackedPlant
+) -> Iterator[Check]:
+    """Yield what the hold has to do with gains and delays, and the gain over disturbances of any course."""
+    delays = ", ".join(f"{delay}" for delay in observer.fault_delays)
+    yield information(
+        "sampling: delay", "samples by which the fault estimates lag, for faults that are held between samples; of a "
+        "fault that moves they show its mean over a sample, half a sample later", float(max(observer.fault_delays)),
+        source="zero-order hold", detail=f"delays {delays}",
+    )  # fmt: skip
+    if not plant.nd:
+        return
+    from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
+
+    smooth = eliminate_algebraic_states(written).plant
+    t = tracked.T[:, : plant.nx]
+    rows = observer.fault_rows
+    direct = observer.Dy[rows] @ plant.Dd
+    if not plant.Dd.any():
+        enclosed = energy(smooth.A, smooth.Bd, dt)
+        middle = (enclosed.midpoint + enclosed.midpoint.T) / 2.0
+        values, vectors = np.linalg.eigh(middle)
+        # The enclosure's radius enters as a larger energy in every direction.
+        slack = float(np.linalg.norm(enclosed.radius)) + 4.0 * np.finfo(np.float64).eps * float(np.max(np.abs(values)))
+        root = vectors * np.sqrt(np.maximum(values, 0.0) + slack)
+        norm = hinf_norm(observer.Az, t @ root, observer.Cz[rows], np.zeros((len(observer.Cz[rows]), plant.nx)))
+        yield information(
+            "gain over all d(t)", "l2 gain from disturbances of any course to the fault error, in the norm h sum r^2 "
+            "over the integral of d^2; gamma is of disturbances that are held between samples",
+            float(np.sqrt(dt) * norm.upper), source="lifted system, from an enclosure of its energy",
+            detail=f"largest at {norm.angle:.4g} rad per sample",
+        )  # fmt: skip
+        return
+    peak = _peak_gain(smooth, dt, observer, t, direct)
+    yield information(
+        "gain over all d(t)", "peak gain from disturbances of any course to a fault error, |d(t)| <= 1 at all times: a "
+        "disturbance reaches a sample at once, so that its l2 gain is infinite; gamma is of disturbances that are held",
+        peak, source="sums over all samples, outward rounded",
+    )  # fmt: skip
+
+
+def _peak_gain(
+    smooth: DescriptorSystem, dt: float, observer: LinearObserver, t: FloatArray, direct: FloatArray
+) -> float:
+    contraction = prove_contraction(observer.Az, discrete=True)
+    if contraction is None:
+        return np.nan
+    rows = observer.Cz[observer.fault_rows]
+    pieces = interval_pieces(smooth.A, smooth.Bd, Ball.exact(-t), dt)
+    az = Ball.exact(observer.Az)
+    between = gathered(pieces, peak_sums(az, rows, pieces.columns, contraction).whole, smooth.nd)
+    sampled = peak_sums(az, rows, Ball.exact(observer.By) @ Ball.exact(smooth.Dd), contraction).whole
+    return float(np.sum(between + sampled + column_norms(Ball.exact(direct))))

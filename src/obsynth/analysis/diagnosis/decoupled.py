@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from obsynth.analysis.diagnosis.reduction import LeftPart, PencilUnits, finite_values, left_part
+from obsynth.analysis.diagnosis.reduction import PencilUnits, finite_values, left_part
 from obsynth.analysis.transformations.recovery import Transformation, linear_plant
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import ComplexArray, FloatArray, read_only
+from obsynth.numerics.libraries import on_one_thread_if_small
 from obsynth.numerics.ranks import CLEAR_GAP, RankDecision
-from obsynth.numerics.threads import on_one_thread_if_small
 from obsynth.plants.descriptor import DescriptorSystem
 
 #: Entries of unit rows below this are rounding of the orthogonal transformations that made them.
@@ -189,7 +189,8 @@ def decoupled(plant: DescriptorSystem, removed: Sequence[int], kept: Sequence[in
         Bu=read_only(parts["u"][:k]), By=read_only(parts["y"][:k]), F=read_only(parts["f"][:k]),
         N=read_only(parts["w"][:k]), Du=read_only(parts["u"][k:]), H=read_only(-parts["y"][k:]),
         G=read_only(parts["f"][k:]), M=read_only(parts["w"][k:]), rows=read_only(rows),
-        states=read_only(_states(found, units, nx)), removed=finite_values(found) * units.time, source=plant,
+        states=read_only((found.right / units.columns)[:, :nx]), removed=finite_values(found) * units.time,
+        source=plant,
         faults=tuple(plant.fault_names[i] for i in kept),
         without=(*plant.disturbance_names, *(plant.fault_names[i] for i in removed)),
         fault_sizes=read_only(np.linalg.norm(units.rows[:, None] * faults, axis=0)), time=units.time,
@@ -204,7 +205,3 @@ def unknowns_pencil(plant: DescriptorSystem, removed: Sequence[int]) -> tuple[Fl
     e = np.zeros_like(a)
     e[: plant.nx, : plant.nx] = plant.E
     return e, a
-
-
-def _states(found: LeftPart, units: PencilUnits, nx: int) -> FloatArray:
-    return (found.right / units.columns)[:, :nx]

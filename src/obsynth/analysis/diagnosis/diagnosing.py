@@ -7,20 +7,18 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.analysis.diagnosis.additions import detectable, estimable, least_additions, listed, state_sensors
-from obsynth.analysis.diagnosis.banks import residual_bank
-from obsynth.analysis.diagnosis.columns import Question, decided_exactly
-from obsynth.analysis.diagnosis.hidden_motions import hidden_motion
-from obsynth.analysis.diagnosis.verdicts import Diagnosis, FaultDiagnosis
+from obsynth.analysis.diagnosis.exact import decided_exactly, question
+from obsynth.analysis.diagnosis.explanations import hidden_motion, least_additions, listed, state_sensors
+from obsynth.analysis.diagnosis.fault_columns import Question, others, rest_point
+from obsynth.analysis.diagnosis.verdicts import Diagnosis, FaultDiagnosis, residual_bank
 from obsynth.analysis.transformations.recovery import Transformation, linear_plant
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import is_finite_number
+from obsynth.numerics.libraries import on_one_thread_if_small
 from obsynth.numerics.pencils import pencil_structure
 from obsynth.numerics.ranks import REST_TOLERANCE
-from obsynth.numerics.threads import on_one_thread_if_small
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.exosystems import Exosystem, exosystem
-from obsynth.plants.fault_models import stated_eigenvalues
+from obsynth.plants.fault_models import Exosystem, exosystem, stated_eigenvalues
 
 #: Zeros that are named in a sentence; the others are counted.
 MOST_ZEROS = 4
@@ -77,8 +75,8 @@ def diagnose(
     report_stage = progress or (lambda _: None)
     exactly = decided_exactly(plant)
     report_stage("asking what shows each fault")
-    shown = [Question(plant, (), i, exactly) for i in range(plant.nf)]
-    free = [Question(plant, _others(plant, i), i, exactly) for i in range(plant.nf)]
+    shown = [question(plant, (), i, exactly) for i in range(plant.nf)]
+    free = [question(plant, others(plant, i), i, exactly) for i in range(plant.nf)]
     faults = tuple(
         _verdict(plant, own, alone, frequencies, model_points(model, i), suggest=suggest)
         for i, (own, alone) in enumerate(zip(shown, free, strict=True))
@@ -92,15 +90,6 @@ def diagnose(
     )  # fmt: skip
 
 
-def rest_point(dt: float) -> complex:
-    """Return the point at which signals are constant."""
-    return 1.0 + 0.0j if dt > 0.0 else 0.0j
-
-
-def _others(plant: DescriptorSystem, fault: int) -> tuple[int, ...]:
-    return tuple(j for j in range(plant.nf) if j != fault)
-
-
 def model_points(model: Exosystem, fault: int) -> list[complex]:
     """Return the eigenvalues of the part of the exosystem that a fault is made of."""
     reached = model.Cw[fault] != 0.0
@@ -110,44 +99,35 @@ def model_points(model: Exosystem, fault: int) -> list[complex]:
     return [complex(value) for value in stated_eigenvalues(part)] if part.size else []
 
 
-def _point(plant: DescriptorSystem, frequency: float) -> complex:
-    return complex(np.exp(1j * frequency * plant.dt)) if plant.dt > 0.0 else 1j * frequency
-
-
 def _verdict(
     plant: DescriptorSystem, shown: Question, free: Question, frequencies: Sequence[float], modes: Sequence[complex],
     *, suggest: bool,
 ) -> FaultDiagnosis:  # fmt: skip
-    rest = rest_point(plant.dt)
-    step = free.visible and free.shows_at(rest)
-    arbitrary = free.visible and not free.blocking.size
-    sentences = tuple(_sentences(plant, shown, free, step=step, arbitrary=arbitrary, suggest=suggest))
+    points = [complex(np.exp(1j * w * plant.dt)) if plant.dt > 0.0 else 1j * w for w in frequencies]
     return FaultDiagnosis(
         name=plant.fault_names[shown.number],
         detectable=shown.visible,
-        detectable_at_rest=shown.visible and shown.shows_at(rest),
-        detectable_at={float(w): shown.visible and shown.shows_at(_point(plant, w)) for w in frequencies},
-        estimable=arbitrary,
-        step_estimable=step,
+        detectable_at_rest=shown.shows_at_rest,
+        detectable_at={float(w): shown.visible and shown.shows_at(s) for w, s in zip(frequencies, points, strict=True)},
+        estimable=free.estimable,
+        step_estimable=free.shows_at_rest,
         model_estimable=free.visible and all(free.shows_at(mode) for mode in modes),
         order=free.derivatives if free.visible else None,
         residual_order=shown.residual_order if shown.visible else None,
         filter_order=free.order,
-        zeros=free.zeros if free.visible else np.zeros(0, dtype=np.complex128),
-        blocking=free.blocking if free.visible else np.zeros(0, dtype=np.complex128),
-        sentences=sentences,
+        zeros=free.zeros,
+        blocking=free.blocking,
+        sentences=tuple(_sentences(plant, shown, free, suggest=suggest)),
         exact=shown.exactly,
         gap=min(shown.gap, free.gap),
     )
 
 
-def _sentences(
-    plant: DescriptorSystem, shown: Question, free: Question, *, step: bool, arbitrary: bool, suggest: bool
-) -> list[str]:
+def _sentences(plant: DescriptorSystem, shown: Question, free: Question, *, suggest: bool) -> list[str]:
     """Return what hides a fault, at which point, and what would help."""
     name, rest = plant.fault_names[shown.number], rest_point(plant.dt)
     letter = "z" if plant.dt > 0.0 else "s"
-    texts = []
+    step, texts = free.shows_at_rest, []
     if not shown.visible:
         unknown = ", ".join(plant.disturbance_names)
         texts.append(f"{name}: nothing shows it" + (f" free of {unknown}." if unknown else "."))
@@ -157,55 +137,43 @@ def _sentences(
     if not step:
         motion = hidden_motion(plant, shown.number, rest, () if not shown.visible else free.removed)
         if motion is not None:
-            seen = (shown.visible and not shown.shows_at(rest)) or (shown.visible and free.visible)
+            seen = shown.visible and (free.visible or not shown.shows_at_rest)
             then = " Not estimable; seen only while it changes." if seen else ""
             texts.append(f"{name}: {motion} ({letter} = {_number(rest)}).{then}")
-    hiding = (
-        [zero for zero in free.blocking if abs(zero - rest) > REST_TOLERANCE and zero.imag >= 0.0]
-        if free.visible
-        else []
-    )
+    hiding = [zero for zero in free.blocking if abs(zero - rest) > REST_TOLERANCE and zero.imag >= 0.0]
     for zero in hiding[:MOST_ZEROS]:
         motion = hidden_motion(plant, shown.number, complex(zero), free.removed)
-        how = (
-            f"{motion} ({letter} = {_number(zero)})" if motion is not None else f"hidden at {letter} = {_number(zero)}"
-        )
+        at = f"{letter} = {_number(zero)}"
+        how = f"hidden at {at}" if motion is None else f"{motion} ({at})"
         texts.append(f"{name}: {how}. Not estimable for every course.")
     if len(hiding) > MOST_ZEROS:
         texts.append(f"{name}: hidden at {len(hiding) - MOST_ZEROS} more points.")
     if free.visible and free.derivatives:
-        texts.append(_derivatives(plant, name, free.derivatives, step=step))
-    if suggest and not (step and arbitrary):
+        more = "s" if free.derivatives > 1 else ""
+        needed = f"sample{more} of delay" if plant.dt > 0.0 else f"derivative{more} of the outputs"
+        texts.append(f"{name}: needs {free.derivatives} {needed}{'; as a step, none' if step else ''}.")
+    if suggest and not (step and free.estimable):
         texts += _suggestion(plant, name, shown, step=step)
     return texts
 
 
-def _derivatives(plant: DescriptorSystem, name: str, count: int, *, step: bool) -> str:
-    what = "sample" if plant.dt > 0.0 else "derivative"
-    of = (
-        "s of delay"
-        if plant.dt > 0.0 and count > 1
-        else " of delay"
-        if plant.dt > 0.0
-        else ("s of the outputs" if count > 1 else " of the outputs")
-    )
-    return f"{name}: needs {count} {what}{of}{'; as a step, none' if step else ''}."
-
-
 def _suggestion(plant: DescriptorSystem, name: str, shown: Question, *, step: bool) -> list[str]:
     """Return which states to measure, computed; and those that would only show the fault."""
-    sensors = state_sensors(plant)
-    fault = shown.number
-    full = least_additions(plant, sensors, estimable(fault, step=False))
-    constant = () if step else least_additions(plant, sensors, estimable(fault, step=True))
+    sensors, fault = state_sensors(plant), shown.number
+
+    def free(changed: DescriptorSystem) -> Question:
+        return Question(changed, others(changed, fault), fault)
+
+    full = least_additions(plant, sensors, lambda changed: free(changed).estimable)
+    constant = () if step else least_additions(plant, sensors, lambda changed: free(changed).shows_at_rest)
     texts = []
     if full:
         texts.append(f"{name}: Add one of: {listed(full)}.")
     elif constant:
         texts.append(f"{name}: Add one of: {listed(constant)} (then it can be estimated as a step).")
     if not shown.visible:
-        useful = {names for names in (*full, *constant)}
-        more = [names for names in least_additions(plant, sensors, detectable(fault)) if names not in useful]
+        showing = least_additions(plant, sensors, lambda changed: Question(changed, (), fault).visible)
+        more = [names for names in showing if names not in (*full, *constant)]
         if more:
             texts.append(f"{name}: {listed(more)} would show it, but not its size.")
     if not texts and plant.nx:
@@ -216,20 +184,13 @@ def _suggestion(plant: DescriptorSystem, name: str, shown: Question, *, step: bo
 def _isolability(
     plant: DescriptorSystem, shown: Sequence[Question], exactly: bool
 ) -> tuple[np.ndarray, np.ndarray, list[Question]]:
-    count, rest = plant.nf, rest_point(plant.dt)
-    weak, strong = np.zeros((count, count), dtype=bool), np.zeros((count, count), dtype=bool)
-    asked = []
-    for i, own in enumerate(shown):
-        weak[i, i] = own.visible
-        strong[i, i] = own.visible and own.shows_at(rest)
-        for j in _others(plant, i):
-            pair = Question(plant, (j,), i, exactly)
-            asked.append(pair)
-            weak[i, j] = pair.visible
-            strong[i, j] = pair.visible and pair.shows_at(rest)
+    weak, strong = np.zeros((2, plant.nf, plant.nf), dtype=bool)
+    asked = {(i, j): question(plant, (j,), i, exactly) for i in range(plant.nf) for j in others(plant, i)}
+    for place, pair in {**asked, **{(i, i): own for i, own in enumerate(shown)}}.items():
+        weak[place], strong[place] = pair.visible, pair.shows_at_rest
     weak.setflags(write=False)
     strong.setflags(write=False)
-    return weak, strong, asked
+    return weak, strong, list(asked.values())
 
 
 def _warnings(plant: DescriptorSystem, asked: Sequence[Question]) -> tuple[str, ...]:

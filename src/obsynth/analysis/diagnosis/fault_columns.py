@@ -9,32 +9,51 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 
-from obsynth.analysis.diagnosis.decoupled import DecoupledPlant
+from obsynth.analysis.diagnosis.decoupled import DecoupledPlant, decoupled
 from obsynth.analysis.diagnosis.reduction import finite_values, left_part
 from obsynth.analysis.zeros import are_outside
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.pencils import FiniteZeros
-from obsynth.numerics.ranks import MARKOV_TOLERANCE, RANK_TOLERANCE, TRACE_TOLERANCE, rank_from
+from obsynth.numerics.ranks import CLEAR_GAP, MARKOV_TOLERANCE, RANK_TOLERANCE, TRACE_TOLERANCE, rank_from
+from obsynth.plants.descriptor import DescriptorSystem
 
 #: Parity spaces of a higher order than this are not formed: their powers hold no digits.
 MOST_PARITY_ORDER = 24
 
 
-@dataclass(frozen=True, eq=False)
-class FaultColumn:
-    """The column of one fault on a decoupled plant."""
+def rest_point(dt: float) -> complex:
+    """Return the point at which signals are constant."""
+    return 1.0 + 0.0j if dt > 0.0 else 0.0j
 
-    plant: DecoupledPlant
+
+def others(plant: DescriptorSystem, fault: int) -> tuple[int, ...]:
+    """Return the columns of all faults but one."""
+    return tuple(j for j in range(plant.nf) if j != fault)
+
+
+@dataclass(frozen=True, eq=False)
+class Question:
+    """A fault of a plant, with the faults ``removed`` and every unknown input out of sight, in floating point."""
+
+    source: DescriptorSystem
+    removed: tuple[int, ...]
     number: int
+    #: Whether it is decided over the rational numbers.
+    exactly: ClassVar[bool] = False
+
+    @cached_property
+    def plant(self) -> DecoupledPlant:
+        """The decoupled plant, in floating point."""
+        return decoupled(self.source, self.removed, [self.number])
 
     @cached_property
     def _scaled(self) -> tuple[FloatArray, FloatArray]:
-        size = max(float(self.plant.fault_sizes[self.number]), np.finfo(np.float64).tiny)
-        columns = [self.number]
-        return self.plant.F[:, columns] / size, self.plant.G[:, columns] / size
+        size = max(float(self.plant.fault_sizes[0]), np.finfo(np.float64).tiny)
+        return self.plant.F / size, self.plant.G / size
 
     @cached_property
     def trace(self) -> float:
@@ -42,27 +61,33 @@ class FaultColumn:
         return float(np.linalg.norm(np.vstack(self._scaled)))
 
     @property
-    def visible(self) -> bool:
-        """Whether the outputs show the fault at all, free of what was removed."""
+    def leaves_trace(self) -> bool:
+        """Whether the fault shows in floating point."""
         return self.trace > TRACE_TOLERANCE
 
-    def strength(self, point: complex) -> float:
-        """Return the part of the column, relative to its size, that shows at a point of the s (or z) plane."""
-        if not self.visible:
-            return 0.0
-        f, g = self._scaled
-        plant = self.plant
-        top = np.vstack([plant.A - point * plant.E, plant.C])
-        column = np.vstack([f, g])[:, 0] / self.trace
-        if plant.order == 0:
-            return float(np.linalg.norm(column))
-        basis = np.linalg.qr(top)[0]
-        rest = column - basis @ (basis.conj().T @ column)
-        return float(np.linalg.norm(rest - basis @ (basis.conj().T @ rest)))
+    @property
+    def visible(self) -> bool:
+        """Whether the outputs show the fault at all, free of what was removed."""
+        return self.leaves_trace
 
     def shows_at(self, point: complex) -> bool:
         """Whether a fault ``exp(point t)`` (or ``point^k``) leaves a trace that the rest cannot imitate."""
-        return self.strength(point) > TRACE_TOLERANCE
+        if not self.leaves_trace:
+            return False
+        plant, column = self.plant, np.vstack(self._scaled)[:, 0] / self.trace
+        basis = np.linalg.qr(np.vstack([plant.A - point * plant.E, plant.C]))[0]
+        rest = column - basis @ (basis.conj().T @ column)
+        return float(np.linalg.norm(rest - basis @ (basis.conj().T @ rest))) > TRACE_TOLERANCE
+
+    @property
+    def shows_at_rest(self) -> bool:
+        """Whether a constant fault leaves a constant trace."""
+        return self.visible and self.shows_at(rest_point(self.source.dt))
+
+    @property
+    def estimable(self) -> bool:
+        """Whether the fault's value can be told whatever its course is."""
+        return self.visible and not self.blocking.size
 
     @cached_property
     def _pencil(self) -> tuple[FloatArray, FloatArray]:
@@ -76,7 +101,7 @@ class FaultColumn:
     @cached_property
     def zeros(self) -> ComplexArray:
         """Roots of the fault polynomial, 1/s (or dimensionless), with multiplicity."""
-        if not self.visible:
+        if not self.leaves_trace:
             return np.zeros(0, dtype=np.complex128)
         return np.asarray(finite_values(left_part(*self._pencil)) * self.plant.time)
 
@@ -86,38 +111,34 @@ class FaultColumn:
         if not self.zeros.size:
             return self.zeros
         e, a = self._pencil
-        found = FiniteZeros(self.zeros / self.plant.time, a.shape[1], ())
-        if self.plant.source.dt > 0.0:
-            # In discrete time the boundary is a number, not a direction: the unit of s must not move it.
-            e = e / self.plant.time
-            found = FiniteZeros(self.zeros, a.shape[1], ())
-        outside = are_outside(e, a, found, self.plant.source.dt)
-        return np.asarray(self.zeros[np.array(outside, dtype=bool)])
+        # In discrete time the boundary is a number, not a direction: the unit of s must not move it.
+        unit = self.plant.time if self.source.dt > 0.0 else 1.0
+        found = FiniteZeros(self.zeros / (self.plant.time / unit), a.shape[1], ())
+        return np.asarray(self.zeros[np.array(are_outside(e / unit, a, found, self.source.dt), dtype=bool)])
+
+    @cached_property
+    def order(self) -> int:
+        """Order of the decoupled plant."""
+        return self.plant.order
 
     @cached_property
     def derivatives(self) -> int | None:
         """Derivatives of y and u (samples of delay) that an estimate needs; ``None`` where nothing shows."""
-        if not self.visible:
-            return None
         f, g = self._scaled
-        return _order_at_infinity(self.plant, f / self.trace, g / self.trace)
+        return _order_at_infinity(self.plant, f / self.trace, g / self.trace) if self.leaves_trace else None
 
     @cached_property
     def residual_order(self) -> int | None:
         """Least order of a scalar residual that shows the fault; ``None`` where nothing does, or beyond 24."""
-        if not self.visible:
-            return None
-        for order in range(min(self.plant.order, MOST_PARITY_ORDER) + 1):
-            if self.seen_by_parity(order):
-                return order
-        return None
+        orders = range(min(self.plant.order, MOST_PARITY_ORDER) + 1 if self.leaves_trace else 0)
+        return next((order for order in orders if self._seen_by_parity(order)), None)
 
-    def seen_by_parity(self, order: int) -> bool:
+    def _seen_by_parity(self, order: int) -> bool:
         """Whether a parity vector of an order shows the fault."""
         plant = self.plant
         f, g = self._scaled
         if plant.order == 0:
-            return self.visible
+            return True
         inverse = np.linalg.inv(plant.E * plant.time)
         a, f = inverse @ plant.A, inverse @ f
         powers, markov = [plant.C], [g]
@@ -128,19 +149,27 @@ class FaultColumn:
         # Powers grow or fade: rows of one length keep a long chain of one output apart from rounding.
         lengths = np.linalg.norm(observed, axis=1, keepdims=True)
         lengths = np.where(lengths > 0.0, lengths, 1.0)
-        observed = observed / lengths
-        left, values, _ = np.linalg.svd(observed)
-        rank = rank_from(values, expected=observed.shape[1]).rank
-        parity = left[:, rank:].T
+        left, values, _ = np.linalg.svd(observed / lengths)
+        parity = left[:, rank_from(values, expected=observed.shape[1]).rank :].T
         if not len(parity):
             return False
-        p = len(plant.C)
-        toeplitz = np.zeros((len(observed), order + 1))
-        for row in range(order + 1):
-            for column in range(row + 1):
-                toeplitz[row * p : (row + 1) * p, column] = markov[row - column][:, 0]
+        zero = np.zeros_like(g)
+        toeplitz = np.block([[markov[i - j] if j <= i else zero for j in range(order + 1)] for i in range(order + 1)])
         toeplitz = toeplitz / lengths
         return bool(np.linalg.norm(parity @ toeplitz) > TRACE_TOLERANCE * max(1.0, float(np.linalg.norm(toeplitz))))
+
+    @property
+    def gap(self) -> float:
+        """How clear the least clear decision was: kept over dropped; infinite for exact ones."""
+        ranks = float("inf") if self.plant.thinnest is None else self.plant.thinnest.gap
+        if self.trace == 0.0:
+            return ranks
+        return min(ranks, self.trace / TRACE_TOLERANCE if self.leaves_trace else TRACE_TOLERANCE / self.trace)
+
+    @property
+    def clear(self) -> bool:
+        """Whether the gap is wide enough to trust the answer without a second look."""
+        return self.gap >= CLEAR_GAP
 
 
 def _order_at_infinity(plant: DecoupledPlant, f: FloatArray, g: FloatArray) -> int:
@@ -150,7 +179,7 @@ def _order_at_infinity(plant: DecoupledPlant, f: FloatArray, g: FloatArray) -> i
         return 0
     inverse = np.linalg.inv(plant.E * plant.time)
     a, f, known = inverse @ plant.A, inverse @ f, inverse @ np.hstack([-plant.By, plant.Bu])
-    rows = np.hstack([plant.C, g, np.hstack([plant.H, plant.Du])])
+    rows = np.hstack([plant.C, g, plant.H, plant.Du])
     for _ in range(n):
         full = np.linalg.norm(rows, 2)
         left, values, _ = np.linalg.svd(rows[:, n:])

@@ -1,8 +1,8 @@
 """The left singular part of a pencil, by orthogonal transformations, with the rows it is made of.
 
-What is left of ``A - sE`` of any shape once its finite zeros, its infinite part and its right singular part are taken
-out is ``[A_o - s E_o; C_o]`` with E_o regular and (E_o, A_o, C_o) observable: its left null space is that of the whole
-pencil.  The pencil must come balanced, and is not balanced again on the way, which would blow rounding up.
+What is left of ``A - sE`` of any shape without its finite zeros, its infinite part and its right singular part is
+``[A_o - s E_o; C_o]``, E_o regular and (E_o, A_o, C_o) observable: its left null space is that of the whole pencil.
+The pencil must come balanced, and is not balanced again on the way, which would blow rounding up.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from obsynth.numerics.arrays import ComplexArray, FloatArray
+from obsynth.numerics.pencil_points import full_svd, largest_singular_value
 from obsynth.numerics.ranks import RankDecision, rank_from
 from obsynth.numerics.scaling import LogBalance
-from obsynth.numerics.staircase import full_svd, largest_singular_value
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,10 +40,9 @@ class PencilUnits:
 
 @dataclass(frozen=True, eq=False)
 class LeftPart:
-    """What is left of a pencil: ``left @ (A - sE) = [A_o - s E_o; C_o] @ right``.
+    """What is left of a pencil: ``left @ (A - sE) = [A_o - s E_o; C_o] @ right``; Ez, Az: that of the finite zeros.
 
-    E, A ``(k, k)``, C ``(p, k)``; left ``(k + p, m)``, right ``(k, n)``; Ez, Az the pencil of the finite zeros that
-    were taken out.
+    E, A ``(k, k)``, C ``(p, k)``; left ``(k + p, m)``, right ``(k, n)``.
     """
 
     E: FloatArray

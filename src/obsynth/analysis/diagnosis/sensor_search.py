@@ -1,18 +1,15 @@
 """Least sets of sensors for detecting, isolating or estimating faults.
 
 Feasible sets grow with every sensor (none hurts), except where added sensors may fail themselves.  Few sets are
-enumerated, which is exact; many are not: greedy choices are not exact (y = (d1, d2, d1 + f): {1, 3} suffices, greedy
-takes three), so what is found then is inclusion-minimal, and said to be that only.
-
-What sets of sensors show at generic points: small constant matrices, on which rank questions are cheap.
-
-At a generic s0 every question of normal rank about a set of sensors is a rank question on its rows of
-``[C, D] (s0 E - A)^-1 [Bd, Bf]``.  Many sets are asked at once.
+enumerated, which is exact; of many, what greedy choices find is inclusion-minimal, and said to be that only (y = (d1,
+d2, d1 + f): {1, 3} suffices, greedy takes three).  Sets are screened at generic points s0, where every question of
+normal rank is one on rows of ``[C, D] (s0 E - A)^-1 [Bd, Bf]``, asked of many sets at once.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from math import comb
@@ -20,8 +17,8 @@ from math import comb
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.analysis.diagnosis.additions import Sensor, with_sensors
-from obsynth.analysis.diagnosis.columns import Question
+from obsynth.analysis.diagnosis.explanations import Sensor, with_sensors
+from obsynth.analysis.diagnosis.fault_columns import Question, others
 from obsynth.analysis.diagnosis.reduction import PencilUnits
 from obsynth.numerics.arrays import SMALLEST, ComplexArray
 from obsynth.numerics.ranks import RANK_TOLERANCE
@@ -35,10 +32,7 @@ SHOWN = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class SensorResponses:
-    """Rows: the plant's outputs, then candidates; columns: unknown inputs, then faults; one table per point.
-
-    Fields: tables ``(points, rows, nd + nf)``; outputs: how many rows are outputs; nd.
-    """
+    """Rows: outputs, then candidates; columns: unknown inputs, then faults; ``tables (points, rows, nd + nf)``."""
 
     tables: ComplexArray
     outputs: int
@@ -116,10 +110,9 @@ class Task:
 
 @dataclass(frozen=True, eq=False)
 class SensorSearch:
-    """A search over sets of candidate sensors.
+    """A search over sets of candidate sensors, for the columns ``faults``.
 
-    Fields: faults: columns that count; may_fail: every added sensor brings a fault of its own, to be told as well;
-    copies: how often a candidate may be taken.
+    ``may_fail``: an added sensor brings a fault of its own, to be told as well; ``copies``: how often it may be taken.
     """
 
     plant: DescriptorSystem
@@ -134,9 +127,9 @@ class SensorSearch:
         if self.goal == "detect":
             return [Task(i, (), self.goal) for i in faults]
         if self.goal == "isolate":
-            pairs = [Task(i, (j,), self.goal) for i in faults for j in range(plant.nf) if j != i]
+            pairs = [Task(i, (j,), self.goal) for i in faults for j in others(plant, i)]
             return [*(Task(i, (), self.goal) for i in faults), *pairs]
-        return [Task(i, tuple(j for j in range(plant.nf) if j != i), self.goal) for i in faults]
+        return [Task(i, others(plant, i), self.goal) for i in faults]
 
     def reachable(self) -> list[Task]:
         """Return the tasks that all candidates together reach: no set can do more."""
@@ -145,14 +138,11 @@ class SensorSearch:
 
     def equipped(self, chosen: Sequence[int]) -> DescriptorSystem:
         """Return the plant with a set of candidates, each with a fault of its own where sensors may fail."""
-        names: list[str] = []
         picked = []
-        for index in chosen:
-            name = self.sensors[index].name
-            names.append(name)
-            again = names.count(name)
-            label = name if again == 1 else f"{name} ({again})"
-            picked.append(replace(self.sensors[index], name=label))
+        names = [self.sensors[index].name for index in chosen]
+        for place, (index, name) in enumerate(zip(chosen, names, strict=True)):
+            again = names[: place + 1].count(name)
+            picked.append(replace(self.sensors[index], name=name if again == 1 else f"{name} ({again})"))
         plant = with_sensors(self.plant, picked)
         if not self.may_fail or not picked:
             return plant
@@ -170,9 +160,9 @@ class SensorSearch:
             return False
         if not self.may_fail:
             return True
-        own = range(self.plant.nf, plant.nf)
-        more = [task for task in self.tasks(plant, [*self.faults, *own]) if _is_new(task, self.plant.nf)]
-        return all(reached(plant, task) for task in more)
+        known = self.plant.nf
+        more = self.tasks(plant, [*self.faults, *range(known, plant.nf)])
+        return all(reached(plant, task) for task in more if max(task.fault, *task.beside, -1) >= known)
 
     def minimal_sets(self, wanted: Sequence[Task], largest: int, most: int) -> tuple[list[tuple[int, ...]], bool]:
         """Return inclusion-minimal sets by size, and whether these are all of them up to the largest size."""
@@ -182,7 +172,8 @@ class SensorSearch:
         for size in range(largest + 1):
             if comb(count * self.copies, size) > MOST_SETS:
                 return found, False
-            sets = [s for s in self._sets(size) if not any(_within(f, s) for f in found)]
+            every = dict.fromkeys(combinations([i for i in range(count) for _ in range(self.copies)], size))
+            sets = [chosen for chosen in every if not any(Counter(f) <= Counter(chosen) for f in found)]
             new: list[tuple[int, ...]] = []
             for tried, chosen in enumerate(self._promising(sets, wanted, responses), start=1):
                 if self.feasible(chosen, wanted):
@@ -191,14 +182,6 @@ class SensorSearch:
                     return [*found, *new], False
             found += new
         return found, True
-
-    def _sets(self, size: int) -> Iterator[tuple[int, ...]]:
-        pool = [i for i in range(len(self.sensors)) for _ in range(self.copies)]
-        seen = set[tuple[int, ...]]()
-        for chosen in combinations(pool, size):
-            if chosen not in seen:
-                seen.add(chosen)
-                yield chosen
 
     def _promising(
         self, sets: Sequence[tuple[int, ...]], wanted: Sequence[Task], responses: SensorResponses | None
@@ -240,18 +223,7 @@ class SensorSearch:
 
 def reached(plant: DescriptorSystem, task: Task) -> bool:
     """Whether a plant reaches a task, decided by taking out what must not show."""
-    asked = Question(plant, task.beside, task.fault, False)
-    if not asked.visible:
-        return False
+    asked = Question(plant, task.beside, task.fault)
     if task.goal == "estimate":
-        return not asked.blocking.size
-    rest = 1.0 if plant.dt > 0.0 else 0.0
-    return asked.shows_at(rest) if task.goal == "estimate-step" else True
-
-
-def _is_new(task: Task, count: int) -> bool:
-    return task.fault >= count or any(j >= count for j in task.beside)
-
-
-def _within(small: Sequence[int], large: Sequence[int]) -> bool:
-    return all(small.count(i) <= large.count(i) for i in set(small))
+        return asked.estimable
+    return asked.shows_at_rest if task.goal == "estimate-step" else asked.visible

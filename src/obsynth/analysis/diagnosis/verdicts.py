@@ -1,18 +1,73 @@
-"""What is known about one fault, and the whole diagnosis of a plant, as results that print themselves."""
+"""Results of a diagnosis that print themselves: what is known of each fault, and the bank of structured residuals."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
 from html import escape
+from itertools import combinations
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.analysis.diagnosis.banks import StructuredResidual
-from obsynth.files.tables import html_table
+from obsynth.analysis.diagnosis.exact import question
+from obsynth.files.tables import html_table, text_table
 from obsynth.numerics.arrays import ComplexArray
+from obsynth.plants.descriptor import DescriptorSystem
+
+#: With more faults only residuals that are blind to one fault, or see one fault, are looked for.
+MOST_FAULTS = 6
+
+
+@dataclass(frozen=True)
+class StructuredResidual:
+    """A residual that can be had: it sees some faults, and neither the others nor any unknown input.
+
+    Parameters
+    ----------
+    sees : tuple of str
+        Faults that leave a trace in it.
+    blind_to : tuple of str
+        The others.
+    at_rest : tuple of str
+        Those of `sees` whose constant values it keeps seeing.
+    order : int or None
+        Least order of a filter with one residual that sees them all; ``None`` where it is beyond what is computed.
+    """
+
+    sees: tuple[str, ...]
+    blind_to: tuple[str, ...]
+    at_rest: tuple[str, ...]
+    order: int | None
+
+
+def residual_bank(plant: DescriptorSystem, exactly: bool) -> tuple[StructuredResidual, ...]:
+    """Return every structured residual that exists, those that see least first."""
+    found = []
+    for removed in _sets(plant.nf):
+        kept = [i for i in range(plant.nf) if i not in removed]
+        asked = [question(plant, removed, i, exactly) for i in kept]
+        if not all(one.visible for one in asked):
+            continue
+        orders = [one.residual_order for one in asked]
+        known = [order for order in orders if order is not None]
+        sets = (kept, removed, [one.number for one in asked if one.shows_at_rest])
+        sees, blind, at_rest = (tuple(plant.fault_names[i] for i in chosen) for chosen in sets)
+        found.append(StructuredResidual(sees, blind, at_rest, max(known) if len(known) == len(orders) else None))
+    return tuple(sorted(found, key=lambda residual: len(residual.sees)))
+
+
+def _sets(count: int) -> Iterator[Sequence[int]]:
+    """Yield the sets of faults to be blind to."""
+    if count <= MOST_FAULTS:
+        for size in range(count):
+            yield from combinations(range(count), size)
+        return
+    yield ()
+    for i in range(count):
+        yield (i,)
+        yield tuple(j for j in range(count) if j != i)
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,13 +129,10 @@ class FaultDiagnosis:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the verdicts as plain data, zeros as ``[real, imaginary]``."""
-        return {
-            "name": self.name, "detectable": self.detectable, "detectable_at_rest": self.detectable_at_rest,
+        plain = {field.name: getattr(self, field.name) for field in fields(self)}
+        return plain | {
             "detectable_at": {f"{frequency:g}": found for frequency, found in self.detectable_at.items()},
-            "estimable": self.estimable, "step_estimable": self.step_estimable,
-            "model_estimable": self.model_estimable, "order": self.order, "residual_order": self.residual_order,
-            "filter_order": self.filter_order, "zeros": _pairs(self.zeros), "blocking": _pairs(self.blocking),
-            "sentences": list(self.sentences), "exact": self.exact,
+            "zeros": _pairs(self.zeros), "blocking": _pairs(self.blocking), "sentences": list(self.sentences),
             "gap": None if np.isinf(self.gap) else self.gap,
         }  # fmt: skip
 
@@ -144,10 +196,8 @@ class Diagnosis:
     def isolability_rows(self) -> tuple[tuple[str, ...], ...]:
         """Return the isolability table as texts: 'yes', 'changing' (not at rest) or 'no', row from column."""
         names = [fault.name for fault in self.faults]
-        rows = [
-            (name, *(_isolability(bool(weak), bool(strong)) for weak, strong in zip(*both, strict=True)))
-            for name, both in zip(names, zip(self.isolable, self.isolable_at_rest, strict=True), strict=True)
-        ]
+        words = np.where(self.isolable_at_rest, "yes", np.where(self.isolable, "changing", "no")).tolist()
+        rows = ((name, *row) for name, row in zip(names, words, strict=True))
         return (("fault", *(f"from {name}" for name in names)), *rows)
 
     def bank_rows(self) -> tuple[tuple[str, ...], ...]:
@@ -171,26 +221,26 @@ class Diagnosis:
     @property
     def heading(self) -> str:
         """What was asked, in one line."""
-        free = f"free of {', '.join(self.unknown_inputs)}" if self.unknown_inputs else "no unknown inputs"
-        if len(self.unknown_inputs) > 4:
-            free = f"free of {len(self.unknown_inputs)} unknown inputs"
+        count = len(self.unknown_inputs)
+        named = ", ".join(self.unknown_inputs) if count <= 4 else f"{count} unknown inputs"
         way = "decided exactly" if self.exact else "decided in floating point"
-        return f"What can be diagnosed ({free}; {way})"
+        return f"What can be diagnosed ({f'free of {named}' if count else 'no unknown inputs'}; {way})"
 
     def __str__(self) -> str:
         if not self.faults:
             return "The plant has no faults to diagnose."
-        lines = [self.heading, *_aligned(self.verdict_rows())]
-        if len(self.faults) > 1:
-            lines += ["", *_aligned(self.isolability_rows())]
-        return "\n".join([*lines, *self.sentences, *(f"Warning: {text}" for text in self.warnings)])
+        more = ["", *text_table(self.isolability_rows())] if len(self.faults) > 1 else []
+        return "\n".join([self.heading, *text_table(self.verdict_rows()), *more, *self._texts])
 
     def _repr_html_(self) -> str:
         parts = [f"<p><b>{escape(self.heading)}</b></p>", html_table(self.verdict_rows())]
         if len(self.faults) > 1:
             parts += [html_table(self.isolability_rows()), html_table(self.bank_rows())]
-        texts = [*self.sentences, *(f"Warning: {text}" for text in self.warnings)]
-        return "".join([*parts, *(f"<p>{escape(text)}</p>" for text in texts)])
+        return "".join([*parts, *(f"<p>{escape(text)}</p>" for text in self._texts)])
+
+    @property
+    def _texts(self) -> list[str]:
+        return [*self.sentences, *(f"Warning: {text}" for text in self.warnings)]
 
 
 def _pairs(values: ComplexArray) -> list[list[float]]:
@@ -203,12 +253,3 @@ def _word(found: bool) -> str:
 
 def _count(number: int | None) -> str:
     return "-" if number is None else str(number)
-
-
-def _isolability(weak: bool, strong: bool) -> str:
-    return "yes" if strong else "changing" if weak else "no"
-
-
-def _aligned(rows: Sequence[Sequence[str]]) -> list[str]:
-    widths = [max(len(row[j]) for row in rows) for j in range(len(rows[0]))]
-    return ["  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in rows]

@@ -28,8 +28,8 @@ from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.numerics.scaling import equilibrate_pencil
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.exosystems import Exosystem
-from obsynth.proofs.written_numbers import written_fraction
+from obsynth.plants.fault_models import Exosystem
+from obsynth.proofs.exact_arithmetic import written_fraction
 
 #: Digits to which the direction of a witness is rounded, until the plant is within the tolerance.
 DIGITS = (1, 2, 3, 5, 8, 11, 14, 17)

@@ -163,13 +163,13 @@ class WrittenNumbers(PlantNumbers):
 
     def zeros(self, rows: int, columns: int) -> fmpq_mat:
         """Return a zero matrix."""
-        from obsynth.proofs.exact_pencils import zeros_matrix
+        from obsynth.proofs.exact_arithmetic import zeros_matrix
 
         return zeros_matrix(rows, columns)
 
     def blocks(self, parts: Sequence[Sequence[fmpq_mat]]) -> fmpq_mat:
         """Return a block matrix."""
-        from obsynth.proofs.exact_pencils import blocks
+        from obsynth.proofs.exact_arithmetic import blocks
 
         return blocks([list(row) for row in parts])
 

@@ -97,7 +97,7 @@ class SampledNumbers(PlantNumbers):
     def pencil(self, inputs: Rows, direct: Rows) -> EnclosedPencil:
         """Return ``[A - z, inputs; C, direct]``."""
         from obsynth.proofs.enclosed_pencils import EnclosedPencil
-        from obsynth.proofs.exact_pencils import blocks, zeros_matrix
+        from obsynth.proofs.exact_arithmetic import blocks, zeros_matrix
 
         whole = self.blocks([[self.matrices["A"], inputs], [self.matrices["C"], direct]])
         outputs, extra = len(whole) - self.states, len(whole[0]) - self.states
@@ -119,7 +119,7 @@ def sampled_numbers(exact: Mapping[str, fmpq_mat], sample_time: Any) -> SampledN
     import flint
 
     from obsynth.proofs.enclosed_pencils import bits_for, enclosed, exponential
-    from obsynth.proofs.exact_pencils import blocks, zeros_matrix
+    from obsynth.proofs.exact_arithmetic import blocks, zeros_matrix
 
     states, faults, unknown = (int(exact[name].ncols()) for name in ("A", "Bf", "Bd"))
     width = faults + unknown

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from obsynth.analysis.existence.numbers import uncleaned
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.exosystems import Exosystem
+from obsynth.plants.fault_models import Exosystem
 from obsynth.plants.origin import DECISIVE, PlantOrigin, origin_of, with_origin
-from obsynth.proofs.written_numbers import written_fraction
+from obsynth.proofs.exact_arithmetic import written_fraction
 
 #: At most so many changes are listed.
 LISTED = 4

@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.analysis.transformations.equations_at_a_point import symbolic_equations
 from obsynth.analysis.transformations.equilibrium import Point
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.expressions import parse_expression
 from obsynth.plants.constants import Constant, ConstantsBox, constants_box
+from obsynth.plants.dae.functions import symbolic_equations
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.uncertain_system import stated_box
 from obsynth.plants.uncertainty import Entry
@@ -62,10 +62,8 @@ def box_of_model(model: DAEModel, constants: Any, given: Mapping[str, float], **
 
 def at_nominal(model: DAEModel, box: ConstantsBox) -> DAEModel:
     """Return the model with the nominal values of a box, whose constants are parameters then."""
-    kept = {name: box.constants[name].nominal if name in box.constants else value
-            for name, value in model.constants.items()}  # fmt: skip
-    changed = {name: box.constants[name].nominal if name in box.constants else value
-               for name, value in model.parameters.items()}  # fmt: skip
+    kept, changed = ({name: box.constants[name].nominal if name in box.constants else value
+                      for name, value in given.items()} for given in (model.constants, model.parameters))  # fmt: skip
     same = kept == dict(model.constants) and changed == dict(model.parameters)
     return promoted(model if same else model.replace(constants=kept, parameters=changed), box.names)
 
@@ -134,8 +132,7 @@ class _Writer:
         for i, _, text in self.entries(column, "the equilibrium's shift"):
             middle = float(parse_expression(text)(nominal))
             rest = f"{text} - {_number(middle)[0]}" if middle else text
-            whole = rest if sign > 0.0 else f"-({rest})"
-            found.append((i, 0, whole))
+            found.append((i, 0, rest if sign > 0.0 else f"-({rest})"))
         return found
 
     def whole(self, node: Any, place: str) -> str:

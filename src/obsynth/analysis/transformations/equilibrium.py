@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.analysis.transformations.equations_at_a_point import local_equations
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.arguments import is_finite_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import JACOBIAN_RANK_TOLERANCE
+from obsynth.plants.dae.functions import local_equations
 from obsynth.plants.dae.model import DAEModel
-from obsynth.plants.names import index_of
+from obsynth.plants.validation import index_of
 
 #: Largest scaled residual of what counts as a root.
 ROOT = 1e-9
@@ -63,8 +63,8 @@ def equilibrium(
 ) -> Point:
     """Return the point where nothing moves, what is given holds, and what is free is as it must be.
 
-    Raises `PreconditionError` with condition ``no-equilibrium`` (the combination of equations that nothing can
-    satisfy is named) or ``equilibrium-not-unique`` (the direction).
+    `PreconditionError` ``no-equilibrium`` (with the combination of equations that nothing can satisfy) or
+    ``equilibrium-not-unique`` (with the direction).
     """
     problem = _Problem(model, given, free, start or {})
     z = problem.solved()
@@ -91,23 +91,24 @@ class _Problem:
             if name not in given:
                 self.base.x[index_of(name, model.state_names, what="start")] = float(value)
         self.states = [i for i, name in enumerate(model.state_names) if name not in given]
-        self.inputs = [model.input_names.index(name) for name in free if name in model.input_names]
-        self.parameters = [model.parameter_names.index(name) for name in free if name in model.parameter_names]
+        self.inputs, self.parameters = ([names.index(name) for name in free if name in names]
+                                        for names in (model.input_names, model.parameter_names))  # fmt: skip
         others = (*model.state_names, *model.input_names, *model.parameter_names)
         self.seen = [i for i, name in enumerate(model.output_names) if name in given and name not in others]
         self.wanted = np.array([given[model.output_names[i]] for i in self.seen])
-        self.names = [model.state_names[i] for i in self.states] + [model.input_names[i] for i in self.inputs]
-        self.names += [model.parameter_names[i] for i in self.parameters]
+        groups = ((model.state_names, self.states), (model.input_names, self.inputs),
+                  (model.parameter_names, self.parameters))  # fmt: skip
+        self.names = [names[i] for names, places in groups for i in places]
         self.rows = [*model.equation_names, *(f"given {model.output_names[i]}" for i in self.seen)]
         begin = np.concatenate([self.base.x[self.states], self.base.u[self.inputs], self.base.theta[self.parameters]])
         freed = np.abs(begin[len(self.states) :])
         self.sizes = np.concatenate([model.state_scales[self.states], np.where(freed > 0.0, freed, 1.0)])
         self.begin: FloatArray = np.asarray(begin / self.sizes)
-        peaks = np.abs(self.raw(self.begin)[1]).max(axis=1, initial=0.0)
-        if not np.isfinite(peaks).all():
+        jacobian = self.raw(self.begin)[1]
+        if not np.isfinite(jacobian).all():
             raise SpecError("The model is not defined at its nominal values: give other ones by start or given.",
                             path="start")  # fmt: skip
-        self.weights = 1.0 / np.where(peaks > 0.0, peaks, 1.0)
+        self.weights = _row_weights(jacobian)
 
     def point(self, z: FloatArray) -> Point:
         """Return the whole point of scaled unknowns."""
@@ -141,7 +142,7 @@ class _Problem:
 
         def finite(part: int) -> Callable[[FloatArray], FloatArray]:
             # Outside the region where the model is defined a large number turns the search back.
-            return lambda z: _finite(self.scaled(z)[part])
+            return lambda z: np.nan_to_num(self.scaled(z)[part], nan=HUGE, posinf=HUGE, neginf=-HUGE)
 
         # As far as rounding allows.
         exact = np.finfo(np.float64).eps * 4.0
@@ -204,9 +205,7 @@ class _Problem:
             return [], ""
         shares = weights / weights[int(np.argmax(np.abs(weights)))]
         kept = [i for i in range(len(shares)) if abs(shares[i]) > NAMED]
-        terms = [
-            f"{self.rows[i]}" if abs(shares[i] - 1.0) < NAMED else f"{shares[i]:.6g} * {self.rows[i]}" for i in kept
-        ]
+        terms = [("" if abs(shares[i] - 1.0) < NAMED else f"{shares[i]:.6g} * ") + self.rows[i] for i in kept]
         return [self.rows[i] for i in kept], " + ".join(terms)
 
 
@@ -254,10 +253,6 @@ def _algebraic_step(constraint: FloatArray, right: FloatArray, E: FloatArray, mo
     return move
 
 
-def _finite(values: FloatArray) -> FloatArray:
-    return np.asarray(np.nan_to_num(values, nan=HUGE, posinf=HUGE, neginf=-HUGE), dtype=np.float64)
-
-
 def _row_weights(matrix: FloatArray) -> FloatArray:
-    peaks = np.abs(matrix).max(axis=1)
+    peaks = np.abs(matrix).max(axis=1, initial=0.0)
     return np.asarray(1.0 / np.where(peaks > 0.0, peaks, 1.0))

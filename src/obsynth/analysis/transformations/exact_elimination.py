@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.holds import zero_order_hold
+from obsynth.numerics.continuous import zero_order_hold
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.origin import DECISIVE, PlantOrigin, origin_of
@@ -51,8 +51,7 @@ class ExactElimination:
 
     def origin(self, sizes: Mapping[str, FloatArray]) -> PlantOrigin:
         """Return what the reduced plant remembers of it, with the sizes of the terms in its own coordinates."""
-        from obsynth.proofs.exact_pencils import identity
-        from obsynth.proofs.written_numbers import fractions_of
+        from obsynth.proofs.exact_arithmetic import fractions_of, identity
 
         found: dict[str, fmpq_mat] = {"E": identity(len(self.pivots)), **self.matrices}
         kept = {name: sizes[name] for name in DECISIVE if name in sizes}
@@ -67,7 +66,7 @@ class ExactElimination:
 
 def exact_elimination(plant: DescriptorSystem) -> ExactElimination | None:
     """Return the elimination; ``None`` for too many states, or where no state can be eliminated so."""
-    from obsynth.proofs.written_numbers import computed_entries
+    from obsynth.proofs.exact_arithmetic import computed_entries
 
     if plant.nx > MOST_STATES or origin_of(plant) is not None:
         return None
@@ -83,8 +82,7 @@ def exact_elimination(plant: DescriptorSystem) -> ExactElimination | None:
 
 def _eliminated(plant: DescriptorSystem, *, clean: bool) -> ExactElimination | None:
     """Return the elimination; with ``clean`` what rounding of computed data may have left is zero."""
-    from obsynth.proofs.exact_pencils import blocks, null_basis, pivot_columns
-    from obsynth.proofs.written_numbers import written_matrix
+    from obsynth.proofs.exact_arithmetic import blocks, null_basis, pivot_columns, written_matrix
 
     e, a, c = (written_matrix(matrix) for matrix in (plant.E, plant.A, plant.C))
     pivots, rows = pivot_columns(e), pivot_columns(e.transpose())
@@ -143,7 +141,7 @@ def rounded_once(
     import flint
 
     from obsynth.proofs.enclosed_pencils import enclosed
-    from obsynth.proofs.written_numbers import nearest_doubles, written_matrix
+    from obsynth.proofs.exact_arithmetic import nearest_doubles, written_matrix
 
     if dynamic is None:
         return (
@@ -204,7 +202,7 @@ def _cleaned(result: fmpq_mat, size_of_terms: FloatArray) -> fmpq_mat:
 
 
 def _sizes(matrix: fmpq_mat) -> FloatArray:
-    from obsynth.proofs.written_numbers import nearest_doubles
+    from obsynth.proofs.exact_arithmetic import nearest_doubles
 
     return np.abs(nearest_doubles(matrix))
 
@@ -215,7 +213,7 @@ def _doubles(matrix: Any) -> FloatArray:
 
 
 def _independent_rows(e: fmpq_mat, pivots: tuple[int, ...]) -> list[int]:
-    from obsynth.proofs.exact_pencils import pivot_columns
+    from obsynth.proofs.exact_arithmetic import pivot_columns
 
     return pivot_columns((e * _units(int(e.ncols()), pivots)).transpose())
 
@@ -234,7 +232,7 @@ def _units(order: int, chosen: list[int] | tuple[int, ...]) -> fmpq_mat:
 
 
 def _zeros(rows: int, columns: int) -> fmpq_mat:
-    from obsynth.proofs.exact_pencils import zeros_matrix
+    from obsynth.proofs.exact_arithmetic import zeros_matrix
 
     return zeros_matrix(rows, columns)
 
@@ -252,7 +250,7 @@ def _split(matrix: fmpq_mat, widths: list[int]) -> list[fmpq_mat]:
 
 def sampled_origin(smooth: DescriptorSystem, sample_time: float) -> PlantOrigin:
     """Return what a plant that is sampled from one with ``E = I`` remembers."""
-    from obsynth.proofs.written_numbers import computed_entries, fractions_of, written_fraction, written_matrix
+    from obsynth.proofs.exact_arithmetic import computed_entries, fractions_of, written_fraction, written_matrix
 
     origin = origin_of(smooth)
     exact: Mapping[str, tuple[tuple[Fraction, ...], ...]] = (

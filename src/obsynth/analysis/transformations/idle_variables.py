@@ -31,11 +31,7 @@ OTHERS_WEIGHT = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class ActiveVariables:
-    """What is left of a plant without its idle variables.
-
-    Fields: rows, columns: Equations and variables that stay; dropped: Names of the variables that do not; equations:
-    Numbers, from 1, of the equations that do not.
-    """
+    """What is left of a plant without its idle variables; names of these, and numbers of their equations from 1."""
 
     rows: Indices
     columns: Indices
@@ -73,13 +69,9 @@ def active_variables(plant: DescriptorSystem) -> ActiveVariables:
             raise_structurally_singular(plant, rows[coarse.over_rows], columns[coarse.under_columns])
     idle_rows, idle_columns = _idle(e[rows][:, columns], pattern, coarse, c[:, columns], plant, rows, columns)
     kept_rows, kept_columns = np.delete(rows, idle_rows), np.delete(columns, idle_columns)
-    left_out = np.setdiff1d(np.arange(plant.nx), kept_columns)
-    return ActiveVariables(
-        kept_rows,
-        kept_columns,
-        tuple(plant.state_names[i] for i in left_out),
-        tuple(int(i) + 1 for i in np.setdiff1d(np.arange(plant.nx), kept_rows)),
-    )
+    dropped, unneeded = (np.setdiff1d(np.arange(plant.nx), kept) for kept in (kept_columns, kept_rows))
+    names, numbers = tuple(plant.state_names[i] for i in dropped), tuple(int(i) + 1 for i in unneeded)
+    return ActiveVariables(kept_rows, kept_columns, names, numbers)
 
 
 def active_part(plant: DescriptorSystem, found: ActiveVariables) -> DescriptorSystem:
@@ -197,8 +189,7 @@ def _spread(marked: Any, source: Indices, target: Indices, *, within: Any = None
     while True:
         more = found.copy()
         more[target[found[source]]] = True
-        if within is not None:
-            more &= within
+        more &= True if within is None else within
         if np.array_equal(more, found):
             return found
         found = more
@@ -223,7 +214,7 @@ def raise_structurally_singular(plant: DescriptorSystem, equations: Indices, var
     names = [plant.state_names[i] for i in variables]
     raise PreconditionError(
         "The plant is not regular, det(A - zE) is zero for every z and whatever the numbers are: "
-        + f"{listed(names)} {_are(names)} in too few equations, and equations "
+        + f"{listed(names)} {'is' if len(names) == 1 else 'are'} in too few equations, and equations "
         + f"{listed([equation_name(plant, i) for i in equations], quoted=False)} hold too few variables. Check for a "
         "missing or repeated equation.",
         condition="regularity",
@@ -234,10 +225,6 @@ def raise_structurally_singular(plant: DescriptorSystem, equations: Indices, var
 def own_first(places: Indices, others: Indices) -> Indices:
     """Return the places with those first that are among others: equations of such variables, or the reverse."""
     return places[np.argsort(~np.isin(places, others), kind="stable")]
-
-
-def _are(names: list[str]) -> str:
-    return "are" if len(names) != 1 else "is"
 
 
 def equation_name(plant: DescriptorSystem, row: int) -> str:

@@ -9,17 +9,16 @@ from typing import Any
 import numpy as np
 
 from obsynth.analysis.transformations.entries_in_constants import at_nominal, box_of_model, entries_in_constants
-from obsynth.analysis.transformations.equations_at_a_point import LocalEquations, local_equations
 from obsynth.analysis.transformations.equilibrium import Point, consistent_point, equilibrium, nominal_point
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.arguments import require_kind
-from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.constants import ConstantsBox
+from obsynth.plants.dae.functions import local_equations
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.names import index_of
 from obsynth.plants.uncertain_system import filled_plant
 from obsynth.plants.uncertainty import Uncertainty
+from obsynth.plants.validation import index_of
 
 #: What E x' may be, in sizes of its row, where a point counts as resting.
 MOVING = 1e-9
@@ -130,11 +129,11 @@ def linearise(
     else:
         if freed or start:
             raise SpecError("free and start belong to an equilibrium: at a point, give every value.", path="free")
-        wrong = [name for name in values if name in model.output_names and not _is_state_or_input(model, name)]
+        others = (*model.state_names, *model.input_names, *model.parameter_names)
+        wrong = [name for name in values if name in model.output_names and name not in others]
         if wrong:
-            raise SpecError(
-                f"The output {wrong[0]!r} cannot be given at a point: give states.", path=f"given.{wrong[0]}"
-            )
+            raise SpecError(f"The output {wrong[0]!r} cannot be given at a point: give states.",
+                            path=f"given.{wrong[0]}")  # fmt: skip
         point = consistent_point(model, nominal_point(model, values), values)
     return linear_model(model, point, faults=faults, disturbances=disturbances, drift=drift, box=box)
 
@@ -151,7 +150,12 @@ def linear_model(
     motion = local.E @ point.rates
     moves = np.abs(motion) > MOVING * np.maximum(np.abs(local.by_state) @ model.state_scales, np.abs(motion).min())
     if moves.any() and not drift:
-        raise _moving(model, motion, moves)
+        moved = {name: value for name, value, moving in zip(model.equation_names, motion, moves, strict=True) if moving}
+        raise PreconditionError(
+            f"The point moves: E x' = ({', '.join(f'{name}: {value:.4g}' for name, value in moved.items())}), so that "
+            f"it is no equilibrium. With drift=True this motion becomes an input {DRIFT!r}, which is 1 in every row.",
+            condition="no-equilibrium", signals=list(moved),
+        )  # fmt: skip
     uncertain = () if box is None else box.names
     every = [name for name in model.parameter_names if name not in uncertain]
     chosen = every if faults is None else _names(faults, "faults")
@@ -161,8 +165,13 @@ def linear_model(
     inputs, B = [model.input_names[i] for i in known], -local.by_input[:, known]
     if moves.any():
         inputs, B = [*inputs, DRIFT], np.column_stack([B, motion])
-    names = [_state_name(model, i, point, local) for i in range(model.nx)]
-    values = _operating_point(model, point, local, names) | ({DRIFT: 0.0} if moves.any() else {})
+    # A state must not have the name of an output with another value.
+    shown = dict(zip(model.output_names, local.y, strict=True))
+    names = [name if shown.get(name, x) == x else f"{name} (state)"
+             for name, x in zip(model.state_names, point.x, strict=True)]  # fmt: skip
+    values = dict(zip((*model.parameter_names, *model.input_names, *names, *model.output_names),
+                      map(float, (*point.theta, *point.u, *point.x, *local.y)), strict=True))  # fmt: skip
+    values |= {DRIFT: 0.0} if moves.any() else {}
     signals = {*names, *inputs, *model.output_names, *chosen, *disturbances}
     units = {name: unit for name, unit in model.units.items() if name in signals}
     units |= {name: model.units[given] for name, given in zip(names, model.state_names, strict=True)
@@ -207,26 +216,6 @@ def _over_box(
     return filled_plant(linear, uncertainty.with_box(replace(box, constants=kept)), set(kept))
 
 
-def _state_name(model: DAEModel, i: int, point: Point, local: LocalEquations) -> str:
-    """Return a state's name, which must not be that of an output with another value."""
-    name = model.state_names[i]
-    if name in model.output_names and local.y[model.output_names.index(name)] != point.x[i]:
-        return f"{name} (state)"
-    return name
-
-
-def _operating_point(model: DAEModel, point: Point, local: LocalEquations, names: Sequence[str]) -> dict[str, float]:
-    found: dict[str, FloatArray] = {}
-    for signals, values in ((model.parameter_names, point.theta), (model.input_names, point.u), (names, point.x),
-                            (model.output_names, local.y)):  # fmt: skip
-        found |= dict(zip(signals, values, strict=True))
-    return {name: float(value) for name, value in found.items()}
-
-
-def _is_state_or_input(model: DAEModel, name: str) -> bool:
-    return name in (*model.state_names, *model.input_names, *model.parameter_names)
-
-
 def _names(value: Sequence[str] | Mapping[str, tuple[float, float]], what: str) -> list[str]:
     if isinstance(value, str):
         raise SpecError(f"{what} is the text {value!r}: give a list of names.", path=what)
@@ -236,26 +225,11 @@ def _names(value: Sequence[str] | Mapping[str, tuple[float, float]], what: str) 
 def _require_bounds(model: DAEModel, point: Point, free: Sequence[str] | Mapping[str, tuple[float, float]]) -> None:
     if not isinstance(free, Mapping):
         return
-    values = dict(zip(model.input_names, point.u, strict=True)) | dict(
-        zip(model.parameter_names, point.theta, strict=True)
-    )
-    outside = []
-    for name, bounds in free.items():
-        low, high = map(float, bounds)
-        if not low <= values[name] <= high:
-            outside.append((name, f"{name} = {values[name]:.6g} is outside [{low:g}, {high:g}]"))
+    values = dict(zip((*model.input_names, *model.parameter_names), (*point.u, *point.theta), strict=True))
+    outside = {name: f"{name} = {values[name]:.6g} is outside [{float(low):g}, {float(high):g}]"
+               for name, (low, high) in free.items() if not float(low) <= values[name] <= float(high)}  # fmt: skip
     if outside:
         raise PreconditionError(
-            f"The equilibrium is not admissible: {'; '.join(text for _, text in outside)}. Give other values, or free "
-            "something else.", condition="outside-bounds", signals=[name for name, _ in outside],
+            f"The equilibrium is not admissible: {'; '.join(outside.values())}. Give other values, or free something "
+            "else.", condition="outside-bounds", signals=list(outside),
         )  # fmt: skip
-
-
-def _moving(model: DAEModel, motion: FloatArray, moves: FloatArray) -> PreconditionError:
-    names = [name for name, moving in zip(model.equation_names, moves, strict=True) if moving]
-    told = ", ".join(f"{name}: {value:.4g}" for name, value, moving in
-                     zip(model.equation_names, motion, moves, strict=True) if moving)  # fmt: skip
-    return PreconditionError(
-        f"The point moves: E x' = ({told}), so that it is no equilibrium. With drift=True this motion becomes an input "
-        f"{DRIFT!r}, which is 1 in every row.", condition="no-equilibrium", signals=names,
-    )  # fmt: skip

@@ -1,13 +1,10 @@
-"""What a transformation did, and the map back to the states of the plant it started from.
-
-Appending faults to the states.
-"""
+"""What a transformation did, and the map back to the states of the plant it started from; faults as states."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
-from typing import TYPE_CHECKING, Any, TypeVar
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,15 +15,14 @@ from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.numerics.ranks import NEGLIGIBLE_INPUT, decide_rank
 from obsynth.numerics.scaling import equilibrate_pencil
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.names import index_of
 from obsynth.plants.uncertainty import matrices_of
+from obsynth.plants.validation import index_of
 
 if TYPE_CHECKING:
     from obsynth.analysis.transformations.recovery_operator import RecoveryOperator
     from obsynth.numerics.sparse_factor import SolutionBounds
 
 
-_Value = TypeVar("_Value")
 #: Map of a recovery -> the signal that it maps.
 _MAPS = {
     "from_state": "state", "from_input": "input", "from_fault": "fault", "from_disturbance": "disturbance",
@@ -36,14 +32,10 @@ _MAPS = {
 
 @dataclass(frozen=True, eq=False)
 class StateRecovery:
-    """The states of a source plant from the signals of a transformed one.
+    """``x_source = from_state x + from_input u + from_fault f + from_disturbance d + from_noise w``.
 
-    ``x_source = from_state x + from_input u + from_fault f + from_disturbance d + from_noise w``
-
-    Fields: names: Names of the source states; from_state, from_input, from_fault, from_disturbance, from_noise:
-    ``(nx_source, nx)``, ``(nx_source, nu)`` and so on, read-only; noise_kept: ``(nw_source, nw)``: the noise of the
-    source as far as the transformed plant still has it; operating_point: Of the source states: the transformed plant
-    forgets that of states which are gone.
+    Maps ``(nx_source, nx)``, ``(nx_source, nu)`` and so on, read-only; ``noise_kept (nw_source, nw)``: the noise of the
+    source as far as the transformed plant still has it; ``operating_point``: of the source states.
     """
 
     names: tuple[str, ...]
@@ -56,9 +48,8 @@ class StateRecovery:
     operating_point: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Make the arrays private and read-only."""
-        for item in fields(self)[1:-1]:
-            object.__setattr__(self, item.name, read_only(getattr(self, item.name)))
+        for name in (*_MAPS, "noise_kept"):
+            object.__setattr__(self, name, read_only(getattr(self, name)))
         object.__setattr__(self, "operating_point", dict(self.operating_point))
 
     @classmethod
@@ -87,10 +78,7 @@ class StateRecovery:
         return self.__dict__.get("operator")
 
     def flags(self) -> tuple[str, ...]:
-        """Return per source state what an estimate from state and input alone is.
-
-        ``exact``, ``needs the fault estimate`` or ``biased by the disturbance`` (which wins).
-        """
+        """Return per source state what an estimate from state and input alone is; a bias wins."""
         return tuple(
             "biased by the disturbance" if biased.any() else "needs the fault estimate" if faulty.any() else "exact"
             for biased, faulty in zip(self.from_disturbance, self.from_fault, strict=True)
@@ -103,26 +91,18 @@ class StateRecovery:
             kept = self.noise_kept @ later.noise_kept
             return StateRecovery.from_operator(self.names, through, kept, self.operating_point)
         step = self.from_state
-        return StateRecovery(
-            names=self.names,
-            from_state=step @ later.from_state,
-            from_input=step @ later.from_input + self.from_input,
-            from_fault=step @ later.from_fault + self.from_fault,
-            from_disturbance=step @ later.from_disturbance + self.from_disturbance,
-            from_noise=step @ later.from_noise + self.from_noise @ later.noise_kept,
-            noise_kept=self.noise_kept @ later.noise_kept,
-            operating_point=self.operating_point,
-        )
+        own = {"from_input": self.from_input, "from_fault": self.from_fault, "from_disturbance": self.from_disturbance,
+               "from_noise": self.from_noise @ later.noise_kept}  # fmt: skip
+        maps = {name: step @ getattr(later, name) + direct for name, direct in own.items()}
+        return replace(self, from_state=step @ later.from_state, noise_kept=self.noise_kept @ later.noise_kept, **maps)
 
 
 @dataclass(frozen=True, eq=False)
 class Transformation:
-    """A plant made from another one.
+    """A plant made from another one, in words, and the states of ``source`` from the signals of ``plant``.
 
-    Fields: source, plant: The plant before and after; description: What was done, in words; recovery: The states of
-    ``source`` from the signals of ``plant``; dropped: names of the states of ``source`` that act on nothing and were
-    left out: they are not recovered; notes: what a user should know; bounds: how well the algebraic equations were
-    solved, where that was done by sparsity.
+    ``dropped``: states of ``source`` that act on nothing and are not recovered; ``bounds``: how well the algebraic
+    equations were solved, where that was done by sparsity.
     """
 
     source: DescriptorSystem
@@ -169,16 +149,10 @@ def unchanged_states(
     source: DescriptorSystem, new: DescriptorSystem, *, from_state: FloatArray, noise_kept: FloatArray | None = None
 ) -> StateRecovery:
     """Return the recovery of a transformation that adds no direct effect of any signal on the states."""
-    return StateRecovery(
-        source.state_names,
-        from_state,
-        from_input=np.zeros((source.nx, new.nu)),
-        from_fault=np.zeros((source.nx, new.nf)),
-        from_disturbance=np.zeros((source.nx, new.nd)),
-        from_noise=np.zeros((source.nx, new.nw)),
-        noise_kept=np.eye(source.nw) if noise_kept is None else noise_kept,
-        operating_point=state_point(source),
-    )
+    inputs, faults, disturbances, noise = (np.zeros((source.nx, n)) for n in (new.nu, new.nf, new.nd, new.nw))
+    kept = np.eye(source.nw) if noise_kept is None else noise_kept
+    point = state_point(source)
+    return StateRecovery(source.state_names, from_state, inputs, faults, disturbances, noise, kept, point)
 
 
 def state_point(plant: DescriptorSystem) -> dict[str, float]:
@@ -192,18 +166,13 @@ def with_states(plant: DescriptorSystem, names: Sequence[str], **changes: Any) -
     # An output or a fault may carry the name of the state it was picked by, and outlives it.
     gone = set(plant.state_names) - set(names) - {name for signals in others for name in signals}
 
-    def surviving(table: Mapping[str, _Value]) -> dict[str, _Value]:
-        return {name: value for name, value in table.items() if name not in gone}
-
-    point, units = surviving(plant.operating_point), surviving(plant.units)
-    return plant.replace(state_names=names, operating_point=point, units=units, **changes)
+    labels = {label: {name: value for name, value in getattr(plant, label).items() if name not in gone}
+              for label in ("operating_point", "units")}  # fmt: skip
+    return plant.replace(state_names=names, **labels, **changes)
 
 
 def augment_faults(plant: DescriptorSystem, faults: Sequence[str]) -> Transformation:
-    """Append the chosen faults that act on the outputs as algebraic states ``phi = f``.
-
-    Shapes: ``plant (ny, nf)``.
-    """
+    """Append the chosen faults that act on the outputs as algebraic states ``phi = f``."""
     columns = [index_of(name, plant.fault_names, what="The plant") for name in faults]
     chosen = sorted({column for column in columns if plant.Df[:, column].any()})
     nx, count = plant.nx, len(chosen)

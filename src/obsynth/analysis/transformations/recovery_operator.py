@@ -22,10 +22,8 @@ SIGNALS = ("state", "input", "fault", "disturbance", "noise")
 class RecoveryOperator:
     """``x = dynamic xi + algebraic z`` with ``coupling z + right [xi; u; f; d; w] = 0``, all sparse.
 
-    Fields: dynamic, algebraic: ``(nx, count)`` and ``(nx, nx - count)``; coupling: ``(nx - count, nx - count)``,
-    nonsingular; right: ``(nx - count, count + nu + nf + nd + nw)``; counts: Numbers of states, inputs, faults,
-    disturbances and noise inputs; states: Signal of the plant now -> ``(count, n)``: ``xi`` from its signals, where
-    later transformations changed them; noise_kept: ``(nw, nw now)``.
+    ``dynamic (nx, count)``, ``coupling (nx - count, nx - count)`` nonsingular; ``counts`` of states, inputs, faults,
+    disturbances, noise; ``states``: ``xi`` from each signal of the plant now, where later transformations changed it.
     """
 
     dynamic: Any
@@ -53,23 +51,20 @@ class RecoveryOperator:
 
     def matrix(self, signal: str) -> FloatArray:
         """Return the dense map from one kind of signal, ``(nx, n)``."""
-        first, last = self._columns(signal)
-        own = np.eye(last - first)
+        own = np.eye(self.counts[SIGNALS.index(signal)])
         if signal == "noise" and self.noise_kept is not None:
             own = self.noise_kept
-        given = {signal: own} if signal != "state" else {}
-        xi = self.states.get(signal)
-        if xi is None and signal == "state":
-            xi = own
-        return self.apply(np.zeros((self.counts[0], own.shape[1])) if xi is None else xi, given)
+        if signal == "state":
+            return self.apply(self.states.get(signal, own), {})
+        return self.apply(self.states.get(signal, np.zeros((self.counts[0], own.shape[1]))), {signal: own})
 
     def apply(self, xi: FloatArray, signals: Mapping[str, FloatArray]) -> FloatArray:
         """Return columns of ``x`` for columns of the eliminated plant's states and of its signals."""
-        first = self._columns("state")[1]
-        terms = self.right[:, :first] @ xi
-        for name, columns in signals.items():
-            start, end = self._columns(name)
-            terms = terms + self.right[:, start:end] @ columns
+        ends = np.cumsum([0, *self.counts])
+        terms = np.zeros((self.right.shape[0], xi.shape[1]))
+        for name, columns in {"state": xi, **signals}.items():
+            place = SIGNALS.index(name)
+            terms = terms + self.right[:, ends[place] : ends[place + 1]] @ columns
         solution = without_rounding(self.factor, -self.factor.solve(terms))
         return np.asarray(self.dynamic @ xi + self.algebraic @ solution)
 
@@ -100,25 +95,15 @@ class RecoveryOperator:
         """Return what `as_dict` wrote."""
         from scipy.sparse import csr_array
 
-        parts = {
-            name: csr_array(
-                (
-                    np.asarray(entry["values"]),
-                    np.asarray(entry["indices"]).astype(np.int64),
-                    np.asarray(entry["starts"]).astype(np.int64),
-                ),
-                shape=(int(entry["rows"]), int(entry["columns"])),
-            )
-            for name, entry in ((name, data[name]) for name in ("dynamic", "algebraic", "coupling", "right"))
-        }
+        def matrix(entry: Mapping[str, Any]) -> Any:
+            indices, starts = (np.asarray(entry[name]).astype(np.int64) for name in ("indices", "starts"))
+            shape = int(entry["rows"]), int(entry["columns"])
+            return csr_array((np.asarray(entry["values"]), indices, starts), shape=shape)
+
+        parts = {name: matrix(data[name]) for name in ("dynamic", "algebraic", "coupling", "right")}
         noise = None if data["noise"] is None else np.asarray(data["noise"])
         states = {name: np.asarray(matrix) for name, matrix in data["states"].items()}
         return cls(**parts, counts=tuple(int(n) for n in data["counts"]), states=states, noise_kept=noise)
-
-    def _columns(self, signal: str) -> tuple[int, int]:
-        ends = np.cumsum([0, *self.counts])
-        place = SIGNALS.index(signal)
-        return int(ends[place]), int(ends[place + 1])
 
 
 def without_rounding(factor: SparseFactor, solution: FloatArray) -> FloatArray:

@@ -13,11 +13,11 @@ from obsynth.analysis.zeros import fault_zeros
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.arguments import is_finite_number
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.holds import zero_order_hold
+from obsynth.numerics.continuous import zero_order_hold
+from obsynth.numerics.libraries import on_one_thread_if_small
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE
 from obsynth.numerics.scaling import balanced_matrix, power_of_two_below
 from obsynth.numerics.sparse import dense
-from obsynth.numerics.threads import on_one_thread_if_small
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.origin import note_source, with_origin
 from obsynth.plants.uncertainty import SAMPLED
@@ -81,16 +81,10 @@ def discretise(plant: DescriptorSystem | Transformation, sample_time: float) -> 
     factor = _noise_factor(smooth.A, smooth.Bw, sample_time)
     kept = [smooth.noise_names[i] for i in direct]
     noise_names = [*(f"process noise {i + 1}" for i in range(factor.shape[1])), *kept]
-    sampled = smooth.replace(
-        A=transition,
-        B=B,
-        Bf=Bf,
-        Bd=Bd,
-        dt=float(sample_time),
-        noise_names=noise_names,
-        Bw=np.hstack([factor, np.zeros((smooth.nx, len(kept)))]),
-        Dw=np.hstack([np.zeros((smooth.ny, factor.shape[1])), smooth.Dw[:, direct]]),
-    )
+    Bw = np.hstack([factor, np.zeros((smooth.nx, len(kept)))])
+    Dw = np.hstack([np.zeros((smooth.ny, factor.shape[1])), smooth.Dw[:, direct]])
+    changes = {"A": transition, "B": B, "Bf": Bf, "Bd": Bd, "Bw": Bw, "Dw": Dw}
+    sampled = smooth.replace(**changes, dt=float(sample_time), noise_names=noise_names)
     sampled = with_origin(sampled, sampled_origin(smooth, sample_time)) if smooth.nx <= MOST_STATES else sampled
     noise_kept = np.hstack([np.zeros((smooth.nw, factor.shape[1])), np.eye(smooth.nw)[:, direct]])
     recovery = unchanged_states(smooth, sampled, from_state=np.eye(smooth.nx), noise_kept=noise_kept)
@@ -101,10 +95,7 @@ def discretise(plant: DescriptorSystem | Transformation, sample_time: float) -> 
 
 
 def sampling_zero_warnings(plant: DescriptorSystem) -> tuple[str, ...]:
-    """Return a text for every fault zero strictly inside, but near, the unit circle of a sampled plant.
-
-    The fault estimate rings for ``dt / -ln abs(z)`` seconds there.
-    """
+    """Return a text for every fault zero inside, but near, the unit circle: estimates ring ``dt / -ln abs(z)`` s."""
     if not plant.is_discrete:
         return ()
     found = fault_zeros(plant)

@@ -13,7 +13,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import UNTOUCHED_SHARE
 from obsynth.plants.constants import ConstantsBox
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.uncertainty import SAMPLED, UNCERTAIN_MATRICES, Uncertainty, matrices_of
+from obsynth.plants.uncertainty import SAMPLED, UNCERTAIN_MATRICES, Uncertainty, as_written, matrices_of
 from obsynth.proofs.affine import AffineMatrix, affine_block, affine_inverse, affine_zero_order_hold
 
 #: Their coordinates are rounded to this many digits: any invertible change of coordinates is exact.
@@ -64,16 +64,14 @@ def affine_plant(plant: DescriptorSystem, box: ConstantsBox | None = None) -> Af
         exact = {name: AffineMatrix.exact(matrix, 0) for name, matrix in matrices_of(plant).items()}
         return AffinePlant(plant, ConstantsBox({}), exact, np.eye(plant.nx))
     box = uncertain.box if box is None else box
-    written: Mapping[str, FloatArray] = matrices_of(plant) if uncertain.written is None else uncertain.written
-    matrices = uncertain.affine(written, box)
-    steps = uncertain.steps
-    if not steps:
-        basis = untouched_coordinates(_touched(matrices), _moved(matrices))
-        return AffinePlant(plant, box, _in_coordinates(matrices, basis), basis)
-    first = _reduced(written, matrices, None)
-    basis = untouched_coordinates(_touched(first), _moved(first))
-    reduced = first if np.array_equal(basis, np.eye(len(basis))) else _reduced(written, matrices, basis)
-    for kind, size in steps:
+    if not uncertain.steps:
+        matrices = uncertain.affine(as_written(plant, uncertain), box)
+        basis = untouched_coordinates(matrices)
+        if not np.array_equal(basis, np.eye(len(basis))):
+            matrices |= {name: matrices[name] @ basis for name in ("E", "A", "C")}
+        return AffinePlant(plant, box, matrices, basis)
+    reduced, basis = reduced_family(plant, uncertain, box)
+    for kind, size in uncertain.steps:
         if kind == SAMPLED:
             inputs = affine_block([[reduced[name] for name in _INPUTS]])
             a, held = affine_zero_order_hold(reduced["A"], inputs, size)
@@ -90,16 +88,18 @@ def moving_family(plant: DescriptorSystem, box: ConstantsBox, basis: FloatArray 
     uncertain = plant.uncertainty
     if uncertain is None:
         return AffineMatrix.exact(plant.A, 0)
-    written: Mapping[str, FloatArray] = matrices_of(plant) if uncertain.written is None else uncertain.written
+    written = as_written(plant, uncertain)
     return _reduced(written, uncertain.affine(written, box), basis)["A"]
 
 
-def reduced_family(plant: DescriptorSystem, uncertain: Uncertainty) -> tuple[dict[str, AffineMatrix], FloatArray]:
-    """Return a continuous plant over its box, algebraic states eliminated and E inverted, and its coordinates."""
-    written: Mapping[str, FloatArray] = matrices_of(plant) if uncertain.written is None else uncertain.written
-    matrices = uncertain.affine(written, uncertain.box)
+def reduced_family(
+    plant: DescriptorSystem, uncertain: Uncertainty, box: ConstantsBox | None = None
+) -> tuple[dict[str, AffineMatrix], FloatArray]:
+    """Return a continuous plant over its box (or another) without algebraic states, E inverted; and its coordinates."""
+    written = as_written(plant, uncertain)
+    matrices = uncertain.affine(written, uncertain.box if box is None else box)
     first = _reduced(written, matrices, None)
-    basis = untouched_coordinates(_touched(first), _moved(first))
+    basis = untouched_coordinates(first)
     return (first if np.array_equal(basis, np.eye(len(basis))) else _reduced(written, matrices, basis)), basis
 
 
@@ -108,9 +108,8 @@ def moving_basis(plant: DescriptorSystem, box: ConstantsBox) -> FloatArray:
     uncertain = plant.uncertainty
     if uncertain is None:
         return np.eye(plant.nx)
-    written: Mapping[str, FloatArray] = matrices_of(plant) if uncertain.written is None else uncertain.written
-    first = _reduced(written, uncertain.affine(written, box), None)
-    return untouched_coordinates(_touched(first), _moved(first))
+    written = as_written(plant, uncertain)
+    return untouched_coordinates(_reduced(written, uncertain.affine(written, box), None))
 
 
 def untouched_states(columns: FloatArray, sizes: FloatArray) -> list[int]:
@@ -129,15 +128,17 @@ def untouched_states(columns: FloatArray, sizes: FloatArray) -> list[int]:
         found = kept
 
 
-def untouched_coordinates(touched: FloatArray, moved: FloatArray) -> FloatArray:
-    """Return ``V (n, n)`` such that ``touched V`` has zero columns where ``touched (m, n)`` has a kernel.
+def untouched_coordinates(matrices: Mapping[str, AffineMatrix]) -> FloatArray:
+    """Return ``V (n, n)``: columns of E V, A V, C V that the constants do not touch, where there are any.
 
     V is the identity but for some columns, so that its inverse is exact: ``2 I - V``.  States whose own equations the
-    constants move most, ``moved (n,)``, become relative to those that they move least.
+    constants move most become relative to those that they move least.
     """
     from scipy.linalg import qr
 
-    n = touched.shape[1]
+    # What the constants multiply the state with, all rows of all of them.
+    touched = np.vstack([matrices[name].parts.reshape(-1, matrices[name].shape[1]) for name in ("E", "A", "C")])
+    n, moved = touched.shape[1], _moved(matrices)
     sizes = np.linalg.norm(touched, axis=1)
     rows = touched[sizes > 0.0] / sizes[sizes > 0.0][:, None]
     if not len(rows):
@@ -157,12 +158,6 @@ def untouched_coordinates(touched: FloatArray, moved: FloatArray) -> FloatArray:
     return found
 
 
-def _touched(matrices: Mapping[str, AffineMatrix]) -> FloatArray:
-    """Return what the constants multiply the state with, all rows of all of them."""
-    stacked = [matrices[name].parts.reshape(-1, matrices[name].shape[1]) for name in ("E", "A", "C")]
-    return np.vstack(stacked)
-
-
 def _moved(matrices: Mapping[str, AffineMatrix]) -> FloatArray:
     """Return how much the constants move each state ``(n,)``: through its own equation, or those of others."""
     a, e = matrices["A"], matrices["E"]
@@ -171,12 +166,6 @@ def _moved(matrices: Mapping[str, AffineMatrix]) -> FloatArray:
     for _ in range(len(found)):
         found = np.maximum(found, size @ found)
     return np.asarray(found)
-
-
-def _in_coordinates(matrices: Mapping[str, AffineMatrix], basis: FloatArray) -> dict[str, AffineMatrix]:
-    if np.array_equal(basis, np.eye(len(basis))):
-        return dict(matrices)
-    return {**matrices, **{name: matrices[name] @ basis for name in ("E", "A", "C")}}
 
 
 def _split(whole: AffineMatrix, like: Mapping[str, AffineMatrix], names: tuple[str, ...]) -> dict[str, AffineMatrix]:

@@ -12,9 +12,8 @@ import numpy as np
 from obsynth.errors import ObsynthError, SpecError
 from obsynth.experiments.alarm_proofs.proof import KIND, SCHEMA_VERSION, Question, statement
 from obsynth.files.inputs import read_json
-from obsynth.results.checks import Check
+from obsynth.results.checks import Check, VerificationReport
 from obsynth.results.gain_sets import digest_of, loaded, restored
-from obsynth.results.report import VerificationReport
 
 #: The stated margin may differ from the one found again by this share: matrices are made anew.
 SAME_MARGIN = 1e-3

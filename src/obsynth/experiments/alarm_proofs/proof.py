@@ -1,9 +1,4 @@
-"""From a record to a proof that it is not fault-free: the programme solved, its dual checked in exact arithmetic.
-
-The file of an alarm's certificate.
-
-Bounds of the plant's state over a record without a fault since its start: the observer run again, and its error.
-"""
+"""From a record to a proof that it is not fault-free: the programme solved, its dual checked in exact arithmetic."""
 
 from __future__ import annotations
 
@@ -24,7 +19,7 @@ from obsynth.experiments.monitors.adaptive_record import thresholds_of_records
 from obsynth.files.outputs import FileKind, write_atomically
 from obsynth.numerics.arguments import is_finite_number, is_whole
 from obsynth.numerics.arrays import FloatArray
-from obsynth.plants.names import index_of
+from obsynth.plants.validation import index_of
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import digest_of
 from obsynth.tolerances.result import EXACT_MODEL
@@ -41,7 +36,7 @@ def window_data(
 ) -> tuple[AffinePlant, WindowData, str]:  # fmt: skip
     """Return the plant over its box, the last ``length`` samples with bounds of the state, and where these come from.
 
-    States are those of `AffinePlant.coordinates`.
+    Without stated ones they come from the observer run again from the start, and its error.
     """
     affine = affine_plant(design.linear[0])
     first = max(0, len(y) - length)

@@ -1,8 +1,7 @@
 """The linear programme of a window: states, disturbances and constants that explain its data without a fault.
 
-Products of a constant and a state are variables of their own, between the planes of McCormick on bounds of the state.
-``t >= 0`` relaxes every inequality: where its least value is above zero, nothing explains the data.  Variables and rows
-are scaled to about one, by powers of two, which changes no number; t is a share of the bounds.
+A product of a constant and a state is a variable between McCormick's planes.  ``t >= 0``, a share of the bounds,
+relaxes every inequality: least above zero, nothing explains the data.  Powers of two scale variables and rows.
 """
 
 from __future__ import annotations
@@ -27,10 +26,7 @@ OUTWARD = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Sparse rows ``sum value * variable (= or <=) right``: lists of columns and values, and right sides.
-
-    ``scales (variables,)``: powers of two in which the variables are counted; the last one is t.
-    """
+    """Sparse rows ``sum value * variable (= or <=) right`` of variables in ``scales``, powers of two; the last is t."""
 
     scales: FloatArray
     columns: list[list[int]] = field(default_factory=list)
@@ -72,10 +68,10 @@ class Window:
         return found[0], found[1]
 
     def proved_least(self, equal: FloatArray, below: FloatArray) -> Fraction:
-        """Return a lower bound of the least t from multipliers (of inequalities: 0 or less), in exact arithmetic.
+        """Return a lower bound of the least t from any multipliers (of inequalities: 0 or less), in exact arithmetic.
 
-        With all variables between bounds, any multipliers prove one: A. Neumaier and O. Shcherbina, "Safe bounds in
-        linear and mixed-integer linear programming", Math. Programming 99, 2004.
+        A. Neumaier, O. Shcherbina, "Safe bounds in linear and mixed-integer linear programming", Math. Programming 99,
+        2004.
         """
         reduced: dict[int, Fraction] = {len(self.lower) - 1: Fraction(1)}
         total = Fraction(0)

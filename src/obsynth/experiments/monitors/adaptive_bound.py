@@ -36,14 +36,13 @@ START_RINGS = 4
 
 @dataclass(frozen=True, eq=False)
 class AdaptiveBound:
-    """What a threshold over a box needs online, for ``v = [xhat; u]`` and outputs ``no``.
+    """What a threshold over a box needs online, for ``v = [xhat; u]``; the ring holds ``w`` numbers of each sample.
 
-    ``drive (p, nz + rows + no, nv)``: what each constant does to eps, channel rows and outputs.  ``shown (rows + no,
-    nz)``: what eps does to them.  The ring holds ``w`` numbers of each sample: ``m`` channels, then inputs with a
-    remainder.  ``kernels (L w, m + no + nz)``, oldest sample first: what it adds to the next channels (solved for the
-    loop at one sample), to the outputs and to the bound of eps.  ``same (w, m + no)``: what inputs and estimates at the
-    same sample add.  ``rounding (m + no, nu + ny + n + 1)``: what rounding adds, for the largest signals so far.
-    ``first (nz, nu)``: what the first inputs do to the sensitivity to the last constant, for continuous designs.
+    ``drive (p, nz + rows + no, nv)``: what each constant does to eps, channel rows and outputs; ``shown (rows + no,
+    nz)``: what eps does to them.  ``kernels (L w, m + no + nz)``, oldest sample first: what the ring adds to channels
+    (solved for the loop at one sample), outputs and eps; ``same (w, m + no)`` at the same sample.  ``rounding (m + no,
+    nu + ny + n + 1)``, for the largest signals so far.  ``first (nz, nu)``: first inputs to the last sensitivity
+    (continuous designs).
     """
 
     structure: ErrorStructure
@@ -119,10 +118,7 @@ class AdaptiveBound:
 
 
 class Start:
-    """What is known of eps at the start: nothing, its norm, or a box of the plant's state.
-
-    ``center, radius (nz,)`` of eps; ``norm``; ``state (nz,)``: where the observer starts, for rounding.
-    """
+    """What is known of eps at the start: nothing, ``norm``, or ``center, radius (nz,)``; ``state`` for rounding."""
 
     def __init__(
         self, nz: int, *, norm: float | None = None, center: FloatArray | None = None, radius: FloatArray | None = None,
@@ -230,10 +226,7 @@ def _nominal(structure: ErrorStructure, responses: Responses, *, center: bool = 
 def _rounding(
     structure: ErrorStructure, responses: Responses, observer: LinearObserver, state: FloatArray
 ) -> FloatArray:
-    """Return ``(m + no, nu + ny + n + 1)``: what rounding of observer and sensitivity filters adds, per largest signal.
-
-    The last column is what the observer's first state adds.
-    """
+    """Return ``(m + no, nu + ny + n + 1)``: what rounding adds, per largest signal; last the observer's start."""
     nz, n, _ = structure.sizes
     nu, ny = observer.Bu.shape[1], observer.By.shape[1]
     inner, at_state, outputs = structure.rows

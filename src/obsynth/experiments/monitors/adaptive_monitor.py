@@ -12,14 +12,14 @@ from obsynth.analysis.transformations.uncertain_plant import AffinePlant, affine
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.experiments.monitors.adaptive_bound import Start, adaptive_bound
 from obsynth.experiments.monitors.adaptive_rule import AdaptivePlan
-from obsynth.experiments.monitors.adaptive_sampling import SAMPLING, sampled_problem
+from obsynth.experiments.monitors.adaptive_sampling import PIECES, SAMPLING, sampled_problem
 from obsynth.experiments.monitors.residual_model import watches_estimates
 from obsynth.numerics.arguments import is_finite_number, require_mapping
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.uncertainty import SAMPLED
 from obsynth.results.design import ObserverDesign
-from obsynth.tolerances.error_structure import error_structure
+from obsynth.tolerances.error_structure import ErrorStructure, error_structure
 from obsynth.tolerances.responses import loop_radius
 from obsynth.tolerances.result import EXACT_MODEL
 from obsynth.tolerances.robustness import structure_of, with_tolerances
@@ -36,12 +36,9 @@ def adaptive_plan(
     design: ObserverDesign, bounds: FloatArray, noise_bound: float, *, initial_error: float | None,
     initial_set: Mapping[str, Any] | None, observer_state: FloatArray | None = None, sample_time: float | None = None,
 ) -> tuple[AdaptivePlan, AdaptivePlan]:  # fmt: skip
-    """Return the plan from the first start on, and the one after a later start; the design's plant has the tolerances.
-
-    Raises `PreconditionError` where there is no bound, with the reason.
-    """
+    """Return the plans from the first start on and after a later one, over the plant's box, if there is a bound."""
     plant, observer = design.linear
-    require_regular(plant)
+    _require_regular(plant)
     if not plant.is_discrete:
         return _sampled_plan(design, bounds, noise_bound, initial_error, initial_set, observer_state, sample_time)
     affine = affine_plant(plant)
@@ -50,10 +47,7 @@ def adaptive_plan(
     noise = noise_bound if plant.nw else 0.0
     sizes = np.where(np.isfinite(bounds), bounds, 0.0)
     structure = structure_of(design, affine, tracking, bounds=sizes, noise_bound=noise)
-    reached = structure.disturbances.magnitude.max(axis=0, initial=0.0)[: plant.nd] > 0.0
-    if np.any(reached & ~np.isfinite(bounds)):
-        raise SpecError("A disturbance has no bound: give disturbance_bounds (--disturbance).",
-                        path="disturbance_bounds")  # fmt: skip
+    _require_bounds(structure, bounds)
     z = np.zeros(observer.order) if observer_state is None else observer_state
     start = start_of(affine, tracking, initial_error, initial_set, z)
     later = Start(observer.order, norm=initial_error, state=z)
@@ -89,10 +83,7 @@ def _sampled_plan(
     structure = error_structure(
         problem.observer, problem.affine, problem.tracking, problem.bounds, noise, reading=problem.reading
     )
-    reached = structure.disturbances.magnitude.max(axis=0, initial=0.0)[: len(problem.bounds)] > 0.0
-    if plant.nd and np.any(reached.reshape(-1, plant.nd).any(axis=0) & ~np.isfinite(bounds)):
-        raise SpecError("A disturbance has no bound: give disturbance_bounds (--disturbance).",
-                        path="disturbance_bounds")  # fmt: skip
+    _require_bounds(structure, np.tile(bounds, PIECES + 1))
     z = np.zeros(observer.order) if observer_state is None else observer_state
     box = None if initial_set is None else initial_box(plant, initial_set)
     stated = Start(observer.order, norm=initial_error, state=z)
@@ -108,7 +99,15 @@ def _sampled_plan(
     return plan(problem.start(stated, box)), plan(problem.start(stated, None))
 
 
-def require_regular(plant: DescriptorSystem) -> None:
+def _require_bounds(structure: ErrorStructure, bounds: FloatArray) -> None:
+    """Raise `SpecError` where a disturbance without a bound reaches the error."""
+    reached = structure.disturbances.magnitude.max(axis=0, initial=0.0)[: len(bounds)] > 0.0
+    if np.any(reached & ~np.isfinite(bounds)):
+        raise SpecError("A disturbance has no bound: give disturbance_bounds (--disturbance).",
+                        path="disturbance_bounds")  # fmt: skip
+
+
+def _require_regular(plant: DescriptorSystem) -> None:
     """Refuse a box with a plant that is singular, or not of index 1."""
     uncertain = plant.uncertainty
     if uncertain is None or not uncertain.box.names:
@@ -139,10 +138,7 @@ def start_of(
 
 
 def initial_box(plant: DescriptorSystem, given: Mapping[str, Any]) -> tuple[FloatArray, FloatArray]:
-    """Return middle and half width of the box of the plant's state at the start, ``(nx,)`` each; deviations.
-
-    States that E does not see need no entry: an algebraic state follows from the others.
-    """
+    """Return middle and half width ``(nx,)`` of the plant's start; states that E does not see need no entry."""
     require_mapping(given, "initial_set")
     center, radius = np.zeros(plant.nx), np.zeros(plant.nx)
     needed = np.abs(plant.E).max(axis=0, initial=0.0) > 0.0
@@ -156,19 +152,16 @@ def initial_box(plant: DescriptorSystem, given: Mapping[str, Any]) -> tuple[Floa
                 raise SpecError(f"initial_set has no entry for the state {name!r}: give a bound, or [low, high].",
                                 path="initial_set")  # fmt: skip
             continue
-        low, high = _ends(name, given[name])
+        value = given[name]
+        ends = list(value) if isinstance(value, (list, tuple, np.ndarray)) else [value]
+        if len(ends) == 1 and is_finite_number(value):
+            ends = [-value, value]
+        if len(ends) != 2 or not all(map(is_finite_number, ends)) or not ends[0] <= ends[1]:
+            raise SpecError(f"initial_set of {name!r} is {value!r}: give a bound of its absolute value, or "
+                            "[low, high].", path="initial_set")  # fmt: skip
+        low, high = map(float, ends)
         center[i], radius[i] = (low + high) / 2.0, (high - low) / 2.0
     return center, radius
-
-
-def _ends(name: str, value: Any) -> tuple[float, float]:
-    ends = list(value) if isinstance(value, (list, tuple, np.ndarray)) else [value]
-    if is_finite_number(value) and value >= 0.0:
-        return -float(value), float(value)
-    if len(ends) == 2 and all(map(is_finite_number, ends)) and ends[0] <= ends[1]:
-        return float(ends[0]), float(ends[1])
-    raise SpecError(f"initial_set of {name!r} is {value!r}: give a bound of its absolute value, or [low, high].",
-                    path="initial_set")  # fmt: skip
 
 
 def adaptive_statement(plan: AdaptivePlan, design: ObserverDesign) -> str:
@@ -211,7 +204,4 @@ def tolerances_of(
         raise SpecError(f"{asked[0]} is for the pointwise monitor.", path=asked[0])
     if initial_set is not None and initial_error is not None:
         raise SpecError("Give initial_set or initial_error, not both.", path="initial_set")
-    found, plant = with_tolerances(design, constants)
-    if not plant.is_discrete:
-        return found, bool(asked)
-    return found, bool(asked)
+    return with_tolerances(design, constants)[0], bool(asked)

@@ -16,10 +16,9 @@ CACHED_SAMPLES = 4000
 
 
 class Thresholds(NamedTuple):
-    """Bounds of the outputs (fault estimates, then residuals), ``(runs, steps, no)``.
+    """Bounds ``(runs, steps, no)`` of fault estimates, then residuals: ``nominal + start + sum of first + rest``.
 
-    ``total = nominal + start + sum of first + rest``; ``first (runs, steps, p, no)`` is what each constant adds to
-    first order, ``shift`` where the middle of the interval is (not zero for a box that is not centred).
+    ``first (runs, steps, p, no)``: of each constant; ``shift`` where the interval's middle is, for a box off centre.
     """
 
     total: FloatArray
@@ -33,11 +32,7 @@ class Thresholds(NamedTuple):
 def thresholds_of_records(
     bound: AdaptiveBound, estimates: FloatArray, inputs: FloatArray, outputs: FloatArray
 ) -> Thresholds:
-    """Return the thresholds for records from the start on.
-
-    ``estimates (runs, steps, n)`` of the state (and faults) as `ErrorStructure.reading` gives them, ``inputs (runs,
-    steps, nu)``, ``outputs (runs, steps, ny)``.
-    """
+    """Return the thresholds for records from the start; ``estimates (runs, steps, n)`` by `ErrorStructure.reading`."""
     _, _, _, m, no = bound.counts
     v = np.concatenate([estimates, inputs], axis=2)
     first_channels, first, shift = (_first_varying if bound.varying else _first_constant)(bound, v)

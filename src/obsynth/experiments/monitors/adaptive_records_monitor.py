@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from obsynth.errors import PreconditionError, SpecError
-from obsynth.experiments.batch_simulation import Runs
+from obsynth.experiments.benches import Runs
 from obsynth.experiments.monitors.adaptive_bound import THRESHOLD_ROUNDING
 from obsynth.experiments.monitors.adaptive_monitor import adaptive_plan, adaptive_statement
 from obsynth.experiments.monitors.adaptive_record import thresholds_of_records
@@ -40,31 +40,22 @@ def noisy_design(design: ObserverDesign, scenario: Scenario | None) -> ObserverD
 
 @dataclass(frozen=True, eq=False)
 class AdaptiveMonitor(Monitor):
-    """A monitor whose threshold adapts to the signals; `threshold` is the nominal one, which it is never below.
+    """A monitor whose threshold adapts to the signals; `threshold` is the nominal one, which it is never below."""
 
-    Fields: plan: The bounds.
-    """
-
-    plan: AdaptivePlan | None = None
+    plan: AdaptivePlan = field(kw_only=True)
 
     def bounds(self, runs: Runs) -> tuple[FloatArray, FloatArray]:
         """Return thresholds of fault estimates and residuals ``(runs, steps, no)``, and intervals of the faults."""
-        return record_columns(self._plan, *_by_run(runs, slice(None)))
-
-    @property
-    def _plan(self) -> AdaptivePlan:
-        if self.plan is None:
-            raise SpecError("An adaptive monitor needs a plan: use obsynth.monitor.", path="plan")
-        return self.plan
+        return record_columns(self.plan, *_by_run(runs, slice(None)))
 
     @cached_property
     def _screening(self) -> Screening:
-        return Screening.of(self._plan)
+        return Screening.of(self.plan)
 
     def passed_in(self, runs: Runs, residuals: slice, *, onset: int | None = None) -> np.ndarray:
         """Return at which samples of which runs a threshold is passed, ``(steps, runs)``."""
-        plan = self._plan
-        no, m = plan.bound.counts[4], plan.bound.counts[3]
+        plan = self.plan
+        *_, m, no = plan.bound.counts
         values = np.abs(runs.rows[:, :, runs.rows.shape[2] - no :])
         norm = self.statistic(runs.rows[:, :, residuals])
         # No threshold over the box is below the nominal one: runs that never pass that need no other.
@@ -94,7 +85,7 @@ class AdaptiveMonitor(Monitor):
         self, runs: Runs, values: FloatArray, norm: FloatArray, candidates: np.ndarray, length: int
     ) -> np.ndarray:
         """Compute the thresholds of runs with candidates in full, up to a number of samples."""
-        plan = self._plan
+        plan = self.plan
         passed = np.zeros(norm.shape, dtype=bool)
         chosen = np.flatnonzero(candidates.any(axis=0))
         if not len(chosen):
@@ -123,22 +114,19 @@ class AdaptiveMonitor(Monitor):
 
 
 def _by_run(runs: Runs, chosen: Any) -> tuple[FloatArray, FloatArray, FloatArray]:
-    return (
-        np.ascontiguousarray(np.moveaxis(runs.rows[:, chosen], 1, 0)),
-        np.ascontiguousarray(np.moveaxis(runs.inputs[:, chosen], 1, 0)),
-        np.ascontiguousarray(np.moveaxis(runs.outputs[:, chosen], 1, 0)),
+    rows, inputs, outputs = (
+        np.ascontiguousarray(np.moveaxis(signals[:, chosen], 1, 0))
+        for signals in (runs.rows, runs.inputs, runs.outputs)
     )
+    return rows, inputs, outputs
 
 
 def with_box(
     design: ObserverDesign, scenario: Scenario, nominal: Monitor, bounds: FloatArray, noise_bound: float | None, *,
     initial_error: float | None, initial_set: Mapping[str, Any] | None,
 ) -> AdaptiveMonitor:  # fmt: skip
-    """Return a pointwise monitor that holds over the box of the design's plant.
-
-    The start is the scenario's own, unless its error or a set is given.
-    """
-    plant, observer = design.linear
+    """Return a pointwise monitor over the box of the design's plant, from the scenario's start unless one is given."""
+    plant, _ = design.linear
     if not plant.is_discrete and scenario.inputs:
         raise PreconditionError(
             "The design is continuous in time, and the inputs of a scenario move between its samples: thresholds over "
@@ -147,13 +135,10 @@ def with_box(
         )
     state = None if scenario.observer_state is None else np.array(scenario.observer_state)
     if initial_set is None and initial_error is None:
-        initial_set = {
-            name: (value, value) for name in plant.state_names for value in (scenario.initial_state.get(name, 0.0),)
-        }
+        initial_set = {name: (scenario.initial_state.get(name, 0.0),) * 2 for name in plant.state_names}
     first, _ = adaptive_plan(
         noisy_design(design, scenario), bounds, noise_bound or 0.0, initial_error=initial_error,
         initial_set=initial_set, observer_state=state, sample_time=None if plant.is_discrete else scenario.sample_time,
     )  # fmt: skip
-    del observer
-    values = {name: getattr(nominal, name) for name in Monitor.__dataclass_fields__}
+    values = {item.name: getattr(nominal, item.name) for item in fields(nominal)}
     return AdaptiveMonitor(**{**values, "statement": adaptive_statement(first, design)}, plan=first)

@@ -1,7 +1,4 @@
-"""The rule of an adaptive threshold on a log: norm and rows of the residual, fault estimates, guaranteed intervals.
-
-The adaptive threshold sample by sample: the recursion of `adaptive_record` with its state as plain arrays.
-"""
+"""The adaptive threshold on a log, row by row: the recursion of `adaptive_record` with its state as plain arrays."""
 
 from __future__ import annotations
 
@@ -14,17 +11,16 @@ import numpy as np
 
 from obsynth.experiments.monitors.adaptive_bound import THRESHOLD_ROUNDING, AdaptiveBound
 from obsynth.experiments.monitors.adaptive_record import thresholds_of_records
-from obsynth.experiments.monitors.online import LinearSample
-from obsynth.experiments.monitors.residual_rules import FITTING_SHARE, NormRule, require_same
+from obsynth.experiments.monitors.online import LinearSample, Rule
+from obsynth.experiments.monitors.rules import FITTING_SHARE, NormRule
 from obsynth.numerics.arrays import FloatArray
 
 
 @dataclass
 class AdaptiveState:
-    """What goes from sample to sample.
+    """What goes from sample to sample: sensitivities ``psi (p, nz)``, ``ring (L, w)``, ``eps (L, nz)``, oldest first.
 
-    ``psi (p, nz)`` sensitivities; ``ring (L, w)`` and ``eps (L, nz)``, oldest first; ``largest`` signals so far; for
-    varying constants ``past (L, nv)`` signals and ``moved (L, nz)`` bounds; ``k`` samples since the start.
+    For varying constants ``past (L, nv)`` signals and ``moved (L, nz)`` bounds; ``k`` samples since the start.
     """
 
     psi: FloatArray
@@ -74,7 +70,7 @@ def adaptive_step(
     bound: AdaptiveBound, state: AdaptiveState, estimates: FloatArray, inputs: FloatArray, outputs: FloatArray
 ) -> AdaptiveStep:
     """Take one sample: ``estimates (n,)`` as `ErrorStructure.reading` gives them; the state is changed."""
-    _, nz, rows, m, no = bound.counts
+    *_, m, no = bound.counts
     v = np.concatenate([estimates, inputs])
     if bound.first is not None and state.k == 0:
         state.psi[-1] = bound.first @ inputs
@@ -93,7 +89,6 @@ def adaptive_step(
     state.ring[:-1], state.eps[:-1] = state.ring[1:], state.eps[1:]
     state.ring[-1], state.eps[-1] = h, older[m + no :]
     state.k += 1
-    del nz, rows
     return AdaptiveStep(total, first, shift, start[m:], rest)
 
 
@@ -133,10 +128,9 @@ FORGETTING_RINGS = 3
 
 @dataclass(frozen=True, eq=False)
 class AdaptivePlan:
-    """What an adaptive monitor of a design is made of; nothing in it changes online.
+    """What an adaptive monitor is made of: ``bound`` without a fault, ``faults`` of fault estimates during one.
 
-    ``bound`` of fault estimates and residuals without a fault; ``faults`` of the errors of fault estimates during one,
-    `None` where there is none (``reason`` says why), or ``same`` as those without; ``names`` of the constants.
+    ``faults`` is `None` where there is none (``reason`` says why), or where it is the ``same`` as without a fault.
     """
 
     bound: AdaptiveBound
@@ -182,8 +176,10 @@ def norm_beyond_nominal(plan: AdaptivePlan, found: AdaptiveStep) -> float:
     return math.fsum(math.hypot(*part) for part in parts)
 
 
-class AdaptiveRule:
+class AdaptiveRule(Rule):
     """The norm of the residual against the nominal bound and what the box adds; rows and fault estimates beside it."""
+
+    KEPT = ("last", "waiting")
 
     def __init__(self, plan: AdaptivePlan, later: AdaptivePlan, nominal: NormRule) -> None:
         self.plan, self._nominal = plan, nominal
@@ -192,13 +188,13 @@ class AdaptiveRule:
         self._state = AdaptiveState.of(self._bound)
         self._fault_state = None if self._faults is None else AdaptiveState.of(self._faults)
         self.cells: tuple[float, ...] = (math.nan,) * len(plan.columns)
-        self._last: float | None = None
-        self._waiting = 0
+        self.last: float | None = None
+        self.waiting = 0
 
     def _irregular(self, time: float) -> bool:
         """Whether a row of a continuous design is not where its sampled observer expects it."""
-        dt, last = self.plan.sample_time, self._last
-        self._last = time
+        dt, last = self.plan.sample_time, self.last
+        self.last = time
         return dt is not None and last is not None and abs(time - last - dt) > FITTING_SHARE * dt
 
     def take(
@@ -212,8 +208,8 @@ class AdaptiveRule:
         if self._irregular(time):
             # What the observer did over another interval is an error of its own, which must be forgotten first.
             self.restart()
-            self._waiting = FORGETTING_RINGS * self._bound.length
-        self._waiting = max(self._waiting - 1, 0)
+            self.waiting = FORGETTING_RINGS * self._bound.length
+        self.waiting = max(self.waiting - 1, 0)
         reading = self._bound.structure.reading
         found = adaptive_step(self._bound, self._state, reading @ evidence.rows, evidence.inputs, evidence.outputs)
         error = found
@@ -229,7 +225,7 @@ class AdaptiveRule:
         nf = len(self.plan.fault_names)
         values = evidence.rows[len(evidence.rows) - len(found.total) :]
         self.cells = self._cells(values[:nf], found, error)
-        if self._waiting:
+        if self.waiting:
             return math.nan, math.nan, None
         if not deciding:
             return math.nan, threshold, None
@@ -261,24 +257,24 @@ class AdaptiveRule:
         self._state = AdaptiveState.of(self._bound)
         self._fault_state = None if self._faults is None else AdaptiveState.of(self._faults)
 
+    def options(self) -> list[Any]:
+        """Return names of constants, how they vary, and the size of the nominal bound."""
+        return [list(self.plan.names), self._bound.varying, float(self._bound.nominal.sum())]
+
     def as_dict(self) -> dict[str, Any]:
         """Return the state that goes from row to row, as data."""
-        first = self._bound is self.plan.bound
         return {
-            "nominal": self._nominal.as_dict(), "first": first, "state": self._state.as_dict(),
+            **super().as_dict(), "nominal": self._nominal.as_dict(), "first": self._bound is self.plan.bound,
+            "state": self._state.as_dict(),
             "faults": None if self._fault_state is None else self._fault_state.as_dict(),
-            "last": self._last, "waiting": self._waiting,
-            "options": [list(self.plan.names), self._bound.varying, float(self._bound.nominal.sum())],
         }  # fmt: skip
 
     def resume(self, data: Mapping[str, Any]) -> None:
         """Go on from what `as_dict` returned."""
-        own = self.as_dict()["options"]
-        require_same(data["options"], own)
+        super().resume(data)
         if not data["first"]:
             self._bound, self._faults = self._restarted
         self._nominal.resume(data["nominal"])
-        self._last, self._waiting = data["last"], int(data["waiting"])
         self._state = AdaptiveState.from_dict(data["state"])
         if data["faults"] is not None:
             self._fault_state = AdaptiveState.from_dict(data["faults"])
@@ -287,10 +283,7 @@ class AdaptiveRule:
 def record_columns(
     plan: AdaptivePlan, rows: FloatArray, inputs: FloatArray, outputs: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return thresholds of the outputs, and intervals of the faults, over records from the start.
-
-    ``rows (runs, steps, rows of the observer)``; thresholds ``(runs, steps, no)``, intervals ``(runs, steps, nf, 2)``.
-    """
+    """Return thresholds ``(runs, steps, no)`` and intervals of faults ``(runs, steps, nf, 2)`` over whole records."""
     found = thresholds_of_records(plan.bound, rows @ plan.bound.structure.reading.T, inputs, outputs)
     nf, error = len(plan.fault_names), found
     if plan.faults is not None:

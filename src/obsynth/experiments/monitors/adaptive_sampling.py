@@ -16,15 +16,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from obsynth.analysis.transformations import discretise
 from obsynth.analysis.transformations.elimination import algebraic_coordinates, eliminate_algebraic_states
+from obsynth.analysis.transformations.sampling import discretise
 from obsynth.analysis.transformations.uncertain_plant import AffinePlant, reduced_family
 from obsynth.errors import PreconditionError
 from obsynth.experiments.monitors.adaptive_bound import Start
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.holds import first_order_hold
+from obsynth.numerics.continuous import first_order_hold
+from obsynth.observers.linear.derived import sample_observer
 from obsynth.observers.linear.observer import LinearObserver
-from obsynth.observers.linear.sampling import sample_observer
 from obsynth.plants.constants import ConstantsBox
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.uncertainty import ELIMINATED, Uncertainty
@@ -42,10 +42,10 @@ SAMPLING = "sampling"
 
 
 class SampledProblem(NamedTuple):
-    """The error system of a continuous design at the samples of its data.
+    """The error system of a continuous design at the samples of its data; ``bounds`` of all pieces.
 
-    ``reading (n, nx)``: the dynamic state from the plant's; ``first (nz, nu)``: what the first inputs do to eps at the
-    start, ``unknown (nz,)`` what first disturbance and noise do at most; ``bounds`` of all pieces.
+    ``reading (n, nx)``: the dynamic state from the plant's; ``first (nz, nu)``, ``unknown (nz,)``: what first inputs,
+    and at most first disturbance and noise, do to eps at the start.
     """
 
     affine: AffinePlant
@@ -140,7 +140,7 @@ def _dynamic(plant: DescriptorSystem, uncertain: Uncertainty) -> FloatArray:
 def _pieces(a: AffineMatrix, bd: AffineMatrix, dt: float) -> list[AffineMatrix]:
     """Return what a disturbance of one sign does in each piece of an interval, newest first ``(n, nd)``.
 
-    The remainder holds what a change of sign inside a piece may add: a quarter of its length, squared, times the slope.
+    The remainder holds a change of sign inside a piece: at most a quarter of its length, squared, times the slope.
     """
     width = dt / PIECES
     step, gathered = affine_zero_order_hold(a, bd, width)

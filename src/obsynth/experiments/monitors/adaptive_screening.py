@@ -1,8 +1,8 @@
-r"""Which runs pass a threshold over a box, without computing all of it.
+"""Which runs pass a threshold over a box, without computing all of it.
 
-The threshold lies between what the first order gives and a bound of the rest by the largest signals so far, which is
-linear in them.  Most values are below the one or above the other; runs with a value in between are computed in full.
-What counts in an evaluation is whether a run passes before something is wrong, and where it does first after that.
+It lies between what the first order gives and a bound of the rest that is linear in the largest signals so far; only
+runs with a value in between are computed in full.  What counts is a pass before something is wrong, and the first
+after.
 """
 
 from __future__ import annotations
@@ -38,10 +38,7 @@ class Sides(NamedTuple):
 
 
 class Records(NamedTuple):
-    """Runs with the time in the first axis: ``estimates, inputs, outputs``, ``values`` of the outputs, their ``norm``.
-
-    ``limits (steps,)`` of the norm for the nominal plant, rounding included.
-    """
+    """Runs, time in the first axis, with ``values`` of the outputs, their ``norm`` and its ``limits (steps,)``."""
 
     estimates: FloatArray
     inputs: FloatArray
@@ -58,9 +55,8 @@ class Records(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Screening:
-    """Bounds of a threshold from both sides.
+    """Bounds of a threshold: ``rest (no, nu + ny + n + 1)``, all but the first order, per largest signal so far.
 
-    ``rest (no, nu + ny + n + 1)``: what second order, remainders and rounding are at most, per largest signal so far;
     ``slack (no, n + nu)``: what rounding may change in the first order.
     """
 
@@ -99,10 +95,7 @@ class Screening:
         return cls(plan, gathered[m:] @ ring + bound.rounding[m:] + bound.same[:, m:].T @ ring, slack)
 
     def sides(self, records: Records, begin: int, end: int, psi: FloatArray) -> tuple[Sides, FloatArray]:
-        """Return what is decided between two samples, and the sensitivities ``(runs, p, nz)`` at the end.
-
-        ``psi`` are those at the beginning.
-        """
+        """Return what is decided between two samples, and the sensitivities ``psi (runs, p, nz)`` at the end."""
         plan, bound = self.plan, self.plan.bound
         p, nz, rows, m, no = bound.counts
         v = np.concatenate([records.estimates[begin:end], records.inputs[begin:end]], axis=2)
@@ -176,10 +169,7 @@ def _known(bound: AdaptiveBound, n: int, nu: int) -> FloatArray:
 
 
 def first_passed(screening: Screening, records: Records, candidates: np.ndarray, begin: int) -> Sides:
-    """Return samples ``(steps, runs)`` that surely pass, and samples that must be computed in full.
-
-    Of the samples before ``begin`` one that passes is enough for a run, and after it the first one.
-    """
+    """Return samples ``(steps, runs)`` that surely pass, and those to be computed in full: the first one counts."""
     above, left = np.zeros(candidates.shape, dtype=bool), np.zeros(candidates.shape, dtype=bool)
     p, nz, *_ = screening.plan.bound.counts
     early = np.flatnonzero(candidates[:begin].any(axis=0))

@@ -23,17 +23,17 @@ from functools import cached_property
 
 import numpy as np
 
-from obsynth.analysis.transformations import eliminate_algebraic_states
+from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.continuous import peak_gain
-from obsynth.numerics.holds import first_order_hold
+from obsynth.numerics.continuous import first_order_hold, peak_gain
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.proofs.balls import Ball, block, rounded_up
+from obsynth.proofs.balls import Ball, rounded_up
 from obsynth.proofs.contraction import Contraction, column_norms, prove_contraction
-from obsynth.proofs.exponentials import exponential
+from obsynth.proofs.extended_balls import block
 from obsynth.proofs.peak_sums import PeakSums, gathered, interval_pieces, peak_sums
+from obsynth.proofs.products import exponential
 
 #: Modes of the plant that decay by less than this exponent in a sample are not followed until they have died out.
 LEAST_DECAY = 1e-4
@@ -51,9 +51,8 @@ FINITE = 1e-12
 class BetweenSamples:
     """A continuous design on samples: ``s+ = M s``, ``r = c s``, ``s = [x; eps]`` with the part of x that is forgotten.
 
-    Fields: plant: Without algebraic states; M: ``(n + nz, n + nz)``; c: ``(nr, n + nz)``; into: How q enters s,
-    ``(n + nz, n)``; first, second: How ``y (ny)`` of a sample enters s at that sample and at the next; direct: ``(nr,
-    ny)``; left: ``(nr,)``: what the modes that are not forgotten add per unit of each state, at most.
+    ``into (n + nz, n)``: how q enters s; ``first, second``: how ``y`` of a sample enters it at that sample and the
+    next; ``left (nr,)``: what the modes that are not forgotten add per unit of each state, at most.
     """
 
     plant: DescriptorSystem
@@ -113,10 +112,7 @@ class BetweenSamples:
         cls, written: DescriptorSystem, plant: DescriptorSystem, observer: LinearObserver, tracking: FloatArray,
         *, rows: slice,
     ) -> BetweenSamples:  # fmt: skip
-        """Return a design for a sampled plant, whose states are those of ``written`` without its algebraic ones.
-
-        The identities hold at the samples, so that the plant's state does not enter: ``eps+ = Az eps - T q + By Dd d``.
-        """
+        """Return a design for a sampled plant, with states of ``written``: ``eps+ = Az eps - T q + By Dd d``."""
         smooth = eliminate_algebraic_states(written).plant
         n, nz, exact = smooth.nx, observer.order, Ball.exact
         m = block([[exact(np.zeros((n, n))), exact(np.zeros((n, nz)))], [exact(np.zeros((nz, n))), exact(observer.Az)]])

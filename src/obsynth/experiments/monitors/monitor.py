@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.observers.estimates import Estimates
+
+if TYPE_CHECKING:
+    from obsynth.experiments.monitors.residual_model import ResidualModel
 
 KINDS = ("paper", "pointwise", "window", "chi-square", "cusum")
 STATEMENTS: Mapping[str, str] = {
@@ -35,14 +38,13 @@ ASSUMED = "; the plant starts at rest, and known inputs are held or go in straig
 OF_ESTIMATES = "the norm of the fault estimates, as the residual does not see the faults that are modelled: "
 
 
-def statement_of(kind: str, *, continuous: bool, sampled: bool = False, estimates: bool = False) -> str:
-    """Return what a threshold promises; ``estimates``: of the fault estimates instead of the residual.
-
-    ``sampled``: the continuous plant behind a sampled one is known, and disturbances may move between samples.
-    """
-    bounded = kind in ("pointwise", "window")
-    held = SAMPLED if sampled else HELD
-    ending = (BETWEEN_SAMPLES + ASSUMED) if continuous and bounded else held if bounded else ""
+def statement_of(kind: str, model: ResidualModel, *, estimates: bool) -> str:
+    """Return what a threshold promises; ``estimates``: of the fault estimates instead of the residual."""
+    ending = ""
+    if kind in ("pointwise", "window"):
+        # Of a sampled plant disturbances may move between samples where the continuous one behind it is known.
+        held = HELD if model.sampled is None else SAMPLED
+        ending = held if model.flow is None else BETWEEN_SAMPLES + ASSUMED
     return (OF_ESTIMATES if estimates else "") + STATEMENTS[kind] + ending
 
 

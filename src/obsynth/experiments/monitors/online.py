@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
+from collections import deque
 from collections.abc import Mapping
-from typing import Any, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -13,11 +15,7 @@ from obsynth.numerics.arrays import FloatArray
 
 
 class Seen(NamedTuple):
-    """What a monitor says of one row.
-
-    Fields: statistic, threshold: NaN where nothing is decided; alarm: Whether the threshold is passed; fault: The fault
-    that stands out; empty without an alarm, or without faults.
-    """
+    """What a monitor says of one row: NaN where nothing is decided; no fault stands out without an alarm."""
 
     statistic: float
     threshold: float
@@ -27,11 +25,9 @@ class Seen(NamedTuple):
 
 
 class Evidence(NamedTuple):
-    """What a recursive observer learnt from a sample.
+    """What a recursive observer learnt from a sample: theta ``(nq,)``, its covariance, innovation ``(m,)``, regressor.
 
-    Fields: theta, covariance: Parameters ``(nq,)`` and their covariance ``(nq, nq)``; innovation, regressor: ``(m,)``
-    and ``(m, nq)``: innovation less regressor times the true parameters is white, N(0, I); score, information: what
-    the sample says of the parameters, ``(nq,)`` and ``(nq, nq)``.
+    Innovation less regressor times the true parameters is white, N(0, I); ``score (nq,)`` and ``information (nq, nq)``.
     """
 
     theta: FloatArray
@@ -53,26 +49,43 @@ class LinearSample(NamedTuple):
 UNDECIDED = Seen(math.nan, math.nan, False, "")
 
 
-class Rule(Protocol):
-    """A statistic and its threshold, row by row."""
+class Rule(ABC):
+    """A statistic and its threshold, row by row; ``KEPT`` names what goes from row to row."""
 
+    KEPT: ClassVar[tuple[str, ...]] = ()
+    #: Where a saved state has the options of its monitor.
+    SAME: ClassVar[str] = "options"
+    #: Of an adaptive threshold: what it is made of, and cells of a row for its columns.
+    plan: Any = None
+    cells: tuple[float, ...] = ()
+
+    @abstractmethod
     def take(
         self, time: float, residuals: FloatArray, evidence: Any, *, deciding: bool
     ) -> tuple[float, float, int | None]:
         """Return statistic, threshold, and the number of the fault if the rule knows it."""
-        ...
 
+    @abstractmethod
     def restart(self) -> None:
         """Forget windows and sums: rows are missing."""
-        ...
+
+    @abstractmethod
+    def options(self) -> Any:
+        """Return what a saved state must share with the monitor that it is for."""
 
     def as_dict(self) -> dict[str, Any]:
         """Return the state that goes from row to row, as data."""
-        ...
+        kept = {name: getattr(self, name) for name in self.KEPT}
+        kept = {name: list(value) if isinstance(value, deque) else value for name, value in kept.items()}
+        return {**kept, self.SAME: self.options()}
 
     def resume(self, data: Mapping[str, Any]) -> None:
         """Go on from what `as_dict` returned."""
-        ...
+        if data[self.SAME] != self.options():
+            raise SpecError("The saved state is of a run whose monitor had other options: use the same.", path="state")
+        for name in self.KEPT:
+            own = getattr(self, name)
+            setattr(self, name, deque(data[name], own.maxlen) if isinstance(own, deque) else data[name])
 
 
 class OnlineMonitor:
@@ -103,14 +116,12 @@ class OnlineMonitor:
     @property
     def bound(self) -> Any:
         """Bound of an adaptive threshold, for exports; `None` for other monitors."""
-        plan = getattr(self._rule, "plan", None)
-        return None if plan is None else plan.bound
+        return None if self._rule.plan is None else self._rule.plan.bound
 
     @property
     def columns(self) -> tuple[str, ...]:
         """Columns of a run besides statistic, threshold and alarm: those of an adaptive threshold."""
-        plan = getattr(self._rule, "plan", None)
-        return () if plan is None else tuple(plan.columns)
+        return () if self._rule.plan is None else tuple(self._rule.plan.columns)
 
     def require_fit(self, residuals: int, fault_names: tuple[str, ...]) -> None:
         """Refuse a design that this monitor was not made for.
@@ -152,7 +163,7 @@ class OnlineMonitor:
             self._rule.restart()
         self._decided = deciding
         statistic, threshold, which = self._rule.take(time, residuals, evidence, deciding=deciding)
-        more = tuple(getattr(self._rule, "cells", ()))
+        more = self._rule.cells
         # A statistic that has overflowed has passed any threshold.
         if math.isnan(statistic) or not math.isfinite(threshold):
             return UNDECIDED._replace(more=more)
@@ -187,10 +198,9 @@ class OnlineMonitor:
 
 
 def share_of_look(look: int) -> float:
-    """Return the share of the probability of a false alarm that look number ``look`` (from 1) may take.
+    """Return the share of the probability of a false alarm that look ``look`` (from 1) may take; all sum up to one.
 
-    The shares of all looks sum up to at most one, however long a run is: looks ``2^j`` to ``2^(j+1) - 1`` share
-    ``6 / (pi (j + 1))^2`` evenly.
+    Looks ``2^j`` to ``2^(j+1) - 1`` share ``6 / (pi (j + 1))^2`` evenly.
     """
     epoch = look.bit_length() - 1
     return 6.0 / (math.pi * (epoch + 1.0)) ** 2 / 2.0**epoch

@@ -13,15 +13,14 @@ from obsynth.experiments.monitors.adaptive_records_monitor import noisy_design
 from obsynth.experiments.monitors.adaptive_rule import AdaptiveRule
 from obsynth.experiments.monitors.monitor import KINDS, statement_of
 from obsynth.experiments.monitors.online import OnlineMonitor, Rule
-from obsynth.experiments.monitors.parameter_rules import ANY_LENGTH, parameter_monitor
 from obsynth.experiments.monitors.residual_model import ResidualModel, residual_model, watches_estimates
 from obsynth.experiments.monitors.residual_monitor import bounds_of, require_options
-from obsynth.experiments.monitors.residual_rules import NormRule, WhitenedRule
+from obsynth.experiments.monitors.rules import ANY_LENGTH, NormRule, WhitenedRule, parameter_monitor
 from obsynth.experiments.monitors.thresholds import samples_of, scaled_inputs, unlimited_bound, unlimited_paper
-from obsynth.experiments.monitors.whitening import cusum_whitener, steady_mean, whitener_of, window_covariance
+from obsynth.experiments.monitors.whitening import steady_mean, whitened
 from obsynth.numerics.arguments import is_finite_number, require_kind, require_mapping
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.holds import first_order_hold
+from obsynth.numerics.continuous import first_order_hold
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.results.design import ObserverDesign
@@ -29,6 +28,7 @@ from obsynth.simulation.scenario import Scenario
 
 _FORGOTTEN = ", once the error at the start, which is not stated, is forgotten (else give a longer warm-up)"
 _AFTER_A_GAP = " (after a gap, too, while the error there is no larger than stated for the start)"
+_FROM_THE_FIRST = "; it holds from the first row on, and after a gap once the error there is forgotten"
 _NOT_CLOSER = "; rows must not be closer than the stated sample time, as noise drives the plant itself"
 _REGULAR = ", for rows that are the stated sample time apart (none further apart, where they are not regular)"
 
@@ -118,9 +118,7 @@ def online_monitor(
     rule: Rule
     if kind in ("pointwise", "window", "paper"):
         start = 0.0 if initial_error is None else float(initial_error)
-        norm, limit = _norm_rule(
-            design, kind, model, bounds, noise_bound, start, gamma, window, dt, estimates=estimates
-        )
+        norm, limit = _norm_rule(design, kind, model, bounds, noise_bound, start, gamma, window, dt, estimates)
         if adaptive:
             return _adaptive(design, scenario, norm, model, bounds, noise_bound, initial_error, initial_set, dt)
         _require_above_zero(limit)
@@ -129,12 +127,10 @@ def online_monitor(
     else:
         rule = _whitened(kind, model, bounds if scenario is None else None, window, change, false_alarms, dt)
         ending = ANY_LENGTH
-    promised = statement_of(
-        kind, continuous=model.flow is not None, sampled=model.sampled is not None, estimates=estimates
-    )
     return OnlineMonitor(
-        kind, promised + ending + EXACT, rule, residuals=len(design.linear[1].residual_names),
-        fault_names=design.linear[1].fault_names, fault_scales=model.fault_scales(),
+        kind, statement_of(kind, model, estimates=estimates) + ending + EXACT, rule,
+        residuals=len(design.linear[1].residual_names), fault_names=design.linear[1].fault_names,
+        fault_scales=model.fault_scales(),
     )  # fmt: skip
 
 
@@ -171,7 +167,7 @@ def _require_above_zero(limit: float) -> None:
 
 def _norm_rule(
     design: ObserverDesign, kind: str, model: ResidualModel, bounds: FloatArray, noise_bound: float | None,
-    start: float, gamma: float | None, window: int, dt: float, *, estimates: bool,
+    start: float, gamma: float | None, window: int, dt: float, estimates: bool,
 ) -> tuple[NormRule, float]:  # fmt: skip
     """Return the rule of a bound on the norm of the residual, or of the fault estimates, and the bound in the end."""
     irregular = None
@@ -195,13 +191,11 @@ def _norm_rule(
 def _more_words(kind: str, model: ResidualModel, limit: float) -> str:
     """Return what else the sentence of a bound must say."""
     words = ""
-    if kind == "paper":
-        return words
-    if model.sensor_noise is not None and model.Bw[:, model.sensor_noise[0].shape[1] :].any():
+    if kind != "paper" and model.sensor_noise is not None and model.Bw[:, model.sensor_noise[0].shape[1] :].any():
         # The noise of the plant itself is what is gathered between samples: the closer they are, the less, but in all
         # the more of it that is of one sign.
         words += _NOT_CLOSER
-    if model.continuous is not None:
+    if kind != "paper" and model.continuous is not None:
         words += _REGULAR + model.continuous.between.lasting_words(limit)
     return words
 
@@ -212,16 +206,10 @@ def _adaptive(
 ) -> OnlineMonitor:  # fmt: skip
     """Return the monitor whose threshold holds for every plant within its tolerances."""
     first, later = adaptive_plan(
-        noisy_design(design, scenario),
-        bounds,
-        noise_bound or 0.0,
-        initial_error=initial_error,
-        initial_set=initial_set,
-        sample_time=dt,
-    )
-    start = _FORGOTTEN if initial_error is None and initial_set is None else _AFTER_A_GAP if initial_set is None else (
-        "; it holds from the first row on, and after a gap once the error there is forgotten"
+        noisy_design(design, scenario), bounds, noise_bound or 0.0, initial_error=initial_error,
+        initial_set=initial_set, sample_time=dt,
     )  # fmt: skip
+    start = _FROM_THE_FIRST if initial_set is not None else _FORGOTTEN if initial_error is None else _AFTER_A_GAP
     return OnlineMonitor(
         "pointwise", adaptive_statement(first, design) + start, AdaptiveRule(first, later, norm),
         residuals=len(design.linear[1].residual_names), fault_names=design.linear[1].fault_names,
@@ -261,11 +249,7 @@ def _whitened(
             f"{kind} needs to know what disturbances are to be expected: give a scenario (a spec with one), or use "
             "pointwise with disturbance bounds.", path="disturbances",
         )  # fmt: skip
-    white = True
-    if kind == "chi-square":
-        whitener = whitener_of(window_covariance(model, window))
-    else:
-        whitener, white = cusum_whitener(model, window)
+    whitener, white = whitened(kind, model, window)
     return WhitenedRule(
         whitener, steady_mean(model), window=window, change=None if kind == "chi-square" else change,
         false_alarms=false_alarms, dt=dt, white=white,

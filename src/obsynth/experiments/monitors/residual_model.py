@@ -1,16 +1,10 @@
-r"""What reaches the residual of a design when nothing is wrong: disturbances, noise, an error at the start.
+"""What reaches the residual of a design when nothing is wrong: disturbances, noise, an error at the start.
 
-The residual of a continuous observer at the samples of its data.
+A continuous observer takes known inputs and outputs as straight lines between samples: at these its state is that in
+continuous time, and the noise of a sample goes through the sampled observer.  With ``e = V E x - z``, held disturbances
+d, process noise w gathered over an interval, and sensor noise n,
 
-Between samples the observer takes known inputs and outputs as straight lines.  As far as they are, its state at the
-samples is that of the observer in continuous time; the noise of a sample is a sample like any other, and goes through
-the sampled observer.  With ``e = V E x - z``, held disturbances d, process noise gathered over an interval, and sensor
-noise n,
-
-    e+ = Phi e + Gamma d + w - By_h n,   r = -C e + Dd d + Dy_h n
-
-and the noise of the first sample is in the start as well, ``e(0) = V E x(0) - z(0) + Gamma_1 n(0)``, as the state that
-is kept is ``z - Gamma_1 v``.
+    e+ = Phi e + Gamma d + w - By_h n,   r = -C e + Dd d + Dy_h n,   e(0) = V E x(0) - z(0) + Gamma_1 n(0)
 """
 
 from __future__ import annotations
@@ -21,19 +15,18 @@ from typing import cast
 
 import numpy as np
 
-from obsynth.analysis.transformations import discretise
+from obsynth.analysis.transformations.sampling import discretise
 from obsynth.errors import SpecError
 from obsynth.experiments.monitors.between_samples import BetweenSamples
 from obsynth.methods.pd_observer.realisation import with_faults_as_states
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.holds import first_order_hold
+from obsynth.numerics.continuous import first_order_hold
 from obsynth.numerics.norms import output_covariance
+from obsynth.observers.linear.derived import sample_observer
 from obsynth.observers.linear.observer import LinearObserver
-from obsynth.observers.linear.sampling import sample_observer
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
-from obsynth.simulation.failures import Random, Uniform
-from obsynth.simulation.profiles import Additive, sampled
+from obsynth.simulation.profiles import Additive, Random
 from obsynth.simulation.scenario import Scenario
 from obsynth.simulation.scenario_signals import resolve
 from obsynth.verification.error_system import ErrorSystem
@@ -41,10 +34,7 @@ from obsynth.verification.error_system import ErrorSystem
 
 @dataclass(frozen=True, eq=False)
 class TrackedErrors:
-    """The error system of a design, with what its error is at a start.
-
-    Fields: errors: In the plant's own time; tracking: ``V (nz, nx)``, of the newest state.
-    """
+    """The error system of a design in the plant's own time, and ``tracking V (nz, nx)``, of the newest state."""
 
     errors: ErrorSystem
     tracking: FloatArray
@@ -78,11 +68,10 @@ def tracked_errors(design: ObserverDesign, plant: DescriptorSystem) -> TrackedEr
 
 @dataclass(frozen=True, eq=False)
 class SampledErrors:
-    """The recursion of the module's text; w is noise of unit covariance, sensors first.
+    """The recursion of the module's text; w is noise of unit covariance, sensors first, ``gathered`` others after them.
 
-    Fields: A, Bd, Bw: Of the error; sensor_outputs: ``Dy_h Dw``: what the noise of a sample adds to states, faults and
-    residuals at once; start: ``(n, sensors)``: what the noise of the first sample adds to the start; gathered: How many
-    noise signals come after those of the sensors.
+    ``sensor_outputs``: ``Dy_h Dw``, to states, faults and residuals at once; ``start (n, sensors)``: noise at the
+    start.
     """
 
     A: FloatArray
@@ -121,13 +110,10 @@ def sampled_errors(plant: DescriptorSystem, observer: LinearObserver, found: Tra
 class ResidualModel:
     """``e+ = A e + Bd d + Bw w``, ``r = C e + Dd d + Dw w`` at the samples, without faults, w of unit covariance.
 
-    Fields: A, C, Bd, Dd, Bw, Dw: Of the residual; fault_C, fault_Dd, fault_Dw: Of the fault estimates; steps: Samples
-    of the scenario; start: ``(n,)``: e at the start of the scenario; bounds, means, deviations: ``(nd,)``: largest
-    absolute value of each disturbance in the scenario (infinite if there is none), mean and standard deviation of what
-    is random in it; steady: Whether each disturbance has no part but random ones over the whole record; flow: Of a
-    continuous design: A and Bd in continuous time; start_noise: Of a continuous design, ``(n, any)``: what the noise w
-    of the first sample (its first signals) adds to e there; sensor_noise: Of a continuous design: what the noise of the
-    sensors (the first signals of w), drawn as straight lines between samples, does to e' and r.
+    ``start (n,)``: e there; ``bounds, means, deviations (nd,)``: largest absolute value of each disturbance (or
+    infinite), mean and deviation of what is random in it; ``steady``: nothing but that, all the time.  Of a continuous
+    design: ``flow``: A and Bd in continuous time; ``start_noise``: what the noise of the first sample adds to e there;
+    ``sensor_noise``: what noise of the sensors, drawn as straight lines between samples, does to e' and r.
     """
 
     A: FloatArray
@@ -169,10 +155,7 @@ class ResidualModel:
         return bool(self.Bw.any() or self.Dw.any())
 
     def fault_scales(self) -> FloatArray:
-        """Return ``(nf,)``: standard deviations of the fault estimates, by which they are compared.
-
-        Disturbances count as white, of their deviation in the scenario or else of half their bound.
-        """
+        """Return ``(nf,)``: deviations of the fault estimates, for disturbances of theirs, or of half their bound."""
         known = np.where(np.isfinite(self.bounds), self.bounds, 0.0) / 2.0
         sizes = np.where(self.deviations > 0.0, self.deviations, known)
         covariance = output_covariance(
@@ -189,11 +172,7 @@ class ResidualModel:
 
 @dataclass(frozen=True, eq=False)
 class ContinuousDesign:
-    """What a bound at the samples of a continuous design is made of.
-
-    Fields: plant: With the noise that counts; tracking: ``V (nz, nx)``; dt: Seconds between samples; endless: Whether
-    the record may have any length.
-    """
+    """What a bound at the samples of a continuous design is made of; ``endless``: the record may have any length."""
 
     plant: DescriptorSystem
     observer: LinearObserver
@@ -227,10 +206,7 @@ def watches_estimates(design: ObserverDesign) -> bool:
 def residual_model(
     design: ObserverDesign, scenario: Scenario, *, endless: bool = False, estimates: bool = False
 ) -> ResidualModel:
-    """Return the model of a design's residual on a scenario; ``endless`` where the record may have any length.
-
-    With ``estimates`` it is that of the fault estimates, which are zero without a fault but for their errors.
-    """
+    """Return the model of a design's residual on a scenario, or of its fault ``estimates``, zero but for errors."""
     plant, observer = design.linear
     drive = resolve(plant, scenario)
     noisy = plant.replace(
@@ -270,21 +246,15 @@ def residual_model(
 def _disturbances(
     scenario: Scenario, names: tuple[str, ...], steps: int, dt: float
 ) -> tuple[FloatArray, FloatArray, FloatArray, tuple[bool, ...]]:
-    bounds, means, variances = np.zeros(len(names)), np.zeros(len(names)), np.zeros(len(names))
-    steady = []
+    totals, steady = np.zeros((3, len(names))), []
     for i, name in enumerate(names):
         fixed, calm = np.zeros(steps), True
         for profile in scenario.disturbances.get(name, ()):  # type: ignore[union-attr]
             if isinstance(profile, Random):
                 calm &= bool(profile.active(steps, dt).all())
-                means[i] += (profile.low + profile.high) / 2 if isinstance(profile, Uniform) else profile.mean
-                bounds[i] += max(abs(profile.low), abs(profile.high)) if isinstance(profile, Uniform) else np.inf
-                spread = (
-                    (profile.high - profile.low) ** 2 / 12 if isinstance(profile, Uniform) else profile.deviation**2
-                )
-                variances[i] += spread
+                totals[:, i] += profile.moments()
             else:
-                fixed, calm = fixed + sampled(cast(Additive, profile), steps, dt)[0], False
-        bounds[i] += np.max(np.abs(fixed))
+                fixed, calm = fixed + cast(Additive, profile).sampled(steps, dt)[0], False
+        totals[0, i] += np.max(np.abs(fixed))
         steady.append(calm)
-    return bounds, means, np.sqrt(variances), tuple(steady)
+    return totals[0], totals[1], np.sqrt(totals[2]), tuple(steady)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.experiments.batch_simulation import LinearBench, make_bench
+from obsynth.experiments.benches import LinearBench, make_bench
 from obsynth.experiments.monitors.adaptive_monitor import EXACT, tolerances_of
 from obsynth.experiments.monitors.monitor import KINDS, Monitor, statement_of
 from obsynth.experiments.monitors.residual_model import ResidualModel, residual_model, watches_estimates
@@ -19,10 +19,10 @@ from obsynth.experiments.monitors.thresholds import (
     scaled_inputs,
     window_threshold,
 )
-from obsynth.experiments.monitors.whitening import cusum_whitener, settled, steady_mean, whitener_of, window_covariance
+from obsynth.experiments.monitors.whitening import settled, steady_mean, whitened
 from obsynth.numerics.arguments import is_finite_number, is_whole, require_kind, require_mapping
 from obsynth.numerics.arrays import FloatArray
-from obsynth.plants.names import index_of
+from obsynth.plants.validation import index_of
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.scenario import Scenario
 
@@ -119,30 +119,19 @@ def monitor(
         threshold = paper_threshold(model, bounds, start, gamma)
     elif kind in ("pointwise", "window"):
         inputs = scaled_inputs(model, bounds, noise_bound)
-        threshold = (
-            pointwise_threshold(model, inputs, start)
-            if kind == "pointwise"
-            else window_threshold(model, inputs, start, window)
-        )
+        threshold = pointwise_threshold(model, inputs, start)
+        if kind == "window":
+            threshold = window_threshold(model, inputs, start, window)
     else:
-        white = True
-        if kind == "chi-square":
-            whitener = whitener_of(window_covariance(model, window))
-        else:
-            whitener, white = cusum_whitener(model, window)
-        mean = steady_mean(model)
+        (whitener, white), mean = whitened(kind, model, window), steady_mean(model)
         threshold = _statistical(kind, model, len(whitener), start, window, false_alarms, white=white)
     bench = make_bench(design, scenario)
     rows = bench.observer.fault_rows if estimates else bench.observer.residual_rows
     if model.flow is not None:
         threshold = threshold + _straight_lines(design, scenario, model, kind, window, rows)
-    statement = (
-        statement_of(kind, continuous=model.flow is not None, sampled=model.sampled is not None, estimates=estimates)
-        + EXACT
-    )
+    statement = statement_of(kind, model, estimates=estimates) + EXACT
     found = Monitor(
-        kind, statement, threshold, _floor(bench, scenario, rows), bench.drive.dt,
-        window,
+        kind, statement, threshold, _floor(bench, scenario, rows), bench.drive.dt, window,
         mean, whitener, float(change), model.fault_scales(), design.linear[1].fault_names, isolation_delay, estimates,
     )  # fmt: skip
     if not adaptive:
@@ -184,10 +173,7 @@ def _statistical(
     kind: str, model: ResidualModel, degrees: int, start: float, window: int, false_alarms: float,
     *, white: bool,
 ) -> FloatArray:  # fmt: skip
-    """Return thresholds by Bonferroni's inequality over all looks (chi-square), or Ville's over all sums (cusum).
-
-    Ville's is for white residuals; sums of others are counted one by one, from each start to each end.
-    """
+    """Return thresholds by Bonferroni's inequality over all looks (chi-square), or Ville's over all white sums."""
     from scipy.special import chdtri
 
     threshold = np.full(model.steps, np.inf)

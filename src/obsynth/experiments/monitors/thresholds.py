@@ -1,6 +1,6 @@
-"""Thresholds for the norm of a residual: the paper's, one that is never passed without a fault, one for a window.
+"""Bounds of the norm of a residual, or of a window of it: the paper's, and such as are never passed without a fault.
 
-Bounds on a residual for records of any length: a table for the start, and one number for ever after.
+For records of known length, and of any length: a table for the start, and one number for ever after.
 """
 
 from __future__ import annotations
@@ -18,11 +18,10 @@ from obsynth.numerics.norms import hinf_norm
 
 
 class ScaledInputs(NamedTuple):
-    """What drives a residual, each input scaled to at most one in absolute value.
+    """What drives a residual, each input scaled to at most one: ``B (n, m)``, ``D (nr, m)`` from sample to sample.
 
-    Fields: B, D: Inputs that change from sample to sample, ``(n, m)`` and ``(nr, m)``; between: ``(steps,)``: what
-    signals that may do anything between samples add to the norm of the residual, at most; limit: The same at any later
-    sample; start: ``(n, any)``: inputs of the first sample alone, straight to the error.
+    ``between (steps,)``, and later ``limit``: what signals that may do anything between samples add to the norm, at
+    most; ``start (n, any)``: inputs of the first sample alone, straight to the error.
     """
 
     B: FloatArray
@@ -35,10 +34,7 @@ class ScaledInputs(NamedTuple):
 def scaled_inputs(
     model: ResidualModel, bounds: FloatArray, noise_bound: float | None, *, any_stamps: bool = False
 ) -> ScaledInputs:
-    """Return what drives the residual, with every input scaled to at most one in absolute value.
-
-    Shapes: ``bounds (nd,)``.
-    """
+    """Return what drives the residual, with every input scaled to at most one in absolute value; ``bounds (nd,)``."""
     between = None if model.continuous is None else model.continuous.between
     sampled = np.any(model.Bd != 0.0, axis=0) | np.any(model.Dd != 0.0, axis=0)
     reached = sampled if between is None else between.reached
@@ -90,10 +86,7 @@ def _at_any_stamps(model: ResidualModel, between: BetweenSamples, sizes: FloatAr
 
 
 def paper_threshold(model: ResidualModel, bounds: FloatArray, initial_error: float, gamma: float | None) -> FloatArray:
-    """Return (66) of Wang et al. 2015 with the norm of the power where the paper has the power of the norm.
-
-    Shapes: ``bounds (nd,)``.
-    """
+    """Return (66) of Wang et al. 2015 with the norm of the power where the paper has the power of the norm."""
     if model.flow is not None:
         raise SpecError("Eq. (66) is for discrete designs: use pointwise, or sample the plant first.",
                         path="kind")  # fmt: skip
@@ -117,10 +110,9 @@ def pointwise_threshold(model: ResidualModel, inputs: ScaledInputs, initial_erro
 def window_threshold(model: ResidualModel, inputs: ScaledInputs, initial_error: float, window: int) -> FloatArray:
     """Return what the l2 norm of the residual over the last ``window`` samples never passes.
 
-    The inputs give at most their l2 gain times ``sqrt(window m)``; the error at the window's start gives the square
-    root of its energy, bounded as the pointwise bound is.  No window has more than the pointwise bounds of its samples,
-    summed up in squares: that is used where it is less, and for continuous designs, whose disturbances may do anything
-    between samples.
+    The inputs give at most their l2 gain times ``sqrt(window m)``; the error at the window's start the root of its
+    energy. The pointwise bounds of its samples, summed up in squares, are used where less, and for what moves between
+    samples.
     """
     one_by_one = pointwise_threshold(model, inputs, initial_error)
     summed = np.array([np.linalg.norm(one_by_one[max(k - window + 1, 0) : k + 1]) for k in range(model.steps)])
@@ -158,20 +150,14 @@ MOST_SAMPLES, MOST_NUMBERS = 16_384, 20_000_000
 
 
 class UnlimitedHorizonBound(NamedTuple):
-    """A bound by the number of samples since the start.
-
-    Fields: table: At samples 0, 1, ; limit: At every later one.
-    """
+    """A bound by the number of samples since the start: a table, and a limit for every later one."""
 
     table: FloatArray
     limit: float
 
 
 def samples_of(transition: FloatArray, window: int) -> int:
-    """Return how many samples a table needs until an error at the start has shrunk to `LEFT`.
-
-    Shapes: ``transition (n, n)``.
-    """
+    """Return how many samples a table needs until an error at the start has shrunk to `LEFT`; ``transition (n, n)``."""
     power, count = transition, 1
     while len(power) and not np.linalg.norm(power, 2) <= LEFT:
         power, count = power @ power, 2 * count
@@ -235,10 +221,7 @@ def _window_limit(
 def unlimited_paper(
     model: ResidualModel, bounds: FloatArray, initial_error: float, gamma: float | None
 ) -> UnlimitedHorizonBound:
-    """Return (66) of Wang et al. 2015 for records of any length.
-
-    Shapes: ``bounds (nd,)``.
-    """
+    """Return (66) of Wang et al. 2015 for records of any length."""
     table = paper_threshold(model, bounds, initial_error, gamma)
     return UnlimitedHorizonBound(table, float(table[-1]))
 

@@ -28,9 +28,7 @@ def window_covariance(model: ResidualModel, window: int) -> FloatArray:
             "A disturbance that reaches the residual has a part that is not random or does not last: its covariance "
             "is not known. Use pointwise or window.", path="disturbances",
         )  # fmt: skip
-    b = np.hstack([model.Bd * model.deviations, model.Bw])
-    d = np.hstack([model.Dd * model.deviations, model.Dw])
-    spread = output_covariance(model.A, b, np.eye(len(model.A)), np.zeros((len(model.A), b.shape[1])))
+    b, d, spread = _driving(model)
     lagged = [model.C @ spread @ model.C.T + d @ d.T]
     ahead = model.A @ spread @ model.C.T + b @ d.T
     for _ in range(window - 1):
@@ -41,6 +39,13 @@ def window_covariance(model: ResidualModel, window: int) -> FloatArray:
     return np.block([
         [lagged[i - j] if i >= j else lagged[j - i].T for j in range(window)] for i in range(window)
     ])  # fmt: skip
+
+
+def _driving(model: ResidualModel) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return what random disturbances and noise do to error and residual, and the covariance of the error."""
+    b = np.hstack([model.Bd * model.deviations, model.Bw])
+    d = np.hstack([model.Dd * model.deviations, model.Dw])
+    return b, d, output_covariance(model.A, b, np.eye(len(model.A)), np.zeros((len(model.A), b.shape[1])))
 
 
 def _felt(model: ResidualModel) -> list[bool]:
@@ -57,20 +62,14 @@ def _felt(model: ResidualModel) -> list[bool]:
 
 
 def whitener_of(covariance: FloatArray) -> FloatArray:
-    """Return ``Wh (rank, n)`` with ``Wh S Wh' = I``; directions without any variance are left out.
-
-    Shapes: ``covariance (n, n)``.
-    """
+    """Return ``Wh (rank, n)`` with ``Wh S Wh' = I`` for ``S (n, n)``; directions without any variance are left out."""
     sizes, vectors = np.linalg.eigh((covariance + covariance.T) / 2.0)
     kept = sizes > CANCELLATION_TOLERANCE * max(float(sizes[-1]), np.finfo(np.float64).tiny)
     return np.asarray((vectors[:, kept] / np.sqrt(sizes[kept])).T)
 
 
 def innovation_whitener(covariance: FloatArray, count: int) -> FloatArray:
-    """Return ``Wh (m, n)``: the newest ``count`` residuals less their prediction from the others, white.
-
-    Shapes: ``covariance (n, n)``.
-    """
+    """Return ``Wh (m, n)``: the newest ``count`` residuals less their prediction from the others, white."""
     old = len(covariance) - count
     past = whitener_of(covariance[:old, :old]) if old else np.zeros((0, 0))
     predict = covariance[old:, :old] @ past.T @ past
@@ -84,21 +83,14 @@ def innovation_whitener(covariance: FloatArray, count: int) -> FloatArray:
 
 
 def correlation_left(model: ResidualModel, window: int, whitener: FloatArray) -> float:
-    """Return the norms of all correlations, at every lag, that whitened residuals still have, summed up.
-
-    Of a residual that remembers more than a window, a prediction from the window is not the best one.
-    """
+    """Return the norms of all correlations, at every lag, that residuals whitened by a window still have, summed up."""
     count, n = len(model.C), len(model.A)
     covariance = window_covariance(model, 2 * window)
     span = window * count
-    near = [
-        whitener @ covariance[j * count : j * count + span, :span] @ whitener.T for j in range(1, window)
-    ]  # fmt: skip
+    near = (whitener @ covariance[j * count : j * count + span, :span] @ whitener.T for j in range(1, window))
     total = float(sum(np.linalg.norm(part, 2) for part in near))
     # Later ones are P A^k Q, k = 0, 1, ...
-    b = np.hstack([model.Bd * model.deviations, model.Bw])
-    d = np.hstack([model.Dd * model.deviations, model.Dw])
-    spread = output_covariance(model.A, b, np.eye(n), np.zeros((n, b.shape[1])))
+    b, d, spread = _driving(model)
     ahead = model.A @ spread @ model.C.T + b @ d.T
     blocks = [whitener[:, i * count : (i + 1) * count] for i in range(window)]
     shown, driven = np.zeros((len(whitener), n)), np.zeros((n, len(whitener)))
@@ -115,13 +107,17 @@ def correlation_left(model: ResidualModel, window: int, whitener: FloatArray) ->
 
 
 def cusum_whitener(model: ResidualModel, window: int) -> tuple[FloatArray, bool]:
-    """Return what cumulative sums add up, and whether it is white.
-
-    Where correlation is left, it is scaled down so that no sum of n samples has more variance than n.
-    """
+    """Return what cumulative sums add up, n samples of no more variance than n, and whether it is white."""
     whitener = innovation_whitener(window_covariance(model, window), len(model.C))
     left = correlation_left(model, window, whitener)
     return whitener / np.sqrt(1.0 + 2.0 * left), left <= WHITE_SHARE
+
+
+def whitened(kind: str, model: ResidualModel, window: int) -> tuple[FloatArray, bool]:
+    """Return the whitener of ``chi-square`` or ``cusum``, and whether what it makes is white."""
+    if kind == "chi-square":
+        return whitener_of(window_covariance(model, window)), True
+    return cusum_whitener(model, window)
 
 
 def steady_mean(model: ResidualModel) -> FloatArray:
@@ -134,10 +130,7 @@ def settled(model: ResidualModel, initial_error: float, window: int) -> int:
     """Return the first sample whose window is free of the start."""
     deviation = float(np.sqrt(np.max(np.diag(window_covariance(model, 1)))))
     # The covariance and the mean have to settle as well, from a start of about the size of their own states.
-    spread = output_covariance(
-        model.A, np.hstack([model.Bd * model.deviations, model.Bw]), np.eye(len(model.A)),
-        np.zeros((len(model.A), model.Bd.shape[1] + model.Bw.shape[1])),
-    )  # fmt: skip
+    spread = _driving(model)[2]
     mean = np.linalg.norm(np.linalg.solve(np.eye(len(model.A)) - model.A, model.Bd @ model.means))
     size = initial_error + float(np.sqrt(np.trace(spread))) + float(mean)
     effects = np.array([np.linalg.norm(model.C @ power, 2) for power in model.powers()]) * size

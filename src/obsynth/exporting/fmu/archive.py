@@ -15,14 +15,13 @@ from pathlib import Path
 
 from obsynth.errors import SpecError
 from obsynth.exporting.c_source import c_identifier, comment, header_text, source_text
-from obsynth.exporting.dae_c_source import dae_c_texts, require_no_sample_time
+from obsynth.exporting.c_templates import dae_c_texts, require_no_sample_time
 from obsynth.exporting.fmu.description import (
     Model,
     Signals,
     build_description,
     finite_warm_up,
-    fmi2_description,
-    fmi3_description,
+    model_description,
     signals_of_dae,
     signals_of_linear,
     start_values,
@@ -30,9 +29,9 @@ from obsynth.exporting.fmu.description import (
 from obsynth.exporting.realisation import Realisation
 from obsynth.files.outputs import write_atomically
 from obsynth.numerics.arguments import chosen
-from obsynth.observers.dae.compiled_library import FLAGS, compiler
+from obsynth.observers.dae.c_code import FLAGS, compiler
 from obsynth.observers.dae.observer import DAEObserver
-from obsynth.observers.linear.warm_up import checked_warm_up, transient
+from obsynth.observers.linear.derived import checked_warm_up, transient
 from obsynth.results.design import ObserverDesign
 
 VERSIONS = ("2.0", "3.0")
@@ -64,10 +63,8 @@ def write_fmu(
     sources |= {name: folder.joinpath(name).read_text(encoding="utf-8") for name in ("instance.h", "common.h", wrapper)}
     compiled = [f"{_PREFIX}.c", wrapper]
     content: dict[str, bytes] = {f"sources/{name}": text.encode() for name, text in sources.items()}
-    if version == "2.0":
-        content["modelDescription.xml"] = fmi2_description(model, compiled)
-    else:
-        content["modelDescription.xml"] = fmi3_description(model)
+    content["modelDescription.xml"] = model_description(model, version, compiled)
+    if version == "3.0":
         content["sources/buildDescription.xml"] = build_description(model, compiled)
     place = _binary_folder(version)
     if place is not None:

@@ -1,13 +1,11 @@
-"""The model description of an FMU, in XML, for FMI 2.0 and 3.0.
-
-The variables of an observer as an FMU: what goes in, what comes out, operating points, thresholds and alarms.
-"""
+"""The model description of an FMU, in XML, for FMI 2.0 and 3.0: inputs, estimates, points, thresholds and alarms."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
 
@@ -61,18 +59,12 @@ def signals_of_linear(found: Realisation, thresholds: Mapping[str, float] | None
         for name, delay in zip(observer.state_names, observer.state_delays, strict=True)
     ]
     outputs += [
-        Output(
-            f"fhat[{name}]",
-            None if name in biases else name,
-            units.get(name, ""),
-            _late(f"estimate of the fault {name}", delay),
-            True,
-        )
+        Output(f"fhat[{name}]", None if name in biases else name, units.get(name, ""),
+               _late(f"estimate of the fault {name}", delay), watched=True)
         for name, delay in zip(observer.fault_names, observer.fault_delays, strict=True)
-    ]
-    outputs += [
-        Output(f"r[{name}]", None, units.get(name, ""), f"residual {name}", True) for name in observer.residual_names
-    ]
+    ]  # fmt: skip
+    outputs += [Output(f"r[{name}]", None, units.get(name, ""), f"residual {name}", watched=True)
+                for name in observer.residual_names]  # fmt: skip
     signals = (*found.inputs, *observer.state_names, *observer.fault_names)
     points = {name: float(stated.get(name, 0.0)) for name in dict.fromkeys(signals)}
     inputs = _apart(observer.input_names, observer.output_names)
@@ -84,22 +76,17 @@ def signals_of_dae(design: ObserverDesign, thresholds: Mapping[str, float] | Non
     """Return the signals of the observer of a nonlinear plant; innovations and their square may be watched."""
     model, observer = design.nonlinear
     units = dict(model.units)
-
-    def unit(name: str) -> str:
-        return units.get(name, "")
-
-    outputs = [Output(f"xhat[{name}]", None, unit(name), f"estimate of {name}") for name in model.state_names]
-    outputs += [Output(f"sd xhat[{name}]", None, unit(name), f"standard deviation of the estimate of {name}")
-                for name in model.state_names]  # fmt: skip
-    outputs += [Output(f"theta[{name}]", None, unit(name), f"estimate of the parameter {name}")
-                for name in model.parameter_names]  # fmt: skip
-    outputs += [Output(f"sd theta[{name}]", None, unit(name), f"standard deviation of the estimate of {name}")
-                for name in model.parameter_names]  # fmt: skip
-    outputs += [Output(f"r[{name}]", None, unit(name), f"innovation of {name}", True) for name in model.output_names]
-    outputs.append(Output("nis", None, "", "square of the innovations in units of their covariance", True))
-    names = (*model.input_names, *model.output_names)
-    return Signals(_apart(model.input_names, model.output_names), names, tuple(outputs), {},
-                   _checked(thresholds, outputs), units, warm_up, observer.dt)  # fmt: skip
+    estimated = (("xhat", "", model.state_names), ("theta", "the parameter ", model.parameter_names))
+    outputs = []
+    for kind, of, names in estimated:
+        outputs += [Output(f"{kind}[{name}]", None, units.get(name, ""), f"estimate of {of}{name}") for name in names]
+        outputs += [Output(f"sd {kind}[{name}]", None, units.get(name, ""),
+                           f"standard deviation of the estimate of {name}") for name in names]  # fmt: skip
+    outputs += [Output(f"r[{name}]", None, units.get(name, ""), f"innovation of {name}", watched=True)
+                for name in model.output_names]  # fmt: skip
+    outputs.append(Output("nis", None, "", "square of the innovations in units of their covariance", watched=True))
+    return Signals(_apart(model.input_names, model.output_names), (*model.input_names, *model.output_names),
+                   tuple(outputs), {}, _checked(thresholds, outputs), units, warm_up, observer.dt)  # fmt: skip
 
 
 def _late(text: str, delay: int) -> str:
@@ -165,21 +152,20 @@ def _variables(signals: Signals) -> Iterator[_Variable]:
         yield _Variable(name, "real", "input", "discrete", None, start, unit, f"signal {signal}")
     for output in signals.outputs:
         yield _Variable(output.name, "real", "output", "discrete", "calculated", None, output.unit, output.description)
-    for name, value in signals.points.items():
-        yield _Variable(f"operating_point[{name}]", "real", "parameter", "tunable", "exact", value,
-                        signals.units.get(name, ""), f"{name} where the linear model was taken")  # fmt: skip
     units = {output.name: output.unit for output in signals.outputs}
-    for name, level in signals.thresholds.items():
-        yield _Variable(f"threshold[{name}]", "real", "parameter", "tunable", "exact", level, units[name],
-                        f"alarm above this absolute value of {name} (its deviation); 0: none")  # fmt: skip
-    yield _Variable("warm_up", "real", "parameter", "tunable", "exact", signals.warm_up, "s",
-                    "no alarm in these seconds after the start")  # fmt: skip
-    for name in signals.thresholds:
-        yield _Variable(f"alarm[{name}]", "flag", "output", "discrete", "calculated", None, "",
-                        f"{name} is above its threshold")  # fmt: skip
-    yield _Variable("alarm", "flag", "output", "discrete", "calculated", None, "", "any alarm")
-    yield _Variable("sample_used", "flag", "output", "discrete", "calculated", None, "",
-                    "the last sample was finite and used; else the estimates are held")  # fmt: skip
+    parameters = [(f"operating_point[{name}]", value, signals.units.get(name, ""),
+                   f"{name} where the linear model was taken") for name, value in signals.points.items()]  # fmt: skip
+    parameters += [(f"threshold[{name}]", level, units[name],
+                    f"alarm above this absolute value of {name} (its deviation); 0: none")
+                   for name, level in signals.thresholds.items()]  # fmt: skip
+    parameters.append(("warm_up", signals.warm_up, "s", "no alarm in these seconds after the start"))
+    for name, value, unit, told in parameters:
+        yield _Variable(name, "real", "parameter", "tunable", "exact", value, unit, told)
+    flags = [(f"alarm[{name}]", f"{name} is above its threshold") for name in signals.thresholds]
+    flags.append(("alarm", "any alarm"))
+    flags.append(("sample_used", "the last sample was finite and used; else the estimates are held"))
+    for name, told in flags:
+        yield _Variable(name, "flag", "output", "discrete", "calculated", None, "", told)
 
 
 def start_values(signals: Signals) -> list[float]:
@@ -187,65 +173,65 @@ def start_values(signals: Signals) -> list[float]:
     return [variable.start or 0.0 for variable in _variables(signals) if variable.kind == "real"]
 
 
-def fmi2_description(model: Model, sources: list[str]) -> bytes:
-    """Return ``modelDescription.xml`` of FMI 2.0."""
+class _Version(NamedTuple):
+    """How a version of FMI spells what both have: elements, attributes and the first reference."""
+
+    token: str
+    real: str
+    outputs: tuple[str, str]
+    abilities: dict[str, str]
+
+
+_STEPS = {"canHandleVariableCommunicationStepSize": "false"}
+_VERSIONS = {
+    "2.0": _Version("guid", "Real", ("Outputs", "InitialUnknowns"), {
+        **_STEPS, "canNotUseMemoryManagementFunctions": "true", "canGetAndSetFMUstate": "true",
+        "canSerializeFMUstate": "true",
+    }),
+    "3.0": _Version("instantiationToken", "Float64", ("Output", "InitialUnknown"), {
+        **_STEPS, "fixedInternalStepSize": "", "canGetAndSetFMUState": "true", "canSerializeFMUState": "true",
+    }),
+}  # fmt: skip
+
+
+def model_description(model: Model, version: str, sources: list[str]) -> bytes:
+    """Return ``modelDescription.xml`` of a version of FMI."""
+    spelled, step = _VERSIONS[version], repr(model.signals.dt)
     root = Element("fmiModelDescription", {
-        "fmiVersion": "2.0", "modelName": model.name, "guid": model.token, "description": model.description,
+        "fmiVersion": version, "modelName": model.name, spelled.token: model.token, "description": model.description,
         "generationTool": "obsynth", "variableNamingConvention": "flat",
     })  # fmt: skip
-    simulation = SubElement(root, "CoSimulation", {
-        "modelIdentifier": model.identifier, "canHandleVariableCommunicationStepSize": "false",
-        "canNotUseMemoryManagementFunctions": "true", "canGetAndSetFMUstate": "true", "canSerializeFMUstate": "true",
-    })  # fmt: skip
-    files = SubElement(simulation, "SourceFiles")
-    for name in sources:
-        SubElement(files, "File", {"name": name})
+    abilities = {name: value or step for name, value in spelled.abilities.items()}
+    simulation = SubElement(root, "CoSimulation", {"modelIdentifier": model.identifier, **abilities})
+    if version == "2.0":
+        files = SubElement(simulation, "SourceFiles")
+        for name in sources:
+            SubElement(files, "File", {"name": name})
     variables = list(_variables(model.signals))
     _units(root, variables)
-    SubElement(root, "DefaultExperiment", {"startTime": "0", "stepSize": repr(model.signals.dt)})
+    SubElement(root, "DefaultExperiment", {"startTime": "0", "stepSize": step})
     listed = SubElement(root, "ModelVariables")
     for reference, variable in enumerate(variables):
-        element = SubElement(listed, "ScalarVariable", {
+        kind = spelled.real if variable.kind == "real" else "Boolean"
+        attributes = {
             "name": variable.name, "valueReference": str(reference), "causality": variable.causality,
             "variability": variable.variability, "description": variable.description,
             **({"initial": variable.initial} if variable.initial else {}),
-        })  # fmt: skip
-        SubElement(element, "Real" if variable.kind == "real" else "Boolean", _value(variable))
-    structure = SubElement(root, "ModelStructure")
-    outputs = [number for number, variable in enumerate(variables, 1) if variable.causality == "output"]
-    for part in ("Outputs", "InitialUnknowns"):
-        unknowns = SubElement(structure, part)
-        for number in outputs:
-            SubElement(unknowns, "Unknown", {"index": str(number)})
-    return _text(root)
-
-
-def fmi3_description(model: Model) -> bytes:
-    """Return ``modelDescription.xml`` of FMI 3.0."""
-    root = Element("fmiModelDescription", {
-        "fmiVersion": "3.0", "modelName": model.name, "instantiationToken": model.token,
-        "description": model.description, "generationTool": "obsynth", "variableNamingConvention": "flat",
-    })  # fmt: skip
-    SubElement(root, "CoSimulation", {
-        "modelIdentifier": model.identifier, "canHandleVariableCommunicationStepSize": "false",
-        "fixedInternalStepSize": repr(model.signals.dt), "canGetAndSetFMUState": "true",
-        "canSerializeFMUState": "true",
-    })  # fmt: skip
-    variables = list(_variables(model.signals))
-    _units(root, variables)
-    SubElement(root, "DefaultExperiment", {"startTime": "0", "stepSize": repr(model.signals.dt)})
-    listed = SubElement(root, "ModelVariables")
-    for reference, variable in enumerate(variables):
-        SubElement(listed, "Float64" if variable.kind == "real" else "Boolean", {
-            "name": variable.name, "valueReference": str(reference), "causality": variable.causality,
-            "variability": variable.variability, "description": variable.description,
-            **({"initial": variable.initial} if variable.initial else {}), **_value(variable),
-        })  # fmt: skip
+        }  # fmt: skip
+        if version == "2.0":
+            SubElement(SubElement(listed, "ScalarVariable", attributes), kind, _value(variable))
+        else:
+            SubElement(listed, kind, {**attributes, **_value(variable)})
     structure = SubElement(root, "ModelStructure")
     outputs = [reference for reference, variable in enumerate(variables) if variable.causality == "output"]
-    for part in ("Output", "InitialUnknown"):
+    for part in spelled.outputs:
+        # FMI 2 counts variables from one, and lists them inside an element.
+        unknowns = SubElement(structure, part) if version == "2.0" else structure
         for reference in outputs:
-            SubElement(structure, part, {"valueReference": str(reference)})
+            if version == "2.0":
+                SubElement(unknowns, "Unknown", {"index": str(reference + 1)})
+            else:
+                SubElement(unknowns, part, {"valueReference": str(reference)})
     return _text(root)
 
 

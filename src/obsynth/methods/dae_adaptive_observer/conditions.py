@@ -7,8 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from obsynth.analysis.conditions import Condition
-from obsynth.analysis.dae_index import index_report
-from obsynth.analysis.identifiability import identifiability
+from obsynth.analysis.dae_structure import identifiability, index_report
 from obsynth.errors import SolverError
 from obsynth.plants.dae.functions import DAEFunctions
 from obsynth.plants.dae.model import DAEModel

@@ -26,11 +26,18 @@ from obsynth.analysis.conditions import Condition, require_all
 from obsynth.methods.dae_adaptive_observer.conditions import dae_conditions
 from obsynth.methods.dae_adaptive_observer.options import DaeAdaptiveObserverOptions
 from obsynth.methods.method_spec import Synthesis
-from obsynth.observers.dae.building import LARGEST_TURN, dae_observer_from_options, largest_turn, resolved_options
-from obsynth.observers.dae.nominal_run import NOMINAL_STEPS, DAEFacts, dae_facts
+from obsynth.observers.dae.building import (
+    LARGEST_TURN,
+    NOMINAL_STEPS,
+    DAEFacts,
+    dae_facts,
+    dae_observer_from_options,
+    largest_turn,
+    resolved_options,
+)
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.dae.steps import PROJECTION_NOTICE
-from obsynth.observers.robustness import plain_recursion
+from obsynth.observers.running import plain_recursion
 from obsynth.plants.dae.model import DAEModel
 from obsynth.results.design import Certificate
 

@@ -48,7 +48,7 @@ def numbers_with_fault_states(plant: DescriptorSystem) -> PlantNumbers | None:
     """Return the numbers of a plant with its sensor faults appended as algebraic states."""
     from flint import fmpq_mat
 
-    from obsynth.proofs.exact_pencils import blocks, identity, zeros_matrix
+    from obsynth.proofs.exact_arithmetic import blocks, identity, zeros_matrix
 
     chosen = [int(j) for j in np.flatnonzero(np.any(plant.Df != 0.0, axis=0))]
     numbers = numbers_of(plant)
@@ -110,7 +110,7 @@ def nonsingular_t(numbers: PlantNumbers) -> fmpq_mat | None:
     """Return a rational nonsingular T with ``T E + N C = I``."""
     from flint import fmpq_mat
 
-    from obsynth.proofs.exact_pencils import blocks, null_basis
+    from obsynth.proofs.exact_arithmetic import blocks, null_basis
 
     e, c = numbers.rational["E"], numbers.rational["C"]
     stacked, order = blocks([[e], [c]]), int(e.ncols())

@@ -59,7 +59,7 @@ def _is_in_doubt(plant: DescriptorSystem, detectability: FaultDetectability) -> 
     found = _exact(plant)
     if found is None:
         return False
-    from obsynth.proofs.exact_matrices import blocks
+    from obsynth.proofs.exact_arithmetic import blocks
 
     a, c, faults, _ = found
     columns = [c * _moved(a, faults, fault, index) for fault, index in enumerate(detectability.indexes)]
@@ -123,7 +123,7 @@ def _solution(maps: list[fmpq_mat], rest: fmpq_mat, order: list[int]) -> list[tu
     """Return delta with ``maps[-1] delta = rest``, and zero for all maps before it, on few equations in this order."""
     from flint import fmpq_mat
 
-    from obsynth.proofs.exact_matrices import blocks, pivot_columns
+    from obsynth.proofs.exact_arithmetic import blocks, pivot_columns
 
     whole = blocks([[part] for part in maps])
     rows, outputs = int(whole.nrows()), int(rest.nrows())

@@ -9,16 +9,18 @@ from typing import Any
 import numpy as np
 
 from obsynth.analysis.conditions import Condition
-from obsynth.analysis.diagnosis.columns import Question, question
-from obsynth.analysis.diagnosis.diagnosing import model_points, rest_point
-from obsynth.analysis.diagnosis.hidden_motions import hidden_motion
+from obsynth.analysis.diagnosis.diagnosing import model_points
+from obsynth.analysis.diagnosis.exact import question
+from obsynth.analysis.diagnosis.explanations import hidden_motion
+from obsynth.analysis.diagnosis.fault_columns import Question, rest_point
 from obsynth.analysis.existence.distance import DROWNED
 from obsynth.analysis.existence.named_pencils import NamedPencil, named_pencil, unclear
 from obsynth.analysis.existence.numbers import COMPUTED_STATES
 from obsynth.analysis.existence.verdicts import DECIDER
 from obsynth.analysis.plant_units import PlantUnits
+from obsynth.methods.functional_filter.options import FunctionalFilterOptions
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.exosystems import Exosystem, exosystem
+from obsynth.plants.fault_models import Exosystem, exosystem
 from obsynth.plants.origin import origin_of
 
 _SOURCE = "left null space of [A - sE, Bd, Bf; C, Dd, Df]"
@@ -33,8 +35,6 @@ def conditions(
     exactly: bool | None = None,
 ) -> tuple[Condition, ...]:
     """Return the existence conditions, one or two for each fault asked for."""
-    from obsynth.methods.functional_filter.options import FunctionalFilterOptions
-
     asked = FunctionalFilterOptions(faults=faults, residuals=residuals)
     sets = asked.residual_sets(plant)
     if plant.nf == 0:
@@ -57,7 +57,7 @@ def fault_conditions(
 ) -> tuple[Condition, ...]:
     """Return whether one fault can be estimated, free of the unknown inputs and of every other fault."""
     name = plant.fault_names[fault]
-    asked = _asked(plant, [j for j in range(plant.nf) if j != fault], fault, exactly)
+    asked = question(plant, [j for j in range(plant.nf) if j != fault], fault, exactly)
     rest = rest_point(plant.dt)
     seen = Condition(
         f"{name} shows", f"{name} shows free of {_rest(plant, fault)}", asked.visible, float(asked.visible), 1.0,
@@ -93,7 +93,7 @@ def _may_show(asked: Question, point: complex | None = None) -> bool:
     plant = asked.source
     if plant.nx + plant.nd + plant.nf > COMPUTED_STATES or origin_of(plant) is not None:
         return False
-    exact = Question(plant, asked.removed, asked.number, True)
+    exact = question(plant, asked.removed, asked.number, True)
     return exact.visible if point is None else exact.shows_at(point)
 
 
@@ -120,7 +120,7 @@ def _residual_conditions(plant: DescriptorSystem, seen: Sequence[int], exactly: 
     removed = [j for j in range(plant.nf) if j not in seen]
     found = []
     for fault in seen:
-        asked = _asked(plant, removed, fault, exactly)
+        asked = question(plant, removed, fault, exactly)
         name = plant.fault_names[fault]
         blind = [*plant.disturbance_names, *(plant.fault_names[j] for j in removed)]
         rest = rest_point(plant.dt)
@@ -152,9 +152,3 @@ def _hidden(plant: DescriptorSystem, asked: Question, point: complex) -> str:
 
 def _place(point: complex) -> str:
     return f"{point.real:.4g}{f'{point.imag:+.4g}j' if point.imag else ''}"
-
-
-def _asked(plant: DescriptorSystem, removed: Sequence[int], fault: int, exactly: bool | None) -> Question:
-    if exactly is None:
-        return question(plant, removed, fault)
-    return Question(plant, tuple(removed), fault, exactly)

@@ -1,15 +1,26 @@
-"""How fast a fault is held to walk where nobody says so: slowly, but so that a step is seen in the plant's own time."""
+"""How fast a fault is held to walk where nobody says so: slowly, but so that a step is seen in the plant's own time.
+
+And what delay buys: one Riccati equation for each walk, as smoothing over L samples takes ``sum_j G_j C M_j`` from the
+error covariance.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import numpy as np
 
-from obsynth.errors import SolverError
-from obsynth.methods.functional_filter.kalman_gain import FilterModel, KalmanGain, kalman_gain
+from obsynth.errors import ObsynthError, SolverError
+from obsynth.methods.functional_filter.kalman_gain import FilterModel, KalmanGain, filter_model, kalman_gain
+from obsynth.methods.riccati import riccati_solution
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.pencils import pencil_structure
+from obsynth.numerics.ranks import decide_rank
 from obsynth.numerics.spectra import speeds
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.fault_models import exosystem
+from obsynth.verification.certificates import slowest_decay
 
 #: Modes slower than this share of the fastest one never settle.
 STANDING = 1e-6
@@ -19,6 +30,8 @@ TIME_CONSTANTS, LEAST_SAMPLES = 7.0, 4.0
 REACHED, ASKED_AT = 0.1, (1.0, 1.5, 2.5)
 #: Where no walk shows a step in time: walks that miss it by so much more than the best are as good.
 AS_CLOSE = 0.05
+#: Errors that need longer than so many settling times to die out would stay in any run: the gain moves such poles.
+FOR_GOOD = 1e5
 #: Decades of the search around a rate of the size of the noise, and its steps per decade at the end.
 DECADES, BISECTIONS = 8, 9
 
@@ -63,12 +76,23 @@ def default_rates(model: FilterModel, seconds: float, *, lag: int) -> tuple[Floa
         if not misses:
             raise SolverError("No walk of the fault gives a stable filter: give fault_rate, or poles.")
         high = min(e for e, miss in misses.items() if miss <= min(misses.values()) + AS_CLOSE)
-        return 10.0**high * unit, _known(tried[high])
+        return 10.0**high * unit, _forgetting(model, 10.0**high * unit, _known(tried[high]), seconds, lag)
     low = high - 1.0
     for _ in range(BISECTIONS):
         middle = 0.5 * (low + high)
         low, high = (low, middle) if in_time(middle) else (middle, high)
-    return 10.0**high * unit, _known(gain(high))
+    return 10.0**high * unit, _forgetting(model, 10.0**high * unit, _known(gain(high)), seconds, lag)
+
+
+def _forgetting(model: FilterModel, walks: FloatArray, found: KalmanGain, seconds: float, lag: int) -> KalmanGain:
+    """Return the gain, or one for the same walks whose errors do not stay for good, where there is one."""
+    slowest = 1.0 / (FOR_GOOD * seconds)
+    if not slowest_decay(model.A - found.K @ model.C, model.dt) < slowest:
+        return found
+    try:
+        return kalman_gain(model, walks, lag=lag, decay=slowest)
+    except SolverError:
+        return found
 
 
 def step_misses(model: FilterModel, gain: KalmanGain, seconds: float) -> float:
@@ -94,3 +118,68 @@ def _known(gain: KalmanGain | None) -> KalmanGain:
     if gain is None:
         raise SolverError("The Riccati equation of the filter has no stable solution: give fault_rate, or poles.")
     return gain
+
+
+#: Lags in samples, and walks relative to the middle one.
+LAGS, FACTORS = (0, 1, 2, 5, 10, 25), (0.3, 1.0, 3.0)
+
+
+@dataclass(frozen=True, eq=False)
+class DelayCurve:
+    """Fields: fault; rates: walks per sample; lags: samples; deviations ``(rates, lags)`` of the delayed error."""
+
+    fault: str
+    rates: tuple[float, ...]
+    lags: tuple[int, ...]
+    deviations: FloatArray
+
+    @property
+    def sentence(self) -> str:
+        """What the first sample of delay is worth at the middle walk, and five of them."""
+        row = self.deviations[len(self.rates) // 2]
+        rate = self.rates[len(self.rates) // 2]
+        at = {lag: float(value) for lag, value in zip(self.lags, row, strict=True)}
+        return (
+            f"{self.fault}: for a walk of {rate:.3g} per sample one sample of delay takes the deviation from "
+            f"{at[0]:.3g} to {at[1]:.3g}, five samples to {at[5]:.3g}."
+        )
+
+
+def delay_curve(
+    plant: DescriptorSystem, fault: int, rate: float | None = None, lags: Sequence[int] = LAGS
+) -> DelayCurve | None:
+    """Return the curve of a fault of a sampled plant, free of all others; ``None`` where it cannot be estimated."""
+    if not plant.dt > 0.0 or not plant.nw:
+        return None
+    removed = [j for j in range(plant.nf) if j != fault]
+    model = filter_model(plant, exosystem("step", plant.fault_names, plant.dt), removed=removed, faults=[fault])
+    if not len(model.M) or decide_rank(model.M, expected=len(model.M)).rank < len(model.M):
+        return None
+    try:
+        middle = float(default_rates(model, settling_time(plant), lag=0)[0][0]) if rate is None else rate
+        rows = []
+        for factor in FACTORS:
+            walks = np.array([factor * middle])
+            gain = kalman_gain(model, walks, lag=max(lags))
+            states = np.diag(np.r_[np.ones(model.order), np.zeros(len(model.A) - model.order)])
+            process = model.N @ model.N.T + (model.drive * walks**2) @ model.drive.T + gain.added**2 * states
+            p = riccati_solution(model.A, model.C, process, model.M @ model.M.T, model.N @ model.M.T)
+            if p is None:
+                return None
+            rows.append(_smoothed(p, model.C, model.A - gain.K @ model.C, model.estimate, gain.lag, lags))
+    except ObsynthError:
+        return None
+    rates = tuple(factor * middle for factor in FACTORS)
+    return DelayCurve(plant.fault_names[fault], rates, tuple(lags), np.array(rows))
+
+
+def _smoothed(
+    p: FloatArray, c: FloatArray, closed: FloatArray, estimate: FloatArray, gains: Sequence[FloatArray],
+    lags: Sequence[int],
+) -> list[float]:  # fmt: skip
+    known, moved, found = np.zeros_like(p), p.copy(), {}
+    for lag in range(max(lags) + 1):
+        known = known + gains[lag] @ c @ moved
+        moved = closed @ moved
+        found[lag] = float(np.sqrt(max((estimate @ (p - known) @ estimate.T)[0, 0], 0.0)))
+    return [found[lag] for lag in lags]

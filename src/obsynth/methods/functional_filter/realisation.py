@@ -12,8 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import reduce
-from typing import Any
 
 import numpy as np
 from scipy.linalg import block_diag, schur
@@ -24,6 +22,8 @@ from obsynth.numerics.ranks import CANCELLATION_TOLERANCE
 from obsynth.numerics.scaling import balanced_matrix
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.proofs.extended_balls import arb_matrix
+from obsynth.proofs.products import BITS, as_ball
 
 #: A matrix larger than its eigenvalues by this is given in coordinates in which it is triangular.
 FAR_FROM_NORMAL = 1e3
@@ -85,7 +85,10 @@ def filter_part(model: FilterModel, gain: KalmanGain, shown: FloatArray, *, dela
     innovation = Rows(-model.C, model.L, model.T0)
     count, nx = len(model.estimate), model.T.shape[1]
     row = Rows(model.estimate, np.zeros((count, model.L.shape[1])), np.zeros((count, nx)))
-    dynamics, innovation, row = _in_plain_coordinates(dynamics, innovation, row)
+    coordinates = _plain_coordinates(dynamics.A)
+    if coordinates is not None:
+        dynamics = _rounded_once(model, gain, coordinates)
+        innovation, row = (Rows(r.C @ coordinates, r.D, r.T0) for r in (innovation, row))
     corrections = [innovation.times(model.estimate @ part) for part in gain.lag]
     if corrections:
         row = row.plus(corrections[0])
@@ -100,22 +103,37 @@ def filter_part(model: FilterModel, gain: KalmanGain, shown: FloatArray, *, dela
     return FilterPart(dynamics, estimates, innovation.times(shown), model.faults, delay + (mean - 1) // 2)
 
 
-def _in_plain_coordinates(dynamics: Dynamics, *rows: Rows) -> tuple[Any, ...]:
-    """Return dynamics and rows in coordinates in which A is about as large as its eigenvalues, if it is not already.
+def _plain_coordinates(a: FloatArray) -> FloatArray | None:
+    """Return coordinates in which A is about as large as its eigenvalues; ``None`` if it is already.
 
     Of gains for noises of very different size the entries cancel each other: a real Schur form, balanced, has none that
     do.
     """
-    a = dynamics.A
     if not len(a) or not np.all(np.isfinite(a)):
-        return dynamics, *rows
+        return None
     largest = float(np.max(np.abs(np.linalg.eigvals(a))))
     if np.linalg.norm(balanced_matrix(a)[0], 2) <= FAR_FROM_NORMAL * largest:
-        return dynamics, *rows
+        return None
     triangular, turn = schur(a, output="real")
-    plain, factors = balanced_matrix(triangular)
-    back, there = turn.T / factors[:, None], turn * factors
-    return Dynamics(plain, back @ dynamics.B, back @ dynamics.T), *(Rows(r.C @ there, r.D, r.T0) for r in rows)
+    return np.asarray(turn * balanced_matrix(triangular)[1])
+
+
+def _rounded_once(model: FilterModel, gain: KalmanGain, coordinates: FloatArray) -> Dynamics:
+    """Return the dynamics in other coordinates, each entry computed with digits to spare.
+
+    The entries that cancelled would leave their rounding errors in the small rows.
+    """
+    import flint
+
+    with flint.ctx.workprec(BITS):
+        k, there = arb_matrix(gain.K), arb_matrix(coordinates)
+        back = there.inv()
+        parts = ((model.A, -model.C, there), (model.B, model.L, None), (model.T, model.T0, None))
+        found = []
+        for own, fed_back, right in parts:
+            part = back * (arb_matrix(own) + k * arb_matrix(fed_back))
+            found.append(part if right is None else part * right)
+    return Dynamics(*(as_ball(part).midpoint for part in found))
 
 
 def _registered(dynamics: Dynamics, row: Rows) -> tuple[Dynamics, Rows]:
@@ -137,37 +155,29 @@ def assembled(
     nu, nx = plant.nu, plant.nx
     a = block_diag(*(part.dynamics.A for part in parts)) if parts else np.zeros((0, 0))
     b = _stacked([part.dynamics.B for part in parts], nu + plant.ny)
-    order = len(a)
-    places = np.cumsum([0, *(len(part.dynamics.A) for part in parts)])
-    estimates = [_placed(part.estimates, place, len(part.dynamics.A), order) for part, place in _with(parts, places)]
-    residuals = [_placed(part.residuals, place, len(part.dynamics.A), order) for part, place in _with(parts, places)]
     faults = [(fault, part.delay) for part in parts for fault in part.faults if len(part.estimates.C)]
     rows = sorted(range(len(faults)), key=lambda i: faults[i][0])
-    whole = Rows(np.zeros((0, order)), np.zeros((0, nu + plant.ny)), np.zeros((0, nx)))
-    estimate, residual = (reduce(_under, group, whole) for group in (estimates, residuals))
-    ordered = Rows(estimate.C[rows], estimate.D[rows], estimate.T0[rows])
-    shipped = _under(ordered, residual)
+    orders = [len(part.dynamics.A) for part in parts]
+    estimate = _side_by_side([part.estimates for part in parts], orders, nu + plant.ny, nx)
+    residual = _side_by_side([part.residuals for part in parts], orders, nu + plant.ny, nx)
+    cz, d, t0 = (
+        np.vstack([mine[rows], other])
+        for mine, other in ((estimate.C, residual.C), (estimate.D, residual.D), (estimate.T0, residual.T0))
+    )
     observer = LinearObserver(
-        Az=a, Bu=b[:, :nu], By=b[:, nu:], Cz=shipped.C, Du=shipped.D[:, :nu], Dy=shipped.D[:, nu:], dt=plant.dt,
+        Az=a, Bu=b[:, :nu], By=b[:, nu:], Cz=cz, Du=d[:, :nu], Dy=d[:, nu:], dt=plant.dt,
         input_names=plant.input_names, output_names=plant.output_names, state_names=(),
         fault_names=tuple(plant.fault_names[faults[i][0]] for i in rows), residual_names=tuple(residual_names),
         state_delays=(), fault_delays=tuple(faults[i][1] for i in rows),
     )  # fmt: skip
-    return observer, _stacked([part.dynamics.T for part in parts], nx), shipped.T0
+    return observer, _stacked([part.dynamics.T for part in parts], nx), t0
 
 
-def _with(parts: Sequence[FilterPart], places: FloatArray) -> list[tuple[FilterPart, int]]:
-    return [(part, int(place)) for part, place in zip(parts, places[:-1], strict=True)]
-
-
-def _placed(rows: Rows, place: int, width: int, order: int) -> Rows:
-    c = np.zeros((len(rows.C), order))
-    c[:, place : place + width] = rows.of_order(width)
-    return Rows(c, rows.D, rows.T0)
-
-
-def _under(first: Rows, second: Rows) -> Rows:
-    return Rows(np.vstack([first.C, second.C]), np.vstack([first.D, second.D]), np.vstack([first.T0, second.T0]))
+def _side_by_side(found: Sequence[Rows], orders: Sequence[int], inputs: int, nx: int) -> Rows:
+    """Return the rows of several filters, each reading its own states."""
+    own = [rows.of_order(order) for rows, order in zip(found, orders, strict=True)]
+    c = block_diag(*own) if own else np.zeros((0, 0))
+    return Rows(c, _stacked([rows.D for rows in found], inputs), _stacked([rows.T0 for rows in found], nx))
 
 
 def _stacked(matrices: Sequence[FloatArray], width: int) -> FloatArray:

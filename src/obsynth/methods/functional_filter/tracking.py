@@ -1,7 +1,4 @@
-"""The error system of a functional filter, and what its estimates make of faults that follow their models.
-
-Standard deviations of the estimates of a shipped functional filter: of noise alone, and of noise and walk.
-"""
+"""The error system of a functional filter: faults that follow their models, deviations by noise and by walks."""
 
 from __future__ import annotations
 
@@ -14,6 +11,11 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.spectra import certain_noise_covariance
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.proofs.extended_balls import arb_matrix
+from obsynth.proofs.products import BITS, as_ball
+
+#: Regulator equations of more unknowns are solved in double precision.
+MOST_UNKNOWNS = 100
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +47,23 @@ def tracking_map(
     entering = (observer.By @ plant.Df - t @ plant.Bf) @ cw
     if not entering.size:
         return np.zeros(entering.shape)
-    return np.asarray(solve_sylvester(observer.Az, -phi, -entering))
+    exact = _with_digits_to_spare(observer.Az, phi, entering) if entering.size <= MOST_UNKNOWNS else None
+    return np.asarray(solve_sylvester(observer.Az, -phi, -entering)) if exact is None else exact
+
+
+def _with_digits_to_spare(a: FloatArray, phi: FloatArray, entering: FloatArray) -> FloatArray | None:
+    """Return Pi to its last digit, however near a slow pole is to the fault model; ``None`` where it has one."""
+    import flint
+
+    order, count = entering.shape
+    whole, right = np.kron(a, np.eye(count)), np.kron(np.eye(order), phi.T)
+    with flint.ctx.workprec(BITS):
+        own, model, known = (arb_matrix(np.asarray(part)) for part in (whole, right, entering.reshape(-1, 1)))
+        try:
+            found = (model - own).solve(known)
+        except ZeroDivisionError:
+            return None
+    return as_ball(found).midpoint.reshape(order, count)
 
 
 def wanted_faults(

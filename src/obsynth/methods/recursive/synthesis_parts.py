@@ -12,14 +12,13 @@ from obsynth.analysis.zeros import leading_names
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.methods.method_spec import Synthesis
 from obsynth.methods.recursive.steady_filter import reached_condition
-from obsynth.numerics.covariances import covariance_factor
-from obsynth.observers.recursive.building import observer_from_options, plain_options
+from obsynth.numerics.ranks import covariance_factor
 from obsynth.observers.recursive.gain_schedule_summary import (
     STEPS_TO_CONTRACT,
     GainScheduleSummary,
     gain_schedule_summary,
 )
-from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.observers.recursive.observer import RecursiveObserver, observer_from_options, plain_options
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.results.design import Certificate

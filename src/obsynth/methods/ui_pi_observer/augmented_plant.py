@@ -1,7 +1,7 @@
-r"""Faults as states and unknown inputs removed: the plant behind an unknown-input PI observer.
+r"""Faults as states and unknown inputs removed: the plant behind an unknown-input PI observer, and its realisation.
 
-Source: Share Pasand, Aliyari, Taghirad, eqs. (10), (11), (13), (19).  Differences: sensor faults (Df); disturbances in
-the outputs (Dd); ``decouple`` instead of the Moore-Penrose ``E#``, with which ``U`` loses rank and the unobservable
+Source: Share Pasand, Aliyari, Taghirad, eqs. (4), (10)-(13), (19), (20).  Differences: sensor faults (Df); disturbances
+in the outputs (Dd); ``decouple`` instead of the Moore-Penrose ``E#``, with which ``U`` loses rank and the unobservable
 modes change.
 
 With the augmented plant ``Ea xa+ = Aa xa + Ba u + Bda d``, ``y = Ca xa + D u + Dd d``, ``xa = [x; w]``, the observer
@@ -15,15 +15,18 @@ equations of the states, and what is left is a plant without ``Dd`` (`Decoupled.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
+from obsynth.analysis.plant_units import PlantUnits
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import RANK_TOLERANCE, decide_rank
+from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.exosystems import Exosystem
+from obsynth.plants.fault_models import Exosystem, stated_eigenvalues
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +63,13 @@ class AugmentedPlant:
     def order(self) -> int:
         """Number of states."""
         return int(self.E.shape[0])
+
+
+def shipped_model(matrices: Mapping[str, FloatArray], faults: int) -> Exosystem:
+    """Return the exosystem of a certificate, with ``Phi (nw, nw)`` and ``Cw (nf, nw)``."""
+    phi = matrices["Phi"]
+    names = tuple(f"w{i + 1}" for i in range(len(phi)))
+    return Exosystem(phi, matrices["Cw"], names, stated_eigenvalues(phi), ("as shipped",) * faults)
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,3 +196,49 @@ def paper_decoupling(
     correction = basis + g @ (np.eye(ny) - plant.C @ basis)
     u = remaining @ (np.eye(nx) - basis @ plant.C) @ e_sharp
     return correction, u, c_sharp + correction @ (np.eye(ny) - plant.C @ c_sharp)
+
+
+@dataclass(frozen=True, eq=False)
+class ObserverGains:
+    """Gains for the augmented plant.
+
+    Fields: U, D, K: ``(na, na)``, ``(na, ny)``, ``(na, ny)``.
+    """
+
+    U: FloatArray
+    D: FloatArray
+    K: FloatArray
+
+
+def realise(
+    plant: DescriptorSystem, model: Exosystem, gains: ObserverGains, seen: FloatArray
+) -> tuple[LinearObserver, dict[str, FloatArray]]:
+    """Return the observer, and its matrices by the paper's letters; ``seen (nr, ny)``."""
+    augmented = AugmentedPlant.of(plant, model)
+    nx, na = plant.nx, augmented.order
+    a_hat = gains.U @ augmented.A - gains.K @ augmented.C
+    b_hat = a_hat @ gains.D + gains.K
+    j_hat = gains.U @ augmented.B
+    faults = np.hstack([np.zeros((plant.nf, nx)), model.Cw])
+    rows = np.vstack([np.eye(nx, na), faults, -seen @ augmented.C])
+    direct = rows @ gains.D
+    direct[nx + plant.nf :] += seen
+    names = (
+        plant.output_names if np.array_equal(seen, np.eye(plant.ny)) else tuple(f"r{i + 1}" for i in range(len(seen)))
+    )
+    observer = LinearObserver(
+        Az=a_hat, Bu=j_hat - b_hat @ plant.D, By=b_hat, Cz=rows, Du=-direct @ plant.D, Dy=direct, dt=plant.dt,
+        input_names=plant.input_names, output_names=plant.output_names, state_names=plant.state_names,
+        fault_names=plant.fault_names, residual_names=names, state_delays=(0,) * nx, fault_delays=(0,) * plant.nf,
+    )  # fmt: skip
+    letters = {"U_a": gains.U, "D_a": gains.D, "K_a": gains.K, "Ahat": a_hat, "Bhat": b_hat, "Jhat": j_hat}
+    return observer, letters
+
+
+def combinations_seen(plant: DescriptorSystem) -> FloatArray:
+    """Return the combinations of outputs that no disturbance reaches directly, each of unit length."""
+    if not plant.Dd.any():
+        return np.eye(plant.ny)
+    units = PlantUnits.of(plant)
+    seen = direct_part(units.scaled_plant(plant))[0] * units.outputs
+    return np.asarray(seen / np.linalg.norm(seen, axis=1, keepdims=True))

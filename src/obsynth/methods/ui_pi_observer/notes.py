@@ -54,3 +54,13 @@ def slow_note(problem: PlacementProblem, asked: UiPiOptions, decay: float | None
         f"that can hardly be told apart ({', '.join(dict.fromkeys(problem.model.descriptions))}) do that: leave one "
         "out, or give decay or poles.",
     )
+
+
+def digits_note(digits: float | None) -> tuple[str, ...]:
+    """Return a note where fewer digits than a double has, but more than are commonly printed, keep Ahat stable."""
+    if digits is None:
+        return ()
+    return (
+        f"Ahat is stable with {digits:.0f} significant digits and more, and unstable with fewer: in the coordinates of "
+        "this plant its entries cancel. Copy the gain set or the exported code, not printed numbers.",
+    )

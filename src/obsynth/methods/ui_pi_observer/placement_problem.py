@@ -1,12 +1,8 @@
 """The pair behind an unknown-input PI observer: what is decoupled, what can be placed, and the noise on it.
 
 Source: Share Pasand, Aliyari, Taghirad, Lemma 5 and procedure 1; the joint design over K and Z is ours: their free
-matrix G is itself an output injection, from the rows ``N_U A`` that the decoupling leaves over.
-
-The noise that an unknown-input PI observer is designed for: what sensors and states are believed to do.
-
-Source: Share Pasand, Aliyari, Taghirad mention "the optimal estimation scheme of Kalman" and no noise; the weights are
-ours.
+matrix G is itself an output injection, from the rows ``N_U A`` that the decoupling leaves over.  They mention "the
+optimal estimation scheme of Kalman" and no noise; the weights are ours.
 """
 
 from __future__ import annotations
@@ -24,17 +20,17 @@ from obsynth.methods.placement.observable import ObservableSplit, observable_spl
 from obsynth.methods.ui_pi_observer.augmented_plant import (
     AugmentedPlant,
     Decoupled,
+    ObserverGains,
     decouple,
     direct_part,
     paper_decoupling,
 )
-from obsynth.methods.ui_pi_observer.realisation import ObserverGains
 from obsynth.numerics.arrays import ComplexArray, FloatArray, as_matrix
 from obsynth.numerics.pencils import finite_zeros, pencil_structure
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE
 from obsynth.numerics.spectra import DEAD_BEAT, eigenvalues, speeds
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.exosystems import Exosystem
+from obsynth.plants.fault_models import Exosystem
 
 #: Modes slower than this share of the fastest do not count for the plant's time scale: integrators and rounding.
 SLOW_SHARE = 1e-6

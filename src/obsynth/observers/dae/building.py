@@ -1,23 +1,25 @@
-"""An observer of a DAE from a model and plain options: used to design one, and to check the one that was shipped.
+"""An observer of a DAE from a model and plain options, and what is known of it from a run at nominal inputs.
 
-Which integration a nonlinear plant needs: backward Euler damps what turns within a step.
+Used to design one, and to check the one that was shipped.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from obsynth.analysis.transformations.equations_at_a_point import local_equations
+from obsynth.analysis.dae_structure import Identifiability, IndexReport, identifiability, index_report
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import is_number, real_number
-from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
-from obsynth.observers.dae.observer import DAEObserver
-from obsynth.plants.dae.checks import finite_vector, step_length
+from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.observers.dae.estimates import DAERow, GatheredRows
+from obsynth.observers.dae.observer import DAEObserver, advanced
+from obsynth.observers.records import named_bounds, named_covariance, named_vector
+from obsynth.plants.dae.checks import step_length
+from obsynth.plants.dae.functions import local_equations
 from obsynth.plants.dae.model import DAEModel
-from obsynth.plants.names import index_of
 
 #: Radians that a mode may turn in one step of backward Euler: its amplitude then falls by an eighth of a per cent.
 LARGEST_TURN = 0.05
@@ -49,53 +51,46 @@ def chosen_integration(model: DAEModel, dt: float) -> str:
 DEFAULT_STATE_SHARE = 0.01
 #: Deviation of an initial parameter that is not stated, as a share of its nominal value.
 DEFAULT_PARAMETER_SHARE = 0.1
+#: Options that are fields of the observer as they are given.
+AS_GIVEN = (
+    "forgetting", "guard", "weight", "largest_move", "window", "outliers", "outlier_limit", "sensors", "state_bounds",
+    "reset",
+)  # fmt: skip
 OPTIONS = (
-    "dt", "Q", "R", "form", "forgetting", "guard", "weight", "integration", "random_walk", "initial_state",
-    "initial_covariance", "initial_parameters", "initial_parameter_covariance", "bounds", "largest_move", "window",
-    "outliers", "outlier_limit", "sensors", "state_bounds", "reset",
+    "dt", "Q", "R", "form", "integration", "random_walk", "initial_state", "initial_covariance", "initial_parameters",
+    "initial_parameter_covariance", "bounds", *AS_GIVEN,
 )  # fmt: skip
 
 
 def dae_observer_from_options(model: DAEModel, options: Mapping[str, Any]) -> DAEObserver:
     """Return the observer that options stand for."""
     states, parameters = model.state_names, model.parameter_names
-    bounds = _bounds(options["bounds"], parameters)
+    form, integration = options["form"], options["integration"]
+    if form == "auto":
+        form = "forgetting" if options["random_walk"] is None else "random-walk"
+    if integration == "auto":
+        integration = chosen_integration(model, step_length(options["dt"]))
+    bounds = named_bounds(options["bounds"], parameters, "bounds")
     return DAEObserver(
         model=model, dt=options["dt"],
-        Q=_covariance(options["Q"], model.equation_names, "Q", None),
-        R=_covariance(options["R"], model.output_names, "R", None),
-        initial_state=_vector(options["initial_state"], states, model.nominal_state, "initial_state"),
-        initial_covariance=_covariance(
+        Q=named_covariance(options["Q"], model.equation_names, "Q", None),
+        R=named_covariance(options["R"], model.output_names, "R", None),
+        initial_state=named_vector(options["initial_state"], states, model.nominal_state, "initial_state"),
+        initial_covariance=named_covariance(
             options["initial_covariance"], states, "initial_covariance",
             (DEFAULT_STATE_SHARE * model.state_scales) ** 2,
         ),
-        initial_parameters=_vector(
+        initial_parameters=named_vector(
             options["initial_parameters"], parameters, model.nominal_parameters, "initial_parameters"
         ),
-        initial_parameter_covariance=_covariance(
+        initial_parameter_covariance=named_covariance(
             options["initial_parameter_covariance"], parameters, "initial_parameter_covariance",
             _default_parameter_variances(model, options["initial_parameter_covariance"]),
         ),
-        random_walk=_covariance(options["random_walk"], parameters, "random_walk", np.zeros(model.nq)),
-        lower=bounds[:, 0], upper=bounds[:, 1], form=_form(options), forgetting=options["forgetting"],
-        guard=options["guard"], weight=options["weight"], integration=_integration(model, options),
-        largest_move=options["largest_move"], window=options["window"],
-        outliers=options.get("outliers", "none"), outlier_limit=options.get("outlier_limit"),
-        sensors=options.get("sensors"), state_bounds=options.get("state_bounds"),
-        reset=options.get("reset", 0.0),
+        random_walk=named_covariance(options["random_walk"], parameters, "random_walk", np.zeros(model.nq)),
+        lower=bounds[:, 0], upper=bounds[:, 1], form=form, integration=integration,
+        **{name: options[name] for name in AS_GIVEN if name in options},
     )  # fmt: skip
-
-
-def _form(options: Mapping[str, Any]) -> str:
-    """Return the form that is asked for; by itself that of parameters that walk where a walk is stated."""
-    walks = options["random_walk"] is not None
-    return ("random-walk" if walks else "forgetting") if options["form"] == "auto" else str(options["form"])
-
-
-def _integration(model: DAEModel, options: Mapping[str, Any]) -> str:
-    """Return the integration that is asked for, or that the plant needs."""
-    wanted: str = options["integration"]
-    return chosen_integration(model, step_length(options["dt"])) if wanted == "auto" else wanted
 
 
 def resolved_options(observer: DAEObserver) -> dict[str, Any]:
@@ -115,55 +110,73 @@ def _default_parameter_variances(model: DAEModel, given: Any) -> FloatArray:
     return np.asarray((DEFAULT_PARAMETER_SHARE * sizes) ** 2)
 
 
-def _covariance(value: Any, names: Sequence[str], what: str, default: FloatArray | None) -> FloatArray:
-    if value is None:
-        if default is None:
-            raise SpecError(f"{what} is missing: give variances, for example by the names {', '.join(names)}.",
-                            path=what)  # fmt: skip
-        return np.diag(default)
-    if isinstance(value, Mapping):
-        variances = np.zeros(len(names))
-        for name, variance in value.items():
-            variances[index_of(name, names, what=what)] = real_number(variance, f"{what}.{name}")
-        return np.diag(variances)
-    empty = isinstance(value, (list, tuple, np.ndarray)) and not np.asarray(value, dtype=object).size
-    matrix = np.zeros((0, 0)) if empty else as_matrix(value, what)
-    return float(matrix[0, 0]) * np.eye(len(names)) if np.ndim(value) == 0 else matrix
+#: Steps of the nominal run.
+NOMINAL_STEPS = 100
 
 
-def _vector(value: Any, names: Sequence[str], default: FloatArray, what: str) -> FloatArray:
-    if value is None:
-        return np.array(default)
-    if isinstance(value, Mapping):
-        vector = np.array(default)
-        for name, entry in value.items():
-            vector[index_of(name, names, what=what)] = real_number(entry, f"{what}.{name}")
-        return vector
-    return finite_vector(value, names, default, what)
+@dataclass(frozen=True, eq=False)
+class DAEFacts:
+    """Facts of a nominal run."""
+
+    index: IndexReport  # at the nominal point
+    condition: float  # largest condition number of (7) along the run
+    condition_k: int  # the sample at which it is largest
+    residual: float  # largest scaled Newton residual
+    contraction: float  # spectral radius of F (I - K H) at the end
+    deviations: FloatArray  # ``(nq,)``: standard deviations of the parameters at the end
+    # ``(nq, nq)``: of the parameters' errors at the end: how much a change of one is taken for another
+    correlations: FloatArray
+    projection: FloatArray  # ``(nx,)``: how far the initial state is moved onto its constraint
+    identifiable: Identifiability  # of states and parameters along the nominal trajectory
+    K: FloatArray  # ``(nx, ny)`` at the end
+    Upsilon: FloatArray  # ``(nx, nq)`` at the end
+    kept: FloatArray  # ``(steps, nx, nx)``: F (I - K H) of every step
+    parameter_covariance: FloatArray  # ``(nq, nq)`` at the end
+
+    @property
+    def decay_time(self) -> float:
+        """Steps in which an error of the state filter falls to 1/e; infinite where it does not."""
+        if not 0.0 < self.contraction < 1.0:
+            return 0.0 if self.contraction == 0.0 else float("inf")
+        return float(-1.0 / np.log(self.contraction))
 
 
-def _bound(value: Any, path: str) -> float:
-    """Return a bound, which may be infinite."""
-    if not is_number(value):
-        raise SpecError(f"{path} is {value!r}: give a number.", path=path)
-    return float(value)
+def dae_facts(observer: DAEObserver) -> DAEFacts:
+    """Run an observer on its own model at nominal inputs and parameters."""
+    model = observer.model
+    u = np.array(model.nominal_input)
+    truth = _nominal_outputs(observer, u)
+    gathered, kept = GatheredRows(observer), []
+
+    def add(rows: DAERow) -> None:
+        gathered.add(rows)
+        kept.append(np.array(rows.several.part("kept")))
+
+    end = advanced(observer.steps, truth, np.tile(u, (len(truth), 1)), add)
+    found = gathered.estimates()
+    covariance = found.parameter_covariances[-1]
+    deviations = np.sqrt(np.diag(covariance))
+    safe = np.where(deviations > 0.0, deviations, 1.0)
+    identifiable = identifiability(
+        model, np.tile(u, (NOMINAL_STEPS + 1, 1)), dt=observer.dt, R=observer.R, method=observer.integration,
+        initial_state=observer.initial_state, parameters=observer.initial_parameters,
+        parameter_scales=np.sqrt(np.diag(observer.initial_parameter_covariance)),
+    )  # fmt: skip
+    return DAEFacts(
+        index_report(model, observer.dt, x=found.states[-1], u=u, theta=found.parameters[-1]),
+        float(found.conditions.max()), int(np.argmax(found.conditions)), float(found.residuals.max()),
+        float(found.contraction[-1]), read_only(deviations), read_only(covariance / np.outer(safe, safe)),
+        found.projection, identifiable, read_only(observer.steps.part(end, "K")),
+        read_only(observer.steps.part(end, "Upsilon")), read_only(np.concatenate(kept)[1:]), read_only(covariance),
+    )  # fmt: skip
 
 
-def _bounds(value: Any, names: Sequence[str]) -> FloatArray:
-    """Return lower and upper bounds ``(nq, 2)`` from rows or from pairs by name."""
-    found = np.tile([-np.inf, np.inf], (len(names), 1))
-    if isinstance(value, Mapping):
-        for name, pair in value.items():
-            if np.shape(pair) != (2,):
-                raise SpecError(f"bounds.{name} must be [lower, upper].", path=f"bounds.{name}")
-            found[index_of(name, names, what="bounds")] = [_bound(bound, f"bounds.{name}") for bound in pair]
-        return found
-    if value is None:
-        return found
-    try:
-        rows = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        rows = np.zeros(0)
-    if rows.shape != found.shape:
-        raise SpecError(f"bounds must be {len(names)} pairs [lower, upper], or pairs by name.", path="bounds")
-    return rows
+def _nominal_outputs(observer: DAEObserver, u: FloatArray) -> FloatArray:
+    """Return the outputs of the model from the observer's initial state, without noise."""
+    step = observer.steps.implicit
+    x, theta = np.array(observer.initial_state), np.array(observer.initial_parameters)
+    outputs = []
+    for k in range(NOMINAL_STEPS + 1):
+        x = step.solve(x, u, theta, k=k).x
+        outputs.append(step.functions.outputs(x, theta)[0])
+    return np.array(outputs)

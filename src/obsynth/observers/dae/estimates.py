@@ -3,63 +3,51 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.analysis.dae_index import involved
+from obsynth.analysis.dae_structure import involved
 from obsynth.errors import SolverError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import SINGULAR_CONDITION
-from obsynth.observers.estimates import Estimates, named_estimates
+from obsynth.observers.estimates import Estimates
+from obsynth.observers.running import named_estimates
 
 if TYPE_CHECKING:
     from obsynth.observers.dae.settings import DAESettings
     from obsynth.observers.dae.step_graph import ObserverGraph
 
 
+def _part(name: str, meaning: str) -> Any:
+    """Return a property of a row: an array by its name in the layouts."""
+    return property(lambda row: row.part(name), doc=meaning)
+
+
 @dataclass(frozen=True, eq=False)
 class DAERow:
-    """What the graph of an observer gave at one sample, or (with a leading axis) at several in a row.
+    """What the graph of an observer gave at one sample, or (with a leading axis) at several in a row."""
 
-    Fields: graph: Which laid it out; k: Number of the (first) sample; memory, said: What is carried on, and what is
-    said besides; seen: ``(ny,)``, of bool: which outputs were there; moved: ``(nx,)``: how far the state was put onto
-    its constraint; zeros but at k = 0.
-    """
-
-    graph: ObserverGraph
-    k: int
-    memory: FloatArray
+    graph: ObserverGraph  # which laid it out
+    k: int  # number of the (first) sample
+    memory: FloatArray  # memory, said: what is carried on, and what is said besides
     said: FloatArray
-    seen: NDArray[np.bool_]
-    moved: FloatArray
+    seen: NDArray[np.bool_]  # ``(ny,)``, of bool: which outputs were there
+    moved: FloatArray  # ``(nx,)``: how far the state was put onto its constraint; zeros but at k = 0
 
     def part(self, name: str) -> FloatArray:
-        """Return one array by its name in the layouts `obsynth.observers.dae.memory_layout`."""
+        """Return one array by its name in the layouts `obsynth.observers.dae.settings`."""
         layout, values = (self.graph.memory, self.memory) if name in self.graph.memory.shapes else (
             self.graph.row, self.said)  # fmt: skip
         return layout.part(values, name)
 
-    @property
-    def x(self) -> FloatArray:
-        """The state after the measurement ``(nx,)``."""
-        return self.part("posterior")
-
-    @property
-    def theta(self) -> FloatArray:
-        """The parameters ``(nq,)``."""
-        return self.part("theta")
-
-    @property
-    def covariance(self) -> FloatArray:
-        """Covariance of `x` ``(nx, nx)``."""
-        return self.part("covariance")
-
-    @property
-    def parameter_covariance(self) -> FloatArray:
-        """Covariance of `theta` ``(nq, nq)``."""
-        return self.part("spread")
+    x = _part("posterior", "The state after the measurement ``(nx,)``.")
+    theta = _part("theta", "The parameters ``(nq,)``.")
+    covariance = _part("covariance", "Covariance of `x` ``(nx, nx)``.")
+    parameter_covariance = _part("spread", "Covariance of `theta` ``(nq, nq)``.")
+    score = _part("score", "What the sample says of the parameters ``(nq,)``, see `row_layout`.")
+    information = _part("information", "How much it says of them ``(nq, nq)``.")
 
     @property
     def cross_covariance(self) -> FloatArray:
@@ -82,9 +70,7 @@ class DAERow:
     @property
     def whitened(self) -> FloatArray:
         """An innovation of the same length in units of its covariance ``(degrees,)``, of one sample; to first order.
-
-        Only its length counts for decisions.
-        """
+        Only its length counts for decisions."""
         white = np.zeros(self.degrees)
         white[:1] = np.sqrt(max(float(self.nis), 0.0))
         return white
@@ -93,16 +79,6 @@ class DAERow:
     def regressor(self) -> FloatArray:
         """Regressor of `whitened` ``(degrees, 0)``: there is none."""
         return np.zeros((self.degrees, 0))
-
-    @property
-    def score(self) -> FloatArray:
-        """What the sample says of the parameters ``(nq,)``, see `row_layout`."""
-        return self.part("score")
-
-    @property
-    def information(self) -> FloatArray:
-        """How much it says of them ``(nq, nq)``."""
-        return self.part("information")
 
     @property
     def state_deviations(self) -> FloatArray:
@@ -150,10 +126,7 @@ class DAERow:
 
 
 class GatheredRows:
-    """What the estimates keep of the rows of a record, while it is being run.
-
-    Fields: observer: Whose rows they are.
-    """
+    """What the estimates keep of the rows of a record, while it is being run."""
 
     def __init__(self, observer: DAESettings) -> None:
         self.observer = observer
@@ -173,10 +146,7 @@ class GatheredRows:
         require_regular(self.observer, rows, self.parts[-1]["conditions"])
 
     def estimates(self, informations: FloatArray | None = None) -> Estimates:
-        """Return what was gathered.
-
-        Shapes: ``informations (any, nq, nq)``.
-        """
+        """Return what was gathered: ``informations (any, nq, nq)``."""
         whole = {name: np.concatenate([part[name] for part in self.parts]) for name in self.parts[0]}
         seen = whole["informations"]
         levels = _excitation(self.observer, seen if informations is None else informations)
@@ -187,10 +157,7 @@ class GatheredRows:
 
 
 def require_regular(observer: DAESettings, rows: DAERow, conditions: FloatArray) -> None:
-    """Raise `SolverError` where the matrix of (7) was singular to working precision.
-
-    Shapes: ``conditions (samples,)``.
-    """
+    """Raise `SolverError` where the matrix of (7) was singular to working precision: ``conditions (samples,)``."""
     if not len(conditions) or conditions.max() <= SINGULAR_CONDITION:
         return
     rows, i = rows.several, int(np.argmax(conditions > SINGULAR_CONDITION))

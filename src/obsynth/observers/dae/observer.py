@@ -1,4 +1,7 @@
-"""The observer of states and parameters of a nonlinear DAE that a design ships."""
+"""The observer of states and parameters of a nonlinear DAE that a design ships.
+
+Whole records through an observer of a DAE: in stretches inside CasADi, with single steps where those fail.
+"""
 
 from __future__ import annotations
 
@@ -8,11 +11,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from obsynth.errors import SpecError
+from obsynth.errors import SolverError, SpecError
 from obsynth.numerics.arrays import FloatArray
-from obsynth.observers.dae.compiled_library import DAELibrary
+from obsynth.observers.dae.c_code import DAELibrary
 from obsynth.observers.dae.estimates import DAERow, GatheredRows, require_regular
-from obsynth.observers.dae.records import run_record
 from obsynth.observers.dae.settings import DAESettings
 from obsynth.observers.dae.step_graph import ObserverGraph
 from obsynth.observers.dae.steps import DAEState, Steps
@@ -21,6 +23,63 @@ from obsynth.observers.progress import shown_progress
 from obsynth.observers.records import measured_record
 from obsynth.observers.running import StepObserver
 from obsynth.plants.dae.checks import checked_inputs, require_known
+from obsynth.plants.dae.functions import Compiled, take_samples
+
+#: Samples in one call of the C: a tenth of a second or less, so that progress shows and memory stays small.
+SAMPLES_PER_CALL = 10_000
+
+
+def _nothing(steps: Steps) -> DAERow:
+    """Return rows of no samples, so that an empty record has estimates of the right shape."""
+    graph, model = steps.graph, steps.settings.model
+    memory, said = np.zeros((0, graph.memory.size)), np.zeros((0, graph.row.size))
+    return DAERow(graph, 0, memory, said, np.zeros((0, model.ny), dtype=bool), np.zeros(model.nx))
+
+
+def _in_c(
+    steps: Steps, library: DAELibrary, y: FloatArray, u: FloatArray, keep: Callable[[DAERow], object],
+    note: Callable[[int], object],
+) -> None:  # fmt: skip
+    moved = np.zeros(0)
+    state = library.started()
+    for begin in range(0, len(y), SAMPLES_PER_CALL):
+        heard = y[begin : begin + SAMPLES_PER_CALL]
+        after, said = library.record(state, heard, u[begin : begin + SAMPLES_PER_CALL])
+        if len(after) < len(heard):
+            # Go there again where the message is written.
+            advanced(steps, y, u, bool, note)
+            raise SolverError(f"The C stops at k = {begin + len(after)}, but CasADi goes on: leave compiled=True out.")
+        if begin == 0:
+            moved = steps.projected(steps.first, u[0])[1]
+        keep(DAERow(steps.graph, begin, after, said, ~np.isnan(heard[: len(after)]), moved))
+        note(begin + len(heard))
+
+
+def advanced(
+    steps: Steps, y: FloatArray, u: FloatArray, keep: Callable[[DAERow], object],
+    note: Callable[[int], object] = bool,
+) -> DAEState:  # fmt: skip
+    """Lead an observer from its start through a record; return its state at the end."""
+    calls: dict[int, Compiled] = {}
+    state = steps.first
+
+    def alone(k: int) -> None:
+        nonlocal state
+        state, row = steps.advance(state, y[k], u[k])
+        keep(row)
+
+    def together(k: int, length: int) -> int:
+        nonlocal state
+        if length not in calls:
+            calls[length] = Compiled(steps.graph.over(length))
+        state, rows = steps.stretch(state, y[k : k + length], u[k : k + length], calls[length])
+        keep(rows)
+        return len(rows.memory)
+
+    if len(y):
+        alone(0)
+    take_samples(1, len(y), together, alone, note)
+    return state
 
 
 class DAEObserver(DAESettings, StepObserver[DAEState, DAERow]):
@@ -79,9 +138,6 @@ class DAEObserver(DAESettings, StepObserver[DAEState, DAERow]):
     @property
     def _steps(self) -> Steps:
         return self.steps
-
-    def _allow(self, state: DAEState) -> None:
-        """Raise nothing: a model has no horizon."""
 
     def _trust(self, row: DAERow) -> None:
         require_regular(self, row, row.conditions)
@@ -154,26 +210,24 @@ class DAEObserver(DAESettings, StepObserver[DAEState, DAERow]):
             raise SpecError(f"compiled is {compiled!r}: give True, False or None.", path="compiled")
         outputs = measured_record(y, self.model.ny)
         inputs = checked_inputs(self.model, u, len(outputs))
-        if not self.is_plain:
-            return self._run_in_rows(outputs, inputs, compiled=compiled, progress=progress)
-        library = self.library if compiled else None
-        return run_record(self.steps, outputs, inputs, compiled=compiled, library=library, progress=progress)
-
-    def _run_in_rows(
-        self, y: FloatArray, u: FloatArray, *, compiled: bool | None, progress: bool | Callable[[int], None] | None
-    ) -> Estimates:
-        """Run sample by sample, with sensors of their own times or bounds on states.
-
-        Shapes: ``y (samples, ny)``, ``u (samples, nu)``.
-        """
-        if compiled:
+        alone = self.outside_graph
+        if compiled and not self.is_plain:
             raise SpecError("The C knows neither sensors of their own times nor state_bounds: leave compiled=True out.",
                             path="compiled")  # fmt: skip
-        found, state = GatheredRows(self), self.init()
-        with shown_progress(progress, len(y), "samples") as note:
-            for k in range(len(y)):
-                state, row = self.accept(state, y[k], u[k])
-                found.add(row)
-                note(k + 1)
-        return found.estimates() if len(y) else run_record(self.steps, y, u, compiled=False, library=None,
-                                                           progress=False)  # fmt: skip
+        if compiled and alone:
+            raise SpecError(f"The C knows no {alone}: leave compiled=True out, or leave {alone} out.", path="compiled")
+        library = self.library if compiled else None
+        found = GatheredRows(self)
+        found.add(_nothing(self.steps))
+        with shown_progress(progress, len(outputs), "samples") as note:
+            if library is not None:
+                _in_c(self.steps, library, outputs, inputs, found.add_regular, note)
+            elif compiled is None and self.is_plain and not alone:
+                advanced(self.steps, outputs, inputs, found.add_regular, note)
+            else:
+                state = self.init()
+                for k in range(len(outputs)):
+                    state, row = self.accept(state, outputs[k], inputs[k])
+                    found.add(row)
+                    note(k + 1)
+        return found.estimates()

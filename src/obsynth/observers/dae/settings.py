@@ -1,4 +1,4 @@
-"""What an observer of a DAE is made of: model, noise, start, and how parameters are estimated; all of it checked."""
+"""What an observer of a DAE is made of, all of it checked, and how it lays out what it remembers and says."""
 
 from __future__ import annotations
 
@@ -12,12 +12,11 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import Count, ForgettingFactor, Positive, Probability, checked_value
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
-from obsynth.numerics.covariances import covariance_factor, is_definite
-from obsynth.observers.estimates import Undelayed
-from obsynth.observers.outliers import Outliers, checked_limit
-from obsynth.observers.sensor_timing import SensorTiming, checked_sensors
-from obsynth.observers.state_bounds import checked_state_bounds
+from obsynth.numerics.ranks import covariance_factor, is_definite
+from obsynth.observers.outliers import Outliers
+from obsynth.observers.running import StepSettings
 from obsynth.plants.dae.checks import finite_vector, step_length
+from obsynth.plants.dae.functions import BUTCHER
 from obsynth.plants.dae.model import DAEModel
 
 Form: TypeAlias = Literal["forgetting", "random-walk", "augmented-kalman"]
@@ -33,7 +32,7 @@ _DEFINITE = ("R", "initial_parameter_covariance")
 
 
 @dataclass(frozen=True, eq=False)
-class DAESettings(Undelayed):
+class DAESettings(StepSettings):
     """The fields of `obsynth.DAEObserver`, which is these with its steps."""
 
     model: DAEModel
@@ -64,14 +63,8 @@ class DAESettings(Undelayed):
         object.__setattr__(self, "dt", step_length(self.dt))
         for name, kind in _KINDS.items():
             checked_value(getattr(self, name), name, kind)
-        checked_limit(self.outliers, self.outlier_limit)
-        object.__setattr__(self, "sensors", checked_sensors(self.sensors, self.model.output_names))
-        object.__setattr__(self, "state_bounds", checked_state_bounds(self.state_bounds, self.state_names))
+        self._check_options()
         self._check_arrays()
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return what makes it again in another process: its functions and its library are made there anew."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
 
     def _check_arrays(self) -> None:
         nx, ny, nq = self.model.nx, self.model.ny, self.model.nq
@@ -112,9 +105,9 @@ class DAESettings(Undelayed):
             raise SpecError(f"{name} must be positive definite, but it is singular.", path=name)
 
     @property
-    def state_names(self) -> tuple[str, ...]:
-        """The states that are estimated, in order."""
-        return self.model.state_names
+    def plant(self) -> DAEModel:
+        """The model, by the name that every observer has for what it runs on."""
+        return self.model
 
     @property
     def fault_names(self) -> tuple[str, ...]:
@@ -126,27 +119,12 @@ class DAESettings(Undelayed):
         """Numbers in an innovation: one for each output."""
         return self.model.ny
 
-    @cached_property
-    def timing(self) -> SensorTiming:
-        """When each sensor is sampled, and how late its values are."""
-        return SensorTiming.of(self.sensors, self.model.output_names, self.model.nu)
-
-    @property
-    def is_plain(self) -> bool:
-        """Whether every sensor is sampled at each row, at once, and no state has bounds."""
-        return self.timing.is_plain and self.state_bounds is None
-
     @property
     def outside_graph(self) -> str:
         """An option in use that stands outside of the compiled steps, by name; empty without one."""
         if self.outliers != "none":
             return "outliers"
         return "reset" if self.reset else "" if self.state_bounds is None else "state_bounds"
-
-    @property
-    def order(self) -> int:
-        """Number of states and parameters in its state."""
-        return self.model.nx + self.model.nq
 
     def as_dict(self) -> dict[str, Any]:
         """Return every field as data."""
@@ -157,3 +135,98 @@ class DAESettings(Undelayed):
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
         """Return the observer that `as_dict` described."""
         return cls(**{**data, "model": DAEModel(**data["model"])})
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Named arrays in one vector, each by columns, as CasADi has them."""
+
+    shapes: Mapping[str, tuple[int, int]]  # in order
+
+    @cached_property
+    def slices(self) -> dict[str, slice]:
+        """Where each array lies."""
+        found, begin = {}, 0
+        for name, (rows, columns) in self.shapes.items():
+            found[name] = slice(begin, begin + rows * columns)
+            begin += rows * columns
+        return found
+
+    @cached_property
+    def size(self) -> int:
+        """Length of the vector."""
+        return sum(rows * columns for rows, columns in self.shapes.values())
+
+    def part(self, vectors: FloatArray, name: str) -> FloatArray:
+        """Return one array of each of many vectors: ``vectors (..., size)``."""
+        return self.shaped(vectors[..., self.slices[name]], name)
+
+    def shaped(self, flat: FloatArray, name: str) -> FloatArray:
+        """Return one array of each of many parts of vectors: ``flat (..., entries)``."""
+        rows, columns = self.shapes[name]
+        if columns == 1 and name not in MATRICES:
+            return flat
+        return np.swapaxes(flat.reshape(*flat.shape[:-1], columns, rows), -1, -2)
+
+    def packed(self, arrays: Mapping[str, FloatArray]) -> FloatArray:
+        """Return the vector of named arrays."""
+        return np.concatenate([np.ravel(arrays[name], order="F") for name in self.shapes])
+
+    def symbols(self, vector: Any) -> dict[str, Any]:
+        """Return the arrays in a vector of CasADi symbols by name."""
+        import casadi as ca
+
+        return {
+            name: ca.reshape(vector[self.slices[name]], *shape) if shape[0] * shape[1] else ca.MX(*shape)
+            for name, shape in self.shapes.items()
+        }
+
+    def column(self, arrays: Mapping[str, Any]) -> Any:
+        """Return the vector of named CasADi expressions."""
+        import casadi as ca
+
+        return ca.vertcat(*(ca.vec(ca.densify(arrays[name])) for name in self.shapes))
+
+
+#: Arrays that stay matrices when they have one column.
+MATRICES = frozenset({
+    "P", "S", "spread", "cross", "Upsilon", "K", "H", "L", "information", "covariance", "F", "G", "noise", "kept",
+    "scaled", "expected",
+})  # fmt: skip
+
+
+def memory_layout(observer: DAESettings) -> Layout:
+    """Return the state. ``posterior`` is the state after the measurement, ``x`` the one before it with the parameters
+    as they are estimated now; P belongs to ``x``, and ``spread`` is the covariance of the parameters, which S with
+    forgetting is not."""
+    nx, ny, nq = observer.model.nx, observer.model.ny, observer.model.nq
+    learning = {"cross": (nx, nq)} if observer.form == "augmented-kalman" else {"S": (nq, nq)}
+    return Layout({
+        "posterior": (nx, 1), "x": (nx, 1), "theta": (nq, 1), "P": (nx, nx), **learning, "spread": (nq, nq),
+        "Upsilon": (nx, nq), "K": (nx, ny), "H": (ny, nx), "L": (ny, nq),
+    })  # fmt: skip
+
+
+def row_layout(observer: DAESettings) -> Layout:
+    """Return what is said of one sample besides what is remembered. ``score`` and ``information``: to first order the
+    score less the information times the true parameters has mean zero and covariance ``information``, of parameters
+    that stay as they are. ``expected`` is the covariance of the innovation, that of the identity for what is not seen;
+    ``noise`` is the derivative by what is added to the equations, ``kept`` F (I - K H) with K and H of the sample
+    before, ``scaled`` the equilibrated matrix of (7), and ``trusted`` one where the step of the compiled graph was
+    solved."""
+    nx, ny, nq = observer.model.nx, observer.model.ny, observer.model.nq
+    n = nx * len(BUTCHER[observer.integration])
+    return Layout({
+        "innovation": (ny, 1), "expected": (ny, ny), "nis": (1, 1), "information": (nq, nq), "score": (nq, 1),
+        "covariance": (nx, nx), "F": (nx, nx), "G": (nx, nq), "noise": (nx, nx), "kept": (nx, nx), "scaled": (n, n),
+        "residual": (1, 1), "trusted": (1, 1),
+    })  # fmt: skip
+
+
+def initial_memory(observer: DAESettings, x: FloatArray) -> FloatArray:
+    """Return what is remembered before the first sample: ``x (nx,)``."""
+    layout = memory_layout(observer)
+    start = {name: np.zeros(shape) for name, shape in layout.shapes.items()}
+    start |= {"posterior": x, "x": x, "theta": observer.initial_parameters, "P": observer.initial_covariance,
+              "S": observer.initial_parameter_covariance, "spread": observer.initial_parameter_covariance}  # fmt: skip
+    return layout.packed(start)

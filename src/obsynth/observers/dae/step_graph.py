@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from obsynth.numerics.symbolic_solve import definite_solved
-from obsynth.observers.dae.memory_layout import Layout, memory_layout, row_layout
+from obsynth.numerics.newton import definite_solved
+from obsynth.observers.dae.settings import Layout, memory_layout, row_layout
 from obsynth.plants.dae.functions import DAEFunctions
 from obsynth.plants.dae.step import StepGraph, step_graph
 
@@ -24,23 +24,16 @@ Arrays = dict[str, Any]
 
 @dataclass(frozen=True, eq=False)
 class ObserverGraph:
-    """The functions of an observer.
+    """The functions of an observer."""
 
-    Fields: memory, row: Of what is carried on, and of what is said besides; functions: The model with its method of
-    integration; step: Its implicit step; first: From memory, outputs and one for each that is seen, at k = 0, to memory
-    and row; sample: From memory, stages of the solved step, input, outputs and what is seen to memory and row; whole:
-    The implicit step and `sample`: from memory and ``[u; y; seen]`` to memory and row; forecast: From memory and row of
-    a sample that nothing was seen of to mean and deviation of each output.
-    """
-
-    memory: Layout
+    memory: Layout  # memory, row: of what is carried on, and of what is said besides
     row: Layout
-    functions: DAEFunctions
-    step: StepGraph
-    first: Any
-    sample: Any
-    whole: Any
-    forecast: Any
+    functions: DAEFunctions  # the model with its method of integration
+    step: StepGraph  # its implicit step
+    first: Any  # from memory, outputs and one for each that is seen, at k = 0, to memory and row
+    sample: Any  # from memory, stages of the solved step, input, outputs and what is seen to memory and row
+    whole: Any  # the implicit step and `sample`: from memory and ``[u; y; seen]`` to memory and row
+    forecast: Any  # from memory and row of a sample that nothing was seen of to mean and deviation of each output
     _stretches: dict[int, Any] = field(default_factory=dict, repr=False)
 
     def over(self, samples: int) -> Any:

@@ -4,55 +4,37 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
 
 from obsynth.errors import SolverError
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.covariances import covariance_factor
+from obsynth.numerics.ranks import covariance_factor
 from obsynth.observers.dae.estimates import DAERow
-from obsynth.observers.dae.memory_layout import initial_memory
-from obsynth.observers.dae.settings import DAESettings
+from obsynth.observers.dae.settings import DAESettings, initial_memory
 from obsynth.observers.dae.step_graph import ObserverGraph, observer_graph
-from obsynth.observers.outliers import checked_limit, no_refusals, robust_advance
-from obsynth.observers.state_bounds import projected
+from obsynth.observers.outliers import checked_limit, has_jumped, no_refusals, projected, robust_advance, with_surprise
 from obsynth.plants.dae.functions import Compiled, DAEFunctions
 from obsynth.plants.dae.step import ImplicitStep
 
-#: Samples whose squared innovations are summed up before a reset.
-RESET_WINDOW = 20
 #: A step of backward Euler this much shorter than dt puts a state onto its constraint and moves it no further.
 PROJECTION_SHARE = 1e-6
 #: Smaller moves, in sizes of the states, are the motion during that step and no projection.
 PROJECTION_NOTICE = 1e-5
 
 
-@lru_cache(maxsize=256)
-def chi_square_limit(degrees: int, probability: float) -> float:
-    """Return what a chi-square variable passes with a probability."""
-    from scipy.special import chdtri
-
-    return float(chdtri(degrees, probability))
-
-
 class DAEState(NamedTuple):
-    """The state of an observer of a DAE.
+    """The state of an observer of a DAE."""
 
-    Fields: memory: Laid out as `memory_layout` says; k: The next sample; u: ``(nu,)``: the inputs of
-    the sample before; informations: ``(nq, nq)`` each: on the parameters, of the latest samples; refused: ``(2, ny)``:
-    outliers in a row, and at all; surprises: ``(any, 2)``: normalised squares of the latest innovations, and their
-    degrees of freedom, for resets; resets: How many there were.
-    """
-
-    memory: FloatArray
-    k: int
-    u: FloatArray
-    informations: tuple[FloatArray, ...]
-    refused: FloatArray
+    memory: FloatArray  # laid out as `memory_layout` says
+    k: int  # the next sample
+    u: FloatArray  # ``(nu,)``: the inputs of the sample before
+    informations: tuple[FloatArray, ...]  # ``(nq, nq)`` each: on the parameters, of the latest samples
+    refused: FloatArray  # ``(2, ny)``: outliers in a row, and at all
+    # ``(any, 2)``: normalised squares of the latest innovations, and their degrees of freedom, for resets
     surprises: FloatArray
-    resets: int
+    resets: int  # how many there were
 
 
 class Steps:
@@ -60,6 +42,7 @@ class Steps:
 
     def __init__(self, settings: DAESettings, graph: ObserverGraph | None = None) -> None:
         self.settings, self.graph = settings, observer_graph(settings) if graph is None else graph
+        self._compiled: dict[str, Compiled] = {}
         self.limit = checked_limit(settings.outliers, settings.outlier_limit)
         self.implicit = ImplicitStep(self.graph.functions, settings.dt, largest_move=settings.largest_move)
         self.first = DAEState(initial_memory(settings, settings.initial_state), 0, np.zeros(settings.model.nu), (),
@@ -70,10 +53,7 @@ class Steps:
         return self.graph.memory.part(state.memory, name)
 
     def advance(self, state: DAEState, y: FloatArray, u: FloatArray) -> tuple[DAEState, DAERow]:
-        """Return the state after a sample and what is said at it.
-
-        Shapes: ``y (ny,)`` with NaN for what is missing, ``u (nu,)``.
-        """
+        """Return the state after a sample and what is said at it; NaN in ``y (ny,)`` is what is missing."""
         take = self.watched if self.settings.reset else self.plain
         if self.settings.outliers == "none":
             after, row = take(state, y, u)
@@ -95,14 +75,10 @@ class Steps:
 
     def watched(self, state: DAEState, y: FloatArray, u: FloatArray) -> tuple[DAEState, DAERow]:
         """Take a sample; where innovations have become too large, again with parameters known no better than at first.
-
-        A jump of a parameter is followed from there at once.
-        """
+        A jump of a parameter is followed from there at once."""
         after, row = self.plain(state, y, u)
-        latest = [float(row.nis), float(row.degrees)]
-        surprises = np.vstack([state.surprises, latest])[-RESET_WINDOW:] if state.k else state.surprises
-        total, degrees = surprises.sum(axis=0)
-        if not degrees or total <= chi_square_limit(int(degrees), self.settings.reset):
+        surprises = with_surprise(state.surprises, float(row.nis), row.degrees) if state.k else state.surprises
+        if not has_jumped(surprises, self.settings.reset):
             return after._replace(surprises=surprises), row
         after, row = self.plain(state._replace(memory=self._forgetful(state)), y, u)
         return after._replace(surprises=state.surprises[:0], resets=state.resets + 1), row
@@ -122,7 +98,7 @@ class Steps:
     def predicted(self, state: DAEState, heard: FloatArray, u: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return mean and deviation of each output ``(ny,)`` from what is heard of the next sample."""
         after, row = self.plain(state, heard, u)
-        mean, deviation = self._forecast(after.memory, row.said)
+        mean, deviation = self._call("forecast", after.memory, row.said)
         return mean[:, 0], deviation[:, 0]
 
     def plain(self, state: DAEState, y: FloatArray, u: FloatArray) -> tuple[DAEState, DAERow]:
@@ -131,9 +107,9 @@ class Steps:
         heard, moved = np.where(seen, y, 0.0), np.zeros(self.settings.model.nx)
         if state.k == 0:
             memory, moved = self.projected(state, u)
-            after, said = self._first(memory, heard, seen)
+            after, said = self._call("first", memory, heard, seen)
         else:
-            after, said = self._whole(state.memory, np.concatenate([u, heard, seen]))
+            after, said = self._call("whole", state.memory, np.concatenate([u, heard, seen]))
             if said[-1, 0] != 1.0:
                 after, said = self._carefully(state, heard, seen, u)
         if not np.isfinite(after).all():
@@ -148,10 +124,8 @@ class Steps:
     def stretch(
         self, state: DAEState, y: FloatArray, u: FloatArray, run: Callable[..., tuple[FloatArray, ...]]
     ) -> tuple[DAEState, DAERow]:
-        """Advance over samples until a step is not solved, by `ObserverGraph.whole` over that many samples.
-
-        Return what was reached, which may be nothing.  Shapes: ``y (samples, ny)``, ``u (samples, nu)``.
-        """
+        """Advance over samples until a step is not solved, by `ObserverGraph.whole` over that many samples. Return what
+        was reached, which may be nothing. Shapes: ``y (samples, ny)``, ``u (samples, nu)``."""
         seen = ~np.isnan(y)
         arriving = np.hstack([u, np.where(seen, y, 0.0), seen])
         after, said = (found.T for found in run(state.memory, arriving.ravel()))
@@ -167,10 +141,8 @@ class Steps:
         return state, rows
 
     def projected(self, state: DAEState, u: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Put the initial state onto the algebraic equations; return the memory and how far it moved.
-
-        Shapes: ``u (nu,)`` at k = 0.
-        """
+        """Put the initial state onto the algebraic equations; return the memory and how far it moved: ``u (nu,)`` at k
+        = 0."""
         model, start = self.settings.model, self.part(state, "x")
         short = ImplicitStep(DAEFunctions(model), PROJECTION_SHARE * self.settings.dt)
         found = short.solve_carefully(start, u, self.part(state, "theta")).x
@@ -182,22 +154,12 @@ class Steps:
         """Take a step that needs damping or a homotopy: solved outside the graph, and all else in it."""
         posterior, theta = self.part(state, "posterior"), self.part(state, "theta")
         solution = self.implicit.solve_carefully(posterior, u, theta, before=state.u, k=state.k)
-        after, said = self._sample(state.memory, solution.stages, u, y, seen)
+        after, said = self._call("sample", state.memory, solution.stages, u, y, seen)
         said[-2:, 0] = solution.residual, 1.0
         return after, said
 
-    @cached_property
-    def _first(self) -> Compiled:
-        return Compiled(self.graph.first)
-
-    @cached_property
-    def _sample(self) -> Compiled:
-        return Compiled(self.graph.sample)
-
-    @cached_property
-    def _forecast(self) -> Compiled:
-        return Compiled(self.graph.forecast)
-
-    @cached_property
-    def _whole(self) -> Compiled:
-        return Compiled(self.graph.whole)
+    def _call(self, name: str, *arguments: FloatArray) -> tuple[FloatArray, ...]:
+        """Return what a function of the graph gives, compiled when it is first needed."""
+        if name not in self._compiled:
+            self._compiled[name] = Compiled(getattr(self.graph, name))
+        return self._compiled[name](*arguments)

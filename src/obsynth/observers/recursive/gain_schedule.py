@@ -1,4 +1,4 @@
-"""Everything a recursive observer computes that does not depend on data, and whole batches of trials run with it."""
+"""What a recursive observer computes that does not depend on data: gains, batches run with them, the steady state."""
 
 from __future__ import annotations
 
@@ -9,56 +9,44 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from obsynth.errors import SpecError
-from obsynth.numerics.arguments import real_array
-from obsynth.numerics.arrays import FloatArray
+from obsynth.errors import PreconditionError, SolverError, SpecError
+from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.numerics.least_squares_step import least_squares_step, rank_revealing_step
-from obsynth.numerics.recursive_least_squares import update
-from obsynth.observers.estimates import Estimates, named_estimates
-from obsynth.observers.records import require_horizon
+from obsynth.numerics.spectra import abscissa
+from obsynth.numerics.square_root_estimation import update
+from obsynth.observers.estimates import Estimates
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.records import batch_record, require_horizon
 from obsynth.observers.recursive.observer import RecursiveObserver
-from obsynth.observers.recursive.parameter_steps import posterior_residual
-from obsynth.observers.recursive.step_model import (
-    EarlyConstraintSteps,
-    PreparedStep,
-    StepMatrices,
-    require_in_range,
-)
+from obsynth.observers.recursive.recursion import posterior_residual
+from obsynth.observers.recursive.step_model import PreparedStep, StepMatrices, spreads
+from obsynth.observers.running import named_estimates
+from obsynth.observers.sensor_timing import require_plain
 
 
 class GainStep(NamedTuple):
-    """The gains of one step; data are the rows ``[A x + B u; outputs]``.
+    """The gains of one step; data are the rows ``[A x + B u; outputs]``."""
 
-    Fields: step: Of the model as it is run; gain: ``[L K] (nx, rows)`` of (11); parity: ``(m, rows)``: from data to the
-    whitened innovation; G: ``(m, nq)``: its regressor; Upsilon: ``(nx, nq)``, after the step; factor: ``(nx, nx)``:
-    square root of the covariance of the state, the parameters being known; learn: ``(nq, rows)``: from data to the
-    correction of the parameters; forget: ``(nq, nq)``: ``theta^+ = forget theta + learn data``; spread: ``(nq, nq)``:
-    square root of the covariance of the parameters.
-    """
-
-    step: StepMatrices
-    gain: FloatArray
-    parity: FloatArray
-    G: FloatArray
-    Upsilon: FloatArray
-    factor: FloatArray
-    learn: FloatArray
-    forget: FloatArray
-    spread: FloatArray
+    step: StepMatrices  # of the model as it is run
+    gain: FloatArray  # ``[L K] (nx, rows)`` of (11)
+    parity: FloatArray  # ``(m, rows)``: from data to the whitened innovation
+    G: FloatArray  # ``(m, nq)``: its regressor
+    Upsilon: FloatArray  # ``(nx, nq)``, after the step
+    factor: FloatArray  # ``(nx, nx)``: square root of the covariance of the state, the parameters being known
+    learn: FloatArray  # ``(nq, rows)``: from data to the correction of the parameters
+    forget: FloatArray  # ``(nq, nq)``: ``theta^+ = forget theta + learn data``
+    spread: FloatArray  # ``(nq, nq)``: square root of the covariance of the parameters
 
 
 def gain_steps(
     observer: RecursiveObserver, steps: int, *, received: NDArray[np.bool_] | None = None
 ) -> Iterator[GainStep]:
-    """Yield the gains of the first steps.
-
-    Shapes: ``received (samples, ny)``.
-    """
+    """Yield the gains of the first steps: ``received (samples, ny)``."""
     recursion = observer.recursion
     start = recursion.first
     factor, Upsilon, parameters, diffuse = start.factor, start.Upsilon, start.parameters, start.diffuse
     adaptation, model = observer.adaptation, recursion.model
-    first = [model.first()] if isinstance(model, EarlyConstraintSteps) else []
+    first = [step for step in (model.first(),) if step is not None]
     prepared: PreparedStep | None = None
     for k, step in enumerate(chain(first, (model.at(k) for k in range(steps))), 1 - len(first)):
         ne, rows, nq = len(step.A), len(step.H), Upsilon.shape[1]
@@ -72,9 +60,7 @@ def gain_steps(
             found = prepared.taken(factor, right if nq else None)
         # The literal form asks for the noise itself.
         if found is None or recursion.literal:
-            S = _noise_root(step, factor)
-            require_in_range(S, factor, k, observer.state_names)
-            unknown = np.vstack([step.A @ diffuse, np.zeros((rows - ne, diffuse.shape[1]))])
+            S, unknown = spreads(step, factor, diffuse, k, observer.state_names)
             H = step.H
             if not complete and received is not None:
                 kept = np.concatenate([np.ones(ne, dtype=bool), received[k], np.ones(len(step.Dn), dtype=bool)])
@@ -98,15 +84,6 @@ def gain_steps(
         yield GainStep(step, gain, parity, G, Upsilon, factor, learn, forget, parameters.spread)
 
 
-def _noise_root(step: StepMatrices, factor: FloatArray) -> FloatArray:
-    """Return the square root ``(rows, any)`` of the covariance of a step's data."""
-    ne, rows, width = len(step.A), len(step.H), factor.shape[1]
-    S = np.zeros((rows, max(width + step.noise.shape[1], rows)))
-    S[:ne, :width] = step.A @ factor
-    S[:, width : width + step.noise.shape[1]] = step.noise
-    return S
-
-
 def run_batch(observer: RecursiveObserver, y: ArrayLike, u: ArrayLike | None = None) -> Estimates:
     """Run many trials at once: the gains do not depend on data, so a step is one product for all trials.
 
@@ -114,54 +91,158 @@ def run_batch(observer: RecursiveObserver, y: ArrayLike, u: ArrayLike | None = N
     """
     if observer.adaptation is not None and observer.adaptation.reset:
         raise SpecError("Resets depend on the data of each trial: run them one by one, or without reset.", path="reset")
-    outputs = real_array(y, "y")
-    if outputs.ndim != 3 or outputs.shape[2] != observer.plant.ny:
-        raise SpecError(f"y has shape {outputs.shape}, but (trials, samples, {observer.plant.ny}) is needed.", path="y")
+    outputs, known = batch_record(y, u, observer.plant.ny, observer.plant.input_names)
     trials, samples = outputs.shape[:2]
-    known = np.zeros((samples, 0)) if u is None and not observer.plant.nu else real_array(u, "u")
-    if known.ndim not in (2, 3) or known.shape[-2:] != (samples, observer.plant.nu):
-        raise SpecError(f"u has shape {known.shape}, but (trials, samples, {observer.plant.nu}) is needed.", path="u")
-    if not (np.isfinite(outputs[:, 1:]).all() and np.isfinite(known).all()):
+    if not np.isfinite(outputs[:, 1:]).all():
         raise SpecError("A batch must be complete: run trials with missing samples one by one.", path="y")
     require_horizon(observer.plant.horizon, samples, early=observer.early_constraints)
     inputs = np.broadcast_to(known, (trials, *known.shape[-2:]))
     start = observer.init()
-    early = isinstance(observer.recursion.model, EarlyConstraintSteps)
+    early = observer.recursion.model.first() is not None
     x = np.broadcast_to(start.x, (trials, len(start.x)))
     theta = np.broadcast_to(start.parameters.theta, (trials, len(start.parameters.theta)))
-    nx = observer.plant.nx
-    states: list[FloatArray] = []
-    parameters: list[FloatArray] = []
+    nx, nq = observer.plant.nx, len(observer.fault_names)
+    states, parameters = np.empty((trials, samples, nx)), np.empty((trials, samples, nq))
+
+    def keep(k: int, Upsilon: FloatArray) -> None:
+        """Keep states and parameters: of a walk they are parts of x, else the states follow the parameters."""
+        walks = x.shape[1] > nx
+        states[:, k] = x[:, :nx] if walks else x + theta @ Upsilon.T
+        parameters[:, k] = x[:, nx:] if walks else theta
+
     innovations: list[FloatArray] = []
     if not early:
-        _note(states, parameters, x, theta, np.zeros((nx, theta.shape[1])), nx)
+        keep(0, np.zeros((nx, theta.shape[1])))
         innovations.append(np.full((trials, 0), np.nan))
     for k, gains in enumerate(gain_steps(observer, samples - 1), 0 if early else 1):
         step, arriving = gains.step, outputs[:, k] if k else outputs[:, k, :0]
         before = inputs[:, k - 1] if k else np.zeros((trials, observer.plant.nu))
-        data = np.concatenate(
-            (x @ step.A.T + before @ step.B.T, arriving, inputs[:, k] @ step.Dn.T), axis=1
-        )  # fmt: skip
+        data = np.concatenate((x @ step.A.T + before @ step.B.T, arriving, inputs[:, k] @ step.Dn.T), axis=1)
         x, theta = data @ gains.gain.T, theta @ gains.forget.T + data @ gains.learn.T
-        _note(states, parameters, x, theta, gains.Upsilon, nx)
+        keep(k, gains.Upsilon)
         innovations.append(data @ gains.parity.T)
-    most = max(found.shape[1] for found in innovations)
-    padded = np.full((trials, samples, most), np.nan)
+    padded = np.full((trials, samples, max(found.shape[1] for found in innovations)), np.nan)
     for k, found in enumerate(innovations):
         padded[:, k, : found.shape[1]] = found
-    return named_estimates(
-        observer, states=np.stack(states, axis=1), faults=np.stack(parameters, axis=1), innovations=padded
-    )
+    return named_estimates(observer, states=states, faults=parameters, innovations=padded)
 
 
-def _note(
-    states: list[FloatArray], parameters: list[FloatArray], x: FloatArray, theta: FloatArray,
-    Upsilon: FloatArray, nx: int,
-) -> None:  # fmt: skip
-    """Keep states and parameters: of a walk they are parts of x, else the states follow the parameters."""
-    if x.shape[1] > nx:
-        states.append(x[:, :nx])
-        parameters.append(x[:, nx:])
-    else:
-        states.append(x + theta @ Upsilon.T)
-        parameters.append(theta)
+#: The gains have settled when what is left of their way is below this share of them.
+SETTLED = 1e-13
+#: Steps of the recursion before it is held to settle nowhere.
+MOST_STEPS = 20_000
+#: Steps in a row that must have settled: at a turning point gains stand still, too.
+STILL_STEPS = 5
+
+
+class SteadyObserver(NamedTuple):
+    """A recursive observer whose gains have settled."""
+
+    # from ``[u; y]`` to states, parameters, and the whitened innovation at the parameters of one sample before
+    observer: LinearObserver
+    start: FloatArray  # ``z(0)``, from the state and the parameters that the recursion starts with; read-only
+    steps: int  # after how many steps the gains had settled
+
+
+def steady_observer(observer: RecursiveObserver) -> SteadyObserver:
+    r"""Return the steady state of a recursive observer.
+
+    Once the covariances have settled, every gain of the recursion is constant.  With ``z(k) = A x(k-1) + B u(k-1)`` and
+    the gains ``[L K M]`` of the rows ``[z; y; Dn u]`` (the last ones with early constraints only),
+
+    .. math::
+        \bar x(k) = L z(k) + K y(k) + M D_n u(k), \qquad z(k+1) = A \bar x(k) + B u(k)
+
+    and parameters that are learnt by least squares follow ``theta(k) = F theta(k-1) + learn [z; y; Dn u]``, with
+    ``x = \bar x + \Upsilon \theta``.
+    """
+    require_plain(observer, "A steady filter")
+    _require_constant(observer)
+    settled, steps = _settled(observer)
+    realisation, start = _realised(observer, settled)
+    radius = abscissa(realisation.Az, observer.dt)
+    if not radius < 1.0:
+        raise PreconditionError(
+            f"The steady filter is not stable (spectral radius {radius:.6g}): a mode is neither seen by the outputs "
+            "nor damped, or parameters are not excited by a plant at rest. Run the recursion itself (obsynth run).",
+            condition="stable steady filter",
+        )  # fmt: skip
+    return SteadyObserver(realisation, read_only(start), steps)
+
+
+def _require_constant(observer: RecursiveObserver) -> None:
+    sequences = {**observer.plant.matrices, "Q": observer.Q, "R": observer.R}
+    moving = [name for name, sequence in sequences.items() if not sequence.is_constant]
+    if moving:
+        raise SpecError(
+            f"{', '.join(moving)} may change with k (given as more than constants), so the gains do too and there is "
+            "no constant realisation to hand on: use the recursion itself, obsynth run or observer.step.", path="plant",
+        )  # fmt: skip
+    if observer.adaptation is not None and observer.adaptation.reset:
+        raise SpecError(
+            "This design resets its gains when the data ask for it, so there is no constant realisation to hand on: "
+            "use the recursion itself (obsynth run), or design without reset.", path="reset",
+        )  # fmt: skip
+
+
+def _settled(observer: RecursiveObserver) -> tuple[GainStep, int]:
+    """Return the first step whose gains have settled."""
+    last: GainStep | None = None
+    still, before = 0, np.inf
+    for k, found in enumerate(gain_steps(observer, MOST_STEPS)):
+        # The correction of the start, which comes first with early constraints, has other rows.
+        if last is not None and last.gain.shape == found.gain.shape:
+            moved = max(_distance(now, then) for now, then in zip(_parts(found), _parts(last), strict=True))
+            # What is left of a geometric series, from two of its terms.
+            rate = min(moved / before, 1.0) if 0.0 < before < np.inf else 1.0
+            left = moved / max(1.0 - rate, np.finfo(np.float64).eps) * rate
+            quiet = moved == 0.0 or (moved <= SETTLED and left <= SETTLED) or moved <= 4.0 * np.finfo(np.float64).eps
+            still, before = still + 1 if quiet else 0, moved
+            if still == STILL_STEPS:
+                return found, k
+        last = found
+    raise SolverError(
+        f"The gains do not settle within {MOST_STEPS} steps: a mode is hardly seen, or hardly driven by noise. Run the "
+        "recursion itself (obsynth run), or state more noise in Q.", record={"steps": MOST_STEPS},
+    )  # fmt: skip
+
+
+def _parts(found: GainStep) -> tuple[FloatArray, ...]:
+    # The sign of a direction of the innovation is free, its square is not.
+    return found.gain, found.Upsilon, found.learn, found.forget, found.parity.T @ found.parity, found.G.T @ found.G
+
+
+def _distance(now: FloatArray, then: FloatArray) -> float:
+    size = float(np.abs(now).max(initial=0.0))
+    return float(np.abs(now - then).max(initial=0.0)) / size if size else 0.0
+
+
+def _realised(observer: RecursiveObserver, found: GainStep) -> tuple[LinearObserver, FloatArray]:
+    step, plant = found.step, observer.plant
+    ne, ny, nx = len(step.A), plant.ny, plant.nx
+    early, width = step.Dn, found.gain.shape[1]
+    parts = slice(0, ne), slice(ne, ne + ny), slice(ne + ny, width)
+    gain, parity = [found.gain[:, part] for part in parts], [found.parity[:, part] for part in parts]
+    learn, q = [found.learn[:, part] for part in parts], len(found.forget)
+    random_walk = found.gain.shape[0] - nx
+    # States: z, then the parameters of one sample before.
+    state = np.hstack([gain[0], np.zeros((len(gain[0]), q))])
+    theta = np.hstack([learn[0], found.forget])
+    az = np.vstack([step.A @ state, theta])
+    by = np.vstack([step.A @ gain[1], learn[1]])
+    bu = np.vstack([step.B + step.A @ gain[2] @ early, learn[2] @ early])
+    # Rows of output: x (with Upsilon theta), theta, innovation less its regressor times theta of before.
+    upsilon = found.Upsilon[:nx]
+    shown = [state[:nx] + upsilon @ theta, np.vstack([state[nx:], theta]), np.hstack([parity[0], -found.G])]
+    seen = [gain[1][:nx] + upsilon @ learn[1], np.vstack([gain[1][nx:], learn[1]]), parity[1]]
+    fed = [(gain[2][:nx] + upsilon @ learn[2]) @ early, np.vstack([gain[2][nx:], learn[2]]) @ early, parity[2] @ early]
+    residuals = tuple(f"innovation {i + 1}" for i in range(len(found.parity)))
+    names = observer.fault_names if random_walk or q else ()
+    realisation = LinearObserver(
+        Az=az, Bu=bu, By=by, Cz=np.vstack(shown), Du=np.vstack(fed), Dy=np.vstack(seen), dt=observer.dt,
+        input_names=plant.input_names, output_names=plant.output_names, state_names=plant.state_names,
+        fault_names=names, residual_names=residuals, state_delays=(0,) * nx, fault_delays=(0,) * len(names),
+    )  # fmt: skip
+    begin = observer.init()
+    # z = E x gives back x, as [L K] [E; C] = I, where the first outputs agree with it.
+    return realisation, np.concatenate([step.H[:ne] @ begin.x, begin.parameters.theta])

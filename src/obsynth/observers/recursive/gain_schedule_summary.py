@@ -31,28 +31,23 @@ CLEARLY_STABLE = 1.0 - 1e-6
 
 @dataclass(frozen=True, eq=False)
 class GainScheduleSummary:
-    """What the gains along the horizon say.
+    """What the gains along the horizon say."""
 
-    Fields: steps: How many steps were looked at; contraction: ``norm(product of L_k A_k)^(1 / steps)``: the mean factor
-    by which an error shrinks in a step; where that is not below one, over the second half of the horizon; growth: The
-    largest norm of the product on the way: how much an error may grow before it dies out; span: What the contraction
-    was taken over; survivors: ``(nx,)``: size of the product in each state after the last step, relative to its
-    largest: where errors last; excitation: The least eigenvalue of the information on the parameters in any window,
-    (26); NaN without parameters; excitation_k: The sample that ends that window; L, K: The gains (11) of the last step;
-    deviations: ``(nq,)``: standard deviations of the parameters after the last step; state_deviations: ``(nx,)``:
-    standard deviations of the states after the last step, the parameters being known.
-    """
-
-    steps: int
+    steps: int  # how many steps were looked at
+    # ``norm(product of L_k A_k)^(1 / steps)``: the mean factor by which an error shrinks in a step; where that is not
+    # below one, over the second half of the horizon
     contraction: float
-    growth: float
-    span: str
+    growth: float  # the largest norm of the product on the way: how much an error may grow before it dies out
+    span: str  # what the contraction was taken over
+    # ``(nx,)``: size of the product in each state after the last step, relative to its largest: where errors last
     survivors: FloatArray
+    # the least eigenvalue of the information on the parameters in any window, (26); NaN without parameters
     excitation: float
-    excitation_k: int
-    L: FloatArray
+    excitation_k: int  # the sample that ends that window
+    L: FloatArray  # L, K: the gains (11) of the last step
     K: FloatArray
-    deviations: FloatArray
+    deviations: FloatArray  # ``(nq,)``: standard deviations of the parameters after the last step
+    # ``(nx,)``: standard deviations of the states after the last step, the parameters being known
     state_deviations: FloatArray
 
 

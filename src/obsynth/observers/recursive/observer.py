@@ -1,23 +1,30 @@
-"""The recursive observer that a time-varying design ships: descriptor Kalman filter, with or without parameters."""
+"""The recursive observer that a time-varying design ships: descriptor Kalman filter, with or without parameters.
+
+A recursive observer from a plant and plain options: used to design one, and to check the one that was shipped.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import real_array, real_vector
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arguments import is_number, real_array, real_number, real_vector
+from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.observers.estimates import Estimates
+from obsynth.observers.outliers import projected
 from obsynth.observers.records import measured_record, require_horizon, whole_record
-from obsynth.observers.recursive.compiled_run import run_record
-from obsynth.observers.recursive.estimates import recursive_estimates
-from obsynth.observers.recursive.recursion import RawEstimate, Recursion, RecursiveState
-from obsynth.observers.recursive.settings import RecursiveSettings
+from obsynth.observers.recursive.compiled_run import kernel_is_chosen, run_compiled
+from obsynth.observers.recursive.estimates import RawEstimate, RecursiveState, recursive_estimates
+from obsynth.observers.recursive.recursion import Recursion
+from obsynth.observers.recursive.settings import Adaptation, RecursiveSettings
 from obsynth.observers.running import StepObserver
-from obsynth.observers.state_bounds import projected
+from obsynth.plants.sequences import MatrixSequence
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 
 
 class RecursiveObserver(RecursiveSettings, StepObserver[RecursiveState, RawEstimate]):
@@ -66,9 +73,6 @@ class RecursiveObserver(RecursiveSettings, StepObserver[RecursiveState, RawEstim
     def _allow(self, state: RecursiveState) -> None:
         require_horizon(self.plant.horizon, state.k + 1, early=self.early_constraints)
 
-    def _trust(self, row: RawEstimate) -> None:
-        """Raise nothing: a step says itself where it loses rank."""
-
     def _sample(self, state: RecursiveState, y: ArrayLike, u: ArrayLike) -> tuple[FloatArray, FloatArray]:
         outputs = measured_record(np.atleast_2d(real_array(y, "y")), self.plant.ny)[0]
         return outputs, real_vector(u, self.plant.nu, "u")
@@ -105,11 +109,11 @@ class RecursiveObserver(RecursiveSettings, StepObserver[RecursiveState, RawEstim
         """
         outputs, inputs = whole_record(y, u, self.plant.ny, self.plant.nu)
         require_horizon(self.plant.horizon, len(outputs), early=self.early_constraints)
-        if self.is_plain:
-            return run_record(self.recursion, outputs, inputs, compiled)
-        if compiled:
+        if compiled and not self.is_plain:
             raise SpecError("compiled=True: the kernel knows neither sensors of their own times nor state_bounds: "
                             "leave it out.", path="compiled")  # fmt: skip
+        if self.is_plain and kernel_is_chosen(self, len(outputs), compiled):
+            return run_compiled(self.recursion, outputs, inputs)
         rows, state = [], self.init()
         for y_k, u_k in zip(outputs, inputs, strict=True):
             state, row = self.advance(state, y_k, u_k)
@@ -127,3 +131,72 @@ class RecursiveObserver(RecursiveSettings, StepObserver[RecursiveState, RawEstim
         if self.state_bounds is None:
             return row
         return row._replace(x=projected(row.x, row.factor, self.state_bounds))
+
+
+def observer_from_options(plant: TimeVaryingDescriptorSystem, options: Mapping[str, Any]) -> RecursiveObserver:
+    """Return the observer that options stand for."""
+    adaptation = None
+    if "form" in options:
+        nq = plant.nq
+        adaptation = Adaptation(
+            form=options["form"],
+            forgetting=options["forgetting"],
+            guard=options["guard"],
+            initial_parameters=_vector(options["initial_parameters"], nq, "initial_parameters"),
+            initial_covariance=_square(
+                options["initial_parameter_covariance"], nq, 1.0, "initial_parameter_covariance"
+            ),
+            walk=_square(options["random_walk"], nq, 0.0, "random_walk"),
+            window=options["window"],
+            reset=options["reset"],
+        )
+    return RecursiveObserver(
+        plant, _sequence(options["Q"], plant.ne, "Q", plant), _sequence(options["R"], plant.ny, "R", plant),
+        _vector(options["initial_state"], plant.nx, "initial_state"),
+        _square(options["initial_covariance"], plant.nx, 1.0, "initial_covariance"), adaptation,
+        options["early_constraints"], options.get("outliers", "none"), options.get("outlier_limit"),
+        options.get("sensors"), options.get("state_bounds"),
+    )  # fmt: skip
+
+
+def plain_options(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return options as they are kept with a design: arrays and sequences as data, callables as they are."""
+    plain: dict[str, Any] = {}
+    for name, given in options.items():
+        value = given.item() if isinstance(given, np.generic) else given
+        if isinstance(value, MatrixSequence):
+            plain[name] = value.as_data() if value.is_data else value.function
+        elif (
+            value is None or callable(value) or isinstance(value, (bool, int, float, str, Mapping)) or _has_text(value)
+        ):
+            plain[name] = value
+        else:
+            plain[name] = np.array(value, dtype=np.float64)
+    return plain
+
+
+def _has_text(value: Any) -> bool:
+    return isinstance(value, (list, tuple)) and any(isinstance(item, str) or _has_text(item) for item in value)
+
+
+def _sequence(value: Any, size: int, name: str, plant: TimeVaryingDescriptorSystem) -> MatrixSequence:
+    if value is None:
+        return MatrixSequence.of(np.eye(size), name)
+    if is_number(value):
+        value = real_number(value, name, "a variance, or a covariance matrix") * np.eye(size)
+    found = MatrixSequence.of(value, name, constants=plant.constants)
+    if found.length is not None and (plant.horizon is None or found.length < plant.horizon):
+        raise SpecError(f"{name} is a stack for {found.length} steps: it must reach as far as the plant's horizon "
+                        f"({plant.horizon or 'without end'}).", path=name)  # fmt: skip
+    return found
+
+
+def _vector(value: Any, size: int, name: str) -> FloatArray:
+    return np.zeros(size) if value is None else real_vector(value, size, name)
+
+
+def _square(value: Any, size: int, default: float, name: str) -> FloatArray:
+    if value is None:
+        return default * np.eye(size)
+    matrix = as_matrix(value, name)
+    return float(matrix[0, 0]) * np.eye(size) if np.ndim(value) == 0 else matrix

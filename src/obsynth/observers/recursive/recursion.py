@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import math
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 
-from obsynth.analysis.time_varying import early_rows
+from obsynth.analysis.time_varying import IntArray, early_rows
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.covariances import covariance_factor
 from obsynth.numerics.least_squares_step import (
     DEPENDENT_COLUMN,
     SUSPECT_COLUMN,
@@ -19,124 +17,73 @@ from obsynth.numerics.least_squares_step import (
     least_squares_step,
     rank_revealing_step,
 )
-from obsynth.numerics.ranks import UNDETERMINED_SHARE
-from obsynth.numerics.recursive_least_squares import ParameterState, start_of, update
-from obsynth.observers.outliers import checked_limit, no_refusals, robust_advance
-from obsynth.observers.recursive.parameter_steps import (
-    ParameterReset,
-    RandomWalkParameterSteps,
-    WalkingEarlySteps,
-    posterior_residual,
-)
+from obsynth.numerics.ranks import UNDETERMINED_SHARE, covariance_factor
+from obsynth.numerics.square_root_estimation import ParameterState, start_of, update
+from obsynth.observers.outliers import checked_limit, has_jumped, no_refusals, robust_advance, with_surprise
+from obsynth.observers.recursive.estimates import RawEstimate, RecursiveState
 from obsynth.observers.recursive.settings import RecursiveSettings
 from obsynth.observers.recursive.step_model import (
     EarlyConstraintSteps,
     PlantSteps,
     PreparedStep,
+    RandomWalkParameterSteps,
     StepMatrices,
     StepModel,
-    require_in_range,
+    WalkingEarlySteps,
+    right_side,
+    spreads,
 )
 
 
-class RawEstimate(NamedTuple):
-    """What is known at one sample.
+def walk_of(settings: RecursiveSettings) -> FloatArray | None:
+    """Return the square root of the covariance of one step of parameters that walk; ``None`` where they do not."""
+    if settings.adaptation is None or settings.adaptation.form != "random-walk":
+        return None
+    return covariance_factor(settings.adaptation.walk, "walk")
 
-    Fields: k: The sample; x: ``(nx,)``: the state estimate, with the parameters as they are estimated now; factor:
-    ``(nx, any)``: square root of its covariance; diffuse: ``(nx, r)``: directions about which nothing is known;
-    parameters: Estimate and spreads; empty without parameters; innovation: ``(m,)``: whitened parity innovation of the
-    model without parameters; regressor: ``(m, nq)``; gap: ``(m,)``: the innovation at the parameters estimated one
-    sample before; y: ``(ny,)``: the outputs that were given, NaN where one was missing.
-    """
 
-    k: int
-    x: FloatArray
-    factor: FloatArray
-    diffuse: FloatArray
-    parameters: ParameterState
-    innovation: FloatArray
-    regressor: FloatArray
-    gap: FloatArray
-    y: FloatArray
-
-    @property
-    def theta(self) -> FloatArray:
-        """The parameters ``(nq,)``."""
-        return self.parameters.theta
-
-    @property
-    def parameter_covariance(self) -> FloatArray:
-        """Covariance of `theta` ``(nq, nq)``."""
-        return self.parameters.spread @ self.parameters.spread.T
-
-    @property
-    def state_deviations(self) -> FloatArray:
-        """Standard deviations ``(nx,)`` of the states; infinite where one is undetermined."""
-        deviations = np.sqrt(np.einsum("ij,ij->i", self.factor, self.factor))
-        open_states = (np.abs(self.diffuse) > UNDETERMINED_SHARE).any(axis=1)
-        return np.where(open_states, np.inf, deviations)
-
-    @property
-    def whitened(self) -> FloatArray:
-        """The innovation in units of its standard deviations, ``(m,)``."""
-        return self.innovation
-
-    @property
-    def nis(self) -> float:
-        """Squared length of `gap`."""
-        return float(self.gap @ self.gap)
-
-    @property
-    def score(self) -> FloatArray:
-        """What the sample says of the parameters ``(nq,)``; nothing where they are states and have no regressor."""
-        return np.asarray(self.regressor.T @ self.innovation[: len(self.regressor)])
-
-    @property
-    def information(self) -> FloatArray:
-        """How much it says of them ``(nq, nq)``."""
-        return np.asarray(self.regressor.T @ self.regressor)
-
-    @property
-    def is_finite(self) -> bool:
-        """Whether no number has overflown; an undetermined state has a finite factor."""
-        arrays = (self.x, self.factor, self.theta, self.parameters.spread, self.innovation)
-        return all(bool(np.isfinite(array).all()) for array in arrays)
+def early_steps(settings: RecursiveSettings, rows: IntArray) -> EarlyConstraintSteps:
+    """Return the steps of an observer whose algebraic equations ``rows`` are used one step earlier."""
+    parts, walk = (settings.plant, settings.Q, settings.R, rows), walk_of(settings)
+    return EarlyConstraintSteps(*parts) if walk is None else WalkingEarlySteps(*parts, walk)
 
 
 def step_model_of(settings: RecursiveSettings) -> StepModel:
     """Return the steps that an observer runs on, with its plant rewritten as its options ask."""
-    parts, adaptation = (settings.plant, settings.Q, settings.R), settings.adaptation
-    walk = None
-    if adaptation is not None and adaptation.form == "random-walk":
-        walk = covariance_factor(adaptation.walk, "walk")
     if settings.early_constraints:
-        rows = early_rows(settings.plant, early=True)
-        return EarlyConstraintSteps(*parts, rows) if walk is None else WalkingEarlySteps(*parts, rows, walk)
-    return PlantSteps(*parts) if walk is None else RandomWalkParameterSteps(PlantSteps(*parts), walk)
+        return early_steps(settings, early_rows(settings.plant, early=True))
+    steps, walk = PlantSteps(settings.plant, settings.Q, settings.R), walk_of(settings)
+    return steps if walk is None else RandomWalkParameterSteps(steps, walk)
 
 
-class RecursiveState(NamedTuple):
-    """The state of a recursive observer.
+def posterior_residual(
+    found: LeastSquaresStep,
+    H: FloatArray,
+    S: FloatArray,
+    right: FloatArray,
+    ne: int,
+    *,
+    unknown: FloatArray,
+    columns: int = 1,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return what (18f) learns from: ``y - C x`` weighted by R, its regressor (18d), and a root of its covariance.
 
-    Fields: k: The next sample; x: ``(n,)``: estimate of the model without parameters, or of states and parameters of a
-    random walk; factor: ``(n, any)``: square root of its covariance; Upsilon: ``(nx, nq)``; diffuse: ``(n, r)``:
-    directions about which nothing is known; parameters: Estimate and spreads; u: ``(nu,)``: the inputs of the sample
-    before; regressors: Of the latest samples; surprises: ``(any, 2)``: normalised squares of the latest innovations,
-    and their degrees of freedom, for resets; resets: How many there were; refused: ``(2, ny)``: outliers in a row, and
-    at all.
+    That covariance is not R but one of rank ``rank E + ny - nx`` (Moussa Ali et al. 2013, (18b), (18d), (18f)).
     """
-
-    k: int
-    x: FloatArray
-    factor: FloatArray
-    Upsilon: FloatArray
-    diffuse: FloatArray
-    parameters: ParameterState
-    u: FloatArray
-    regressors: tuple[FloatArray, ...]
-    surprises: FloatArray
-    resets: int
-    refused: FloatArray
+    gaps = right[ne:] - H[ne:] @ found.estimate
+    triangle = np.asarray(np.linalg.qr(S[ne:].T, mode="r")).T
+    if not np.all(np.abs(np.diag(triangle)) > 0.0):
+        raise PreconditionError("The literal form (18) divides by R, which is singular: use form 'innovation'.",
+                                condition="R nonsingular")  # fmt: skip
+    data = np.eye(len(H))
+    gains = None if unknown.shape[1] else least_squares_step(H, S, data)
+    if gains is None:
+        # Undetermined directions lie in the null space of the outputs that are there: y - C xhat is what it is.
+        gains = rank_revealing_step(H, S, data, unknown, mapped=len(H))
+    spread = S[ne:] - H[ne:] @ gains.estimate @ S
+    weighted = np.linalg.solve(triangle, np.hstack((gaps, spread)))
+    regressor, end = slice(columns, gaps.shape[1]), gaps.shape[1]
+    return weighted[:, :columns], -weighted[:, regressor], weighted[:, end:]
 
 
 class Recursion:
@@ -151,7 +98,6 @@ class Recursion:
         self.directional = adaptation is not None and adaptation.guard == "directional"
         self.window = 1 if adaptation is None else adaptation.window
         self.regular: FloatArray | None = None
-        self.reset: ParameterReset | None = None
         # The factorisation of a step that stays the same; it follows from the step alone.
         self._prepared: PreparedStep | None = None
         factor = covariance_factor(settings.initial_covariance, "initial_covariance")
@@ -173,14 +119,10 @@ class Recursion:
             return
         parameters = start_of(adaptation.initial_parameters, spread)
         self.first = self.first._replace(parameters=parameters)
-        self.reset = ParameterReset(adaptation.reset, parameters) if adaptation.reset else None
         self.regular = parameters.triangle if adaptation.guard == "regularise" else None
 
     def advance(self, state: RecursiveState, y: FloatArray, u: FloatArray) -> tuple[RecursiveState, RawEstimate]:
-        """Return the state after a sample and what is known at it.
-
-        Shapes: ``y (ny,)`` with NaN for what is missing, ``u (nu,)``.
-        """
+        """Return the state after a sample and what is known at it; NaN in ``y (ny,)`` is what is missing."""
         if self.settings.outliers == "none":
             return self.plain(state, y, u)
         foreseen = self.foreseen if state.k and self._constraints is not None else None
@@ -189,10 +131,8 @@ class Recursion:
         )
 
     def foreseen(self, state: RecursiveState, u: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return mean and deviation of each output ``(ny,)`` before the sample, with its own algebraic equations.
-
-        They come with the next step, but what they say of this sample is known now.  Infinite where nothing is.
-        """
+        """Return mean and deviation of each output ``(ny,)`` before the sample, with its own algebraic equations. They
+        come with the next step, but what they say of this sample is known now. Infinite where nothing is."""
         plant, k = self.settings.plant, state.k
         nothing = np.full(plant.ny, np.nan)
         if self._constraints is None or (plant.horizon is not None and k >= plant.horizon):
@@ -206,10 +146,8 @@ class Recursion:
         return self._outputs(self._estimate(corrected, v, G, v, nothing)._replace(k=k))
 
     def predicted(self, state: RecursiveState, heard: FloatArray, u: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return mean and deviation of each output ``(ny,)`` from what is heard of the next sample.
-
-        The deviation is infinite where nothing is known.
-        """
+        """Return mean and deviation of each output ``(ny,)`` from what is heard of the next sample. The deviation is
+        infinite where nothing is known."""
         plant, k = self.settings.plant, state.k
         if k == 0:
             return np.zeros(plant.ny), np.full(plant.ny, np.inf)
@@ -238,18 +176,15 @@ class Recursion:
         others = np.setdiff1d(np.arange(settings.plant.ne), rows)
         if np.any(settings.Q.at(0)[np.ix_(others, rows)]):
             return None
-        parts = (settings.plant, settings.Q, settings.R, rows)
-        if settings.adaptation is None or settings.adaptation.form != "random-walk":
-            return EarlyConstraintSteps(*parts)
-        return WalkingEarlySteps(*parts, covariance_factor(settings.adaptation.walk, "walk"))
+        return early_steps(settings, rows)
 
     def plain(self, state: RecursiveState, y: FloatArray, u: FloatArray) -> tuple[RecursiveState, RawEstimate]:
         """Take a sample as it is."""
         theta = state.parameters.theta
         if state.k > 0:
             after, v, G = self._stepped(state, self.model.at(state.k - 1), y, u)
-        elif isinstance(self.model, EarlyConstraintSteps):
-            after, v, G = self._stepped(state, self.model.first(), np.zeros(0), u)
+        elif (first := self.model.first()) is not None:
+            after, v, G = self._stepped(state, first, np.zeros(0), u)
         else:
             after, v, G = state, np.zeros(0), np.zeros((0, state.Upsilon.shape[1]))
         gap = v - G @ theta if len(theta) else v
@@ -260,28 +195,26 @@ class Recursion:
         self, state: RecursiveState, step: StepMatrices, y: FloatArray, u: FloatArray
     ) -> tuple[RecursiveState, FloatArray, FloatArray]:
         """Take the step that ends at the sample ``y``; return also innovation and regressor."""
-        ne, nq = len(step.A), state.Upsilon.shape[1]
-        right = np.empty((len(step.H), 1 + nq), order="F")
-        right[:ne, 0] = step.A @ state.x + step.B @ state.u
-        right[ne : ne + len(y), 0] = y
-        if len(step.Dn):
-            right[ne + len(y) :, 0] = step.Dn @ u
-        if nq:
-            right[:ne, 1:] = step.A @ state.Upsilon + step.Phi
-            right[ne:, 1:] = -step.Psi
+        nq = state.Upsilon.shape[1]
+        right = right_side(step, state.x, state.Upsilon, state.u, y, u)
         found, lesson = None, None
         # The product is NaN exactly if a sample is.
         if not (self.literal or state.diffuse.shape[1] or math.isnan(y.dot(y))):
-            found = self._fast(state, step, right)
+            self._prepared = PreparedStep.of(step, self._prepared)
+            found = self._prepared.taken(state.factor, right)
         if found is None:
             found, lesson = self._careful(state, step, right)
         v, G = found.innovation[:, 0], -found.innovation[:, 1:]
         parameters, surprises, resets = state.parameters, state.surprises, state.resets
         if nq and self.settings.adaptation is not None:
-            if self.reset is not None:
-                surprises = self.reset.surprises(surprises, parameters, v, G)
-                if self.reset.is_due(surprises):
-                    parameters, surprises, resets = self.reset.forgetful(parameters), surprises[:0], resets + 1
+            if self.settings.adaptation.reset:
+                gap, seen = v - G @ parameters.theta, G @ parameters.spread
+                nis = float(gap @ np.linalg.solve(np.eye(len(v)) + seen @ seen.T, gap))
+                surprises = with_surprise(surprises, nis, len(v))
+                if has_jumped(surprises, self.settings.adaptation.reset):
+                    # The same estimate, known no better than at the start.
+                    parameters, surprises = self.first.parameters._replace(theta=parameters.theta), surprises[:0]
+                    resets += 1
             seen, regressor, noise = lesson or (v, G, None)
             parameters, _ = update(
                 parameters, seen, regressor, forgetting=self.settings.adaptation.forgetting, regular=self.regular,
@@ -293,27 +226,13 @@ class Recursion:
         )  # fmt: skip
         return after, v, G
 
-    def _fast(self, state: RecursiveState, step: StepMatrices, right: FloatArray) -> LeastSquaresStep | None:
-        """Take a step that is complete; what depends on the matrices alone is kept while they stay the same."""
-        prepared = self._prepared
-        if prepared is None or step is not prepared.step:
-            prepared = self._prepared = PreparedStep.of(step, prepared)
-        return prepared.taken(state.factor, right)
-
     def _careful(
         self, state: RecursiveState, step: StepMatrices, right: FloatArray
     ) -> tuple[LeastSquaresStep, tuple[FloatArray, FloatArray, FloatArray] | None]:
         """Take a step with missing samples, with undetermined directions, with perfect rows, or of the literal form.
-
-        Return also what the literal form learns from.
-        """
-        ne, width, H = len(step.A), state.factor.shape[1], step.H
-        S = np.zeros((len(H), max(width + step.noise.shape[1], len(H))))
-        S[:ne, :width] = step.A @ state.factor
-        S[:, width : width + step.noise.shape[1]] = step.noise
-        require_in_range(S, state.factor, state.k, self.settings.state_names)
-        unknown = np.zeros((len(H), state.diffuse.shape[1]))
-        unknown[:ne] = step.A @ state.diffuse
+        Return also what the literal form learns from."""
+        ne, H = len(step.A), step.H
+        S, unknown = spreads(step, state.factor, state.diffuse, state.k, self.settings.state_names)
         kept = ~np.isnan(right[:, 0])
         complete = bool(kept.all())
         if not complete:

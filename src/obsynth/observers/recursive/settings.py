@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from functools import cached_property
 from typing import Any, Literal, Self, TypeAlias
 
 import numpy as np
@@ -12,12 +11,9 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import Count, ForgettingFactor, Probability, checked_value, real_vector, truth
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
-from obsynth.numerics.covariances import covariance_factor
-from obsynth.numerics.ranks import rounding_rank
-from obsynth.observers.estimates import Undelayed
-from obsynth.observers.outliers import Outliers, checked_limit
-from obsynth.observers.sensor_timing import SensorTiming, checked_sensors
-from obsynth.observers.state_bounds import checked_state_bounds
+from obsynth.numerics.ranks import covariance_factor, rounding_rank
+from obsynth.observers.outliers import Outliers
+from obsynth.observers.running import StepSettings
 from obsynth.plants.sequences import MatrixSequence
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 
@@ -83,7 +79,7 @@ class Adaptation:
 
 
 @dataclass(frozen=True, eq=False)
-class RecursiveSettings(Undelayed):
+class RecursiveSettings(StepSettings):
     """The fields of `obsynth.RecursiveObserver`, which is these with a recursion."""
 
     plant: TimeVaryingDescriptorSystem
@@ -99,9 +95,7 @@ class RecursiveSettings(Undelayed):
     state_bounds: FloatArray | None = None
 
     def __post_init__(self) -> None:
-        checked_limit(self.outliers, self.outlier_limit)
-        object.__setattr__(self, "sensors", checked_sensors(self.sensors, self.plant.output_names))
-        object.__setattr__(self, "state_bounds", checked_state_bounds(self.state_bounds, self.state_names))
+        self._check_options()
         plant = self.plant
         for name, size in (("Q", plant.ne), ("R", plant.ny)):
             shape = getattr(self, name).shape
@@ -124,11 +118,6 @@ class RecursiveSettings(Undelayed):
         return self.plant.dt
 
     @property
-    def state_names(self) -> tuple[str, ...]:
-        """The states that are estimated, in order."""
-        return self.plant.state_names
-
-    @property
     def fault_names(self) -> tuple[str, ...]:
         """The parameters that are estimated, in order."""
         return () if self.adaptation is None else self.plant.parameter_names
@@ -147,21 +136,6 @@ class RecursiveSettings(Undelayed):
     def innovation_count(self) -> int:
         """Numbers in an innovation: what equations and outputs say beyond the state."""
         return self.plant.ne + self.plant.ny - self.plant.nx
-
-    @cached_property
-    def timing(self) -> SensorTiming:
-        """When each sensor is sampled, and how late its values are."""
-        return SensorTiming.of(self.sensors, self.plant.output_names, self.plant.nu)
-
-    @property
-    def is_plain(self) -> bool:
-        """Whether every sensor is sampled at each row, at once, and no state has bounds."""
-        return self.timing.is_plain and self.state_bounds is None
-
-    @property
-    def order(self) -> int:
-        """Number of states and parameters in its state."""
-        return self.plant.nx + len(self.fault_names)
 
     def as_dict(self) -> dict[str, Any]:
         """Return every field as data."""
@@ -188,7 +162,3 @@ class RecursiveSettings(Undelayed):
             None if data["adaptation"] is None else Adaptation(**data["adaptation"]), data["early_constraints"],
             data.get("outliers", "none"), data.get("outlier_limit"), data.get("sensors"), data.get("state_bounds"),
         )  # fmt: skip
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return what makes it again in another process: its recursion is made there anew."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}

@@ -2,63 +2,48 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import UNDETERMINED_SHARE
-from obsynth.numerics.square_root_smoothing import Gaussian, WayBack, nothing_later, stepped_back
-from obsynth.observers.state_bounds import projected
+from obsynth.numerics.square_root_estimation import Gaussian, WayBack, nothing_later, stepped_back
+from obsynth.observers.outliers import projected
 
 
 class Lesson(NamedTuple):
-    """What the samples up to one, and that one itself, say of constant parameters.
+    """What the samples up to one, and that one itself, say of constant parameters."""
 
-    Fields: theta: ``(nq,)``: the estimate; triangle: ``(any, nq)``: its weight is ``triangle' triangle``; spread:
-    ``(nq, any)``: square root of its covariance; v, G: ``v = G theta + noise`` of this sample, ``(m,)`` and ``(m,
-    nq)``; noise: ``(m, any)``: square root of the covariance of that noise, in units of the weight; is_reset: Whether
-    what was learnt before this sample was forgotten at it.
-    """
-
-    theta: FloatArray
-    triangle: FloatArray
-    spread: FloatArray
-    v: FloatArray
+    theta: FloatArray  # ``(nq,)``: the estimate
+    triangle: FloatArray  # ``(any, nq)``: its weight is ``triangle' triangle``
+    spread: FloatArray  # ``(nq, any)``: square root of its covariance
+    v: FloatArray  # v, G: ``v = G theta + noise`` of this sample, ``(m,)`` and ``(m, nq)``
     G: FloatArray
-    noise: FloatArray
-    is_reset: bool = False
+    noise: FloatArray  # ``(m, any)``: square root of the covariance of that noise, in units of the weight
+    is_reset: bool = False  # whether what was learnt before this sample was forgotten at it
 
 
 class Node(NamedTuple):
-    """One sample of the chain: ``x = origin [1; theta] + factor c + diffuse d`` with parameters theta.
+    """One sample of the chain: ``x = origin [1; theta] + factor c + diffuse d`` with parameters theta."""
 
-    Fields: origin: ``(n, 1 + nq)`` of constant parameters, ``(n, 1)`` where they are among the states or none; factor:
-    ``(n, any)``; diffuse: ``(n, r)``; back: To the coordinates of the sample before; `None` at the first; lesson: Of
-    constant parameters; `None` where there are none.
-    """
-
-    origin: FloatArray
-    factor: FloatArray
-    diffuse: FloatArray
-    back: WayBack | None
-    lesson: Lesson | None = None
+    origin: FloatArray  # ``(n, 1 + nq)`` of constant parameters, ``(n, 1)`` where they are among the states or none
+    factor: FloatArray  # ``(n, any)``
+    diffuse: FloatArray  # ``(n, r)``
+    back: WayBack | None  # to the coordinates of the sample before; `None` at the first
+    lesson: Lesson | None = None  # of constant parameters; `None` where there are none
 
 
 class Smoothed(NamedTuple):
-    """One smoothed sample.
+    """One smoothed sample."""
 
-    Fields: x: ``(n,)``; factor: ``(n, any)``: square root of its covariance; diffuse: ``(n, r)``: directions about
-    which nothing is known; theta: ``(nq,)``; spread: ``(nq, any)``: square root of their covariance; both empty where
-    parameters are among the states.
-    """
-
-    x: FloatArray
-    factor: FloatArray
-    diffuse: FloatArray
-    theta: FloatArray
+    x: FloatArray  # ``(n,)``
+    factor: FloatArray  # ``(n, any)``: square root of its covariance
+    diffuse: FloatArray  # ``(n, r)``: directions about which nothing is known
+    theta: FloatArray  # ``(nq,)``
+    # ``(nq, any)``: square root of their covariance; both empty where parameters are among the states
     spread: FloatArray
 
 
@@ -66,13 +51,11 @@ class LaterLessons:
     """Constant parameters from the samples after one, with weights that fall by the forgetting factor.
 
     They are independent of what the sample itself has learnt, and of the errors of the states at given parameters.
-
-    Fields: forgetting: lambda; triangle: ``(any, nq + 1)``: weight and weighted data; noise: ``(nq, any)``: square root
-    of the covariance of the weighted sum.
     """
 
     def __init__(self, forgetting: float, nq: int) -> None:
         self.forgetting = forgetting
+        # Weight and weighted data ``(any, nq + 1)``; square root of the covariance of the weighted sum ``(nq, any)``.
         self.triangle, self.noise = np.zeros((0, nq + 1)), np.zeros((nq, 0))
 
     def add(self, lesson: Lesson) -> None:
@@ -100,23 +83,25 @@ class LaterLessons:
         return theta, np.asarray(np.linalg.solve(triangle, np.linalg.solve(triangle.T, sums)))
 
 
-@dataclass(frozen=True)
-class Links:
-    """How an observer makes a chain.
+class Links(ABC):
+    """How an observer makes a chain."""
 
-    Fields: first: From the state after the first sample and its row to its node; next: From the node before, the states
-    before and after a sample, its row and its input to its node; begun: From the state at which a run went on to the
-    node it stands for; forgetting: lambda of constant parameters; bounds:
-    ``(nx, 2)``, of the states; lower, upper: ``(nq,)``, of the parameters.
-    """
-
-    first: Callable[[Any, Any, FloatArray], Node]
-    next: Callable[[Node, Any, Any, Any, FloatArray], Node]
-    begun: Callable[[Any], Node]
-    forgetting: float = 1.0
-    bounds: FloatArray | None = None
-    lower: FloatArray | None = None
+    forgetting = 1.0  # lambda of constant parameters
+    bounds: FloatArray | None = None  # ``(nx, 2)``, of the states
+    lower: FloatArray | None = None  # ``(nq,)``, of the parameters, as `upper`
     upper: FloatArray | None = None
+
+    @abstractmethod
+    def begun(self, state: Any) -> Node:
+        """Return the node of a state from which a chain begins."""
+
+    def first(self, after: Any, row: Any, u: FloatArray) -> Node:
+        """Return the node of k = 0 from the state after it and its row."""
+        return self.begun(after)
+
+    @abstractmethod
+    def next(self, node: Node, before: Any, after: Any, row: Any, u: FloatArray) -> Node:
+        """Return the node of the next sample, from the states before and after it, its row and its input."""
 
 
 def smoothed_from(links: Links, nodes: Sequence[Node], begin: int, end: int) -> list[Smoothed]:
@@ -154,17 +139,6 @@ def _smoothed(links: Links, node: Node, known: Gaussian, later: LaterLessons) ->
         states = slice(0, len(links.bounds))
         estimate[states] = projected(estimate[states], factor[states], links.bounds)
     return Smoothed(estimate, factor, diffuse, theta, spread)
-
-
-def all_smoothed(links: Links, nodes: Sequence[Node], lag: int | None) -> list[Smoothed]:
-    """Return every sample, from the whole chain or from ``lag`` samples after it."""
-    last = len(nodes) - 1
-    if not nodes:
-        return []
-    if lag is None or lag >= last:
-        return smoothed_from(links, nodes, 0, last)
-    found = [smoothed_from(links, nodes, i, i + lag)[0] for i in range(last - lag)]
-    return found + smoothed_from(links, nodes, last - lag, last)
 
 
 def deviations_in(factor: FloatArray, diffuse: FloatArray) -> FloatArray:

@@ -17,19 +17,15 @@ from obsynth.observers.estimates import Estimates
 from obsynth.observers.records import measured_record, whole_record
 from obsynth.observers.recursive.estimates import recursive_estimates
 from obsynth.observers.recursive.observer import RecursiveObserver
-from obsynth.observers.smoothing.chain import Links, Node, Smoothed, all_smoothed, deviations_in, smoothed_from
-from obsynth.observers.smoothing.dae_links import dae_links
-from obsynth.observers.smoothing.recursive_links import recursive_links
+from obsynth.observers.smoothing.chain import Links, Node, Smoothed, deviations_in, smoothed_from
+from obsynth.observers.smoothing.links import links_of
 from obsynth.plants.dae.checks import checked_inputs
 
 SmoothedObserver = RecursiveObserver | DAEObserver
 
 
 class Chain:
-    """The samples of one run from its start, or from where it went on.
-
-    Fields: nodes, rows: One for each sample that is kept; begin: The k of the first of them.
-    """
+    """The samples of one run from its start, or from where it went on; the first that is kept is at k ``begin``."""
 
     def __init__(self) -> None:
         self.nodes: list[Node] = []
@@ -70,15 +66,11 @@ class Chain:
 
 
 class KeepingObserver:
-    """An observer that adds each sample it takes to a chain; a new start begins a new one.
-
-    Fields: observer: What runs; chain: Of the last start.
-    """
+    """An observer that adds each sample it takes to a chain; a new start begins a new one."""
 
     def __init__(self, observer: SmoothedObserver) -> None:
         self.observer = observer
-        self.links = recursive_links(observer.recursion) if isinstance(observer, RecursiveObserver) else dae_links(
-            observer.steps)  # fmt: skip
+        self.links = links_of(observer)
         self.chain = Chain()
 
     def __getattr__(self, name: str) -> Any:
@@ -140,10 +132,7 @@ def checked_lag(lag: Any) -> int | None:
 
 
 def smoothed_record(observer: SmoothedObserver, y: ArrayLike, u: ArrayLike | None, lag: int | None) -> Estimates:
-    """Return smoothed estimates of a whole record of arrays.
-
-    Shapes: ``y (samples, ny)``, ``u (samples, nu)``.
-    """
+    """Return smoothed estimates of a whole record of arrays: ``y (samples, ny)``, ``u (samples, nu)``."""
     if isinstance(observer, RecursiveObserver):
         outputs, inputs = whole_record(y, u, observer.plant.ny, observer.plant.nu)
     else:
@@ -153,14 +142,10 @@ def smoothed_record(observer: SmoothedObserver, y: ArrayLike, u: ArrayLike | Non
         return observer.run(outputs, inputs)
     kept = KeepingObserver(observer)
     state, found = kept.init(), []
-    is_late = lag is not None and observer.timing.longest > 0
     for k in range(len(outputs)):
         state, _ = kept.accept(state, outputs[k], inputs[k])
-        if is_late and lag is not None and k >= lag:
+        if lag is not None and k >= lag:
             # Values that come later than that change the samples behind them.
             found.append(kept.chain.smoothed(kept.links, k - lag, k)[0])
-    if is_late:
-        found += kept.chain.smoothed(kept.links, len(found), len(outputs) - 1)
-    else:
-        found = all_smoothed(kept.links, kept.chain.nodes, lag)
+    found += kept.chain.smoothed(kept.links, len(found), len(outputs) - 1)
     return smoothed_estimates(observer, kept.chain.rows, found)

@@ -13,8 +13,7 @@ from obsynth.numerics.arguments import is_finite_number, real_array
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.expressions import CONSTANTS, DECIDING_WORDS, FUNCTIONS, FUNCTIONS_OF_TWO
 from obsynth.plants.dae.symbols import DAEFields, DAESymbols, symbols_of
-from obsynth.plants.names import checked_names
-from obsynth.plants.validation import Problems
+from obsynth.plants.validation import Problems, checked_names
 
 #: Names that mean something else in the language.
 RESERVED = frozenset({*CONSTANTS, *FUNCTIONS, *FUNCTIONS_OF_TWO, *DECIDING_WORDS, "der", "where"})
@@ -79,10 +78,9 @@ def check_structure(model: DAEFields, problems: Problems) -> None:
     """Note what is wrong with the equations as a whole: their number, empty ones, signals that enter nothing."""
     symbols = problems.collect(lambda: symbols_of(model))
     problems.raise_if_any()
-    for check in (
-        _square, _only_states_stored, _no_empty_equation, _every_input_used, _every_parameter_used, _every_output_sees,
-    ):  # fmt: skip
+    for check in (_square, _only_states_stored, _no_empty_equation):
         problems.collect(partial(check, model, symbols))
+    _every_signal_used(model, symbols, problems)
 
 
 def _square(model: DAEFields, symbols: DAESymbols) -> None:
@@ -134,34 +132,24 @@ def _no_empty_equation(model: DAEFields, symbols: DAESymbols) -> None:
         raise SpecError(f"The state {name!r} enters no equation: nothing determines it.", path=f"states.{name}")
 
 
-def _every_input_used(model: DAEFields, symbols: DAESymbols) -> None:
+def _every_signal_used(model: DAEFields, symbols: DAESymbols, problems: Problems) -> None:
+    """Note the first input and parameter that enter nothing, and the first output that nothing enters."""
     import casadi as ca
 
     # What an output must not contain is said elsewhere.
-    used = _depends(ca.vertcat(symbols.equations, symbols.stored, symbols.outputs), symbols.u).any(axis=0)
-    for name, enters in zip(model.input_names, used, strict=True):
-        if not enters:
-            raise SpecError(f"The input {name!r} enters no equation: remove it, or use it.", path=f"inputs.{name}")
-
-
-def _every_parameter_used(model: DAEFields, symbols: DAESymbols) -> None:
-    import casadi as ca
-
-    used = _depends(ca.vertcat(symbols.equations, symbols.stored, symbols.outputs), symbols.theta).any(axis=0)
-    for name, enters in zip(model.parameter_names, used, strict=True):
-        if not enters:
-            raise SpecError(f"The parameter {name!r} enters no equation and no output: remove it, or use it.",
-                            path=f"parameters.{name}")  # fmt: skip
-
-
-def _every_output_sees(model: DAEFields, symbols: DAESymbols) -> None:
-    import casadi as ca
-
+    everything = ca.vertcat(symbols.equations, symbols.stored, symbols.outputs)
     seen = _depends(symbols.outputs, ca.vertcat(symbols.x, symbols.theta)).any(axis=1)
-    for name, sees in zip(model.output_names, seen, strict=False):
-        if not sees:
-            raise SpecError(f"The output {name!r} contains neither a state nor a parameter: it tells nothing.",
-                            path=f"outputs.{name}")  # fmt: skip
+    for path, names, used, text in (
+        ("inputs", model.input_names, _depends(everything, symbols.u).any(axis=0),
+         "The input {!r} enters no equation: remove it, or use it."),
+        ("parameters", model.parameter_names, _depends(everything, symbols.theta).any(axis=0),
+         "The parameter {!r} enters no equation and no output: remove it, or use it."),
+        ("outputs", model.output_names, seen, "The output {!r} contains neither a state nor a parameter: it tells "
+         "nothing."),
+    ):  # fmt: skip
+        idle = [name for name, enters in zip(names, used, strict=False) if not enters]
+        if idle:
+            problems.note(text.format(idle[0]), f"{path}.{idle[0]}")
 
 
 def step_length(dt: Any) -> float:
@@ -218,7 +206,5 @@ def _depends(expressions: Any, symbols: Any) -> Any:
     """Return which expression ``(rows)`` contains which symbol ``(columns)``."""
     import casadi as ca
 
-    pattern = ca.jacobian_sparsity(expressions, symbols) if hasattr(ca, "jacobian_sparsity") else None
-    if pattern is None:
-        pattern = ca.jacobian(expressions, symbols).sparsity()
+    pattern = ca.jacobian_sparsity(expressions, symbols)
     return np.array(ca.DM(pattern, 1.0).full() != 0.0).reshape(expressions.numel(), symbols.numel())

@@ -1,11 +1,9 @@
-"""Compiled evaluation of a DAE: the residual of one implicit step and the outputs, with exact derivatives.
-
-Many samples in one call, and single samples where such a call cannot go on.
-"""
+"""Compiled evaluation of a DAE with exact derivatives: one implicit step, outputs, and its equations at one point."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -28,10 +26,7 @@ BUTCHER: dict[str, FloatArray] = {
 
 
 class Compiled:
-    """A CasADi function that is called on float arrays without conversion.
-
-    Fields: function: Of columns, with dense results.
-    """
+    """A CasADi function of columns that is called on float arrays without conversion."""
 
     def __init__(self, function: Any) -> None:
         # CasADi's own annotations of these two do not fit what they return.
@@ -61,10 +56,7 @@ class Compiled:
 
 
 class DAEFunctions:
-    """What an observer or a simulation needs of a model, compiled.
-
-    Fields: model: The model; method: The implicit method.
-    """
+    """What an observer or a simulation needs of a model, compiled, for an implicit method."""
 
     def __init__(self, model: DAEModel, method: str = "backward-euler") -> None:
         if method not in BUTCHER:
@@ -77,10 +69,7 @@ class DAEFunctions:
         self.residual, self._outputs = Compiled(self.residual_function), Compiled(self.output_function)
 
     def outputs(self, x: FloatArray, theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return ``y (ny,)``, ``H = dh/dx (ny, nx)`` and ``L = dh/dtheta (ny, nq)``.
-
-        Shapes: ``x (nx,)``, ``theta (nq,)``.
-        """
+        """Return ``y (ny,)``, ``H = dh/dx (ny, nx)`` and ``L = dh/dtheta (ny, nq)`` at ``x (nx,)``, ``theta (nq,)``."""
         y, H, L = self._outputs(x, theta)
         return y[:, 0], H, L
 
@@ -144,3 +133,49 @@ def take_samples(
             alone(k)
             k += 1
         note(k)
+
+
+@dataclass(frozen=True, eq=False)
+class LocalEquations:
+    """``G(x', x, u, theta) = F(q_x x', x, u, theta)`` and ``h(x, theta)`` with their Jacobians at a point."""
+
+    value: FloatArray
+    E: FloatArray
+    by_state: FloatArray
+    by_input: FloatArray
+    by_parameter: FloatArray
+    y: FloatArray
+    C: FloatArray
+    outputs_by_parameter: FloatArray
+
+    @property
+    def is_defined(self) -> bool:
+        """Whether every number is finite."""
+        return all(np.isfinite(part).all() for part in vars(self).values())
+
+
+def local_equations(
+    model: DAEModel, rates: FloatArray, x: FloatArray, u: FloatArray, theta: FloatArray
+) -> LocalEquations:
+    """Return the equations at derivatives ``(nx,)``, states ``(nx,)``, inputs ``(nu,)`` and parameters ``(nq,)``."""
+    found = [np.array(part.full()) for part in symbolic_equations(model)(rates, x, u, theta)]
+    value, E, by_state, by_input, by_parameter, y, C, outputs_by_parameter = found
+    return LocalEquations(value[:, 0], E, by_state, by_input, by_parameter, y[:, 0], C, outputs_by_parameter)
+
+
+def symbolic_equations(model: DAEModel) -> Any:
+    """Return CasADi's function from derivatives, states, inputs and parameters to the fields of `LocalEquations`."""
+    if ("local",) not in model.graphs:
+        model.graphs[("local",)] = _function(model)
+    return model.graphs[("local",)]
+
+
+def _function(model: DAEModel) -> Any:
+    import casadi as ca
+
+    s = symbols_of(model)
+    rates = ca.SX.sym("rates", model.nx)
+    value = ca.substitute(s.equations, s.rates, ca.jacobian(s.stored, s.x) @ rates)
+    parts = [value, *(ca.jacobian(value, by) for by in (rates, s.x, s.u, s.theta))]
+    parts += [s.outputs, ca.jacobian(s.outputs, s.x), ca.jacobian(s.outputs, s.theta)]
+    return ca.Function("local", [rates, s.x, s.u, s.theta], [ca.densify(part) for part in parts])

@@ -1,14 +1,11 @@
 """One implicit step of a DAE: Newton, then homotopy in the input, with sensitivities and the residual that is left.
 
-One implicit step of a DAE as CasADi functions: a Newton iteration, the whole step, and its sensitivities.
-
-The iteration is the undamped one of `obsynth.numerics.newton`.  Where that would damp, lead the input along a homotopy,
-or give up, the whole step says that it is not to be trusted, and the caller takes `ImplicitStep.solve`.
+As CasADi functions the iteration is the undamped one of `obsynth.numerics.newton`; where that would damp, lead the
+input along a homotopy, or give up, the step is not to be trusted, and `ImplicitStep.solve_carefully` takes it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -17,8 +14,17 @@ import numpy as np
 
 from obsynth.errors import SolverError
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.newton import LARGEST_RESIDUAL, LAST_STEP, MOST_ITERATIONS, NewtonResult, condition_number, newton
-from obsynth.numerics.symbolic_solve import SMALL, equilibrated, solved
+from obsynth.numerics.newton import (
+    LARGEST_RESIDUAL,
+    LAST_STEP,
+    MOST_ITERATIONS,
+    SMALL,
+    NewtonResult,
+    condition_number,
+    equilibrated,
+    newton,
+    solved,
+)
 from obsynth.plants.dae.functions import Compiled, DAEFunctions
 
 #: Iterations that every step takes, and further ones in blocks for those that need them.  From the last sample's state
@@ -28,13 +34,11 @@ BLOCKS = (4, 4, 8, MOST_ITERATIONS - 16)
 
 @dataclass(frozen=True, eq=False)
 class StepGraph:
-    """The functions of one implicit step of fixed length.
+    """The functions of one implicit step of fixed length; ``small``: whether all is scalar operations.
 
-    Fields: newton: From stages, state before, input and parameters to the residual, its scale by rows, and the Newton
-    step; sensitivities: From the same to F ``(nx, nx)`` of (8), G ``(nx, nq)`` of (9), the derivative with respect to
-    what is added to the equations ``(nx, nx)``, and the equilibrated matrix of (7); step: From state before, input and
-    parameters to stages, scaled residual, and one if the step is to be trusted; small: Whether everything is scalar
-    operations.
+    ``newton``: from stages, state before, input and parameters to residual, row scales and Newton step;
+    ``sensitivities``: to F ``(nx, nx)`` of (8), G ``(nx, nq)`` of (9), that of what is added to the equations, and the
+    equilibrated matrix of (7); ``step``: from state, input, parameters to stages, residual, and one if it is trusted.
     """
 
     newton: Any
@@ -141,10 +145,9 @@ MOST_SUBSOLVES = 10_000
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """The state at the end of a step.
+    """The state ``x (nx,)`` at the end of a step, its ``stages``, the largest residual in sizes of the states.
 
-    Fields: x: ``(nx,)``; stages: ``(stages * nx,)``; residual: Largest residual in units of the states' sizes;
-    subsolves: Newton iterations that were started: 1, or more where a homotopy was needed.
+    ``subsolves``: Newton iterations that were started: 1, or more where a homotopy was needed.
     """
 
     x: FloatArray
@@ -155,11 +158,9 @@ class Solution:
 
 @dataclass(frozen=True, eq=False)
 class Sensitivities:
-    """Derivatives of a step.
+    """Derivatives of a step by the state before, F (8), the parameters, G (9), and what is added to the equations.
 
-    Fields: F: ``(nx, nx)``: with respect to the state before, (8); G: ``(nx, nq)``: with respect to the parameters,
-    (9); noise: ``(nx, nx)``: with respect to what is added to the right sides of the equations; condition: Condition
-    number of the equilibrated matrix of (7).
+    ``condition``: of the equilibrated matrix of (7).
     """
 
     F: FloatArray
@@ -169,11 +170,10 @@ class Sensitivities:
 
 
 class ImplicitStep:
-    """Steps of a fixed length.
+    """Steps of a fixed length dt in s.
 
-    Fields: functions: The compiled model, with its method of integration; dt: Seconds, positive; largest_move: In sizes
-    of the states: a solution further away than this is taken only along a homotopy none of whose parts is longer, so
-    that of several roots the one connected with the last is found.
+    A solution further away than ``largest_move`` (in sizes of the states) is taken only along a homotopy none of whose
+    parts is longer, so that of several roots the one connected with the last is found.
     """
 
     def __init__(self, functions: DAEFunctions, dt: float, *, largest_move: float | None = None) -> None:
@@ -197,10 +197,7 @@ class ImplicitStep:
     def solve(
         self, x: FloatArray, u: FloatArray, theta: FloatArray, *, before: FloatArray | None = None, k: int = 0
     ) -> Solution:
-        """Return the state after one step.
-
-        Shapes: ``x (nx,)``, ``u (nu,)``, ``theta (nq,)``, ``before (nu,)``.
-        """
+        """Return the state after one step from ``x (nx,)`` with ``u (nu,)``, ``theta (nq,)``; ``before``: last u."""
         stages, residual, trusted = self._fast(x, u, theta)
         if trusted[0, 0] == 1.0:
             return Solution(stages[-self.functions.model.nx :, 0], stages[:, 0], float(residual[0, 0]), 1)
@@ -231,18 +228,13 @@ class ImplicitStep:
         return float(np.abs((stages - start) / self.sizes).max())
 
     def _newton(self, start: FloatArray, x: FloatArray, u: FloatArray, theta: FloatArray) -> NewtonResult:
-        return newton(self._evaluation(x, u, theta), start, self.sizes)
-
-    def _evaluation(
-        self, x: FloatArray, u: FloatArray, theta: FloatArray
-    ) -> Callable[[FloatArray], tuple[FloatArray, FloatArray]]:
         dt = np.array([self.dt])
 
         def evaluate(stages: FloatArray) -> tuple[FloatArray, FloatArray]:
             value, jacobian = self.functions.residual(stages, x, u, theta, dt)
             return value[:, 0], jacobian
 
-        return evaluate
+        return newton(evaluate, start, self.sizes)
 
     def _homotopy(
         self, start: FloatArray, x: FloatArray, before: FloatArray, u: FloatArray, theta: FloatArray, k: int

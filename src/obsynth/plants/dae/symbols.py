@@ -71,10 +71,9 @@ class DAEFields:
 
 @dataclass(frozen=True, eq=False)
 class DAESymbols:
-    """``F(q', x, u, theta) = 0`` and ``y = h(x, theta)`` with ``q = q(x, theta)``, as CasADi SX columns.
+    """``F(q', x, u, theta) = 0`` and ``y = h(x, theta)`` with ``q = q(x, theta)``, as columns of CasADi's SX.
 
-    Fields: rates, x, u, theta: The free symbols; ``rates`` ``(nq,)`` stands for q'; equations: ``(n,)``; stored:
-    ``(nq,)``: the quantities whose derivatives occur; outputs: ``(ny,)``.
+    ``rates`` stands for q'; ``stored``: the quantities q whose derivatives occur.
     """
 
     rates: Any
@@ -108,7 +107,7 @@ def _from_texts(model: DAEFields, equations: Mapping[str, str]) -> DAESymbols:
     for names, column in ((model.state_names, x), (model.input_names, u), (model.parameter_names, theta)):
         known |= {name: column[i] for i, name in enumerate(names)}
     for name, text in model.definitions.items():
-        known[name] = _value(_parsed(text, f"definitions.{name}"), known, f"definitions.{name}")
+        known[name] = _text_value(text, known, f"definitions.{name}")
     parsed = {name: _equation(text, f"equations.{name}") for name, text in equations.items()}
     stored: dict[str, Any] = {}
     for name, expression in parsed.items():
@@ -117,18 +116,15 @@ def _from_texts(model: DAEFields, equations: Mapping[str, str]) -> DAESymbols:
     rates = ca.SX.sym("rates", len(stored))
     with_rates = known | {key: rates[i] for i, key in enumerate(stored)}
     rows = [_value(expression, with_rates, f"equations.{name}") for name, expression in parsed.items()]
-    seen = [
-        _value(_parsed(text, f"outputs.{name}"), known, f"outputs.{name}")
-        for name, text in _texts(model.outputs).items()
-    ]
+    if callable(model.outputs):
+        raise SpecError("The equations are texts, but the outputs are a function: give both in one way.",
+                        path="outputs")  # fmt: skip
+    seen = [_text_value(text, known, f"outputs.{name}") for name, text in model.outputs.items()]
     return DAESymbols(rates, x, u, theta, ca.vertcat(*rows), ca.vertcat(*stored.values()), ca.vertcat(*seen))
 
 
-def _texts(outputs: Mapping[str, str] | Callable[..., Any]) -> Mapping[str, str]:
-    if callable(outputs):
-        raise SpecError("The equations are texts, but the outputs are a function: give both in one way.",
-                        path="outputs")  # fmt: skip
-    return outputs
+def _text_value(text: str, known: Mapping[str, Any], path: str) -> Any:
+    return _value(_parsed(text, path), known, path)
 
 
 def _parsed(text: str, path: str, *, rates: bool = False) -> Expression:
@@ -170,7 +166,7 @@ def _translation(operation: Callable[..., Any]) -> Callable[..., Any]:
     import casadi as ca
 
     special: dict[Callable[..., Any], Callable[..., Any]] = {
-        np.add: lambda a, b: ca.plus(a, b), np.subtract: lambda a, b: ca.minus(a, b), np.multiply: ca.times,
+        np.add: ca.plus, np.subtract: ca.minus, np.multiply: ca.times,
         np.divide: ca.rdivide, np.power: ca.power, np.negative: lambda a: -a, np.arcsin: ca.asin, np.arccos: ca.acos,
         np.arctan: ca.atan, np.abs: ca.fabs, np.minimum: ca.fmin, np.maximum: ca.fmax,
         step_function: lambda a: ca.if_else(a >= 0.0, 1.0, 0.0), np.where: ca.if_else, np.less: ca.lt,
@@ -178,10 +174,7 @@ def _translation(operation: Callable[..., Any]) -> Callable[..., Any]:
     }  # fmt: skip
     found = special.get(operation) or getattr(ca, operation.__name__)
 
-    def applied(*values: Any) -> Any:
-        return found(*(ca.SX(value) for value in values))
-
-    return applied
+    return lambda *values: found(*(ca.SX(value) for value in values))
 
 
 def _from_functions(model: DAEFields) -> DAESymbols:
@@ -203,16 +196,14 @@ def _called(function: Callable[..., Any], columns: Sequence[Any], path: str) -> 
     import casadi as ca
 
     arguments = [[column[i] for i in range(column.numel())] for column in columns]
-    mode = ca.GlobalOptions.getNumpyMode() if hasattr(ca.GlobalOptions, "getNumpyMode") else None
+    mode = ca.GlobalOptions.getNumpyMode()
+    ca.GlobalOptions.setNumpyMode(1)
     try:
-        if mode is not None:
-            ca.GlobalOptions.setNumpyMode(1)
         found = function(*arguments)
-        if isinstance(found, (list, tuple, np.ndarray, ca.SX)):
-            entries = ca.vertsplit(ca.vec(found)) if isinstance(found, ca.SX) else list(found)
-            column = ca.vertcat(*(ca.SX(entry) for entry in entries)) if entries else ca.SX(0, 1)
-        else:
+        if not isinstance(found, (list, tuple, np.ndarray, ca.SX)):
             raise SpecError(f"The function {path} must return a list with one expression for each entry.", path=path)
+        entries = ca.vertsplit(ca.vec(found)) if isinstance(found, ca.SX) else list(found)
+        column = ca.vertcat(*(ca.SX(entry) for entry in entries)) if entries else ca.SX(0, 1)
     except (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
         if "truth value" in str(error):
             raise SpecError(
@@ -221,8 +212,7 @@ def _called(function: Callable[..., Any], columns: Sequence[Any], path: str) -> 
             ) from error  # fmt: skip
         raise _not_symbolic(path, len(columns), f"{type(error).__name__}: {str(error).splitlines()[0]}") from error
     finally:
-        if mode is not None:
-            ca.GlobalOptions.setNumpyMode(mode)
+        ca.GlobalOptions.setNumpyMode(mode)
     if _holds_nan(column, columns):
         # A symbol made into a number, such as by the functions of `math`.
         raise _not_symbolic(path, len(columns), "an expression is not a number")

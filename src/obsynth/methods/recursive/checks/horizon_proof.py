@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from itertools import chain, repeat
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray
@@ -21,7 +22,7 @@ from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.recursive.step_model import EarlyConstraintSteps, StepMatrices
 from obsynth.proofs.balls import Ball, rounded_up
 from obsynth.proofs.definiteness import prove_positive_definite
-from obsynth.proofs.error_products import AT_ONCE, logarithm_of_product, product_of_stack, stacked_product
+from obsynth.proofs.products import AT_ONCE, logarithm_of_product, product_of_stack, stacked_product
 from obsynth.results.checks import Check, information, upper_bound_check
 from obsynth.verification.identities import EQUALITY_TOLERANCE
 
@@ -150,7 +151,7 @@ def _closed(
 def largest_bias(pairs: list[tuple[StepMatrices, GainStep]], units: FloatArray) -> float:
     """Return the largest entry of ``[L K] H - I`` in units of the terms of its row, rounded up."""
     gains, matrices = np.array([found.gain for _, found in pairs]), np.array([step.H for step, _ in pairs])
-    middle, radius = stacked_product((gains, np.zeros_like(gains)), (matrices, np.zeros_like(matrices)))
+    middle, radius = _product(gains, matrices)
     one = np.eye(middle.shape[1])
     missed = rounded_up(np.abs(middle - one) + radius, 3)
     # An entry is judged by what rounding of its whole row does to it, in natural units of the states.
@@ -161,18 +162,21 @@ def largest_bias(pairs: list[tuple[StepMatrices, GainStep]], units: FloatArray) 
 _Stack = tuple[FloatArray, FloatArray]
 
 
+def _product(first: ArrayLike, second: FloatArray) -> _Stack:
+    """Return balls that hold the products of two stacks of exact matrices."""
+    left = np.asarray(first, dtype=np.float64)
+    return stacked_product((left, np.zeros_like(left)), (second, np.zeros_like(second)))
+
+
 def _transitions(pairs: list[tuple[StepMatrices, GainStep]]) -> tuple[_Stack, _Stack | None]:
     """Return balls of ``L A`` and, with parameters, of the transition of both errors."""
     ne = pairs[0][0].A.shape[0]
     a = np.array([step.A for step, _ in pairs])
-    zero = np.zeros_like(a)
-    gains = np.array([found.gain[:, :ne] for _, found in pairs])
-    middle, radius = stacked_product((gains, np.zeros_like(gains)), (a, zero))
+    middle, radius = _product([found.gain[:, :ne] for _, found in pairs], a)
     nq, nx = pairs[0][1].forget.shape[0], middle.shape[1]
     if not nq:
         return (middle, radius), None
-    learn = np.array([found.learn[:, :ne] for _, found in pairs])
-    taken, taken_radius = stacked_product((learn, np.zeros_like(learn)), (a, zero))
+    taken, taken_radius = _product([found.learn[:, :ne] for _, found in pairs], a)
     whole, whole_radius = (np.zeros((len(pairs), nx + nq, nx + nq)) for _ in range(2))
     whole[:, :nx, :nx], whole_radius[:, :nx, :nx] = middle, radius
     whole[:, nx:, :nx], whole_radius[:, nx:, :nx] = taken, taken_radius
@@ -186,8 +190,7 @@ def _mean_factor(found: _Followed, factor: FloatArray) -> tuple[float, str]:
     bound = logarithm_of_product(errors)
     if bound < 0.0:
         return float(np.exp(bound / steps)), "from the start"
-    sizes = np.sqrt(np.einsum("ij,ij->i", factor, factor))
-    units = np.exp2(np.round(np.log2(np.where(sizes > 0.0, sizes, 1.0))))
+    units = _deviations(factor)
     bound = logarithm_of_product(errors, units)
     if bound < 0.0:
         return float(np.exp(bound / steps)), "from the start, in units of the last deviations"
@@ -195,6 +198,12 @@ def _mean_factor(found: _Followed, factor: FloatArray) -> tuple[float, str]:
     late = logarithm_of_product(errors[half:], units)
     mean = late / sum(found.lengths[half:])
     return float(np.exp(min(mean, 0.0))), "over the second half, in units of the last deviations"
+
+
+def _deviations(factor: FloatArray) -> FloatArray:
+    """Return the deviations of a covariance ``factor factor'``, to powers of two; one where there is none."""
+    sizes = np.sqrt(np.einsum("ij,ij->i", factor, factor))
+    return np.exp2(np.round(np.log2(np.where(sizes > 0.0, sizes, 1.0))))
 
 
 def bias_row(proof: HorizonProof, condition: float) -> Check:
@@ -220,19 +229,34 @@ def parameter_row(proof: HorizonProof) -> Iterator[Check]:
     )  # fmt: skip
 
 
-def covariance_row(stated: RecursiveObserver, last: GainStep) -> Check:
+def covariance_row(stated: RecursiveObserver, shipped: RecursiveObserver, last: GainStep) -> Check:
     """Return the row that the covariance of the state after the last step is definite, as it is with definite noise."""
     factor = last.factor[: stated.plant.nx]
-    sizes = np.sqrt(np.einsum("ij,ij->i", factor, factor))
-    units = np.exp2(-np.round(np.log2(np.where(sizes > 0.0, sizes, 1.0))))
-    root = Ball.exact(units[:, None] * factor)
+    root = Ball.exact(factor / _deviations(factor)[:, None])
     proof = prove_positive_definite(root @ root.T)
     claim = "the covariance of the states after the last step is positive definite, in units of their deviations"
-    if proof.proved or noise_is_definite(stated):
+    definite = noise_is_definite(stated)
+    if definite and not proof.proved and noise_is_definite(shipped):
+        return definite_by_its_noise("covariance", claim, last.gain, last.step.H, natural_units(stated))
+    if definite or proof.proved:
         return Check("covariance", claim, proof.lower_bound, 0.0, proof.lower_bound, proof.proved,
                      "recomputed, the square root as computed", "proved", proof.text)  # fmt: skip
     return information("covariance", claim, proof.lower_bound, source="recomputed", detail="not definite, or not "
                        "proved to be: Q or R is singular, and what they hold exact is known exactly")  # fmt: skip
+
+
+def definite_by_its_noise(name: str, claim: str, gain: FloatArray, H: FloatArray, units: FloatArray) -> Check:
+    """Return the row that errors are never less than the last noise makes them: ``P >= [L K] diag(Q, R) [L K]'``.
+
+    Where Q and R are definite, that is definite if ``[L K]`` has full row rank, as it has with ``[L K] H`` near I.
+    """
+    units = units[: len(gain)]
+    missed = Ball.exact(gain) @ Ball.exact(H) - Ball.exact(np.eye(len(gain)))
+    scale = units[None, :] / units[:, None]  # powers of two
+    least = 1.0 - Ball(missed.midpoint * scale, rounded_up(missed.radius * scale, 1)).frobenius_norm
+    return Check(name, claim, least, 0.0, least, least > 0.0, "P >= L Q L' + K R K' with definite Q and R, outward "
+                 "rounded", "proved", "value: least singular value of [L K] [E; C] in natural units, which is to be "
+                 "above zero; the covariance as computed is too near a singular one to tell")  # fmt: skip
 
 
 def noise_is_definite(stated: RecursiveObserver) -> bool:

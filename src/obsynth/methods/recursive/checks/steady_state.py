@@ -8,10 +8,16 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 
 import numpy as np
 
-from obsynth.methods.recursive.checks.horizon_proof import largest_bias, natural_units, noise_is_definite
+from obsynth.methods.recursive.checks.horizon_proof import (
+    definite_by_its_noise,
+    largest_bias,
+    natural_units,
+    noise_is_definite,
+)
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.norms import spectral_radius
 from obsynth.observers.recursive.gain_schedule import GainStep
@@ -110,8 +116,13 @@ def _steady_covariance(
         f"standard deviations {', '.join(listed)}{more}; the filter itself, whose gains move on, ends at these or below"
     )
     source = "P = L A P A' L' + L Q L' + K R K', outward rounded"
-    if proof.proved or (certain and noise_is_definite(stated)):
-        return Check("steady state: covariance", claim, proof.lower_bound, 0.0, proof.lower_bound, proof.proved, source,
+    if proof.proved:
+        return Check("steady state: covariance", claim, proof.lower_bound, 0.0, proof.lower_bound, True, source,
                      "proved", detail)  # fmt: skip
+    if certain and noise_is_definite(stated):
+        plant = stated.plant
+        H = np.vstack([plant.E.at(1), plant.C.at(1)])
+        row = definite_by_its_noise("steady state: covariance", claim, np.hstack(gains), H, natural_units(stated))
+        return replace(row, detail=f"{detail}; {row.detail}")
     return information("steady state: covariance", "largest standard deviation that the listed gains lead to, enclosed",
                        float(np.max(high, initial=0.0)), source=source, status="proved", detail=detail)  # fmt: skip

@@ -1,9 +1,4 @@
-"""Numbers of a shipped observer, recomputed: stability, poles, rates, digits, noise.
-
-The letters of the gain set beside the realisation: what is listed must be what is shipped.
-
-Source: Share Pasand, Aliyari, Taghirad, eqs. (4), (12), (19), (20).
-"""
+"""Numbers of a shipped observer, recomputed: stability, poles, rates, digits, noise; and the letters of its gains."""
 
 from __future__ import annotations
 
@@ -15,45 +10,36 @@ from obsynth.methods.ui_pi_observer.augmented_plant import AugmentedPlant
 from obsynth.methods.ui_pi_observer.pencils import numbers
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.spectra import (
+    DOUBLE_DIGITS,
+    PRINTED_DIGITS,
     abscissa,
+    as_printed,
     certain_noise_covariance,
+    digits_needed,
     eigenvalues,
     farthest_pole,
     spectrum_error,
 )
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.exosystems import Exosystem
+from obsynth.plants.fault_models import Exosystem
 from obsynth.proofs.extended_balls import enclosed_eigenvalues, middle_of
 from obsynth.results.checks import Check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
-from obsynth.verification.certificates import decay_row, prove_stable
+from obsynth.verification.certificates import decay_row, stability_row
 from obsynth.verification.claims import UNCERTAIN
 from obsynth.verification.identities import Residual, equality, residual, worst
 
 #: Recomputed poles may miss the claimed ones by this, relative to their size; claimed rates and norms likewise.
 SPECTRUM_TOLERANCE = 1e-4
 CLAIM_TOLERANCE = 1e-4
-#: Significant digits with which gains are commonly printed in full: the observer must stay stable with them.
-PRINTED_DIGITS = 9
 
 
 def stability_rows(design: ObserverDesign, poles: FloatArray, factor: FloatArray) -> Iterator[Check]:
     """Yield the proof of stability, and what the eigenvalues say about the claims."""
     (plant, observer), claims = design.linear, design.certificate.claims
     dt = plant.dt
-    proof = prove_stable(observer.Az, factor, dt)
-    yield Check(
-        "stability",
-        "every error dies out: the Lyapunov inequality is positive definite",
-        proof.lower_bound,
-        0.0,
-        proof.lower_bound,
-        proof.proved,
-        "Share Pasand, eq. (7)",
-        "proved",
-        proof.text,
-    )
+    yield stability_row(observer.Az, factor, dt, "Share Pasand, eq. (7)")
     claimed = [complex(*row) for row in poles]
     yield upper_bound_check(
         "poles",
@@ -65,12 +51,18 @@ def stability_rows(design: ObserverDesign, poles: FloatArray, factor: FloatArray
     )
     if "decay" in claims:
         yield decay_row(observer.Az, dt, claims["decay"])
-    rounded = _rounded(observer.Az, PRINTED_DIGITS)
-    bound = 1.0 if dt > 0.0 else 0.0
-    found = abscissa(rounded, dt)
+    yield from _digits_rows(observer.Az, dt, claimed, claims)
+
+
+def _digits_rows(ahat: FloatArray, dt: float, poles: list[complex], claims: Mapping[str, float]) -> Iterator[Check]:
+    """Yield in how many digits Ahat has to be kept: as many as are commonly printed, or more where that is claimed."""
+    wanted = claims.get("digits", PRINTED_DIGITS)
+    digits = int(wanted) if 1 <= wanted <= DOUBLE_DIGITS else 1
+    rounded = as_printed(ahat, digits)
+    found, bound = abscissa(rounded, dt), 1.0 if dt > 0.0 else 0.0
     yield Check(
-        f"stable with {PRINTED_DIGITS} digits",
-        f"Ahat rounded to {PRINTED_DIGITS} significant digits is still stable (strictly below the bound)",
+        "stable with the claimed digits" if "digits" in claims else f"stable with {PRINTED_DIGITS} digits",
+        f"Ahat rounded to {digits} significant digits is still stable (strictly below the bound)",
         found,
         bound,
         bound - found,
@@ -80,9 +72,9 @@ def stability_rows(design: ObserverDesign, poles: FloatArray, factor: FloatArray
     yield information(
         "digits needed",
         "significant digits of Ahat with which every mode stays stable",
-        float(_least_digits(observer.Az, dt)),
+        float(digits_needed(ahat, dt)),
         source="recomputed eigenvalues",
-        detail=f"with {PRINTED_DIGITS} digits poles move by {spectrum_error(rounded, claimed, dt):.1e} of their size",
+        detail=f"with {digits} digits poles move by {spectrum_error(rounded, poles, dt):.1e} of their size",
     )
 
 
@@ -100,18 +92,6 @@ def _missed(a: FloatArray, claimed: list[complex], dt: float) -> float:
 def _some(poles: list[complex], most: int = 8) -> str:
     shown = numbers(sorted(poles, key=lambda pole: -pole.real))
     return "slowest " + ", ".join(shown[:most]) if shown else "none"
-
-
-def _rounded(matrix: FloatArray, digits: int) -> FloatArray:
-    """Return each entry as it is when printed with so many significant digits."""
-    text = np.char.mod(f"%.{digits - 1}e", matrix)
-    return np.asarray(text.astype(np.float64))
-
-
-def _least_digits(matrix: FloatArray, dt: float) -> int:
-    bound = 1.0 if dt > 0.0 else 0.0
-    stable = [abscissa(_rounded(matrix, digits), dt) < bound for digits in range(1, 17)]
-    return next((digits for digits in range(1, 17) if all(stable[digits - 1 :])), 17)
 
 
 def noise_rows(design: ObserverDesign) -> Iterator[Check]:

@@ -1,0 +1,177 @@
+"""What hides a fault, as a motion in one sentence, and which sensors would let it be detected or estimated."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from obsynth.analysis.diagnosis.decoupled import unknowns_pencil
+from obsynth.analysis.diagnosis.fault_columns import rest_point
+from obsynth.analysis.diagnosis.reduction import PencilUnits
+from obsynth.numerics.arrays import ComplexArray, FloatArray
+from obsynth.numerics.ranks import RANK_TOLERANCE
+from obsynth.plants.descriptor import DescriptorSystem
+
+#: Plants with more states are not searched for pairs.
+MOST_FOR_PAIRS = 24
+#: Plants with more states are not searched for suggestions at all.
+MOST_FOR_ONE = 120
+
+
+@dataclass(frozen=True, eq=False)
+class Sensor:
+    """A signal that could be measured: rows of C, D, Dd and Df."""
+
+    name: str
+    C: FloatArray
+    D: FloatArray
+    Dd: FloatArray
+    Df: FloatArray
+    deviation: float | None = None
+
+
+def state_sensors(plant: DescriptorSystem, names: Sequence[str] | None = None) -> tuple[Sensor, ...]:
+    """Return a sensor for each state that is not an output already."""
+    measured = set(plant.output_names)
+    chosen = [name for name in plant.state_names if name not in measured] if names is None else list(names)
+    zero = (np.zeros(plant.nu), np.zeros(plant.nd), np.zeros(plant.nf))
+    eye = np.eye(plant.nx)
+    return tuple(Sensor(name, eye[plant.state_names.index(name)], *zero) for name in chosen)
+
+
+def with_sensors(plant: DescriptorSystem, sensors: Sequence[Sensor]) -> DescriptorSystem:
+    """Return the plant with more outputs; a stated deviation adds a noise of its own."""
+    if not sensors:
+        return plant
+
+    def stacked(matrix: FloatArray, part: str) -> FloatArray:
+        return np.vstack([matrix, *(getattr(sensor, part)[None, :] for sensor in sensors)])
+
+    stated = [i for i, sensor in enumerate(sensors) if sensor.deviation is not None]
+    noise = np.zeros((plant.ny + len(sensors), plant.nw + len(stated)))
+    noise[: plant.ny, : plant.nw] = plant.Dw
+    for column, i in enumerate(stated):
+        noise[plant.ny + i, plant.nw + column] = float(sensors[i].deviation or 0.0)
+    names = [*plant.noise_names, *(f"noise of {sensors[i].name}" for i in stated)]
+    return plant.replace(
+        C=stacked(plant.C, "C"), D=stacked(plant.D, "D"), Dd=stacked(plant.Dd, "Dd"), Df=stacked(plant.Df, "Df"),
+        Bw=np.hstack([plant.Bw, np.zeros((plant.nx, len(stated)))]), Dw=noise, noise_names=names,
+        output_names=[*plant.output_names, *(sensor.name for sensor in sensors)],
+    )  # fmt: skip
+
+
+def least_additions(
+    plant: DescriptorSystem, sensors: Sequence[Sensor], reached: Callable[[DescriptorSystem], bool],
+    *, most: tuple[int, int] = (MOST_FOR_ONE, MOST_FOR_PAIRS),
+) -> tuple[tuple[str, ...], ...]:  # fmt: skip
+    """Return all single sensors that do it, or else all pairs; nothing where none of them does.
+
+    Plants of more than ``most`` states are not searched for one, and not for pairs.
+    """
+    if plant.nx > most[0]:
+        return ()
+    for size in (1, 2) if plant.nx <= most[1] else (1,):
+        helping = [chosen for chosen in combinations(sensors, size) if reached(with_sensors(plant, chosen))]
+        if helping:
+            return tuple(tuple(sensor.name for sensor in chosen) for chosen in helping)
+    return ()
+
+
+def listed(sets: Sequence[Sequence[str]], most: int = 6) -> str:
+    """Return sensor sets as a text: ``theta l, or omega l with i``."""
+    texts = [" with ".join(names) for names in sets[:most]]
+    return ", ".join(texts) + (f", or {len(sets) - most} others" if len(sets) > most else "")
+
+
+#: A motion is stated where it cancels the fault to this, relative to the fault's own column.
+EXACTNESS = 1e-8
+#: Signals of a motion that are named; the others are counted.
+MOST_NAMED = 6
+
+
+@dataclass(frozen=True, eq=False)
+class HiddenMotion:
+    """States, unknown inputs and other faults that, with a fault of 1, leave every output at zero.
+
+    All go like ``exp(point t)`` (``point^k``); ``values``: the amplitudes, first those of the ``causes`` (a count).
+    """
+
+    fault: str
+    point: complex
+    values: dict[str, complex]
+    causes: int
+    dt: float
+
+    def __str__(self) -> str:
+        named = list(self.values.items())
+        inputs = [f"{self._course} of {_amplitude(value)} in {name}" for name, value in named[: self.causes]]
+        states = [f"{name} = {_amplitude(value)}" for name, value in named[self.causes :][:MOST_NAMED]]
+        more = len(named) - self.causes - len(states)
+        rest = [*states, *([f"{more} more states"] if more else [])]
+        by = " and ".join(inputs) or "the initial state"
+        return f"{self._course} of 1 in {self.fault} is hidden by {by}" + (f" with {', '.join(rest)}" if rest else "")
+
+    @property
+    def _course(self) -> str:
+        point = self.point
+        if point == rest_point(self.dt):
+            return "a step"
+        if self.dt > 0.0:
+            return f"a course {_amplitude(point)}^k"
+        if point.real == 0.0:
+            return f"a sinusoid ({abs(point.imag):.4g} rad/s)"
+        return f"a course exp({_amplitude(point)} t)"
+
+
+def hidden_motion(plant: DescriptorSystem, fault: int, point: complex, removed: Sequence[int]) -> HiddenMotion | None:
+    """Return the motion that hides a fault at a point, least in balanced units; ``None`` where there is none."""
+    e, a = unknowns_pencil(plant, removed)
+    matrix = a - point * e
+    right = -np.concatenate([plant.Bf[:, fault], plant.Df[:, fault]])
+    found = _solved(matrix, right)
+    if found is None:
+        return None
+    names = (*plant.disturbance_names, *(plant.fault_names[j] for j in removed))
+    inputs, states = _named(names, found[plant.nx :]), _named(plant.state_names, found[: plant.nx])
+    return HiddenMotion(plant.fault_names[fault], complex(point), {**inputs, **states}, len(inputs), plant.dt)
+
+
+def _solved(matrix: ComplexArray, right: ComplexArray) -> ComplexArray | None:
+    """Return the solution with few entries: least squares, then those that are not needed left out one by one."""
+    units = PencilUnits.of(np.zeros(matrix.shape), np.abs(matrix))
+    work, goal = units.rows[:, None] * matrix * units.columns, units.rows * right
+    reach = float(np.linalg.norm(goal))
+    if reach == 0.0:
+        return None
+
+    def solve(kept: list[int]) -> tuple[ComplexArray, float]:
+        part, *_ = np.linalg.lstsq(work[:, kept], goal, rcond=RANK_TOLERANCE)
+        return np.asarray(part, dtype=np.complex128), float(np.linalg.norm(work[:, kept] @ part - goal)) / reach
+
+    kept = list(range(matrix.shape[1]))
+    part, miss = solve(kept)
+    if miss > EXACTNESS:
+        return None
+    for index in sorted(kept, key=lambda j: abs(part[kept.index(j)]))[: len(kept) if len(kept) <= 40 else 0]:
+        fewer = [j for j in kept if j != index]
+        if solve(fewer)[1] <= EXACTNESS:
+            kept = fewer
+    part, _ = solve(kept)
+    whole = np.zeros(matrix.shape[1], dtype=np.complex128)
+    whole[kept] = part
+    # What is only rounding in balanced units is nothing in those of the data.
+    whole[np.abs(whole) <= RANK_TOLERANCE * float(np.max(np.abs(whole), initial=0.0))] = 0.0
+    return np.asarray(units.columns * whole)
+
+
+def _named(names: Sequence[str], values: ComplexArray) -> dict[str, complex]:
+    return {name: complex(value) for name, value in zip(names, values, strict=True) if value != 0.0}
+
+
+def _amplitude(value: complex) -> str:
+    if abs(value.imag) <= EXACTNESS * abs(value):
+        return f"{value.real:.4g}"
+    return f"{value.real:.4g}{value.imag:+.4g}j"

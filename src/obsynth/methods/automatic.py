@@ -1,0 +1,222 @@
+"""The method by default: those that exist, designed; the best by closed-form figures on one clock."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from obsynth.errors import ObsynthError, PreconditionError, SpecError
+from obsynth.methods.fault_figures import DECOUPLED, FaultFigures, fault_figures, on_the_clock
+from obsynth.methods.functional_filter.rates import settling_time
+from obsynth.methods.method_spec import MethodSpec
+from obsynth.methods.registry import REGISTRY, method_spec
+from obsynth.observers.linear.derived import sample_observer
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.recursive.gain_schedule import steady_observer
+from obsynth.plants.dae.model import DAEModel
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.results.design import ObserverDesign
+
+#: Methods whose designs are continuous whatever the plant is used for: they are sampled afterwards.
+CONTINUOUS_ONLY = ("pd-observer",)
+#: An estimate that shows 90 % of a step later than this share of the plant's settling time comes after faster ones.
+SLOW = 0.25
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A method for a plant: its design and figures, or why there is none.
+
+    Fields: method; design; observer: on the clock; figures: of each fault; milliseconds: to design; refused.
+    """
+
+    method: str
+    design: ObserverDesign | None
+    observer: LinearObserver | None
+    figures: tuple[FaultFigures, ...]
+    milliseconds: float
+    refused: str
+
+    def rank(self, leaky: bool, settling: float = np.inf) -> tuple[float, ...]:
+        """Return what sorts candidates by closed-form figures, the best first; ``leaky``: there are unknown inputs.
+
+        Steps that are reached first, then decoupled estimates, then those that show a step well within the plant's
+        settling time (s); among these a mean over time T divides noise by the root of T: the deviation times the root
+        of the delay is what averaging cannot change.
+        """
+        if not self.figures:
+            return (2.0, 0.0, 0.0, np.inf)
+        missed = float(not all(found.reaches for found in self.figures))
+        leak = float(leaky and any(found.leak > DECOUPLED for found in self.figures))
+        slow = float(any(found.most > SLOW * settling for found in self.figures))
+        dt = self.observer.dt if self.observer is not None else 0.0
+        prices = [found.deviation * np.sqrt(max(found.most, dt)) for found in self.figures]
+        price = float(np.prod(prices) ** (1.0 / len(prices))) if np.all(np.isfinite(prices)) else np.inf
+        return (missed, leak, slow, price)
+
+
+def candidate(
+    method: str,
+    plant: DescriptorSystem,
+    sampled: DescriptorSystem,
+    steps: int,
+    maker: Callable[[DescriptorSystem, str, Mapping[str, Any]], ObserverDesign],
+    options: Mapping[str, Any],
+    *,
+    continuous: bool = False,
+) -> Candidate:
+    """Return one method for a plant; on the sampled plant where it can be, or else (or if asked) sampled afterwards."""
+    spec = method_spec(method)
+    if "time-invariant" not in spec.plants:
+        return _refused(method, "for nonlinear plants")
+    begun = perf_counter()
+    try:
+        made = maker(plant if continuous or method in CONTINUOUS_ONLY else sampled, method, options)
+        observer = _sampled(made, sampled.dt)
+    except ObsynthError as error:
+        return _refused(method, one_line(str(error)), 1e3 * (perf_counter() - begun))
+    spent = 1e3 * (perf_counter() - begun)
+    if not observer.fault_names or any(name not in sampled.fault_names for name in observer.fault_names):
+        return _refused(method, "estimates the state, but no fault", spent)
+    return Candidate(method, made, observer, fault_figures(sampled, observer, steps), spent, "")
+
+
+def _sampled(design: ObserverDesign, dt: float) -> LinearObserver:
+    if isinstance(design.observer, LinearObserver):
+        return design.observer if design.observer.dt > 0.0 else sample_observer(design.observer, dt)
+    return steady_observer(design.recursive[1]).observer
+
+
+def _refused(method: str, reason: str, spent: float = 0.0) -> Candidate:
+    return Candidate(method, None, None, (), spent, reason)
+
+
+#: Letters of a message that are shown.
+MOST_LETTERS = 160
+
+
+def one_line(text: str) -> str:
+    """Return the start of a message in one line, with what would help, which stands at its end."""
+    flat = " ".join(text.split())
+    for mark in ("Add one of:", "Leave out one of:"):
+        head, found, tail = flat.rpartition(mark)
+        if found:
+            return f"{_cut(head)} {mark}{tail}"
+    return _cut(flat)
+
+
+def _cut(text: str) -> str:
+    short = text.removeprefix("No observer of this kind exists: ").strip()
+    return short if len(short) <= MOST_LETTERS else short[: MOST_LETTERS - 3].rstrip() + "..."
+
+
+def linear_methods() -> Sequence[MethodSpec]:
+    """Return the methods that take linear plants with constant matrices."""
+    return [found for found in map(method_spec, REGISTRY) if "time-invariant" in found.plants]
+
+
+#: Samples of the plant's settling time, and how many settling times figures look ahead.
+SAMPLES, SETTLING_TIMES, MOST_STEPS = 200, 8, 2000
+
+
+Maker = Callable[[Any, str, Mapping[str, Any]], ObserverDesign]
+
+
+#: Linear methods whose estimates of faults are compared; the recursive ones estimate parameters, or no fault.
+FAULT_METHODS = ("fault-estimation-filter", "pd-observer", "ui-pi-observer", "functional-filter")
+
+
+def automatic_design(plant: Any, options: Mapping[str, Any], maker: Maker, refusing: Maker) -> ObserverDesign:
+    """Return the design of the method chosen, with a note that says why.
+
+    ``maker(plant, method, options)`` designs; ``refusing`` does too, and says what would help where it refuses.
+    """
+    if isinstance(plant, DAEModel):
+        return maker(plant, "dae-adaptive-observer", options)
+    if isinstance(plant, TimeVaryingDescriptorSystem):
+        method = "adaptive-observer" if plant.parameter_names else "descriptor-kalman"
+        return maker(plant, method, options)
+    possible = [spec.id for spec in linear_methods() if set(options) <= set(spec.option_names)]
+    if not possible:
+        raise SpecError(
+            f"No single method has the options {', '.join(sorted(options))}: name the method they are for.",
+            path="method.options",
+        )
+    if plant.nf == 0:
+        return _for_the_state(plant, options, possible, maker)
+    return _chosen(plant, options, possible, maker, refusing)
+
+
+def _for_the_state(
+    plant: DescriptorSystem, options: Mapping[str, Any], possible: list[str], maker: Maker
+) -> ObserverDesign:
+    """Return an observer of the state: there are no faults."""
+    order = (
+        ["ui-pi-observer", "descriptor-kalman"]
+        if plant.nd or not plant.nw
+        else [
+            "descriptor-kalman",
+            "ui-pi-observer",
+        ]
+    )
+    refusals = []
+    for method in [name for name in order if name in possible]:
+        try:
+            return _with_note(maker(plant, method, options), "there are no faults to estimate")
+        except ObsynthError as error:
+            refusals.append(error)
+    if refusals:
+        raise refusals[0]
+    raise SpecError("The plant has no faults, and the options are for methods that estimate some.", path="method")
+
+
+def _chosen(
+    plant: DescriptorSystem, options: Mapping[str, Any], possible: list[str], maker: Maker, refusing: Maker
+) -> ObserverDesign:
+    found = [entry for entry in designed(plant, options, possible, maker) if entry.design is not None]
+    if not found:
+        # The functional filter needs least: what forbids it forbids the fault.
+        last = next((name for name in ("functional-filter", *FAULT_METHODS) if name in possible), possible[0])
+        return refusing(plant, last, options)
+    settling = settling_time(plant)
+    best, *others = sorted(found, key=lambda entry: entry.rank(plant.nd > 0, settling))
+    if best.design is None:
+        raise PreconditionError("No method exists for this plant.", condition="existence")
+    return _with_note(best.design, reason(best, others, plant))
+
+
+def designed(plant: DescriptorSystem, options: Mapping[str, Any], methods: list[str], maker: Maker) -> list[Candidate]:
+    """Return every method for a plant in its own time, with figures on one clock."""
+    step = plant.dt if plant.dt > 0.0 else settling_time(plant) / SAMPLES
+    steps = int(min(max(SETTLING_TIMES * settling_time(plant) / step, 50), MOST_STEPS))
+    try:
+        sampled = on_the_clock(plant, step)
+    except ObsynthError:
+        # Not of index one: only methods that need no elimination are left, and nothing to compare on.
+        return []
+    own_time = plant.dt == 0.0
+    taken = [m for m in methods if m in FAULT_METHODS and not (plant.dt > 0.0 and m in CONTINUOUS_ONLY)]
+    return [candidate(method, plant, sampled, steps, maker, options, continuous=own_time) for method in taken]
+
+
+def reason(best: Candidate, others: list[Candidate], plant: DescriptorSystem) -> str:
+    """Return in one sentence why a candidate is first."""
+    if not others:
+        return "no other method exists for this plant"
+    worst_leak = max(found.leak for found in best.figures)
+    words = ["it reaches every step"] if best.rank(False)[0] == 0.0 else []
+    if plant.nd:
+        words.append(f"unknown inputs leak by {worst_leak:.1e}")
+    deviation = ", ".join(f"{found.deviation:.3g}" for found in best.figures)
+    delay = ", ".join(f"{found.most:.3g}" for found in best.figures)
+    words.append(f"deviation {deviation} at 90 % of a step after {delay} s")
+    return f"{'; '.join(words)}; after it: {', '.join(other.method for other in others)}"
+
+
+def _with_note(design: ObserverDesign, why: str) -> ObserverDesign:
+    return design.replace(notes=(f"Method chosen by auto: {design.method} ({why}).", *design.notes))

@@ -1,0 +1,239 @@
+"""What would make a refused design possible, found by asking again; and designs that rounding makes useless.
+
+With ``y = G f`` the response of the outputs to one fault, an estimate is ``(Cz (s - Az)^-1 By + Dy) G f``, and outputs
+that are right to their last digit change it by up to ``u (|Cz| |(s - Az)^-1| |By| + |Dy|) |G| |f|``, u the unit
+roundoff, whatever the units.  The observer's own numbers, right to their last digit, change it by up to
+``u (|Cz| |(s - Az)^-1| (|Az| |z| + |By| |y|) + |Cz| |z| + |Dy| |y|)``, z its state, which is said where it matters.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+
+from obsynth.analysis.conditions import Condition
+from obsynth.analysis.diagnosis.explanations import least_additions, listed, state_sensors
+from obsynth.analysis.existence.witnesses import EntryChange, Unclear, Witness
+from obsynth.errors import ObsynthError, PreconditionError
+from obsynth.methods.method_spec import MethodSpec
+from obsynth.numerics.arrays import ComplexArray, FloatArray
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.proofs.balls import UNIT_ROUNDOFF
+
+#: Plants with more states are not searched for pairs, and those with more still not at all.
+MOST_FOR_PAIRS, MOST_FOR_ONE = 16, 48
+#: Conditions on the kind of plant, whose messages say what to do: no sensor changes it.
+OF_THE_KIND = ("continuous time", "discrete time", "plant of this kind")
+
+
+def require_all_told(conditions: Iterable[Condition]) -> None:
+    """Raise `PreconditionError` for the first condition that fails, and say which others fail too."""
+    failed = [condition for condition in conditions if not condition.holds]
+    if not failed:
+        return
+    first, *others = failed
+    try:
+        first.require()
+    except PreconditionError as error:
+        if not others:
+            raise
+        also = "; ".join(f"{other.name}: {other.detail}" for other in others)
+        raise PreconditionError(
+            f"{error} Also fails: {also}", condition=first.name,
+            mode=next((condition.mode for condition in failed if condition.mode is not None), None),
+            signals=tuple(dict.fromkeys(name for condition in failed for name in condition.signals)),
+        ) from None  # fmt: skip
+
+
+def with_advice(
+    error: PreconditionError, plant: DescriptorSystem, method: MethodSpec, options: Mapping[str, Any]
+) -> PreconditionError:
+    """Return the refusal with what would help at its end; as it is where the existence conditions hold."""
+    holds = _asker(method, options)
+    if holds(plant):
+        return error
+    sets = least_additions(plant, state_sensors(plant), holds, most=(MOST_FOR_ONE, MOST_FOR_PAIRS))
+    if sets:
+        text = f"Add one of: {listed(sets)}."
+    elif drops := _drops(plant, holds):
+        text = f"Leave out one of: {', '.join(drops)}."
+    elif error.condition in OF_THE_KIND:
+        return error
+    else:
+        text = _nothing(plant)
+    return PreconditionError(
+        f"{error} {text}", condition=error.condition, mode=error.mode, signals=error.signals, add=sets
+    )
+
+
+def _asker(method: MethodSpec, options: Mapping[str, Any]) -> Callable[[DescriptorSystem], bool]:
+    """Return what says whether all existence conditions of a method hold for a plant."""
+
+    def holds(plant: DescriptorSystem) -> bool:
+        # What would help is told to be tried, not proved: the tried plant is decided exactly then.
+        judge = method.existence({**_fitting(options, plant), "exactly": False})
+        try:
+            return all(condition.holds for condition in judge(plant))
+        except (ObsynthError, np.linalg.LinAlgError):
+            return False
+
+    return holds
+
+
+def _fitting(given: Mapping[str, Any], plant: DescriptorSystem) -> dict[str, Any]:
+    """Return options without the faults that a plant no longer has."""
+    faults = given.get("faults")
+    if faults is None or isinstance(faults, str):
+        return dict(given)
+    return {**given, "faults": [name for name in faults if name in plant.fault_names]}
+
+
+def _drops(plant: DescriptorSystem, holds: Callable[[DescriptorSystem], bool]) -> list[str]:
+    """Return the unknown inputs and faults without any one of which the design exists."""
+    if plant.nx > MOST_FOR_ONE:
+        return []
+    kinds = {"unknown input": ("Bd", "Dd", "disturbance_names"), "fault": ("Bf", "Df", "fault_names")}
+    found = []
+    for kind, (entering, direct, listed_names) in kinds.items():
+        names = getattr(plant, listed_names)
+        for i, name in enumerate(names if kind != "fault" or plant.nf > 1 else ()):
+            rest = [j for j in range(len(names)) if j != i]
+            fewer = {part: getattr(plant, part)[:, rest] for part in (entering, direct)}
+            fewer |= {listed_names: [names[j] for j in rest]}
+            if holds(plant.replace(**fewer, units={}, operating_point={})):
+                found.append(f"{kind} {name}")
+    return found
+
+
+def _nothing(plant: DescriptorSystem) -> str:
+    if plant.nx > MOST_FOR_ONE:
+        return f"With {plant.nx} states, ask obsynth.sensor_sets which sensors would help."
+    return "No state measured besides, and no unknown input or fault left out, would help."
+
+
+#: Share of a unit fault that rounding of the outputs may be of its estimate.
+MOST = 0.1
+#: Share of a unit fault from which on rounding of the observer's own numbers is told.
+TOLD = 1e-6
+#: Observers of more states are not examined: their certificates bound what rounding of their numbers does.
+MOST_STATES = 150
+#: Points at which that is judged, in continuous time in units of the plant's own rate.
+POINTS = (0.0, 1e-2, 1e-1, 1.0)
+
+
+def require_above_rounding(plant: DescriptorSystem, observer: LinearObserver) -> None:
+    """Raise `PreconditionError` (unclear) where rounding of the outputs drowns the estimate of a unit fault."""
+    least = _least(plant, observer, own=False)
+    if least is None:
+        return
+    worst = int(np.argmax(least))
+    if least[worst] >= MOST:
+        name = plant.fault_names[worst]
+        raise PreconditionError(
+            "Unclear: gains were found and proved, but they are so large that rounding of the outputs to double "
+            f"precision alone moves the estimate of {name!r} by {least[worst]:.2g} of the fault at every frequency "
+            f"tried. {_doubt(plant, observer, worst).described(plant)}",
+            condition="gains against rounding",
+            signals=(name,),
+        )
+
+
+def _doubt(plant: DescriptorSystem, observer: LinearObserver, fault: int) -> Unclear:
+    """Return the last digit of a number of the plant, or else of the observer, that moves an estimate most."""
+    found = max((witness for point in _points(plant) for witness in last_digits(plant, observer, fault, point)),
+                key=lambda witness: (witness.changes[0].matrix in ("C", "Df") and witness.size >= MOST, witness.size),
+                default=None)  # fmt: skip
+    size, place = (0.0, 0j) if found is None else (found.size, found.point or 0j)
+    where = f"{place.real:.4g}" if place.imag == 0.0 else f"{place:.4g}"
+    return Unclear(
+        UNIT_ROUNDOFF, found,
+        f"has an estimate of {plant.fault_names[fault]!r} that differs by {size:.2g} of the fault at "
+        f"{'z' if plant.is_discrete else 's'} = {where}",
+        "Less asked of the gains (a slower decay, a larger gamma), or an output in which the fault shows more, would "
+        "decide it.",
+    )  # fmt: skip
+
+
+def last_digits(plant: DescriptorSystem, observer: LinearObserver, fault: int, point: complex) -> Iterator[Witness]:
+    """Yield the entry of each matrix whose last digit moves the estimate of a unit fault most at a point."""
+    responses = _responses(plant, observer, point)
+    if responses is None:
+        return
+    outputs, resolvent = responses
+    row = range(len(observer.Cz))[observer.fault_rows][fault]
+    states = np.linalg.solve(point * plant.E - plant.A, plant.Bf)[:, fault]
+    left, shown = observer.Cz[row] @ resolvent, outputs[:, fault]
+    gain = left @ observer.By + observer.Dy[row]
+    effects = {
+        "C": np.outer(np.abs(gain), np.abs(states)), "Df": np.outer(np.abs(gain), np.eye(plant.nf)[fault]),
+        "By": np.outer(np.abs(left), np.abs(shown)), "Dy": np.outer(np.arange(len(observer.Dy)) == row, np.abs(shown)),
+    }  # fmt: skip
+    for name, effect in effects.items():
+        matrix = getattr(plant if name in ("C", "Df") else observer, name)
+        moved = effect * np.where(matrix != 0.0, np.spacing(np.abs(matrix)), 0.0)
+        if not moved.size or not np.all(np.isfinite(moved)) or not moved.any():
+            continue
+        i, j = (int(k) for k in np.unravel_index(np.argmax(moved), moved.shape))
+        before = float(matrix[i, j])
+        after = before + float(np.copysign(np.spacing(abs(before)), before))
+        change = EntryChange(name, i, j, Fraction(before), Fraction(after))
+        yield Witness((change,), float(moved[i, j]), point)
+
+
+def rounding_notes(plant: DescriptorSystem, observer: LinearObserver) -> tuple[str, ...]:
+    """Return what rounding of the observer's own numbers may do to an estimate, where that matters."""
+    found = _least(plant, observer, own=True)
+    return () if found is None else tuple(
+        f"The numbers of the observer cancel each other: their last digits alone may move the estimate of {name!r} by"
+        f" {share:.2g} of the fault, and by more at some frequencies. State the noise of the sensors, or ask for a"
+        " larger gamma."
+        for name, share in zip(plant.fault_names, found, strict=True) if share >= TOLD
+    )  # fmt: skip
+
+
+def _least(plant: DescriptorSystem, observer: LinearObserver, *, own: bool) -> FloatArray | None:
+    """Return the least share of each fault over the points; ``None`` where it is not examined."""
+    if not plant.nf or observer.order > MOST_STATES or plant.is_sparse or len(observer.fault_names) != plant.nf:
+        return None
+    with np.errstate(all="ignore"):
+        shares = [share for point in _points(plant) if (share := _shares(plant, observer, point, own=own)) is not None]
+    return np.asarray(np.min(shares, axis=0)) if shares else None
+
+
+def _points(plant: DescriptorSystem) -> list[complex]:
+    if plant.is_discrete:
+        return [complex(np.exp(1j * point)) for point in POINTS]
+    sizes = np.linalg.norm(plant.E), np.linalg.norm(plant.A)
+    rate = float(sizes[1] / sizes[0]) if all(sizes) else 1.0
+    return [complex(0.0, rate * point) for point in POINTS]
+
+
+def _responses(
+    plant: DescriptorSystem, observer: LinearObserver, point: complex
+) -> tuple[ComplexArray, ComplexArray] | None:
+    """Return the outputs for each fault and the observer's resolvent at one point; ``None`` at a pole of either."""
+    try:
+        states = np.linalg.solve(point * plant.E - plant.A, plant.Bf)
+        resolvent = np.linalg.inv(point * np.eye(observer.order) - observer.Az)
+    except np.linalg.LinAlgError:
+        return None
+    return np.asarray(plant.C @ states + plant.Df, dtype=np.complex128), np.asarray(resolvent)
+
+
+def _shares(plant: DescriptorSystem, observer: LinearObserver, point: complex, *, own: bool) -> FloatArray | None:
+    """Return the share of each fault that rounding of the outputs, or of the observer's ``own`` numbers, may be."""
+    found = _responses(plant, observer, point)
+    if found is None:
+        return None
+    outputs, resolvent = found
+    rows, seen = observer.fault_rows, np.abs(outputs)
+    entering, state = np.abs(observer.By) @ seen, np.abs(resolvent @ observer.By @ outputs)
+    moved = (
+        np.abs(resolvent) @ (entering + np.abs(observer.Az) @ state) + state if own else np.abs(resolvent) @ entering
+    )
+    shares = UNIT_ROUNDOFF * np.diag(np.abs(observer.Cz[rows]) @ moved + np.abs(observer.Dy[rows]) @ seen)
+    return np.asarray(shares) if np.all(np.isfinite(shares)) else None

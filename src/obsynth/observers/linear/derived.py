@@ -1,0 +1,135 @@
+"""Observers made from a linear one: sampled, or with means of its fault estimates; and how long it remembers its start.
+
+Means of the last fault estimates of an observer: registers behind it, and the observer without them again.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from obsynth.errors import SpecError
+from obsynth.numerics.arguments import is_finite_number, require_kind
+from obsynth.numerics.continuous import first_order_hold
+from obsynth.numerics.spectra import abscissa
+from obsynth.observers.linear.observer import LinearObserver
+
+
+def sample_observer(observer: LinearObserver, dt: float) -> LinearObserver:
+    r"""Sample a continuous-time observer by a first-order hold.
+
+    Exact for known inputs and outputs that are linear between samples: with v = [u; y],
+
+    .. math::
+        z_{k+1} = \Phi z_k + \Gamma_0 v_k + \Gamma_1 (v_{k+1} - v_k), \qquad \xi_k = z_k - \Gamma_1 v_k
+
+    and the state that is kept is :math:`\xi`, so that no sample is needed in advance.
+
+    Parameters
+    ----------
+    observer : LinearObserver
+        Continuous time (``dt == 0``).
+    dt : float
+        Seconds between samples, positive.
+
+    Returns
+    -------
+    LinearObserver
+        Of the same order and with the same signals; a start at rest means ``z(0) = Gamma_1 v(0)``.
+
+    Raises
+    ------
+    SpecError
+        The observer is discrete in time already, or ``dt`` is not positive and finite.
+    """
+    require_kind(observer, LinearObserver, "observer", "the LinearObserver of a continuous design")
+    if observer.dt > 0.0:
+        raise SpecError(f"The observer is discrete in time already (dt = {observer.dt:g} s).", path="dt")
+    if not (is_finite_number(dt) and dt > 0.0):
+        raise SpecError(f"dt is {dt!r}: give the seconds between two samples, a positive number.", path="dt")
+    inputs = len(observer.input_names)
+    b, d = np.hstack([observer.Bu, observer.By]), np.hstack([observer.Du, observer.Dy])
+    transition, constant, ramp = first_order_hold(observer.Az, b, dt)
+    into, through = transition @ ramp + constant - ramp, d + observer.Cz @ ramp
+    return replace(
+        observer, Az=transition, Bu=into[:, :inputs], By=into[:, inputs:], Du=through[:, :inputs],
+        Dy=through[:, inputs:], dt=dt,
+    )  # fmt: skip
+
+
+def averaged(observer: LinearObserver, mean: int) -> LinearObserver:
+    """Return the observer whose fault estimates are means of its last ``mean`` ones."""
+    rows, order, count = observer.fault_rows, observer.order, len(observer.fault_names)
+    kept = (mean - 1) * count
+    az, cz = np.zeros((order + kept,) * 2), np.zeros((len(observer.Cz), order + kept))
+    az[:order, :order], cz[:, :order] = observer.Az, observer.Cz
+    first = slice(order, order + count)
+    az[first, :order] = observer.Cz[rows]
+    for j in range(1, mean - 1):
+        place = slice(order + j * count, order + (j + 1) * count)
+        az[place, order + (j - 1) * count : order + j * count] = np.eye(count)
+    cz[rows] = cz[rows] / mean
+    for j in range(mean - 1):
+        cz[rows, order + j * count : order + (j + 1) * count] = np.eye(count) / mean
+    below = np.zeros((kept - count, 1))
+
+    def widened(matrix: np.ndarray, direct: np.ndarray) -> np.ndarray:
+        return np.vstack([matrix, direct[rows], np.repeat(below, matrix.shape[1], axis=1)])
+
+    du, dy = observer.Du.copy(), observer.Dy.copy()
+    du[rows], dy[rows] = du[rows] / mean, dy[rows] / mean
+    return replace(
+        observer, Az=az, Bu=widened(observer.Bu, observer.Du), By=widened(observer.By, observer.Dy), Cz=cz, Du=du,
+        Dy=dy, fault_delays=tuple(delay + (mean - 1) // 2 for delay in observer.fault_delays),
+    )  # fmt: skip
+
+
+def unaveraged(observer: LinearObserver, mean: int) -> LinearObserver | None:
+    """Return the observer that `averaged` was given; ``None`` where this is not exactly what it makes of one."""
+    rows, count = observer.fault_rows, len(observer.fault_names)
+    order = observer.order - (mean - 1) * count
+    if order < 0 or not all(np.all(np.isfinite(part)) for part in (observer.Az, observer.Cz, observer.Du, observer.Dy)):
+        return None
+    first = slice(order, order + count)
+    cz, du, dy = observer.Cz[:, :order].copy(), observer.Du.copy(), observer.Dy.copy()
+    cz[rows], du[rows], dy[rows] = observer.Az[first, :order], observer.Bu[first], observer.By[first]
+    earlier = tuple(delay - (mean - 1) // 2 for delay in observer.fault_delays)
+    if min(earlier, default=0) < 0:
+        return None
+    base = replace(
+        observer, Az=observer.Az[:order, :order], Bu=observer.Bu[:order], By=observer.By[:order], Cz=cz, Du=du, Dy=dy,
+        fault_delays=earlier,
+    )  # fmt: skip
+    again = averaged(base, mean)
+    same = all(np.array_equal(getattr(again, n), getattr(observer, n)) for n in ("Az", "Bu", "By", "Cz", "Du", "Dy"))
+    return base if same else None
+
+
+#: The start counts as forgotten when the slowest part of it has shrunk to this share.
+FORGOTTEN = 0.02
+
+
+def transient(observer: LinearObserver) -> float:
+    """Return the seconds after which an observer has forgotten its start: the slowest mode at `FORGOTTEN`."""
+    if observer.order == 0:
+        return 0.0
+    slowest = abscissa(observer.Az, observer.dt)
+    if observer.dt == 0.0:
+        return math.log(FORGOTTEN) / slowest if slowest < 0.0 else math.inf
+    if slowest >= 1.0:
+        return math.inf
+    samples = math.ceil(math.log(FORGOTTEN) / math.log(slowest)) if slowest > 0.0 else 0
+    return observer.dt * (
+        max(samples, observer.order) + max((*observer.state_delays, *observer.fault_delays), default=0)
+    )
+
+
+def checked_warm_up(asked: float | None, default: float) -> float:
+    """Return the warm-up in seconds."""
+    if asked is None:
+        return default
+    if not (is_finite_number(asked) and asked >= 0.0):
+        raise SpecError(f"warm_up is {asked!r}: give seconds, 0 or more.", path="warm_up")
+    return float(asked)

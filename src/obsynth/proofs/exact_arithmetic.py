@@ -1,0 +1,275 @@
+"""Exact arithmetic: what a stored double was written as, matrices of rational numbers, and roots of polynomials.
+
+A double holds a decimal of up to 15 digits without loss, and ``repr`` gives that decimal back.  A double with more
+digits is a short multiple of a power of two (data scaled by powers of two are exact), or it was computed: then the
+shortest decimal that rounds to it stands for it, known only to its last digit.
+
+A root on the boundary is also a root of the mirrored polynomial, ``p(-s)`` or ``z^n p(1/z)``; so is every pair of
+roots that mirror each other, of which one is unstable.  So the greatest common divisor of both decides whether there is
+any such root, and all others are told from the boundary by isolating them in enough digits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Any, TypeAlias
+
+import flint
+import numpy as np
+from flint import fmpq, fmpq_mat, fmpq_poly, fmpz, fmpz_mat, fmpz_poly
+from numpy.typing import NDArray
+
+from obsynth.numerics.arrays import FloatArray
+
+
+def blocks(parts: list[list[fmpq_mat]]) -> fmpq_mat:
+    """Return the block matrix with these rows of blocks."""
+    height = sum(row[0].nrows() for row in parts)
+    width = sum(part.ncols() for part in parts[0])
+    lines = (line for row in parts for line in zip(*(part.tolist() for part in row), strict=True))
+    return fmpq_mat(height, width, [value for line in lines for piece in line for value in piece])
+
+
+def zeros_matrix(rows: int, columns: int) -> fmpq_mat:
+    """Return a zero matrix."""
+    return fmpq_mat(rows, columns)
+
+
+def identity(order: int) -> fmpq_mat:
+    """Return a unit matrix."""
+    return fmpq_mat(order, order, [int(i == j) for i in range(order) for j in range(order)])
+
+
+def pivot_columns(matrix: fmpq_mat) -> list[int]:
+    """Return the columns, from the left, that are no combination of those before them."""
+    return _leading(*matrix.rref())
+
+
+def _leading(reduced: fmpq_mat, rank: int) -> list[int]:
+    return [next(j for j in range(reduced.ncols()) if reduced[i, j] != 0) for i in range(rank)]
+
+
+def null_basis(matrix: fmpq_mat) -> fmpq_mat:
+    """Return a basis ``(n, n - rank)`` of the null space, as columns."""
+    reduced, rank = matrix.rref()
+    columns, pivots = int(matrix.ncols()), _leading(reduced, rank)
+    free = [j for j in range(columns) if j not in set(pivots)]
+    basis = fmpq_mat(columns, len(free))
+    for k, j in enumerate(free):
+        basis[j, k] = fmpq(1)
+        for i, pivot in enumerate(pivots):
+            basis[pivot, k] = -reduced[i, j]
+    return basis
+
+
+def with_integer_entries(E: fmpq_mat, A: fmpq_mat) -> tuple[fmpz_mat, fmpz_mat]:
+    """Return two matrices ``(m, n)`` with common rows and columns multiplied by rationals, so that all are integers."""
+    rows, columns = int(A.nrows()), int(A.ncols())
+    table = np.array([E.tolist(), A.tolist()], dtype=object).reshape(2, rows, columns)
+    for i in range(rows):
+        table[:, i] /= _common_factor(table[:, i])
+    for j in range(columns):
+        table[:, :, j] /= _common_factor(table[:, :, j])
+    # Columns may have brought denominators back; rows are cleared for good.
+    for i in range(rows):
+        table[:, i] /= _common_factor(table[:, i])
+    e, a = ([fmpz(value.p) for value in part.ravel()] for part in table)
+    return fmpz_mat(rows, columns, e), fmpz_mat(rows, columns, a)
+
+
+def _common_factor(values: NDArray[np.object_]) -> fmpq:
+    """Return the number that divides all of these into coprime integers."""
+    numerator, denominator = fmpz(0), fmpz(1)
+    for value in values.ravel():
+        numerator, denominator = numerator.gcd(value.p), denominator.lcm(value.q)
+    return fmpq(numerator, denominator) if numerator else fmpq(1)
+
+
+#: Bits of the whole number that, times a power of two, is a double.
+MANTISSA_BITS = 53
+#: Decimals of so many digits survive the way into a double and back.
+LOSSLESS_DIGITS = 15
+#: Odd parts of fewer bits are data that were multiplied by a power of two.
+SHORT_BITS = 34
+#: Rows of rational numbers.
+FractionRows: TypeAlias = Sequence[Sequence[Fraction]]
+
+
+def written_fraction(value: float) -> Fraction:
+    """Return the rational number that a finite double was written as."""
+    text = repr(float(value))
+    if _digits(text) <= LOSSLESS_DIGITS:
+        return Fraction(text)
+    exact = Fraction(value)
+    return exact if _odd_part(exact).bit_length() <= SHORT_BITS else Fraction(text)
+
+
+def is_computed(value: float) -> bool:
+    """Whether a double has so many digits that it was computed, and is known only to its last digit."""
+    return _digits(repr(float(value))) > LOSSLESS_DIGITS and _odd_part(Fraction(value)).bit_length() > SHORT_BITS
+
+
+def computed_entries(matrix: FloatArray) -> int:
+    """Return how many entries of a matrix were computed."""
+    return sum(is_computed(value) for value in np.ravel(matrix).tolist())
+
+
+def written_matrix(matrix: FloatArray) -> fmpq_mat:
+    """Return a matrix ``(m, n)`` of doubles as the rational numbers that were written."""
+    rows, columns = matrix.shape
+    return fmpq_mat(rows, columns, [_as_fmpq(written_fraction(value)) for value in np.ravel(matrix).tolist()])
+
+
+def stored_matrix(matrix: FloatArray) -> fmpq_mat:
+    """Return a matrix ``(m, n)`` of doubles as the rational numbers that are stored, whatever they stand for."""
+    # Whole numbers of one power of two.
+    parts, exponents = np.frexp(matrix)
+    least = int(np.min(exponents, initial=0, where=matrix != 0.0)) - MANTISSA_BITS
+    whole, shifts = np.ldexp(parts, MANTISSA_BITS).astype(np.int64), exponents - MANTISSA_BITS - least
+    shifted = [value << shift for value, shift in zip(whole.ravel().tolist(), shifts.ravel().tolist(), strict=True)]
+    rows, columns = matrix.shape
+    found: fmpq_mat = fmpq_mat(fmpz_mat(rows, columns, shifted)) / fmpz(2) ** -least
+    return found
+
+
+def rational_matrix(rows: FractionRows, columns: int) -> fmpq_mat:
+    """Return rows of fractions as a matrix ``(m, columns)``."""
+    return fmpq_mat(len(rows), columns, [_as_fmpq(value) for row in rows for value in row])
+
+
+def fractions_of(matrix: fmpq_mat) -> tuple[tuple[Fraction, ...], ...]:
+    """Return the rows of a rational matrix as fractions."""
+    return tuple(tuple(Fraction(int(entry.p), int(entry.q)) for entry in row) for row in matrix.tolist())
+
+
+def nearest_doubles(matrix: fmpq_mat) -> FloatArray:
+    """Return a rational matrix with every entry rounded once."""
+    shape = (matrix.nrows(), matrix.ncols())
+    values = [_nearest_double(int(entry.p), int(entry.q)) for entry in matrix.entries()]
+    return np.array(values, dtype=np.float64).reshape(shape)
+
+
+def _nearest_double(numerator: int, denominator: int) -> float:
+    """Return the quotient, infinite where it is larger than any double."""
+    try:
+        return numerator / denominator
+    except OverflowError:
+        return float("inf") if numerator > 0 else float("-inf")
+
+
+def _as_fmpq(value: Fraction) -> fmpq:
+    return fmpq(value.numerator, value.denominator)
+
+
+def _digits(text: str) -> int:
+    mantissa = text.lower().partition("e")[0].lstrip("-").replace(".", "")
+    return len(mantissa.strip("0")) or 1
+
+
+def _odd_part(value: Fraction) -> int:
+    numerator = abs(value.numerator)
+    return numerator >> ((numerator & -numerator).bit_length() - 1) if numerator else 0
+
+
+#: Digits (binary) in which roots are isolated first, and how often they are doubled.
+FIRST_BITS = 106
+
+
+MOST_DOUBLINGS = 7
+
+
+@dataclass(frozen=True)
+class Root:
+    """One root: its value to double precision, how often, and which side of the stability boundary it is on."""
+
+    value: complex
+    multiplicity: int
+    side: str
+
+
+@dataclass(frozen=True)
+class RootLocation:
+    """The roots of a polynomial, by decreasing instability; `side` is 'stable', 'boundary' or 'unstable'."""
+
+    roots: tuple[Root, ...]
+
+    @property
+    def stable(self) -> bool:
+        """Whether every root is strictly inside the region of stability."""
+        return all(root.side == "stable" for root in self.roots)
+
+    @property
+    def outside(self) -> tuple[Root, ...]:
+        """Those on or outside its boundary."""
+        return tuple(root for root in self.roots if root.side != "stable")
+
+
+def locate_roots(polynomial: fmpz_poly, *, discrete: bool) -> RootLocation:
+    """Return the roots of a nonzero polynomial and where they are: exact, however close to the boundary.
+
+    ``discrete`` takes the open unit disk as the region of stability, and the open left half plane otherwise.
+    """
+    if polynomial.degree() <= 0:
+        return RootLocation(())
+    coefficients = polynomial.coeffs()
+    at_minus = [(-1) ** power * coefficient for power, coefficient in enumerate(coefficients)]
+    mirror = fmpz_poly(coefficients[::-1] if discrete else at_minus)
+    common = polynomial.gcd(mirror)
+    found: list[Root] = []
+    # Origin: under the mirror of the unit circle it goes to infinity, and reversing has dropped it.
+    others = primitive(fmpq_poly(polynomial) / fmpq_poly(common)) if common.degree() > 0 else polynomial
+    for part, may_lie_on_boundary in ((common, True), (others, False)):
+        found += _isolated(part, discrete=discrete, may_lie_on_boundary=may_lie_on_boundary)
+    found.sort(key=lambda root: -(abs(root.value) if discrete else root.value.real))
+    return RootLocation(tuple(found))
+
+
+def primitive(polynomial: fmpq_poly) -> fmpz_poly:
+    """Return a multiple with coprime integer coefficients and a positive leading one."""
+    numerator = polynomial.numer()
+    if numerator.is_zero():
+        return numerator
+    content = numerator.content()
+    sign = -1 if int(numerator.leading_coefficient()) < 0 else 1
+    return fmpz_poly([sign * coefficient // content for coefficient in numerator.coeffs()])
+
+
+def _isolated(polynomial: fmpz_poly, *, discrete: bool, may_lie_on_boundary: bool) -> list[Root]:
+    """Return the roots with their sides; more digits until each is told from the boundary, or shown to be on it."""
+    if polynomial.degree() <= 0:
+        return []
+    bits = FIRST_BITS
+    found: list[tuple[flint.acb, int, str]] = []
+    for _ in range(MOST_DOUBLINGS):
+        with flint.ctx.workprec(bits):
+            pairs: Any = polynomial.complex_roots()
+            found = [(root, int(times), _side(root, discrete)) for root, times in pairs]
+        if all(side != "boundary" for _, _, side in found):
+            break
+        # What mirrors itself within so many digits cannot be one of a pair: those are further apart.
+        if may_lie_on_boundary and bits > _separation_bits(polynomial):
+            break
+        bits *= 2
+    return [Root(_value(root, side, discrete), times, side) for root, times, side in found]
+
+
+def _side(root: flint.acb, discrete: bool) -> str:
+    distance = root.real * root.real + root.imag * root.imag - 1 if discrete else root.real
+    return "unstable" if distance > 0 else "stable" if distance < 0 else "boundary"
+
+
+def _separation_bits(polynomial: fmpz_poly) -> int:
+    """Return digits in which two different roots differ for certain (Mahler 1964), generously."""
+    degree = polynomial.degree()
+    return int(degree * (degree.bit_length() + 2) + degree * (polynomial.height_bits() + degree.bit_length()))
+
+
+def _value(root: flint.acb, side: str, discrete: bool) -> complex:
+    # Roots are isolated far beyond double precision: a part that may be zero is.
+    real, imaginary = (0.0 if part.contains(0) else float(part.mid()) for part in (root.real, root.imag))
+    value = complex(real, imaginary)
+    if side == "boundary":
+        value = value / abs(value) if discrete else complex(0.0, imaginary)
+    return value

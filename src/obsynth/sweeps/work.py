@@ -1,0 +1,256 @@
+"""Much work on any executor: the cases of a sweep with digests of all they read, results kept in a folder, tables."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import itertools
+import json
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from obsynth.errors import SpecError
+from obsynth.files.inputs import input_file, read_json
+from obsynth.files.tables import TableWriter
+from obsynth.methods.designing import Plant
+from obsynth.observers.progress import as_they_come
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.validation import index_of
+from obsynth.results.gain_sets import plain
+from obsynth.spec.documents import read_yaml
+from obsynth.spec.loader import changed_document
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+#: Keys of a spec; a parameter that begins with none of them is an option of the method.
+_SECTIONS = ("plant", "method", "scenario", "name", "description")
+#: What a section ``plant`` may hold beside a reference to a file; everything else is changed in that file.
+_REFERENCE = ("file", "transform")
+#: More cases than this are taken for a slip.
+MOST_CASES = 100_000
+
+
+@dataclass(frozen=True, eq=False)
+class SweepCase:
+    """One design to be made: a spec and the changes to the plant in its file, or a plant, method and options in memory.
+
+    ``key``: digest of all that the design depends on; ``parameters``: what was put in place, by name.
+    """
+
+    name: str
+    parameters: Mapping[str, Any]
+    key: str
+    source: Path | None = None
+    document: Mapping[str, Any] = field(default_factory=dict)
+    plant_changes: Mapping[str, Any] = field(default_factory=dict)
+    plant: Plant | None = None
+    method: str = ""
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+
+def spec_cases(specs: Sequence[Path], parameters: Mapping[str, Sequence[Any]], version: str) -> list[SweepCase]:
+    """Return a case for each spec and each combination of values."""
+    cases: list[SweepCase] = []
+    stems = [path.stem if [other.stem for other in specs].count(path.stem) == 1 else str(path) for path in specs]
+    for path, stem in zip(specs, stems, strict=True):
+        document = read_yaml(path)
+        for chosen in _combinations(parameters, len(specs)):
+            own, of_plant = _sorted_out(document, chosen)
+            changed = changed_document(document, own)
+            digest = _digest(version, changed, of_plant, path)
+            cases.append(SweepCase(_named(stem, chosen), chosen, digest, path, changed, of_plant))
+    return _distinct(cases)
+
+
+def plant_cases(
+    plants: Mapping[str, Plant], method: str, parameters: Mapping[str, Sequence[Any]], version: str
+) -> list[SweepCase]:
+    """Return a case for each plant and each combination of values: of its fields (``plant.C``) or of options."""
+    cases: list[SweepCase] = []
+    for name, plant in plants.items():
+        for chosen in _combinations(parameters, len(plants)):
+            changes = {key.removeprefix("plant."): value for key, value in chosen.items() if key.startswith("plant.")}
+            options = {
+                key.removeprefix("method.options."): value
+                for key, value in chosen.items()
+                if not key.startswith("plant.")
+            }
+            if changes and not isinstance(plant, DescriptorSystem):
+                raise SpecError(f"Fields of a {type(plant).__name__} cannot be varied in a sweep.", path="parameters")
+            varied = _varied(plant, changes) if changes and isinstance(plant, DescriptorSystem) else plant
+            written = varied.dense() if isinstance(varied, DescriptorSystem) else varied
+            body = json.dumps(plain([version, method, options, written.as_dict()]), sort_keys=True)
+            digest = hashlib.sha256(body.encode()).hexdigest()
+            cases.append(SweepCase(_named(name, chosen), chosen, digest, plant=varied, method=method, options=options))
+    return _distinct(cases)
+
+
+def _varied(plant: DescriptorSystem, changes: Mapping[str, Any]) -> DescriptorSystem:
+    """Return a plant with some fields changed; ``outputs`` picks some of its own by name."""
+    changes = dict(changes)
+    if "outputs" in changes:
+        picked = changes.pop("outputs")
+        names = [picked] if isinstance(picked, str) else list(picked)
+        rows = [index_of(name, plant.output_names, what="The plant") for name in names]
+        for name in ("C", "D", "Df", "Dd", "Dw"):
+            changes.setdefault(name, getattr(plant, name)[rows])
+        changes.setdefault("output_names", names)
+    unknown = sorted(set(changes) - {item.name for item in fields(plant)})
+    if unknown:
+        raise SpecError(f"A plant has no field {', '.join(map(repr, unknown))}.", path=f"parameters.plant.{unknown[0]}")
+    return plant.replace(**changes)
+
+
+def _combinations(parameters: Mapping[str, Sequence[Any]], sources: int) -> Iterator[dict[str, Any]]:
+    count = sources
+    for name, values in parameters.items():
+        if isinstance(values, (str, Mapping)) or not isinstance(values, Sequence) or not len(values):
+            raise SpecError(f"The parameter {name!r} is {values!r}: give a list of values.", path=f"parameters.{name}")
+        count *= len(values)
+    if count > MOST_CASES:
+        raise SpecError(f"The sweep has {count} cases, more than {MOST_CASES}: give fewer values.", path="parameters")
+    for values in itertools.product(*parameters.values()):
+        yield dict(zip(parameters, values, strict=True))
+
+
+def _sorted_out(document: Mapping[str, Any], chosen: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the changes to a spec, and those to the plant in the file that it refers to."""
+    plant = document.get("plant")
+    by_reference = isinstance(plant, Mapping) and "file" in plant
+    own, of_plant = {}, {}
+    for path, value in chosen.items():
+        first, _, rest = path.partition(".")
+        if first not in _SECTIONS:
+            own[f"method.options.{path}"] = value
+        elif first == "plant" and by_reference and rest.partition(".")[0] not in _REFERENCE:
+            of_plant[rest] = value
+        else:
+            own[path] = value
+    return own, of_plant
+
+
+def _digest(version: str, document: Mapping[str, Any], plant_changes: Mapping[str, Any], source: Path) -> str:
+    """Return the digest of a changed spec and of every file that it refers to."""
+    found = hashlib.sha256(version.encode())
+
+    def read(part: Any, folder: Path) -> None:
+        found.update(json.dumps(part, sort_keys=True, default=str).encode())
+        for name in _files_in(part):
+            file = folder / name
+            found.update(input_file(file, where=name).read_bytes())
+            if file.suffix.lower() in (".yaml", ".yml"):
+                read(changed_document(read_yaml(file), plant_changes), file.parent)
+
+    read([document, plant_changes], source.parent)
+    return found.hexdigest()
+
+
+def _files_in(part: Any) -> Iterator[str]:
+    """Return every ``file`` in nested data."""
+    if isinstance(part, Mapping):
+        if isinstance(part.get("file"), str):
+            yield part["file"]
+        for value in part.values():
+            yield from _files_in(value)
+    elif isinstance(part, list):
+        for value in part:
+            yield from _files_in(value)
+
+
+def _named(stem: str, chosen: Mapping[str, Any]) -> str:
+    said = [f"{path.rpartition('.')[2]} = {_said(value)}" for path, value in chosen.items()]
+    return ", ".join([stem, *said])
+
+
+def _said(value: Any) -> str:
+    text = f"{value:g}" if isinstance(value, float) else str(value)
+    return text if len(text) <= 40 else f"{text[:36]} ..."
+
+
+def _distinct(cases: list[SweepCase]) -> list[SweepCase]:
+    """Return the cases without repetitions: the same design is made once."""
+    return list({case.key: case for case in reversed(cases)}.values())[::-1]
+
+
+#: What a piece of work came to, by the exit code of its error.
+STATUSES = {0: "designed", 2: "malformed", 3: "impossible", 4: "infeasible", 5: "unknown", 6: "unverified"}
+#: Digits of the digest of a piece of work in the names of its files.
+DIGITS = 16
+_Item = TypeVar("_Item")
+_Outcome = TypeVar("_Outcome")
+_Result = TypeVar("_Result")
+
+
+class ResultTable(ABC):
+    """Results with a row each."""
+
+    @abstractmethod
+    def rows(self) -> tuple[list[str], list[list[Any]]]:
+        """Return the header and the rows of the table; what does not apply is empty."""
+
+    def table(self) -> pd.DataFrame:
+        """Return the table as a data frame."""
+        import pandas as pd
+
+        header, rows = self.rows()
+        return pd.DataFrame(rows, columns=header)
+
+    def csv(self) -> str:
+        """Return the table as CSV."""
+        header, rows = self.rows()
+        stream = io.StringIO()
+        TableWriter(stream, header).write(rows)
+        return stream.getvalue()
+
+
+def all_of(mappings: Iterable[Mapping[str, Any]]) -> list[str]:
+    """Return every key once, in order of appearance."""
+    return list(dict.fromkeys(name for mapping in mappings for name in mapping))
+
+
+def carried_out(
+    items: Sequence[_Item], work: Callable[[_Item], _Outcome], *, executor: Executor | None,
+    known: Callable[[_Item], _Result | None], kept: Callable[[_Item, _Outcome], _Result],
+    told: Callable[[int, int], object] | None, at_start: bool = False,
+) -> tuple[_Result, ...]:  # fmt: skip
+    """Return the result of every item, in order; ``known`` ones are not worked on, others ``kept`` as they come."""
+    found = {i: result for i, item in enumerate(items) if (result := known(item)) is not None}
+    waiting = [i for i in range(len(items)) if i not in found]
+    if told is not None and at_start:
+        told(len(found), len(items))
+    for place, outcome in as_they_come(work, [items[i] for i in waiting], executor):
+        found[waiting[place]] = kept(items[waiting[place]], outcome)
+        if told is not None:
+            told(len(found), len(items))
+    return tuple(found[i] for i in range(len(items)))
+
+
+def folder_for(folder: Path) -> Path:
+    """Return a folder for results, made where there is none."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise SpecError(f"{folder} cannot be used as a folder: {error.strerror}.", path=str(folder)) from error
+    return folder
+
+
+def file_stem(name: str, key: str, *, most: int) -> str:
+    """Return how the files of a piece of work begin: its name in letters that every file may have, and its digest."""
+    stem = "".join(letter if letter.isalnum() or letter in "-_." else "-" for letter in name)[:most]
+    return f"{stem}-{key[:DIGITS]}"
+
+
+def result_in(file: Path, kind: str, key: str) -> dict[str, Any] | None:
+    """Return the result in a file, `None` where it is missing, damaged, or of other work."""
+    try:
+        body = read_json(file, where=str(file)) if file.is_file() else None
+    except SpecError:
+        return None
+    whole = isinstance(body, dict) and body.get("kind") == kind and body.get("key") == key
+    return body if whole else None
