@@ -61,7 +61,7 @@ def nominal_point(model: DAEModel, given: Mapping[str, float], free: Sequence[st
 def equilibrium(
     model: DAEModel, given: Mapping[str, float], free: Sequence[str], start: Mapping[str, float] | None = None
 ) -> Point:
-    """Return the point where nothing moves, what is given holds, and what is free is as it must be; or why there is none."""
+    """Return the point where nothing moves, what is given holds, what is free is as it must be, or why none is."""
     problem = _Problem(model, given, free, start or {})
     z = problem.solved()
     residual, jacobian = problem.scaled(z)
@@ -206,7 +206,7 @@ class _Problem:
 
 
 def consistent_point(model: DAEModel, point: Point, fixed: Collection[str] = ()) -> Point:
-    """Return a near point with derivatives that satisfy the equations; ``fixed`` states stay, differentiated ones may."""
+    """Return a near point with derivatives that satisfy the equations; ``fixed`` states stay, differentiated may."""
     x, rates, sizes = np.array(point.x), np.zeros(model.nx), model.state_scales
     movable = np.array([name not in fixed for name in model.state_names])
     for _ in range(MOST_EVALUATIONS):

@@ -36,7 +36,7 @@ BLOCKS = (4, 4, 8, MOST_ITERATIONS - 16)
 class StepGraph:
     """The functions of one implicit step of fixed length; ``small``: whether all is scalar operations.
 
-    ``newton``: stages, state before, input, parameters to residual, row scales, Newton step; ``sensitivities``: these to
+    ``newton``: stages, state before, input, parameters to residual, row scales, step; ``sensitivities``: these to
     F of (8), G of (9), that of what is added, and the matrix of (7); ``step``: to stages, residual, and 1 if trusted.
     """
 
