@@ -35,8 +35,8 @@ from obsynth.errors import PreconditionError as PreconditionError
 from obsynth.errors import SolverError as SolverError
 from obsynth.errors import SpecError as SpecError
 from obsynth.errors import VerificationError as VerificationError
-from obsynth.experiments.alarm_proofs.certificate import verify_alarm as verify_alarm
-from obsynth.experiments.alarm_proofs.proof import AlarmProof as AlarmProof
+from obsynth.experiments.alarm_proof import AlarmProof as AlarmProof
+from obsynth.experiments.alarm_proof import verify_alarm as verify_alarm
 from obsynth.experiments.evaluation import Evaluation as Evaluation
 from obsynth.experiments.evaluation import Interval as Interval
 from obsynth.experiments.monitors.monitor import Detection as Detection
@@ -110,6 +110,7 @@ from obsynth.results.design import Certificate as Certificate
 from obsynth.results.design import ObserverDesign as ObserverDesign
 from obsynth.results.gain_sets import load as load
 from obsynth.simulation.dae import simulate_dae as simulate_dae
+from obsynth.simulation.linear import simulate_time_varying as simulate_time_varying
 from obsynth.simulation.profiles import Drift as Drift
 from obsynth.simulation.profiles import Gaussian as Gaussian
 from obsynth.simulation.profiles import Intermittent as Intermittent
@@ -120,7 +121,6 @@ from obsynth.simulation.profiles import Step as Step
 from obsynth.simulation.profiles import Stuck as Stuck
 from obsynth.simulation.profiles import Uniform as Uniform
 from obsynth.simulation.scenario import Scenario as Scenario
-from obsynth.simulation.time_varying import simulate_time_varying as simulate_time_varying
 from obsynth.simulation.trajectory import Trajectory as Trajectory
 from obsynth.spec.loader import Spec as Spec
 from obsynth.spec.loader import load_spec as load_spec

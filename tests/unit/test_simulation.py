@@ -15,7 +15,7 @@ from obsynth.errors import PreconditionError, SpecError
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.simulation import Trajectory, simulate_plant
-from obsynth.simulation.time_varying import simulate_time_varying
+from obsynth.simulation.linear import simulate_time_varying
 from obsynth.spec import load_spec
 
 DESIGNS = Path(__file__).parents[2] / "designs"

@@ -22,10 +22,9 @@ from obsynth.plants.sequences import MatrixSequence
 from obsynth.plants.validation import index_of
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.dae import simulate_dae
-from obsynth.simulation.linear import Stepper, make_stepper
+from obsynth.simulation.linear import Stepper, make_stepper, varying_runs
 from obsynth.simulation.scenario import Scenario
 from obsynth.simulation.scenario_signals import Drive, resolve, resolve_parameters
-from obsynth.simulation.time_varying import varying_runs
 
 #: Warm-up ends when the effect of an error at the start has shrunk to this share of its largest, for good.
 WARM_UP_SHARE = 0.01
