@@ -28,8 +28,6 @@ from obsynth.tolerances.result import EXACT_MODEL
 SCHEMA_VERSION = 1
 KIND = "obsynth alarm certificate"
 CERTIFICATE = FileKind("an alarm certificate", b'"kind": "obsynth alarm certificate"')
-
-
 #: Samples of a window.
 WINDOW = 20
 #: The solver of linear programmes may take so long; without an answer nothing is proved.

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from types import MappingProxyType
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.experiments.benches import Bench, LinearBench, Runs, bench_of, make_bench
-from obsynth.experiments.evaluation import Evaluation, Interval, mean, share
 from obsynth.experiments.monitors.monitor import Monitor
 from obsynth.experiments.simulation import aligned_errors
 from obsynth.numerics.arguments import OpenUnitInterval, checked_value, require_kind, whole_number
@@ -25,6 +24,95 @@ from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.scenario import Scenario
 from obsynth.tolerances.exact_plant import drawn_points, plant_at
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A number estimated from runs.
+
+    Parameters
+    ----------
+    value : float
+        The share, or the mean; NaN without any run that counts.
+    low, high : float
+        Confidence interval; NaN where too few runs count.
+    count : int
+        Runs that count.
+    """
+
+    value: float
+    low: float
+    high: float
+    count: int
+
+
+def _share(hits: int, count: int, confidence: float) -> Interval:
+    """Return a share with its exact (Clopper-Pearson) interval."""
+    from scipy.special import betaincinv
+
+    if count == 0:
+        return Interval(float("nan"), float("nan"), float("nan"), 0)
+    tail = (1.0 - confidence) / 2.0
+    low = 0.0 if hits == 0 else float(betaincinv(hits, count - hits + 1, tail))
+    high = 1.0 if hits == count else float(betaincinv(hits + 1, count - hits, 1.0 - tail))
+    return Interval(hits / count, low, high, count)
+
+
+def _mean(values: FloatArray, confidence: float) -> Interval:
+    """Return a mean with Student's interval; NaN among the values does not count."""
+    from scipy.special import stdtrit
+
+    known = values[~np.isnan(values)]
+    centre = float(np.mean(known)) if known.size else float("nan")
+    if known.size < 2:
+        return Interval(centre, float("nan"), float("nan"), int(known.size))
+    half = float(stdtrit(known.size - 1, (1.0 + confidence) / 2.0) * np.std(known, ddof=1) / np.sqrt(known.size))
+    return Interval(centre, centre - half, centre + half, int(known.size))
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """What many runs of a scenario say, each number with its confidence interval.
+
+    Parameters
+    ----------
+    runs : int
+        Run i has the scenario's seed plus i.
+    confidence : float
+        Of the intervals.
+    false_alarm_rate : Interval
+        Share of the runs with an alarm before the first fault; of all runs where the scenario has none.
+    missed_detection_rate : Interval
+        Share of the runs without an alarm from the first fault on; of no runs without a fault.
+    detection_delay : Interval
+        Seconds from the first fault to the first alarm after it, mean over the runs that have one.
+    isolation_error_rate : Interval
+        Share of the detections that name a fault which did not act until then; of no runs where no fault of the plant
+        acts.
+    fault_rmse, state_rmse : mapping of str to Interval
+        Root mean square error after warm-up of each estimate, mean over runs; of recursive designs, which state how
+        uncertain they are from the start, over the whole record but its first row.
+    """
+
+    runs: int
+    confidence: float
+    false_alarm_rate: Interval
+    missed_detection_rate: Interval
+    detection_delay: Interval
+    isolation_error_rate: Interval
+    fault_rmse: Mapping[str, Interval]
+    state_rmse: Mapping[str, Interval]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return everything as plain data."""
+        found: dict[str, Any] = {}
+        for name, value in vars(self).items():
+            if isinstance(value, Mapping):
+                found[name] = {signal: asdict(item) for signal, item in value.items()}
+            else:
+                found[name] = asdict(value) if isinstance(value, Interval) else value
+        return found
+
 
 #: Numbers that a batch of runs may hold at once, per signal: what keeps memory small and one task worth sending.
 BATCH_SAMPLES = 100_000
@@ -131,7 +219,7 @@ def evaluate(
             if told is not None:
                 told(finished, runs)
     parts = {name: np.concatenate([part[name] for part in results]) for name in results[0]}
-    return _summed(parts, design, bench.onset, bench.drive.dt, watched=monitor is not None, level=confidence)
+    return _summed(parts, design, bench, watched=monitor is not None, level=confidence)
 
 
 def _require_fit(bench: Bench, monitor: Monitor | ParameterMonitor | None, plants: int | None) -> None:
@@ -143,9 +231,8 @@ def _require_fit(bench: Bench, monitor: Monitor | ParameterMonitor | None, plant
     if plants is not None:
         raise SpecError("plants are drawn for linear designs of a plant with tolerances.", path="plants")
     if isinstance(monitor, Monitor):
-        raise SpecError(
-            "This design is recursive or nonlinear: give monitor=obsynth.ParameterMonitor(...).", path="monitor"
-        )
+        raise SpecError("This design is recursive or nonlinear: give monitor=obsynth.ParameterMonitor(...).",
+                        path="monitor")  # fmt: skip
 
 
 def _drawn_benches(design: ObserverDesign, scenario: Scenario, plants: int) -> list[Bench]:
@@ -192,30 +279,23 @@ def _judged_parameters(watched: ParameterMonitor, bench: Bench, estimates: Estim
 
 
 def _summed(
-    parts: Mapping[str, FloatArray],
-    design: ObserverDesign,
-    onset: int | None,
-    dt: float,
-    *,
-    watched: bool,
-    level: float,
+    parts: Mapping[str, FloatArray], design: ObserverDesign, bench: Bench, *, watched: bool, level: float
 ) -> Evaluation:
+    onset = bench.onset
     runs, observer = len(parts["false"]), design.observer
     detected, judged = ~np.isnan(parts["found"]), ~np.isnan(parts["wrong"])
     counted = runs if watched else 0
     faulty = counted if onset is not None else 0
-    delays = np.array([]) if not watched or onset is None else (parts["found"] - onset) * dt
+    delays = np.array([]) if not watched or onset is None else (parts["found"] - onset) * bench.drive.dt
 
     def errors(name: str, signals: tuple[str, ...]) -> Mapping[str, Interval]:
-        return MappingProxyType({signal: mean(parts[name][:, i], level) for i, signal in enumerate(signals)})
+        return MappingProxyType({signal: _mean(parts[name][:, i], level) for i, signal in enumerate(signals)})
 
     return Evaluation(
-        runs=runs,
-        confidence=level,
-        false_alarm_rate=share(int(np.nansum(parts["false"])), counted, level),
-        missed_detection_rate=share(faulty - int(np.sum(detected)) if faulty else 0, faulty, level),
-        detection_delay=mean(delays, level),
-        isolation_error_rate=share(int(np.nansum(parts["wrong"])), int(np.sum(judged)), level),
-        fault_rmse=errors("faults", observer.fault_names),
-        state_rmse=errors("states", observer.state_names),
-    )
+        runs, level,
+        false_alarm_rate=_share(int(np.nansum(parts["false"])), counted, level),
+        missed_detection_rate=_share(faulty - int(np.sum(detected)) if faulty else 0, faulty, level),
+        detection_delay=_mean(delays, level),
+        isolation_error_rate=_share(int(np.nansum(parts["wrong"])), int(np.sum(judged)), level),
+        fault_rmse=errors("faults", observer.fault_names), state_rmse=errors("states", observer.state_names),
+    )  # fmt: skip

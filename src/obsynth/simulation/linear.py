@@ -23,8 +23,7 @@ from obsynth.numerics.holds import driven, first_order_hold
 from obsynth.numerics.ranks import decide_rank
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
-from obsynth.simulation.scenario_signals import Drive
-from obsynth.simulation.trajectory import Trajectory, signal_of
+from obsynth.simulation.signals import Drive, Trajectory, signal_of
 
 
 def simulate_plant(

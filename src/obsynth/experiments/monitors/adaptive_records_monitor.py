@@ -22,7 +22,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.estimates import Estimates
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.scenario import Scenario
-from obsynth.simulation.scenario_signals import resolve
+from obsynth.simulation.signals import resolve
 
 
 def noisy_design(design: ObserverDesign, scenario: Scenario | None) -> ObserverDesign:

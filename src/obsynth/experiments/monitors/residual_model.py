@@ -28,7 +28,7 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.profiles import Additive, Random
 from obsynth.simulation.scenario import Scenario, observer_start
-from obsynth.simulation.scenario_signals import Drive, resolve
+from obsynth.simulation.signals import Drive, resolve
 from obsynth.verification.error_system import ErrorSystem
 
 
