@@ -203,13 +203,13 @@ def evaluate(
     bench = bench_of(design, scenario)
     _require_fit(bench, monitor, plants)
     benches = [bench] if plants is None else _drawn_benches(design, scenario, plants)
-    share, size = -(-len(seeds) // len(benches)), max(1, BATCH_SAMPLES // bench.drive.steps)
+    size = max(1, BATCH_SAMPLES // bench.drive.steps)
     # The first row of a plant with parameters is what was known before: no sample has been used.
     states, faults = ((end or 0) if isinstance(bench, LinearBench) else 1 for end in bench.warm_ups())
     tasks = [
-        _Task(one, monitor, (states, faults), tuple(seeds[i : min(i + size, (number + 1) * share)]))
-        for number, one in enumerate(benches)
-        for i in range(number * share, min((number + 1) * share, len(seeds)), size)
+        _Task(one, monitor, (states, faults), tuple(seeds[i] for i in part[begin : begin + size]))
+        for one, part in zip(benches, np.array_split(np.arange(runs), len(benches)), strict=True)
+        for begin in range(0, len(part), size)
     ]
     results: list[dict[str, FloatArray]] = [{} for _ in tasks]
     finished = 0
