@@ -46,7 +46,7 @@ class Interval:
     count: int
 
 
-def _share(hits: int, count: int, confidence: float) -> Interval:
+def share(hits: int, count: int, confidence: float) -> Interval:
     """Return a share with its exact (Clopper-Pearson) interval."""
     from scipy.special import betaincinv
 
@@ -58,7 +58,7 @@ def _share(hits: int, count: int, confidence: float) -> Interval:
     return Interval(hits / count, low, high, count)
 
 
-def _mean(values: FloatArray, confidence: float) -> Interval:
+def mean(values: FloatArray, confidence: float) -> Interval:
     """Return a mean with Student's interval; NaN among the values does not count."""
     from scipy.special import stdtrit
 
@@ -289,13 +289,13 @@ def _summed(
     delays = np.array([]) if not watched or onset is None else (parts["found"] - onset) * bench.drive.dt
 
     def errors(name: str, signals: tuple[str, ...]) -> Mapping[str, Interval]:
-        return MappingProxyType({signal: _mean(parts[name][:, i], level) for i, signal in enumerate(signals)})
+        return MappingProxyType({signal: mean(parts[name][:, i], level) for i, signal in enumerate(signals)})
 
     return Evaluation(
         runs, level,
-        false_alarm_rate=_share(int(np.nansum(parts["false"])), counted, level),
-        missed_detection_rate=_share(faulty - int(np.sum(detected)) if faulty else 0, faulty, level),
-        detection_delay=_mean(delays, level),
-        isolation_error_rate=_share(int(np.nansum(parts["wrong"])), int(np.sum(judged)), level),
+        false_alarm_rate=share(int(np.nansum(parts["false"])), counted, level),
+        missed_detection_rate=share(faulty - int(np.sum(detected)) if faulty else 0, faulty, level),
+        detection_delay=mean(delays, level),
+        isolation_error_rate=share(int(np.nansum(parts["wrong"])), int(np.sum(judged)), level),
         fault_rmse=errors("faults", observer.fault_names), state_rmse=errors("states", observer.state_names),
     )  # fmt: skip
