@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass
 from types import MappingProxyType
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
@@ -118,8 +118,7 @@ class Evaluation:
 BATCH_SAMPLES = 100_000
 
 
-@dataclass(frozen=True, eq=False)
-class _Task:
+class _Task(NamedTuple):
     """What a worker needs; plain data and arrays."""
 
     bench: Bench
@@ -211,8 +210,7 @@ def evaluate(
         for one, part in zip(benches, np.array_split(np.arange(runs), len(benches)), strict=True)
         for begin in range(0, len(part), size)
     ]
-    results: list[dict[str, FloatArray]] = [{} for _ in tasks]
-    finished = 0
+    results, finished = [dict[str, FloatArray]() for _ in tasks], 0
     with progress_of_runs(progress) as told:
         for i, found in as_they_come(_run, tasks, executor):
             results[i], finished = found, finished + len(found["false"])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any
 
@@ -102,8 +102,8 @@ class Scenario:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Return what makes it again in another process: read-only mappings do not travel."""
-        given = {item.name: getattr(self, item.name) for item in fields(self)}
-        return _made, ({name: dict(value) if isinstance(value, Mapping) else value for name, value in given.items()},)
+        given = {name: dict(value) if isinstance(value, Mapping) else value for name, value in vars(self).items()}
+        return _made, (given,)
 
     def replace(self, **changes: Any) -> Scenario:
         """Return the scenario with some fields changed, such as its seed.
