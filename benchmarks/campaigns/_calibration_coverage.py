@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from obsynth.calibration.innovations_fit import guarded_maximum
-from obsynth.calibration.intervals import deviance_root, quantile
+from obsynth.calibration.intervals import Profile, quantile
 from obsynth.calibration.logs import Log
 from obsynth.calibration.maximum import Objective
 from obsynth.calibration.plants import NonlinearPlant
@@ -78,7 +78,8 @@ def root_at_truth(rows: int, seed: int, quantum: float = 0.0) -> float:
     fits = simulation_fits(problem, 1, 0, lambda text: None)
     objective = Objective(problem, fits[0])
     maximum, _ = guarded_maximum(objective, fits, lambda text: None)
-    return max(deviance_root(objective, maximum, i, TRUTH[name]) for i, name in enumerate(BOUNDS))
+    return max(Profile(objective, maximum, i).root(TRUTH[name] / float(objective.problem.widths[i]))
+               for i, name in enumerate(BOUNDS))  # fmt: skip
 
 
 def limit(rows: int) -> float:

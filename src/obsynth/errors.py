@@ -1,8 +1,4 @@
-"""The errors of obsynth: one type per kind of bad news, each with its exit code.
-
-Every message says what failed, where, and what to do about it.  The attributes hold the same facts
-for programs.
-"""
+"""The errors of obsynth: one type per kind of bad news, each with its exit code, and its facts for programs."""
 
 from __future__ import annotations
 

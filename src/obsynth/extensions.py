@@ -1,7 +1,6 @@
-"""What a lower package leaves to an upper one: asked for by name here, and named where the packages are put together.
+"""What a lower package leaves to an upper one, such as how a design is printed: asked for by name here.
 
-A design is printed by the reports above it, for example; only `obsynth` itself, above everything, says which function
-that is.
+Only `obsynth` itself, above everything, says which function that is.
 """
 
 from __future__ import annotations

@@ -12,6 +12,8 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 from benchmarks.campaigns import existence, recursive_existence
 
 LOST = {
+    # An equation that is small beside an output of the same state.
+    "fault-estimation-filter": (2188, 5656, 6684, 2008),
     # Ahat is unstable in the nine digits that are commonly printed.
     "ui-pi-observer": (386, 162, 3054),
     # All digits of the deviation under noise are rounding; a pole that stays for good; gains whose entries cancel; a

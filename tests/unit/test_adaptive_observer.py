@@ -10,7 +10,7 @@ from time_varying_plants import maximum_likelihood, observer_for, printed, recor
 from obsynth import PreconditionError, SpecError, run_batch, simulate_time_varying
 from obsynth.analysis.time_varying import horizon_ranks
 from obsynth.methods.recursive.conditions import residual_condition
-from obsynth.numerics.recursive_least_squares import ParameterState, start_of, update
+from obsynth.numerics.square_root_estimation import ParameterState, start_of, update
 from obsynth.observers.recursive.estimates import RawEstimate
 
 SAMPLES = 40
@@ -316,6 +316,13 @@ class TestReset:
             observer_for(varying(), adapt={"form": "random-walk", "reset": 0.01})
         with pytest.raises(SpecError, match="run them one by one"):
             run_batch(observer_for(varying(), adapt={"reset": 0.01}), np.zeros((2, 5, 2)), np.zeros((5, 1)))
+
+
+def test_a_batch_whose_inputs_are_of_another_number_of_trials_is_refused() -> None:
+    """It used to end in an error of numpy, which names no argument."""
+    with pytest.raises(SpecError, match=r"u has shape \(3, 5, 1\), but \(5, 1\) or \(2, 5, 1\) is needed") as found:
+        run_batch(observer_for(varying()), np.zeros((2, 5, 2)), np.zeros((3, 5, 1)))
+    assert found.value.path == "u"
 
 
 def test_the_random_walk_has_no_regressors_to_report_an_excitation_of() -> None:

@@ -13,7 +13,7 @@ from test_dae_observer import BALANCES, drive, linear_observer, observer, record
 
 import obsynth
 from obsynth import DAEModel, DAEObserver, SolverError, SpecError, run_batch, simulate_dae
-from obsynth.numerics.symbolic_solve import SMALL, solved
+from obsynth.numerics.newton import SMALL, solved
 from obsynth.observers import batches as dae_batch
 from obsynth.observers import progress
 from obsynth.observers.dae import c_code as dae_library

@@ -11,7 +11,6 @@ from filterpy.kalman import KalmanFilter
 from paper_filter import paper_gains
 
 from obsynth.errors import PreconditionError, SpecError
-from obsynth.numerics.covariances import covariance_factor
 from obsynth.numerics.least_squares_step import (
     LeastSquaresStep,
     least_squares_step,
@@ -20,6 +19,7 @@ from obsynth.numerics.least_squares_step import (
     projection_of,
     rank_revealing_step,
 )
+from obsynth.numerics.ranks import covariance_factor
 
 #: Working digits of the reference: 50 are left after the worst cancellation below (sizes from 1e-32 to 1e20).
 DIGITS = 120

@@ -19,7 +19,7 @@ from obsynth.analysis.structure import analyse_structure
 from obsynth.methods import designing
 from obsynth.methods.pd_observer import synthesis as method
 from obsynth.methods.pd_observer.options import PdOptions
-from obsynth.numerics.threads import STATES_WORTH_THREADS, one_thread_if_small
+from obsynth.numerics.libraries import STATES_WORTH_THREADS, one_thread_if_small
 
 PLANT = obsynth.DescriptorSystem(None, [[0.5, 1.0], [0.0, -1.0]], C=[[1.0, 0.0]], Bf=[[0.0], [1.0]])
 
@@ -72,7 +72,7 @@ TWO_AT_ONCE = """
 import threading
 import scipy.linalg
 from threadpoolctl import threadpool_info
-from obsynth.numerics.threads import one_thread_if_small
+from obsynth.numerics.libraries import one_thread_if_small
 
 first_is_in, second_is_in, first_is_out = threading.Event(), threading.Event(), threading.Event()
 

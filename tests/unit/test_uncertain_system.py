@@ -163,3 +163,15 @@ def test_tolerances_that_a_method_leaves_behind_are_told() -> None:
     kept = obsynth.ui_pi_observer(obsynth.eliminate_algebraic_states(plant).plant)
     assert kept.plant.uncertainty.box.names == ("p",)
     assert obsynth.robustness(kept).finite_for_ever
+
+
+@pytest.mark.parametrize("number", [float, np.float64])
+@pytest.mark.parametrize(("operation", "exact"), [(np.minimum, min), (np.maximum, max)])
+def test_the_smaller_and_the_larger_of_two_numbers_whatever_their_floats_are(number, operation, exact) -> None:
+    low = AffineNumber(number(1.0), np.array([0.1]), number(0.0))
+    for other in (AffineNumber(number(2.0), np.array([0.1]), 0.0), AffineNumber(number(1.05), np.array([-0.1]), 0.0)):
+        for one, two in ((low, other), (other, low)):
+            found = affine_translation(1)(operation)(one, two)
+            for q in np.linspace(-1.0, 1.0, 21):
+                truth = exact(one.center + one.parts[0] * q, two.center + two.parts[0] * q)
+                assert abs(truth - found.center - found.parts[0] * q) <= found.radius + 1e-15

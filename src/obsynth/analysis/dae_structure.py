@@ -9,9 +9,8 @@ from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
-from obsynth.numerics.covariances import covariance_factor, is_definite
 from obsynth.numerics.newton import ScaledMatrix
-from obsynth.numerics.ranks import IDENTIFIABLE_SHARE, NAMED_SHARE, SINGULAR_CONDITION
+from obsynth.numerics.ranks import IDENTIFIABLE_SHARE, NAMED_SHARE, SINGULAR_CONDITION, covariance_factor, is_definite
 from obsynth.plants.dae.checks import checked_inputs, finite_vector, step_length
 from obsynth.plants.dae.functions import DAEFunctions
 from obsynth.plants.dae.model import DAEModel
@@ -214,10 +213,8 @@ def index_report(
     u = model.nominal_input if u is None else u
     theta = model.nominal_parameters if theta is None else theta
     functions = DAEFunctions(model)
-    matrices = []
-    for factor in SHORTENINGS:
-        _, jacobian = functions.residual(x, x, u, theta, np.array([factor * dt]))
-        matrices.append(ScaledMatrix.of(jacobian, model.state_scales))
+    jacobians = (functions.residual(x, x, u, theta, np.array([factor * dt]))[1] for factor in SHORTENINGS)
+    matrices = [ScaledMatrix.of(jacobian, model.state_scales) for jacobian in jacobians]
     conditions = tuple(matrix.condition for matrix in matrices)
     if not np.isfinite(conditions[0]) or conditions[0] > SINGULAR_CONDITION:
         return IndexReport(0, conditions, *involved(model, matrices[0].matrix))

@@ -15,7 +15,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from obsynth.numerics.arrays import ComplexArray, FloatArray, read_only
+from obsynth.numerics.arrays import ComplexArray, FloatArray, read_only, remembered
 from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.numerics.scaling import LogBalance
 from obsynth.plants.descriptor import DescriptorSystem
@@ -50,6 +50,10 @@ class PlantUnits:
     @classmethod
     def of(cls, plant: DescriptorSystem, model: Exosystem | None = None) -> PlantUnits:
         """Return the units that suit a plant and the model of its faults."""
+        return _units_of(plant) if model is None else cls._found(plant, model)
+
+    @classmethod
+    def _found(cls, plant: DescriptorSystem, model: Exosystem | None) -> PlantUnits:
         nx, ny, order = plant.nx, plant.ny, 0 if model is None else model.order
         ends = np.cumsum([1, nx, nx, ny, plant.nf, plant.nd, order])
         equations, states, outputs, faults, disturbances, fault_model = (
@@ -155,6 +159,11 @@ class PlantUnits:
     def eigenvalues(self, scaled: ComplexArray) -> ComplexArray:
         """Return eigenvalues or zeros in the plant's own time."""
         return np.asarray(scaled / self.rate, dtype=np.complex128)
+
+
+@remembered
+def _units_of(plant: DescriptorSystem) -> PlantUnits:
+    return PlantUnits._found(plant, None)
 
 
 def sized_plant(plant: DescriptorSystem) -> DescriptorSystem | None:

@@ -13,10 +13,10 @@ from obsynth.analysis.existence.verdicts import hidden_modes
 from obsynth.analysis.transformations.recovery import Transformation, linear_plant
 from obsynth.analysis.zeros import are_outside
 from obsynth.numerics.arrays import ComplexArray
+from obsynth.numerics.libraries import on_one_thread_if_small
 from obsynth.numerics.pencils import FiniteZeros, pencil_structure
 from obsynth.numerics.ranks import RankDecision, decide_rank
 from obsynth.numerics.scaling import equilibrate_pencil
-from obsynth.numerics.threads import on_one_thread_if_small
 from obsynth.plants.descriptor import DescriptorSystem
 
 

@@ -17,13 +17,7 @@ from obsynth.calibration.plants import NonlinearPlant
 from obsynth.calibration.problem import Problem, calibration_problem, require_variation
 from obsynth.calibration.reporting import IntegrationError, integration_error, reported
 from obsynth.calibration.result import Calibration
-from obsynth.calibration.simulation_error import (
-    FIRST_ROWS,
-    Fit,
-    SimulationError,
-    simulation_fits,
-    with_seen_start,
-)
+from obsynth.calibration.simulation_error import FIRST_ROWS, Fit, SimulationError, simulation_fits, with_seen_start
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import chosen, is_whole, whole_number
 from obsynth.plants.dae.model import DAEModel
@@ -172,10 +166,7 @@ def calibrate(
         problem, fits = seen, simulation_fits(seen, 1, seed, note, start=fits[0].t)
     error = None
     if integration == "auto" and isinstance(plant, NonlinearPlant):
-        theta = np.array(plant.theta(problem.unknown, fits[0].t), dtype=np.float64)
-        states = SimulationError(problem).states(fits[0])
-        error = integration_error(plant.promoted(problem.unknown), states, problem.u, theta, fits[0].deviations,
-                                  problem.log.dt)  # fmt: skip
+        error = _step_error(problem, plant, fits[0])
         if error is not None and error.matters:
             note("integrating by Radau")
             problem = problem.integrated("radau", substeps)
@@ -193,6 +184,17 @@ def calibrate(
                 fits = simulation_fits(seen, 1, seed, note, start=fits[0].t)
                 problem, fit, error = _innovations(seen, fits, level, note, before[1])
     return reported(problem, fits[0], fit, level=level, timing=timing, error=error, digest=digest)
+
+
+def _step_error(problem: Problem, plant: NonlinearPlant, fit: Fit) -> IntegrationError | None:
+    """Return what backward Euler errs along the best simulation."""
+    states, theta = (
+        SimulationError(problem).states(fit),
+        np.array(plant.theta(problem.unknown, fit.t), dtype=np.float64),
+    )
+    return integration_error(
+        plant.promoted(problem.unknown), states, problem.u, theta, fit.deviations, problem.log.dt
+    )  # fmt: skip
 
 
 def _innovations(

@@ -59,19 +59,13 @@ class Consistency:
         return self.low <= self.value <= self.high
 
 
-def consistency(whitened: FloatArray, seen: Any, *, level: float = 0.95) -> Consistency:
-    """Return the mean square of whitened innovations where they were seen, with its chi-square interval."""
-    return consistency_of(float((whitened[seen] ** 2).sum()), int(np.sum(seen)), level=level)
-
-
-def consistency_of(squares: float, count: int, *, level: float = 0.95) -> Consistency:
-    """Return a sum of squares of whitened innovations over their number, with its chi-square interval."""
+def consistency(squares: float, count: int) -> Consistency:
+    """Return a sum of squares of whitened innovations over their number, with its chi-square interval of 95 %."""
     from scipy.stats import chi2
 
     if not count:
         return Consistency(float("nan"), 0.0, float("inf"), 0)
-    share = (1.0 - level) / 2.0
-    low, high = chi2.ppf([share, 1.0 - share], count) / count
+    low, high = chi2.ppf([0.025, 0.975], count) / count
     return Consistency(squares / count, float(low), float(high), count)
 
 
@@ -91,7 +85,7 @@ def whiteness(column: FloatArray) -> Whiteness:
     return Whiteness(statistic, float(chi2.sf(statistic, lags)), float(r[0]))
 
 
-def change_of_mean(whitened: FloatArray, *, confidence: float = CHANGE_CONFIDENCE) -> int | None:
+def change_of_mean(whitened: FloatArray) -> int | None:
     """Return the row where the mean of whitened innovations ``(n, ny)`` changes: the likeliest split, or none."""
     from scipy.stats import chi2
 
@@ -105,7 +99,7 @@ def change_of_mean(whitened: FloatArray, *, confidence: float = CHANGE_CONFIDENC
     k = np.arange(CHANGE_MARGIN, n - CHANGE_MARGIN)
     before, after = total[k - 1] / k[:, None], (total[-1] - total[k - 1]) / (n - k)[:, None]
     statistic = ((before - after) ** 2).sum(axis=1) * k * (n - k) / n
-    limit = chi2.ppf(1.0 - (1.0 - confidence) / n, m)
+    limit = chi2.ppf(1.0 - (1.0 - CHANGE_CONFIDENCE) / n, m)
     return int(k[int(np.argmax(statistic))]) if statistic.max() > limit else None
 
 

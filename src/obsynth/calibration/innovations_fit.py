@@ -10,14 +10,7 @@ from numpy.typing import NDArray
 
 from obsynth.calibration.intervals import Information, Side, information, profile_box, quantile, upper_limit
 from obsynth.calibration.likelihood import IMPOSSIBLE
-from obsynth.calibration.maximum import (
-    Maximum,
-    Objective,
-    at_bounds,
-    collapsed,
-    greatest_likelihood,
-    without_collapse,
-)
+from obsynth.calibration.maximum import Maximum, Objective, at_bounds, collapsed, greatest_likelihood, without_collapse
 from obsynth.calibration.problem import Problem
 from obsynth.calibration.simulation_error import Fit, simulation_fits
 from obsynth.numerics.arrays import FloatArray
@@ -116,12 +109,7 @@ def moved_by(exact: Problem, start: Fit, maximum: Maximum, avoided: FloatArray, 
 
 
 def innovations_fit(
-    problem: Problem,
-    fits: list[Fit],
-    level: float,
-    note: Callable[[str], object],
-    *,
-    exact: Problem | None = None,
+    problem: Problem, fits: list[Fit], level: float, note: Callable[[str], object], *, exact: Problem | None = None
 ) -> tuple[InnovationsFit | None, float]:
     """Return the fit of the innovations, from fits of the simulation. With an ``exact`` problem also by how much its
     constants would move; there is no fit where that matters."""

@@ -128,12 +128,7 @@ def upper_limit(objective: Objective, maximum: Maximum, i: int) -> float:
     return side.value
 
 
-def deviance_root(objective: Objective, maximum: Maximum, i: int, value: float) -> float:
-    """Return the root of the profile's deviance at a value of a constant."""
-    return _Profile(objective, maximum, i).root(value / float(objective.problem.widths[i]))
-
-
-class _Profile:
+class Profile:
     """The least value of the objective as a function of one variable, the others led along."""
 
     def __init__(self, objective: Objective, maximum: Maximum, i: int) -> None:
@@ -175,7 +170,7 @@ class _Profile:
 
 def _side(objective: Objective, maximum: Maximum, i: int, sign: float, target: float) -> Side:
     """Return where the root of the profile's deviance reaches a target; open where a bound comes first."""
-    profile, begin = _Profile(objective, maximum, i), float(maximum.z[i])
+    profile, begin = Profile(objective, maximum, i), float(maximum.z[i])
     end = float(objective.low[i] if sign < 0 else objective.high[i])
     if abs(end - begin) < AT_BOUND:
         return Side(end, True)

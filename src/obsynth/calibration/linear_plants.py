@@ -30,6 +30,10 @@ EXACT = "exact"
 SIZED_SAMPLES = 50
 #: The least effect of a state on the outputs, as a share of the largest, by which it is sized.
 LEAST_EFFECT = 1e-6
+#: What the matrices of varying and of invariant plants are called here; G and L are of constant effects.
+VARYING = {"E": "E", "A": "A", "B": "B", "C": "C", "Phi": "G", "Psi": "L"}
+INVARIANT = {"E": "E", "A": "A", "B": "B", "C": "C", "D": "D", "Bf": "G", "Df": "L"}
+
 Known = Mapping[str, Any]
 
 
@@ -73,18 +77,27 @@ class LinearPlant(CalibrationPlant):
     has_levels = False
 
     def __init__(self, plant: DescriptorSystem | TimeVaryingDescriptorSystem, log: Log) -> None:
-        matrices, values, continuous = (
-            _of_varying(plant) if isinstance(plant, TimeVaryingDescriptorSystem) else _of_invariant(plant)
-        )
-        self.matrices, self.continuous = matrices, continuous
+        uncertainty = getattr(plant, "uncertainty", None)
+        constants = {} if uncertainty is None else uncertainty.box.constants
+        if isinstance(plant, TimeVaryingDescriptorSystem):
+            self.matrices = {key: _of_sequence(getattr(plant, name)) for name, key in VARYING.items()}
+            values, effects = {name: float(value) for name, value in plant.constants.items()}, plant.parameter_names
+            self.continuous = False
+        else:
+            entries = {} if uncertainty is None else uncertainty.entries
+            self.matrices = {key: _with_entries(getattr(plant, name), entries.get(name, ()), uncertainty)
+                             for name, key in INVARIANT.items()}  # fmt: skip
+            values, effects = {name: item.nominal for name, item in constants.items()}, plant.fault_names
+            self.continuous = not plant.is_discrete
         self.state_names = self.equation_names = plant.state_names
         self.nx, self.nu, self.ny = len(plant.state_names), plant.nu, plant.ny
-        effects = plant.parameter_names if isinstance(plant, TimeVaryingDescriptorSystem) else plant.fault_names
         self.effects = tuple(effects)
         self.unstated = frozenset(self.effects)
-        self.values: Mapping[str, float] = {**values, **dict.fromkeys(self.effects, 0.0)}
-        self.units = {**_constant_units(plant), **plant.units}
-        self.notes = _notes(plant)
+        self.values = {**values, **dict.fromkeys(self.effects, 0.0)}
+        self.units = {**{name: item.unit or "1" for name, item in constants.items()}, **plant.units}
+        if unknown := getattr(plant, "disturbance_names", ()):
+            self.notes = (f"Of the unknown inputs ({', '.join(unknown)}) nothing is known: the noise of the equations "
+                          "stands for them.",)  # fmt: skip
         self.integrations = tuple(BUTCHER) if self.continuous else (EXACT,)
         if self.matrices["E"].shape != (self.nx, self.nx):
             raise SpecError("The plant has another number of equations than of states: they do not determine a step, "
@@ -249,36 +262,6 @@ class LinearPlant(CalibrationPlant):
             np.nan_to_num(effects), LEAST_EFFECT * max(float(np.nanmax(effects, initial=0.0)), SMALLEST)
         )
         return np.asarray(1.0 / effects)
-
-
-def _notes(plant: DescriptorSystem | TimeVaryingDescriptorSystem) -> tuple[str, ...]:
-    names = getattr(plant, "disturbance_names", ())
-    if not names:
-        return ()
-    return (
-        f"Of the unknown inputs ({', '.join(names)}) nothing is known: the noise of the equations stands for them.",
-    )
-
-
-def _constant_units(plant: Any) -> dict[str, str]:
-    uncertainty = getattr(plant, "uncertainty", None)
-    return {} if uncertainty is None else {name: item.unit or "1" for name, item in uncertainty.box.constants.items()}
-
-
-def _of_varying(plant: TimeVaryingDescriptorSystem) -> tuple[dict[str, _Matrix], dict[str, float], bool]:
-    found = {name: _of_sequence(getattr(plant, name)) for name in ("E", "A", "B", "C")}
-    found |= {"G": _of_sequence(plant.Phi), "L": _of_sequence(plant.Psi)}
-    return found, {name: float(value) for name, value in plant.constants.items()}, False
-
-
-def _of_invariant(plant: DescriptorSystem) -> tuple[dict[str, _Matrix], dict[str, float], bool]:
-    uncertainty = plant.uncertainty
-    entries = {} if uncertainty is None else uncertainty.entries
-    values = {} if uncertainty is None else {name: item.nominal for name, item in uncertainty.box.constants.items()}
-    found = {}
-    for name, key in (*((name, name) for name in ("E", "A", "B", "C", "D")), ("Bf", "G"), ("Df", "L")):
-        found[key] = _with_entries(getattr(plant, name), entries.get(name, ()), uncertainty)
-    return found, values, not plant.is_discrete
 
 
 def _with_entries(matrix: FloatArray, entries: Sequence[tuple[int, int, str]], uncertainty: Any) -> _Matrix:

@@ -14,7 +14,7 @@ from obsynth.calibration.step_graphs import SampleGraphs, sample_graphs
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import is_number, whole_number
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.covariances import covariance_factor
+from obsynth.numerics.ranks import covariance_factor
 from obsynth.observers.records import named_covariance, named_vector
 from obsynth.plants.validation import index_of
 

@@ -100,7 +100,7 @@ def reported(
     whitened = np.where(seen, found.whitened, np.nan)
     colours = {name: whiteness(column) for name, column in zip(problem.output_names, whitened.T, strict=True)}
     change = change_of_mean(whitened)
-    nis = consistency(np.where(seen, found.whitened, 0.0), seen)
+    nis = consistency(float((found.whitened[seen] ** 2).sum()), int(seen.sum()))
     sides = dict(zip(names, found.sides, strict=True))
     open_sides = tuple((name, side) for name, pair in sides.items()
                        for side, end in zip(("low", "high"), pair, strict=True) if end.is_open)  # fmt: skip

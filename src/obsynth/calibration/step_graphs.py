@@ -19,7 +19,7 @@ import numpy as np
 
 from obsynth.calibration.plants import CalibrationPlant
 from obsynth.numerics.arrays import SMALLEST, FloatArray
-from obsynth.numerics.symbolic_solve import largest_entries
+from obsynth.numerics.newton import largest_entries
 from obsynth.observers.dae.c_code import compiler
 
 #: Optimisation costs more than it gains on straight code of thousands of lines.

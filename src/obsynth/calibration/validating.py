@@ -13,7 +13,6 @@ from obsynth.calibration.diagnostics import (
     Validation,
     change_of_mean,
     consistency,
-    consistency_of,
     whiteness,
     wrong_samples,
 )
@@ -200,11 +199,11 @@ def validate(
     found = found.without(wrong_samples(found.y))
     record = recorded_innovations(design, found)
     sensors = _sensors(record, plant.output_names)
-    whole = consistency_of(record.squares, record.degrees)
+    whole = consistency(record.squares, record.degrees)
     place = change_of_mean(record.standardised)
     change = None if place is None else found.rows[0] + place
     ratios = noise_ratios(design.observer, found) if isinstance(design.observer, DAEObserver) else {}
-    verdict = [*found.notes, *_sentences(sensors, ratios, whole.value, change, record, design)]
+    verdict = [*found.notes, *_sentences(sensors, ratios, change, record, design)]
     passed = not verdict[len(found.notes) :] and whole.holds
     if not passed and not whole.holds and not ratios:
         far = "small" if whole.value > whole.high else "large"
@@ -234,12 +233,12 @@ def _sensors(record: RecordedInnovations, names: Sequence[str]) -> dict[str, Sen
         seen = np.isfinite(column)
         count = int(seen.sum())
         mean = float(column[seen].mean() * np.sqrt(count)) if count else 0.0
-        found[name] = SensorValidation(consistency(column, seen), mean, whiteness(column))
+        found[name] = SensorValidation(consistency(float((column[seen] ** 2).sum()), count), mean, whiteness(column))
     return found
 
 
 def _sentences(
-    sensors: Mapping[str, SensorValidation], ratios: Mapping[str, float], nis: float, change: int | None,
+    sensors: Mapping[str, SensorValidation], ratios: Mapping[str, float], change: int | None,
     record: RecordedInnovations, design: ObserverDesign,
 ) -> list[str]:  # fmt: skip
     found = []

@@ -114,7 +114,7 @@ def require_same_signals(design: ObserverDesign, gains: Path, spec: Spec) -> Non
         raise SpecError(f"{gains} is for a plant with other signals than that of {spec.path}.", path=str(gains))
 
 
-def spec_output(wanted: Path, kind: FileKind, spec: Spec, options: argparse.Namespace, *, option: str) -> Path:
+def spec_output(wanted: Path, kind: FileKind | None, spec: Spec, options: argparse.Namespace, *, option: str) -> Path:
     """Return where to write what a spec asks for; refuse a hopeless place before any work is done."""
     if wanted.exists() and wanted.samefile(spec.path):
         raise SpecError(f"{wanted} is the spec itself: give another file to {option}.", path=str(wanted))

@@ -77,10 +77,8 @@ def ranges_of(pairs: list[tuple[str, str]]) -> dict[str, float | tuple[float, fl
 
 
 def own_tolerances(design: ObserverDesign, kind: str | None) -> Uncertainty | None:
-    """Return the tolerances of a design's plant, which its pointwise threshold holds for.
-
-    Continuous designs with known inputs must be asked for it: the inputs have to be held between rows.
-    """
+    """Return the tolerances of a design's plant, which its pointwise threshold holds for."""
+    # Continuous designs with known inputs must be asked for it: the inputs have to be held between rows.
     from obsynth.observers.linear.observer import LinearObserver
     from obsynth.plants.descriptor import DescriptorSystem
 

@@ -1,8 +1,6 @@
-"""The commands ``design`` and ``obsynth``: arguments in, exit code out.
+"""The commands ``design`` and ``obsynth``: arguments in, exit code out; streams may be closed or full.
 
 Nothing heavy is imported here, so that ``--help`` answers at once.
-
-The process around a verb: standard streams that may be closed or full, and what numbers can do to a computation.
 """
 
 from __future__ import annotations
@@ -68,7 +66,7 @@ def told_error(error: Exception) -> ObsynthError | None:
         is_ours = (error.name or "").startswith("obsynth")
         text = f"This needs the library {error.name or error}, which cannot be loaded: install it with pip."
         return None if is_ours else SpecError(text)
-    from obsynth.numerics.failures import failure_of
+    from obsynth.numerics.libraries import failure_of
 
     return failure_of(error)
 

@@ -26,7 +26,7 @@ from obsynth.numerics.arguments import (
     require_kind,
 )
 from obsynth.numerics.arrays import FloatArray, read_only
-from obsynth.numerics.threads import on_one_thread_if_small
+from obsynth.numerics.libraries import on_one_thread_if_small
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.simulation.profiles import Sine, Step
 from obsynth.simulation.scenario import Scenario

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.holds import driven
+from obsynth.numerics.continuous import driven
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.simulation.scenario import Scenario

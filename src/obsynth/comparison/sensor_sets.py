@@ -17,7 +17,7 @@ from obsynth.errors import ObsynthError, PreconditionError, SpecError
 from obsynth.files.tables import html_table, text_table
 from obsynth.methods.functional_filter.public import functional_filter
 from obsynth.numerics.arguments import is_finite_number
-from obsynth.numerics.threads import on_one_thread_if_small
+from obsynth.numerics.libraries import on_one_thread_if_small
 from obsynth.plants.descriptor import DescriptorSystem
 
 #: So many sets are returned at most by default, and so many of them designed for.

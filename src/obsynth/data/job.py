@@ -270,7 +270,10 @@ def _fits(own: Any, saved: Any) -> bool:
     if isinstance(own, Mapping):
         if not isinstance(saved, dict) or saved.keys() != own.keys():
             return False
-        return all(_fits(own[key], saved[key]) and _is_time(key, saved[key]) for key in own)
+        return all(
+            _fits(own[key], saved[key]) and (key not in _TIMES or saved[key] is None or is_finite_number(saved[key]))
+            for key in own
+        )
     if isinstance(own, (bool, np.bool_)):
         return isinstance(saved, bool)
     if isinstance(own, str):
@@ -278,10 +281,6 @@ def _fits(own: Any, saved: Any) -> bool:
     if isinstance(own, (list, tuple)):
         return isinstance(saved, list)
     return saved is None or is_number(saved) or (own is None and isinstance(saved, (np.ndarray, dict, list)))
-
-
-def _is_time(key: str, saved: Any) -> bool:
-    return key not in _TIMES or saved is None or is_finite_number(saved)
 
 
 def _alike(own: tuple[int, ...], saved: tuple[int, ...]) -> bool:

@@ -15,7 +15,7 @@ from obsynth.errors import ObsynthError, PreconditionError, SpecError
 from obsynth.experiments.monitors.online import LinearSample
 from obsynth.numerics.arguments import is_finite_number
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.holds import first_order_hold
+from obsynth.numerics.continuous import first_order_hold
 from obsynth.observers.linear.derived import transient
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem

@@ -57,7 +57,10 @@ class RecoveredStates:
         if recovery is None:
             return None
         names = _asked_for(recovery, asked)
-        if not names or _states_of(recovery) != len(engine.state_names):
+        # Of a large map its operator knows the number of states from which the others follow.
+        operator = recovery.by_operator
+        states = recovery.from_state.shape[1] if operator is None else operator.state_count
+        if not names or states != len(engine.state_names):
             return None
         found = cls(recovery, engine, names)
         return found if found.names else None
@@ -84,12 +87,6 @@ class RecoveredStates:
         self._rows.clear()
         self._rows.extend(data["rows"])
         self._known = data["known"]
-
-
-def _states_of(recovery: StateRecovery) -> int:
-    """Return the number of states from which the others follow, without forming a large map."""
-    operator = recovery.by_operator
-    return int(recovery.from_state.shape[1]) if operator is None else operator.state_count
 
 
 def _asked_for(recovery: StateRecovery, asked: str | Sequence[str] | None) -> tuple[str, ...]:

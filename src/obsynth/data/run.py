@@ -228,7 +228,7 @@ def run_on_data(
     if not (state is None or out is None or isinstance(out, str | Path)):
         save = partial(save_state, Path(state), job, digest)
     with sink_for(out, job.header, stamps) as sink:
-        _run_rows(job, chunks(data, job.signals, stamps, chunk_rows), sink, kept, save, progress or _nothing)
+        _run_rows(job, chunks(data, job.signals, stamps, chunk_rows), sink, kept, save, progress or bool)
     if state is not None:
         save_state(Path(state), job, digest)
     table = sink.frame() if isinstance(sink, FrameSink) else None
@@ -257,13 +257,9 @@ def _later_rows(engine: Engine, data: Data, *, smooth: bool, lag: int | None, st
     return LaterRows(engine, lag)
 
 
-def _nothing(_: int) -> None:
-    """Progress that nobody asked for."""
-
-
 def _run_rows(
     job: Job, rows: Iterator[FloatArray], sink: Sink, kept: list[FloatArray] | None, save: Callable[[], None] | None,
-    progress: Callable[[int], None],
+    progress: Callable[[int], object],
 ) -> None:  # fmt: skip
     """Run over all rows: in chunks, or one by one where the state is to be saved after a stream."""
     held, is_whole = HeldSignals(), True

@@ -46,7 +46,10 @@ class Stamps:
                 self.is_dated = False
                 return seconds
         if self.is_dated is not False:
-            found = _date(cell)
+            try:
+                found = datetime.fromisoformat(cell)
+            except ValueError:
+                found = None
             if found is not None:
                 return self._seconds(found, row, column)
         raise SpecError(
@@ -101,13 +104,6 @@ class Stamps:
         return "the rows before hold dates and times" if self.is_dated else "the rows before hold seconds"
 
 
-def _date(cell: str) -> datetime | None:
-    try:
-        return datetime.fromisoformat(cell)
-    except ValueError:
-        return None
-
-
 #: The column of time stamps, in seconds.
 TIME = "time"
 
@@ -124,12 +120,7 @@ class Signals:
     one: int | None = None  # number of the signal that is one in every row and has no column, if there is such a one
 
     @classmethod
-    def of(
-        cls,
-        engine: Engine,
-        columns: Mapping[str, str] | None,
-        scales: Mapping[str, float] | None,
-    ) -> Signals:
+    def of(cls, engine: Engine, columns: Mapping[str, str] | None, scales: Mapping[str, float] | None) -> Signals:
         """Return the signals that a running design reads."""
         names = engine.input_names + engine.output_names
         renamed, factors = dict(columns or {}), dict(scales or {})

@@ -169,7 +169,7 @@ def smooth(
     if isinstance(design.observer, LinearObserver):
         # The same refusal as on logs.
         LaterRows(engine_of(design), waited)
-    if _is_log(data):
+    if isinstance(data, str) or any(hasattr(data, name) for name in ("__fspath__", "readline", "columns")):
         if u is not None:
             raise SpecError("u is for arrays: a log has the inputs in its columns.", path="u")
         if waited is None and hasattr(data, "readline"):
@@ -187,10 +187,6 @@ def smooth(
     if isinstance(data, tuple) and len(data) == 2 and u is None and np.ndim(data[0]) == 2:
         data, u = data
     return smoothed_record(observer, data, u, waited)
-
-
-def _is_log(data: Any) -> bool:
-    return isinstance(data, str) or hasattr(data, "__fspath__") or hasattr(data, "readline") or hasattr(data, "columns")
 
 
 def _smoothed_log(engine: Any, data: Any, lag: int | None, signals: Signals) -> Estimates:

@@ -39,7 +39,12 @@ class SteppingEngine(Engine):
     """
 
     def __init__(self, design: ObserverDesign, *, warm_up: float | None = None, outliers: str | None = None) -> None:
-        self.observer, plant = _with_gate(design.observer, outliers), design.plant
+        observer: Any = design.observer
+        wanted = outliers or ("gate" if observer.outliers == "none" else observer.outliers)
+        self.observer: RecursiveObserver | DAEObserver = observer
+        if wanted != observer.outliers:
+            self.observer = changed(observer, outliers=wanted)
+        plant = design.plant
         super().__init__(self.observer, None, warm_up, 0.0)
         self.input_names, self.output_names = plant.input_names, plant.output_names
         self.is_recursive, self.may_restart = isinstance(self.observer, RecursiveObserver), True
@@ -77,19 +82,24 @@ class SteppingEngine(Engine):
             )  # fmt: skip
         return values
 
-    def _taken(self, y: FloatArray, u: FloatArray, row: int) -> StepRow | SolverError | None:
-        """Take one sample, or return why the sample cannot be taken; `None` if numbers are not finite."""
+    def _taken(self, y: FloatArray, u: FloatArray, row: int) -> StepRow | None:
+        """Take one sample, or none of it: `None` where numbers are no finite ones any more."""
+        before = self.state
         try:
-            self.state, found = self.observer.accept(self.state, y, u)
+            with np.errstate(all="ignore"):
+                self.state, found = self.observer.accept(self.state, y, u)
         except SolverError as error:
-            return SolverError(f"Row {row}: {error}")
+            raise SolverError(f"Row {row}: {error}") from error
         except SpecError as error:
             raise SpecError(f"Row {row}: {error}", path=f"row {row}") from error
         except PreconditionError as error:
             raise PreconditionError(f"Row {row}: {error}", condition=error.condition) from error
         except (np.linalg.LinAlgError, ValueError):
             return None
-        return found if found.is_finite else None
+        if found.is_finite:
+            return found
+        self.state = before
+        return None
 
     def _values(self, found: StepRow) -> FloatArray:
         """Return a row: estimates, standard deviations, innovation at the parameters of one sample before."""
@@ -177,21 +187,15 @@ class SteppingEngine(Engine):
         return OK if outputs.all() else PARTIAL
 
     def _safe(self, y: FloatArray, u: FloatArray, row: int) -> StepRow | None:
-        """Take one sample, or none of it: what overflows leaves the state as it was."""
-        before = self.state
-        with np.errstate(all="ignore"):
-            found = self._taken(y, u, row)
-        if found is None or isinstance(found, SolverError):
-            self.state = before
+        """Take one sample, or none of it where there is no solution either."""
+        try:
+            return self._taken(y, u, row)
+        except SolverError:
             return None
-        return found
 
     def _required(self, u: FloatArray, row: int) -> StepRow:
         """Take one sample without outputs."""
-        with np.errstate(all="ignore"):
-            found = self._taken(np.full(len(self.output_names), np.nan), u, row)
-        if isinstance(found, SolverError):
-            raise found
+        found = self._taken(np.full(len(self.output_names), np.nan), u, row)
         if found is None:
             raise SpecError(
                 f"Row {row}: the estimates are no finite numbers any more: the model is unstable, or the inputs are "
@@ -204,11 +208,3 @@ class SteppingEngine(Engine):
 
     def _resume_own(self, data: dict[str, Any]) -> None:
         self.state, self.u = state_from_data(self.state, data["observer"]), data["u"]
-
-
-def _with_gate(observer: Any, outliers: str | None) -> RecursiveObserver | DAEObserver:
-    """Return an observer for logs: with a gate, unless it or ``outliers`` says otherwise."""
-    wanted = outliers or ("gate" if observer.outliers == "none" else observer.outliers)
-    found: RecursiveObserver | DAEObserver
-    found = observer if wanted == observer.outliers else changed(observer, outliers=wanted)
-    return found

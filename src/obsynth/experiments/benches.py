@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray, read_only
-from obsynth.numerics.covariances import covariance_factor
-from obsynth.numerics.holds import driven, first_order_hold
+from obsynth.numerics.continuous import driven, first_order_hold
+from obsynth.numerics.ranks import covariance_factor
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.estimates import Estimates
 from obsynth.observers.linear.derived import sample_observer

@@ -1,7 +1,4 @@
-"""A sampled observer as C99: one header, one source, no allocation, no library.
-
-Words of C: names, comments and paths that a compiler takes, whatever they are made of.
-"""
+"""A sampled observer as C99: one header, one source, no allocation, no library."""
 
 from __future__ import annotations
 

@@ -36,12 +36,7 @@ STEADY = (
 
 @dataclass(frozen=True, eq=False)
 class Realisation:
-    """The observer of a design, ready to be handed on.
-
-    Fields: design: Linear, or recursive for a time-invariant plant; observer: Its observer, sampled if that was asked
-    for, or the steady state of its recursion; digest: sha256 of the gain set; start: ``z(0)``; note: What a reader must
-    know; may be empty.
-    """
+    """The observer of a design, sampled if that was asked for, or the steady state of its recursion; from ``z(0)``."""
 
     design: ObserverDesign
     observer: LinearObserver
@@ -83,9 +78,7 @@ class Realisation:
     @property
     def outputs(self) -> tuple[str, ...]:
         """Names of the outputs, ``xhat[...]``, ``fhat[...]``, ``r[...]``."""
-        observer = self.observer
-        kinds = (("xhat", observer.state_names), ("fhat", observer.fault_names), ("r", observer.residual_names))
-        return tuple(f"{kind}[{name}]" for kind, names in kinds for name in names)
+        return self.observer.row_names
 
     @property
     def operating_point(self) -> tuple[FloatArray, FloatArray]:

@@ -21,10 +21,10 @@ LOOKED_AT = 1 << 16
 
 @dataclass(frozen=True)
 class FileKind:
-    """A kind of file that obsynth writes.
+    """A kind of file that obsynth writes: its name in messages, and by what it is known.
 
-    Fields: name: In messages, such as ``a gain set``; mark: What the beginning or the end of each of its files holds
-    (regular expression); ending: How files of this kind are named, and no others.
+    ``mark``: a regular expression for the beginning or the end of each; ``ending``: how these files, and no others, are
+    named.
     """
 
     name: str

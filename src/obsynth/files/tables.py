@@ -49,12 +49,11 @@ def text_table(rows: Sequence[Sequence[str]], *, left: int | None = None) -> lis
     """Return the lines of a table; its columns, or the first ``left`` of them, begin at the left, others end right."""
     widths = [max(len(row[j]) for row in rows) for j in range(len(rows[0]))]
     count = len(widths) if left is None else left
-    return [
-        "  ".join(
-            cell.ljust(w) if j < count else cell.rjust(w) for j, (cell, w) in enumerate(zip(row, widths, strict=True))
-        )
+    aligned = (
+        [cell.ljust(w) if j < count else cell.rjust(w) for j, (cell, w) in enumerate(zip(row, widths, strict=True))]
         for row in rows
-    ]
+    )
+    return ["  ".join(cells).rstrip() for cells in aligned]
 
 
 def html_table(rows: Sequence[Sequence[str]]) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.extras import imported
+from obsynth.numerics.libraries import imported
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.validation import checked_names
 

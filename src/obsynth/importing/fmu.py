@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import shutil
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -18,8 +17,9 @@ from obsynth.importing.fmu_instance import Instance
 from obsynth.importing.roles import plant_of
 from obsynth.numerics.arguments import is_finite_number, require_mapping
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.extras import imported
+from obsynth.numerics.libraries import imported
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.validation import suggestion
 
 #: Newton steps towards an equilibrium.
 _STEPS = 50
@@ -152,20 +152,15 @@ def _used(known: Sequence[str], picked: Sequence[str] | None, what: str) -> list
         raise SpecError(f"{what} is {picked!r}: give a list of names.", path=what)
     for name in picked:
         if name not in known:
-            raise SpecError(f"{what}: the FMU has no {name!r} among its {what}.{_close(name, known)}", path=what)
+            raise SpecError(f"{what}: the FMU has no {name!r} among its {what}.{suggestion(name, known)}", path=what)
     return list(picked)
 
 
 def _require_known(at: Mapping[str, float], instance: Instance) -> None:
     for name in at:
         if name not in instance.settable:
-            close = _close(name, instance.settable)
+            close = suggestion(name, instance.settable)
             raise SpecError(f"at: the FMU has no real variable {name!r} that can be set.{close}", path="at")
-
-
-def _close(name: str, known: Sequence[str]) -> str:
-    close = difflib.get_close_matches(name, list(known), n=2)
-    return f" Did you mean {' or '.join(map(repr, close))}?" if close else ""
 
 
 def _equilibrium(instance: Instance, states: FloatArray) -> FloatArray:

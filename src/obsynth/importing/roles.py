@@ -27,9 +27,9 @@ def plant_of(
     `DescriptorSystem`, which go before ``dt``, and entry by entry before operating point and units.
     """
     more = {"dt": dt, **plant}
-    for name, known in (("operating_point", point), ("units", units)):
-        if known is not None:
-            more[name] = {**known, **(more.get(name) or {})}
+    for name, stated in (("operating_point", point), ("units", units)):
+        if stated is not None:
+            more[name] = {**stated, **(more.get(name) or {})}
     faults, disturbances, actuator_faults, sensor_faults = _role_lists(more)
     a = as_matrix(matrices["A"], "A")
     given = {name: None if value is None else as_matrix(value, name) for name, value in matrices.items()}

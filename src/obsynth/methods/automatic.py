@@ -24,8 +24,6 @@ from obsynth.results.design import ObserverDesign
 
 #: Methods whose designs are continuous whatever the plant is used for: they are sampled afterwards.
 CONTINUOUS_ONLY = ("pd-observer",)
-
-
 #: An estimate that shows 90 % of a step later than this share of the plant's settling time comes after faster ones.
 SLOW = 0.25
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
@@ -20,8 +19,7 @@ from obsynth.methods.method_spec import MethodSpec, PlantKind, Synthesis
 from obsynth.methods.refusals import require_above_rounding, rounding_notes, with_advice
 from obsynth.methods.registry import AUTO, REGISTRY, method_spec, methods_for
 from obsynth.methods.verifying import verify
-from obsynth.numerics.failures import failed_computations
-from obsynth.numerics.threads import one_thread_if_small
+from obsynth.numerics.libraries import failed_computations, one_thread_if_small
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
@@ -206,10 +204,7 @@ def _checked(plant: Plant, options: Mapping[str, Mapping[str, Any]]) -> dict[str
         asked = {} if method not in options else spec.read_options(options[method]).as_given()
         conditions = _kind_conditions(plant, spec)
         if not conditions:
-            judge = spec.load("conditions")
-            known = set(inspect.signature(judge).parameters)
-            given = {name: value for name, value in asked.items() if name in known}
-            conditions = judge(plant, **given)
+            conditions = tuple(spec.existence(asked)(plant))
         found[method] = VerificationReport.of(condition_rows(conditions))
     return found
 
@@ -273,9 +268,8 @@ def verified(
     draft = with_stored_errors(draft_of(plant, method, found, name=name, recovery=recovery))
     report = verify(draft)
     if not report.passed:
-        failed = "; ".join(f"{row.name} ({row.value:.3g} against {row.bound:.3g})" for row in report.failures)
         raise VerificationError(
-            f"Gains were found, but the shipped realisation fails: {failed}. Nothing was shipped; "
+            f"Gains were found, but the shipped realisation fails: {failed_rows(report)}. Nothing was shipped; "
             "the plant may be badly scaled, or what was asked may be at the edge of what can be had: ask for less."
             + "".join(f" {note}" for note in draft.notes),
             report=report,
@@ -284,6 +278,20 @@ def verified(
         require_above_rounding(draft.plant, draft.observer)
         draft = draft.replace(notes=(*draft.notes, *rounding_notes(draft.plant, draft.observer)))
     return draft.replace(report=report, notes=(*draft.notes, *_lost_tolerances(plant, draft.plant)))
+
+
+def failed_rows(report: VerificationReport) -> str:
+    """Return the rows that fail as a text."""
+    return "; ".join(f"{row.name} ({row.value:.3g} against {row.bound:.3g})" for row in report.failures)
+
+
+def design_of_given_gains(
+    plant: Plant | Transformation, method: str, synthesis: Callable[[Any], Synthesis], *, name: str
+) -> ObserverDesign:
+    """Return the design that ``synthesis(plant)`` makes of given gains, with its report, whatever that says."""
+    own, recovery = plant_and_recovery(plant)
+    draft = draft_of(own, method, synthesis(own), name=name, recovery=recovery)
+    return draft.replace(report=verify(draft))
 
 
 def _lost_tolerances(given: Plant, shipped: Plant) -> tuple[str, ...]:

@@ -1,15 +1,17 @@
-"""What a method is: one declaration, from which schema, checks of arguments, reports and lists of methods derive.
-
-What a method hands to the pipeline: gains, realisation and certificate, not yet verified.
-"""
+"""What a method is: one declaration, from which schema, checks and lists derive; and what it hands to the pipeline."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
+from functools import cache, partial
 from importlib import import_module
+from inspect import signature
 from typing import Any, ClassVar, Literal, TypeAlias, cast, get_type_hints
 
+import numpy as np
+
+from obsynth.analysis.conditions import Condition
 from obsynth.analysis.transformations.recovery import Transformation
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import problem_with
@@ -18,6 +20,7 @@ from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.fault_models import FaultModel
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.results.design import Certificate
 
@@ -47,7 +50,23 @@ class MethodOptions:
         """Return every option by name."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
+    def as_plain(self) -> dict[str, Any]:
+        """Return every option by name, as lists, mappings, numbers and texts."""
+        return {name: plain(value) for name, value in self.as_given().items()}
 
+
+def plain(value: Any) -> Any:
+    """Return an option as lists, mappings and numbers."""
+    if isinstance(value, FaultModel):
+        return {"Phi": value.Phi.tolist(), "Cw": value.Cw.tolist()}
+    if isinstance(value, Mapping):
+        return {str(key): plain(part) for key, part in value.items()}
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    return [plain(part) for part in value] if isinstance(value, (list, tuple)) else value
+
+
+@cache
 def option_types(options: type[MethodOptions]) -> dict[str, Any]:
     """Return name -> annotated type of every option."""
     hints = get_type_hints(options, include_extras=True)
@@ -105,6 +124,12 @@ class MethodSpec:
         module, name = path.split(":")
         found: Callable[..., Any] = getattr(import_module(module, self.folder), name)
         return found
+
+    def existence(self, options: Mapping[str, Any]) -> Callable[[Any], Sequence[Condition]]:
+        """Return the existence conditions as a function of the plant, with those options that they depend on."""
+        judge = self.load("conditions")
+        known = signature(judge).parameters
+        return partial(judge, **{name: value for name, value in options.items() if name in known})
 
     @property
     def option_names(self) -> tuple[str, ...]:

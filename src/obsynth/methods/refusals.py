@@ -8,10 +8,9 @@ roundoff, whatever the units.  The observer's own numbers, right to their last d
 
 from __future__ import annotations
 
-import inspect
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from fractions import Fraction
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 
@@ -29,6 +28,25 @@ from obsynth.proofs.balls import UNIT_ROUNDOFF
 MOST_FOR_PAIRS, MOST_FOR_ONE = 16, 48
 #: Conditions on the kind of plant, whose messages say what to do: no sensor changes it.
 OF_THE_KIND = ("continuous time", "discrete time", "plant of this kind")
+
+
+def require_all_told(conditions: Iterable[Condition]) -> None:
+    """Raise `PreconditionError` for the first condition that fails, and say which others fail too."""
+    failed = [condition for condition in conditions if not condition.holds]
+    if not failed:
+        return
+    first, *others = failed
+    try:
+        first.require()
+    except PreconditionError as error:
+        if not others:
+            raise
+        also = "; ".join(f"{other.name}: {other.detail}" for other in others)
+        raise PreconditionError(
+            f"{error} Also fails: {also}", condition=first.name,
+            mode=next((condition.mode for condition in failed if condition.mode is not None), None),
+            signals=tuple(dict.fromkeys(name for condition in failed for name in condition.signals)),
+        ) from None  # fmt: skip
 
 
 def with_advice(
@@ -54,16 +72,12 @@ def with_advice(
 
 def _asker(method: MethodSpec, options: Mapping[str, Any]) -> Callable[[DescriptorSystem], bool]:
     """Return what says whether all existence conditions of a method hold for a plant."""
-    judge: Callable[..., Sequence[Condition]] = method.load("conditions")
-    known = set(inspect.signature(judge).parameters)
-    given = {name: value for name, value in options.items() if name in known}
-    if "exactly" in known:
-        # What would help is told to be tried, not proved: the tried plant is decided exactly then.
-        given["exactly"] = False
 
     def holds(plant: DescriptorSystem) -> bool:
+        # What would help is told to be tried, not proved: the tried plant is decided exactly then.
+        judge = method.existence({**_fitting(options, plant), "exactly": False})
         try:
-            return all(condition.holds for condition in judge(plant, **_fitting(given, plant)))
+            return all(condition.holds for condition in judge(plant))
         except (ObsynthError, np.linalg.LinAlgError):
             return False
 
@@ -82,23 +96,16 @@ def _drops(plant: DescriptorSystem, holds: Callable[[DescriptorSystem], bool]) -
     """Return the unknown inputs and faults without any one of which the design exists."""
     if plant.nx > MOST_FOR_ONE:
         return []
+    kinds = {"unknown input": ("Bd", "Dd", "disturbance_names"), "fault": ("Bf", "Df", "fault_names")}
     found = []
-    for i, name in enumerate(plant.disturbance_names):
-        rest = [j for j in range(plant.nd) if j != i]
-        fewer = plant.replace(
-            Bd=plant.Bd[:, rest], Dd=plant.Dd[:, rest], disturbance_names=[plant.disturbance_names[j] for j in rest],
-            units={}, operating_point={},
-        )  # fmt: skip
-        if holds(fewer):
-            found.append(f"unknown input {name}")
-    for i, name in enumerate(plant.fault_names if plant.nf > 1 else ()):
-        rest = [j for j in range(plant.nf) if j != i]
-        fewer = plant.replace(
-            Bf=plant.Bf[:, rest], Df=plant.Df[:, rest], fault_names=[plant.fault_names[j] for j in rest], units={},
-            operating_point={},
-        )  # fmt: skip
-        if holds(fewer):
-            found.append(f"fault {name}")
+    for kind, (entering, direct, listed_names) in kinds.items():
+        names = getattr(plant, listed_names)
+        for i, name in enumerate(names if kind != "fault" or plant.nf > 1 else ()):
+            rest = [j for j in range(len(names)) if j != i]
+            fewer = {part: getattr(plant, part)[:, rest] for part in (entering, direct)}
+            fewer |= {listed_names: [names[j] for j in rest]}
+            if holds(plant.replace(**fewer, units={}, operating_point={})):
+                found.append(f"{kind} {name}")
     return found
 
 
@@ -118,12 +125,9 @@ MOST_STATES = 150
 POINTS = (0.0, 1e-2, 1e-1, 1.0)
 
 
-_Shares: TypeAlias = Callable[[DescriptorSystem, LinearObserver, complex], FloatArray | None]
-
-
 def require_above_rounding(plant: DescriptorSystem, observer: LinearObserver) -> None:
     """Raise `PreconditionError` (unclear) where rounding of the outputs drowns the estimate of a unit fault."""
-    least = _least(plant, observer, _shares)
+    least = _least(plant, observer, own=False)
     if least is None:
         return
     worst = int(np.argmax(least))
@@ -182,7 +186,7 @@ def last_digits(plant: DescriptorSystem, observer: LinearObserver, fault: int, p
 
 def rounding_notes(plant: DescriptorSystem, observer: LinearObserver) -> tuple[str, ...]:
     """Return what rounding of the observer's own numbers may do to an estimate, where that matters."""
-    found = _least(plant, observer, own_shares)
+    found = _least(plant, observer, own=True)
     return () if found is None else tuple(
         f"The numbers of the observer cancel each other: their last digits alone may move the estimate of {name!r} by"
         f" {share:.2g} of the fault, and by more at some frequencies. State the noise of the sensors, or ask for a"
@@ -191,12 +195,12 @@ def rounding_notes(plant: DescriptorSystem, observer: LinearObserver) -> tuple[s
     )  # fmt: skip
 
 
-def _least(plant: DescriptorSystem, observer: LinearObserver, shares_at: _Shares) -> FloatArray | None:
+def _least(plant: DescriptorSystem, observer: LinearObserver, *, own: bool) -> FloatArray | None:
     """Return the least share of each fault over the points; ``None`` where it is not examined."""
     if not plant.nf or observer.order > MOST_STATES or plant.is_sparse or len(observer.fault_names) != plant.nf:
         return None
     with np.errstate(all="ignore"):
-        shares = [share for point in _points(plant) if (share := shares_at(plant, observer, point)) is not None]
+        shares = [share for point in _points(plant) if (share := _shares(plant, observer, point, own=own)) is not None]
     return np.asarray(np.min(shares, axis=0)) if shares else None
 
 
@@ -220,25 +224,16 @@ def _responses(
     return np.asarray(plant.C @ states + plant.Df, dtype=np.complex128), np.asarray(resolvent)
 
 
-def own_shares(plant: DescriptorSystem, observer: LinearObserver, point: complex) -> FloatArray | None:
-    """Return the share of each fault that rounding of the observer's own numbers may be at one point."""
+def _shares(plant: DescriptorSystem, observer: LinearObserver, point: complex, *, own: bool) -> FloatArray | None:
+    """Return the share of each fault that rounding of the outputs, or of the observer's ``own`` numbers, may be."""
     found = _responses(plant, observer, point)
     if found is None:
         return None
     outputs, resolvent = found
-    state, seen, rows = np.abs(resolvent @ observer.By @ outputs), np.abs(outputs), observer.fault_rows
-    moved = np.abs(resolvent) @ (np.abs(observer.Az) @ state + np.abs(observer.By) @ seen)
-    shares = UNIT_ROUNDOFF * np.diag(np.abs(observer.Cz[rows]) @ (moved + state) + np.abs(observer.Dy[rows]) @ seen)
+    rows, seen = observer.fault_rows, np.abs(outputs)
+    entering, state = np.abs(observer.By) @ seen, np.abs(resolvent @ observer.By @ outputs)
+    moved = (
+        np.abs(resolvent) @ (entering + np.abs(observer.Az) @ state) + state if own else np.abs(resolvent) @ entering
+    )
+    shares = UNIT_ROUNDOFF * np.diag(np.abs(observer.Cz[rows]) @ moved + np.abs(observer.Dy[rows]) @ seen)
     return np.asarray(shares) if np.all(np.isfinite(shares)) else None
-
-
-def _shares(plant: DescriptorSystem, observer: LinearObserver, point: complex) -> FloatArray | None:
-    """Return the share of each fault that rounding of the outputs may be at one point; ``None`` at a pole of either."""
-    responses = _responses(plant, observer, point)
-    if responses is None:
-        return None
-    outputs, resolvent = np.abs(responses[0]), responses[1]
-    rows = observer.fault_rows
-    sizes = np.abs(observer.Cz[rows]) @ (np.abs(resolvent) @ (np.abs(observer.By) @ outputs))
-    found = UNIT_ROUNDOFF * np.diag(sizes + np.abs(observer.Dy[rows]) @ outputs)
-    return np.asarray(found) if np.all(np.isfinite(found)) else None

@@ -1,7 +1,4 @@
-"""Riccati equations: a rough observer gain, and certificates of a bounded gain in closed form.
-
-Finding a Lyapunov factor with which the stability of a matrix in hand can be proved.
-"""
+"""Riccati and Lyapunov equations: a rough observer gain, bounded gains in closed form, factors that prove stability."""
 
 from __future__ import annotations
 
@@ -173,6 +170,24 @@ def _by_qz(
             return np.asarray(solve_discrete_are(a.T, h.T, process, weight, s=cross))
     except (np.linalg.LinAlgError, ValueError):
         return None
+
+
+def continuous_solution(
+    a: FloatArray, h: FloatArray, process: FloatArray, weight: FloatArray, cross: FloatArray | None = None
+) -> FloatArray | None:
+    """Return P with ``a P + P a' - (P h' + cross) weight^-1 (P h' + cross)' + process = 0`` by SciPy, or ``None``.
+
+    What an ill-conditioned equation gives is judged by its user: by the poles, or by whether it proves anything.
+    """
+    from scipy.linalg import solve_continuous_are
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            p = np.asarray(solve_continuous_are(a.T, h.T, process, weight, s=cross))
+    except (np.linalg.LinAlgError, ValueError):
+        return None
+    return p if np.all(np.isfinite(p)) else None
 
 
 def normalising_change(p: FloatArray) -> FloatArray:

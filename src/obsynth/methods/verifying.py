@@ -8,8 +8,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.methods.registry import REGISTRY, method_spec
-from obsynth.numerics.failures import failed_computations
-from obsynth.numerics.threads import one_thread_if_small
+from obsynth.numerics.libraries import failed_computations, one_thread_if_small
 from obsynth.results.checks import VerificationReport
 from obsynth.results.plant_source import remembering
 from obsynth.verification.claims import before_the_mean, closed_claims, mean_noise_rows

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any, TypeAlias
+from collections.abc import Callable
+from functools import wraps
+from typing import Any, TypeAlias, TypeVar
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +17,22 @@ ComplexArray: TypeAlias = NDArray[np.complex128]
 
 #: Stands for a size that may be zero, where something is divided by it.
 SMALLEST = 1e-300
+
+
+Made = TypeVar("Made")
+
+
+def remembered(make: Callable[[Any], Made]) -> Callable[[Any], Made]:
+    """Make something of an object that never changes once, for as long as it lives; it must not hold the object."""
+    known: WeakKeyDictionary[Any, Made] = WeakKeyDictionary()
+
+    @wraps(make)
+    def once(item: Any) -> Made:
+        if item not in known:
+            known[item] = make(item)
+        return known[item]
+
+    return once
 
 
 def read_only(array: FloatArray) -> FloatArray:

@@ -36,7 +36,9 @@ class Modes(NamedTuple):
 
     @classmethod
     def of(cls, a: FloatArray) -> Modes:
-        """Return those of ``a (n, n)``."""
+        """Return those of ``a (n, n)``; of a matrix that is not finite, infinite ones."""
+        if not np.all(np.isfinite(a)):
+            return cls(np.full(len(a), np.inf, dtype=np.complex128), np.eye(len(a), dtype=np.complex128))
         values, vectors = np.linalg.eig(a)
         return cls(np.asarray(values, dtype=np.complex128), np.asarray(vectors, dtype=np.complex128))
 

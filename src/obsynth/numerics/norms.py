@@ -115,7 +115,9 @@ def hinf_norm(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, *, mod
     return HinfNorm(best, np.inf, angle, distance)
 
 
-def norm_is_at_most(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, level: float) -> bool:
+def norm_is_at_most(
+    a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, level: float, *, modes: Modes | None = None
+) -> bool:
     """Return whether the H-infinity norm of a discrete-time system is at most ``level``, as cheaply as can be told.
 
     By a Riccati equation or, where that leaves it open, by the norm.
@@ -124,19 +126,17 @@ def norm_is_at_most(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, 
     """
     if a.shape[0] == 0 or b.shape[1] == 0 or c.shape[0] == 0:
         return hinf_norm(a, b, c, d).upper <= level
-    if not all(np.all(np.isfinite(part)) for part in (a, b, c, d)) or spectral_radius(a) >= 1.0:
+    if not all(np.all(np.isfinite(part)) for part in (a, b, c, d)):
+        return False
+    modes = Modes.of(a) if modes is None else modes
+    if modes.radius >= 1.0:
         return False
     scaled = balanced_realisation(a, b, c)
     verdict = compared_gain(*scaled, d, level)
     if verdict is not None:
         return verdict
     # A gain above the level that is attained is cheaper to find than the norm.
-    modes, points = Modes.of(a), GRID_POINTS if a.shape[0] <= STATES_OF_PENCIL else MANY_GRID_POINTS
-    balanced = _balanced(a, b, c, modes)
-    best, _ = _modal_peak(*balanced[:3], d, balanced[3], points=points)
-    if np.isfinite(best) and best > level:
-        return False
-    return hinf_norm(a, b, c, d, modes=modes).upper <= level
+    return largest_peak(a, b, c, d, modes=modes) <= level and hinf_norm(a, b, c, d, modes=modes).upper <= level
 
 
 def highest_gain_found(
@@ -146,14 +146,25 @@ def highest_gain_found(
 
     Shapes: ``a (n, n)``, ``b (n, m)``, ``c (p, n)``, ``d (p, m)``.
     """
-    if a.shape[0] <= STATES_OF_PENCIL or b.shape[1] == 0 or c.shape[0] == 0 or not np.all(np.isfinite(a)):
-        return hinf_norm(a, b, c, d, modes=modes).upper
+    many = a.shape[0] > STATES_OF_PENCIL
+    return largest_peak(a, b, c, d, modes=modes) if many else hinf_norm(a, b, c, d, modes=modes).upper
+
+
+def largest_peak(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, *, modes: Modes | None = None) -> float:
+    """Return the largest gain that a modal response shows, the H-infinity norm where that is not to be believed.
+
+    Shapes: ``a (n, n)``, ``b (n, m)``, ``c (p, n)``, ``d (p, m)``.
+    """
     modes = Modes.of(a) if modes is None else modes
     if modes.radius >= 1.0:
         return float("inf")
-    balanced = _balanced(a, b, c, modes)
-    best, _ = _modal_peak(*balanced[:3], d, balanced[3], points=MANY_GRID_POINTS)
-    return best if np.isfinite(best) else hinf_norm(a, b, c, d, modes=modes).upper
+    if all(part.size for part in (a, b, c)) and all(np.all(np.isfinite(part)) for part in (b, c, d)):
+        points = MANY_GRID_POINTS if a.shape[0] > STATES_OF_PENCIL else GRID_POINTS
+        balanced = _balanced(a, b, c, modes)
+        best, _ = _modal_peak(*balanced[:3], d, balanced[3], points=points)
+        if np.isfinite(best):
+            return best
+    return hinf_norm(a, b, c, d, modes=modes).upper
 
 
 def _norm_of_many_states(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, modes: Modes) -> HinfNorm | None:

@@ -1,24 +1,22 @@
-"""Whether a tall pencil loses rank at given points: the Schur form is taken once, each point costs a square of it.
+"""Whether a tall pencil loses rank at given points, and the staircase (Van Dooren) of its infinite and singular parts.
 
-In the Schur basis of the part on the range of E a pencil is ``[T - z I; W]`` with T triangular and few rows W, and its
-QR factorisation at a point is that of a triangle with a few rows below (LAPACK's ``tpqrt``).
-
-The smallest singular values of a large matrix, with their vectors: one QR factorisation and inverse iteration.
-
-A full singular value decomposition of 600 columns takes ten times as long, and a decision about a rank at a known
-point needs only the smallest values.
+In the Schur basis of the part on the range of E a pencil is ``[T - z I; W]`` with T triangular and few rows W: the
+Schur form is taken once, and the QR factorisation at a point is that of a triangle with a few rows below (``tpqrt``).
+Smallest singular values come from one QR factorisation and inverse iteration, in a tenth of the time of all of them.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.numerics.arrays import ComplexArray, FloatArray
-from obsynth.numerics.ranks import RANK_TOLERANCE
+from obsynth.numerics.ranks import RANK_TOLERANCE, RankDecision, rank_from
+from obsynth.numerics.scaling import EquilibratedPencil
 
 #: Matrices with fewer columns are decomposed as a whole.
 FEW_COLUMNS = 80
@@ -158,3 +156,92 @@ class PencilPoints:
             return triangle
         found, _, _, _ = ztpqrt(0, min(BLOCK, triangle.shape[0]), triangle, below, overwrite_a=1, overwrite_b=1)
         return np.triu(found)
+
+
+_Svd: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
+
+
+@dataclass(frozen=True, eq=False)
+class Deflation:
+    """A pencil without its infinite and right singular part, and the sizes of the steps taken."""
+
+    E: FloatArray
+    A: FloatArray
+    nullities: tuple[int, ...]
+    ranks: tuple[int, ...]
+    decisions: tuple[RankDecision, ...]
+
+
+def reduce_pencil(pencil: EquilibratedPencil) -> tuple[Deflation, Deflation]:
+    """Deflate the infinite and right singular part, then the left singular part (transposed)."""
+    scales, right = without_infinite_part(pencil)
+    return right, without_left_singular_part(right, scales)
+
+
+def without_infinite_part(pencil: EquilibratedPencil) -> tuple[tuple[float, float], Deflation]:
+    """Deflate the infinite and right singular part; the norms of E and A, which decide its ranks, come first."""
+    first = full_svd(pencil.E)
+    scales = (float(np.max(first[1], initial=0.0)), largest_singular_value(pencil.A))
+    return scales, _deflate(pencil.E, pencil.A, scales, most_nullity=pencil.E.shape[1], first=first)
+
+
+def without_left_singular_part(right: Deflation, scales: tuple[float, float]) -> Deflation:
+    """Deflate what is left of the singular part."""
+    # E now has full column rank, so the ranks of E in the second pass follow from its shape.
+    surplus = right.E.shape[0] - right.E.shape[1]
+    return _deflate(right.E.T, right.A.T, scales, most_nullity=surplus)
+
+
+def _deflate(
+    E: FloatArray, A: FloatArray, scales: tuple[float, float], *, most_nullity: int, first: _Svd | None = None
+) -> Deflation:
+    """Deflate step by step; ``first`` is the singular value decomposition of E, where it is known."""
+    nullities: list[int] = []
+    ranks: list[int] = []
+    decisions: list[RankDecision] = []
+    while most_nullity > 0:
+        rows, columns = E.shape
+        if first is None and columns > rows:
+            first = full_svd(E)
+        # Most often nothing is left to deflate after the first step: bases are then not needed.
+        values = _singular_values(E) if first is None else first[1]
+        decision = rank_from(values, scale=scales[0], expected=columns)
+        # Rows were removed from a matrix of full column rank: this bounds the loss, whatever the tolerance says.
+        rank = max(decision.rank, columns - most_nullity)
+        if max(columns - rows, 0) < most_nullity:
+            decisions.append(decision)
+        if rank == columns:
+            break
+        right = (full_svd(E) if first is None else first)[2]
+        kernel, complement, first = right[rank:].T, right[:rank].T, None
+        left, values, _ = full_svd(A @ kernel)
+        decision = rank_from(values, scale=scales[1], expected=columns - rank)
+        decisions.append(decision)
+        rest = left[:, decision.rank :].T
+        E, A = rest @ E @ complement, rest @ A @ complement
+        nullities.append(columns - rank)
+        ranks.append(decision.rank)
+        most_nullity = decision.rank
+    return Deflation(E, A, tuple(nullities), tuple(ranks), tuple(decisions))
+
+
+def full_svd(matrix: FloatArray) -> _Svd:
+    """Return the full left basis, the singular values and the full right basis."""
+    if matrix.size == 0:
+        return np.eye(matrix.shape[0]), np.zeros(0), np.eye(matrix.shape[1])
+    left, values, right = np.linalg.svd(matrix)
+    return left, values, right
+
+
+def _singular_values(matrix: FloatArray) -> FloatArray:
+    return np.asarray(np.linalg.svd(matrix, compute_uv=False)) if matrix.size else np.zeros(0)
+
+
+def normal_rank_of(right: Deflation, left: Deflation) -> int:
+    """Return the rank of the pencil at almost every point, from both passes."""
+    return sum(right.ranks) + sum(left.ranks) + int(left.E.shape[0])
+
+
+def largest_singular_value(matrix: FloatArray) -> float:
+    """Return the spectral norm; zero of an empty matrix."""
+    return float(np.linalg.norm(matrix, 2)) if matrix.size else 0.0

@@ -20,16 +20,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.numerics.arrays import ComplexArray, FloatArray
-from obsynth.numerics.pencil_points import PencilPoints
-from obsynth.numerics.ranks import CLUSTER_TOLERANCE, RANK_TOLERANCE, RankDecision
-from obsynth.numerics.scaling import equilibrate_pencil
-from obsynth.numerics.staircase import (
+from obsynth.numerics.pencil_points import (
     Deflation,
+    PencilPoints,
     normal_rank_of,
     reduce_pencil,
     without_infinite_part,
     without_left_singular_part,
 )
+from obsynth.numerics.ranks import CLUSTER_TOLERANCE, RANK_TOLERANCE, RankDecision
+from obsynth.numerics.scaling import equilibrate_pencil
 
 #: From so many states on, a well-conditioned E is inverted: ordinary eigenvalues take a fraction of the time.
 MANY_STATES = 100

@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.numerics.arrays import FloatArray, read_only
 
@@ -161,20 +160,12 @@ def balance_by_least_squares(
     ne, nx = E.shape
     b, c = np.hstack([np.zeros((ne, 0)), *inputs]), np.vstack([np.zeros((0, nx)), *outputs])
     ends = [0, ne, ne + nx, ne + nx + len(c), ne + nx + len(c) + b.shape[1]]
-    equations, states, shown, entering = map(slice, ends[:-1], ends[1:])
-    normal = SMALL_RIDGE * np.eye(ends[-1])
-    diagonal, right = np.einsum("ii->i", normal), np.zeros(ends[-1])
-    blocks = ((E, equations, states), (A, equations, states), (c, shown, states), (b, equations, entering))
-    for matrix, rows, columns in blocks:
-        there = matrix != 0.0
-        sizes = np.log2(np.abs(np.where(there, matrix, 1.0)))
-        normal[rows, columns] += there
-        normal[columns, rows] += there.T
-        diagonal[rows] += np.sum(there, axis=1)
-        diagonal[columns] += np.sum(there, axis=0)
-        right[rows] -= np.sum(sizes, axis=1)
-        right[columns] -= np.sum(sizes, axis=0)
-    exponents = np.round(np.linalg.solve(normal, right)).astype(np.int64)
+    equations, states, shown, entering = map(range, ends[:-1], ends[1:])
+    problem = LogBalance(ends[-1])
+    for matrix, rows, columns in ((E, equations, states), (A, equations, states), (c, shown, states)):
+        problem.add(matrix, rows, columns)
+    problem.add(b, equations, entering)
+    exponents = np.round(problem.solve(passes=0, ridge=SMALL_RIDGE)).astype(np.int64)
     return Scaling(*(read_only(np.ldexp(1.0, exponents[part])) for part in (equations, states, shown)))
 
 
@@ -226,8 +217,8 @@ class LogBalance:
     def add(
         self,
         matrix: FloatArray,
-        rows: Sequence[int],
-        columns: Sequence[int],
+        rows: range,
+        columns: range,
         *,
         signs: tuple[int, int] = (1, 1),
         common: int | None = None,
@@ -237,53 +228,67 @@ class LogBalance:
 
         Shapes: ``matrix (m, n)``.
         """
-        i, j = np.nonzero(matrix)
-        unknowns = [np.array(rows, dtype=np.int64)[i], np.array(columns, dtype=np.int64)[j]]
-        if common is not None:
-            unknowns.append(np.full(len(i), common))
-        self._terms.append(_Term(np.log2(np.abs(matrix[i, j])), tuple(unknowns), (*signs, 1)[: len(unknowns)], weight))
+        there = matrix != 0.0
+        sizes = np.log2(np.abs(np.where(there, matrix, 1.0)))
+        places = slice(rows.start, rows.stop), slice(columns.start, columns.stop)
+        self._terms.append(_Term(sizes, weight * there, *places, *signs, common))
 
     def wish(self, unknown: int, exponent: float) -> None:
         """Ask for a value where the entries leave the unknown open."""
         self._wishes.append((unknown, exponent))
 
-    def solve(self) -> FloatArray:
+    def solve(self, *, passes: int = PASSES, ridge: float = RIDGE) -> FloatArray:
         """Return the exponents ``(count,)``, not rounded."""
-        found = self._solved([np.full(len(term.sizes), term.weight) for term in self._terms])
-        for _ in range(PASSES):
-            found = self._solved([term.weight * term.say(found) for term in self._terms])
+        found = self._solved([term.weights for term in self._terms], ridge)
+        for _ in range(passes):
+            found = self._solved([term.weights * term.say(found) for term in self._terms], ridge)
         return found
 
-    def _solved(self, weights: Sequence[FloatArray]) -> FloatArray:
-        n = self.count
-        normal, right = RIDGE * np.eye(n), np.zeros(n)
+    def _solved(self, weights: Sequence[FloatArray], ridge: float) -> FloatArray:
+        normal, right = ridge * np.eye(self.count), np.zeros(self.count)
+        diagonal = np.einsum("ii->i", normal)
         for term, weight in zip(self._terms, weights, strict=True):
-            known = [*zip(term.unknowns, term.signs, strict=True)]
-            for k, (p, sign) in enumerate(known):
-                right -= sign * np.bincount(p, weight * term.sizes, n)
-                normal.reshape(-1)[:: n + 1] += np.bincount(p, weight, n)
-                for q, other in known[:k]:
-                    both = sign * other * np.bincount(p * n + q, weight, n * n).reshape(n, n)
-                    normal += both
-                    normal += both.T
+            both, sizes = term.row_sign * term.column_sign * weight, weight * term.sizes
+            turned = (term.rows, term.row_sign, weight.T, sizes.T), (term.columns, term.column_sign, weight, sizes)
+            for places, sign, says, sized in turned:
+                sums = _in_turn(says)
+                right[places] -= sign * _in_turn(sized)
+                diagonal[places] += sums
+                if term.common is not None:
+                    normal[places, term.common] += sign * sums
+                    normal[term.common, places] += sign * sums
+            normal[term.rows, term.columns] += both
+            normal[term.columns, term.rows] += both.T
+            if term.common is not None:
+                right[term.common] -= _in_turn(sizes.reshape(-1))
+                diagonal[term.common] += _in_turn(weight.reshape(-1))
         for unknown, exponent in self._wishes:
             normal[unknown, unknown] += WISH_WEIGHT
             right[unknown] += WISH_WEIGHT * exponent
         return np.asarray(np.linalg.solve(normal, right), dtype=np.float64)
 
 
+def _in_turn(parts: FloatArray) -> FloatArray:
+    """Return the sum of numbers or rows, added up one after the other."""
+    return np.asarray(np.add.accumulate(parts, axis=0)[-1] if len(parts) else np.zeros(parts.shape[1:]))
+
+
 @dataclass(frozen=True, eq=False)
 class _Term:
-    """The nonzero entries of one matrix, and the unknowns that scale each of them."""
+    """One matrix: the logarithms and weights of its entries (no weight for zeros), and the unknowns that scale them."""
 
     sizes: FloatArray
-    unknowns: tuple[NDArray[np.int64], ...]
-    signs: tuple[int, ...]
-    weight: float
+    weights: FloatArray
+    rows: slice
+    columns: slice
+    row_sign: int
+    column_sign: int
+    common: int | None
 
     def say(self, exponents: FloatArray) -> FloatArray:
         """Return the say of each entry: all of it above one, less the further it is below."""
-        sizes = self.sizes.copy()
-        for unknown, sign in zip(self.unknowns, self.signs, strict=True):
-            sizes += sign * exponents[unknown]
+        rows, columns = self.row_sign * exponents[self.rows], self.column_sign * exponents[self.columns]
+        sizes = self.sizes + rows[:, None] + columns
+        if self.common is not None:
+            sizes += exponents[self.common]
         return np.asarray(1.0 / (1.0 + (np.minimum(sizes, 0.0) / HALF_SAY) ** 2))

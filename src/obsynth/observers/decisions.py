@@ -173,7 +173,7 @@ def _chi_square(
             raise SpecError("chi-square of a nonlinear observer asks about the parameters that it starts from: design "
                             "it with initial_parameters at what is nominal.", path="nominal")  # fmt: skip
         gaps = gaps - pull_of_the_start(observer, estimates, start)
-    values = np.einsum("ki,kij,kj->k", gaps, _inverses(estimates.parameter_covariances), gaps)
+    values = np.einsum("ki,kij,kj->k", gaps, np.linalg.pinv(estimates.parameter_covariances, hermitian=True), gaps)
     looks = len(values)
     thresholds = np.full(looks, float(quantile(np.array(float(nq)), false_alarms / looks)))
     hits = np.flatnonzero(values > thresholds)
@@ -189,13 +189,6 @@ def _chi_square(
         k, estimates.parameter_names[alone(weights @ gaps[k], np.diag(weights))], onset, confidence, float(values[k])
     )
     return Decision("chi-square", read_only(values), read_only(thresholds), alarm)
-
-
-def _inverses(covariances: FloatArray) -> FloatArray:
-    """Return pseudo-inverses ``(samples, nq, nq)``."""
-    if not covariances.shape[1]:
-        return covariances
-    return np.asarray(np.linalg.pinv(covariances, hermitian=True))
 
 
 def _nis(estimates: Estimates, squares: FloatArray, false_alarms: float) -> Decision:
@@ -220,8 +213,7 @@ def _nis(estimates: Estimates, squares: FloatArray, false_alarms: float) -> Deci
 def _cusum(
     estimates: Estimates, along: FloatArray, squares: FloatArray, change: FloatArray, false_alarms: float
 ) -> Decision:
-    """Decide by sums of log likelihood ratios: ``along (samples, nq)``: scores at the nominal parameters; ``squares
-    (samples, nq)``: their variances."""
+    """Decide by sums of log likelihood ratios, from scores at the nominal parameters and their variances."""
     samples, nq = along.shape
     signs = np.concatenate([change, -change])
     steps = np.hstack([along, along]) * signs - 0.5 * np.hstack([squares, squares]) * signs**2

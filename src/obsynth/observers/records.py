@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import is_number, is_whole, real_array, real_number
+from obsynth.numerics.arguments import is_number, real_array, real_number
 from obsynth.numerics.arrays import FloatArray, as_matrix, unmasked
 from obsynth.plants.dae.checks import finite_vector
 from obsynth.plants.validation import index_of
@@ -29,11 +29,6 @@ def require_names(names: Any, field: str) -> None:
         raise SpecError(
             f"{field} of the observer repeats {', '.join(map(repr, repeated))}: names must be unique.", path=field
         )
-
-
-def is_delay(delay: Any) -> bool:
-    """Whether ``delay`` is a whole number of samples, 0 or more."""
-    return is_whole(delay) and delay >= 0
 
 
 def require_horizon(horizon: int | None, samples: int, *, early: bool) -> None:
@@ -170,8 +165,8 @@ def batch_record(
     trials, samples = outputs.shape[:2]
     known = np.zeros((samples, 0)) if u is None and not nu else real_array(u, "u")
     if known.shape not in ((samples, nu), (trials, samples, nu)):
-        raise SpecError(f"u has shape {known.shape}, but (samples, {nu}) or (trials, samples, {nu}) is needed, with "
-                        f"{trials} trials and {samples} samples.", path="u")  # fmt: skip
+        raise SpecError(f"u has shape {known.shape}, but {(samples, nu)} or {(trials, samples, nu)} is needed.",
+                        path="u")  # fmt: skip
     if not np.isfinite(known).all():
         *trial, k, i = np.argwhere(~np.isfinite(known))[0]
         where = f" of trial {trial[0]}" if trial else ""

@@ -97,31 +97,19 @@ class StepSettings(ABC):
         return self.timing.is_plain and self.state_bounds is None
 
 
-class Steps(Protocol[State, Row]):
-    """The steps of an observer: what follows from it alone, made once for all runs."""
-
-    first: State
-
-    def advance(self, state: State, y: FloatArray, u: FloatArray) -> tuple[State, Row]:
-        """Return the state after a sample, and what is known at it."""
-        ...
-
-
 class StepObserver(StepSettings, Generic[State, Known]):
     """An observer of states and parameters, which takes missing samples itself and states deviations."""
 
     @property
     @abstractmethod
-    def _steps(self) -> Steps[State, Known]:
-        """What follows from the observer alone."""
+    def _steps(self) -> Any:
+        """What follows from the observer alone, made once for all runs: a state `first`, and `advance`."""
 
-    @abstractmethod
     def _allow(self, state: State) -> None:
         """Raise where no sample can follow."""
 
-    @abstractmethod
     def _trust(self, row: Known) -> None:
-        """Raise where a step cannot be trusted."""
+        """Raise where a step cannot be trusted, and does not say so itself."""
 
     @abstractmethod
     def _sample(self, state: State, y: ArrayLike, u: ArrayLike) -> tuple[FloatArray, FloatArray]:
@@ -230,7 +218,7 @@ def named_estimates(observer: StepSettings, *, states: FloatArray, faults: Float
 
 def changed(observer: Robust, **options: Any) -> Robust:
     """Return the observer with other options; the steps of a nonlinear one are built once."""
-    found = replace(observer, **options)  # type: ignore[type-var]
+    found = replace(observer, **options)
     if "steps" in vars(observer):
         # What these options do stands outside of the compiled steps.
         vars(found)["steps"] = type(observer.steps)(found, observer.steps.graph)

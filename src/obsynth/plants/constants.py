@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -258,17 +257,13 @@ def _with_range(name: str, given: Mapping[str, Any], middle: Any, unit: str) -> 
     if ends is not None:
         if given.get("tolerance") is not None:
             raise SpecError(f"{name!r} has both a tolerance and a range: give one of them.", path=path)
-        if isinstance(ends, str) or not hasattr(ends, "__len__") or len(ends) != 2 or not all(map(is_number, ends)):
+        two = not isinstance(ends, str) and hasattr(ends, "__len__") and len(ends) == 2
+        if not (two and all(map(is_finite_number, ends)) and ends[0] <= ends[1]):
             raise SpecError(
-                f"The range of {name!r} is {ends!r}: give [low, high]. A box with an open side bounds nothing.",
-                path=f"{path}.range",
-            )  # fmt: skip
-        low, high = map(float, ends)
-        if not (math.isfinite(low) and math.isfinite(high) and low <= high):
-            raise SpecError(
-                f"The range of {name!r} is [{low:g}, {high:g}]: give finite ends, the lower one first. A box with an "
+                f"The range of {name!r} is {ends!r}: give [low, high], finite and the lower one first. A box with an "
                 "open side bounds nothing.", path=f"{path}.range",
             )  # fmt: skip
+        low, high = map(float, ends)
         inside = middle is not None and is_finite_number(middle)
         return Constant(name, float(middle) if inside else (middle or low + (high - low) / 2.0), low, high, unit)
     if not is_finite_number(middle):
@@ -292,7 +287,7 @@ def constants_box(
         return given
     if not isinstance(given, Mapping):
         raise SpecError(f"constants is {given!r}: give a mapping from names to tolerances.", path="constants")
-    before = dict(known or {})
+    before = known or {}
     found = dict(before)
     for name, value in given.items():
         if not isinstance(name, str) or not name:

@@ -1,7 +1,4 @@
-"""From what a caller gives for a linear plant to its fields: frames, names for rows, noise of sensors.
-
-Labelled frames (pandas.DataFrame) as matrices: rows and columns in one order, labels as names.
-"""
+"""From what a caller gives for a linear plant to its fields: labelled frames, names for rows, noise of sensors."""
 
 from __future__ import annotations
 
@@ -15,21 +12,19 @@ from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.numerics.sparse import as_sparse_matrix, dense, is_sparse
 from obsynth.plants.validation import (
+    COUNTED_BY,
     MATRIX_LAYOUT,
     Problems,
     any_matrix,
     checked_dt,
     checked_labels,
     checked_names,
-    expected_shapes,
     is_name_list,
     matrix_or_picks,
     picked_names,
     require_picked,
     rows_picking,
     signal_counts,
-    square,
-    uncounted_signals,
 )
 
 #: Names of the signals of each kind.
@@ -40,7 +35,7 @@ _FIELDS = {"x": "state_names", "u": "input_names", "y": "output_names", "f": "fa
 def _without_frames(
     matrices: Mapping[str, Any], names: Mapping[str, Sequence[str] | None]
 ) -> tuple[dict[str, Any], dict[str, Sequence[str] | None]]:
-    """Return matrices and names ``{"state_names": ...}`` in which the frames' labels are used, in one order.
+    """Return matrices and names ``{"state_names": ...}`` in which the labels of pandas' frames are used, in one order.
 
     The rows of the dynamics are the equations of the states of the same name.  Numbered labels are no names.
     """
@@ -93,9 +88,11 @@ def plant_fields(
     """Return every field of a `DescriptorSystem`; raise one `SpecError` with all problems."""
     problems = Problems()
     matrices, labels = _without_frames(asked, names)
-    a = problems.collect(lambda: square(any_matrix(matrices.pop("A"), "A"), "A"))
+    a = problems.collect(lambda: any_matrix(matrices.pop("A"), "A"))
     problems.raise_if_any()
     nx = a.shape[0]
+    if nx == 0 or a.shape[1] != nx:
+        raise SpecError(f"A is {nx} by {a.shape[1]}, but it must be square (nx by nx, nx >= 1).", path="A")
     states = problems.collect(lambda: checked_names(labels["state_names"], nx, prefix="x", what="state_names"))
     problems.raise_if_any()
     given: dict[str, FloatArray | None] = {"A": a, "E": _identity_like(a) if matrices["E"] is None else None}
@@ -103,14 +100,15 @@ def plant_fields(
         if value is not None and not (name in SENSOR_PICKS and is_name_list(value)):
             given[name] = problems.collect(partial(matrix_or_picks, value, name, states))
     more = _appended(matrices, labels, given, sensor_noise, problems)
-    sizes = signal_counts(given)
+    sizes = {"x": nx, **signal_counts(given)}
     # What depends on a matrix that could not be read is not judged: its own message is enough.
     broken = {name for name, value in matrices.items() if value is not None and given.get(name) is None}
-    unknown = uncounted_signals(given, broken)
+    unknown = {signal for signal, telling in COUNTED_BY.items()
+               if broken.intersection(telling) and all(given.get(name) is None for name in telling)}  # fmt: skip
     values: dict[str, Any] = {
-        name: problems.shaped(given.get(name), name, shape)
-        for name, shape in expected_shapes(nx, sizes, unknown).items()
-    }
+        name: problems.shaped(given.get(name), name, (sizes[rows], sizes[columns]))
+        for name, rows, columns in MATRIX_LAYOUT if not unknown.intersection((rows, columns))
+    }  # fmt: skip
     values |= {"dt": problems.collect(lambda: checked_dt(dt)), "state_names": states}
     for signal, field in _FIELDS.items():
         if signal in unknown or signal == "x":

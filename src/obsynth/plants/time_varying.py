@@ -226,8 +226,7 @@ class TimeVaryingDescriptorSystem:
         SpecError
             A matrix is a callable.
         """
-        data = {name: matrix.as_data() for name, matrix in self.matrices.items()}
-        return {**data, **self._labels()}
+        return {**{name: matrix.as_data() for name, matrix in self.matrices.items()}, **self._labels()}
 
     def replace(self, **changes: Any) -> TimeVaryingDescriptorSystem:
         """Return a plant with some fields changed, checked again as a whole.

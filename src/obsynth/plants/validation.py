@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import unicodedata
 from collections import Counter
-from collections.abc import Callable, Container, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -99,7 +99,7 @@ MATRIX_LAYOUT = (
     ("Df", "y", "f"), ("Bd", "x", "d"), ("Dd", "y", "d"), ("Bw", "x", "w"), ("Dw", "y", "w"),
 )  # fmt: skip
 #: Matrices that tell how many signals of a kind there are.
-_COUNTED_BY = {"y": ("C",), "u": ("B", "D"), "f": ("Bf", "Df"), "d": ("Bd", "Dd"), "w": ("Bw", "Dw")}
+COUNTED_BY = {"y": ("C",), "u": ("B", "D"), "f": ("Bf", "Df"), "d": ("Bd", "Dd"), "w": ("Bw", "Dw")}
 
 
 class Problems:
@@ -147,13 +147,6 @@ def any_matrix(value: Any, name: str) -> Any:
     return as_sparse_matrix(value, name) if is_sparse(value) else as_matrix(value, name)
 
 
-def square(matrix: FloatArray, name: str) -> FloatArray:
-    """Return a non-empty square matrix as it is; raise `SpecError` otherwise."""
-    if matrix.shape[0] == 0 or matrix.shape[0] != matrix.shape[1]:
-        raise SpecError(f"{name} is {_by(matrix.shape)}, but it must be square (nx by nx, nx >= 1).", path=name)
-    return matrix
-
-
 def matrix_or_picks(value: Any, name: str, states: Sequence[str]) -> Any:
     """Return a matrix, or the selection that a list of state names stands for (rows of C, columns of inputs)."""
     if not is_name_list(value):
@@ -175,27 +168,8 @@ def signal_counts(given: Mapping[str, FloatArray | None]) -> dict[str, int]:
         return next((m.shape[1] for m in found if m is not None and 0 not in m.shape), 0)
 
     outputs = given.get("C")
-    counts = {signal: columns(*names) for signal, names in _COUNTED_BY.items()}
+    counts = {signal: columns(*names) for signal, names in COUNTED_BY.items()}
     return counts | {"y": 0 if outputs is None else outputs.shape[0]}
-
-
-def uncounted_signals(given: Mapping[str, FloatArray | None], broken: Container[str]) -> set[str]:
-    """Return the kinds of signals whose number nothing tells, since a matrix that might is ``broken``."""
-    return {
-        signal
-        for signal, names in _COUNTED_BY.items()
-        if any(name in broken for name in names) and not any(given.get(name) is not None for name in names)
-    }
-
-
-def expected_shapes(nx: int, counts: Mapping[str, int], unknown: Container[str] = ()) -> dict[str, tuple[int, int]]:
-    """Return the shape every matrix must have, of those whose signals have a known number."""
-    sizes = {"x": nx, **counts}
-    return {
-        name: (sizes[rows], sizes[columns])
-        for name, rows, columns in MATRIX_LAYOUT
-        if rows not in unknown and columns not in unknown
-    }
 
 
 def _by(shape: tuple[int, ...]) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,13 +17,13 @@ from obsynth.plotting.panels import (
     BAND_STYLE,
     ESTIMATE_STYLE,
     LINE_COLOURS,
-    MARK_STYLE,
     PANEL_HEIGHT,
     RESIDUAL_STYLE,
     THRESHOLD_STYLES,
     TRUE_STYLE,
     WIDTH,
     legend_above,
+    mark,
     new_panels,
     short_dates,
     tidy,
@@ -91,9 +92,10 @@ def plot_data(
     units = {} if design is None else dict(design.plant.units)
     # A marked alarm explains the red rows as well.
     told = {"alarm"} if any(part == "faults" and name in run.alarms for part, name in plans) else set[str]()
+    drawing = _Drawing(run, run.table, units, design)
     for panel, (part, name) in zip(panels, plans, strict=True):
         _shade(panel, run.table, told, alarms=part != "outputs")
-        _DRAWN[part](panel, run, name, units, design)
+        getattr(drawing, part)(panel, name)
         legend_above(panel)
         tidy(panel)
     if panels:
@@ -123,115 +125,111 @@ def _plans(table: pd.DataFrame, measured: pd.DataFrame, show: Sequence[str]) -> 
     return [plan for plan in plans if plan[0] in show]
 
 
-def _draw_output(panel: Axes, run: DataRun, name: str, units: dict[str, str], _: Any) -> None:
-    measured: Any = run.measured
-    table: Any = run.table
-    panel.plot(measured["time"], measured[name], label="measured", **{**TRUE_STYLE, "linewidth": 2.5})
-    column = f"xhat[{name}]"
-    if column in table:
-        panel.plot(_times(table, column), table[column], label="estimate", **ESTIMATE_STYLE)
-    panel.set_ylabel(with_unit(name, units))
+@dataclass(frozen=True)
+class _Drawing:
+    """What is drawn of a run: one method for each kind of panel, by its name, for the signal of that panel."""
+
+    run: DataRun
+    table: Any
+    units: dict[str, str]
+    design: Any
+
+    def outputs(self, panel: Axes, name: str) -> None:
+        """Draw a measured output with its estimate."""
+        measured: Any = self.run.measured
+        panel.plot(measured["time"], measured[name], label="measured", **{**TRUE_STYLE, "linewidth": 2.5})
+        column = f"xhat[{name}]"
+        if column in self.table:
+            panel.plot(self._times(column), self.table[column], label="estimate", **ESTIMATE_STYLE)
+        panel.set_ylabel(with_unit(name, self.units))
+
+    def faults(self, panel: Axes, column: str) -> None:
+        """Draw a fault estimate with its interval, its thresholds and its first alarm."""
+        run, table = self.run, self.table
+        name, times = column[5:-1], self._times(column)
+        values, deviation = table[column].to_numpy(float), self._deviation(column)
+        guaranteed, adaptive = f"lowest {name}" in table, f"threshold {column}" in table
+        if guaranteed:
+            low, high = table[f"lowest {name}"].to_numpy(float), table[f"highest {name}"].to_numpy(float)
+            panel.fill_between(times, low, high, label="guaranteed interval", **BAND_STYLE)
+        elif deviation is not None and not adaptive:
+            low, high = values - BAND_WIDTH * deviation, values + BAND_WIDTH * deviation
+            panel.fill_between(times, low, high, label="95 % interval of the stated noise", **BAND_STYLE)
+        panel.plot(times, values, label="estimate", **{**ESTIMATE_STYLE, "linestyle": "-"})
+        if adaptive:
+            limit = table[f"threshold {column}"].to_numpy(float)
+            for side, label in ((limit, "threshold without a fault"), (-limit, None)):
+                panel.plot(table["time"], side, label=label, **THRESHOLD_STYLES[0])
+        if (level := run.thresholds.get(column)) is not None:
+            biases = () if self.design is None else getattr(self.design.plant, "sensor_faults", ())
+            centre = 0.0
+            if self.design is not None and name not in biases:
+                centre = self.design.plant.operating_point.get(name, 0.0)
+            _limits(panel, centre, level, "threshold", THRESHOLD_STYLES[0])
+        if column in run.alarms:
+            row = int(table["alarm"].astype(str).str.contains(column, regex=False).to_numpy().argmax())
+            mark(panel, times.iloc[row], values[row], f"alarm at {run.stamps.shown(run.alarms[column])}")
+        panel.set_ylabel(with_unit(name, self.units))
+
+    def residuals(self, panel: Axes, _: str) -> None:
+        """Draw all residuals with the thresholds of the run."""
+        names = [name for name in self.table.columns if name.startswith("r[")][:MOST]
+        for name, colour in zip(names, LINE_COLOURS, strict=False):
+            style = {**RESIDUAL_STYLE, "linewidth": 0.9, "color": colour}
+            panel.plot(self.table["time"], self.table[name], label=name, **style)
+        for i, name in enumerate(name for name in names if name in self.run.thresholds):
+            style = THRESHOLD_STYLES[i % len(THRESHOLD_STYLES)]
+            _limits(panel, 0.0, self.run.thresholds[name], f"threshold of {name}", style)
+        panel.set_ylabel("residuals")
+
+    def statistic(self, panel: Axes, _: str) -> None:
+        """Draw the statistic of the monitor with its threshold and its first alarm."""
+        run, table = self.run, self.table
+        panel.plot(table["time"], table["statistic"], label="statistic", **RESIDUAL_STYLE)
+        panel.plot(table["time"], table["threshold"], label="threshold", **THRESHOLD_STYLES[0])
+        values, levels = table["statistic"].to_numpy(float), table["threshold"].to_numpy(float)
+        passed = np.flatnonzero(values > levels)
+        own = [run.alarms[name] for name in run.alarms if name not in run.thresholds]
+        if passed.size and own:
+            first = int(passed[0])
+            mark(panel, table["time"].iloc[first], values[first], f"first alarm at {run.stamps.shown(own[0])}")
+        level = float(np.nanmax(levels, initial=0.0))
+        if level > 0.0 and np.nanmax(values, initial=0.0) > _FAR * level:
+            panel.set_yscale("symlog", linthresh=level)
+        panel.set_ylabel("statistic")
+
+    def shares(self, panel: Axes, _: str) -> None:
+        """Stack what each constant makes of the threshold; those that make least count together."""
+        names = [name for name in self.table.columns if name.startswith("share ")]
+        values = 100.0 * np.nan_to_num(self.table[names].to_numpy(float))
+        order = np.argsort(-values.mean(axis=0), kind="stable")
+        shown, others = order[: MOST - 1], order[MOST - 1 :]
+        parts = [values[:, i] for i in shown] + ([values[:, others].sum(axis=1)] if len(others) else [])
+        labels = [names[i].removeprefix("share ") for i in shown] + (["other constants"] if len(others) else [])
+        panel.stackplot(self.table["time"], parts, labels=labels, colors=LINE_COLOURS[: len(parts)], alpha=0.7,
+                        linewidth=0.0)  # fmt: skip
+        panel.set_ylim(0.0, 100.0)
+        panel.set_ylabel("share of the\nthreshold (%)")
+
+    def _times(self, column: str) -> Any:
+        """Return the time of which a column is the estimate."""
+        own = f"time of {column}"
+        return self.table[own if own in self.table else "time"]
+
+    def _deviation(self, column: str) -> Any:
+        if f"sd {column}" in self.table:
+            return self.table[f"sd {column}"].to_numpy(float)
+        # Of a continuous design it is that for one second between samples: of no use without the sampling.
+        if self.design is None or not getattr(self.design.observer, "dt", 0.0) > 0.0:
+            return None
+        rows = (check.value for check in self.design.report.checks if check.name == f"noise in {column}")
+        return next(map(float, rows), None)
 
 
-def _draw_fault(panel: Axes, run: DataRun, column: str, units: dict[str, str], design: Any) -> None:
-    table: Any = run.table
-    name, times = column[5:-1], _times(table, column)
-    values, deviation = table[column].to_numpy(float), _deviation(table, column, design)
-    guaranteed, adaptive = f"lowest {name}" in table, f"threshold {column}" in table
-    if guaranteed:
-        low, high = table[f"lowest {name}"].to_numpy(float), table[f"highest {name}"].to_numpy(float)
-        panel.fill_between(times, low, high, label="guaranteed interval", **BAND_STYLE)
-    elif deviation is not None and not adaptive:
-        low, high = values - BAND_WIDTH * deviation, values + BAND_WIDTH * deviation
-        panel.fill_between(times, low, high, label="95 % interval of the stated noise", **BAND_STYLE)
-    panel.plot(times, values, label="estimate", **{**ESTIMATE_STYLE, "linestyle": "-"})
-    if adaptive:
-        limit = table[f"threshold {column}"].to_numpy(float)
-        for side, label in ((limit, "threshold without a fault"), (-limit, None)):
-            panel.plot(table["time"], side, label=label, **THRESHOLD_STYLES[0])
-    level = run.thresholds.get(column)
-    if level is not None:
-        biases = () if design is None else getattr(design.plant, "sensor_faults", ())
-        centre = 0.0 if design is None or name in biases else design.plant.operating_point.get(name, 0.0)
-        for i, side in enumerate((centre + level, centre - level)):
-            panel.axhline(side, label="threshold" if i == 0 else None, **THRESHOLD_STYLES[0])
-    if column in run.alarms:
-        _mark_alarm(panel, run, column, times, values)
-    panel.set_ylabel(with_unit(name, units))
-
-
-def _mark_alarm(panel: Axes, run: DataRun, column: str, times: Any, values: Any) -> None:
-    """Mark where a threshold is first passed, with its time."""
-    table: Any = run.table
-    row = int(table["alarm"].astype(str).str.contains(column, regex=False).to_numpy().argmax())
-    panel.plot([times.iloc[row]], [values[row]], marker="o", color="black",
-               label=f"alarm at {run.stamps.shown(run.alarms[column])}", **MARK_STYLE)  # fmt: skip
-
-
-def _draw_residuals(panel: Axes, run: DataRun, _: str, units: dict[str, str], __: Any) -> None:
-    table: Any = run.table
-    names = [name for name in table.columns if name.startswith("r[")]
-    for i, name in enumerate(names[:MOST]):
-        style = {**RESIDUAL_STYLE, "linewidth": 0.9, "color": LINE_COLOURS[i]}
-        panel.plot(table["time"], table[name], label=name, **style)
-    for i, name in enumerate(name for name in names[:MOST] if name in run.thresholds):
-        style = THRESHOLD_STYLES[i % len(THRESHOLD_STYLES)]
-        for side, label in ((run.thresholds[name], f"threshold of {name}"), (-run.thresholds[name], None)):
-            panel.axhline(side, label=label, **style)
-    panel.set_ylabel("residuals")
-
-
-def _draw_statistic(panel: Axes, run: DataRun, _: str, __: dict[str, str], ___: Any) -> None:
-    table: Any = run.table
-    panel.plot(table["time"], table["statistic"], label="statistic", **RESIDUAL_STYLE)
-    panel.plot(table["time"], table["threshold"], label="threshold", **THRESHOLD_STYLES[0])
-    values, levels = table["statistic"].to_numpy(float), table["threshold"].to_numpy(float)
-    passed = np.flatnonzero(values > levels)
-    own = [run.alarms[name] for name in run.alarms if name not in run.thresholds]
-    if passed.size and own:
-        first = int(passed[0])
-        panel.plot([table["time"].iloc[first]], [values[first]], marker="o", color="black",
-                   label=f"first alarm at {run.stamps.shown(own[0])}", **MARK_STYLE)  # fmt: skip
-    level = float(np.nanmax(levels, initial=0.0))
-    if level > 0.0 and np.nanmax(values, initial=0.0) > _FAR * level:
-        panel.set_yscale("symlog", linthresh=level)
-    panel.set_ylabel("statistic")
-
-
-def _draw_shares(panel: Axes, run: DataRun, _: str, __: dict[str, str], ___: Any) -> None:
-    """Stack what each constant makes of the threshold; those that make least count together."""
-    table: Any = run.table
-    names = [name for name in table.columns if name.startswith("share ")]
-    values = 100.0 * np.nan_to_num(table[names].to_numpy(float))
-    order = np.argsort(-values.mean(axis=0), kind="stable")
-    shown, others = order[: MOST - 1], order[MOST - 1 :]
-    parts = [values[:, i] for i in shown] + ([values[:, others].sum(axis=1)] if len(others) else [])
-    labels = [names[i].removeprefix("share ") for i in shown] + (["other constants"] if len(others) else [])
-    panel.stackplot(table["time"], parts, labels=labels, colors=LINE_COLOURS[: len(parts)], alpha=0.7, linewidth=0.0)
-    panel.set_ylim(0.0, 100.0)
-    panel.set_ylabel("share of the\nthreshold (%)")
-
-
-_DRAWN = {
-    "outputs": _draw_output, "faults": _draw_fault, "residuals": _draw_residuals, "statistic": _draw_statistic,
-    "shares": _draw_shares,
-}  # fmt: skip
-
-
-def _times(table: Any, column: str) -> Any:
-    """Return the time of which a column is the estimate."""
-    own = f"time of {column}"
-    return table[own] if own in table else table["time"]
-
-
-def _deviation(table: Any, column: str, design: Any) -> Any:
-    if f"sd {column}" in table:
-        return table[f"sd {column}"].to_numpy(float)
-    rows = () if design is None else design.report.checks
-    values = [check.value for check in rows if check.name == f"noise in {column}"]
-    # Of a continuous design it is that for one second between samples: of no use without the sampling.
-    known = values and design is not None and getattr(design.observer, "dt", 0.0) > 0.0
-    return float(values[0]) if known else None
+def _limits(panel: Axes, centre: float, level: float, label: str, style: dict[str, Any]) -> None:
+    """Draw a threshold on both sides of a centre."""
+    for side, text in ((level, label), (-level, None)):
+        panel.axhline(centre + side, label=text, **style)
 
 
 def _shade(panel: Axes, table: Any, told: set[str], *, alarms: bool) -> None:

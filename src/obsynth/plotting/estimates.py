@@ -15,12 +15,12 @@ from obsynth.plants.validation import index_of
 from obsynth.plotting.panels import (
     BAND_STYLE,
     ESTIMATE_STYLE,
-    MARK_STYLE,
     RESIDUAL_STYLE,
     THRESHOLD_STYLES,
     TRUE_STYLE,
     finish,
     legend_above,
+    mark,
     new_panels,
     tidy,
     with_unit,
@@ -253,10 +253,8 @@ def plot_residuals(
         crossed = np.flatnonzero(size > curve)
         if crossed.size:
             first = int(crossed[0])
-            panel.plot(
-                time[first], size[first], marker=marker, color=style["color"],
-                label=f"first above it at k = {first} ({time[first]:g} s)", **MARK_STYLE,
-            )  # fmt: skip
+            label = f"first above it at k = {first} ({time[first]:g} s)"
+            mark(panel, time[first], size[first], label, marker=marker, color=style["color"])
     return finish(panel, "norm of the residual")
 
 

@@ -77,34 +77,28 @@ def estimate_gains(design: ObserverDesign, *, to: str = "faults") -> EstimateGai
     if rows.start == rows.stop:
         what = "estimates no faults" if to == "faults" else f"has no {to}"
         raise SpecError(f"The design {what}.", path="observer")
-    frequencies = frequency_grid(observer)[1:]
-    points = boundary_points(frequencies, observer.dt)
-    to_estimate = response(observer.Az, observer.By, observer.Cz[rows], observer.Dy[rows], points)
+    frequencies, points, to_estimate = _over_frequencies(observer, rows)
     inputs = {"faults": (plant.Bf, plant.Df), "disturbances": (plant.Bd, plant.Dd), "noise": (plant.Bw, plant.Dw)}
-    gains, least = {}, np.zeros(len(points))
+    gains: dict[str, FloatArray] = {}
+    least: FloatArray = np.zeros(len(points))
     for name, (b, d) in inputs.items():
         if not b.shape[1]:
             continue
-        states = _state_response(plant, b, points)
-        outputs = plant.C @ states + d
-        seen, terms = to_estimate @ outputs, _sizes(to_estimate) * _sizes(outputs)
+        states, seen, terms = _seen(plant, b, d, points, to_estimate)
         if to == "states":
             truth = _delayed(observer, points) * states
             seen, terms = seen - truth, terms + _sizes(truth)
-        values = np.linalg.svd(seen, compute_uv=False)
-        gains[name] = np.where(values[:, 0] > ROUNDING_SHARE * terms, values[:, 0], 0.0)
+        found = np.linalg.svd(seen, compute_uv=False)
+        values = np.asarray(np.where(found > ROUNDING_SHARE * terms[:, None], found, 0.0), dtype=np.float64)
+        gains[name] = values[:, 0]
         if name == "faults":
-            least = np.where(values[:, -1] > ROUNDING_SHARE * terms, values[:, -1], 0.0)
+            least = values[:, -1]
     return EstimateGains(frequencies, gains, least)
 
 
 @dataclass(frozen=True, eq=False)
 class FaultGains:
-    """What reaches each fault estimate of a linear design.
-
-    Fields: leaks: ``(nf, nd)``: largest gain over the frequency from each unknown input, zero where only rounding is
-    left; steady: ``(nf,)``: share of a step of the fault that its estimate shows in the end.
-    """
+    """Largest gain from unknown inputs to fault estimates ``(nf, nd)``; share of a step shown in the end ``(nf,)``."""
 
     leaks: FloatArray
     steady: FloatArray
@@ -113,23 +107,32 @@ class FaultGains:
 def fault_gains(design: ObserverDesign) -> FaultGains:
     """Return what reaches each fault estimate of a linear design that estimates faults."""
     plant, observer = design.linear
-    rows, frequencies = observer.fault_rows, frequency_grid(observer)[1:]
-    points = boundary_points(frequencies, observer.dt)
-    to_estimate = response(observer.Az, observer.By, observer.Cz[rows], observer.Dy[rows], points)
-
-    def seen(b: FloatArray, d: FloatArray) -> tuple[ComplexArray, FloatArray]:
-        outputs = plant.C @ _state_response(plant, b, points) + d
-        return np.asarray(to_estimate @ outputs), _sizes(to_estimate) * _sizes(outputs)
-
+    _, points, to_estimate = _over_frequencies(observer, observer.fault_rows)
     leaks = np.zeros((len(observer.fault_names), plant.nd))
     if plant.nd:
-        found, terms = seen(plant.Bd, plant.Dd)
+        _, found, terms = _seen(plant, plant.Bd, plant.Dd, points, to_estimate)
         sizes = np.abs(found)
         leaks = np.where(sizes > ROUNDING_SHARE * terms[:, None, None], sizes, 0.0).max(axis=0)
     own = [plant.fault_names.index(name) for name in observer.fault_names]
-    slowest, _ = seen(plant.Bf, plant.Df)
+    _, slowest, _ = _seen(plant, plant.Bf, plant.Df, points, to_estimate)
     steady = slowest[0].real[np.arange(len(own)), own]
     return FaultGains(leaks, np.asarray(steady))
+
+
+def _over_frequencies(observer: LinearObserver, rows: slice) -> tuple[FloatArray, ComplexArray, ComplexArray]:
+    """Return frequencies (rad/s), their points on the boundary, and what some outputs make of y there."""
+    frequencies = frequency_grid(observer)[1:]
+    points = boundary_points(frequencies, observer.dt)
+    return frequencies, points, response(observer.Az, observer.By, observer.Cz[rows], observer.Dy[rows], points)
+
+
+def _seen(
+    plant: DescriptorSystem, b: FloatArray, d: FloatArray, points: ComplexArray, to_estimate: ComplexArray
+) -> tuple[ComplexArray, ComplexArray, FloatArray]:
+    """Return the states that an input drives, what the outputs show of it, and the size of the terms of that."""
+    states = _state_response(plant, b, points)
+    outputs = plant.C @ states + d
+    return states, np.asarray(to_estimate @ outputs), _sizes(to_estimate) * _sizes(outputs)
 
 
 def _sizes(matrices: ComplexArray) -> FloatArray:

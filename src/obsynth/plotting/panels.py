@@ -74,6 +74,11 @@ def finish(panel: Axes, label: str) -> Axes:
     return panel
 
 
+def mark(panel: Axes, time: Any, value: Any, label: str, *, marker: str = "o", color: str = "black") -> None:
+    """Draw a ring where something happens."""
+    panel.plot([time], [value], marker=marker, color=color, label=label, **MARK_STYLE)
+
+
 def names_as_they_are(panel: Axes) -> None:
     """Show dollars in names as dollars: two of them would begin and end a formula, which most names are not."""
     legend = panel.get_legend()

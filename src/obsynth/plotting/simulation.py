@@ -12,7 +12,7 @@ from obsynth.experiments.simulation import Simulation
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.alarms import Decision
 from obsynth.plotting.estimates import plot_faults, plot_parameters
-from obsynth.plotting.panels import MARK_STYLE, RESIDUAL_STYLE, THRESHOLD_STYLES, finish, legend_above, new_panels
+from obsynth.plotting.panels import RESIDUAL_STYLE, THRESHOLD_STYLES, finish, legend_above, mark, new_panels
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -61,10 +61,7 @@ def plot_decision(decision: Decision, *, dt: float = 1.0, axes: Axes | None = No
     alarm = decision.alarm
     if alarm is not None:
         blamed = f": {alarm.parameter}" if alarm.parameter else ""
-        panel.plot(
-            [dt * alarm.k], [alarm.value], marker="o", color="black", label=f"alarm at {dt * alarm.k:g} s{blamed}",
-            **MARK_STYLE,
-        )  # fmt: skip
+        mark(panel, dt * alarm.k, alarm.value, f"alarm at {dt * alarm.k:g} s{blamed}")
         panel.axvline(dt * alarm.onset, color="0.4", linestyle=":", label=f"onset at {dt * alarm.onset:g} s")
     return finish(panel, _DECISION_LABELS.get(decision.statistic, decision.statistic))
 
@@ -180,8 +177,6 @@ def plot_detection(detection: Detection, *, dt: float, axes: Axes | None = None)
         if deciding.any():
             panel.set_ylim(bottom=float(np.min(detection.threshold[deciding])) * 10.0**-DECADES_BELOW)
     if detection.k is not None:
-        panel.plot(
-            time[detection.k], detection.values[detection.k], marker="o", color="black",
-            label=f"alarm at {detection.time:g} s" + (f": {detection.fault}" if detection.fault else ""), **MARK_STYLE,
-        )  # fmt: skip
+        blamed = f": {detection.fault}" if detection.fault else ""
+        mark(panel, time[detection.k], detection.values[detection.k], f"alarm at {detection.time:g} s{blamed}")
     return finish(panel, label)

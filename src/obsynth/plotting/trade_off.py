@@ -241,7 +241,7 @@ def _mark_failures(panel: Axes, lines: Mapping[str, list[tuple[float, Any]]]) ->
 
 
 def _claim(results: Sequence[Any], claim: str | None) -> str:
-    counts = Counter(name for result in results for name in result.claims)
+    counts: Counter[str] = Counter(name for result in results for name in result.claims)
     if claim is None and counts:
         return max(counts, key=lambda name: counts[name])
     if claim is None or claim not in counts:

@@ -228,7 +228,7 @@ def _absolute(x: AffineNumber) -> AffineNumber:
 def _extreme(x: AffineNumber, y: AffineNumber, *, largest: bool) -> AffineNumber:
     low, high = (x - y).interval
     if high <= 0.0 or low >= 0.0:
-        return x if (high <= 0.0) is not largest else y
+        return x if (high <= 0.0) != largest else y
     apart = _absolute(x - y)
     return (x + y + (apart if largest else -apart)) * 0.5
 

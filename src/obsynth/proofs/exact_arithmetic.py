@@ -11,7 +11,7 @@ any such root, and all others are told from the boundary by isolating them in en
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any, TypeAlias
@@ -87,6 +87,8 @@ def _common_factor(values: NDArray[np.object_]) -> fmpq:
     return fmpq(numerator, denominator) if numerator else fmpq(1)
 
 
+#: Bits of the whole number that, times a power of two, is a double.
+MANTISSA_BITS = 53
 #: Decimals of so many digits survive the way into a double and back.
 LOSSLESS_DIGITS = 15
 #: Odd parts of fewer bits are data that were multiplied by a power of two.
@@ -116,17 +118,20 @@ def computed_entries(matrix: FloatArray) -> int:
 
 def written_matrix(matrix: FloatArray) -> fmpq_mat:
     """Return a matrix ``(m, n)`` of doubles as the rational numbers that were written."""
-    return _converted(matrix, written_fraction)
+    rows, columns = matrix.shape
+    return fmpq_mat(rows, columns, [_as_fmpq(written_fraction(value)) for value in np.ravel(matrix).tolist()])
 
 
 def stored_matrix(matrix: FloatArray) -> fmpq_mat:
     """Return a matrix ``(m, n)`` of doubles as the rational numbers that are stored, whatever they stand for."""
-    return _converted(matrix, Fraction)
-
-
-def _converted(matrix: FloatArray, convert: Callable[[float], Fraction]) -> fmpq_mat:
+    # Whole numbers of one power of two.
+    parts, exponents = np.frexp(matrix)
+    least = int(np.min(exponents, initial=0, where=matrix != 0.0)) - MANTISSA_BITS
+    whole, shifts = np.ldexp(parts, MANTISSA_BITS).astype(np.int64), exponents - MANTISSA_BITS - least
+    shifted = [value << shift for value, shift in zip(whole.ravel().tolist(), shifts.ravel().tolist(), strict=True)]
     rows, columns = matrix.shape
-    return fmpq_mat(rows, columns, [_as_fmpq(convert(value)) for value in np.ravel(matrix).tolist()])
+    found: fmpq_mat = fmpq_mat(fmpz_mat(rows, columns, shifted)) / fmpz(2) ** -least
+    return found
 
 
 def rational_matrix(rows: FractionRows, columns: int) -> fmpq_mat:

@@ -70,9 +70,7 @@ class ExactPencil:
     def zero_polynomial(self) -> fmpz_poly:
         """Primitive polynomial whose roots, with multiplicity, are the finite zeros; 1 where there are none."""
         rank = self.normal_rank
-        if rank == 0 or self._degree == 0:
-            return fmpz_poly([1])
-        if self._has_no_zero_modulo(rank):
+        if rank == 0 or self._degree == 0 or self._has_no_zero_modulo(rank):
             return fmpz_poly([1])
         found = self._compressed_determinant(rank)
         if self.shape == (rank, rank):
@@ -182,13 +180,8 @@ class ExactPencil:
 
 def system_pencil(E: fmpq_mat, A: fmpq_mat, B: fmpq_mat, C: fmpq_mat, D: fmpq_mat) -> ExactPencil:
     """Return ``[A - s E, B; C, D]``."""
-    padded = blocks(
-        [
-            [E, zeros_matrix(B.nrows(), B.ncols())],
-            [zeros_matrix(C.nrows(), C.ncols()), zeros_matrix(D.nrows(), D.ncols())],
-        ]
-    )
-    return ExactPencil(padded, blocks([[A, B], [C, D]]))
+    nothing = [zeros_matrix(part.nrows(), part.ncols()) for part in (B, C, D)]
+    return ExactPencil(blocks([[E, nothing[0]], nothing[1:]]), blocks([[A, B], [C, D]]))
 
 
 def _at(e: fmpz_mat, a: fmpz_mat, point: int) -> fmpz_mat:

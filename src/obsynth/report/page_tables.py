@@ -110,10 +110,7 @@ def _row(check: Check) -> str:
 
 
 def matrix_rows(matrix: FloatArray) -> Iterator[str]:
-    """Yield a matrix; zeros are faint.
-
-    Shapes: ``matrix (rows, cols)``.
-    """
+    """Yield a matrix ``(rows, cols)``; zeros are faint."""
     if not matrix.size:
         yield '<p class="soft">empty</p>'
         return

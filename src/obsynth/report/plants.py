@@ -1,11 +1,4 @@
-"""The structure of a plant and the existence conditions of each method, for people.
-
-The diagnosis of a plant as tables.
-
-Whether each method can serve a plant: one line each, with the reason and what to add.
-
-A linear plant as text for people, and as a document that specs can name.
-"""
+"""A plant for people: its structure, what can be diagnosed on it, which methods can serve it, its matrices as text."""
 
 from __future__ import annotations
 

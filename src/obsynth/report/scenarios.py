@@ -1,15 +1,11 @@
-"""Simulations, evaluations and comparisons for people: how far estimates were off, how often alarms were right.
-
-Methods side by side, as a table that fits the console.
-
-A simulation for people: how far each estimate was off, and when the start was forgotten.
-"""
+"""Simulations, evaluations and comparisons for people: how far estimates were off, how often alarms were right."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -57,15 +53,19 @@ def evaluation_report(
         console.print(Text(f"Its threshold{size}: {statement}."))
         console.print()
     for title, errors in (("Fault estimates", found.fault_rmse), ("State estimates", found.state_rmse)):
-        if not errors:
-            continue
-        table = headed_table("signal", "RMSE after warm-up", share, "unit")
-        rows = sorted(errors.items(), key=lambda row: -row[1].value) if len(errors) > SHOWN else list(errors.items())
-        if len(rows) > SHOWN:
-            title = f"{title}: the worst {SHOWN} of {len(rows)}"
-        for signal, item in rows[:SHOWN]:
-            table.add_row(Text(signal), number(item.value), _interval(item), Text(units.get(signal, "")))
-        print_section(console, f"{title} (mean over runs)", table)
+        if errors:
+            table = headed_table("signal", "RMSE after warm-up", share, "unit")
+            title, rows = _worst(title, list(errors.items()), lambda row: row[1].value)
+            for signal, item in rows:
+                table.add_row(Text(signal), number(item.value), _interval(item), Text(units.get(signal, "")))
+            print_section(console, f"{title} (mean over runs)", table)
+
+
+def _worst(title: str, rows: list[Any], size: Callable[[Any], float]) -> tuple[str, list[Any]]:
+    """Return title and rows of a table; of many the worst."""
+    if len(rows) <= SHOWN:
+        return title, rows
+    return f"{title}: the worst {SHOWN} of {len(rows)}", sorted(rows, key=lambda row: -size(row))[:SHOWN]
 
 
 def described(monitor: Monitor | ParameterMonitor) -> tuple[str, str]:
@@ -134,21 +134,14 @@ def simulation_report(
             continue
         lasts = _last_column(found, kind)
         table = headed_table("signal", "RMSE", "largest error", next(lasts), "unit")
-        rows = list(zip(summary[kind].items(), lasts, strict=True))
-        if len(rows) > SHOWN:
-            title = f"{title}: the worst {SHOWN} of {len(rows)}"
-            rows = sorted(rows, key=lambda row: -row[0][1]["rmse"])[:SHOWN]
+        title, rows = _worst(title, list(zip(summary[kind].items(), lasts, strict=True)), lambda row: row[0][1]["rmse"])
         for (signal, row), last in rows:
             table.add_row(Text(signal), number(row["rmse"]), number(row["largest"]), last, Text(units.get(signal, "")))
-        if linear:
-            end = summary[f"{kind[:-1]}_warm_up"]
-            told = (
-                "the start still shows at the end: errors are of the whole record"
-                if end is None
-                else f"warm-up ended at {end:g} s, errors are of what follows"
-            )
-        else:
-            told = "errors are of the whole record, start included"
+        told = "errors are of the whole record, start included"
+        if linear and (end := summary[f"{kind[:-1]}_warm_up"]) is None:
+            told = "the start still shows at the end: errors are of the whole record"
+        elif linear:
+            told = f"warm-up ended at {end:g} s, errors are of what follows"
         print_section(console, f"{title} ({told})", table)
     for note in summary["notes"]:
         console.print(Text(note))

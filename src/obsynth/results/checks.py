@@ -71,16 +71,16 @@ def upper_bound_check(
     name: str, claim: str, value: float, bound: float, *, source: str, kind: CheckKind = "computed", detail: str = ""
 ) -> Check:
     """Return a check that passes when ``value <= bound``; NaN fails."""
-    passed = bool(value <= bound) and not math.isnan(value)
-    return Check(name, claim, float(value), float(bound), float(bound - value), passed, source, kind, detail)
+    return Check(name, claim, float(value), float(bound), float(bound - value), bool(value <= bound), source, kind,
+                 detail)  # fmt: skip
 
 
 def lower_bound_check(
     name: str, claim: str, value: float, bound: float, *, source: str, kind: CheckKind = "computed", detail: str = ""
 ) -> Check:
     """Return a check that passes when ``value >= bound``; NaN fails."""
-    passed = bool(value >= bound) and not math.isnan(value)
-    return Check(name, claim, float(value), float(bound), float(value - bound), passed, source, kind, detail)
+    return Check(name, claim, float(value), float(bound), float(value - bound), bool(value >= bound), source, kind,
+                 detail)  # fmt: skip
 
 
 def information(

@@ -210,19 +210,8 @@ class ObserverDesign:
         observer = (
             steady_observer(self.observer).observer if isinstance(self.observer, RecursiveObserver) else self.linear[1]
         )
-        outputs = [
-            *(f"xhat[{name}]" for name in observer.state_names),
-            *(f"fhat[{name}]" for name in observer.fault_names),
-            *(f"r[{name}]" for name in observer.residual_names),
-        ]
         return control.ss(
-            observer.Az,
-            np.hstack([observer.Bu, observer.By]),
-            observer.Cz,
-            np.hstack([observer.Du, observer.Dy]),
-            observer.dt,
-            inputs=[*observer.input_names, *observer.output_names],
-            outputs=outputs,
-            states=[f"z[{i + 1}]" for i in range(observer.order)],
-            name=self.name,
-        )
+            observer.Az, np.hstack([observer.Bu, observer.By]), observer.Cz, np.hstack([observer.Du, observer.Dy]),
+            observer.dt, inputs=[*observer.input_names, *observer.output_names], outputs=list(observer.row_names),
+            states=[f"z[{i + 1}]" for i in range(observer.order)], name=self.name,
+        )  # fmt: skip

@@ -1,7 +1,6 @@
 """Tables: the checks of a report, and the pieces that all tables share: numbers, verdicts, lists of names.
 
-Text is always wrapped in `rich.text.Text`, so that brackets in a signal's name are never read as markup,
-and a verdict is always a word, so that it is readable without colour.
+Text is always a `rich.text.Text`, so that brackets in names are no markup; a verdict is always a word, not a colour.
 """
 
 from __future__ import annotations

@@ -24,11 +24,7 @@ MOST_EXACT = 64
 
 @dataclass(frozen=True, eq=False)
 class PlantSource:
-    """A plant as it was written, and what was done to it.
-
-    Fields: plant: As written; sample_time: With which it was sampled, after its algebraic states were eliminated;
-    ``None`` where it was not.
-    """
+    """A plant as it was written; its algebraic states were eliminated, and it was sampled if there is a sample time."""
 
     plant: DescriptorSystem
     sample_time: float | None = None

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from obsynth.errors import SolverError, SpecError
 from obsynth.numerics.arguments import is_whole
 from obsynth.numerics.arrays import FloatArray, as_matrix
-from obsynth.numerics.covariances import covariance_factor
+from obsynth.numerics.ranks import covariance_factor
 from obsynth.plants.dae.checks import checked_inputs, finite_vector, step_length
 from obsynth.plants.dae.functions import Compiled, DAEFunctions, take_samples
 from obsynth.plants.dae.model import DAEModel

@@ -19,7 +19,7 @@ from obsynth.analysis.transformations.sampling import discretise
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.arguments import real_array, real_vector, whole_number
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.holds import driven, first_order_hold
+from obsynth.numerics.continuous import driven, first_order_hold
 from obsynth.numerics.ranks import decide_rank
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem

@@ -235,8 +235,5 @@ def signal_of(value: ArrayLike | None, name: str, shape: tuple[int, int]) -> Flo
     array = np.asarray(value)
     matrix = as_matrix(array.reshape(-1, 1) if array.ndim == 1 and shape[1] == 1 else array, name)
     if matrix.shape != shape:
-        raise SpecError(
-            f"{name} is {matrix.shape[0]} by {matrix.shape[1]}, but {shape[0]} by {shape[1]} is needed (samples by "
-            "signals).", path=name,
-        )  # fmt: skip
+        raise SpecError(f"{name} has shape {matrix.shape}, but {shape} is needed (samples by signals).", path=name)
     return matrix

@@ -1,14 +1,25 @@
-"""Reading text documents (YAML, JSON) into plain data; every way a file can be bad is a `SpecError`."""
+"""Documents (YAML, JSON) read into plain data and checked: every problem at once, each with its path."""
 
 from __future__ import annotations
 
 import re
 import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from obsynth.errors import SpecError
 from obsynth.files.inputs import read_json, read_text
+from obsynth.numerics.arguments import is_whole
+from obsynth.plants.validation import suggestion
+
+if TYPE_CHECKING:
+    from pydantic import BaseModel
+
+    from obsynth.spec.schema import DAESection, PlantSection, SpecDocument, TimeVaryingSection
+
+    Model = TypeVar("Model", bound=BaseModel)
 
 
 def read_yaml(path: Path, *, where: str | None = None) -> dict[str, Any]:
@@ -83,3 +94,184 @@ def _one_line(error: Exception) -> str:
     mark = getattr(error, "problem_mark", None) or getattr(error, "context_mark", None)
     place = f" (line {mark.line + 1}, column {mark.column + 1})" if mark is not None else ""
     return f"{str(problem).strip()}{place}."
+
+
+#: A document with more problems than this is not read to its end by anybody.
+MAXIMUM_PROBLEMS = 25
+
+
+@dataclass(frozen=True)
+class DocumentProblems:
+    """Collects path and text of each problem of one document, which is to be a ``what``, to raise them together."""
+
+    source: Path
+    what: str
+    found: list[tuple[str, str]] = field(default_factory=list)
+
+    def add(self, path: str, text: str) -> None:
+        """Note that ``text`` is wrong at ``path``."""
+        if (path, text) not in self.found:
+            self.found.append((path, text))
+
+    def raise_if_any(self) -> None:
+        """Raise one `SpecError` with everything noted, if anything was."""
+        if not self.found:
+            return
+        lines = [f"{path}: {text}" if path else text for path, text in self.found]
+        if len(lines) > MAXIMUM_PROBLEMS:
+            lines = [*lines[:MAXIMUM_PROBLEMS], f"and {len(lines) - MAXIMUM_PROBLEMS} more"]
+        head = f"{self.source} is no valid {self.what}:"
+        raise SpecError(head, path=self.found[0][0] or str(self.source), problems=lines)
+
+
+def checked_spec(document: Mapping[str, Any], source: Path) -> tuple[SpecDocument, dict[str, Any]]:
+    """Check a whole spec, and the options of its method."""
+    from obsynth.methods.registry import AUTO, REGISTRY
+    from obsynth.spec.schema import SpecDocument
+    from obsynth.spec.schema_values import options_schema
+
+    problems = DocumentProblems(source, what="spec")
+    _check_version(document, problems)
+    checked = _validated(SpecDocument, document, problems)
+    method = document.get("method", {"id": AUTO})
+    raw_options: Any = {}
+    identifier = None
+    if isinstance(method, dict):
+        identifier, raw_options = method.get("id", AUTO), method.get("options", {})
+    options = None
+    if identifier == AUTO and isinstance(raw_options, dict) and checked is not None:
+        problems.raise_if_any()
+        return checked, _options_of_any(raw_options, source)
+    if isinstance(identifier, str) and identifier not in (*REGISTRY, AUTO):
+        close = suggestion(identifier, list(REGISTRY))
+        known = ", ".join(sorted([*REGISTRY, AUTO]))
+        problems.add("method.id", f"unknown method {identifier!r}; the known methods are: {known}.{close}")
+    elif isinstance(identifier, str) and identifier != AUTO and isinstance(raw_options, dict):
+        options = _validated(options_schema(identifier), raw_options, problems, prefix="method.options")
+    problems.raise_if_any()
+    if checked is None or options is None:
+        raise SpecError(f"{source} is no valid spec.", path=str(source))
+    return checked, {name: getattr(options, name) for name in options.model_fields_set}
+
+
+def _options_of_any(given: dict[str, Any], source: Path) -> dict[str, Any]:
+    """Return options as the first method reads them that has them all; `auto` decides between those that do."""
+    from obsynth.methods.registry import REGISTRY
+    from obsynth.spec.schema_values import options_schema
+
+    if not given:
+        return {}
+    for method in REGISTRY:
+        problems = DocumentProblems(source, what="spec")
+        found = _validated(options_schema(method), given, problems, prefix="method.options")
+        if not problems.found and found is not None:
+            return {name: getattr(found, name) for name in found.model_fields_set}
+    raise SpecError(
+        f"{source}: no single method has the options {', '.join(sorted(given))} with these values: name the method "
+        "that they are for.", path="method.options",
+    )  # fmt: skip
+
+
+def checked_plant(document: Mapping[str, Any], source: Path) -> PlantSection | TimeVaryingSection | DAESection:
+    """Check a plant in a file of its own."""
+    from obsynth.spec.schema import PLANT_DOCUMENTS
+
+    problems = DocumentProblems(source, what="plant")
+    _check_version(document, problems)
+    kind = document.get("kind")
+    known = PLANT_DOCUMENTS.get(kind if isinstance(kind, str) else None, PLANT_DOCUMENTS[None])
+    checked: Any = _validated(known, document, problems)
+    problems.raise_if_any()
+    found: PlantSection | TimeVaryingSection | DAESection = checked
+    return found
+
+
+def _check_version(document: Mapping[str, Any], problems: DocumentProblems) -> None:
+    """Raise at once for another version: the other keys would then mean something else."""
+    from obsynth.spec.schema import SCHEMA_VERSION
+
+    version = document.get("schema_version")
+    if is_whole(version) and version != SCHEMA_VERSION:
+        problems.add("schema_version", f"version {version} is unknown; this obsynth reads version {SCHEMA_VERSION}.")
+        problems.raise_if_any()
+
+
+def _validated(
+    model: type[Model], document: Mapping[str, Any], problems: DocumentProblems, *, prefix: str = ""
+) -> Model | None:
+    from pydantic import ValidationError
+
+    try:
+        return model.model_validate(document)
+    except ValidationError as error:
+        for item in error.errors(include_url=False):
+            problems.add(*_explained(item, model, prefix))
+        return None
+
+
+def _explained(item: Any, model: type[BaseModel], prefix: str) -> tuple[str, str]:
+    """Return the path and the message of one of pydantic's errors."""
+    location = [part for part in item["loc"] if not (isinstance(part, str) and re.fullmatch(r"<\w+>", part))]
+    names = [str(part) for part in location if isinstance(part, str) and part != "[key]"]
+    numbers = [part + 1 for part in location if isinstance(part, int)]
+    kind, value, context = item["type"], item["input"], item.get("ctx", {})
+    in_stack = "<stack>" in item["loc"]
+    in_rows = in_stack or "<rows>" in item["loc"]
+    key = names[-1] if names else ""
+    if kind == "invalid_key" or "[key]" in location:
+        text, numbers = f"a key must be a non-empty text, not {described(value)}.", []
+    elif kind == "extra_forbidden":
+        known = _known_keys(item["loc"]) if len(names) > 1 else list(model.model_fields)
+        text = f"unknown key.{suggestion(key, known)}"
+    elif kind == "missing":
+        needed = ": give the seconds between samples, or 0 for a plant in continuous time"
+        text = f"this key is missing{needed if key == 'dt' else ''}."
+    elif kind in ("ragged_rows", "stack_shapes"):
+        text = f"{item['msg']}."
+    elif kind == "finite_number":
+        text = f"must be a finite number, not {value}."
+    elif kind == "entry_of_k":
+        text = f"{item['msg']}, not {described(value)}."
+    elif kind == "string_pattern_mismatch":
+        text = f"use letters, digits, '.', '_' and '-' only (at most 100), not {described(value)}."
+    else:
+        wanted = "a list of numbers" if in_rows and kind in ("list_type", "too_short") else _wanted(kind, context)
+        wanted = "a list of rows, such as [[1, 0], [0, 1]]" if in_rows and not numbers else wanted
+        found = "an empty one" if kind in ("too_short", "string_too_short") else described(value)
+        text = f"must be {wanted}, not {found}."
+    words = ("matrix", "row", "column") if in_stack else ("row", "column") if in_rows else ("entry",)
+    place = ", ".join(f"{word} {number}" for word, number in zip(words, numbers, strict=False))
+    return ".".join([*([prefix] if prefix else []), *names]), f"{place} {text}" if place else text
+
+
+def _wanted(kind: str, context: Mapping[str, Any]) -> str:
+    if kind == "literal_error":
+        return f"one of {context['expected']}"
+    limits = {"greater_than": "greater than", "greater_than_equal": "at least", "less_than": "less than"}
+    if kind in limits:
+        limit = next(iter(context.values()))
+        return f"{limits[kind]} {limit:g}"
+    plain = {
+        "float_type": "a number", "int_type": "a whole number", "string_type": "a text", "bool_type": "true or false",
+        "string_too_short": "a non-empty text", "list_type": "a list", "dict_type": "a mapping (key: value)",
+        "model_type": "a mapping (key: value)", "too_short": "a list with at least one entry",
+    }  # fmt: skip
+    return plain.get(kind, f"valid ({kind.replace('_', ' ')})")
+
+
+def _known_keys(location: Sequence[str | int]) -> list[str]:
+    """Return the keys that the section around the last part of ``location`` may have."""
+    from obsynth.spec import schema
+    from obsynth.spec.schema_values import MatrixFile
+
+    sections: dict[str, type[BaseModel]] = {
+        "<file>": MatrixFile, "<inline>": schema.PlantSection, "<varying>": schema.TimeVaryingSection,
+        "<dae>": schema.DAESection, "<one>": schema.ProfileSection, "method": schema.MethodSection,
+        "transform": schema.TransformSection, "scenario": schema.ScenarioSection,
+    }  # fmt: skip
+    if "<pick>" in location:
+        return ["outputs" if {"C", "Df", "Dd"} & set(location) else "states", "file"]
+    if "<list>" in location and location[0] == "scenario":
+        return list(schema.ProfileSection.model_fields)
+    section = sections.get(str(location[-2]))
+    return list(section.model_fields) if section is not None else []

@@ -8,15 +8,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from obsynth.errors import SpecError
-from obsynth.numerics.threads import one_thread_if_small
+from obsynth.numerics.libraries import one_thread_if_small
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.simulation.profiles import KINDS, Profile
 from obsynth.simulation.scenario import Scenario
 from obsynth.simulation.signals import check_parameters
-from obsynth.spec.checking import DocumentProblems, checked_plant, checked_spec
-from obsynth.spec.documents import read_yaml
+from obsynth.spec.documents import DocumentProblems, checked_plant, checked_spec, read_yaml
 from obsynth.spec.plants import boxed_constants, built_plant, joined, matlab_plant, read_value
 
 if TYPE_CHECKING:

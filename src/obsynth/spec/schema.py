@@ -9,13 +9,13 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Discriminator, Field, Tag, create_model, model_validator
 
+from obsynth.numerics.arguments import Positive
 from obsynth.plants.uncertainty import UNCERTAIN_MATRICES, expressions_in
 from obsynth.spec.schema_values import (
     EquationMatrix,
     Matrix,
     Names,
     OutputMatrix,
-    Positive,
     Range,
     Section,
     SensorMatrix,

@@ -39,10 +39,7 @@ def prove_bounded_real(
     *,
     lag: int,
 ) -> DefinitenessProof:
-    """Try to prove the bounded real inequality for the shipped observer.
-
-    Shapes: ``factor (core, core)``.
-    """
+    """Try to prove the bounded real inequality for the shipped observer; ``factor (core, core)``."""
     core = factor.shape[0]
     outside = (observer.Az[:core, core:], observer.Cz[observer.fault_rows, core:])
     # What follows the core must be a chain of delays: strictly lower triangular, hence stable.
@@ -51,8 +48,8 @@ def prove_bounded_real(
         return unproved("the states after the core are no chain of delays, or act on the core or the fault estimate")
     if not _is_triangular(factor) or not gain > 0.0:
         return unproved("the certificate is not triangular and nonsingular, or the gain is not positive")
-    inverse = _inverse(factor)
-    if inverse is None:
+    inverse = np.triu(np.linalg.inv(factor))
+    if not _is_invertible(inverse):
         return unproved("the certificate cannot be inverted")
 
     def formula(kind: type[Enclosed]) -> Enclosed:
@@ -66,9 +63,8 @@ def _is_triangular(factor: FloatArray) -> bool:
     return bool(np.all(np.tril(factor, -1) == 0.0) and np.all(np.diag(factor) != 0.0))
 
 
-def _inverse(factor: FloatArray) -> FloatArray | None:
-    inverse = np.triu(np.linalg.inv(factor))
-    return inverse if np.all(np.isfinite(inverse)) and np.all(np.diag(inverse) != 0.0) else None
+def _is_invertible(inverse: FloatArray) -> bool:
+    return bool(np.all(np.isfinite(inverse)) and np.all(np.diag(inverse) != 0.0))
 
 
 def _formed(
@@ -111,18 +107,15 @@ RATE_TOLERANCE = 1e-4
 
 
 def prove_stable(a: FloatArray, factor: FloatArray, dt: float) -> DefinitenessProof:
-    """Try to prove that every mode of ``a`` dies out.
-
-    Shapes: ``a (n, n)``, ``factor (n, n)``.
-    """
+    """Try to prove that every mode of ``a (n, n)`` dies out; ``factor (n, n)``."""
     if factor.shape != a.shape or not np.all(np.isfinite(factor)) or not np.all(np.isfinite(a)):
         return unproved("the certificate does not fit, or a number is not finite")
     if a.shape[0] == 0:
         return DefinitenessProof(True, np.inf, 0.0, "Cholesky")
     if not _is_triangular(factor):
         return unproved("the certificate is not triangular and nonsingular")
-    inverse = _inverse(factor)
-    if inverse is None:
+    inverse = np.triu(np.linalg.inv(factor))
+    if not _is_invertible(inverse):
         return unproved("the certificate cannot be inverted")
 
     def formula(kind: type[Enclosed]) -> Enclosed:
@@ -137,12 +130,20 @@ def prove_stable(a: FloatArray, factor: FloatArray, dt: float) -> DefinitenessPr
     return prove_positive_definite(formula)
 
 
-def decay_row(a: FloatArray, dt: float, claimed: float) -> Check:
-    """Return the row on a claimed decay (1/s): proved for all but `RATE_TOLERANCE` of it, whatever poles there are.
+def stability_row(a: FloatArray, factor: FloatArray, dt: float, source: str) -> Check:
+    """Return the row that every mode of ``a (n, n)`` dies out, by a Lyapunov factor."""
+    claim = "every error dies out: the Lyapunov inequality is positive definite"
+    return proof_row("stability", claim, prove_stable(a, factor, dt), source)
 
-    By a Lyapunov inequality shifted by the rate, or where multiple poles leave none, by an enclosure of each eigenvalue
-    of the stored numbers.
-    """
+
+def proof_row(name: str, claim: str, proof: DefinitenessProof, source: str) -> Check:
+    """Return the row of a proof that a matrix is positive definite."""
+    bound = proof.lower_bound
+    return Check(name, claim, bound, 0.0, bound, proof.proved, source, "proved", proof.text)
+
+
+def decay_row(a: FloatArray, dt: float, claimed: float) -> Check:
+    """Return the row on a claimed decay (1/s): proved for all but `RATE_TOLERANCE` of it, whatever poles there are."""
     slowest = float(np.min(decay_rates(eigenvalues(a), dt), initial=np.inf))
     wanted = claimed - RATE_TOLERANCE * abs(claimed)
     source, passed = "recomputed eigenvalues", bool(slowest >= wanted)

@@ -1,8 +1,7 @@
 """Monte Carlo on the plant's own model: are the errors as large as the covariances say, and the innovations white?
 
-The errors of a linear estimator do not depend on the trajectory.  We take the one that is zero, on which noise enters
-as data and the *prior mean* is what is random: this is the consistent simulation of a descriptor plant, in which mu(k)
-of an algebraic equation and x(k) are not independent (to draw x(0) and project it onto the constraint is inconsistent).
+Errors of a linear estimator do not depend on the trajectory: on the one that is zero the *prior mean* is random.  To
+draw x(0) and project it onto the constraint would be inconsistent, as mu(k) of an algebraic equation depends on x(k).
 """
 
 from __future__ import annotations
@@ -80,11 +79,8 @@ def _joint_root(gains: GainStep) -> FloatArray:
 
 
 def _terms(gains: GainStep, factor: FloatArray) -> FloatArray:
-    """Return the deviations that those of states and parameters are computed from, ``(nx + nq,)``.
-
-    Orthogonal factorisations round relative to the whole noise, as it reaches the unknowns through the pseudo-inverse
-    of H, however small the result: a covariance that tends to zero ends there.
-    """
+    """Return the deviations that those of states and parameters are computed from, ``(nx + nq,)``."""
+    # Factorisations round relative to the whole noise: a covariance that tends to zero ends there.
     terms = state_terms(gains.step, data_deviations(gains.step, factor))
     parameters = np.linalg.norm(gains.spread, axis=1)
     parameters = parameters + np.abs(gains.learn) @ data_deviations(gains.step, factor)
@@ -92,10 +88,7 @@ def _terms(gains: GainStep, factor: FloatArray) -> FloatArray:
 
 
 def data_deviations(step: StepMatrices, factor: FloatArray) -> FloatArray:
-    """Return the standard deviations of the data of one step, ``(rows,)``.
-
-    Shapes: ``factor (nx, any)``.
-    """
+    """Return the standard deviations of the data of one step, ``(rows,)``; ``factor (nx, any)``."""
     deviations = np.linalg.norm(step.noise, axis=1)
     deviations[: len(step.A)] = np.hypot(deviations[: len(step.A)], np.linalg.norm(step.A @ factor, axis=1))
     return np.asarray(deviations)
@@ -107,21 +100,14 @@ def state_terms(step: StepMatrices, sizes: FloatArray) -> FloatArray:
 
 
 class Scores(NamedTuple):
-    """Errors at one sample.
-
-    Fields: normalised: ``(trials, rank)``: in units of their deviations, where these are not zero; known: ``(trials, n
-    - rank)``: in units of the terms, in the directions that are claimed to be known exactly.
-    """
+    """Errors at one sample, in units of their deviations, and of the terms where they are claimed to be known."""
 
     normalised: FloatArray
     known: FloatArray
 
 
 def normalised(errors: FloatArray, root: FloatArray, terms: FloatArray) -> Scores:
-    """Return errors in units of their covariance ``root root'``; its rank is that beside rounding of its terms.
-
-    Shapes: ``errors (trials, n)``, ``root (n, any)``, ``terms (n,)``.
-    """
+    """Return ``errors (trials, n)`` in units of their covariance ``root root'``, of the rank beside ``terms (n,)``."""
     sizes = np.where(terms > 0.0, terms, 1.0)
     left, values, _ = np.linalg.svd(root / sizes[:, None])
     found = (errors / sizes) @ left
@@ -130,10 +116,8 @@ def normalised(errors: FloatArray, root: FloatArray, terms: FloatArray) -> Score
 
 
 def _error_rows(scores: dict[int, Scores]) -> Iterator[Check]:
-    """Yield NEES at its worst sample, and the errors in directions without covariance.
-
-    Errors at different samples are correlated, fully so without process noise: each sample has a band of its own.
-    """
+    """Yield NEES at its worst sample, and the errors in directions without covariance."""
+    # Errors at different samples are correlated, fully so without process noise: each has a band of its own.
     rows = [
         _band("NEES", "squared errors per degree of freedom are one", found.normalised**2, f" at k = {k}")
         for k, found in scores.items()

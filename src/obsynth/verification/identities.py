@@ -25,11 +25,7 @@ ROUGHLY = 4.0
 
 @dataclass(frozen=True, eq=False)
 class Residual:
-    """How far an identity is from holding, at its worst entry.
-
-    Fields: error: Absolute value of the sum there; scale: Size of the terms it is made of; allowance: What the rounding
-    of printed gains may add to the error.
-    """
+    """Error and scale (size of terms) of an identity at its worst entry, and what rounding of printed gains allows."""
 
     error: float
     scale: float
@@ -56,12 +52,10 @@ class Residual:
 
 @dataclass(frozen=True, eq=False)
 class Identity:
-    """A sum of terms that must vanish: ``terms[0] + terms[1] + ... = 0``.
+    """A sum of terms of one shape that must vanish; ``factors``, the products inside them, say what rounding can do.
 
-    Fields: terms: All of one shape; factors: The products inside the terms, which also say what rounding can do; units:
-    Sizes of the columns' signals: multiplied by them, entries of one row compare; entrywise: Whether each entry is
-    judged by its own terms; by default it is by the largest ones of its row; rough: Factor within which the sizes are
-    known; also: The same terms with sizes that are told otherwise: both must hold.
+    Entries of a row compare in ``units`` of their columns, known to within the factor ``rough``; ``entrywise`` each is
+    judged by its own terms.  ``also``: the same with other units: both must hold.
     """
 
     terms: tuple[FloatArray, ...]

@@ -20,7 +20,7 @@ from obsynth.proofs.peak_sums import gathered, interval_pieces, peak_sums
 from obsynth.proofs.products import energy
 from obsynth.results.checks import Check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
-from obsynth.verification.remainder_channel import TrackedPlant
+from obsynth.verification.error_system import TrackedPlant
 
 #: Imaginary parts below this are not shown.
 SHOWN_AS_REAL = 1e-12

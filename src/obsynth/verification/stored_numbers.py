@@ -1,7 +1,7 @@
 """What the stored numbers of a linear design add to the errors, whatever the identities are in exact arithmetic.
 
 The identities hold to rounding, not exactly: what they miss is driven by the plant's state and its known inputs (see
-`obsynth.verification.remainder_channel`).  The rows bound the errors per unit of each; where the plant does not forget,
+`obsynth.verification.error_system`).  The rows bound the errors per unit of each; where the plant does not forget,
 its state has no bound, no finite gain from the disturbances exists, and what can be said is after how long it matters.
 """
 
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from obsynth.numerics.arrays import SMALLEST, ComplexArray, FloatArray
+from obsynth.numerics.arrays import SMALLEST, ComplexArray, FloatArray, remembered
 from obsynth.numerics.norms import MOST_ENTRIES_AT_ONCE, resolved
 from obsynth.numerics.pencils import pencil_structure
 from obsynth.numerics.ranks import BOUNDARY_TOLERANCE
@@ -21,7 +21,7 @@ from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.checks import Check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
-from obsynth.verification.remainder_channel import (
+from obsynth.verification.error_system import (
     RemainderChannel,
     TrackedPlant,
     contraction_of,
@@ -62,6 +62,16 @@ class StoredErrors:
     @classmethod
     def of(cls, tracked: TrackedPlant, observer: LinearObserver) -> StoredErrors | None:
         """Return the bounds; ``None`` where no contraction of the observer can be proved."""
+        # A design is given them, and verified: the same realisation on the same plant is looked at once.
+        known = _bounds_of(observer)
+        for other, found in known:
+            if other.equals(tracked):
+                return found
+        known.append((tracked, cls._found(tracked, observer)))
+        return known[-1][1]
+
+    @classmethod
+    def _found(cls, tracked: TrackedPlant, observer: LinearObserver) -> StoredErrors | None:
         contraction = contraction_of(observer)
         if contraction is None:
             return None
@@ -74,6 +84,11 @@ class StoredErrors:
     def witnesses(self) -> dict[str, FloatArray]:
         """Return what a certificate claims of them, by name; what has no column is left out."""
         return {name: bound for name, bound in zip(_WITNESSES, self.bounds, strict=True) if bound.shape[1]}
+
+
+@remembered
+def _bounds_of(_observer: LinearObserver) -> list[tuple[TrackedPlant, StoredErrors | None]]:
+    return []
 
 
 def stored_number_rows(design: ObserverDesign, tracked: TrackedPlant, gamma: float | None = None) -> Iterator[Check]:
@@ -103,15 +118,10 @@ def stored_number_rows(design: ObserverDesign, tracked: TrackedPlant, gamma: flo
 def _per_unit(
     observer: LinearObserver, kind: str, bound: FloatArray, claimed: FloatArray | None, labels: tuple[str, ...]
 ) -> Check:
-    rows = (
-        *(f"xhat[{name}]" for name in observer.state_names),
-        *(f"fhat[{name}]" for name in observer.fault_names),
-        *(f"r[{name}]" for name in observer.residual_names),
-    )
     shown = bound[observer.fault_rows] if observer.fault_names else bound
     first = observer.fault_rows.start if observer.fault_names else 0
     i, j = np.unravel_index(int(np.argmax(shown)), shown.shape)
-    text = f"largest to {rows[first + int(i)]}: {shown[i, j]:.2g} per unit of {labels[int(j)]}"
+    text = f"largest to {observer.row_names[first + int(i)]}: {shown[i, j]:.2g} per unit of {labels[int(j)]}"
     what = f"error of an estimate per unit of the plant's {kind}, from rounding of the stored numbers"
     name, source = f"stored numbers: {kind}", "the residuals of the identities, outward rounded"
     if claimed is None:
@@ -214,39 +224,35 @@ class _Composite:
         return np.asarray(kept[:MOST_ANGLES], dtype=np.float64)
 
     def gains(self, frequencies: FloatArray) -> FloatArray:
-        """Return `gain` at many frequencies, those that take little memory at once."""
+        """Return the largest singular values at frequencies (rad per sample, or rad/s), a few of them at once."""
         dt = self.plant.dt
         points = boundary_points(frequencies / dt if dt > 0.0 else frequencies, dt)
-        at_once = max(1, MOST_ENTRIES_AT_ONCE // max(self.driven.size, self.K.shape[1] * self.plant.nd, 1))
+        at_once = max(1, MOST_ENTRIES_AT_ONCE // max(self.plant.E.size, self.K.size, 1))
+        parts = [points[i : i + at_once] for i in range(0, len(points), at_once)]
         try:
-            parts = [self._gains_at(points[i : i + at_once]) for i in range(0, len(points), at_once)]
+            return np.concatenate([self._gains_at(part) for part in parts])
         except np.linalg.LinAlgError:
-            return np.array([self.gain(float(frequency)) for frequency in frequencies])
-        return np.concatenate(parts)
+            return np.array([self._gain_at(point) for point in points])
 
-    def _gains_at(self, points: ComplexArray) -> FloatArray:
-        x = np.concatenate([*resolved(self.plant.E, self.plant.A, self.plant.Bd, points)])
-        one = np.eye(self.observer.order)
-        left = np.concatenate([*resolved(one, self.observer.Az.T, self.shown.T, points)])
-        stacked = np.concatenate([x * points[:, None, None] ** -age for age in range(self.lags)], axis=1)
-        whole = left.transpose(0, 2, 1) @ (self.K @ stacked + self.driven) + self.J @ stacked + self.direct
-        finite = np.all(np.isfinite(whole), axis=(1, 2))
-        return np.where(finite, np.linalg.norm(np.where(finite[:, None, None], whole, 0.0), 2, axis=(1, 2)), 0.0)
-
-    def gain(self, frequency: float) -> float:
-        """Return the largest singular value at a frequency (rad per sample, or rad/s); zero at a pole of the plant."""
-        dt = self.plant.dt
-        point = complex(boundary_points(np.array([frequency / dt if dt > 0.0 else frequency]), dt)[0])
+    def _gain_at(self, point: complex) -> float:
+        """Return the largest singular value at a point; zero at a pole of the plant."""
         try:
-            x = np.linalg.solve(point * self.plant.E - self.plant.A, self.plant.Bd.astype(complex))
-            stacked = np.vstack([x * point**-age for age in range(self.lags)])
-            inner = np.linalg.solve(
-                point * np.eye(self.observer.order) - self.observer.Az, self.K @ stacked + self.driven
-            )
+            return float(self._gains_at(np.array([point]))[0])
         except np.linalg.LinAlgError:
             return 0.0
-        whole = self.shown @ inner + self.J @ stacked + self.direct
-        return float(np.linalg.norm(whole, 2)) if np.all(np.isfinite(whole)) else 0.0
+
+    def _gains_at(self, points: ComplexArray) -> FloatArray:
+        # From the left, where the rows of fault errors are fewer than the disturbances.
+        left = np.concatenate([*resolved(np.eye(self.observer.order), self.observer.Az.T, self.shown.T, points)])
+        left = left.transpose(0, 2, 1)
+        ages = np.split(left @ self.K + self.J, self.lags, axis=2)
+        seen = sum(part * points[:, None, None] ** -age for age, part in enumerate(ages))
+        through = np.linalg.solve(
+            points[:, None, None] * self.plant.E.T - self.plant.A.T, np.asarray(seen).transpose(0, 2, 1)
+        )
+        whole = through.transpose(0, 2, 1) @ self.plant.Bd + left @ self.driven + self.direct
+        finite = np.all(np.isfinite(whole), axis=(1, 2))
+        return np.where(finite, np.linalg.norm(np.where(finite[:, None, None], whole, 0.0), 2, axis=(1, 2)), 0.0)
 
 
 def _when_it_matters(system: _Composite, level: float, unit: float, beyond: float) -> tuple[str, float]:
@@ -273,7 +279,7 @@ def _when_it_matters(system: _Composite, level: float, unit: float, beyond: floa
         ), seconds
     last = SLOWEST
     for frequency in () if np.isfinite(seconds) else SLOWER:
-        if system.gain(frequency * unit) > level:
+        if system.gains(np.array([frequency * unit]))[0] > level:
             seconds = per_unit / frequency
             break
         last = frequency

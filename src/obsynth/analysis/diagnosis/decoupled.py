@@ -11,8 +11,8 @@ from obsynth.analysis.diagnosis.reduction import PencilUnits, finite_values, lef
 from obsynth.analysis.transformations.recovery import Transformation, linear_plant
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import ComplexArray, FloatArray, read_only
+from obsynth.numerics.libraries import on_one_thread_if_small
 from obsynth.numerics.ranks import CLEAR_GAP, RankDecision
-from obsynth.numerics.threads import on_one_thread_if_small
 from obsynth.plants.descriptor import DescriptorSystem
 
 #: Entries of unit rows below this are rounding of the orthogonal transformations that made them.

@@ -14,9 +14,9 @@ from obsynth.analysis.diagnosis.verdicts import Diagnosis, FaultDiagnosis, resid
 from obsynth.analysis.transformations.recovery import Transformation, linear_plant
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import is_finite_number
+from obsynth.numerics.libraries import on_one_thread_if_small
 from obsynth.numerics.pencils import pencil_structure
 from obsynth.numerics.ranks import REST_TOLERANCE
-from obsynth.numerics.threads import on_one_thread_if_small
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.fault_models import Exosystem, exosystem, stated_eigenvalues
 
@@ -99,28 +99,24 @@ def model_points(model: Exosystem, fault: int) -> list[complex]:
     return [complex(value) for value in stated_eigenvalues(part)] if part.size else []
 
 
-def _point(plant: DescriptorSystem, frequency: float) -> complex:
-    return complex(np.exp(1j * frequency * plant.dt)) if plant.dt > 0.0 else 1j * frequency
-
-
 def _verdict(
     plant: DescriptorSystem, shown: Question, free: Question, frequencies: Sequence[float], modes: Sequence[complex],
     *, suggest: bool,
 ) -> FaultDiagnosis:  # fmt: skip
-    nothing = np.zeros(0, dtype=np.complex128)
+    points = [complex(np.exp(1j * w * plant.dt)) if plant.dt > 0.0 else 1j * w for w in frequencies]
     return FaultDiagnosis(
         name=plant.fault_names[shown.number],
         detectable=shown.visible,
         detectable_at_rest=shown.shows_at_rest,
-        detectable_at={float(w): shown.visible and shown.shows_at(_point(plant, w)) for w in frequencies},
+        detectable_at={float(w): shown.visible and shown.shows_at(s) for w, s in zip(frequencies, points, strict=True)},
         estimable=free.estimable,
         step_estimable=free.shows_at_rest,
         model_estimable=free.visible and all(free.shows_at(mode) for mode in modes),
         order=free.derivatives if free.visible else None,
         residual_order=shown.residual_order if shown.visible else None,
         filter_order=free.order,
-        zeros=free.zeros if free.visible else nothing,
-        blocking=free.blocking if free.visible else nothing,
+        zeros=free.zeros,
+        blocking=free.blocking,
         sentences=tuple(_sentences(plant, shown, free, suggest=suggest)),
         exact=shown.exactly,
         gap=min(shown.gap, free.gap),
@@ -144,8 +140,7 @@ def _sentences(plant: DescriptorSystem, shown: Question, free: Question, *, sugg
             seen = shown.visible and (free.visible or not shown.shows_at_rest)
             then = " Not estimable; seen only while it changes." if seen else ""
             texts.append(f"{name}: {motion} ({letter} = {_number(rest)}).{then}")
-    blocking = free.blocking if free.visible else ()
-    hiding = [zero for zero in blocking if abs(zero - rest) > REST_TOLERANCE and zero.imag >= 0.0]
+    hiding = [zero for zero in free.blocking if abs(zero - rest) > REST_TOLERANCE and zero.imag >= 0.0]
     for zero in hiding[:MOST_ZEROS]:
         motion = hidden_motion(plant, shown.number, complex(zero), free.removed)
         at = f"{letter} = {_number(zero)}"

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from obsynth.numerics.arrays import ComplexArray, FloatArray
+from obsynth.numerics.pencil_points import full_svd, largest_singular_value
 from obsynth.numerics.ranks import RankDecision, rank_from
 from obsynth.numerics.scaling import LogBalance
-from obsynth.numerics.staircase import full_svd, largest_singular_value
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.analysis.diagnosis.exact import question
-from obsynth.files.tables import html_table
+from obsynth.files.tables import html_table, text_table
 from obsynth.numerics.arrays import ComplexArray
 from obsynth.plants.descriptor import DescriptorSystem
 
@@ -229,8 +229,8 @@ class Diagnosis:
     def __str__(self) -> str:
         if not self.faults:
             return "The plant has no faults to diagnose."
-        more = ["", *_aligned(self.isolability_rows())] if len(self.faults) > 1 else []
-        return "\n".join([self.heading, *_aligned(self.verdict_rows()), *more, *self._texts])
+        more = ["", *text_table(self.isolability_rows())] if len(self.faults) > 1 else []
+        return "\n".join([self.heading, *text_table(self.verdict_rows()), *more, *self._texts])
 
     def _repr_html_(self) -> str:
         parts = [f"<p><b>{escape(self.heading)}</b></p>", html_table(self.verdict_rows())]
@@ -253,8 +253,3 @@ def _word(found: bool) -> str:
 
 def _count(number: int | None) -> str:
     return "-" if number is None else str(number)
-
-
-def _aligned(rows: Sequence[Sequence[str]]) -> list[str]:
-    widths = [max(len(row[j]) for row in rows) for j in range(len(rows[0]))]
-    return ["  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in rows]

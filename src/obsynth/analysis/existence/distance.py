@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.analysis.far_zeros import equilibrated_at
+from obsynth.analysis.zeros import equilibrated_at
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.scaling import equilibrate_pencil
 

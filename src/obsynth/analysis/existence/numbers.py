@@ -9,6 +9,8 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TypeVar
 
+import numpy as np
+
 from obsynth.analysis.existence.rational import PlantNumbers, WrittenNumbers
 from obsynth.analysis.existence.sampled import sampled_numbers
 from obsynth.plants.descriptor import DescriptorSystem
@@ -33,6 +35,11 @@ def decided(*, exactly: bool) -> Iterator[None]:
         yield
     finally:
         _EXACTLY.reset(token)
+
+
+def decides_exactly() -> bool:
+    """Whether existence is decided exactly where that can be done."""
+    return _EXACTLY.get()
 
 
 #: Whether numbers are asked for as they were before what elimination left by rounding was set to zero, and for which
@@ -102,7 +109,7 @@ class _Content:
 @lru_cache(maxsize=8)
 def _numbers_of(content: _Content, uncleaned: bool) -> PlantNumbers | None:
     plant = content.plant
-    from obsynth.proofs.exact_arithmetic import computed_entries, rational_matrix, written_matrix
+    from obsynth.proofs.exact_arithmetic import is_computed, rational_matrix, written_matrix
 
     origin = origin_of(plant)
     if origin is not None:
@@ -115,7 +122,7 @@ def _numbers_of(content: _Content, uncleaned: bool) -> PlantNumbers | None:
             return written if states <= (COMPUTED_STATES if origin.computed else EXACT_STATES) else None
         sampled = sampled_numbers(exact, origin.sample_time) if states <= SAMPLED_STATES else None
         return None if sampled is None else replace(sampled, computed=origin.computed)
-    computed = any(computed_entries(getattr(plant, name)) for name in DECISIVE)
+    computed = any(map(is_computed, (value for name in DECISIVE for value in np.ravel(getattr(plant, name)).tolist())))
     if computed and plant.nx > COMPUTED_STATES:
         return None
     matrices = {name: written_matrix(getattr(plant, name)) for name in DECISIVE}

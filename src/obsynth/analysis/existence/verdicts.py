@@ -8,11 +8,12 @@ Modes that no output shows: those of the numbers as written, and those that only
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from obsynth.analysis.conditions import Condition
 from obsynth.analysis.existence.distance import (
     DROWNED,
     Distance,
@@ -24,9 +25,8 @@ from obsynth.analysis.existence.named_pencils import named_pencil, unclear
 from obsynth.analysis.existence.numbers import numbers_of
 from obsynth.analysis.existence.rational import SystemFacts
 from obsynth.analysis.existence.witnesses import Unclear
-from obsynth.analysis.far_zeros import system_zeros
 from obsynth.analysis.plant_units import PlantUnits
-from obsynth.analysis.zeros import are_outside, is_outside
+from obsynth.analysis.zeros import are_outside, is_outside, system_zeros
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.pencils import finite_zeros
 from obsynth.numerics.ranks import NAMED_SHARE, RANK_TOLERANCE, RankDecision
@@ -139,6 +139,28 @@ def unclear_detail(verdict: ZeroVerdict, what: str) -> str:
         f"{what} exists for the numbers as written ({verdict.means}), but the least singular value of the scaled "
         f"pencil outside is {size:.1g}: rounding of the data, or of any gains, is as large."
     )
+
+
+def verdict_condition(
+    verdict: ZeroVerdict, holding: Condition, plant: DescriptorSystem, *, what: str, doubt: Callable[[], Unclear],
+    lost: Callable[[Sequence[complex]], Condition], gain: Callable[[complex], str],
+    seen: Callable[[], Sequence[complex]],
+) -> Condition:  # fmt: skip
+    """Return the condition of a verdict: as it holds; lost, with the gain that anything else would need; or in doubt.
+
+    ``lost(zeros)`` says what hides there, ``seen()`` which zeros floating point has outside, ``what`` would exist.
+    """
+    if verdict.answer == "no":
+        found = lost(verdict.facts.outside)
+        return replace(found, detail=f"{found.detail} {gain(found.mode or 0j)}".rstrip())
+    if verdict.answer == "yes":
+        return replace(holding, detail=f"{holding.detail}; {described_distance(verdict)}")
+    detail, zeros = unclear_detail(verdict, what), seen()
+    found = replace(holding, holds=False, detail=detail)
+    if zeros:
+        found = lost(zeros)
+        found = replace(found, detail=f"{detail} In floating point, {found.detail}")
+    return found.in_doubt(doubt(), plant)
 
 
 def zero_doubt(

@@ -18,11 +18,11 @@ from obsynth.analysis.transformations.recovery import (
 )
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.libraries import one_thread_if_small
 from obsynth.numerics.pencils import pencil_structure
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, rounding_rank
 from obsynth.numerics.scaling import equilibrate_pencil, power_of_two_below
 from obsynth.numerics.sparse import is_sparse
-from obsynth.numerics.threads import one_thread_if_small
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.origin import note_source, with_origin
 from obsynth.plants.uncertainty import ELIMINATED

@@ -142,7 +142,7 @@ class _Problem:
 
         def finite(part: int) -> Callable[[FloatArray], FloatArray]:
             # Outside the region where the model is defined a large number turns the search back.
-            return lambda z: _finite(self.scaled(z)[part])
+            return lambda z: np.nan_to_num(self.scaled(z)[part], nan=HUGE, posinf=HUGE, neginf=-HUGE)
 
         # As far as rounding allows.
         exact = np.finfo(np.float64).eps * 4.0
@@ -251,10 +251,6 @@ def _algebraic_step(constraint: FloatArray, right: FloatArray, E: FloatArray, mo
             move = np.zeros(E.shape[1])
             move[kept] = np.linalg.lstsq(constraint[:, kept], right, rcond=JACOBIAN_RANK_TOLERANCE)[0]
     return move
-
-
-def _finite(values: FloatArray) -> FloatArray:
-    return np.asarray(np.nan_to_num(values, nan=HUGE, posinf=HUGE, neginf=-HUGE), dtype=np.float64)
 
 
 def _row_weights(matrix: FloatArray) -> FloatArray:

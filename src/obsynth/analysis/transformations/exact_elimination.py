@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.holds import zero_order_hold
+from obsynth.numerics.continuous import zero_order_hold
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.origin import DECISIVE, PlantOrigin, origin_of

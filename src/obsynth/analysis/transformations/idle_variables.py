@@ -40,8 +40,8 @@ class ActiveVariables:
             return ""
         return (
             f"Left out, since they act on no state and no output: {', '.join(map(repr, self.dropped))} (with "
-            f"{'equations' if len(self.equations) > 1 else 'equation'} {', '.join(map(str, self.equations))}); "
-            "nothing else changes, and their values are not estimated."
+            f"equation{'s' if len(self.equations) > 1 else ''} {', '.join(map(str, self.equations))}); nothing else "
+            "changes, and their values are not estimated."
         )
 
 
@@ -94,11 +94,10 @@ def _repeated_equations(plant: DescriptorSystem, e: Any, a: Any, unused: Indices
     if empty or np.any(left > RANK_TOLERANCE * np.max(sizes, initial=0.0)):
         names = [plant.state_names[i] for i in unused]
         raise PreconditionError(
-            f"The plant is not regular, det(A - zE) is zero for every z: {listed(names)} {_are(names)} in no equation "
-            "and no output, and no equation repeats others. Check for missing terms.",
-            condition="regularity",
-            signals=names,
-        )
+            f"The plant is not regular, det(A - zE) is zero for every z: {listed(names)} "
+            f"{'is' if len(names) == 1 else 'are'} in no equation and no output, and no equation repeats others. Check "
+            "for missing terms.", condition="regularity", signals=names,
+        )  # fmt: skip
     own = found[unused]
     if np.linalg.svd(own, compute_uv=False)[-1] > np.sqrt(RANK_TOLERANCE) * np.max(np.abs(found)):
         return unused
@@ -148,8 +147,7 @@ def _spread(marked: Any, source: Indices, target: Indices, *, within: Any = None
     while True:
         more = found.copy()
         more[target[found[source]]] = True
-        if within is not None:
-            more &= within
+        more &= True if within is None else within
         if np.array_equal(more, found):
             return found
         found = more
@@ -183,16 +181,10 @@ def raise_structurally_singular(plant: DescriptorSystem, equations: Indices, var
     names = [plant.state_names[i] for i in variables]
     raise PreconditionError(
         "The plant is not regular, det(A - zE) is zero for every z and whatever the numbers are: "
-        + f"{listed(names)} {_are(names)} in too few equations, and equations "
-        + f"{listed([equation_name(plant, i) for i in equations], quoted=False)} hold too few variables. Check for a "
-        "missing or repeated equation.",
-        condition="regularity",
-        signals=names,
-    )
-
-
-def _are(names: list[str]) -> str:
-    return "are" if len(names) != 1 else "is"
+        f"{listed(names)} {'is' if len(names) == 1 else 'are'} in too few equations, and equations "
+        f"{listed([equation_name(plant, i) for i in equations], quoted=False)} hold too few variables. Check for a "
+        "missing or repeated equation.", condition="regularity", signals=names,
+    )  # fmt: skip
 
 
 def equation_name(plant: DescriptorSystem, row: int) -> str:

@@ -13,11 +13,11 @@ from obsynth.analysis.zeros import fault_zeros
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.arguments import is_finite_number
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.holds import zero_order_hold
+from obsynth.numerics.continuous import zero_order_hold
+from obsynth.numerics.libraries import on_one_thread_if_small
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE
 from obsynth.numerics.scaling import balanced_matrix, power_of_two_below
 from obsynth.numerics.sparse import dense
-from obsynth.numerics.threads import on_one_thread_if_small
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.origin import note_source, with_origin
 from obsynth.plants.uncertainty import SAMPLED

@@ -22,7 +22,7 @@ from obsynth.analysis.transformations.uncertain_plant import AffinePlant, reduce
 from obsynth.errors import PreconditionError
 from obsynth.experiments.monitors.adaptive_bound import Start
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.holds import first_order_hold
+from obsynth.numerics.continuous import first_order_hold
 from obsynth.observers.linear.derived import sample_observer
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.constants import ConstantsBox

@@ -26,8 +26,7 @@ import numpy as np
 from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.continuous import peak_gain
-from obsynth.numerics.holds import first_order_hold
+from obsynth.numerics.continuous import first_order_hold, peak_gain
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.balls import Ball, rounded_up

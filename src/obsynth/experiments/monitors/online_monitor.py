@@ -20,7 +20,7 @@ from obsynth.experiments.monitors.thresholds import samples_of, scaled_inputs, u
 from obsynth.experiments.monitors.whitening import steady_mean, whitened
 from obsynth.numerics.arguments import is_finite_number, require_kind, require_mapping
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.holds import first_order_hold
+from obsynth.numerics.continuous import first_order_hold
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.results.design import ObserverDesign

@@ -20,7 +20,7 @@ from obsynth.errors import SpecError
 from obsynth.experiments.monitors.between_samples import BetweenSamples
 from obsynth.methods.pd_observer.realisation import with_faults_as_states
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.holds import first_order_hold
+from obsynth.numerics.continuous import first_order_hold
 from obsynth.numerics.norms import output_covariance
 from obsynth.observers.linear.derived import sample_observer
 from obsynth.observers.linear.observer import LinearObserver

@@ -18,8 +18,6 @@ factorisation of the order of x, shared by Mehrotra's predictor and corrector.
 Sources: Todd, Toh and Tutuncu, SIAM J. Optim. 8 (1998) 769-796; Andersen, Dahl, Liu and Vandenberghe, "Interior-point
 methods for large-scale cone programming", in Optimization for Machine Learning (2011), whose start we take.  Primal and
 dual steps have lengths of their own.  Nobody believes the numbers that come out: callers judge what is made of them.
-
-The normal equations of an interior-point method, which become ever more singular towards the solution.
 """
 
 from __future__ import annotations
@@ -38,10 +36,7 @@ REFINEMENTS = 2
 
 
 class NormalEquations:
-    """``G'G x = r``, by a Cholesky factorisation in units of the diagonal.
-
-    Fields: columns: The columns of G, as rows: ``(n, m)``.
-    """
+    """``G'G x = r``, with the columns of G as rows ``(n, m)``, by a Cholesky factorisation in units of the diagonal."""
 
     def __init__(self, columns: FloatArray) -> None:
         from scipy.linalg import cho_factor
@@ -241,10 +236,7 @@ class _Newton:
 
 
 def solve_cone_programme(c: FloatArray, a: FloatArray, b: FloatArray, orders: Sequence[int]) -> ConeSolution:
-    """Return the solution of a cone programme.
-
-    Shapes: ``c (n,)``, ``a (m, n)``, ``b (m,)``.
-    """
+    """Return the solution of a cone programme; ``c (n,)``, ``a (m, n)``, ``b (m,)``."""
     ends = np.cumsum([0, *(order * (order + 1) // 2 for order in orders)])
     blocks = tuple(SemidefiniteBlock(order, int(first)) for order, first in zip(orders, ends[:-1], strict=True))
     programme = _Programme(c, np.ascontiguousarray(a.T), b, blocks)

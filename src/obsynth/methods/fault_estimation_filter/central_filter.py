@@ -13,6 +13,7 @@ import numpy as np
 from obsynth.methods.fault_estimation_filter.central_equation import CentralEquation, central_injection
 from obsynth.methods.fault_estimation_filter.gamma_iteration import NEXT_TO, Descent
 from obsynth.methods.fault_estimation_filter.injection_problem import GainProblem, Injection
+from obsynth.numerics.arrays import SMALLEST
 
 #: Artificial noise relative to the disturbance, in turn: the first is bisected, and each of the others only where it
 #: reaches a level below.
@@ -45,6 +46,8 @@ DECOUPLING_ATTEMPTS = ((1e-4, 1e-6), (1e-2, 1e-6), (1e-4, 1e-8), (1e-2, 1e-8))
 #: The same share where states are many: no gain that is shipped is smaller than ten times that.
 COARSELY_DECOUPLED = 1e-4
 GENERIC_POINT = 1.3247
+#: A point so far out that a combination which waits for samples is larger there than at the first by more than this.
+FAR_POINT, MOST_GROWTH = 1e6, 1e4
 SAME_ROWS = 1e-8
 #: A level this far above anything a disturbance could do is no limit.
 WITHOUT_LIMIT = 1e4
@@ -131,15 +134,25 @@ def _decoupling_filter(problem: GainProblem, gain: float) -> tuple[Injection, fl
 
 
 def _follows_from_measurements(problem: GainProblem) -> bool:
-    """Whether the rows of xi are combinations of those of state and measurements, at a point without meaning."""
-    shifted = problem.A - GENERIC_POINT * np.eye(problem.order)
-    known = np.vstack([np.hstack([shifted, problem.B]), np.hstack([problem.C, problem.D])])
-    wanted = np.hstack([problem.Z, problem.Zd])
+    """Whether the rows of xi are combinations of those of state and measurements, without samples yet to come."""
+    generic, left = _combined(problem, GENERIC_POINT)
+    if left > SAME_ROWS:
+        return False
+    # A sample yet to come is a factor of z.
+    far, _ = _combined(problem, FAR_POINT * max(1.0, float(np.linalg.norm(problem.A))))
+    return far <= MOST_GROWTH * generic
+
+
+def _combined(problem: GainProblem, point: float) -> tuple[float, float]:
+    """Return the size of the combination at a point of the z-plane, and what it leaves, as a share of xi."""
     from scipy.linalg import lstsq
 
+    shifted = problem.A - point * np.eye(problem.order)
+    known = np.vstack([np.hstack([shifted, problem.B]), np.hstack([problem.C, problem.D])])
+    wanted = np.hstack([problem.Z, problem.Zd])
     solved = lstsq(known.T, wanted.T, lapack_driver="gelsy", check_finite=False)[0]
     left = float(np.linalg.norm(known.T @ solved - wanted.T))
-    return left <= SAME_ROWS * float(np.linalg.norm(wanted))
+    return float(np.linalg.norm(solved)), left / max(float(np.linalg.norm(wanted)), SMALLEST)
 
 
 def least_level(problem: GainProblem) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from itertools import product
+from itertools import islice, product
 
 import numpy as np
 
@@ -29,17 +29,19 @@ NEAR_ONE = 1.05
 
 
 def bounded_real_certificate(
-    plant: DescriptorSystem, observer: LinearObserver, tracking: FloatArray, gain: float, *, core: int, lag: int
-) -> FloatArray:
+    plant: DescriptorSystem, observer: LinearObserver, tracking: FloatArray, gain: float, *, core: int, lag: int,
+    tries: int | None = None,
+) -> tuple[FloatArray, bool]:  # fmt: skip
     """Return Q ``(core, core)``, upper triangular with P = Q'Q, for the shipped observer at level ``gain``.
 
-    The Riccati solution with the largest slack that gives a proof; the last try when none does, for the report.
+    The Riccati solution with the largest slack that gives a proof, and true; the last try when none does, for the
+    report, and false.  At most ``tries`` coordinates are tried.
     """
     errors = ErrorSystem.of(plant, observer, tracking, lag)
     a, b = observer.Az[:core, :core], errors.disturbance[:core] / gain
     c, d = -errors.fault_output[0][:, :core], errors.fault_output[2] / gain
     best, spare = np.eye(core), None
-    for change in _changes(a, b, c, d):
+    for change in islice(_changes(a, b, c, d), tries):
         inverse = np.asarray(np.linalg.inv(change))
         moved_a, moved_b, moved_c = inverse @ a @ change, inverse @ b, c @ change
         weight = max(1.0, float(np.linalg.norm(moved_c, 2)) ** 2)
@@ -50,9 +52,9 @@ def bounded_real_certificate(
             best = _triangular(np.asarray(np.linalg.cholesky(p)).T @ inverse)
             proof = prove_bounded_real(plant, observer, tracking, best, gain, lag=lag)
             if proof.in_double_precision:
-                return best
+                return best, True
             spare = best if proof.proved and spare is None else spare
-    return best if spare is None else spare
+    return (best, False) if spare is None else (spare, True)
 
 
 def _changes(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> Iterator[FloatArray]:

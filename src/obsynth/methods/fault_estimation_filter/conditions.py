@@ -14,7 +14,7 @@ import numpy as np
 
 from obsynth.analysis.conditions import Condition, is_doubted, is_refused, rank_condition
 from obsynth.analysis.existence.distance import least_share
-from obsynth.analysis.existence.numbers import numbers_of, reconsidered
+from obsynth.analysis.existence.numbers import decides_exactly, numbers_of, reconsidered
 from obsynth.analysis.existence.rational import PlantNumbers
 from obsynth.analysis.existence.verdicts import (
     described_distance,
@@ -34,7 +34,8 @@ from obsynth.methods.fault_estimation_filter.detectability_indexes import (
 )
 from obsynth.methods.fault_estimation_filter.index_doubt import index_doubt
 from obsynth.methods.fault_estimation_filter.prepared_plant import PreparedPlant, prepare, with_sensor_faults_as_states
-from obsynth.numerics.pencils import PencilStructure, regularity
+from obsynth.numerics.arrays import remembered
+from obsynth.numerics.pencils import regularity
 from obsynth.numerics.ranks import decide_rank
 from obsynth.plants.descriptor import DescriptorSystem
 
@@ -44,26 +45,28 @@ _CLAIM = "every invariant zero from the faults to the outputs strictly inside th
 _SOURCE = "never stated in Wang 2015: detectability of (A1, C1)"
 
 
-def fault_filter_conditions(
-    plant: DescriptorSystem, *, structure: PencilStructure | None = None
-) -> tuple[Condition, ...]:
+@remembered
+def _decided(_plant: DescriptorSystem) -> dict[bool, tuple[Condition, ...]]:
+    """Return a place for the conditions of a plant, decided exactly or not: synthesis and verification ask for them."""
+    return {}
+
+
+def fault_filter_conditions(plant: DescriptorSystem) -> tuple[Condition, ...]:
     """Return the existence conditions of the fault-estimation filter, in order; the list ends at the first failure."""
-    return examine_fault_filter(plant, structure=structure)[0]
+    return _decided(plant).get(decides_exactly()) or examine_fault_filter(plant)[0]
 
 
-def examine_fault_filter(
-    plant: DescriptorSystem, *, structure: PencilStructure | None = None
-) -> tuple[tuple[Condition, ...], PreparedPlant | None]:
+def examine_fault_filter(plant: DescriptorSystem) -> tuple[tuple[Condition, ...], PreparedPlant | None]:
     """Return the existence conditions, and the prepared plant on which the last of them were decided."""
-    plant = plant.dense()
-    return reconsidered(
-        lambda: _examined(plant, structure), lambda found: is_refused(found[0]), lambda found: is_doubted(found[0])
+    dense = plant.dense()
+    found = reconsidered(
+        lambda: _examined(dense), lambda found: is_refused(found[0]), lambda found: is_doubted(found[0])
     )
+    _decided(plant)[decides_exactly()] = found[0]
+    return found
 
 
-def _examined(
-    plant: DescriptorSystem, structure: PencilStructure | None
-) -> tuple[tuple[Condition, ...], PreparedPlant | None]:
+def _examined(plant: DescriptorSystem) -> tuple[tuple[Condition, ...], PreparedPlant | None]:
     prepared: PreparedPlant | None = None
 
     def visibility_conditions() -> list[Condition]:
@@ -75,7 +78,7 @@ def _examined(
         return [*first, last if doubt is None else last.in_doubt(doubt, plant)]
 
     groups: tuple[Callable[[], list[Condition]], ...] = (
-        lambda: _form_conditions(plant, structure),
+        lambda: _form_conditions(plant),
         lambda: _rank_conditions(plant),
         visibility_conditions,
         lambda: _zero_conditions(plant),
@@ -89,15 +92,13 @@ def _examined(
     return tuple(found), prepared
 
 
-def _form_conditions(plant: DescriptorSystem, structure: PencilStructure | None) -> list[Condition]:
+def _form_conditions(plant: DescriptorSystem) -> list[Condition]:
     numbers = numbers_of(plant)
     if numbers is not None:
         normal_rank = numbers.regular_rank
         regular = normal_rank == plant.nx
-    elif structure is None:
-        regular, normal_rank = regularity(plant.E, plant.A)
     else:
-        regular, normal_rank = structure.regular, structure.normal_rank
+        regular, normal_rank = regularity(plant.E, plant.A)
     return [
         Condition(
             "discrete time",

@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.errors import SolverError
+from obsynth.errors import InfeasibleError, SolverError
 from obsynth.methods.fault_estimation_filter import inequality_search, inequality_solutions
 from obsynth.methods.fault_estimation_filter.central_filter import central_filter_at
-from obsynth.methods.fault_estimation_filter.gamma_lower_bound import require_reachable
+from obsynth.methods.fault_estimation_filter.gamma_lower_bound import BOUND_MARGIN, proved_lower_bound
 from obsynth.methods.fault_estimation_filter.inequality_search import LeastGain, coordinates
 from obsynth.methods.fault_estimation_filter.injection_problem import GainProblem, Injection, WeightLimit
 from obsynth.methods.fault_estimation_filter.options import FilterOptions
@@ -50,6 +50,7 @@ def bisected_gain(
 
 def search_by_bisection(problem: GainProblem, *, tolerance: float, solver: str, polish: bool = True) -> LeastGain:
     """Minimise the gain by bisection (the paper's Algorithm 1, made to end)."""
+    problem = replace(problem, judged_exactly=True)
     normalised = coordinates(problem, solver=solver)
     gain = normalised.start_gain
     if problem.measured == 0 or gain == 0.0:
@@ -172,6 +173,30 @@ def _gain_to_ship(
         return max((1.0 + asked.gamma_margin) * least.gain, least.starting_gain)
     if asked.gamma is None:
         return max((1.0 + asked.gamma_margin) * least.gain, floor)
-    require_reachable(problem, least, asked.gamma, solver=asked.solver)
+    _require_reachable(problem, least, asked.gamma, solver=asked.solver)
     ceiling = LARGEST_USEFUL_GAIN * least.starting_gain
     return min(asked.gamma, ceiling) if ceiling > 0.0 else asked.gamma
+
+
+def _require_reachable(problem: GainProblem, least: inequality_search.LeastGain, gain: float, *, solver: str) -> None:
+    """Raise unless ``gain`` is within reach of the best filter found."""
+    best = least.gain
+    if problem.disturbances == 0 or best <= gain:
+        return
+    # Without free measurements there is one filter, and its norm is attained at a frequency.
+    bound = best * (1.0 - BOUND_MARGIN)
+    if problem.measured:
+        bound = proved_lower_bound(problem, solver=solver, best=least.injection, enough=gain)
+    choice = "for this T and N" if problem.free_weight else "for this T, N and W"
+    if bound > gain:
+        remedy = "" if problem.free_weight else ", or set free_residual_weight: true"
+        raise InfeasibleError(
+            f"No filter reaches gamma = {gain:.6g} {choice}: a checked certificate proves gamma >= {bound:.6g}, and "
+            f"the best filter found has {best:.6g}. Ask for a larger gamma, leave it out for the least{remedy}.",
+            necessary=False,
+            lower_bound=bound,
+        )
+    raise SolverError(
+        f"gamma = {gain:.6g} was not reached (best found {best:.6g}), and the proved lower bound {bound:.6g} does not "
+        f"rule it out: nothing is known {choice}. Ask for a slightly larger gamma."
+    )

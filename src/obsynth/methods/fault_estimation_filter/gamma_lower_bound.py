@@ -8,9 +8,8 @@ from itertools import product
 
 import numpy as np
 
-from obsynth.errors import InfeasibleError, SolverError
+from obsynth.errors import SolverError
 from obsynth.methods.conic import lmi
-from obsynth.methods.fault_estimation_filter.inequality_search import LeastGain
 from obsynth.methods.fault_estimation_filter.injection_problem import (
     GainProblem,
     Injection,
@@ -293,27 +292,3 @@ def _mixture(
     later = corner @ np.linalg.inv(0.5 * (q + q.T))
     values, vectors = np.linalg.eigh(0.5 * (last + last.T) - later @ q @ later.T)
     return f, later @ np.linalg.inv(states), vectors * np.sqrt(np.maximum(values, 0.0))
-
-
-def require_reachable(problem: GainProblem, least: LeastGain, gain: float, *, solver: str) -> None:
-    """Raise unless ``gain`` is within reach of the best filter found."""
-    best = least.gain
-    if problem.disturbances == 0 or best <= gain:
-        return
-    # Without free measurements there is one filter, and its norm is attained at a frequency.
-    bound = best * (1.0 - BOUND_MARGIN)
-    if problem.measured:
-        bound = proved_lower_bound(problem, solver=solver, best=least.injection, enough=gain)
-    choice = "for this T and N" if problem.free_weight else "for this T, N and W"
-    if bound > gain:
-        remedy = "" if problem.free_weight else ", or set free_residual_weight: true"
-        raise InfeasibleError(
-            f"No filter reaches gamma = {gain:.6g} {choice}: a checked certificate proves gamma >= {bound:.6g}, and "
-            f"the best filter found has {best:.6g}. Ask for a larger gamma, leave it out for the least{remedy}.",
-            necessary=False,
-            lower_bound=bound,
-        )
-    raise SolverError(
-        f"gamma = {gain:.6g} was not reached (best found {best:.6g}), and the proved lower bound {bound:.6g} does not "
-        f"rule it out: nothing is known {choice}. Ask for a slightly larger gamma."
-    )

@@ -17,9 +17,8 @@ from obsynth.errors import SpecError
 from obsynth.methods.fault_estimation_filter.certificate import bounded_real_certificate
 from obsynth.methods.fault_estimation_filter.conditions import fault_filter_conditions
 from obsynth.methods.fault_estimation_filter.detectability_indexes import FaultDetectability, fault_detectability
-from obsynth.methods.fault_estimation_filter.notes import notes
 from obsynth.methods.fault_estimation_filter.prepared_plant import prepare, with_sensor_faults_as_states
-from obsynth.methods.fault_estimation_filter.realisation import realise_filter
+from obsynth.methods.fault_estimation_filter.realisation import notes, realise_filter
 from obsynth.methods.method_spec import Synthesis
 from obsynth.numerics.arguments import is_whole
 from obsynth.numerics.arrays import FloatArray, as_matrix
@@ -45,7 +44,7 @@ def synthesis_from_gains(
     gains |= {"Psi": detectability.Psi, "Upsilon": detectability.Upsilon}
     observer, tracking, lag = realise_filter(plant, work, gains, detectability)
     level = 1.0 if gamma is None else gamma
-    factor = bounded_real_certificate(plant, observer, tracking, level, core=work.nx, lag=lag)
+    factor, _ = bounded_real_certificate(plant, observer, tracking, level, core=work.nx, lag=lag)
     claims = {"state_lag": float(lag)} | ({"gamma": level} if plant.nd else {})
     doubts = () if indexes is not None else _lost_indexes(plant, detectability)
     return Synthesis(

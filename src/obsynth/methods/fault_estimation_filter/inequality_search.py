@@ -6,7 +6,7 @@ says so.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,6 @@ from obsynth.errors import SolverError
 from obsynth.methods.conic import lmi
 from obsynth.methods.fault_estimation_filter import inequality_solutions
 from obsynth.methods.fault_estimation_filter.central_filter import (
-    FEW_STATES,
     least_level,
     search_central_filter,
     with_least_weight,
@@ -84,7 +83,7 @@ def search_least_gain(problem: GainProblem, *, solver: str, polish: bool = True)
             better = improve(normalised, best, gain, records, solver=solver, first=number == 0)
             if better is None:
                 reached = np.inf
-            elif improve is _central_filter and problem.order > FEW_STATES:
+            elif improve is _central_filter:
                 reached = records[-1]["gain"] * normalised.gain  # known already, in the other coordinates
             else:
                 reached = problem.achieved_gain(better)
@@ -100,6 +99,7 @@ def search_least_gain(problem: GainProblem, *, solver: str, polish: bool = True)
             break
     if polish and gain <= least_level(problem) * (1.0 + PASS_IMPROVEMENT):
         records.append({"what": "least gain", "solver": "lower bound", "status": NOTHING_TO_POLISH, "gain": gain})
+    gain = replace(problem, judged_exactly=True).achieved_gain(best)
     return LeastGain(gain, first, best, starting, (gain, gain), records)
 
 

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -60,31 +61,39 @@ class InvisiblePairs:
     @classmethod
     def of(cls, work: DescriptorSystem, gains: Mapping[str, FloatArray]) -> InvisiblePairs | None:
         """Return the pairs of a plant with its sensor faults as states; ``None`` where there are too many states."""
-        from obsynth.proofs.exact_arithmetic import blocks, null_basis, stored_matrix, zeros_matrix
-
         if work.nx > MOST_STATES or not work.nd:
             return None
-        t, n, feedback, w, upsilon = (stored_matrix(gains[letter]) for letter in ("T", "N", "L", "W", "Upsilon"))
-        plain, c, bd, dd = (stored_matrix(part) for part in (work.A, work.C, work.Bd, work.Dd))
+        parts = (*(gains[letter] for letter in ("T", "N", "L", "W", "Upsilon")), work.A, work.C, work.Bd, work.Dd)
+        return cls._of(*((part.shape, part.tobytes()) for part in parts))
+
+    # Synthesis and verification ask for those of the same numbers.
+    @classmethod
+    @lru_cache(maxsize=2)
+    def _of(cls, *numbers: tuple[tuple[int, ...], bytes]) -> InvisiblePairs:
+        from obsynth.proofs.exact_arithmetic import blocks, null_basis, stored_matrix, zeros_matrix
+
+        t, n, feedback, w, upsilon, plain, c, bd, dd = (
+            stored_matrix(np.frombuffer(data).reshape(shape)) for shape, data in numbers
+        )
         ta, direct = t * plain, dd - c * (n * dd)
         a, b = ta - feedback * c, t * bd - ta * (n * dd) - feedback * direct
         z, zd = w * c, w * direct
         pairs = null_basis(blocks([[c, direct, upsilon]]))
-        count, states, inputs = int(pairs.ncols()), work.nx, work.nd
+        count, states, inputs = int(pairs.ncols()), int(plain.ncols()), int(bd.ncols())
         tops, bottoms = _rows(pairs, 0, states), _rows(pairs, states, states + inputs)
-        images = a * tops + b * bottoms
         reached = zeros_matrix(states, 0)
         while True:
-            staying = null_basis(blocks([[tops, reached]]))
-            chosen = _rows(staying, 0, count)
-            larger = _echelon(blocks([[reached, images * chosen]]))
+            # Pairs that start where others have ended.
+            chosen = _rows(null_basis(blocks([[tops, reached]])), 0, count)
+            starts, ends = tops * chosen, bottoms * chosen
+            images = a * starts + b * ends
+            larger = _echelon(blocks([[reached, images]]))
             if larger.ncols() == reached.ncols():
                 break
             reached = larger
         places = _pivot_rows(reached)
-        top, image = _picked(tops * chosen, places), _picked(images * chosen, places)
-        bottom = bottoms * chosen
-        return cls(reached, top, bottom, image, z * (tops * chosen) + zd * bottom, z * reached, zd)
+        top, image = _picked(starts, places), _picked(images, places)
+        return cls(reached, top, ends, image, z * starts + zd * ends, z * reached, zd)
 
     def bound(self, matrices: Mapping[str, FloatArray], *, free_weight: bool) -> float:
         """Return the lower bound that a certificate proves, rounded down; zero where it proves nothing."""

@@ -17,7 +17,8 @@ algebraic equations; `restricted_equivalent` uses a T that is nonsingular by con
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -31,7 +32,7 @@ from obsynth.methods.fault_estimation_filter.detectability_indexes import (
 )
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import RANK_TOLERANCE, decide_rank
-from obsynth.numerics.scaling import Scaling, balance_system
+from obsynth.numerics.scaling import Scaling, balance_system, power_of_two_below
 from obsynth.plants.descriptor import DescriptorSystem
 
 
@@ -84,7 +85,7 @@ def restricted_equivalent_from(e: FloatArray, c: FloatArray, s: FloatArray) -> t
     return t, n
 
 
-#: Balanced units are kept while the condition number of ``[E; C]`` is below this.
+#: Units are kept while the condition numbers of ``[E; C]`` and T are below this.
 MOST_CONDITION = 256.0
 
 
@@ -119,18 +120,30 @@ def with_sensor_faults_as_states(plant: DescriptorSystem) -> DescriptorSystem:
     return augment_faults(plant, direct).plant if direct else plant
 
 
-def _scaling(work: DescriptorSystem) -> Scaling:
-    """Return balanced units, or the natural ones where balancing leaves ``[E; C]``, on which T and N rest, worse."""
+def _units(work: DescriptorSystem) -> Iterator[Scaling]:
+    """Yield units to try in turn: balanced, natural, and balanced with the rows of E of one size.
+
+    Where A is far larger than E, an equation is scaled by A: T would lose it beside an output of the same state.
+    """
     balanced = balance_system(work.E, work.A, inputs=[work.Bf], outputs=[work.C])
-    if _condition(work, balanced) <= MOST_CONDITION:
-        return balanced
+    yield balanced
     units = PlantUnits.of(work).rounded()
-    natural = Scaling(units.equations, units.states, units.outputs)
-    return min(natural, balanced, key=lambda scaling: _condition(work, scaling))
+    yield Scaling(units.equations, units.states, units.outputs)
+    sizes = np.linalg.norm(balanced.scale_dynamics(work.E), axis=1)
+    yield replace(balanced, equations=balanced.equations / power_of_two_below(np.where(sizes > 0.0, sizes, 1.0)))
 
 
-def _condition(work: DescriptorSystem, scaling: Scaling) -> float:
-    return float(np.linalg.cond(np.vstack([scaling.scale_dynamics(work.E), scaling.scale_output(work.C)])))
+def _equivalent(work: DescriptorSystem) -> tuple[Scaling, FloatArray, FloatArray]:
+    """Return units in which ``[E; C]`` and T are well conditioned, or as well as can be had, with T and N in them."""
+    tried = []
+    for scaling in _units(work):
+        e, c = scaling.scale_dynamics(work.E), scaling.scale_output(work.C)
+        t, n = restricted_equivalent(e, c)
+        condition = max(float(np.linalg.cond(np.vstack([e, c]))), float(np.linalg.cond(t)))
+        tried.append((condition, (scaling, t, n)))
+        if condition <= MOST_CONDITION:
+            break
+    return min(tried, key=lambda entry: entry[0])[1]
 
 
 def prepare(plant: DescriptorSystem, s: FloatArray | None = None) -> PreparedPlant:
@@ -139,11 +152,9 @@ def prepare(plant: DescriptorSystem, s: FloatArray | None = None) -> PreparedPla
     Shapes: ``s (na, na + ny)``.
     """
     work = with_sensor_faults_as_states(plant)
-    scaling = _scaling(work)
+    scaling, t, n = _equivalent(work)
     a, c = scaling.scale_dynamics(work.A), scaling.scale_output(work.C)
-    if s is None:
-        t, n = restricted_equivalent(scaling.scale_dynamics(work.E), c)
-    else:
+    if s is not None:
         # S is meant for the plant as given; what it makes is then moved to the balanced coordinates, exactly.
         t, n = restricted_equivalent_from(work.E, work.C, s)
         t, n = t / scaling.states[:, None] / scaling.equations, n / scaling.states[:, None] / scaling.outputs

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 from numpy.typing import ArrayLike
 
-from obsynth.analysis.transformations.recovery import Transformation, plant_and_recovery
+from obsynth.analysis.transformations.recovery import Transformation, linear_plant
 from obsynth.errors import SpecError
-from obsynth.methods.designing import design, draft_of
-from obsynth.methods.verifying import verify
+from obsynth.methods.designing import design, design_of_given_gains
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.scenario import Scenario
@@ -180,11 +180,9 @@ def fault_estimation_filter_from_gains(
     """
     from obsynth.methods.fault_estimation_filter.given_gains import synthesis_from_gains
 
-    own, recovery = plant_and_recovery(plant)
-    if own.nd and gamma is None:
+    if linear_plant(plant).nd and gamma is None:
         raise SpecError(
             "gamma is needed: the plant has disturbances, and a gain set claims a bound on them.", path="gamma"
         )
-    found = synthesis_from_gains(own, T=T, N=N, L=L, W=W, gamma=gamma, indexes=indexes)
-    draft = draft_of(own, "fault-estimation-filter", found, name=name, recovery=recovery)
-    return draft.replace(report=verify(draft))
+    synthesis = partial(synthesis_from_gains, T=T, N=N, L=L, W=W, gamma=gamma, indexes=indexes)
+    return design_of_given_gains(plant, "fault-estimation-filter", synthesis, name=name)

@@ -19,7 +19,7 @@ from obsynth.methods.fault_estimation_filter.central_filter import (
 )
 from obsynth.methods.fault_estimation_filter.inequality_search import LeastGain
 from obsynth.methods.fault_estimation_filter.injection_problem import GainProblem, Injection
-from obsynth.methods.fault_estimation_filter.small_gains_by_inequality import Goal, gains_by_inequality, radius
+from obsynth.methods.fault_estimation_filter.small_gains_by_inequality import Goal, gains_by_inequality
 
 #: The error shall be forgotten at least this fast (spectral radius), or half as fast as the starting filter does: the
 #: smallest gains alone would leave an observable mode at the very edge of stability.
@@ -49,7 +49,7 @@ def small_gain_design(
         return least.injection, records
     nothing = Injection(np.zeros_like(least.injection.R), np.zeros_like(least.injection.V))
     fresh = least.first
-    goal = Goal(problem, gain, max(SLOWEST_DECAY, 0.5 + 0.5 * radius(problem, fresh.start)))
+    goal = Goal(problem, gain, max(SLOWEST_DECAY, 0.5 + 0.5 * problem.radius(fresh.start)))
     if not goal.noisy and goal.met_fast(nothing):
         # Without a noise model the objective is the size of the gains themselves, and zero is least.
         return nothing, records
@@ -62,7 +62,7 @@ def small_gain_design(
     quick = None
     if lively:
         # The filter of least noise may forget slowly again: what was bought is not given back.
-        quick = _towards(goal, lively[0], target, slowest=radius(problem, lively[0]))
+        quick = _towards(goal, lively[0], target, slowest=problem.radius(lively[0]))
         candidates.append(quick)
         central += lively
     else:
@@ -105,9 +105,7 @@ def _lively_filters(goal: Goal) -> list[Injection]:
         noisier = problem.with_state_noise(share * size)
         found += [item for item in noise_weighted_filters(noisier, goal.gain, reaches=goal.met) if goal.met_fast(item)]
     least = min(map(goal.cost, found), default=0.0)
-    return sorted(
-        (item for item in found if goal.cost(item) <= PRICE_OF_SPEED * least), key=lambda item: radius(problem, item)
-    )
+    return sorted((item for item in found if goal.cost(item) <= PRICE_OF_SPEED * least), key=problem.radius)
 
 
 def _towards(goal: Goal, injection: Injection, target: Injection | None, *, slowest: float | None = None) -> Injection:
@@ -118,10 +116,10 @@ def _towards(goal: Goal, injection: Injection, target: Injection | None, *, slow
     best, least, share, step = injection, goal.cost(injection), 0.0, 1.0
     judge = goal.met_fast if goal.met_fast(injection) else goal.met
     few = goal.problem.order <= FEW_STATES
-    if not few and not goal.noisy:
+    if not goal.noisy:
         step = 0.5  # without noise the target is no filter of this gain
     many = COARSE_LINE_STEPS if goal.problem.order <= MOST_STATES_FOR_LEVELS else COARSEST_LINE_STEPS
-    for _ in range(LINE_STEPS if few else many):
+    for _ in range(LINE_STEPS - (not goal.noisy) if few else many):
         tried = share + step
         mixed = Injection(*((1.0 - tried) * a + tried * b for a, b in zip(injection.parts, target.parts, strict=True)))
         if tried <= 1.0 and judge(mixed) and (cost := goal.cost(mixed)) <= least:

@@ -16,7 +16,6 @@ from obsynth.errors import SolverError
 from obsynth.methods.fault_estimation_filter import inequality_solutions
 from obsynth.methods.fault_estimation_filter.inequality_search import LeastGain, coordinates
 from obsynth.methods.fault_estimation_filter.injection_problem import GainProblem, Injection, NormalisedProblem
-from obsynth.numerics.norms import spectral_radius
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +49,7 @@ class Goal:
 
     def is_fast(self, injection: Injection) -> bool:
         """Return whether the filter forgets fast enough."""
-        return radius(self.problem, injection) <= self.slowest
+        return self.problem.radius(injection) <= self.slowest
 
     def met_fast(self, injection: Injection) -> bool:
         """Return both."""
@@ -63,17 +62,12 @@ class Goal:
         return float(np.linalg.norm(np.vstack([injection.R, injection.V])))
 
 
-def radius(problem: GainProblem, injection: Injection) -> float:
-    """Return the spectral radius of the closed loop."""
-    return spectral_radius(problem.closed_loop(injection)[0])
-
-
 def _reaches(problem: GainProblem, injection: Injection, gain: float) -> bool:
     limit = problem.weight_limit
     if limit is not None and float(np.linalg.norm(limit.fixed + injection.V @ limit.free, 2)) > limit.bound:
         return False
     if problem.disturbances == 0:
-        return radius(problem, injection) < 1.0
+        return problem.radius(injection) < 1.0
     return problem.reaches(injection, gain)
 
 

@@ -18,7 +18,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -28,22 +29,24 @@ from obsynth.errors import InfeasibleError
 from obsynth.methods.conic.lmi import FILTER_SOLVERS
 from obsynth.methods.fault_estimation_filter.certificate import bounded_real_certificate
 from obsynth.methods.fault_estimation_filter.conditions import examine_fault_filter, fault_filter_conditions
-from obsynth.methods.fault_estimation_filter.filter_search import NOMINAL_GAIN, found_gains, found_within
+from obsynth.methods.fault_estimation_filter.filter_search import NOMINAL_GAIN, FoundGains, found_gains, found_within
 from obsynth.methods.fault_estimation_filter.gamma_lower_bound import least_gain_certificate
 from obsynth.methods.fault_estimation_filter.inequality_solutions import null_basis
 from obsynth.methods.fault_estimation_filter.injection_problem import GainProblem, Injection, WeightLimit
-from obsynth.methods.fault_estimation_filter.notes import notes
 from obsynth.methods.fault_estimation_filter.options import FilterOptions
 from obsynth.methods.fault_estimation_filter.prepared_plant import PreparedPlant, prepare
-from obsynth.methods.fault_estimation_filter.realisation import realise_filter
+from obsynth.methods.fault_estimation_filter.realisation import notes, realise_filter
 from obsynth.methods.method_spec import Synthesis
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.observers.linear.derived import averaged
+from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import Certificate
 
 #: Fictitious noise on the measurements, relative to the given one, so that no direction of the gains is free of cost.
 BACKGROUND_NOISE = 1e-3
+#: Coordinates in which a certificate is looked for before the gain is judged again.
+FIRST_TRIES = 4
 
 
 def conditions(plant: DescriptorSystem, *, exactly: bool = True) -> tuple[Condition, ...]:
@@ -62,22 +65,25 @@ def synthesise(plant: DescriptorSystem, asked: FilterOptions, *, progress: Calla
     limit = asked.residual_weight_limit
     free = asked.free_residual_weight if asked.free_residual_weight is not None else plant.nw > 0 or limit is not None
     problem, parts = gain_problem(prepared, free_weight=free)
-    size = max(problem.disturbance_size, NOMINAL_GAIN)
+    # Where nothing disturbs the estimates, a small share of what disturbances could do is proved.
+    nominal = NOMINAL_GAIN * max(problem.disturbance_size, NOMINAL_GAIN)
     if s is not None and limit is None:
         # With the paper's S the weight is its W = Upsilon^+ too, which is that of the outputs as given.
         problem, parts = centred(problem, prepared, parts)
-    if limit is None:
-        found = found_gains(problem, asked, asked.engine, noisy=plant.nw > 0, progress=progress)
-    else:
+    limited = None
+    if limit is not None:
         problem, parts = centred(problem, prepared, parts)
         limited = with_weight_limit(problem, prepared, parts, limit)
-        found = found_within(problem, limited, asked, noisy=plant.nw > 0, progress=progress)
-    problem, least, gamma, records = found.problem, found.least, found.gamma, found.records
-    gains = _gains(prepared, parts, found.chosen)
+    search = partial(_found, problem, limited, asked, noisy=plant.nw > 0, progress=progress)
+    found = search(exactly=False)
     progress("building the realisation and its certificate")
-    observer, tracking, lag = realise_filter(plant, prepared.plant, gains, prepared.detectability)
-    level = gamma if problem.disturbances else NOMINAL_GAIN * size
-    factor = bounded_real_certificate(plant, observer, tracking, level, core=prepared.plant.nx, lag=lag)
+    shipped = _Shipped.of(plant, prepared, parts, found, nominal, tries=FIRST_TRIES)
+    if not shipped.proved:
+        if not replace(found.problem, judged_exactly=True).reaches(found.chosen, shipped.level):
+            found = search(exactly=True)  # a peak was missed
+        shipped = _Shipped.of(plant, prepared, parts, found, nominal, tries=None)
+    problem, least, records = found.problem, found.least, found.records
+    gains, observer, tracking, lag, level, factor = shipped[:6]
     claims = (
         {"gamma": level, "gamma_min": least.gain, "state_lag": float(lag)} if plant.nd else {"state_lag": float(lag)}
     )
@@ -122,6 +128,41 @@ def synthesise(plant: DescriptorSystem, asked: FilterOptions, *, progress: Calla
             *notes(plant, prepared.detectability, observer, largest_zero=held[-1].value),
         ),
     )
+
+
+def _found(
+    problem: GainProblem, limited: GainProblem | None, asked: FilterOptions, *, exactly: bool, noisy: bool,
+    progress: Callable[[str], None],
+) -> FoundGains:  # fmt: skip
+    problem = replace(problem, judged_exactly=exactly)
+    if limited is None:
+        return found_gains(problem, asked, asked.engine, noisy=noisy, progress=progress)
+    return found_within(problem, replace(limited, judged_exactly=exactly), asked, noisy=noisy, progress=progress)
+
+
+class _Shipped(NamedTuple):
+    """Gains, their realisation, and the certificate of the level that is claimed."""
+
+    gains: dict[str, FloatArray]
+    observer: LinearObserver
+    tracking: FloatArray
+    lag: int
+    level: float
+    factor: FloatArray
+    proved: bool
+
+    @classmethod
+    def of(
+        cls, plant: DescriptorSystem, prepared: PreparedPlant, parts: _Parts, found: FoundGains, nominal: float,
+        *, tries: int | None,
+    ) -> _Shipped:  # fmt: skip
+        gains = _gains(prepared, parts, found.chosen)
+        observer, tracking, lag = realise_filter(plant, prepared.plant, gains, prepared.detectability)
+        level = found.gamma if found.problem.disturbances else nominal
+        factor, proved = bounded_real_certificate(
+            plant, observer, tracking, level, core=prepared.plant.nx, lag=lag, tries=tries
+        )
+        return cls(gains, observer, tracking, lag, level, factor, proved)
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,6 +18,7 @@ from obsynth.analysis.existence.named_pencils import NamedPencil, named_pencil, 
 from obsynth.analysis.existence.numbers import COMPUTED_STATES
 from obsynth.analysis.existence.verdicts import DECIDER
 from obsynth.analysis.plant_units import PlantUnits
+from obsynth.methods.functional_filter.options import FunctionalFilterOptions
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.fault_models import Exosystem, exosystem
 from obsynth.plants.origin import origin_of
@@ -34,8 +35,6 @@ def conditions(
     exactly: bool | None = None,
 ) -> tuple[Condition, ...]:
     """Return the existence conditions, one or two for each fault asked for."""
-    from obsynth.methods.functional_filter.options import FunctionalFilterOptions
-
     asked = FunctionalFilterOptions(faults=faults, residuals=residuals)
     sets = asked.residual_sets(plant)
     if plant.nf == 0:

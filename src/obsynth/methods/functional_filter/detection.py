@@ -6,7 +6,6 @@ to the residual co-inner, and no filter of gain one shows any fault more at any 
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -16,12 +15,13 @@ from obsynth.analysis.transformations.elimination import eliminate_algebraic_sta
 from obsynth.analysis.transformations.recovery import Transformation, linear_plant
 from obsynth.errors import PreconditionError, SolverError, SpecError
 from obsynth.methods.functional_filter.detection_proofs import Transfer, gain_is_proved, sensitivity_is_proved
+from obsynth.methods.riccati import continuous_solution
 from obsynth.numerics.arguments import is_finite_number
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.libraries import on_one_thread_if_small
 from obsynth.numerics.norms import response
 from obsynth.numerics.ranks import decide_rank
 from obsynth.numerics.spectra import abscissa
-from obsynth.numerics.threads import on_one_thread_if_small
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.balls import Ball
@@ -150,17 +150,15 @@ def _verified(
     source = "Ding et al. 2000; proofs ours"
     weight, injected = observer.Dy, observer.By
 
-    def into(b: FloatArray, d: FloatArray) -> tuple[Ball, Ball]:
-        direct = Ball.exact(d)
-        return Ball.exact(b) - Ball.exact(injected) @ direct, Ball.exact(weight) @ direct
+    def transfer(b: FloatArray, d: FloatArray) -> Transfer:
+        direct, out = Ball.exact(d), Ball.exact(weight)
+        return Transfer(
+            observer.Az, Ball.exact(b) - Ball.exact(injected) @ direct, out @ Ball.exact(smooth.C), out @ direct
+        )
 
-    shown = Ball.exact(weight) @ Ball.exact(smooth.C)
-    felt = Transfer(
-        observer.Az, *_in_order(into(np.hstack([smooth.Bd, smooth.Bw]), np.hstack([smooth.Dd, smooth.Dw])), shown)
-    )
-    faults = Transfer(observer.Az, *_in_order(into(smooth.Bf, smooth.Df), shown))
+    felt = transfer(np.hstack([smooth.Bd, smooth.Bw]), np.hstack([smooth.Dd, smooth.Dw]))
     proved = gain_is_proved(felt, gain)
-    sensed = sensitivity == 0.0 or sensitivity_is_proved(faults, sensitivity, *band)
+    sensed = sensitivity == 0.0 or sensitivity_is_proved(transfer(smooth.Bf, smooth.Df), sensitivity, *band)
     terms = ((observer.Az,), (injected, smooth.C), (smooth.A,))
     return VerificationReport.of([
         equality(
@@ -191,24 +189,12 @@ def _verified(
     ])  # fmt: skip
 
 
-def _in_order(entering: tuple[Ball, Ball], shown: Ball) -> tuple[Ball, Ball, Ball]:
-    return entering[0], shown, entering[1]
-
-
 def _gains(plant: DescriptorSystem, b: FloatArray, d: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return L ``(nx, ny)`` and V ``(ny, ny)`` that make the transfer from the unknown inputs co-inner."""
-    from scipy.linalg import solve_continuous_are
-
     measured = d @ d.T
-    try:
-        with warnings.catch_warnings():
-            # What a badly conditioned equation gives is judged by its poles.
-            warnings.simplefilter("ignore")
-            y = solve_continuous_are(plant.A.T, plant.C.T, b @ b.T, measured, s=b @ d.T)
-    except (np.linalg.LinAlgError, ValueError):
-        y = np.full((plant.nx, plant.nx), np.nan)
-    gain = np.linalg.solve(measured, (y @ plant.C.T + b @ d.T).T).T
-    if not np.all(np.isfinite(gain)) or not abscissa(plant.A - gain @ plant.C, 0.0) < 0.0:
+    y = continuous_solution(plant.A, plant.C, b @ b.T, measured, b @ d.T)
+    gain = None if y is None else np.linalg.solve(measured, (y @ plant.C.T + b @ d.T).T).T
+    if gain is None or not np.all(np.isfinite(gain)) or not abscissa(plant.A - gain @ plant.C, 0.0) < 0.0:
         raise SolverError(
             "The Riccati equation of the detection filter has no stabilising solution: a zero from the unknown inputs "
             "to the outputs lies on the imaginary axis, or a mode shows in no output. State noise of the states (Bw)."

@@ -1,13 +1,10 @@
-"""The Kalman gain of a filter model: correlated noise, walks of the fault models, and gains for a fixed lag.
+"""Filter models (a plant without unknown inputs, fault models on it) and their Kalman gains, for a fixed lag too.
 
 A decoupled plant is driven by y itself, so the same noise stands in its states and in its outputs.
-
-The model that a Kalman filter is designed for: a plant without unknown inputs, and fault models on it.
 """
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
@@ -16,7 +13,7 @@ import numpy as np
 
 from obsynth.analysis.diagnosis.decoupled import DecoupledPlant, decoupled
 from obsynth.errors import PreconditionError, SolverError
-from obsynth.methods.riccati import riccati_solution
+from obsynth.methods.riccati import continuous_solution, riccati_solution
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import RANK_TOLERANCE, rank_from
 from obsynth.numerics.scaling import balanced_matrix
@@ -56,11 +53,11 @@ def filter_model(
 ) -> FilterModel:
     """Return the model for some faults, free of the unknown inputs and of the faults removed."""
     found = decoupled(plant, removed, faults)
-    used = _model_states(model, faults)
+    used = model_states(model, faults)
     return _with_fault_models(found, model.Phi[np.ix_(used, used)], model.Cw[np.ix_(list(faults), used)], tuple(faults))
 
 
-def _model_states(model: Exosystem, faults: Sequence[int]) -> list[int]:
+def model_states(model: Exosystem, faults: Sequence[int]) -> list[int]:
     """Return the states of the exosystem that some faults are made of."""
     reached = np.any(model.Cw[list(faults)] != 0.0, axis=0) if len(faults) else np.zeros(model.order, dtype=bool)
     for _ in range(model.order):
@@ -206,14 +203,8 @@ def _discrete(
 def _continuous(
     model: FilterModel, process: FloatArray, measured: FloatArray, cross: FloatArray, decay: float
 ) -> tuple[FloatArray, tuple[FloatArray, ...], FloatArray] | None:
-    from scipy.linalg import solve_continuous_are
-
-    try:
-        with warnings.catch_warnings():
-            # What a badly conditioned equation gives is judged by its poles.
-            warnings.simplefilter("ignore")
-            p = solve_continuous_are((model.A + decay * np.eye(len(model.A))).T, model.C.T, process, measured, s=cross)
-    except (np.linalg.LinAlgError, ValueError):
+    p = continuous_solution(model.A + decay * np.eye(len(model.A)), model.C, process, measured, cross)
+    if p is None:
         return None
     gain = np.asarray(np.linalg.solve(measured, (p @ model.C.T + cross).T).T)
     closed = model.A - gain @ model.C

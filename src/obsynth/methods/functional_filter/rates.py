@@ -28,8 +28,6 @@ STANDING = 1e-6
 TIME_CONSTANTS, LEAST_SAMPLES = 7.0, 4.0
 #: Estimates of a step within this of one count as there; asked at these multiples of the time.
 REACHED, ASKED_AT = 0.1, (1.0, 1.5, 2.5)
-
-
 #: Where no walk shows a step in time: walks that miss it by so much more than the best are as good.
 AS_CLOSE = 0.05
 #: Errors that need longer than so many settling times to die out would stay in any run: the gain moves such poles.

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import reduce
 
 import numpy as np
 from scipy.linalg import block_diag, schur
@@ -156,37 +155,29 @@ def assembled(
     nu, nx = plant.nu, plant.nx
     a = block_diag(*(part.dynamics.A for part in parts)) if parts else np.zeros((0, 0))
     b = _stacked([part.dynamics.B for part in parts], nu + plant.ny)
-    order = len(a)
-    places = np.cumsum([0, *(len(part.dynamics.A) for part in parts)])
-    estimates = [_placed(part.estimates, place, len(part.dynamics.A), order) for part, place in _with(parts, places)]
-    residuals = [_placed(part.residuals, place, len(part.dynamics.A), order) for part, place in _with(parts, places)]
     faults = [(fault, part.delay) for part in parts for fault in part.faults if len(part.estimates.C)]
     rows = sorted(range(len(faults)), key=lambda i: faults[i][0])
-    whole = Rows(np.zeros((0, order)), np.zeros((0, nu + plant.ny)), np.zeros((0, nx)))
-    estimate, residual = (reduce(_under, group, whole) for group in (estimates, residuals))
-    ordered = Rows(estimate.C[rows], estimate.D[rows], estimate.T0[rows])
-    shipped = _under(ordered, residual)
+    orders = [len(part.dynamics.A) for part in parts]
+    estimate = _side_by_side([part.estimates for part in parts], orders, nu + plant.ny, nx)
+    residual = _side_by_side([part.residuals for part in parts], orders, nu + plant.ny, nx)
+    cz, d, t0 = (
+        np.vstack([mine[rows], other])
+        for mine, other in ((estimate.C, residual.C), (estimate.D, residual.D), (estimate.T0, residual.T0))
+    )
     observer = LinearObserver(
-        Az=a, Bu=b[:, :nu], By=b[:, nu:], Cz=shipped.C, Du=shipped.D[:, :nu], Dy=shipped.D[:, nu:], dt=plant.dt,
+        Az=a, Bu=b[:, :nu], By=b[:, nu:], Cz=cz, Du=d[:, :nu], Dy=d[:, nu:], dt=plant.dt,
         input_names=plant.input_names, output_names=plant.output_names, state_names=(),
         fault_names=tuple(plant.fault_names[faults[i][0]] for i in rows), residual_names=tuple(residual_names),
         state_delays=(), fault_delays=tuple(faults[i][1] for i in rows),
     )  # fmt: skip
-    return observer, _stacked([part.dynamics.T for part in parts], nx), shipped.T0
+    return observer, _stacked([part.dynamics.T for part in parts], nx), t0
 
 
-def _with(parts: Sequence[FilterPart], places: FloatArray) -> list[tuple[FilterPart, int]]:
-    return [(part, int(place)) for part, place in zip(parts, places[:-1], strict=True)]
-
-
-def _placed(rows: Rows, place: int, width: int, order: int) -> Rows:
-    c = np.zeros((len(rows.C), order))
-    c[:, place : place + width] = rows.of_order(width)
-    return Rows(c, rows.D, rows.T0)
-
-
-def _under(first: Rows, second: Rows) -> Rows:
-    return Rows(np.vstack([first.C, second.C]), np.vstack([first.D, second.D]), np.vstack([first.T0, second.T0]))
+def _side_by_side(found: Sequence[Rows], orders: Sequence[int], inputs: int, nx: int) -> Rows:
+    """Return the rows of several filters, each reading its own states."""
+    own = [rows.of_order(order) for rows, order in zip(found, orders, strict=True)]
+    c = block_diag(*own) if own else np.zeros((0, 0))
+    return Rows(c, _stacked([rows.D for rows in found], inputs), _stacked([rows.T0 for rows in found], nx))
 
 
 def _stacked(matrices: Sequence[FloatArray], width: int) -> FloatArray:

@@ -10,19 +10,18 @@ Source: ours; the null space is that of Frisk and Nyberg (2001), the fixed lag t
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from obsynth.analysis.conditions import Condition
-from obsynth.errors import PreconditionError, SpecError
+from obsynth.errors import SpecError
 from obsynth.methods.functional_filter.conditions import conditions
 from obsynth.methods.functional_filter.kalman_gain import (
     FilterModel,
     KalmanGain,
     filter_model,
     kalman_gain,
+    model_states,
     require_noise,
     whitening,
 )
@@ -32,8 +31,9 @@ from obsynth.methods.functional_filter.realisation import FilterPart, assembled,
 from obsynth.methods.functional_filter.tracking import estimate_deviations, tracking_map
 from obsynth.methods.method_spec import Synthesis
 from obsynth.methods.placement.eigenstructure import place
+from obsynth.methods.refusals import require_all_told
 from obsynth.methods.riccati import lyapunov_factor
-from obsynth.methods.ui_pi_observer.options import checked_poles, plain
+from obsynth.methods.ui_pi_observer.options import checked_poles
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import rounding_rank
 from obsynth.plants.descriptor import DescriptorSystem
@@ -52,7 +52,7 @@ def synthesise(
     _require_samples(plant, asked)
     model = exosystem(asked.fault_model, plant.fault_names, plant.dt)
     progress("checking the existence conditions")
-    _require(conditions(plant, fault_model=asked.fault_model, faults=asked.faults, residuals=asked.residuals))
+    require_all_told(conditions(plant, fault_model=asked.fault_model, faults=asked.faults, residuals=asked.residuals))
     noisy, notes = _with_noise(plant, asked)
     progress("taking the unknown inputs out of the plant")
     models = _models(noisy, model, asked)
@@ -86,20 +86,6 @@ def _require_samples(plant: DescriptorSystem, asked: FunctionalFilterOptions) ->
             f"{' and '.join(late)} count samples, but the plant is continuous: sample it (transform: sample_time).",
             path="method.options",
         )
-
-
-def _require(found: Sequence[Condition]) -> None:
-    """Raise for the first condition that fails, naming all that do."""
-    failed = [condition for condition in found if not condition.holds]
-    for condition in failed[:1]:
-        try:
-            condition.require()
-        except PreconditionError as error:
-            others = "; ".join(f"{other.name}: {other.detail}" for other in failed[1:])
-            raise PreconditionError(
-                f"{error}{f' Also fails: {others}' if others else ''}", condition=condition.name, mode=condition.mode,
-                signals=tuple(name for entry in failed for name in entry.signals),
-            ) from None  # fmt: skip
 
 
 def _with_noise(plant: DescriptorSystem, asked: FunctionalFilterOptions) -> tuple[DescriptorSystem, tuple[str, ...]]:
@@ -213,12 +199,7 @@ def _walks(model: Exosystem, models: Sequence[FilterModel], rates: Sequence[Floa
     """Return the walk of every state of the whole exosystem."""
     walks = np.zeros(model.order)
     for part, walk in zip(models, rates, strict=True):
-        states = np.flatnonzero(np.any(model.Cw[list(part.faults)] != 0.0, axis=0)) if part.faults else np.zeros(0, int)
-        reached = np.zeros(model.order, dtype=bool)
-        reached[states] = True
-        for _ in range(model.order):
-            reached = reached | np.any(model.Phi[reached] != 0.0, axis=0)
-        walks[np.flatnonzero(reached)] = walk
+        walks[model_states(model, part.faults)] = walk
     return walks
 
 
@@ -227,8 +208,7 @@ def _resolved(
     estimated: Sequence[int],
 ) -> dict[str, Any]:  # fmt: skip
     """Return the options as plain data, for the gain set."""
-    found = replace(asked).as_given()
-    found = {name: plain(value) for name, value in found.items()}
+    found = asked.as_plain()
     found["faults"] = None if asked.residuals is not None else [plant.fault_names[i] for i in estimated]
     found["fault_model_in_words"] = dict(zip(plant.fault_names, model.descriptions, strict=True))
     chosen = np.concatenate([np.zeros(0), *rates])

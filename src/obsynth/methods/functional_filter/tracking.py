@@ -1,7 +1,4 @@
-"""The error system of a functional filter, and what its estimates make of faults that follow their models.
-
-Standard deviations of the estimates of a shipped functional filter: of noise alone, and of noise and walk.
-"""
+"""The error system of a functional filter: faults that follow their models, deviations by noise and by walks."""
 
 from __future__ import annotations
 

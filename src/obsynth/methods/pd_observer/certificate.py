@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from obsynth.methods.pd_observer.checks.certificate import prove_gain
+from obsynth.methods.riccati import continuous_solution
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import spectral_abscissa
 from obsynth.numerics.scaling import balanced_matrix
@@ -107,21 +108,14 @@ def gain_certificate(a: FloatArray, b: Ball, c: FloatArray, gain: float) -> Floa
 
     Shapes: ``a (n, n)``, ``c (p, n)``, ``b (n, m)``.
     """
-    from scipy.linalg import solve_continuous_are
-
     balanced, units = balanced_matrix(a)
     entering, shown = b.midpoint / units[:, None], c * units
     weight = max(float(np.linalg.norm(shown, 2)) ** 2, np.finfo(np.float64).tiny)
     spare = None
     for slack in SLACKS:
-        try:
-            p = np.asarray(
-                solve_continuous_are(
-                    balanced, entering, shown.T @ shown + slack * weight * np.eye(len(a)),
-                    -(gain**2) * np.eye(entering.shape[1]),
-                )
-            )  # fmt: skip
-        except (np.linalg.LinAlgError, ValueError):
+        out = shown.T @ shown + slack * weight * np.eye(len(a))
+        p = continuous_solution(balanced.T, entering.T, out, -(gain**2) * np.eye(entering.shape[1]))
+        if p is None:
             continue
         found = 0.5 * (p + p.T) / units[:, None] / units
         found = np.asarray(0.5 * (found + found.T))

@@ -8,7 +8,7 @@ paper supposes, is more than needed.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -18,20 +18,18 @@ from obsynth.analysis.existence.distance import least_share
 from obsynth.analysis.existence.numbers import numbers_of, reconsidered
 from obsynth.analysis.existence.rational import PlantNumbers, WrittenNumbers
 from obsynth.analysis.existence.verdicts import (
-    described_distance,
     needed_gain,
     rank_doubt,
     settled_rank,
-    unclear_detail,
+    verdict_condition,
     zero_doubt,
     zero_verdict,
 )
-from obsynth.analysis.far_zeros import equilibrated_at
 from obsynth.analysis.plant_units import PlantUnits, sized_plant
 from obsynth.analysis.structure import analyse_structure
 from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
 from obsynth.analysis.transformations.recovery import Transformation
-from obsynth.analysis.zeros import leading_names, system_pencil
+from obsynth.analysis.zeros import equilibrated_at, leading_names, system_pencil
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.pencils import pencil_structure
 from obsynth.numerics.ranks import decide_rank, equilibrate
@@ -181,40 +179,34 @@ def _detectability(plant: DescriptorSystem, numbers: PlantNumbers) -> Condition:
     units, terms = PlantUnits.of(plant).rounded(), sized_plant(plant)
     sizes = None if terms is None else units.scaled_pencil(wide_e, np.vstack([terms.A, terms.C]))[1]
     verdict = zero_verdict(facts, *units.scaled_pencil(wide_e, wide_a), nx=plant.nx, discrete=False, sizes=sizes)
-    facts = verdict.facts
-    if verdict.answer == "no":
-        lost = _hidden_mode(plant, list(facts.outside))
-        return replace(lost, detail=f"{lost.detail} {needed_gain(plant, units, lost.mode or 0j)}")
-    if verdict.answer == "unclear":
-        detail = unclear_detail(verdict, "An observer")
-        doubt = zero_doubt(plant, units, verdict, [["A"], ["C"]], what="observer")
+
+    def seen() -> list[complex]:
         hidden = list(analyse_structure(plant).undetectable_modes)
-        if not hidden and verdict.distance is not None:
-            hidden = [verdict.distance.point]
-        lost = Condition("detectability", _CLAIM, False, 0.0, 0.0, _NEEDED_FOR, detail)
-        if hidden:
-            lost = _hidden_mode(plant, hidden)
-            lost = replace(lost, detail=f"{detail} In floating point, {lost.detail}")
-        return lost.in_doubt(doubt, plant)
-    detail = f"{len(facts.zeros)} unobservable mode(s)" + (
-        f", slowest real part {max(value.real for value in facts.zeros):.6g}" if facts.zeros else ""
-    )
-    detail += f"; {described_distance(verdict)}"
-    return Condition("detectability", _CLAIM, True, 0.0, 0.0, _NEEDED_FOR, detail)
+        return hidden or ([] if verdict.distance is None else [verdict.distance.point])
+
+    return verdict_condition(
+        verdict, _detectable(verdict.facts.zeros), plant, what="An observer", seen=seen,
+        lost=lambda zeros: _hidden_mode(plant, zeros), gain=lambda mode: needed_gain(plant, units, mode),
+        doubt=lambda: zero_doubt(plant, units, verdict, [["A"], ["C"]], what="observer"),
+    )  # fmt: skip
 
 
 def _detectability_in_floating_point(plant: DescriptorSystem) -> Condition:
     structure = analyse_structure(plant)
-    if structure.detectable:
-        slowest = max((mode.real for mode in structure.unobservable_modes), default=-np.inf)
-        detail = f"{len(structure.unobservable_modes)} unobservable mode(s)" + (
-            f", slowest real part {slowest:.6g}" if structure.unobservable_modes else ""
-        )
-        return Condition("detectability", _CLAIM, True, 0.0, 0.0, _NEEDED_FOR, detail)
-    return _hidden_mode(plant, list(structure.undetectable_modes))
+    return (
+        _detectable(structure.unobservable_modes)
+        if structure.detectable
+        else _hidden_mode(plant, structure.undetectable_modes)
+    )
 
 
-def _hidden_mode(plant: DescriptorSystem, hidden: list[complex]) -> Condition:
+def _detectable(modes: Sequence[complex]) -> Condition:
+    slowest = f", slowest real part {max(mode.real for mode in modes):.6g}" if modes else ""
+    detail = f"{len(modes)} unobservable mode(s){slowest}"
+    return Condition("detectability", _CLAIM, True, 0.0, 0.0, _NEEDED_FOR, detail)
+
+
+def _hidden_mode(plant: DescriptorSystem, hidden: Sequence[complex]) -> Condition:
     mode = max(hidden, key=lambda value: value.real)
     signals = leading_names(_hidden_direction(plant, mode), plant.state_names, most=MOST_NAMES)
     value = f"{mode.real:.6g}" if mode.imag == 0.0 else f"{mode:.6g}"

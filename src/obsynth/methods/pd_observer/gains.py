@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -42,15 +42,15 @@ class PdGains:
     L: FloatArray
     P1: FloatArray
     P3: FloatArray
-    ends: tuple[FloatArray, ...]
-    gain_certificates: Mapping[str, FloatArray]
     theorem: int
     asked_delta: float
     delta: float
     decay: float
     observer: LinearObserver
-    proved: bool
     record: Mapping[str, Any]
+    ends: tuple[FloatArray, ...] = ()
+    gain_certificates: Mapping[str, FloatArray] = field(default_factory=dict)
+    proved: bool = False
     proved_in_double_precision: bool = False
     engine: str = ""
 
@@ -79,21 +79,7 @@ def certified(
         return None
     ends = asked.range_numbers
     p1, p3 = symmetric(found.P1[0]), symmetric(found.P3) if asked.theorem == 2 else found.P3
-    gains = PdGains(
-        found.J,
-        found.L,
-        p1,
-        p3,
-        (),
-        {},
-        asked.theorem,
-        delta,
-        delta,
-        decay,
-        observer,
-        proved=False,
-        record=found.record,
-    )
+    gains = PdGains(found.J, found.L, p1, p3, asked.theorem, delta, delta, decay, observer, found.record)
     if ends is not None:
         return _certified_range(plant, replace(gains, ends=found.P1), ends)
     certificates = _gain_certificates(plant, asked, gains)

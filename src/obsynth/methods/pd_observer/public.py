@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from obsynth.analysis.transformations.recovery import Transformation, linear_plant, plant_and_recovery
+from obsynth.analysis.transformations.recovery import Transformation, linear_plant
 from obsynth.errors import SpecError, VerificationError
 from obsynth.methods.designing import design as design_by_method
-from obsynth.methods.designing import draft_of
-from obsynth.methods.verifying import verify
+from obsynth.methods.designing import design_of_given_gains, failed_rows
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.delta_scan import DeltaScan
 from obsynth.results.design import ObserverDesign
@@ -166,11 +166,10 @@ def pd_observer_from_gains(
     """
     from obsynth.methods.pd_observer.synthesis import synthesis_from_gains
 
-    own, recovery = plant_and_recovery(plant)
-    gains = {"J": J, "L": L, "M": M, "N": N}
-    found = synthesis_from_gains(own, gains=gains, adaptation_gain=adaptation_gain, decay=decay)
-    draft = draft_of(own, "pd-observer", found, name=name, recovery=recovery)
-    return draft.replace(report=verify(draft))
+    synthesis = partial(
+        synthesis_from_gains, gains={"J": J, "L": L, "M": M, "N": N}, adaptation_gain=adaptation_gain, decay=decay
+    )
+    return design_of_given_gains(plant, "pd-observer", synthesis, name=name)
 
 
 def apply_adaptation_gain(design: ObserverDesign, adaptation_gain: ArrayLike) -> ObserverDesign:
@@ -210,10 +209,9 @@ def apply_adaptation_gain(design: ObserverDesign, adaptation_gain: ArrayLike) ->
         name=design.name,
     )  # fmt: skip
     if not changed.report.passed:
-        failed = "; ".join(f"{row.name} ({row.value:.3g} against {row.bound:.3g})" for row in changed.report.failures)
         raise VerificationError(
-            f"With this adaptation gain the observer fails: {failed}. Give it to pd_observer as adaptation_gain, so "
-            "that the design is for it.",
+            f"With this adaptation gain the observer fails: {failed_rows(changed.report)}. Give it to pd_observer as "
+            "adaptation_gain, so that the design is for it.",
             report=changed.report,
         )
     return changed.replace(recovery=design.recovery)

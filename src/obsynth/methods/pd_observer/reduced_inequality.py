@@ -31,6 +31,7 @@ import numpy as np
 from obsynth.errors import SolverError
 from obsynth.methods.pd_observer.certificate import coupled_certificate, symmetric_certificate
 from obsynth.methods.pd_observer.inequalities import PdSolution, PdTask, solve
+from obsynth.methods.riccati import continuous_solution
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import spectral_abscissa
 from obsynth.numerics.doubling import EQUATION_TOLERANCE, continuous_riccati_solution
@@ -118,17 +119,12 @@ def closed_form(task: PdTask, *, free_delta: bool, once: bool = False) -> tuple[
 
 def _normalising(a: FloatArray, c: FloatArray) -> tuple[FloatArray, FloatArray] | None:
     """Return a change of states, and its inverse, in which the solution of the Riccati equation is near one."""
-    from scipy.linalg import solve_continuous_are
-
-    one = np.eye(len(a))
-    try:
-        p = _doubled(a, c)
-        if p is None and len(a) > MOST_STATES_FOR_QZ:
-            return None
-        p = solve_continuous_are(a.T, c.T, one, np.eye(len(c))) if p is None else p
-        sizes, directions = np.linalg.eigh(0.5 * (p + p.T))
-    except (np.linalg.LinAlgError, ValueError):
+    p = _doubled(a, c)
+    if p is None and len(a) <= MOST_STATES_FOR_QZ:
+        p = continuous_solution(a, c, np.eye(len(a)), np.eye(len(c)))
+    if p is None:
         return None
+    sizes, directions = np.linalg.eigh(0.5 * (p + p.T))
     roots = np.sqrt(np.maximum(sizes, NEGLIGIBLE_SHARE * sizes[-1]))
     return directions * roots, (directions / roots).T
 
@@ -169,7 +165,7 @@ def _riccati_gain(a: FloatArray, c: FloatArray, record: Mapping[str, Any]) -> Fl
     Of many states by doubling; else from the stable invariant subspace of the Hamiltonian matrix; where that is not
     found, or too inaccurate for a stable filter, by the QZ algorithm on a pencil, which takes several times as long.
     """
-    from scipy.linalg import schur, solve_continuous_are
+    from scipy.linalg import schur
 
     n, one = len(a), np.eye(len(a))
     p = _doubled(a, c)
@@ -183,12 +179,9 @@ def _riccati_gain(a: FloatArray, c: FloatArray, record: Mapping[str, Any]) -> Fl
             return gain
     except np.linalg.LinAlgError:
         pass
-    if n > MOST_STATES_FOR_QZ:
+    p = None if n > MOST_STATES_FOR_QZ else continuous_solution(a, c, one, np.eye(len(c)))
+    if p is None:
         raise SolverError("The Riccati equation was not solved: nothing is known.", record=record)
-    try:
-        p = solve_continuous_are(a.T, c.T, one, np.eye(len(c)))
-    except (np.linalg.LinAlgError, ValueError) as error:
-        raise SolverError("The Riccati equation was not solved: nothing is known.", record=record) from error
     return np.asarray(p @ c.T)
 
 

@@ -17,8 +17,6 @@ Our deviations
        computed from the gains.
     9. For hundreds of states the gains come from a smaller inequality or in closed form (see
        `obsynth.methods.pd_observer.reduced_inequality`), with L = 0.
-
-A scan of delta: the same requirements solved for several values, measured on the true error system.
 """
 
 from __future__ import annotations
@@ -35,12 +33,16 @@ from obsynth.analysis.existence.numbers import decided
 from obsynth.errors import InfeasibleError, SolverError, SpecError
 from obsynth.methods.method_spec import Synthesis
 from obsynth.methods.pd_observer.certificate import explicit_certificate
-from obsynth.methods.pd_observer.checks.error_system import PdErrorSystem
 from obsynth.methods.pd_observer.conditions import explicit_form, pd_observer_conditions
 from obsynth.methods.pd_observer.gain_search import design_gains, gains_for
 from obsynth.methods.pd_observer.gains import PdGains
 from obsynth.methods.pd_observer.options import PdOptions, checked_adaptation_gain
-from obsynth.methods.pd_observer.realisation import realise_pd_observer, with_faults_as_states, with_sensor_noise
+from obsynth.methods.pd_observer.realisation import (
+    PdErrorSystem,
+    realise_pd_observer,
+    with_faults_as_states,
+    with_sensor_noise,
+)
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.numerics.continuous import spectral_abscissa
 from obsynth.observers.linear.observer import LinearObserver
@@ -116,18 +118,13 @@ def synthesise(plant: DescriptorSystem, asked: PdOptions, *, progress: Callable[
 
 def _resolved(asked: PdOptions, gains: PdGains, g: FloatArray | None) -> dict[str, Any]:
     return {
-        "theorem": asked.theorem,
+        **asked.as_given(),
         "delta": gains.asked_delta,
         "decay": gains.decay,
         "disk": None if asked.disk_numbers is None else list(asked.disk_numbers),
-        "gain_bound": asked.gain_bound,
-        "fault_rate_gain": asked.fault_rate_gain,
-        "noise_gain": asked.noise_gain,
         "adaptation_gain": None if g is None else g.tolist(),
         "adaptation_range": None if asked.range_numbers is None else list(asked.range_numbers),
         "delta_scan": None if asked.delta_scan is None else np.ravel(asked.delta_scan).tolist(),
-        "engine": asked.engine,
-        "solver": asked.solver,
     }
 
 

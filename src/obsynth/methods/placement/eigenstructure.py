@@ -89,10 +89,7 @@ def place(
     objective: str = "conditioning",
     weight: FloatArray | None = None,
 ) -> Placement:
-    """Return K ``(n, ny)`` such that ``F - K C`` has these poles.
-
-    Shapes: ``f (n, n)``, ``c (ny, n)``, ``weight (m, n)``.
-    """
+    """Return K ``(n, ny)`` such that ``F - K C`` has these poles; ``f (n, n)``, ``c (ny, n)``, ``weight (m, n)``."""
     n, outputs = f.shape[0], c.shape[0]
     if n == 0:
         return Placement(np.zeros((0, outputs)), 1.0, 0.0)

@@ -1,9 +1,6 @@
-"""Kalman gains with a prescribed rate of decay.
+"""Kalman gains with a prescribed rate of decay (Anderson, Moore, "Linear optimal control", 1971, section 4).
 
-Source: Share Pasand, Aliyari, Taghirad mention "the optimal estimation scheme of Kalman"; the prescribed rate is
-Anderson and Moore's.
-
-The default gain, which needs no numbers: as fast as a fixed price in noise allows.  This compromise is ours.
+The default needs no numbers: as fast as a fixed price in noise allows.  This compromise is ours.
 """
 
 from __future__ import annotations
@@ -47,12 +44,7 @@ class KalmanProblem:
     dt: float
 
     def gain(self, decay: float, *, persistent: bool = False) -> FloatArray | None:
-        """Return the gain whose poles all decay at ``decay`` (1/s) or faster; ``None`` when the equation has none.
-
-        References
-        ----------
-        .. [AndersonMoore1971] B. D. O. Anderson, J. B. Moore, "Linear optimal control", 1971, section 4.
-        """
+        """Return the gain whose poles all decay at ``decay`` (1/s) or faster; ``None`` when the equation has none."""
         plain = np.eye(self.F.shape[0])
         best, change = self.solved(decay, plain)
         if best is not None or not persistent:

@@ -58,10 +58,7 @@ class ObservableSplit:
 
 
 def observable_split(f: FloatArray, c: FloatArray, fixed_modes: ComplexArray) -> ObservableSplit:
-    """Split the pair ``(F, C)`` at its fixed modes.
-
-    Shapes: ``f (n, n)``, ``c (ny, n)``.
-    """
+    """Split the pair ``(F, C)`` at its fixed modes; ``f (n, n)``, ``c (ny, n)``."""
     n = f.shape[0]
     units = _balancing(f, c)
     work_f, work_c, basis = f * units / units[:, None], c * units, np.eye(n)

@@ -1,7 +1,4 @@
-"""What the recursive methods share: conditions, synthesis, checks.
-
-The claims that recursive methods share.
-"""
+"""What the recursive methods share: claims, conditions, synthesis, checks."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from obsynth.analysis.conditions import Condition, rank_condition
-from obsynth.analysis.existence.verdicts import described_distance, needed_gain, unclear_detail
+from obsynth.analysis.existence.verdicts import needed_gain, verdict_condition
 from obsynth.analysis.time_varying import HorizonRanks, as_time_varying, early_rows, horizon_ranks, step_blocks
 from obsynth.analysis.zeros import are_outside, leading_names
 from obsynth.errors import SpecError
@@ -117,18 +117,15 @@ def _decided_detectability(constant: ConstantPlant) -> Condition:
     """Return the same, decided on the numbers of the plant as written."""
     plant, verdict = constant.plant, constant.detectability
     tall_e, tall_a = np.vstack([plant.E, np.zeros_like(plant.C)]), np.vstack([plant.A, plant.C])
-    if verdict.answer == "no":
-        hidden = list(verdict.facts.outside) or [1 + 0j]
-        found = _hidden_modes(plant, tall_e, tall_a, hidden)
-        gain = needed_gain(plant, constant.units, found.mode or 1 + 0j)
-        return replace(found, detail=f"{found.detail} {gain}")
-    if verdict.answer == "yes":
-        detail = f"{_dying(len(verdict.facts.zeros))}; {described_distance(verdict)}"
-        return Condition("detectability", _detectable(plant), True, 0.0, 0.0, _DETECTABLE, detail)
-    point = 1 + 0j if verdict.distance is None else verdict.distance.point
-    lost = _hidden_modes(plant, tall_e, tall_a, [point])
-    detail = f"{unclear_detail(verdict, 'A filter')} In floating point, {lost.detail}"
-    return replace(lost, detail=detail).in_doubt(constant.mode_doubt(), plant)
+    holding = Condition(
+        "detectability", _detectable(plant), True, 0.0, 0.0, _DETECTABLE, _dying(len(verdict.facts.zeros))
+    )
+    return verdict_condition(
+        verdict, holding, plant, what="A filter", doubt=constant.mode_doubt,
+        lost=lambda zeros: _hidden_modes(plant, tall_e, tall_a, zeros or [1 + 0j]),
+        gain=lambda mode: needed_gain(plant, constant.units, mode),
+        seen=lambda: [1 + 0j if verdict.distance is None else verdict.distance.point],
+    )  # fmt: skip
 
 
 def _detectable(plant: TimeVaryingDescriptorSystem | DescriptorSystem) -> str:
@@ -140,7 +137,10 @@ def _dying(count: int) -> str:
 
 
 def _hidden_modes(
-    plant: TimeVaryingDescriptorSystem | DescriptorSystem, tall_e: FloatArray, tall_a: FloatArray, modes: list[complex]
+    plant: TimeVaryingDescriptorSystem | DescriptorSystem,
+    tall_e: FloatArray,
+    tall_a: FloatArray,
+    modes: Sequence[complex],
 ) -> Condition:
     hidden = sorted(modes, key=lambda z: (-abs(z), -z.imag))
     mode = hidden[0]

@@ -84,14 +84,13 @@ class ConstantPlant:
 
     def settled_traces(self, decision: RankDecision) -> RankDecision:
         """Decide the rank of ``[A - E, Phi; C, Psi]``."""
-        pencil: Any = self.numbers.pencil(self.numbers.matrix("Bf"), self.numbers.matrix("Df"))  # type: ignore[attr-defined]
-        if isinstance(self.numbers, WrittenNumbers):
-            from fractions import Fraction
+        from fractions import Fraction
 
-            return settled_rank(decision, int(pencil.rank_at(Fraction(1))))
         from flint import arb
 
-        return settled_rank(decision, int(pencil.rank_at(arb(1))))
+        pencil: Any = self.numbers.pencil(self.numbers.matrix("Bf"), self.numbers.matrix("Df"))  # type: ignore[attr-defined]
+        one = Fraction(1) if isinstance(self.numbers, WrittenNumbers) else arb(1)
+        return settled_rank(decision, int(pencil.rank_at(one)))
 
     def step_doubt(self, decision: RankDecision, late: IntArray) -> Unclear:
         """Return why the first rank is unclear."""
@@ -99,7 +98,10 @@ class ConstantPlant:
         named = named_pencil(self.plant, self.units, layout)
         if late.size:
             kept = [*range(self.plant.nx + self.plant.ny), *(self.plant.nx + self.plant.ny + late)]
-            named = _picked(named, kept)
+            terms = None if named.terms is None else named.terms[kept]
+            named = NamedPencil(
+                named.A[kept], named.E[kept], named.owners[kept], named.rows[kept], named.columns, terms
+            )
         return unclear(self.plant, named, tolerance=DROWNED, other=f"has rank {decision.expected - 1}", decider=DECIDER)
 
     def traces_doubt(self, decision: RankDecision) -> Unclear:
@@ -122,13 +124,6 @@ class ConstantPlant:
 
         columns = int(matrix.ncols())
         return fmpq_mat(len(rows), columns, [matrix[int(i), j] for i in rows for j in range(columns)])
-
-
-def _picked(named: NamedPencil, rows: list[int]) -> NamedPencil:
-    return NamedPencil(
-        named.A[rows], named.E[rows], named.owners[rows], named.rows[rows], named.columns,
-        None if named.terms is None else named.terms[rows],
-    )  # fmt: skip
 
 
 _NAME = "identifiable parameters"

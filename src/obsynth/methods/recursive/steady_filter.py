@@ -14,11 +14,10 @@ from obsynth.analysis.zeros import are_outside
 from obsynth.errors import SolverError, SpecError
 from obsynth.methods.recursive.conditions import described_mode, recursive_conditions
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
-from obsynth.numerics.covariances import covariance_factor
 from obsynth.numerics.least_squares_step import least_squares_step, rank_revealing_step
 from obsynth.numerics.norms import spectral_radius
 from obsynth.numerics.pencils import finite_zeros
-from obsynth.numerics.ranks import BOUNDARY_TOLERANCE, CANCELLATION_TOLERANCE, decide_rank
+from obsynth.numerics.ranks import BOUNDARY_TOLERANCE, CANCELLATION_TOLERANCE, covariance_factor, decide_rank
 from obsynth.observers.recursive.step_model import stacked_noise
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem

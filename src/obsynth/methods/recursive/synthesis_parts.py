@@ -12,7 +12,7 @@ from obsynth.analysis.zeros import leading_names
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.methods.method_spec import Synthesis
 from obsynth.methods.recursive.steady_filter import reached_condition
-from obsynth.numerics.covariances import covariance_factor
+from obsynth.numerics.ranks import covariance_factor
 from obsynth.observers.recursive.gain_schedule_summary import (
     STEPS_TO_CONTRACT,
     GainScheduleSummary,

@@ -15,6 +15,7 @@ equations of the states, and what is left is a plant without ``Dd`` (`Decoupled.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,7 +26,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import RANK_TOLERANCE, decide_rank
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.fault_models import Exosystem
+from obsynth.plants.fault_models import Exosystem, stated_eigenvalues
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +63,13 @@ class AugmentedPlant:
     def order(self) -> int:
         """Number of states."""
         return int(self.E.shape[0])
+
+
+def shipped_model(matrices: Mapping[str, FloatArray], faults: int) -> Exosystem:
+    """Return the exosystem of a certificate, with ``Phi (nw, nw)`` and ``Cw (nf, nw)``."""
+    phi = matrices["Phi"]
+    names = tuple(f"w{i + 1}" for i in range(len(phi)))
+    return Exosystem(phi, matrices["Cw"], names, stated_eigenvalues(phi), ("as shipped",) * faults)
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,10 +213,7 @@ class ObserverGains:
 def realise(
     plant: DescriptorSystem, model: Exosystem, gains: ObserverGains, seen: FloatArray
 ) -> tuple[LinearObserver, dict[str, FloatArray]]:
-    """Return the observer, and its matrices by the paper's letters.
-
-    Shapes: ``seen (nr, ny)``.
-    """
+    """Return the observer, and its matrices by the paper's letters; ``seen (nr, ny)``."""
     augmented = AugmentedPlant.of(plant, model)
     nx, na = plant.nx, augmented.order
     a_hat = gains.U @ augmented.A - gains.K @ augmented.C

@@ -15,6 +15,7 @@ regularity nor index 1 is needed.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,16 +26,16 @@ from obsynth.analysis.existence.numbers import numbers_of, reconsidered
 from obsynth.analysis.existence.rational import SystemFacts
 from obsynth.analysis.existence.verdicts import (
     believed,
-    described_distance,
     in_own_time,
     needed_gain,
-    unclear_detail,
+    verdict_condition,
     zero_doubt,
     zero_verdict,
 )
+from obsynth.analysis.existence.witnesses import Unclear
 from obsynth.analysis.plant_units import PlantUnits, sized_plant
 from obsynth.analysis.transformations.recovery import Transformation
-from obsynth.analysis.zeros import Zero, leading_names, zero_at, zeros_of_system
+from obsynth.analysis.zeros import Zero, leading_names, system_pencil, zero_at, zeros_of_system
 from obsynth.methods.ui_pi_observer.augmented_plant import AugmentedPlant
 from obsynth.methods.ui_pi_observer.decoupling_condition import (
     SOURCE,
@@ -43,19 +44,19 @@ from obsynth.methods.ui_pi_observer.decoupling_condition import (
     disturbance_rank,
 )
 from obsynth.methods.ui_pi_observer.fault_model_condition import (
-    exact_drops,
     lost_in_rounding,
     model_conditions,
     order_conditions,
 )
 from obsynth.methods.ui_pi_observer.pencils import (
     MOST_NAMES,
+    exact_drops,
     in_disturbances,
     independent_disturbances,
     instability,
+    kept_disturbances,
     number,
     numbers,
-    system_pencil,
 )
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.pencils import finite_zeros
@@ -140,7 +141,7 @@ def _zero_condition(given: DescriptorSystem, plant: DescriptorSystem, units: Pla
     numbers = numbers_of(given)
     if numbers is None:
         return _zero_condition_in_floating_point(plant, units)
-    kept = numbers.independent_columns(numbers.blocks([[numbers.matrix("Bd")], [numbers.matrix("Dd")]]), given.nd)
+    kept = kept_disturbances(given, numbers)
     facts = numbers.system(numbers.picked(numbers.matrix("Bd"), kept), numbers.picked(numbers.matrix("Dd"), kept))
     inputs, direct = plant.Bd[:, kept], plant.Dd[:, kept]
     if not facts.full:
@@ -151,29 +152,33 @@ def _zero_condition(given: DescriptorSystem, plant: DescriptorSystem, units: Pla
         terms = units.scaled_plant(terms)
         sizes = np.block([[terms.A, terms.Bd[:, kept]], [terms.C, terms.Dd[:, kept]]])
     verdict = zero_verdict(_timed(facts, units.rate), wide_e, wide_a, nx=plant.nx, discrete=plant.dt > 0.0, sizes=sizes)
-    if verdict.facts.outside:
-        zero = zero_at(plant.E, plant.A, verdict.facts.outside[0], inputs, plant.C, direct)
-        lost = _zero_failure(plant, units, zero, inputs, direct)
-        gain = needed_gain(given, units, units.eigenvalue(zero.value), inputs="Bd" if given.nd else "")
-        return replace(lost, detail=f"{lost.detail} {gain}".rstrip())
-    if verdict.answer == "unclear":
-        own = in_own_time(verdict, units.rate)
-        detail, layout = unclear_detail(own, "An observer"), [["A", "Bd"], ["C", "Dd"]]
-        doubt = zero_doubt(given, units, own, layout, kept={"Bd": kept, "Dd": kept}, what="observer")
+    holding = _zeros(True, facts.normal_rank, facts.columns, f"{len(verdict.facts.zeros)} stable zero(s)")
+    own = in_own_time(verdict, units.rate)
+
+    def lost(zeros: Sequence[complex]) -> Condition:
+        zero = zero_at(plant.E, plant.A, zeros[0], inputs, plant.C, direct)
+        return _zero_failure(plant, units, zero, inputs, direct)
+
+    def seen() -> list[complex]:
         _, _, outside = zeros_of_system(plant.E, plant.A, inputs, plant.C, direct, dt=plant.dt)
-        if outside:
-            worst = max(outside, key=lambda zero: instability(zero.value, plant.dt))
-            lost = _zero_failure(plant, units, worst, inputs, direct)
-            lost = replace(lost, detail=f"{detail} In floating point, {lost.detail}")
-        else:
-            lost = Condition(
-                "(D2) zeros", _D2, False, float(facts.normal_rank), float(facts.columns), _D2_SOURCE, detail
-            )
-        return lost.in_doubt(doubt, given)
-    return Condition(
-        "(D2) zeros", _D2, True, float(facts.normal_rank), float(facts.columns), _D2_SOURCE,
-        f"{len(verdict.facts.zeros)} stable zero(s); {described_distance(in_own_time(verdict, units.rate))}",
+        return [_worst(outside, plant.dt).value] if outside else []
+
+    def doubt() -> Unclear:
+        kept_columns = {"Bd": kept, "Dd": kept}
+        return zero_doubt(given, units, own, [["A", "Bd"], ["C", "Dd"]], kept=kept_columns, what="observer")
+
+    return verdict_condition(
+        own, holding, given, what="An observer", lost=lost, seen=seen, doubt=doubt,
+        gain=lambda mode: needed_gain(given, units, mode, inputs="Bd" if given.nd else ""),
     )  # fmt: skip
+
+
+def _zeros(holds: bool, value: float, bound: float, detail: str) -> Condition:
+    return Condition("(D2) zeros", _D2, holds, float(value), float(bound), _D2_SOURCE, detail)
+
+
+def _worst(outside: Sequence[Zero], dt: float) -> Zero:
+    return max(outside, key=lambda zero: instability(zero.value, dt))
 
 
 def _timed(facts: SystemFacts, rate: float) -> SystemFacts:
@@ -184,7 +189,7 @@ def _timed(facts: SystemFacts, rate: float) -> SystemFacts:
 
 def _hidden_trajectories(rank: int, full: int) -> Condition:
     detail = f"normal rank {rank} of {full}: the plant hides whole trajectories from its outputs."
-    return Condition("(D2) zeros", _D2, False, float(rank), float(full), _D2_SOURCE, detail)
+    return _zeros(False, rank, full, detail)
 
 
 def _zero_condition_in_floating_point(plant: DescriptorSystem, units: PlantUnits) -> Condition:
@@ -194,34 +199,25 @@ def _zero_condition_in_floating_point(plant: DescriptorSystem, units: PlantUnits
     if found.normal_rank < full:
         return _hidden_trajectories(found.normal_rank, full)
     if outside:
-        worst = max(outside, key=lambda zero: instability(zero.value, plant.dt))
-        return _zero_failure(plant, units, worst, inputs, direct)
-    return Condition(
-        "(D2) zeros", _D2, True, float(found.normal_rank), float(full), _D2_SOURCE, f"{len(zeros)} stable zero(s)"
-    )
+        return _zero_failure(plant, units, _worst(outside, plant.dt), inputs, direct)
+    return _zeros(True, found.normal_rank, full, f"{len(zeros)} stable zero(s)")
 
 
 def _zero_failure(
-    plant: DescriptorSystem,
-    units: PlantUnits,
-    zero: Zero,
-    inputs: FloatArray,
-    direct: FloatArray,
+    plant: DescriptorSystem, units: PlantUnits, zero: Zero, inputs: FloatArray, direct: FloatArray
 ) -> Condition:
     value = units.eigenvalue(zero.value)
     states = leading_names(np.abs(zero.state_direction), plant.state_names, most=MOST_NAMES)
     shares = in_disturbances(plant, inputs, direct, zero.input_direction)
     disturbances = () if zero.is_unobservable_mode else leading_names(shares, plant.disturbance_names, most=MOST_NAMES)
-    where = f"s = {number(value)}" if plant.dt == 0.0 else f"z = {number(value)}"
+    where = f"{'s' if plant.dt == 0.0 else 'z'} = {number(value)}"
     masked = f" under the unknown input {', '.join(map(repr, disturbances))}" if disturbances else ""
     detail = (
         f"at {where} the states {', '.join(map(repr, states))} move{masked} without showing in any output, and do not "
         "come to rest: no observer can know them. Measure something they move."
     )
-    return Condition(
-        "(D2) zeros", _D2, False, value.real if plant.dt == 0.0 else abs(value), 0.0, _D2_SOURCE, detail, mode=value,
-        signals=(*states, *disturbances),
-    )  # fmt: skip
+    found = _zeros(False, instability(value, plant.dt), 0.0, detail)
+    return replace(found, mode=value, signals=(*states, *disturbances))
 
 
 def _fixed_modes(

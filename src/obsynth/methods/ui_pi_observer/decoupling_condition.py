@@ -22,7 +22,7 @@ from obsynth.analysis.transformations.elimination import (
 from obsynth.analysis.transformations.recovery import StateRecovery, Transformation
 from obsynth.analysis.zeros import leading_names
 from obsynth.errors import PreconditionError
-from obsynth.methods.ui_pi_observer.pencils import MOST_NAMES
+from obsynth.methods.ui_pi_observer.pencils import MOST_NAMES, kept_disturbances
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import RANK_TOLERANCE, RankDecision, decide_rank
 from obsynth.numerics.scaling import equilibrate_pencil
@@ -47,18 +47,12 @@ def decoupling_rank(plant: DescriptorSystem) -> RankDecision:
     if numbers is None:
         return decide_rank(_decoupling_matrix(scaled), expected=plant.nx + _rank(scaled.Dd) + disturbance_rank(plant))
     bd, dd = numbers.matrix("Bd"), numbers.matrix("Dd")
-    nothing, tall, square = (
-        numbers.zeros(plant.nx, plant.nd),
-        numbers.zeros(plant.ny, plant.nx),
-        numbers.zeros(plant.ny, plant.nd),
-    )
-    matrix = numbers.blocks(
-        [
-            [numbers.matrix("E"), nothing, bd],
-            [numbers.matrix("C"), dd, square],
-            [tall, square, dd],
-        ]
-    )
+    nothing, square = numbers.zeros(plant.nx, plant.nd), numbers.zeros(plant.ny, plant.nd)
+    matrix = numbers.blocks([
+        [numbers.matrix("E"), nothing, bd],
+        [numbers.matrix("C"), dd, square],
+        [numbers.zeros(plant.ny, plant.nx), square, dd],
+    ])  # fmt: skip
     expected = plant.nx + numbers.rank(dd) + disturbance_rank(plant)
     decision, terms = decide_rank(_decoupling_matrix(scaled), expected=expected), sized_plant(plant)
     if terms is None:
@@ -193,9 +187,7 @@ def _decoupling_condition(plant: DescriptorSystem, decision: RankDecision, detai
     if decision.means != "unclear":
         return found
     # Without direct parts, as almost always, the condition is that [E Bd; C 0] has full rank.
-    numbers = numbers_of(plant)
-    both = None if numbers is None else numbers.blocks([[numbers.matrix("Bd")], [numbers.matrix("Dd")]])
-    kept = list(range(plant.nd)) if numbers is None else numbers.independent_columns(both, plant.nd)
+    kept = kept_disturbances(plant, numbers_of(plant))
     free = [j for j in kept if not plant.Dd[:, j].any()]
     seen = [j for j in kept if j not in free]
     layout: list[list[str | None]] = [["E", "Bd"], ["C", None]] if not seen else [["E", "Bd", None], ["C", None, "Dd"]]

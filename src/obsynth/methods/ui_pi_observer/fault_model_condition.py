@@ -1,15 +1,14 @@
 """Whether a fault model can be told from states and unknown inputs: (D3), and the order of the model.
 
 Source: in place of Share Pasand, Aliyari, Taghirad, Theorems 1 and 2, which are false as printed: (D3) has the column
-of ``Bd``, and is tested exactly at the eigenvalues of Phi.
-
-(D3) and the fixed modes on the numbers of plant and fault model as written.
+of ``Bd``, and is tested exactly at the eigenvalues of Phi. Decided on numbers as written
+where that is possible.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,124 +17,26 @@ from obsynth.analysis.conditions import Condition
 from obsynth.analysis.existence.distance import DROWNED, least_share
 from obsynth.analysis.existence.named_pencils import named_augmented, unclear
 from obsynth.analysis.existence.numbers import numbers_of
-from obsynth.analysis.existence.rational import PlantNumbers, SystemFacts, WrittenNumbers
 from obsynth.analysis.existence.verdicts import DECIDER, settled_rank
 from obsynth.analysis.existence.witnesses import Unclear
 from obsynth.analysis.plant_units import PlantUnits, sized_plant
-from obsynth.analysis.zeros import is_outside, leading_names
+from obsynth.analysis.zeros import is_outside, leading_names, system_pencil
 from obsynth.methods.ui_pi_observer.augmented_plant import AugmentedPlant
 from obsynth.methods.ui_pi_observer.pencils import (
     MOST_NAMES,
     equilibrated,
+    exact_loss,
     in_disturbances,
     independent_disturbances,
+    kept_disturbances,
     kernel,
     number,
-    system_pencil,
 )
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.pencils import finite_zeros
 from obsynth.numerics.ranks import RANK_TOLERANCE, RankDecision, decide_rank
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.fault_models import Exosystem
-
-if TYPE_CHECKING:
-    from flint import fmpz_poly
-
-
-#: Degree of the minimal polynomial of an eigenvalue, times columns of the pencil, above which its rank there is left
-#: to floating point.
-MOST_COLUMNS = 400
-
-
-@dataclass(frozen=True, eq=False)
-class ExactDrops:
-    """Facts on the augmented pencil, and the disturbances that are kept in it."""
-
-    facts: SystemFacts
-    kept: list[int]
-
-
-def exact_drops(plant: DescriptorSystem, model: Exosystem) -> ExactDrops | None:
-    """Return the drops of the augmented pencil ``[Aa - s Ea, Bda; Ca, Dd]``; ``None`` for too many states."""
-    numbers = numbers_of(plant)
-    if numbers is None:
-        return None
-    key = ("drops", model.Phi.tobytes(), model.Cw.tobytes(), model.order)
-    found: ExactDrops = numbers.remembered(key, lambda: _drops(numbers, plant, model))
-    return found
-
-
-def _drops(numbers: PlantNumbers, plant: DescriptorSystem, model: Exosystem) -> ExactDrops:
-    kept = numbers.independent_columns(numbers.blocks([[numbers.matrix("Bd")], [numbers.matrix("Dd")]]), plant.nd)
-    augmented = _augmented(numbers, plant, model)
-    bd = numbers.picked(numbers.matrix("Bd"), kept)
-    below = (
-        numbers.blocks([[bd], [numbers.zeros(model.order, len(kept))]])
-        if kept
-        else numbers.zeros(plant.nx + model.order, 0)
-    )
-    return ExactDrops(augmented.system(below, numbers.picked(numbers.matrix("Dd"), kept)), kept)
-
-
-def exact_loss(plant: DescriptorSystem, model: Exosystem, value: complex) -> int | None:
-    """Return by how much the pencil of (D3) falls short of its columns at an eigenvalue of Phi.
-
-    ``None`` where that is left to floating point: irrational eigenvalues of sampled plants, or too many states.
-    """
-    numbers = numbers_of(plant)
-    factor = _factor_of(model, value)
-    if numbers is None or factor is None:
-        return None
-    kept = numbers.independent_columns(numbers.blocks([[numbers.matrix("Bd")], [numbers.matrix("Dd")]]), plant.nd)
-    augmented = _augmented(numbers, plant, model)
-    bd, dd = (numbers.picked(numbers.matrix(name), kept) for name in ("Bd", "Dd"))
-    below = numbers.blocks([[bd], [numbers.zeros(model.order, len(kept))]])
-    columns = plant.nx + model.order + len(kept)
-    if isinstance(augmented, WrittenNumbers):
-        if columns * factor.degree() > MOST_COLUMNS:
-            return None
-        return columns - augmented.pencil(below, dd).rank_at_root(factor)
-    if factor.degree() > 1:
-        return None
-    from flint import arb, fmpq
-
-    pencil: Any = augmented.pencil(below, dd)  # type: ignore[attr-defined]
-    return columns - int(pencil.rank_at(arb(fmpq(-factor[0], factor[1]))))
-
-
-def _augmented(numbers: PlantNumbers, plant: DescriptorSystem, model: Exosystem) -> PlantNumbers:
-    from obsynth.proofs.exact_arithmetic import blocks, identity, written_matrix, zeros_matrix
-
-    count, nx = model.order, plant.nx
-    own = numbers.as_own
-    across, down = zeros_matrix(nx, count), zeros_matrix(count, nx)
-    course = own(written_matrix(model.Cw))
-    changed = {
-        "E": numbers.blocks([[numbers.matrix("E"), own(across)], [own(down), own(identity(count))]]),
-        "A": numbers.blocks([
-            [numbers.matrix("A"), numbers.product(numbers.matrix("Bf"), course)],
-            [own(down), own(written_matrix(model.Phi))],
-        ]),
-        "C": numbers.blocks([[numbers.matrix("C"), numbers.product(numbers.matrix("Df"), course)]]),
-    }  # fmt: skip
-    rational = {"E": blocks([[numbers.rational["E"], across], [down, identity(count)]])}
-    return numbers.with_matrices(changed, rational=rational)
-
-
-def _factor_of(model: Exosystem, value: complex) -> fmpz_poly | None:
-    """Return the irreducible polynomial of Phi as written of which the value is a root."""
-    from obsynth.proofs.exact_arithmetic import primitive, written_matrix
-
-    polynomial = primitive(written_matrix(model.Phi).charpoly())
-    factors = [factor for factor, _ in polynomial.factor()[1]]
-
-    def size(factor: fmpz_poly) -> float:
-        coefficients = [float(int(coefficient)) for coefficient in factor.coeffs()]
-        scale = sum(abs(c) * abs(value) ** k for k, c in enumerate(coefficients)) or 1.0
-        return abs(sum(c * value**k for k, c in enumerate(coefficients))) / scale
-
-    return min(factors, key=size) if factors else None
 
 
 def model_conditions(
@@ -216,14 +117,11 @@ def _model_condition(
         disturbances = _masking(scaled, plant, width, shares)
         signals = (*faults, *disturbances)
         masked = f" is masked by the unknown input {', '.join(map(repr, disturbances))}" if disturbances else ""
-        who = (
-            f"the fault {faults[0]!r}"
-            if len(faults) == 1
-            else f"a combination of the faults {', '.join(map(repr, faults))}"
-        )
+        alone = len(faults) == 1
+        who = f"the fault {faults[0]!r}" if alone else f"a combination of the faults {', '.join(map(repr, faults))}"
         detail += (
             f": at {where} {who}{masked or ' can persist'} without showing in any output, so no observer can estimate "
-            f"{'it' if len(faults) == 1 else 'them'}. Measure another signal, or leave one of them out."
+            f"{'it' if alone else 'them'}. Measure another signal, or leave one of them out."
         )
     return Condition(
         f"(D3) fault model at {number(own)}",
@@ -243,9 +141,7 @@ def _model_doubt(
     decider: str = DECIDER, of_the_model: bool = False, tolerance: float = DROWNED, moving: bool = False,
 ) -> Unclear:  # fmt: skip
     """Return why it is unclear whether plant and fault model hide something at a point, in the plant's own time."""
-    numbers = numbers_of(plant)
-    both = None if numbers is None else numbers.blocks([[numbers.matrix("Bd")], [numbers.matrix("Dd")]])
-    kept = list(range(plant.nd)) if numbers is None else numbers.independent_columns(both, plant.nd)
+    kept = kept_disturbances(plant, numbers_of(plant))
     named = named_augmented(plant, model, units, kept=kept, of_the_model=of_the_model)
     return unclear(
         plant, named, tolerance=tolerance, point=value, dt=plant.dt if moving else None, other=other, decider=decider

@@ -15,7 +15,7 @@ from obsynth.methods.ui_pi_observer.placement_problem import NoiseWeights
 from obsynth.numerics.arguments import NonNegative, Positive, WrittenAs, problem_with
 from obsynth.numerics.arrays import ComplexArray
 from obsynth.numerics.spectra import decay_rates
-from obsynth.plants.fault_models import Exosystem, FaultModel
+from obsynth.plants.fault_models import Exosystem
 
 #: Poles given as numbers count as a conjugate pair when they agree to this, relative to their size.
 PAIR_TOLERANCE = 1e-9
@@ -113,32 +113,11 @@ class UiPiOptions(MethodOptions):
         """Return the options as plain data, for the gain set."""
         listed = None if self.poles is None else [_as_complex(pole) for pole in self.poles]
         return {
-            "fault_model": plain(self.fault_model),
+            "fault_model": None,
             "fault_model_in_words": dict(zip(fault_names, model.descriptions, strict=True)),
+            **self.as_plain(),
             "poles": None if listed is None else [[pole.real, pole.imag] for pole in listed],
-            "decay": self.decay,
-            "region": plain(self.region),
-            "noise": plain(self.noise),
-            "objective": self.objective,
-            "joint": self.joint,
-            "E_sharp": plain(self.E_sharp),
-            "C_sharp": plain(self.C_sharp),
-            "G": plain(self.G),
-            "solver": self.solver,
         }
-
-
-def plain(value: Any) -> Any:
-    """Return options as lists, mappings and numbers."""
-    if isinstance(value, FaultModel):
-        return {"Phi": value.Phi.tolist(), "Cw": value.Cw.tolist()}
-    if isinstance(value, Mapping):
-        return {str(key): plain(part) for key, part in value.items()}
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    if isinstance(value, (list, tuple)):
-        return [plain(part) for part in value]
-    return value
 
 
 def checked_poles(

@@ -1,12 +1,8 @@
 """The pair behind an unknown-input PI observer: what is decoupled, what can be placed, and the noise on it.
 
 Source: Share Pasand, Aliyari, Taghirad, Lemma 5 and procedure 1; the joint design over K and Z is ours: their free
-matrix G is itself an output injection, from the rows ``N_U A`` that the decoupling leaves over.
-
-The noise that an unknown-input PI observer is designed for: what sensors and states are believed to do.
-
-Source: Share Pasand, Aliyari, Taghirad mention "the optimal estimation scheme of Kalman" and no noise; the weights are
-ours.
+matrix G is itself an output injection, from the rows ``N_U A`` that the decoupling leaves over.  They mention "the
+optimal estimation scheme of Kalman" and no noise; the weights are ours.
 """
 
 from __future__ import annotations

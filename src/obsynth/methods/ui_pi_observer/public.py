@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 from numpy.typing import ArrayLike
 
-from obsynth.analysis.transformations.recovery import Transformation, plant_and_recovery
-from obsynth.methods.designing import design, draft_of
-from obsynth.methods.verifying import verify
+from obsynth.analysis.transformations.recovery import Transformation
+from obsynth.methods.designing import design, design_of_given_gains
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
 
@@ -157,7 +157,5 @@ def ui_pi_observer_from_gains(
     """
     from obsynth.methods.ui_pi_observer.synthesis import synthesis_from_gains
 
-    own, recovery = plant_and_recovery(plant)
-    found = synthesis_from_gains(own, U=U, D=D, K=K, F=F, fault_model=fault_model)
-    draft = draft_of(own, "ui-pi-observer", found, name=name, recovery=recovery)
-    return draft.replace(report=verify(draft))
+    synthesis = partial(synthesis_from_gains, U=U, D=D, K=K, F=F, fault_model=fault_model)
+    return design_of_given_gains(plant, "ui-pi-observer", synthesis, name=name)

@@ -22,19 +22,20 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.analysis.conditions import Condition, require_all
+from obsynth.analysis.conditions import Condition
 from obsynth.analysis.existence.numbers import decided
 from obsynth.analysis.zeros import is_outside
 from obsynth.errors import PreconditionError, SolverError, SpecError
-from obsynth.methods.method_spec import Synthesis
+from obsynth.methods.method_spec import Synthesis, plain
 from obsynth.methods.placement.eigenstructure import place
 from obsynth.methods.placement.kalman import KalmanProblem, compromise
 from obsynth.methods.placement.region import Region, region_gain
+from obsynth.methods.refusals import require_all_told
 from obsynth.methods.riccati import lyapunov_factor
 from obsynth.methods.ui_pi_observer.augmented_plant import ObserverGains, combinations_seen, realise
 from obsynth.methods.ui_pi_observer.conditions import existence
 from obsynth.methods.ui_pi_observer.notes import digits_note, elimination_note, fixed_mode_notes, slow_note
-from obsynth.methods.ui_pi_observer.options import UiPiOptions, checked_poles, plain
+from obsynth.methods.ui_pi_observer.options import UiPiOptions, checked_poles
 from obsynth.methods.ui_pi_observer.pencils import number
 from obsynth.methods.ui_pi_observer.placement_problem import (
     NoiseWeights,
@@ -80,7 +81,7 @@ def synthesise(plant: DescriptorSystem, asked: UiPiOptions, *, progress: Callabl
     weights = asked.checked_noise(plant.output_names)
     progress("checking the existence conditions")
     found = existence(plant, model)
-    _require_all(found.conditions)
+    require_all_told(found.conditions)
     working = found.plant
     progress("decoupling the unknown inputs")
     problem = placement_problem(working, model, found.fixed_modes, joint=asked.joint, given=asked.given_decoupling())
@@ -178,23 +179,6 @@ def _in_region(
             # What was asked may be possible all the same.
             pass
     return region_gain(kalman, region, solver=asked.solver)
-
-
-def _require_all(found: Sequence[Condition]) -> None:
-    """Raise for the first condition that fails, and say which others fail too."""
-    failed = [condition for condition in found if not condition.holds]
-    if len(failed) <= 1:
-        require_all(found)
-        return
-    others = "; ".join(f"{condition.name}: {condition.detail}" for condition in failed[1:])
-    try:
-        failed[0].require()
-    except PreconditionError as error:
-        mode = next((condition.mode for condition in failed if condition.mode is not None), None)
-        signals = tuple(dict.fromkeys(name for condition in failed for name in condition.signals))
-        raise PreconditionError(
-            f"{error} Also fails: {others}", condition=failed[0].name, mode=mode, signals=signals
-        ) from None
 
 
 def _require_stable(problem: PlacementProblem) -> None:

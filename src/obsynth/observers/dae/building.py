@@ -1,8 +1,6 @@
-"""An observer of a DAE from a model and plain options: used to design one, and to check the one that was shipped.
+"""An observer of a DAE from a model and plain options, and what is known of it from a run at nominal inputs.
 
-Which integration a nonlinear plant needs: backward Euler damps what turns within a step.
-
-What is known of an observer of a DAE from a run at nominal inputs and parameters, without noise.
+Used to design one, and to check the one that was shipped.
 """
 
 from __future__ import annotations
@@ -53,10 +51,14 @@ def chosen_integration(model: DAEModel, dt: float) -> str:
 DEFAULT_STATE_SHARE = 0.01
 #: Deviation of an initial parameter that is not stated, as a share of its nominal value.
 DEFAULT_PARAMETER_SHARE = 0.1
+#: Options that are fields of the observer as they are given.
+AS_GIVEN = (
+    "forgetting", "guard", "weight", "largest_move", "window", "outliers", "outlier_limit", "sensors", "state_bounds",
+    "reset",
+)  # fmt: skip
 OPTIONS = (
-    "dt", "Q", "R", "form", "forgetting", "guard", "weight", "integration", "random_walk", "initial_state",
-    "initial_covariance", "initial_parameters", "initial_parameter_covariance", "bounds", "largest_move", "window",
-    "outliers", "outlier_limit", "sensors", "state_bounds", "reset",
+    "dt", "Q", "R", "form", "integration", "random_walk", "initial_state", "initial_covariance", "initial_parameters",
+    "initial_parameter_covariance", "bounds", *AS_GIVEN,
 )  # fmt: skip
 
 
@@ -86,12 +88,8 @@ def dae_observer_from_options(model: DAEModel, options: Mapping[str, Any]) -> DA
             _default_parameter_variances(model, options["initial_parameter_covariance"]),
         ),
         random_walk=named_covariance(options["random_walk"], parameters, "random_walk", np.zeros(model.nq)),
-        lower=bounds[:, 0], upper=bounds[:, 1], form=form, forgetting=options["forgetting"],
-        guard=options["guard"], weight=options["weight"], integration=integration,
-        largest_move=options["largest_move"], window=options["window"],
-        outliers=options.get("outliers", "none"), outlier_limit=options.get("outlier_limit"),
-        sensors=options.get("sensors"), state_bounds=options.get("state_bounds"),
-        reset=options.get("reset", 0.0),
+        lower=bounds[:, 0], upper=bounds[:, 1], form=form, integration=integration,
+        **{name: options[name] for name in AS_GIVEN if name in options},
     )  # fmt: skip
 
 

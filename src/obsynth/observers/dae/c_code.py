@@ -27,11 +27,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import DEPENDENT_BOUND
 from obsynth.observers.dae.settings import initial_memory
 from obsynth.observers.dae.step_graph import ObserverGraph
-from obsynth.observers.dae.steps import (
-    PROJECTION_NOTICE,
-    PROJECTION_SHARE,
-    Steps,
-)
+from obsynth.observers.dae.steps import PROJECTION_NOTICE, PROJECTION_SHARE, Steps
 from obsynth.observers.outliers import LONGEST, OVERFLOW, RESET_WINDOW, chi_square_limit
 from obsynth.plants.dae import step as implicit_step
 from obsynth.plants.dae.functions import DAEFunctions
@@ -238,8 +234,7 @@ class DAELibrary:
         return state
 
     def record(self, state: ctypes.Array[ctypes.c_char], y: FloatArray, u: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Go on over some samples; return memory and row of each that could be taken: ``y (samples, ny)``, ``u
-        (samples, nu)``."""
+        """Go on over some samples; return memory and row of each that could be taken."""
         graph = self.steps.graph
         after, said = np.zeros((len(y), graph.memory.size)), np.zeros((len(y), graph.row.size))
         taken = self._library.record(state, len(y), *map(_pointer, (_plain(u), _plain(y), after, said)))

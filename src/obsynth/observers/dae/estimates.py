@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,11 @@ from obsynth.observers.running import named_estimates
 if TYPE_CHECKING:
     from obsynth.observers.dae.settings import DAESettings
     from obsynth.observers.dae.step_graph import ObserverGraph
+
+
+def _part(name: str, meaning: str) -> Any:
+    """Return a property of a row: an array by its name in the layouts."""
+    return property(lambda row: row.part(name), doc=meaning)
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,25 +42,12 @@ class DAERow:
             self.graph.row, self.said)  # fmt: skip
         return layout.part(values, name)
 
-    @property
-    def x(self) -> FloatArray:
-        """The state after the measurement ``(nx,)``."""
-        return self.part("posterior")
-
-    @property
-    def theta(self) -> FloatArray:
-        """The parameters ``(nq,)``."""
-        return self.part("theta")
-
-    @property
-    def covariance(self) -> FloatArray:
-        """Covariance of `x` ``(nx, nx)``."""
-        return self.part("covariance")
-
-    @property
-    def parameter_covariance(self) -> FloatArray:
-        """Covariance of `theta` ``(nq, nq)``."""
-        return self.part("spread")
+    x = _part("posterior", "The state after the measurement ``(nx,)``.")
+    theta = _part("theta", "The parameters ``(nq,)``.")
+    covariance = _part("covariance", "Covariance of `x` ``(nx, nx)``.")
+    parameter_covariance = _part("spread", "Covariance of `theta` ``(nq, nq)``.")
+    score = _part("score", "What the sample says of the parameters ``(nq,)``, see `row_layout`.")
+    information = _part("information", "How much it says of them ``(nq, nq)``.")
 
     @property
     def cross_covariance(self) -> FloatArray:
@@ -87,16 +79,6 @@ class DAERow:
     def regressor(self) -> FloatArray:
         """Regressor of `whitened` ``(degrees, 0)``: there is none."""
         return np.zeros((self.degrees, 0))
-
-    @property
-    def score(self) -> FloatArray:
-        """What the sample says of the parameters ``(nq,)``, see `row_layout`."""
-        return self.part("score")
-
-    @property
-    def information(self) -> FloatArray:
-        """How much it says of them ``(nq, nq)``."""
-        return self.part("information")
 
     @property
     def state_deviations(self) -> FloatArray:

@@ -59,8 +59,7 @@ def advanced(
     steps: Steps, y: FloatArray, u: FloatArray, keep: Callable[[DAERow], object],
     note: Callable[[int], object] = bool,
 ) -> DAEState:  # fmt: skip
-    """Lead an observer from its start through a record; return its state at the end: ``y (samples, ny)``, ``u (samples,
-    nu)``."""
+    """Lead an observer from its start through a record; return its state at the end."""
     calls: dict[int, Compiled] = {}
     state = steps.first
 
@@ -139,9 +138,6 @@ class DAEObserver(DAESettings, StepObserver[DAEState, DAERow]):
     @property
     def _steps(self) -> Steps:
         return self.steps
-
-    def _allow(self, state: DAEState) -> None:
-        """Raise nothing: a model has no horizon."""
 
     def _trust(self, row: DAERow) -> None:
         require_regular(self, row, row.conditions)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any, Literal, Self, TypeAlias
@@ -12,7 +12,7 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import Count, ForgettingFactor, Positive, Probability, checked_value
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
-from obsynth.numerics.covariances import covariance_factor, is_definite
+from obsynth.numerics.ranks import covariance_factor, is_definite
 from obsynth.observers.outliers import Outliers
 from obsynth.observers.running import StepSettings
 from obsynth.plants.dae.checks import finite_vector, step_length
@@ -20,24 +20,14 @@ from obsynth.plants.dae.functions import BUTCHER
 from obsynth.plants.dae.model import DAEModel
 
 Form: TypeAlias = Literal["forgetting", "random-walk", "augmented-kalman"]
-
-
 Guard: TypeAlias = Literal["regularise", "none"]
-
-
 Weight: TypeAlias = Literal["innovation", "paper"]
-
-
 Integration: TypeAlias = Literal["backward-euler", "radau"]
-
-
 _KINDS = {
     "form": Form, "guard": Guard, "weight": Weight, "integration": Integration, "forgetting": ForgettingFactor,
     "window": Count, "largest_move": Positive | None,
     "reset": Probability,
 }  # fmt: skip
-
-
 _DEFINITE = ("R", "initial_parameter_covariance")
 
 
@@ -196,9 +186,6 @@ class Layout:
         import casadi as ca
 
         return ca.vertcat(*(ca.vec(ca.densify(arrays[name])) for name in self.shapes))
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.shapes)
 
 
 #: Arrays that stay matrices when they have one column.

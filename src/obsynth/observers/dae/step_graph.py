@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from obsynth.numerics.symbolic_solve import definite_solved
+from obsynth.numerics.newton import definite_solved
 from obsynth.observers.dae.settings import Layout, memory_layout, row_layout
 from obsynth.plants.dae.functions import DAEFunctions
 from obsynth.plants.dae.step import StepGraph, step_graph

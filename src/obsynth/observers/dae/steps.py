@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
 from obsynth.errors import SolverError
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.covariances import covariance_factor
+from obsynth.numerics.ranks import covariance_factor
 from obsynth.observers.dae.estimates import DAERow
 from obsynth.observers.dae.settings import DAESettings, initial_memory
 from obsynth.observers.dae.step_graph import ObserverGraph, observer_graph
@@ -43,6 +42,7 @@ class Steps:
 
     def __init__(self, settings: DAESettings, graph: ObserverGraph | None = None) -> None:
         self.settings, self.graph = settings, observer_graph(settings) if graph is None else graph
+        self._compiled: dict[str, Compiled] = {}
         self.limit = checked_limit(settings.outliers, settings.outlier_limit)
         self.implicit = ImplicitStep(self.graph.functions, settings.dt, largest_move=settings.largest_move)
         self.first = DAEState(initial_memory(settings, settings.initial_state), 0, np.zeros(settings.model.nu), (),
@@ -53,8 +53,7 @@ class Steps:
         return self.graph.memory.part(state.memory, name)
 
     def advance(self, state: DAEState, y: FloatArray, u: FloatArray) -> tuple[DAEState, DAERow]:
-        """Return the state after a sample and what is said at it: ``y (ny,)`` with NaN for what is missing, ``u
-        (nu,)``."""
+        """Return the state after a sample and what is said at it; NaN in ``y (ny,)`` is what is missing."""
         take = self.watched if self.settings.reset else self.plain
         if self.settings.outliers == "none":
             after, row = take(state, y, u)
@@ -99,7 +98,7 @@ class Steps:
     def predicted(self, state: DAEState, heard: FloatArray, u: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return mean and deviation of each output ``(ny,)`` from what is heard of the next sample."""
         after, row = self.plain(state, heard, u)
-        mean, deviation = self._forecast(after.memory, row.said)
+        mean, deviation = self._call("forecast", after.memory, row.said)
         return mean[:, 0], deviation[:, 0]
 
     def plain(self, state: DAEState, y: FloatArray, u: FloatArray) -> tuple[DAEState, DAERow]:
@@ -108,9 +107,9 @@ class Steps:
         heard, moved = np.where(seen, y, 0.0), np.zeros(self.settings.model.nx)
         if state.k == 0:
             memory, moved = self.projected(state, u)
-            after, said = self._first(memory, heard, seen)
+            after, said = self._call("first", memory, heard, seen)
         else:
-            after, said = self._whole(state.memory, np.concatenate([u, heard, seen]))
+            after, said = self._call("whole", state.memory, np.concatenate([u, heard, seen]))
             if said[-1, 0] != 1.0:
                 after, said = self._carefully(state, heard, seen, u)
         if not np.isfinite(after).all():
@@ -155,22 +154,12 @@ class Steps:
         """Take a step that needs damping or a homotopy: solved outside the graph, and all else in it."""
         posterior, theta = self.part(state, "posterior"), self.part(state, "theta")
         solution = self.implicit.solve_carefully(posterior, u, theta, before=state.u, k=state.k)
-        after, said = self._sample(state.memory, solution.stages, u, y, seen)
+        after, said = self._call("sample", state.memory, solution.stages, u, y, seen)
         said[-2:, 0] = solution.residual, 1.0
         return after, said
 
-    @cached_property
-    def _first(self) -> Compiled:
-        return Compiled(self.graph.first)
-
-    @cached_property
-    def _sample(self) -> Compiled:
-        return Compiled(self.graph.sample)
-
-    @cached_property
-    def _forecast(self) -> Compiled:
-        return Compiled(self.graph.forecast)
-
-    @cached_property
-    def _whole(self) -> Compiled:
-        return Compiled(self.graph.whole)
+    def _call(self, name: str, *arguments: FloatArray) -> tuple[FloatArray, ...]:
+        """Return what a function of the graph gives, compiled when it is first needed."""
+        if name not in self._compiled:
+            self._compiled[name] = Compiled(getattr(self.graph, name))
+        return self._compiled[name](*arguments)

@@ -12,7 +12,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import is_finite_number, require_kind
-from obsynth.numerics.holds import first_order_hold
+from obsynth.numerics.continuous import first_order_hold
 from obsynth.numerics.spectra import abscissa
 from obsynth.observers.linear.observer import LinearObserver
 

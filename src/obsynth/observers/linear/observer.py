@@ -11,15 +11,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
+from obsynth.numerics.arguments import is_whole
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.observers.estimates import Estimates
-from obsynth.observers.records import (
-    NAME_FIELDS,
-    checked_sample,
-    is_delay,
-    require_names,
-    whole_record,
-)
+from obsynth.observers.records import NAME_FIELDS, checked_sample, require_names, whole_record
 from obsynth.observers.running import RunningObserver
 
 
@@ -89,13 +84,20 @@ class LinearObserver:
         if not (math.isfinite(self.dt) and self.dt >= 0.0):
             raise SpecError(f"dt of the observer is {self.dt}: give seconds, or 0 for continuous time.", path="dt")
         for names, delays in ((self.state_names, self.state_delays), (self.fault_names, self.fault_delays)):
-            if not isinstance(delays, tuple) or len(names) != len(delays) or not all(map(is_delay, delays)):
+            whole = isinstance(delays, tuple) and all(is_whole(delay) and delay >= 0 for delay in delays)
+            if not whole or len(names) != len(delays):
                 raise SpecError("The observer needs one delay >= 0, in samples, for each signal.", path="delays")
 
     @property
     def order(self) -> int:
         """Number of observer states ``nz``."""
         return int(self.Az.shape[0])
+
+    @property
+    def row_names(self) -> tuple[str, ...]:
+        """Names of the rows of ``Cz``: ``xhat[...]``, ``fhat[...]``, ``r[...]``."""
+        kinds = (("xhat", self.state_names), ("fhat", self.fault_names), ("r", self.residual_names))
+        return tuple(f"{kind}[{name}]" for kind, names in kinds for name in names)
 
     @property
     def state_rows(self) -> slice:

@@ -13,17 +13,16 @@ Many steps of a model as stacks of arrays, factorised together: what a compiled 
 from __future__ import annotations
 
 import importlib.util
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.covariances import covariance_factor
 from obsynth.numerics.least_squares_step import DEPENDENT_COLUMN, SUSPECT_PARITY
+from obsynth.numerics.ranks import covariance_factor
 from obsynth.observers.estimates import Estimates
-from obsynth.observers.recursive.estimates import RawEstimate, RecursiveState, received_in
+from obsynth.observers.recursive.estimates import RecursiveState, received_in
 from obsynth.observers.recursive.recursion import Recursion
 from obsynth.observers.recursive.settings import RecursiveSettings
 from obsynth.observers.recursive.step_model import PlantSteps, StepMatrices, StepModel, stacked_noise
@@ -79,8 +78,10 @@ def _products(matrices: FloatArray, rows: FloatArray) -> FloatArray:
 
 
 def stacked_steps(step: StepMatrices, before: FloatArray, y: FloatArray, u: FloatArray) -> StepStack | None:
-    """Return steps with H factorised and everything rotated, up to the first H whose rank has to be decided: ``before
-    (steps, nu)``, ``y (steps, measured)``, ``u (steps, nu)``."""
+    """Return steps with H factorised and everything rotated, up to the first H whose rank has to be decided.
+
+    Shapes: ``before (steps, nu)``, ``y (steps, measured)``, ``u (steps, nu)``.
+    """
     ne, rows, n = step.A.shape[1], step.H.shape[1], step.H.shape[2]
     if rows < n:
         return None
@@ -136,61 +137,28 @@ def kernel_is_chosen(observer: RecursiveSettings, samples: int, compiled: bool |
     return True
 
 
-@dataclass
-class _Record:
-    """The estimates of a record while it is being filled; innovations are padded by NaN."""
-
-    states: FloatArray
-    deviations: FloatArray
-    parameters: FloatArray
-    covariances: FloatArray
-    innovations: FloatArray
-    degrees: FloatArray
-
-    @classmethod
-    def empty(cls, samples: int, nx: int, nq: int, rows: int) -> _Record:
-        """Return a record of samples without estimates."""
-        return cls(
-            np.empty((samples, nx)), np.empty((samples, nx)), np.empty((samples, nq)), np.empty((samples, nq, nq)),
-            np.full((samples, rows), np.nan), np.zeros(samples),
-        )  # fmt: skip
-
-    def note(self, k: int, row: RawEstimate) -> None:
-        """Keep one sample of a running observer."""
-        self.states[k], self.deviations[k] = row.x, row.state_deviations
-        self.parameters[k], self.covariances[k] = row.theta, row.parameter_covariance
-        self.innovations[k, : len(row.innovation)], self.degrees[k] = row.innovation, len(row.innovation)
-
-    def estimates(self, observer: RecursiveSettings, y: FloatArray) -> Estimates:
-        """Return the whole."""
-        most = int(self.degrees.max(initial=0.0))
-        innovations = self.innovations[:, :most]
-        samples, nq = self.parameters.shape
-        # Without parameters there is nothing to excite; with a random walk no window is watched.
-        excitation = np.full(samples, 0.0 if observer.adaptation is None else np.nan)
-        return named_estimates(
-            observer, states=self.states, state_deviations=self.deviations, faults=self.parameters,
-            fault_covariances=self.covariances, innovations=innovations,
-            regressors=np.full((samples, most, nq), np.nan), nis=np.nansum(innovations * innovations, axis=1),
-            nis_degrees=self.degrees, excitation=excitation, received=received_in(y),
-        )  # fmt: skip
-
-
 def run_compiled(recursion: Recursion, y: FloatArray, u: FloatArray) -> Estimates:
-    """Run over a whole record with the kernel; single steps where samples are missing or a rank has to be decided: ``y
-    (samples, ny)``, ``u (samples, nu)``."""
-    state, observer = recursion.first, recursion.settings
-    plant = observer.plant
-    nq = 0 if observer.adaptation is None else plant.nq
-    record = _Record.empty(len(y), plant.nx, nq, plant.ne + plant.ny + nq)
+    """Run over a whole record with the kernel: ``y (samples, ny)``, ``u (samples, nu)``.
+
+    Single steps are taken where samples are missing or a rank has to be decided.
+    """
+    state, observer, samples = recursion.first, recursion.settings, len(y)
+    nx, nq, rows = observer.plant.nx, len(observer.fault_names), observer.innovation_count + observer.order
+    # Innovations are padded by NaN.
+    record = {
+        "states": np.empty((samples, nx)), "state_deviations": np.empty((samples, nx)),
+        "faults": np.empty((samples, nq)), "fault_covariances": np.empty((samples, nq, nq)),
+        "innovations": np.full((samples, rows), np.nan), "nis_degrees": np.zeros(samples),
+    }  # fmt: skip
     stretches = _complete_stretches(y)
     pause, patience = 1, 1
     k = 0
-    while k < len(y):
+    while k < samples:
         count = min(int(stretches[k]), CHUNK)
         if pause or count < SHORT_STRETCH or state.diffuse.shape[1]:
             state, row = recursion.advance(state, y[k], u[k])
-            record.note(k, row)
+            _fill(record, slice(k, k + 1), row.x, row.state_deviations, row.theta, row.parameter_covariance,
+                  row.innovation)  # fmt: skip
             k, pause = k + 1, max(pause - 1, 0)
             continue
         state = _kernel_steps(recursion, state, record, y[k : k + count], u[k - 1 : k + count])
@@ -198,7 +166,22 @@ def run_compiled(recursion: Recursion, y: FloatArray, u: FloatArray) -> Estimate
         if taken < count:
             # A step for the other path; where such steps are the rule, the kernel is tried less and less often.
             pause, patience = patience, 2 * patience
-    return record.estimates(observer, y)
+    most = int(record["nis_degrees"].max(initial=0.0))
+    record["innovations"] = innovations = record["innovations"][:, :most]
+    # Without parameters there is nothing to excite; with a random walk no window is watched.
+    excitation = np.full(samples, 0.0 if observer.adaptation is None else np.nan)
+    return named_estimates(
+        observer, **record, regressors=np.full((samples, most, nq), np.nan), excitation=excitation,
+        nis=np.nansum(innovations * innovations, axis=1), received=received_in(y),
+    )  # fmt: skip
+
+
+def _fill(record: dict[str, FloatArray], kept: slice, *parts: FloatArray) -> None:
+    """Keep some samples: states, their deviations, parameters, their covariances, and innovations ``(..., any)``."""
+    for name, part in zip(("states", "state_deviations", "faults", "fault_covariances"), parts[:4], strict=True):
+        record[name][kept] = part
+    record["innovations"][kept, : parts[4].shape[-1]] = parts[4]
+    record["nis_degrees"][kept] = parts[4].shape[-1]
 
 
 def _complete_stretches(y: FloatArray) -> FloatArray:
@@ -209,7 +192,7 @@ def _complete_stretches(y: FloatArray) -> FloatArray:
 
 
 def _kernel_steps(
-    recursion: Recursion, state: RecursiveState, record: _Record, y: FloatArray, u: FloatArray
+    recursion: Recursion, state: RecursiveState, record: dict[str, FloatArray], y: FloatArray, u: FloatArray
 ) -> RecursiveState:
     """Take as many steps as the kernel can; ``u`` begins one sample before ``y``."""
     from obsynth.numerics.compiled_steps import square_root_steps
@@ -219,13 +202,11 @@ def _kernel_steps(
     if stack is None:
         return state
     count, rows = stack.data.shape
-    n, nx = len(state.x), record.states.shape[1]
+    n, nx = len(state.x), recursion.settings.plant.nx
     x, factor = np.array(state.x), np.array(state.factor, order="C")
     states, innovations = np.empty((count, n)), np.empty((count, rows - n))
     deviations, covariances = np.empty((count, nx)), np.empty((count, n - nx, n - nx))
     taken = square_root_steps(x, factor, *stack, states, innovations, deviations, covariances, SUSPECT_PARITY)
-    kept = slice(first, first + taken)
-    record.states[kept], record.parameters[kept] = states[:taken, :nx], states[:taken, nx:]
-    record.deviations[kept], record.covariances[kept] = deviations[:taken], covariances[:taken]
-    record.innovations[kept, : rows - n], record.degrees[kept] = innovations[:taken], rows - n
+    _fill(record, slice(first, first + taken), states[:taken, :nx], deviations[:taken], states[:taken, nx:],
+          covariances[:taken], innovations[:taken])  # fmt: skip
     return state._replace(x=x, factor=factor, k=first + taken, u=u[taken])

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import UNDETERMINED_SHARE
-from obsynth.numerics.recursive_least_squares import ParameterState
+from obsynth.numerics.square_root_estimation import ParameterState
 from obsynth.observers.estimates import Estimates
 from obsynth.observers.recursive.settings import RecursiveSettings
 from obsynth.observers.running import named_estimates

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from itertools import chain
 from typing import NamedTuple
 
@@ -13,19 +12,14 @@ from numpy.typing import ArrayLike, NDArray
 from obsynth.errors import PreconditionError, SolverError, SpecError
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.numerics.least_squares_step import least_squares_step, rank_revealing_step
-from obsynth.numerics.recursive_least_squares import update
 from obsynth.numerics.spectra import abscissa
+from obsynth.numerics.square_root_estimation import update
 from obsynth.observers.estimates import Estimates
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.records import batch_record, require_horizon
 from obsynth.observers.recursive.observer import RecursiveObserver
-from obsynth.observers.recursive.parameter_steps import posterior_residual
-from obsynth.observers.recursive.step_model import (
-    EarlyConstraintSteps,
-    PreparedStep,
-    StepMatrices,
-    spreads,
-)
+from obsynth.observers.recursive.recursion import posterior_residual
+from obsynth.observers.recursive.step_model import PreparedStep, StepMatrices, spreads
 from obsynth.observers.running import named_estimates
 from obsynth.observers.sensor_timing import require_plain
 
@@ -52,7 +46,7 @@ def gain_steps(
     start = recursion.first
     factor, Upsilon, parameters, diffuse = start.factor, start.Upsilon, start.parameters, start.diffuse
     adaptation, model = observer.adaptation, recursion.model
-    first = [model.first()] if isinstance(model, EarlyConstraintSteps) else []
+    first = [step for step in (model.first(),) if step is not None]
     prepared: PreparedStep | None = None
     for k, step in enumerate(chain(first, (model.at(k) for k in range(steps))), 1 - len(first)):
         ne, rows, nq = len(step.A), len(step.H), Upsilon.shape[1]
@@ -104,45 +98,33 @@ def run_batch(observer: RecursiveObserver, y: ArrayLike, u: ArrayLike | None = N
     require_horizon(observer.plant.horizon, samples, early=observer.early_constraints)
     inputs = np.broadcast_to(known, (trials, *known.shape[-2:]))
     start = observer.init()
-    early = isinstance(observer.recursion.model, EarlyConstraintSteps)
+    early = observer.recursion.model.first() is not None
     x = np.broadcast_to(start.x, (trials, len(start.x)))
     theta = np.broadcast_to(start.parameters.theta, (trials, len(start.parameters.theta)))
-    nx = observer.plant.nx
-    states: list[FloatArray] = []
-    parameters: list[FloatArray] = []
+    nx, nq = observer.plant.nx, len(observer.fault_names)
+    states, parameters = np.empty((trials, samples, nx)), np.empty((trials, samples, nq))
+
+    def keep(k: int, Upsilon: FloatArray) -> None:
+        """Keep states and parameters: of a walk they are parts of x, else the states follow the parameters."""
+        walks = x.shape[1] > nx
+        states[:, k] = x[:, :nx] if walks else x + theta @ Upsilon.T
+        parameters[:, k] = x[:, nx:] if walks else theta
+
     innovations: list[FloatArray] = []
     if not early:
-        _note(states, parameters, x, theta, np.zeros((nx, theta.shape[1])), nx)
+        keep(0, np.zeros((nx, theta.shape[1])))
         innovations.append(np.full((trials, 0), np.nan))
     for k, gains in enumerate(gain_steps(observer, samples - 1), 0 if early else 1):
         step, arriving = gains.step, outputs[:, k] if k else outputs[:, k, :0]
         before = inputs[:, k - 1] if k else np.zeros((trials, observer.plant.nu))
-        data = np.concatenate(
-            (x @ step.A.T + before @ step.B.T, arriving, inputs[:, k] @ step.Dn.T), axis=1
-        )  # fmt: skip
+        data = np.concatenate((x @ step.A.T + before @ step.B.T, arriving, inputs[:, k] @ step.Dn.T), axis=1)
         x, theta = data @ gains.gain.T, theta @ gains.forget.T + data @ gains.learn.T
-        _note(states, parameters, x, theta, gains.Upsilon, nx)
+        keep(k, gains.Upsilon)
         innovations.append(data @ gains.parity.T)
-    most = max(found.shape[1] for found in innovations)
-    padded = np.full((trials, samples, most), np.nan)
+    padded = np.full((trials, samples, max(found.shape[1] for found in innovations)), np.nan)
     for k, found in enumerate(innovations):
         padded[:, k, : found.shape[1]] = found
-    return named_estimates(
-        observer, states=np.stack(states, axis=1), faults=np.stack(parameters, axis=1), innovations=padded
-    )
-
-
-def _note(
-    states: list[FloatArray], parameters: list[FloatArray], x: FloatArray, theta: FloatArray,
-    Upsilon: FloatArray, nx: int,
-) -> None:  # fmt: skip
-    """Keep states and parameters: of a walk they are parts of x, else the states follow the parameters."""
-    if x.shape[1] > nx:
-        states.append(x[:, :nx])
-        parameters.append(x[:, nx:])
-    else:
-        states.append(x + theta @ Upsilon.T)
-        parameters.append(theta)
+    return named_estimates(observer, states=states, faults=parameters, innovations=padded)
 
 
 #: The gains have settled when what is left of their way is below this share of them.
@@ -153,17 +135,13 @@ MOST_STEPS = 20_000
 STILL_STEPS = 5
 
 
-@dataclass(frozen=True, eq=False)
-class SteadyObserver:
+class SteadyObserver(NamedTuple):
     """A recursive observer whose gains have settled."""
 
     # from ``[u; y]`` to states, parameters, and the whitened innovation at the parameters of one sample before
     observer: LinearObserver
     start: FloatArray  # ``z(0)``, from the state and the parameters that the recursion starts with; read-only
     steps: int  # after how many steps the gains had settled
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "start", read_only(self.start))
 
 
 def steady_observer(observer: RecursiveObserver) -> SteadyObserver:
@@ -189,7 +167,7 @@ def steady_observer(observer: RecursiveObserver) -> SteadyObserver:
             "nor damped, or parameters are not excited by a plant at rest. Run the recursion itself (obsynth run).",
             condition="stable steady filter",
         )  # fmt: skip
-    return SteadyObserver(realisation, start, steps)
+    return SteadyObserver(realisation, read_only(start), steps)
 
 
 def _require_constant(observer: RecursiveObserver) -> None:

@@ -73,9 +73,6 @@ class RecursiveObserver(RecursiveSettings, StepObserver[RecursiveState, RawEstim
     def _allow(self, state: RecursiveState) -> None:
         require_horizon(self.plant.horizon, state.k + 1, early=self.early_constraints)
 
-    def _trust(self, row: RawEstimate) -> None:
-        """Raise nothing: a step says itself where it loses rank."""
-
     def _sample(self, state: RecursiveState, y: ArrayLike, u: ArrayLike) -> tuple[FloatArray, FloatArray]:
         outputs = measured_record(np.atleast_2d(real_array(y, "y")), self.plant.ny)[0]
         return outputs, real_vector(u, self.plant.nu, "u")

@@ -10,7 +10,6 @@ import numpy as np
 from obsynth.analysis.time_varying import IntArray, early_rows
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.covariances import covariance_factor
 from obsynth.numerics.least_squares_step import (
     DEPENDENT_COLUMN,
     SUSPECT_COLUMN,
@@ -18,22 +17,20 @@ from obsynth.numerics.least_squares_step import (
     least_squares_step,
     rank_revealing_step,
 )
-from obsynth.numerics.ranks import UNDETERMINED_SHARE
-from obsynth.numerics.recursive_least_squares import ParameterState, start_of, update
+from obsynth.numerics.ranks import UNDETERMINED_SHARE, covariance_factor
+from obsynth.numerics.square_root_estimation import ParameterState, start_of, update
 from obsynth.observers.outliers import checked_limit, has_jumped, no_refusals, robust_advance, with_surprise
 from obsynth.observers.recursive.estimates import RawEstimate, RecursiveState
-from obsynth.observers.recursive.parameter_steps import (
-    RandomWalkParameterSteps,
-    WalkingEarlySteps,
-    posterior_residual,
-)
 from obsynth.observers.recursive.settings import RecursiveSettings
 from obsynth.observers.recursive.step_model import (
     EarlyConstraintSteps,
     PlantSteps,
     PreparedStep,
+    RandomWalkParameterSteps,
     StepMatrices,
     StepModel,
+    WalkingEarlySteps,
+    right_side,
     spreads,
 )
 
@@ -57,6 +54,36 @@ def step_model_of(settings: RecursiveSettings) -> StepModel:
         return early_steps(settings, early_rows(settings.plant, early=True))
     steps, walk = PlantSteps(settings.plant, settings.Q, settings.R), walk_of(settings)
     return steps if walk is None else RandomWalkParameterSteps(steps, walk)
+
+
+def posterior_residual(
+    found: LeastSquaresStep,
+    H: FloatArray,
+    S: FloatArray,
+    right: FloatArray,
+    ne: int,
+    *,
+    unknown: FloatArray,
+    columns: int = 1,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return what (18f) learns from: ``y - C x`` weighted by R, its regressor (18d), and a root of its covariance.
+
+    That covariance is not R but one of rank ``rank E + ny - nx`` (Moussa Ali et al. 2013, (18b), (18d), (18f)).
+    """
+    gaps = right[ne:] - H[ne:] @ found.estimate
+    triangle = np.asarray(np.linalg.qr(S[ne:].T, mode="r")).T
+    if not np.all(np.abs(np.diag(triangle)) > 0.0):
+        raise PreconditionError("The literal form (18) divides by R, which is singular: use form 'innovation'.",
+                                condition="R nonsingular")  # fmt: skip
+    data = np.eye(len(H))
+    gains = None if unknown.shape[1] else least_squares_step(H, S, data)
+    if gains is None:
+        # Undetermined directions lie in the null space of the outputs that are there: y - C xhat is what it is.
+        gains = rank_revealing_step(H, S, data, unknown, mapped=len(H))
+    spread = S[ne:] - H[ne:] @ gains.estimate @ S
+    weighted = np.linalg.solve(triangle, np.hstack((gaps, spread)))
+    regressor, end = slice(columns, gaps.shape[1]), gaps.shape[1]
+    return weighted[:, :columns], -weighted[:, regressor], weighted[:, end:]
 
 
 class Recursion:
@@ -95,8 +122,7 @@ class Recursion:
         self.regular = parameters.triangle if adaptation.guard == "regularise" else None
 
     def advance(self, state: RecursiveState, y: FloatArray, u: FloatArray) -> tuple[RecursiveState, RawEstimate]:
-        """Return the state after a sample and what is known at it: ``y (ny,)`` with NaN for what is missing, ``u
-        (nu,)``."""
+        """Return the state after a sample and what is known at it; NaN in ``y (ny,)`` is what is missing."""
         if self.settings.outliers == "none":
             return self.plain(state, y, u)
         foreseen = self.foreseen if state.k and self._constraints is not None else None
@@ -157,8 +183,8 @@ class Recursion:
         theta = state.parameters.theta
         if state.k > 0:
             after, v, G = self._stepped(state, self.model.at(state.k - 1), y, u)
-        elif isinstance(self.model, EarlyConstraintSteps):
-            after, v, G = self._stepped(state, self.model.first(), np.zeros(0), u)
+        elif (first := self.model.first()) is not None:
+            after, v, G = self._stepped(state, first, np.zeros(0), u)
         else:
             after, v, G = state, np.zeros(0), np.zeros((0, state.Upsilon.shape[1]))
         gap = v - G @ theta if len(theta) else v
@@ -169,15 +195,8 @@ class Recursion:
         self, state: RecursiveState, step: StepMatrices, y: FloatArray, u: FloatArray
     ) -> tuple[RecursiveState, FloatArray, FloatArray]:
         """Take the step that ends at the sample ``y``; return also innovation and regressor."""
-        ne, nq = len(step.A), state.Upsilon.shape[1]
-        right = np.empty((len(step.H), 1 + nq), order="F")
-        right[:ne, 0] = step.A @ state.x + step.B @ state.u
-        right[ne : ne + len(y), 0] = y
-        if len(step.Dn):
-            right[ne + len(y) :, 0] = step.Dn @ u
-        if nq:
-            right[:ne, 1:] = step.A @ state.Upsilon + step.Phi
-            right[ne:, 1:] = -step.Psi
+        nq = state.Upsilon.shape[1]
+        right = right_side(step, state.x, state.Upsilon, state.u, y, u)
         found, lesson = None, None
         # The product is NaN exactly if a sample is.
         if not (self.literal or state.diffuse.shape[1] or math.isnan(y.dot(y))):

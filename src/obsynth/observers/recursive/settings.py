@@ -11,8 +11,7 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import Count, ForgettingFactor, Probability, checked_value, real_vector, truth
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
-from obsynth.numerics.covariances import covariance_factor
-from obsynth.numerics.ranks import rounding_rank
+from obsynth.numerics.ranks import covariance_factor, rounding_rank
 from obsynth.observers.outliers import Outliers
 from obsynth.observers.running import StepSettings
 from obsynth.plants.sequences import MatrixSequence

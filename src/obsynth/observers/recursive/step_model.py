@@ -1,15 +1,14 @@
-"""The matrices of one step as the recursion needs them, of a plant as it is or with early constraints.
+"""The matrices of one step as the recursion needs them: of a plant as it is, with early constraints, with walks.
 
 Early constraints: an equation of step k + 1 without x(k + 2) is an output of x(k + 1) already.
-
-What a complete step needs of its matrices, kept from step to step while they stay the same.
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,7 +16,6 @@ from obsynth.analysis.time_varying import IntArray
 from obsynth.analysis.zeros import leading_names
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.covariances import covariance_factor
 from obsynth.numerics.least_squares_step import (
     OUTGROWN,
     LeastSquaresStep,
@@ -26,6 +24,7 @@ from obsynth.numerics.least_squares_step import (
     projected_step,
     projection_of,
 )
+from obsynth.numerics.ranks import covariance_factor
 from obsynth.plants.sequences import MatrixSequence
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 
@@ -45,12 +44,32 @@ class StepMatrices(NamedTuple):
     noise: FloatArray  # ``(ne + ny, any)``: square root of the covariance of q and r
 
 
-class StepModel(Protocol):
+class StepModel(ABC):
     """Something that knows the matrices of every step."""
 
+    @abstractmethod
     def at(self, k: int) -> StepMatrices:
         """Return the matrices of the step from k to k + 1."""
-        ...
+
+    def first(self) -> StepMatrices | None:
+        """Return the correction of x(0) by the algebraic equations of step 0, where these are used early."""
+        return None
+
+
+def right_side(
+    step: StepMatrices, x: FloatArray, Upsilon: FloatArray, before: FloatArray, y: FloatArray, u: FloatArray
+) -> FloatArray:
+    """Return the data of a step ``(rows, 1 + nq)``: of its state, inputs and outputs, and by its parameters."""
+    ne, nq = len(step.A), Upsilon.shape[1]
+    right = np.empty((len(step.H), 1 + nq), order="F")
+    right[:ne, 0] = step.A @ x + step.B @ before
+    right[ne : ne + len(y), 0] = y
+    if len(step.Dn):
+        right[ne + len(y) :, 0] = step.Dn @ u
+    if nq:
+        right[:ne, 1:] = step.A @ Upsilon + step.Phi
+        right[ne:, 1:] = -step.Psi
+    return right
 
 
 def stacked_noise(first: FloatArray, second: FloatArray) -> FloatArray:
@@ -61,8 +80,7 @@ def stacked_noise(first: FloatArray, second: FloatArray) -> FloatArray:
 
 
 def require_in_range(S: FloatArray, factor: FloatArray, k: int, state_names: Sequence[str]) -> None:
-    """Raise `PreconditionError` when deviations outgrow double precision on the way to sample ``k``: ``factor (nx or
-    more, any)``."""
+    """Raise `PreconditionError` when deviations outgrow double precision on the way to sample ``k``."""
     if float(np.max(np.abs(S), initial=0.0)) < OUTGROWN:
         return
     sizes = np.max(np.abs(np.nan_to_num(factor[: len(state_names)])), axis=1, initial=0.0)
@@ -87,7 +105,7 @@ def spreads(
 
 
 @dataclass
-class PlantSteps:
+class PlantSteps(StepModel):
     """The steps of a plant as it is."""
 
     plant: TimeVaryingDescriptorSystem  # the plant
@@ -123,7 +141,7 @@ class PlantSteps:
 
 
 @dataclass
-class EarlyConstraintSteps:
+class EarlyConstraintSteps(StepModel):
     """The steps of a plant with its algebraic equations used as outputs one step earlier."""
 
     plant: TimeVaryingDescriptorSystem  # the plant
@@ -138,12 +156,11 @@ class EarlyConstraintSteps:
                 "k): this plant has none. Bring E into that form, or leave the option out.",
                 path="method.options.early_constraints",
             )
-        self.late = self.rows
-        self.others = np.setdiff1d(np.arange(self.plant.ne), self.late)
+        self.others = np.setdiff1d(np.arange(self.plant.ne), self.rows)
 
     def _factors(self, k: int) -> tuple[FloatArray, FloatArray]:
         covariance = self.Q.at(k)
-        if np.any(covariance[np.ix_(self.others, self.late)]):
+        if np.any(covariance[np.ix_(self.others, self.rows)]):
             raise SpecError(
                 f"Q({k}) couples the noise of algebraic equations with that of the others: early_constraints needs "
                 "them independent.", path="method.options.early_constraints",
@@ -151,12 +168,12 @@ class EarlyConstraintSteps:
         name = f"Q({k})"
         return (
             covariance_factor(covariance[np.ix_(self.others, self.others)], name),
-            covariance_factor(covariance[np.ix_(self.late, self.late)], name),
+            covariance_factor(covariance[np.ix_(self.rows, self.rows)], name),
         )
 
     def at(self, k: int) -> StepMatrices:
         """Return the matrices of the step from k to k + 1."""
-        plant, late, others = self.plant, self.late, self.others
+        plant, late, others = self.plant, self.rows, self.others
         H = np.vstack([plant.E.at(k + 1)[others], plant.C.at(k + 1), plant.A.at(k + 1)[late]])
         outputs = stacked_noise(covariance_factor(self.R.at(k), f"R({k})"), self._factors(k + 1)[1])
         return StepMatrices(
@@ -171,13 +188,71 @@ class EarlyConstraintSteps:
 
     def correction(self, k: int) -> StepMatrices:
         """Return the correction of x(k) by the algebraic equations of step k: what is known is the 'equation'."""
-        plant, late = self.plant, self.late
+        plant, late = self.plant, self.rows
         H = np.vstack([np.eye(plant.nx), plant.A.at(k)[late]])
         noise = stacked_noise(np.zeros((plant.nx, 0)), self._factors(k)[1])
         return StepMatrices(
             H, np.eye(plant.nx), np.zeros((plant.nx, plant.nu)), np.zeros((plant.nx, plant.nq)),
             plant.Phi.at(k)[late], -plant.B.at(k)[late], noise,
         )  # fmt: skip
+
+
+@dataclass
+class RandomWalkParameterSteps(StepModel):
+    """The steps of a model with its parameters among the states, as a random walk.
+
+    The state at k + 1 is ``[x(k+1); theta(k)]``: the parameters that acted in the step that led there.  Their increment
+    then is noise of an equation of its own, and no noise is correlated in time.
+    """
+
+    model: StepModel  # with parameters
+    walk: FloatArray  # ``(nq, nq)``: square root of the covariance of one step of the walk
+
+    def at(self, k: int) -> StepMatrices:
+        """Return the matrices of the step from k to k + 1."""
+        return with_walking_parameters(self.model.at(k), self.walk)
+
+
+@dataclass
+class WalkingEarlySteps(EarlyConstraintSteps):
+    """Both at once: early constraints, and parameters that walk.
+
+    An early equation of k + 1 holds for the parameters of k + 1, so the state at k + 1 is ``[x(k+1); theta(k+1)]``.
+    The outputs still hold theta(k), which is theta(k + 1) without its last increment: that noise they share.
+    """
+
+    walk: FloatArray  # ``(nq, nq)``: square root of the covariance of one step of the walk
+
+    def at(self, k: int) -> StepMatrices:
+        """Return the matrices of the step from k to k + 1."""
+        return with_walking_parameters(super().at(k), self.walk, early=True)
+
+    def first(self) -> StepMatrices:
+        """Return the correction of x(0) and theta(0) by the algebraic equations of step 0."""
+        return with_walking_parameters(super().correction(0), np.zeros_like(self.walk), early=True)
+
+    def correction(self, k: int) -> StepMatrices:
+        """Return the correction of x(k) by the algebraic equations of step k, of parameters that walk until there."""
+        return with_walking_parameters(super().correction(k), self.walk, early=True)
+
+
+def with_walking_parameters(step: StepMatrices, walk: FloatArray, *, early: bool = False) -> StepMatrices:
+    """Return one step with its parameters among the states: those before it, with early constraints those after it."""
+    ne, nx, nq = *step.A.shape, step.Phi.shape[1]
+    nothing, acting, rows, width = np.zeros((ne, nq)), step.Phi, len(step.H) + nq, step.noise.shape[1]
+    below = [np.zeros((nq, nx)), np.eye(nq)]
+    H = np.block([[step.H[:ne], nothing if early else -acting], below, [step.H[ne:], step.Psi]])
+    A = np.block([[step.A, acting if early else nothing], below])
+    noise = np.zeros((rows, width + nq))
+    noise[:ne, :width], noise[ne + nq :, :width] = step.noise[:ne], step.noise[ne:]
+    noise[ne : ne + nq, width:] = walk
+    if early:
+        measured = len(step.Psi) - len(step.Dn)
+        noise[ne + nq : ne + nq + measured, width:] = step.Psi[:measured] @ walk
+    return StepMatrices(
+        np.asfortranarray(H), A, np.vstack([step.B, np.zeros((nq, step.B.shape[1]))]), np.zeros((ne + nq, 0)),
+        np.zeros((len(step.Psi), 0)), step.Dn, noise,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,8 +262,7 @@ class PreparedStep:
     step: StepMatrices  # which step it is
     projection: Projection | None  # of H; ``None`` where its rank has to be decided
     moved: FloatArray  # ``(rows, n)``: rotated A, empty without a projection
-    # ``(any, rows)``: the transpose of the rotated noise, empty without a projection; its triangular factor ``(rows,
-    # rows)`` from so many rows on
+    # The transpose of the rotated noise ``(any, rows)``, empty without a projection; of many rows its triangle.
     known: FloatArray
 
     @classmethod
@@ -208,8 +282,7 @@ class PreparedStep:
         return cls(step, projection, moved, known if len(rotation) < MANY_ROWS else noise_triangle(known))
 
     def taken(self, factor: FloatArray, right: FloatArray | None) -> LeastSquaresStep | None:
-        """Take the step, or return ``None`` where a rank has to be decided: ``factor (n, any)``, ``right (rows,
-        columns)``, ``None`` for the identity."""
+        """Take the step, or return ``None`` where a rank has to be decided; ``right`` is the identity by default."""
         if self.projection is None:
             return None
         rotation = self.projection.rotation

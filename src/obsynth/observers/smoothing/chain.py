@@ -10,7 +10,7 @@ import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import UNDETERMINED_SHARE
-from obsynth.numerics.square_root_smoothing import Gaussian, WayBack, nothing_later, stepped_back
+from obsynth.numerics.square_root_estimation import Gaussian, WayBack, nothing_later, stepped_back
 from obsynth.observers.outliers import projected
 
 
@@ -139,17 +139,6 @@ def _smoothed(links: Links, node: Node, known: Gaussian, later: LaterLessons) ->
         states = slice(0, len(links.bounds))
         estimate[states] = projected(estimate[states], factor[states], links.bounds)
     return Smoothed(estimate, factor, diffuse, theta, spread)
-
-
-def all_smoothed(links: Links, nodes: Sequence[Node], lag: int | None) -> list[Smoothed]:
-    """Return every sample, from the whole chain or from ``lag`` samples after it."""
-    last = len(nodes) - 1
-    if not nodes:
-        return []
-    if lag is None or lag >= last:
-        return smoothed_from(links, nodes, 0, last)
-    found = [smoothed_from(links, nodes, i, i + lag)[0] for i in range(last - lag)]
-    return found + smoothed_from(links, nodes, last - lag, last)
 
 
 def deviations_in(factor: FloatArray, diffuse: FloatArray) -> FloatArray:

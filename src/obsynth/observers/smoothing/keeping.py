@@ -17,7 +17,7 @@ from obsynth.observers.estimates import Estimates
 from obsynth.observers.records import measured_record, whole_record
 from obsynth.observers.recursive.estimates import recursive_estimates
 from obsynth.observers.recursive.observer import RecursiveObserver
-from obsynth.observers.smoothing.chain import Links, Node, Smoothed, all_smoothed, deviations_in, smoothed_from
+from obsynth.observers.smoothing.chain import Links, Node, Smoothed, deviations_in, smoothed_from
 from obsynth.observers.smoothing.links import links_of
 from obsynth.plants.dae.checks import checked_inputs
 
@@ -142,14 +142,10 @@ def smoothed_record(observer: SmoothedObserver, y: ArrayLike, u: ArrayLike | Non
         return observer.run(outputs, inputs)
     kept = KeepingObserver(observer)
     state, found = kept.init(), []
-    is_late = lag is not None and observer.timing.longest > 0
     for k in range(len(outputs)):
         state, _ = kept.accept(state, outputs[k], inputs[k])
-        if is_late and lag is not None and k >= lag:
+        if lag is not None and k >= lag:
             # Values that come later than that change the samples behind them.
             found.append(kept.chain.smoothed(kept.links, k - lag, k)[0])
-    if is_late:
-        found += kept.chain.smoothed(kept.links, len(found), len(outputs) - 1)
-    else:
-        found = all_smoothed(kept.links, kept.chain.nodes, lag)
+    found += kept.chain.smoothed(kept.links, len(found), len(outputs) - 1)
     return smoothed_estimates(observer, kept.chain.rows, found)

@@ -12,15 +12,15 @@ import numpy as np
 
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.covariances import covariance_factor
-from obsynth.numerics.square_root_smoothing import joint_step
+from obsynth.numerics.ranks import covariance_factor
+from obsynth.numerics.square_root_estimation import joint_step
 from obsynth.observers.dae.estimates import DAERow
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.dae.steps import DAEState, Steps
 from obsynth.observers.recursive.estimates import RawEstimate, RecursiveState
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.recursive.recursion import Recursion
-from obsynth.observers.recursive.step_model import EarlyConstraintSteps, StepMatrices, stacked_noise
+from obsynth.observers.recursive.step_model import StepMatrices, right_side, stacked_noise
 from obsynth.observers.smoothing.chain import Lesson, Links, Node
 
 
@@ -209,9 +209,8 @@ class _RecursiveLinks(Links):
         start = self.start
         origin = np.column_stack((start.x, start.Upsilon))
         node = Node(origin, start.factor, np.zeros((len(start.x), 0)), None)
-        if isinstance(self.recursion.model, EarlyConstraintSteps):
-            step = self.recursion.model.first()
-            node = self._linked(node, step, np.zeros(0), np.zeros(0), u)._replace(back=None)
+        if (step := self.recursion.model.first()) is not None:
+            node = self._linked(node, step, start.u, np.zeros(0), u)._replace(back=None)
         return node._replace(lesson=self._lesson(start, after, row))
 
     def begun(self, state: RecursiveState) -> Node:
@@ -229,15 +228,7 @@ class _RecursiveLinks(Links):
 
     def _linked(self, node: Node, step: StepMatrices, before: FloatArray, y: FloatArray, u: FloatArray) -> Node:
         """Take a step from inputs ``before`` to the sample ``y`` with inputs ``u``."""
-        ne, columns = len(step.A), node.origin.shape[1]
-        right = np.empty((len(step.H), columns))
-        right[:ne] = step.A @ node.origin
-        right[:ne, 0] += step.B @ before if len(before) else 0.0
-        right[ne : ne + len(y), 0] = y
-        right[ne + len(y) :, 0] = step.Dn @ u
-        if columns > 1:
-            right[:ne, 1:] += step.Phi
-            right[ne:, 1:] = -step.Psi
+        ne, right = len(step.A), right_side(step, node.origin[:, 0], node.origin[:, 1:], before, y, u)
         known, unknown = (np.zeros((len(step.H), part.shape[1])) for part in (node.factor, node.diffuse))
         known[:ne], unknown[:ne] = step.A @ node.factor, step.A @ node.diffuse
         kept = ~np.isnan(right[:, 0])

@@ -13,7 +13,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, read_only
-from obsynth.numerics.extras import imported
+from obsynth.numerics.libraries import imported
 from obsynth.plants.dae.checks import (
     check_distinct,
     check_structure,
@@ -167,15 +167,21 @@ class DAEModel(DAEFields):
                 "The model is given as Python functions, which cannot be saved as data: write its equations as texts.",
                 path="equations",
             )
-        names = ("equations", "outputs", "states", "inputs", "parameters", "constants", "definitions", "units")
-        return {name: dict(getattr(self, name)) for name in names}
+        return {name: dict(value) for name, value in self._given().items() if name != "storage"}
+
+    def _given(self) -> dict[str, Any]:
+        """Return the arguments of the constructor."""
+        given = {field.name: getattr(self, field.name) for field in fields_of(self)}
+        if self.is_data:
+            del given["equation_names"], given["output_names"]
+        return given
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Return what makes it again in another process: read-only mappings do not travel, functions by their names."""
-        given: dict[str, Any] = {field.name: getattr(self, field.name) for field in fields_of(self)}
-        if self.is_data:
-            del given["equation_names"], given["output_names"]
-        return _made, ({name: dict(value) if isinstance(value, Mapping) else value for name, value in given.items()},)
+        given: dict[str, Any] = {
+            name: dict(value) if isinstance(value, Mapping) else value for name, value in self._given().items()
+        }
+        return partial(DAEModel, **given), ()
 
     def replace(self, **changes: Any) -> DAEModel:
         """Return a model with some fields changed, checked again as a whole.
@@ -185,16 +191,7 @@ class DAEModel(DAEFields):
         **changes
             Any argument of the constructor.
         """
-        fields = ("equations", "outputs", "states", "inputs", "parameters", "constants", "definitions", "units",
-                  "storage")  # fmt: skip
-        given = {name: getattr(self, name) for name in fields}
-        if not self.is_data:
-            given |= {"equation_names": self.equation_names, "output_names": self.output_names}
-        return DAEModel(**{**given, **changes})
+        return DAEModel(**{**self._given(), **changes})
 
     def __repr__(self) -> str:
         return f"DAEModel(nx={self.nx}, nu={self.nu}, ny={self.ny}, nq={self.nq}, states={list(self.states)})"
-
-
-def _made(given: dict[str, Any]) -> DAEModel:
-    return DAEModel(**given)

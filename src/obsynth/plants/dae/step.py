@@ -14,8 +14,17 @@ import numpy as np
 
 from obsynth.errors import SolverError
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.newton import LARGEST_RESIDUAL, LAST_STEP, MOST_ITERATIONS, NewtonResult, condition_number, newton
-from obsynth.numerics.symbolic_solve import SMALL, equilibrated, solved
+from obsynth.numerics.newton import (
+    LARGEST_RESIDUAL,
+    LAST_STEP,
+    MOST_ITERATIONS,
+    SMALL,
+    NewtonResult,
+    condition_number,
+    equilibrated,
+    newton,
+    solved,
+)
 from obsynth.plants.dae.functions import Compiled, DAEFunctions
 
 #: Iterations that every step takes, and further ones in blocks for those that need them.  From the last sample's state

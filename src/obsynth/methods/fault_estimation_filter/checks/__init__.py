@@ -10,9 +10,8 @@ from collections.abc import Generator, Iterator
 import numpy as np
 
 from obsynth.errors import PreconditionError
-from obsynth.methods.fault_estimation_filter.checks.faults import fault_rows
+from obsynth.methods.fault_estimation_filter.checks.faults import Equations, fault_rows
 from obsynth.methods.fault_estimation_filter.checks.gains import gain_rows, gains_fit, printed_allowances
-from obsynth.methods.fault_estimation_filter.checks.realisation import Equations
 from obsynth.methods.fault_estimation_filter.conditions import fault_filter_conditions
 from obsynth.methods.fault_estimation_filter.least_gain_proof import WITNESSES, least_gain_row
 from obsynth.methods.fault_estimation_filter.prepared_plant import with_sensor_faults_as_states
@@ -28,10 +27,9 @@ from obsynth.results.checks import Check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.certificates import prove_bounded_real
 from obsynth.verification.claims import UNCERTAIN, claim_rows, claimed, recovery_rows
-from obsynth.verification.error_system import ErrorSystem, LaggedPlant
+from obsynth.verification.error_system import ErrorSystem, LaggedPlant, TrackedPlant
 from obsynth.verification.identities import equality, tracking_identities
 from obsynth.verification.plant import condition_rows, plant_information
-from obsynth.verification.remainder_channel import TrackedPlant
 
 _IDENTITIES = {
     "dynamics": ("unbiased: dynamics", "Az V E + By C = V A", "Wang 2015, eqs. (7), (26)"),
@@ -56,7 +54,7 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
     (plant, observer), claims = design.linear, design.certificate.claims
     structure = pencil_structure(plant.E, plant.A)
     yield from plant_information(plant, structure)
-    yield from condition_rows(fault_filter_conditions(plant, structure=structure))
+    yield from condition_rows(fault_filter_conditions(plant))
     yield from claim_rows(plant, claims)
     yield from recovery_rows(plant, design.recovery)
     tracking, factor = design.certificate.matrices.get("tracking"), design.certificate.matrices.get("P_factor")

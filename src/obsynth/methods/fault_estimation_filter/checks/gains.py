@@ -16,8 +16,13 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from obsynth.methods.fault_estimation_filter.checks.faults import fault_identities, step_key
-from obsynth.methods.fault_estimation_filter.checks.realisation import MATRICES, Equations, filter_of
+from obsynth.methods.fault_estimation_filter.checks.faults import (
+    MATRICES,
+    Equations,
+    fault_identities,
+    filter_of,
+    step_key,
+)
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.scaling import Scaling
 from obsynth.observers.linear.observer import LinearObserver

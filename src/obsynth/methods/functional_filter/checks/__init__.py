@@ -1,28 +1,81 @@
-"""Checks of a functional filter, from the plant, the shipped realisation and T, T0 alone.
-
-Deviations of the estimates, recomputed from the shipped realisation and the stated noise.
-"""
+"""Checks of a functional filter, from the plant, the shipped realisation and T, T0 alone; leaks without T and T0."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
-from obsynth.methods.functional_filter.checks.leaks import leak_rows
 from obsynth.methods.functional_filter.conditions import conditions
+from obsynth.methods.functional_filter.options import FunctionalFilterOptions
 from obsynth.methods.functional_filter.tracking import estimate_deviations, wanted_faults
+from obsynth.methods.ui_pi_observer.augmented_plant import shipped_model
+from obsynth.methods.ui_pi_observer.checks.decoupling import decoupling_norm
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.scaling import balance_by_least_squares
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.fault_models import Exosystem, stated_eigenvalues
 from obsynth.results.checks import Check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
-from obsynth.verification.certificates import decay_row, prove_stable
+from obsynth.verification.certificates import decay_row, stability_row
+from obsynth.verification.error_system import TrackedPlant
 from obsynth.verification.identities import Identity, equality, relative_tolerance
 from obsynth.verification.plant import condition_rows, plant_information
-from obsynth.verification.remainder_channel import TrackedPlant
+
+#: Estimates at a frequency may miss by this much, relative to terms that pass through the inverse of ``sI - Az``.
+LEAK_TOLERANCE = 1e-7
+
+
+def leak_rows(design: ObserverDesign) -> Iterator[Check]:
+    """Yield the measured leaks: of d into everything, of other faults into each estimate or set of residuals."""
+    plant, observer = design.linear
+    if plant.nd:
+        yield _leak_row("unknown inputs", "the unknown inputs reach neither estimates nor residuals", plant, observer)
+    for name, rows, blind in _blind_to(design):
+        if not blind:
+            continue
+        columns = [plant.fault_names.index(fault) for fault in blind]
+        other = plant.replace(
+            Bd=np.hstack([plant.Bd, plant.Bf[:, columns]]), Dd=np.hstack([plant.Dd, plant.Df[:, columns]]),
+            disturbance_names=[*plant.disturbance_names, *(f"fault {fault}" for fault in blind)],
+        )  # fmt: skip
+        claim = f"neither unknown inputs nor {', '.join(blind)} reach it, whatever their course"
+        yield _leak_row(f"free of others: {name}", claim, other, _only(observer, rows))
+
+
+def _leak_row(name: str, claim: str, plant: DescriptorSystem, observer: LinearObserver) -> Check:
+    found = decoupling_norm(plant, observer)
+    return upper_bound_check(
+        name, claim, found.relative, LEAK_TOLERANCE, source="measured on the plant, without T and T0",
+        detail=f"relative to the terms; worst at {found.frequency:.3g} rad/s",
+    )  # fmt: skip
+
+
+def _blind_to(design: ObserverDesign) -> Iterator[tuple[str, list[int], list[str]]]:
+    """Yield, for groups of rows, their name, the rows and the faults that must not reach them."""
+    plant, observer = design.linear
+    options = design.options
+    if options.get("residuals") is None:
+        others = [name for name in plant.fault_names if name not in observer.fault_names]
+        for row, name in enumerate(observer.fault_names):
+            beside = [] if options.get("joint") else [other for other in observer.fault_names if other != name]
+            yield name, [row], [*others, *beside]
+        return
+    sets = FunctionalFilterOptions(residuals=options["residuals"]).residual_sets(plant) or []
+    for seen in ([plant.fault_names[i] for i in indices] for indices in sets):
+        label = f"{' '.join(seen)}: "
+        rows = [row for row, name in enumerate(observer.residual_names) if len(sets) == 1 or name.startswith(label)]
+        yield label.rstrip(": "), rows, [name for name in plant.fault_names if name not in seen]
+
+
+def _only(observer: LinearObserver, rows: list[int]) -> LinearObserver:
+    """Return the observer with some of its rows, as residuals: a fault estimate that must vanish is one."""
+    return replace(
+        observer, Cz=observer.Cz[rows], Du=observer.Du[rows], Dy=observer.Dy[rows], fault_names=(), fault_delays=(),
+        residual_names=tuple(f"row {row + 1}" for row in rows),
+    )  # fmt: skip
+
 
 #: The regulator equation may miss by this much, relative to its terms: its solution is no part of the gains.
 TRACKING_TOLERANCE = 1e-8
@@ -77,17 +130,16 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
     options = design.options
     yield from condition_rows(
         conditions(
-            plant, fault_model=_model(plant, matrices), faults=options.get("faults"), residuals=options.get("residuals")
+            plant,
+            fault_model=shipped_model(matrices, plant.nf),
+            faults=options.get("faults"),
+            residuals=options.get("residuals"),
         )
     )
     tolerance = relative_tolerance(printed_digits, plant.nx + plant.ny + observer.order)
     for name, claim, identity in _identities(plant, observer, matrices["T"], matrices["T0"]):
         yield equality(name, claim, identity.residual(), _SOURCE, bound=tolerance)
-    proof = prove_stable(observer.Az, matrices["stability"], plant.dt)
-    yield Check(
-        "stability", "every error dies out: the Lyapunov inequality is positive definite", proof.lower_bound, 0.0,
-        proof.lower_bound, proof.proved, "Lyapunov", "proved", proof.text,
-    )  # fmt: skip
+    yield stability_row(observer.Az, matrices["stability"], plant.dt, "Lyapunov")
     yield from _claimed(design)
     for name, claim, identity in _tracking(plant, observer, design):
         yield equality(
@@ -105,12 +157,6 @@ def tracked_plant(design: ObserverDesign) -> TrackedPlant:
         plant.E, plant.A, plant.B, plant.C, plant.D, matrices["T"], goal, plant.state_names, -matrices["T0"], plant.Bd,
         plant.Dd,
     )  # fmt: skip
-
-
-def _model(plant: DescriptorSystem, matrices: Mapping[str, FloatArray]) -> Exosystem:
-    phi = matrices["Phi"]
-    names = tuple(f"w{i + 1}" for i in range(len(phi)))
-    return Exosystem(phi, matrices["Cw"], names, stated_eigenvalues(phi), ("as shipped",) * plant.nf)
 
 
 def _fits(design: ObserverDesign) -> bool:

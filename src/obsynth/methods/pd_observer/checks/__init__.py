@@ -12,21 +12,21 @@ from dataclasses import replace
 import numpy as np
 
 from obsynth.methods.pd_observer.checks.certificate import fitting_claims, proof_rows, stacked_gains
-from obsynth.methods.pd_observer.checks.error_system import PdErrorSystem, norm_rows, solved
 from obsynth.methods.pd_observer.conditions import pd_observer_conditions
-from obsynth.methods.pd_observer.realisation import with_faults_as_states, with_sensor_noise
+from obsynth.methods.pd_observer.realisation import PdErrorSystem, solved, with_faults_as_states, with_sensor_noise
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.continuous import spectral_abscissa
+from obsynth.numerics.continuous import ContinuousHinfNorm, spectral_abscissa
 from obsynth.numerics.ranks import RANK_TOLERANCE, rounding_rank
 from obsynth.numerics.scaling import balance_by_least_squares, balanced_matrix
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.checks import Check, information, lower_bound_check, upper_bound_check
 from obsynth.results.design import ObserverDesign
+from obsynth.verification.error_system import TrackedPlant
 from obsynth.verification.identities import equality, relative_tolerance, residual, tracking_identities, worst
 from obsynth.verification.plant import condition_rows, plant_information
-from obsynth.verification.remainder_channel import TrackedPlant
 
+_ALIKE = ("input_names", "output_names", "state_names", "fault_names", "dt")
 _IDENTITIES = {
     "dynamics": ("unbiased: dynamics", "Az + By C = A, with the faults as states", "Filasova et al., eq. (29)"),
     "inputs": ("unbiased: inputs", "Bu + By D = B", "Filasova et al., eq. (4)"),
@@ -80,13 +80,9 @@ def _fits(plant: DescriptorSystem, observer: LinearObserver) -> bool:
     return bool(
         np.array_equal(plant.E, np.eye(plant.nx))
         and not plant.is_discrete
-        and observer.dt == 0.0
         and observer.order == plant.nx + plant.nf
-        and observer.input_names == plant.input_names
-        and observer.output_names == plant.output_names
         and observer.residual_names == plant.output_names
-        and observer.state_names == plant.state_names
-        and observer.fault_names == plant.fault_names
+        and all(getattr(observer, name) == getattr(plant, name) for name in _ALIKE)
         and not any((*observer.state_delays, *observer.fault_delays))
     )
 
@@ -193,3 +189,77 @@ def _pencil_row(design: ObserverDesign, augmented: DescriptorSystem) -> Check:
         source="Filasova et al., eqs. (38), (39), Definition 1",
         detail=f"{augmented.nx} finite modes of {2 * augmented.nx}" if impulse_free else "I + L C is singular",
     )  # fmt: skip
+
+
+#: Norms of ``[J L]`` above this many times the norm of A are out of proportion to the plant, and worth a warning.
+LARGE_GAIN = 1e2
+
+
+def norm_rows(design: ObserverDesign, errors: PdErrorSystem) -> Iterator[Check]:
+    """Yield norms and gains: checks where a bound is claimed, else information."""
+    plant, claims = design.linear[0], design.certificate.claims
+    noisy = with_sensor_noise(plant)
+    unit = "" if plant.nw else "unit noise on every output, as the plant states none"
+    yield _norm_row(
+        "fault rate in the fault estimate", "H-infinity norm from f' to the fault error, seconds",
+        errors.fault_norm(errors.rate), claims.get("fault_rate_gain"),
+    )  # fmt: skip
+    yield _norm_row(
+        "noise and its derivative in the fault estimate",
+        "H-infinity norm from noise and its derivative, as free inputs, to the fault error",
+        errors.separate_noise_norm(noisy.Bw, noisy.Dw), claims.get("noise_gain"), unit,
+    )  # fmt: skip
+    yield _norm_row(
+        "noise in the fault estimate", "H-infinity norm from the noise to the fault error",
+        errors.fault_norm(errors.noise), None, unit,
+    )  # fmt: skip
+    yield information(
+        "fast noise in the fault estimate", "gain from the noise to the fault error at high frequencies",
+        _size(errors.noise[1][plant.nx :]), source="recomputed", detail=unit,
+    )  # fmt: skip
+    if plant.nd:
+        yield _norm_row(
+            "disturbance in the fault estimate", "H-infinity norm from d to the fault error: d is not decoupled",
+            errors.fault_norm(errors.disturbance), None,
+        )  # fmt: skip
+        yield _norm_row(
+            "disturbance in the state estimate", "H-infinity norm from d to the state error",
+            errors.state_norm(errors.disturbance), None,
+        )  # fmt: skip
+    yield from _gain_rows(design, errors)
+
+
+def _norm_row(name: str, claim: str, norm: ContinuousHinfNorm, bound: float | None, note: str = "") -> Check:
+    peak = f"peak at {norm.frequency:.4g} rad/s"
+    detail = f"{peak}; {note}" if note else peak
+    if bound is None:
+        return information(name, claim, norm.upper, source="recomputed", detail=detail)
+    return upper_bound_check(name, f"{claim}: at most as claimed", norm.upper, bound, source="ours", detail=detail)
+
+
+def _gain_rows(design: ObserverDesign, errors: PdErrorSystem) -> Iterator[Check]:
+    claims = design.certificate.claims
+    gain = _size(np.hstack([errors.J, errors.L]))
+    if "gain_bound" in claims:
+        yield upper_bound_check(
+            "gain bound", "norm of [J L], with the rows of M and N: at most as claimed", gain, claims["gain_bound"],
+            source="ours",
+        )  # fmt: skip
+    own = max(_size(design.linear[0].A), 1.0)
+    warning = (
+        "WARNING: out of proportion to the plant: any error of the model or the sensors is multiplied by it. Ask for a "
+        "slower decay."
+        if not gain <= LARGE_GAIN * own
+        else ""
+    )
+    yield information(
+        "gain", "spectral norm of [J L], with the rows of M and N", gain, source="recomputed", detail=warning
+    )
+
+
+def _size(matrix: np.ndarray) -> float:
+    return (
+        float(np.linalg.norm(matrix, 2))
+        if matrix.size and np.all(np.isfinite(matrix))
+        else float(0.0 if not matrix.size else np.inf)
+    )

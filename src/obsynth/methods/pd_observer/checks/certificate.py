@@ -1,6 +1,4 @@
-r"""The certificate of a PD observer: what it must hold, and the proofs of its inequalities.
-
-The matrix inequality of the PD observer, formed with guaranteed error bounds and proved.
+r"""The certificate of a PD observer: what it must hold, and proofs of its inequalities with all rounding bounded.
 
 Theorem 1 of Filasova, Krokavec, Serbak is, with ``D = I + L C`` and ``Ae = A - J C`` of the augmented plant,
 
@@ -33,6 +31,7 @@ from obsynth.proofs.definiteness import DefinitenessProof, prove_positive_defini
 from obsynth.proofs.extended_balls import Enclosed, block
 from obsynth.results.checks import Check
 from obsynth.results.design import ObserverDesign
+from obsynth.verification.certificates import proof_row
 
 
 def prove_shipped_stability(
@@ -197,17 +196,11 @@ def _gain_row(design: ObserverDesign, kind: Literal["rate", "noise"], gain: floa
     )
     source = {"rate": "the rate of the faults", "noise": "noise and its derivative, as free inputs,"}[kind]
     claim = f"l2 gain from {source} to the fault error < {gain:.6g}"
-    return Check(
-        f"LMI, {kind}", claim, found.lower_bound, 0.0, found.lower_bound, found.proved, "ours: bounded real lemma",
-        "proved", found.text,
-    )  # fmt: skip
+    return proof_row(f"LMI, {kind}", claim, found, "ours: bounded real lemma")
 
 
 def _proof(name: str, claim: str, found: DefinitenessProof, label: str) -> Check:
-    return Check(
-        name, claim, found.lower_bound, 0.0, found.lower_bound, found.proved, f"Filasova et al., eq. {label}", "proved",
-        found.text,
-    )  # fmt: skip
+    return proof_row(name, claim, found, f"Filasova et al., eq. {label}")
 
 
 def _range_row(design: ObserverDesign) -> Check:
@@ -226,9 +219,5 @@ def _range_row(design: ObserverDesign) -> Check:
         proofs.append(prove_gains(end.A, end.C, gain_j, gain_l, p1, p3, delta=claims["delta"], decay=claims["decay"]))
     worst = min(proofs, key=lambda proof: (proof.proved, proof.lower_bound))
     low, high = claims["adaptation_low"], claims["adaptation_high"]
-    return Check(
-        "adaptation range", f"stable for every G = g I with g from {low:.6g} to {high:.6g}", worst.lower_bound, 0.0,
-        worst.lower_bound, all(proof.proved for proof in proofs), "ours: the theorem at both ends, with common P3",
-        "proved",
-        worst.text,
-    )  # fmt: skip
+    claim = f"stable for every G = g I with g from {low:.6g} to {high:.6g}"
+    return proof_row("adaptation range", claim, worst, "ours: the theorem at both ends, with common P3")

@@ -129,7 +129,7 @@ def _problem(observer: RecursiveObserver, y: FloatArray, u: FloatArray) -> tuple
         H[top : top + len(step.A), k * n : (k + 1) * n] = -step.A
         top += len(step.H)
     if isinstance(model, EarlyConstraintSteps):
-        first, late = model.first(), len(model.late)
+        first, late = model.first(), len(model.rows)
         H = np.vstack([H, np.hstack([first.H[n:], np.zeros((late, n * steps))])])
         roots.append(first.noise[n:])
     S = np.zeros((len(H), max(sum(root.shape[1] for root in roots), len(H))))

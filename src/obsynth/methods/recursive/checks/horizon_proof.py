@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from itertools import chain, repeat
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray
@@ -150,7 +151,7 @@ def _closed(
 def largest_bias(pairs: list[tuple[StepMatrices, GainStep]], units: FloatArray) -> float:
     """Return the largest entry of ``[L K] H - I`` in units of the terms of its row, rounded up."""
     gains, matrices = np.array([found.gain for _, found in pairs]), np.array([step.H for step, _ in pairs])
-    middle, radius = stacked_product((gains, np.zeros_like(gains)), (matrices, np.zeros_like(matrices)))
+    middle, radius = _product(gains, matrices)
     one = np.eye(middle.shape[1])
     missed = rounded_up(np.abs(middle - one) + radius, 3)
     # An entry is judged by what rounding of its whole row does to it, in natural units of the states.
@@ -161,18 +162,21 @@ def largest_bias(pairs: list[tuple[StepMatrices, GainStep]], units: FloatArray) 
 _Stack = tuple[FloatArray, FloatArray]
 
 
+def _product(first: ArrayLike, second: FloatArray) -> _Stack:
+    """Return balls that hold the products of two stacks of exact matrices."""
+    left = np.asarray(first, dtype=np.float64)
+    return stacked_product((left, np.zeros_like(left)), (second, np.zeros_like(second)))
+
+
 def _transitions(pairs: list[tuple[StepMatrices, GainStep]]) -> tuple[_Stack, _Stack | None]:
     """Return balls of ``L A`` and, with parameters, of the transition of both errors."""
     ne = pairs[0][0].A.shape[0]
     a = np.array([step.A for step, _ in pairs])
-    zero = np.zeros_like(a)
-    gains = np.array([found.gain[:, :ne] for _, found in pairs])
-    middle, radius = stacked_product((gains, np.zeros_like(gains)), (a, zero))
+    middle, radius = _product([found.gain[:, :ne] for _, found in pairs], a)
     nq, nx = pairs[0][1].forget.shape[0], middle.shape[1]
     if not nq:
         return (middle, radius), None
-    learn = np.array([found.learn[:, :ne] for _, found in pairs])
-    taken, taken_radius = stacked_product((learn, np.zeros_like(learn)), (a, zero))
+    taken, taken_radius = _product([found.learn[:, :ne] for _, found in pairs], a)
     whole, whole_radius = (np.zeros((len(pairs), nx + nq, nx + nq)) for _ in range(2))
     whole[:, :nx, :nx], whole_radius[:, :nx, :nx] = middle, radius
     whole[:, nx:, :nx], whole_radius[:, nx:, :nx] = taken, taken_radius
@@ -186,8 +190,7 @@ def _mean_factor(found: _Followed, factor: FloatArray) -> tuple[float, str]:
     bound = logarithm_of_product(errors)
     if bound < 0.0:
         return float(np.exp(bound / steps)), "from the start"
-    sizes = np.sqrt(np.einsum("ij,ij->i", factor, factor))
-    units = np.exp2(np.round(np.log2(np.where(sizes > 0.0, sizes, 1.0))))
+    units = _deviations(factor)
     bound = logarithm_of_product(errors, units)
     if bound < 0.0:
         return float(np.exp(bound / steps)), "from the start, in units of the last deviations"
@@ -195,6 +198,12 @@ def _mean_factor(found: _Followed, factor: FloatArray) -> tuple[float, str]:
     late = logarithm_of_product(errors[half:], units)
     mean = late / sum(found.lengths[half:])
     return float(np.exp(min(mean, 0.0))), "over the second half, in units of the last deviations"
+
+
+def _deviations(factor: FloatArray) -> FloatArray:
+    """Return the deviations of a covariance ``factor factor'``, to powers of two; one where there is none."""
+    sizes = np.sqrt(np.einsum("ij,ij->i", factor, factor))
+    return np.exp2(np.round(np.log2(np.where(sizes > 0.0, sizes, 1.0))))
 
 
 def bias_row(proof: HorizonProof, condition: float) -> Check:
@@ -223,9 +232,7 @@ def parameter_row(proof: HorizonProof) -> Iterator[Check]:
 def covariance_row(stated: RecursiveObserver, shipped: RecursiveObserver, last: GainStep) -> Check:
     """Return the row that the covariance of the state after the last step is definite, as it is with definite noise."""
     factor = last.factor[: stated.plant.nx]
-    sizes = np.sqrt(np.einsum("ij,ij->i", factor, factor))
-    units = np.exp2(-np.round(np.log2(np.where(sizes > 0.0, sizes, 1.0))))
-    root = Ball.exact(units[:, None] * factor)
+    root = Ball.exact(factor / _deviations(factor)[:, None])
     proof = prove_positive_definite(root @ root.T)
     claim = "the covariance of the states after the last step is positive definite, in units of their deviations"
     definite = noise_is_definite(stated)

@@ -121,8 +121,8 @@ def _steady_covariance(
                      "proved", detail)  # fmt: skip
     if certain and noise_is_definite(stated):
         plant = stated.plant
-        rows = np.hstack(gains), np.vstack([plant.E.at(1), plant.C.at(1)]), natural_units(stated)
-        found = definite_by_its_noise("steady state: covariance", claim, *rows)
-        return replace(found, detail=f"{detail}; {found.detail}")
+        H = np.vstack([plant.E.at(1), plant.C.at(1)])
+        row = definite_by_its_noise("steady state: covariance", claim, np.hstack(gains), H, natural_units(stated))
+        return replace(row, detail=f"{detail}; {row.detail}")
     return information("steady state: covariance", "largest standard deviation that the listed gains lead to, enclosed",
                        float(np.max(high, initial=0.0)), source=source, status="proved", detail=detail)  # fmt: skip

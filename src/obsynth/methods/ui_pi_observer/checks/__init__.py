@@ -10,7 +10,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from obsynth.analysis.plant_units import PlantUnits
-from obsynth.methods.ui_pi_observer.augmented_plant import AugmentedPlant
+from obsynth.methods.ui_pi_observer.augmented_plant import AugmentedPlant, shipped_model
 from obsynth.methods.ui_pi_observer.checks.decoupling import decoupling_norm
 from obsynth.methods.ui_pi_observer.checks.fault_response import tracking_rows
 from obsynth.methods.ui_pi_observer.checks.numbers import gain_rows, noise_rows, stability_rows
@@ -18,16 +18,17 @@ from obsynth.methods.ui_pi_observer.conditions import existence
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.fault_models import Exosystem, stated_eigenvalues
+from obsynth.plants.fault_models import Exosystem
 from obsynth.results.checks import Check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
+from obsynth.verification.error_system import TrackedPlant
 from obsynth.verification.identities import Residual, equality, relative_tolerance, residual
 from obsynth.verification.plant import condition_rows, plant_information
-from obsynth.verification.remainder_channel import TrackedPlant
 
 #: Estimates at a frequency may miss by this much, relative to terms that pass through the inverse of ``sI - Az``.
 DECOUPLING_TOLERANCE = 1e-8
 _PAPER = "Share Pasand, eq. (19)"
+_ALIKE = ("input_names", "output_names", "state_names", "fault_names", "dt")
 _MATRICES = ("tracking", "Phi", "Cw", "poles", "stability")
 
 
@@ -40,9 +41,8 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
     if good:
         # Letters of a realisation that fails need no word of their own.
         (plant, observer), matrices = design.linear, design.certificate.matrices
-        phi, cw = matrices["Phi"], matrices["Cw"]
-        model = Exosystem(phi, cw, tuple(f"w{i + 1}" for i in range(len(phi))), stated_eigenvalues(phi), ())
-        tolerance = relative_tolerance(printed_digits, plant.nx + len(phi) + plant.ny)
+        model = shipped_model(matrices, plant.nf)
+        tolerance = relative_tolerance(printed_digits, plant.nx + model.order + plant.ny)
         yield from gain_rows(design.gains, plant, observer, model, matrices["tracking"], tolerance)
 
 
@@ -52,16 +52,13 @@ def _realisation_rows(design: ObserverDesign, printed_digits: int | None) -> Ite
     yield from plant_information(plant)
     fitting = _fits(design)
     yield upper_bound_check(
-        "fits the plant",
-        "observer, certificate and plant have matching signals and shapes",
-        0.0 if fitting else 1.0,
-        0.0,
+        "fits the plant", "observer, certificate and plant have matching signals and shapes", float(not fitting), 0.0,
         source="shipped realisation",
-    )
+    )  # fmt: skip
     if not fitting:
         return
     tracking, phi, cw, poles, factor = (certificate.matrices[name] for name in _MATRICES)
-    model = Exosystem(phi, cw, tuple(f"w{i + 1}" for i in range(len(phi))), stated_eigenvalues(phi), ())
+    model = shipped_model(certificate.matrices, plant.nf)
     *conditions, last = existence(plant, model).conditions
     yield from condition_rows(conditions)
     if last.name == "fixed modes":
@@ -89,12 +86,10 @@ def _realisation_rows(design: ObserverDesign, printed_digits: int | None) -> Ite
 def tracked_plant(design: ObserverDesign) -> TrackedPlant:
     """Return the plant with the fault model as the shipped observer tracks it, decoupled from the disturbances."""
     (plant, observer), matrices = design.linear, design.certificate.matrices
-    phi, cw = matrices["Phi"], matrices["Cw"]
-    names = tuple(f"w{i + 1}" for i in range(len(phi)))
-    augmented = AugmentedPlant.of(plant, Exosystem(phi, cw, names, stated_eigenvalues(phi), ()))
+    augmented = AugmentedPlant.of(plant, shipped_model(matrices, plant.nf))
     goal = np.zeros((len(observer.Cz), augmented.order))
     goal[observer.state_rows, : plant.nx] = np.eye(plant.nx)
-    goal[observer.fault_rows, plant.nx :] = cw
+    goal[observer.fault_rows, plant.nx :] = matrices["Cw"]
     return TrackedPlant(
         augmented.E, augmented.A, augmented.B, augmented.C, plant.D, matrices["tracking"], goal, augmented.names,
         matrices.get("T0"), augmented.Bd, plant.Dd,
@@ -113,20 +108,13 @@ def _fits(design: ObserverDesign) -> bool:
     return bool(
         all(matrices[name].shape == shape and np.all(np.isfinite(matrices[name])) for name, shape in shapes.items())
         and observer.order == plant.nx + order
-        and observer.input_names == plant.input_names
-        and observer.output_names == plant.output_names
-        and observer.state_names == plant.state_names
-        and observer.fault_names == plant.fault_names
-        and observer.dt == plant.dt
+        and all(getattr(observer, name) == getattr(plant, name) for name in _ALIKE)
         and all(delay == 0 for delay in (*observer.state_delays, *observer.fault_delays))
     )
 
 
 def _identities(
-    plant: DescriptorSystem,
-    observer: LinearObserver,
-    model: Exosystem,
-    tracking: FloatArray,
+    plant: DescriptorSystem, observer: LinearObserver, model: Exosystem, tracking: FloatArray
 ) -> Iterator[tuple[str, str, Residual, str]]:
     """Yield the identities (19) of the shipped realisation: name, claim, residual, source."""
     augmented = AugmentedPlant.of(plant, model)
@@ -154,7 +142,21 @@ def _identities(
         residual(bu, by @ plant.D, -tracking @ augmented.B, factors=((by, plant.D), (tracking, augmented.B))),
         _PAPER,
     )
-    yield from _disturbance_identities(plant, observer, augmented, tracking, own_u, own_dy)
+    yield (
+        "disturbance in the error",
+        "U_a Bd_a = 0 (Bhat Dd, where d reaches y)",
+        residual(
+            tracking @ augmented.Bd, -by @ plant.Dd,
+            factors=((tracking, augmented.Bd), (by, plant.Dd), (own_u, augmented.Bd)),
+        ),
+        _PAPER,
+    )  # fmt: skip
+    yield (
+        "disturbance in the estimates",
+        "D_a Dd = 0: no estimate sees d directly",
+        residual(dy @ plant.Dd, factors=((dy, plant.Dd), (own_dy, plant.Dd))),
+        "our extension",
+    )
     wanted = {
         "state": (observer.state_rows, np.eye(plant.nx, augmented.order), "U_a E_a + D_a C_a = I, rows of the state"),
         "fault": (
@@ -175,31 +177,5 @@ def _identities(
         "feedthrough",
         "no estimate sees the input directly (Du + Dy D = 0)",
         residual(du, dy @ plant.D, factors=((dy, plant.D),)),
-        "our extension",
-    )
-
-
-def _disturbance_identities(
-    plant: DescriptorSystem,
-    observer: LinearObserver,
-    augmented: AugmentedPlant,
-    tracking: FloatArray,
-    own_u: FloatArray,
-    own_dy: FloatArray,
-) -> Iterator[tuple[str, str, Residual, str]]:
-    by, dy = observer.By, observer.Dy
-    yield (
-        "disturbance in the error",
-        "U_a Bd_a = 0 (Bhat Dd, where d reaches y)",
-        residual(
-            tracking @ augmented.Bd, -by @ plant.Dd,
-            factors=((tracking, augmented.Bd), (by, plant.Dd), (own_u, augmented.Bd)),
-        ),
-        _PAPER,
-    )  # fmt: skip
-    yield (
-        "disturbance in the estimates",
-        "D_a Dd = 0: no estimate sees d directly",
-        residual(dy @ plant.Dd, factors=((dy, plant.Dd), (own_dy, plant.Dd))),
         "our extension",
     )

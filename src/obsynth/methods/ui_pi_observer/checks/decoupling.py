@@ -52,7 +52,7 @@ def frequency_grid(observer: LinearObserver) -> FloatArray:
 
 
 def decoupling_norm(plant: DescriptorSystem, observer: LinearObserver) -> DecouplingNorm:
-    """Return how much of any unknown input reaches the estimates of state, fault and residual."""
+    """Return how much of any unknown input reaches the estimates of states (if any), faults and residuals."""
     if not all(np.all(np.isfinite(part)) for part in (observer.Az, observer.By, observer.Cz, observer.Dy)):
         return DecouplingNorm(float("nan"), float("nan"), float("nan"))
     frequencies = frequency_grid(observer)
@@ -93,7 +93,7 @@ def trajectories_at(pencil: ComplexArray) -> tuple[ComplexArray, int]:
 
 @dataclass(frozen=True, eq=False)
 class _Shipped:
-    """An observer that reads scaled outputs in scaled time; its own states are balanced, which is exact."""
+    """An observer of the first ``tracked`` states that reads scaled outputs in scaled time, its own states balanced."""
 
     Az: FloatArray
     By: FloatArray
@@ -102,12 +102,13 @@ class _Shipped:
     formed: FloatArray
     direct: FloatArray
     faults: slice
+    tracked: int
 
     @classmethod
     def of(cls, observer: LinearObserver, units: PlantUnits) -> _Shipped:
-        order, outputs, nx = observer.order, observer.By.shape[1], len(units.states)
+        order, outputs, nx = observer.order, observer.By.shape[1], len(observer.state_names)
         rows = np.ones(len(observer.Cz))
-        rows[:nx] = 1.0 / units.states
+        rows[:nx] = 1.0 / units.states[:nx]
         az, by = units.rate * observer.Az, units.rate * observer.By / units.outputs
         cz, dy = rows[:, None] * observer.Cz, rows[:, None] * observer.Dy / units.outputs
         system = np.zeros((order + outputs + len(cz),) * 2)
@@ -116,25 +117,25 @@ class _Shipped:
         states = balancing_factors(system)[:order]
         az, by, cz = az * states / states[:, None], by / states[:, None], cz * states
         # Bhat = Ahat D + K may cancel: what it is formed of says how well it can be known.
-        offsets = (units.states / states[:nx])[:, None] * np.abs(dy[:nx])
+        offsets = (units.states[:nx] / states[:nx])[:, None] * np.abs(dy[:nx])
         formed = np.abs(by) + np.abs(az[:, :nx]) @ offsets
         # The same holds for a residual, y - C xhat with xhat = z + D y.
-        return cls(az, by, cz, dy, formed, np.abs(dy) + np.abs(cz[:, :nx]) @ offsets, observer.fault_rows)
+        return cls(az, by, cz, dy, formed, np.abs(dy) + np.abs(cz[:, :nx]) @ offsets, observer.fault_rows, nx)
 
     def misses(self, plant: DescriptorSystem, point: complex, trajectories: ComplexArray) -> tuple[float, float] | None:
         """Return the largest relative error of an estimate and that of a fault; ``None`` at a pole."""
-        nx = plant.nx
-        x, d = trajectories[:nx], trajectories[nx:]
+        nx = self.tracked
+        x, d = trajectories[: plant.nx], trajectories[plant.nx :]
         y = plant.C @ x + plant.Dd @ d
         try:
             resolvent = np.linalg.inv(point * np.eye(len(self.Az)) - self.Az)
         except np.linalg.LinAlgError:
             return None
         error = self.Cz @ (resolvent @ (self.By @ y)) + self.Dy @ y
-        error[:nx] -= x
+        error[:nx] -= x[:nx]
         passed = np.abs(self.Cz) @ (np.abs(resolvent) @ self.formed) + self.direct
         size = passed @ (np.abs(plant.C) @ np.abs(x) + np.abs(plant.Dd) @ np.abs(d))
-        size[:nx] += np.abs(x)
+        size[:nx] += np.abs(x[:nx])
         # A signal that a trajectory does not move is rounding: it is judged by what trajectories of its size could do.
         possible = passed @ (np.sum(np.abs(plant.C), axis=1) + np.sum(np.abs(plant.Dd), axis=1))
         possible[:nx] += 1.0

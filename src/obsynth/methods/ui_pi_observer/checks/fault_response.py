@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.analysis.plant_units import PlantUnits
-from obsynth.analysis.zeros import invariant_zeros, is_outside, leading_names
+from obsynth.analysis.zeros import invariant_zeros, is_outside, leading_names, system_pencil
 from obsynth.errors import SpecError
 from obsynth.methods.ui_pi_observer.checks.decoupling import frequency_grid
-from obsynth.methods.ui_pi_observer.pencils import number, system_pencil
+from obsynth.methods.ui_pi_observer.pencils import number
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.norms import balanced_realisation, response
 from obsynth.numerics.pencils import finite_zeros

@@ -1,8 +1,6 @@
-"""One BLAS thread for small problems, while they run: two cost more than they give.
+"""The libraries underneath: computations beyond double precision, packages that are missing, and BLAS threads.
 
-BLAS libraries know only one number of threads for the whole process, so it is set on entry and put back on exit, also
-when an error is raised.  One block at a time sets it: of two that overlap in different Python threads, the second would
-save what the first had set, and leave that behind.
+BLAS knows one number of threads for the whole process: it is set on entry and put back on exit, by one block at a time.
 """
 
 from __future__ import annotations
@@ -12,16 +10,63 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import lru_cache, wraps
+from importlib import import_module
 from typing import TYPE_CHECKING, Any, TypeVar, cast
+
+import numpy as np
+
+from obsynth.errors import SolverError, SpecError
 
 if TYPE_CHECKING:
     from threadpoolctl import ThreadpoolController
+
+
+#: How scipy says that an overflow has reached LAPACK.
+_NOT_FINITE = "infs or NaNs"
+
+
+def failure_of(error: Exception) -> SolverError | None:
+    """Return what the error of a library says of the numbers; `None` if it says nothing of them."""
+    is_numerical = isinstance(error, (np.linalg.LinAlgError, ArithmeticError))
+    if not is_numerical and not (isinstance(error, ValueError) and _NOT_FINITE in str(error)):
+        return None
+    return SolverError(
+        f"LAPACK gave up ({str(error).rstrip('.')}): the numbers are beyond double precision. Nothing is known; look "
+        "at the units of the plant and at the options."
+    )
+
+
+@contextmanager
+def failed_computations() -> Iterator[None]:
+    """Raise `SolverError` where LAPACK or the range of numbers fails; also a decorator."""
+    try:
+        yield
+    except (np.linalg.LinAlgError, ArithmeticError, ValueError) as error:
+        told = failure_of(error)
+        if told is None:
+            raise
+        raise told from error
+
+
+def imported(module: str, *, extra: str | None, what: str = "This") -> Any:
+    """Return a module; where it is not installed, raise `SpecError` with the one command that installs it."""
+    try:
+        return import_module(module)
+    except ImportError as error:
+        package = module.partition(".")[0]
+        wanted = package if extra is None else f"'obsynth[{extra}]'"
+        raise SpecError(
+            f"{what} needs {package}, which is not installed: pip install {wanted}", path=package
+        ) from error
+
 
 #: Problems with fewer states than this run on one BLAS thread: two took more time wherever they were measured, up to
 #: twelve times as much at 100 states (``benchmarks/README.md``).
 STATES_WORTH_THREADS = 1000
 
+
 _Function = TypeVar("_Function", bound=Callable[..., Any])
+
 
 #: Held by the block that has set the number of threads.
 _SETTING = threading.Lock()
