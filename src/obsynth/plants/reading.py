@@ -1,7 +1,4 @@
-"""From what a caller gives for a linear plant to its fields: frames, names for rows, noise of sensors.
-
-Labelled frames (pandas.DataFrame) as matrices: rows and columns in one order, labels as names.
-"""
+"""From what a caller gives for a linear plant to its fields: labelled frames, names for rows, noise of sensors."""
 
 from __future__ import annotations
 
@@ -38,7 +35,7 @@ _FIELDS = {"x": "state_names", "u": "input_names", "y": "output_names", "f": "fa
 def _without_frames(
     matrices: Mapping[str, Any], names: Mapping[str, Sequence[str] | None]
 ) -> tuple[dict[str, Any], dict[str, Sequence[str] | None]]:
-    """Return matrices and names ``{"state_names": ...}`` in which the frames' labels are used, in one order.
+    """Return matrices and names ``{"state_names": ...}`` in which the labels of pandas' frames are used, in one order.
 
     The rows of the dynamics are the equations of the states of the same name.  Numbered labels are no names.
     """
@@ -174,10 +171,7 @@ def _size(given: Mapping[str, Any]) -> int:
 def _with_sensor_picks(
     asked: Mapping[str, Any], given: dict[str, FloatArray | None], outputs: Sequence[str]
 ) -> dict[str, tuple[str, ...]]:
-    """Append one signal for each sensor that Df or Dd names; return the names of the sensors by matrix.
-
-    ``given`` is changed: ``Df (ny, nf)`` and ``Bf (nx, nf)`` get a column for each, after those that are there.
-    """
+    """Append a column to Df, Bf (Dd, Bd) in ``given`` for each sensor that Df (Dd) names; return these."""
     found = {}
     for name, beside in SENSOR_PICKS.items():
         picked = asked[name]
@@ -195,10 +189,7 @@ def _with_sensor_picks(
 def _noise_of_sensors(
     sensor_noise: Any, given: dict[str, FloatArray | None], outputs: Sequence[str]
 ) -> tuple[str, ...]:
-    """Append one noise input for each sensor with a standard deviation; return the names of these.
-
-    ``given`` is changed: ``Bw (nx, nw)`` and ``Dw (ny, nw)`` get a column for each, after those that are there.
-    """
+    """Append a column to Bw, Dw in ``given`` for each sensor with a standard deviation; return their names."""
     if sensor_noise is None:
         return ()
     if not isinstance(sensor_noise, Mapping):

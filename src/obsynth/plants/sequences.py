@@ -1,7 +1,4 @@
-"""Matrices that change with k: callables, stacked arrays, or expressions; checked at every k they are asked for.
-
-Checking what a time-varying plant is made of.
-"""
+"""Matrices that change with k (callables, stacks, expressions), and checks of what a time-varying plant is made of."""
 
 from __future__ import annotations
 

@@ -89,10 +89,8 @@ class ExactQuestion(Question):
     def shows_at(self, point: complex) -> bool:
         """Whether the fault polynomial has no root at a point, whose parts are taken as they are written."""
         real, imaginary = written_fraction(complex(point).real), written_fraction(complex(point).imag)
-        if imaginary == 0:
-            at = fmpq_poly([_rational(-real), 1])
-        else:
-            at = fmpq_poly([_rational(real * real + imaginary * imaginary), _rational(-2 * real), 1])
+        factor = [real * real + imaginary * imaginary, -2 * real, Fraction(1)] if imaginary else [-real, Fraction(1)]
+        at = fmpq_poly([fmpq(value.numerator, value.denominator) for value in factor])
         return self.visible and not (fmpq_poly(self.polynomial) % at).is_zero()
 
     @property
@@ -233,7 +231,3 @@ def _is_zero(matrix: fmpq_mat) -> bool:
 def _values(roots: Sequence[Root]) -> ComplexArray:
     listed = [root.value for root in roots for _ in range(root.multiplicity)]
     return np.array(listed, dtype=np.complex128)
-
-
-def _rational(value: Fraction) -> fmpq:
-    return fmpq(value.numerator, value.denominator)
