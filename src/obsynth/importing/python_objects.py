@@ -13,11 +13,8 @@ from obsynth.importing.roles import plant_of
 from obsynth.numerics.arguments import is_finite_number, require_mapping
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.libraries import imported
-from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.descriptor import MATRICES, SIGNAL_NAMES, DescriptorSystem
 from obsynth.plants.validation import suggestion
-
-_MATRICES = ("E", "A", "B", "C", "D", "Bf", "Df", "Bd", "Dd", "Bw", "Dw")
-_NAMES = ("state_names", "input_names", "output_names", "fault_names", "disturbance_names", "noise_names")
 
 
 def from_control(
@@ -151,7 +148,7 @@ def from_sympy(A: Any, B: Any = None, C: Any = None, *, parameters: Mapping[Any,
     sympy = imported("sympy", extra="sympy")
     require_mapping(parameters, "parameters")
     given = {"A": A, "B": B, "C": C, **plant}
-    symbolic = {name: sympy.Matrix(given[name]) for name in _MATRICES if _is_symbolic(given.get(name), sympy)}
+    symbolic = {name: sympy.Matrix(given[name]) for name in MATRICES if _is_symbolic(given.get(name), sympy)}
     free = {str(symbol) for matrix in symbolic.values() for symbol in matrix.free_symbols}
     values = {str(name): value for name, value in (parameters or {}).items()}
     _require_values(free, values)
@@ -159,7 +156,7 @@ def from_sympy(A: Any, B: Any = None, C: Any = None, *, parameters: Mapping[Any,
     for name, matrix in symbolic.items():
         numbers = {symbol: _exact(values[str(symbol)], sympy) for symbol in matrix.free_symbols}
         arguments[name] = _evaluated(matrix, numbers, name)
-    for name in _NAMES:
+    for name in SIGNAL_NAMES:
         if arguments.get(name) is not None:
             arguments[name] = [str(entry) for entry in arguments[name]]
     return DescriptorSystem(**{"E": None, **arguments})

@@ -18,8 +18,8 @@ from obsynth.plants.uncertainty import UNCERTAIN_MATRICES, Uncertainty, uncertai
 from obsynth.plants.validation import MATRIX_LAYOUT
 
 MatrixOrNames = ArrayLike | Sequence[str] | None
-_NAMES = ("state_names", "input_names", "output_names", "fault_names", "disturbance_names", "noise_names")
-_MATRICES = tuple(name for name, *_ in MATRIX_LAYOUT)
+SIGNAL_NAMES = ("state_names", "input_names", "output_names", "fault_names", "disturbance_names", "noise_names")
+MATRICES = tuple(name for name, *_ in MATRIX_LAYOUT)
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -181,13 +181,13 @@ class DescriptorSystem:
     @property
     def is_sparse(self) -> bool:
         """Whether any matrix of the plant is a sparse one."""
-        return any(is_sparse(getattr(self, name)) for name in _MATRICES)
+        return any(is_sparse(getattr(self, name)) for name in MATRICES)
 
     def dense(self) -> DescriptorSystem:
         """Return the same plant with arrays instead of sparse matrices; a plant without any is returned as it is."""
         if not self.is_sparse:
             return self
-        return self.replace(**{name: dense(getattr(self, name)) for name in _MATRICES})
+        return self.replace(**{name: dense(getattr(self, name)) for name in MATRICES})
 
     @property
     def sensor_faults(self) -> tuple[str, ...]:
@@ -219,8 +219,8 @@ class DescriptorSystem:
         kept = self.as_dict()
         if self.uncertainty is not None and changes.keys() & {*UNCERTAIN_MATRICES, "dt"}:
             del kept["uncertainty"]
-        gone = {name for field in _NAMES if field in changes for name in getattr(self, field)}
-        gone -= {name for field in _NAMES for name in (changes[field] or () if field in changes else kept[field])}
+        gone = {name for field in SIGNAL_NAMES if field in changes for name in getattr(self, field)}
+        gone -= {name for field in SIGNAL_NAMES for name in (changes[field] or () if field in changes else kept[field])}
         for label in ("operating_point", "scales", "units"):
             kept[label] = {name: value for name, value in kept[label].items() if name not in gone}
         return carry_origin(self, DescriptorSystem(**{**kept, **changes}))

@@ -12,7 +12,7 @@ from obsynth.errors import SpecError
 from obsynth.files.inputs import read_json
 from obsynth.plants.constants import constant_of
 from obsynth.plants.dae.model import DAEModel
-from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.descriptor import MATRICES, SIGNAL_NAMES, DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.plants.uncertain_system import with_expressions
 from obsynth.plants.uncertainty import UNCERTAIN_MATRICES, Entry
@@ -25,8 +25,6 @@ if TYPE_CHECKING:
 
 
 _Plant = TypeVar("_Plant", DescriptorSystem, TimeVaryingDescriptorSystem, DAEModel)
-_MATRICES = ("E", "A", "B", "C", "D", "Bf", "Df", "Bd", "Dd", "Bw", "Dw")
-_NAME_LISTS = ("state_names", "input_names", "output_names", "fault_names", "disturbance_names", "noise_names")
 # Equations picked by name also name the signal that enters there.
 _SIGNAL_OF_PICK = {"B": "input_names", "Bw": "noise_names"}
 _LABELS = ("operating_point", "scales", "units")
@@ -132,7 +130,7 @@ def _nonlinear_plant(section: DAESection, source: Path, prefix: str) -> DAEModel
 
 
 def _invariant_plant(section: PlantSection, source: Path, prefix: str) -> DescriptorSystem:
-    arguments = _read(section, source, prefix, ("dt", "sensor_noise", *_LABELS), _MATRICES, _NAME_LISTS,
+    arguments = _read(section, source, prefix, ("dt", "sensor_noise", *_LABELS), MATRICES, SIGNAL_NAMES,
                       keep_sparse=True)  # fmt: skip
     for matrix, names in _SIGNAL_OF_PICK.items():
         if isinstance(arguments[matrix], list) and arguments[names] is None:

@@ -229,7 +229,7 @@ KINDS: Mapping[str, Any] = {
 @cache
 def options_schema(method: str) -> type[Section]:
     """Return the schema of the options of a method, made from its typed options."""
-    options = method_spec(method).options_type
+    options: Any = method_spec(method).options_type
     types, defaults = option_types(options), {field.name: field.default for field in fields(options)}
     entries: dict[str, Any] = {name: (_in_document(kind), defaults[name]) for name, kind in types.items()}
     return create_model(options.__name__, __base__=Section, __doc__=options.__doc__, **entries)

@@ -6,7 +6,7 @@ import json
 import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -281,16 +281,11 @@ def _files(case: SweepCase, folder: Path) -> tuple[Path, Path]:
 def _kept(case: SweepCase, result: SweepResult, folder: Path) -> SweepResult:
     """Write a gain set, then its result, and return the result with the file."""
     file, gains = _files(case, folder)
-    written = None
-    if result.content is not None:
-        written = write_atomically(gains, result.content)
-    body = {
-        "kind": _KIND, "key": case.key, "name": result.name, "parameters": result.parameters, "status": result.status,
-        "message": result.message, "condition": result.condition, "signals": result.signals, "claims": result.claims,
-        "facts": result.facts, "seconds": result.seconds, "gains": None if written is None else written.name,
-    }  # fmt: skip
+    written = None if result.content is None else write_atomically(gains, result.content)
+    kept = {name: value for name, value in vars(result).items() if name not in ("file", "content")}
+    body = {"kind": _KIND, "key": case.key, **kept, "gains": None if written is None else written.name}
     write_atomically(file, json.dumps(plain(body), indent=1) + "\n")
-    return SweepResult(**{**vars(result), "file": written, "content": None})
+    return replace(result, file=written, content=None)
 
 
 def _known(case: SweepCase, folder: Path) -> SweepResult | None:
