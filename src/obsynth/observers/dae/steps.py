@@ -124,7 +124,7 @@ class Steps:
     def stretch(
         self, state: DAEState, y: FloatArray, u: FloatArray, run: Callable[..., tuple[FloatArray, ...]]
     ) -> tuple[DAEState, DAERow]:
-        """Advance until a step is not solved, by `ObserverGraph.whole` over so many samples; return what was reached."""
+        """Advance until a step is not solved, by `ObserverGraph.whole` over so many samples; return what is reached."""
         seen = ~np.isnan(y)
         arriving = np.hstack([u, np.where(seen, y, 0.0), seen])
         after, said = (found.T for found in run(state.memory, arriving.ravel()))
