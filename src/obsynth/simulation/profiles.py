@@ -1,7 +1,6 @@
-"""How one signal of a scenario goes with time: steps, ramps, drifts, failing actuators and sensors, random signals.
+"""How one signal of a scenario goes with time; between samples it is held or linear, so that simulations are exact.
 
-A profile acts from the first sample at or after ``start`` until the last one before ``end``.  Between samples of a
-continuous plant it is held or linear, as its class says, so that a simulation of it is exact.
+A profile acts from the first sample at or after ``start`` until the last one before ``end``.
 """
 
 from __future__ import annotations

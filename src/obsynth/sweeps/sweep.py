@@ -9,7 +9,7 @@ from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 
@@ -17,9 +17,6 @@ from obsynth.errors import ObsynthError, SpecError
 from obsynth.files.outputs import write_atomically
 from obsynth.methods.designing import Plant, design
 from obsynth.observers.progress import RunsProgress, progress_of_runs
-from obsynth.plants.dae.model import DAEModel
-from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import gain_set_bytes, load, loaded, plain
 from obsynth.spec.loader import spec_of
@@ -42,7 +39,7 @@ _KIND = "obsynth sweep result"
 _KEPT = ("name", "parameters", "status", "message", "condition", "signals", "claims", "facts", "seconds")
 #: Letters of a case's name in the names of its files.
 LONGEST_STEM = 60
-_PLANTS = (DescriptorSystem, TimeVaryingDescriptorSystem, DAEModel)
+_PLANTS = get_args(Plant)
 
 
 @dataclass(frozen=True, eq=False)
