@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from html import escape
 from typing import Annotated, Any
@@ -271,29 +272,21 @@ def _note(search: SensorSearch, exact: bool, bound: int, most: int, count: int) 
 def _ranked(
     search: SensorSearch, found: Sequence[tuple[int, ...]], costs: Sequence[float], with_design: bool
 ) -> tuple[SensorSet, ...]:
+    """Return the sets by cost and largest deviation after design, with the walks that the first got by default."""
     rates: dict[str, float] | None = None
-    rows, deviation = [], None
+    rows = []
     for chosen in found:
+        names, deviation = tuple(search.sensors[i].name for i in chosen), None
         if with_design:
-            deviation, rates = _deviation(search, chosen, rates)
-        names = tuple(search.sensors[i].name for i in chosen)
+            plant = search.equipped(chosen)
+            faults = [plant.fault_names[i] for i in search.faults]
+            with suppress(ObsynthError):
+                made = functional_filter(plant, faults=faults, fault_rate=rates)
+                deviation = float(np.max(made.certificate.matrices["deviations"][:, 1]))
+                if rates is None and made.options["fault_rate_found"] is not None:
+                    rates = dict(zip(made.observer.fault_names, made.options["fault_rate_found"], strict=True))
         rows.append(SensorSet(names, sum(costs[i] for i in chosen), deviation))
     return tuple(sorted(rows, key=lambda row: (row.cost, np.inf if row.deviation is None else row.deviation)))
-
-
-def _deviation(
-    search: SensorSearch, chosen: Sequence[int], rates: dict[str, float] | None
-) -> tuple[float | None, dict[str, float] | None]:
-    """Return the largest deviation after design, all sets with the walks that the first of them got by default."""
-    plant = search.equipped(chosen)
-    names = [plant.fault_names[i] for i in search.faults]
-    try:
-        made = functional_filter(plant, faults=names, fault_rate=rates)
-    except ObsynthError:
-        return None, rates
-    if rates is None and made.options["fault_rate_found"] is not None:
-        rates = dict(zip(made.observer.fault_names, made.options["fault_rate_found"], strict=True))
-    return float(np.max(made.certificate.matrices["deviations"][:, 1])), rates
 
 
 def _lost_without(plant: DescriptorSystem, had: Sequence[Task], output: int) -> tuple[str, ...]:
