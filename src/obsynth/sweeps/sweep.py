@@ -15,7 +15,8 @@ import numpy as np
 
 from obsynth.errors import ObsynthError, SpecError
 from obsynth.files.outputs import write_atomically
-from obsynth.methods.designing import Plant, design
+from obsynth.methods.designing import design
+from obsynth.methods.registry import Plant
 from obsynth.observers.progress import RunsProgress, progress_of_runs
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import gain_set_bytes, load, loaded, plain

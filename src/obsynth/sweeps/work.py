@@ -17,7 +17,7 @@ from obsynth.errors import SpecError
 from obsynth.files.inputs import input_file, read_json
 from obsynth.files.outputs import write_atomically
 from obsynth.files.tables import TableWriter
-from obsynth.methods.designing import Plant
+from obsynth.methods.registry import Plant
 from obsynth.observers.progress import as_they_come
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.validation import index_of
