@@ -220,13 +220,8 @@ def _log(data: Any, plant: DescriptorSystem) -> _Log:
     truth = np.zeros((len(frame), plant.nf))
     for name in there:
         truth[:, plant.fault_names.index(name)] = _numbers(frame, [name])[:, 0]
-    return _Log(
-        _clock(len(frame), plant.dt),
-        columns(plant.input_names),
-        columns(plant.output_names),
-        truth,
-        bool(there),
-    )
+    u, y = columns(plant.input_names), columns(plant.output_names)
+    return _Log(_clock(len(frame), plant.dt), u, y, truth, bool(there))
 
 
 def _clock(samples: int, dt: float) -> FloatArray:
