@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import io
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -147,8 +146,6 @@ def _target(options: argparse.Namespace) -> Path | TextIO:
 
 #: Formats of pictures, with the mark by which an older one may be replaced.
 PICTURES = {".png": rb"\A\x89PNG", ".svg": rb"<svg", ".pdf": rb"\A%PDF"}
-#: Dots per inch of a picture made of dots.
-_RESOLUTION = 160
 
 
 def run_plot(options: argparse.Namespace) -> int:
@@ -197,18 +194,6 @@ def picture_kind(target: Path) -> FileKind:
 
 def written_picture(target: Path, count: int, draw: Callable[[list[Any]], Any]) -> None:
     """Write a picture of so many panels, one above the other; ``draw`` fills them."""
-    from matplotlib.figure import Figure
+    from obsynth.plotting.panels import image_of
 
-    from obsynth.plotting.panels import PANEL_HEIGHT, WIDTH
-
-    figure = Figure(figsize=(WIDTH, PANEL_HEIGHT * max(count, 1) + 0.6), layout="constrained")
-    axes = list(figure.subplots(max(count, 1), 1, sharex=True, squeeze=False)[:, 0])
-    draw(axes[:count])
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format=target.suffix[1:].lower(), dpi=_RESOLUTION, metadata=_undated(target))
-    write_atomically(target, buffer.getvalue())
-
-
-def _undated(target: Path) -> dict[str, Any] | None:
-    """Return what keeps the date out of a file, so that the same data give the same picture."""
-    return {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}.get(target.suffix.lower())
+    write_atomically(target, image_of(count, draw, kind=target.suffix[1:].lower()))
