@@ -77,7 +77,7 @@ def run_export(options: argparse.Namespace) -> int:
         design, options.to, sample_time=options.sample_time, fmi=options.fmi,
         thresholds=numbers_of(options.threshold) or None, warm_up=options.warm_up,
     )  # fmt: skip
-    answer(options, {"gains": str(options.gains), "files": [str(file) for file in files]}, "", files)
+    answer(options, {"gains": options.gains, "files": files})
     return 0
 
 
@@ -91,7 +91,7 @@ def run_prove_alarm(options: argparse.Namespace) -> int:
     found = proof_of(design, options, options.row, state_bounds=numbers_of(options.state_bound) or None)
     file = str(found.save(target)) if found.proved and target is not None else None
     answer(options, {
-        "gains": str(options.gains), "proved": found.proved, "row": found.row, "window": found.window,
+        "gains": options.gains, "proved": found.proved, "row": found.row, "window": found.window,
         "margin": found.margin, "statement": found.statement, "origin": found.origin, "file": file,
     }, found.statement + (f"\nCertificate: {file}" if file else ""))  # fmt: skip
     return 0
@@ -121,7 +121,7 @@ def run_report(options: argparse.Namespace) -> int:
         design, options.out, report=report, gains_file=options.gains.name, scenario=scenario, system_file=system,
         run=run, data_file=options.data, statement="" if watched is None else watched.statement, rows=options.rows,
     )  # fmt: skip
-    answer(options, {"gains": str(options.gains), "file": str(file), "passed": report.passed}, "", [file])
+    answer(options, {"gains": options.gains, "file": file, "passed": report.passed})
     return 0 if report.passed else VerificationError.exit_code
 
 
@@ -163,8 +163,7 @@ def run_plot(options: argparse.Namespace) -> int:
     found = run_of(design, options, watched)
     _draw(found, design, parts, target)
     if options.json or not options.quiet:
-        answer(options, {"gains": str(options.gains), "file": None if target is None else str(target),
-                         **found.as_dict()}, summary_of_run(found, watched), [target] if target else [])  # fmt: skip
+        answer(options, {"gains": options.gains, "file": target, **found.as_dict()}, summary_of_run(found, watched))
     return 0
 
 
