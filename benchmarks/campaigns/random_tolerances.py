@@ -25,7 +25,7 @@ from scipy.linalg import expm
 
 import obsynth
 from obsynth.errors import ObsynthError, PreconditionError, SpecError
-from obsynth.experiments.alarm_proofs.proof import proved_alarm
+from obsynth.experiments.alarm_proof import proved_alarm
 from obsynth.experiments.monitors.adaptive_monitor import adaptive_plan
 from obsynth.experiments.monitors.adaptive_rule import record_columns
 

@@ -35,15 +35,15 @@ from obsynth.errors import PreconditionError as PreconditionError
 from obsynth.errors import SolverError as SolverError
 from obsynth.errors import SpecError as SpecError
 from obsynth.errors import VerificationError as VerificationError
-from obsynth.experiments.alarm_proofs.certificate import verify_alarm as verify_alarm
-from obsynth.experiments.alarm_proofs.proof import AlarmProof as AlarmProof
-from obsynth.experiments.evaluation import Evaluation as Evaluation
-from obsynth.experiments.evaluation import Interval as Interval
+from obsynth.experiments.alarm_proof import AlarmProof as AlarmProof
+from obsynth.experiments.alarm_proof import verify_alarm as verify_alarm
 from obsynth.experiments.monitors.monitor import Detection as Detection
 from obsynth.experiments.monitors.monitor import Monitor as Monitor
 from obsynth.experiments.monitors.online import OnlineMonitor as OnlineMonitor
 from obsynth.experiments.monitors.online_monitor import online_monitor as online_monitor
 from obsynth.experiments.monitors.residual_monitor import monitor as monitor
+from obsynth.experiments.monte_carlo import Evaluation as Evaluation
+from obsynth.experiments.monte_carlo import Interval as Interval
 from obsynth.experiments.monte_carlo import evaluate as evaluate
 from obsynth.experiments.simulation import Simulation as Simulation
 from obsynth.experiments.simulation import simulate as simulate
@@ -110,6 +110,7 @@ from obsynth.results.design import Certificate as Certificate
 from obsynth.results.design import ObserverDesign as ObserverDesign
 from obsynth.results.gain_sets import load as load
 from obsynth.simulation.dae import simulate_dae as simulate_dae
+from obsynth.simulation.linear import simulate_time_varying as simulate_time_varying
 from obsynth.simulation.profiles import Drift as Drift
 from obsynth.simulation.profiles import Gaussian as Gaussian
 from obsynth.simulation.profiles import Intermittent as Intermittent
@@ -120,8 +121,7 @@ from obsynth.simulation.profiles import Step as Step
 from obsynth.simulation.profiles import Stuck as Stuck
 from obsynth.simulation.profiles import Uniform as Uniform
 from obsynth.simulation.scenario import Scenario as Scenario
-from obsynth.simulation.time_varying import simulate_time_varying as simulate_time_varying
-from obsynth.simulation.trajectory import Trajectory as Trajectory
+from obsynth.simulation.signals import Trajectory as Trajectory
 from obsynth.spec.loader import Spec as Spec
 from obsynth.spec.loader import load_spec as load_spec
 from obsynth.sweeps.fleet import Fleet as Fleet

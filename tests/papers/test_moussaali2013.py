@@ -11,7 +11,7 @@ import pytest
 import obsynth
 from obsynth.cli.main import main
 from obsynth.observers.recursive.gain_schedule import run_batch
-from obsynth.simulation.time_varying import simulate_time_varying
+from obsynth.simulation.linear import simulate_time_varying
 from obsynth.spec import load_spec
 from obsynth.spec.documents import read_yaml
 

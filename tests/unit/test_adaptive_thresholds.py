@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -207,6 +208,16 @@ def test_plants_are_drawn_from_the_box() -> None:
     found = obsynth.evaluate(design, faulty, runs=20, monitor=obsynth.monitor(design, faulty, constants=box), plants=20)
     assert found.false_alarm_rate.value == 0.0
     assert found.missed_detection_rate.value == 0.0
+    shares: dict[int, int] = {}
+
+    class Counting(ThreadPoolExecutor):
+        def submit(self, work: Any, /, task: Any) -> Any:
+            shares[id(task.bench)] = shares.get(id(task.bench), 0) + len(task.seeds)
+            return super().submit(work, task)
+
+    with Counting(1) as executor:
+        assert obsynth.evaluate(design, quiet, runs=10, plants=7, executor=executor).runs == 10
+    assert sorted(shares.values()) == [1, 1, 1, 1, 2, 2, 2]
     with pytest.raises(SpecError, match="has none"):
         obsynth.evaluate(exact, quiet, runs=2, plants=2)
     with pytest.raises(SpecError, match="follows inputs and outputs"):

@@ -11,7 +11,7 @@ from test_adaptive_thresholds import exact_records, start_set
 from uncertain_plants import drive, wang
 
 import obsynth
-from obsynth.experiments.alarm_proofs.proof import proved_alarm
+from obsynth.experiments.alarm_proof import proved_alarm
 from obsynth.tolerances.exact_plant import drawn_points
 
 

@@ -79,7 +79,7 @@ def test_spec_without_a_method(tmp_path: Path, capsys: pytest.CaptureFixture[str
 def test_figures_are_what_a_simulation_gives() -> None:
     spec = load_spec(DESIGNS / "smib" / "functional.yaml")
     design = obsynth.functional_filter(spec.plant, fault_rate=0.01)
-    (found,) = fault_figures(on_the_clock(spec.plant, None), design.observer, 400)
+    (found,) = fault_figures(on_the_clock(spec.plant, spec.plant.dt), design.observer, 400)
     scenario = obsynth.Scenario(horizon=8.0 - 0.02, faults={"tm GENCLS 1": obsynth.Step(size=1.0)})
     run = obsynth.simulate(design, scenario)
     estimate = run.estimates.faults[:, 0]

@@ -10,7 +10,7 @@ from time_varying_plants import observer_for, printed, textbook, varying
 
 from obsynth import PreconditionError, SpecError, TimeVaryingDescriptorSystem
 from obsynth.observers.decisions import STATISTICS, decide
-from obsynth.simulation.time_varying import simulate_time_varying
+from obsynth.simulation.linear import simulate_time_varying
 
 SAMPLES, CHANGE = 160, 90
 PLANT = varying(horizon=SAMPLES)

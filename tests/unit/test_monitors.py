@@ -16,9 +16,9 @@ from scipy.linalg import solve_discrete_lyapunov
 import obsynth
 from obsynth.errors import SpecError
 from obsynth.experiments.benches import make_bench
-from obsynth.experiments.evaluation import mean, share
 from obsynth.experiments.monitors.residual_model import residual_model
 from obsynth.experiments.monitors.whitening import innovation_whitener, whitener_of, window_covariance
+from obsynth.experiments.monte_carlo import mean, share
 from obsynth.spec import load_spec
 
 DESIGNS = Path(__file__).parents[2] / "designs"

@@ -342,13 +342,13 @@ class TestCertificates:
 
     def test_a_symmetric_certificate_serves_below_its_delta(self) -> None:
         a = np.array([[0.0, 1.0], [-4.0, -0.4]])
-        found = symmetric_certificate(a, decay=0.0)
+        found = symmetric_certificate(a)
         assert found is not None
         none = np.zeros((2, 1))
         for delta, proved in ((0.999 * found.limit, True), (1.001 * found.limit, False)):
             p1 = found.P1(delta)
             assert prove_gains(a, none.T, none, none, p1, found.P3, delta=delta, decay=0.0).proved is proved
-        assert symmetric_certificate(-a, decay=0.0) is None
+        assert symmetric_certificate(-a) is None
 
     @pytest.mark.parametrize("delta", [1e-3, 0.1, 1.0, 10.0, 1e3])
     def test_a_coupled_certificate_serves_for_every_delta(self, delta: float) -> None:

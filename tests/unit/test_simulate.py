@@ -14,7 +14,7 @@ from scipy.integrate import solve_ivp
 import obsynth
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.simulation.linear import make_stepper, simulate_plant
-from obsynth.simulation.scenario_signals import resolve
+from obsynth.simulation.signals import resolve
 from obsynth.spec import load_spec
 
 DESIGNS = Path(__file__).parents[2] / "designs"

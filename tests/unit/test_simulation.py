@@ -15,7 +15,7 @@ from obsynth.errors import PreconditionError, SpecError
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.simulation import Trajectory, simulate_plant
-from obsynth.simulation.time_varying import simulate_time_varying
+from obsynth.simulation.linear import simulate_time_varying
 from obsynth.spec import load_spec
 
 DESIGNS = Path(__file__).parents[2] / "designs"
@@ -273,7 +273,7 @@ def test_states_that_outgrow_double_precision_are_no_result() -> None:
 @pytest.mark.parametrize("name", ["u", "parameters"])
 def test_a_signal_that_a_time_varying_plant_does_not_have_is_refused(name):
     plant = TimeVaryingDescriptorSystem(np.eye(1), 0.5 * np.eye(1), C=np.eye(1), dt=1.0)
-    with pytest.raises(SpecError, match=f"{name} is 3 by 2, but 3 by 0 is needed"):
+    with pytest.raises(SpecError, match=rf"{name} has shape \(3, 2\), but \(3, 0\) is needed"):
         simulate_time_varying(plant, samples=3, **{name: np.ones((3, 2))})
     empty = simulate_time_varying(plant, samples=3, **{name: np.zeros((3, 0))}, initial_state=[1.0])
     np.testing.assert_array_equal(empty.states, [[1.0], [0.5], [0.25]])

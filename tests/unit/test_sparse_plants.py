@@ -17,7 +17,7 @@ from obsynth.analysis.transformations.recovery_operator import without_rounding
 from obsynth.methods.designing import check
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE
 from obsynth.numerics.sparse import blocks_of, coarse_structure
-from obsynth.numerics.sparse_factor import SparseFactor
+from obsynth.numerics.sparse_factor import SparseFactor, scales_by_all_entries
 from obsynth.spec.loader import load_spec
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -168,11 +168,79 @@ class TestIdleVariables:
         e, a = np.diag([1.0, 0, 0]), np.array([[-1.0, 0, 0], [1, -1, 0], [3, -3, 0]])
         found = obsynth.eliminate_algebraic_states(obsynth.DescriptorSystem(make(e), make(a), C=[[1, 0, 0]]))
         assert found.dropped == ("x3",)
-        for other in ([3, -2, 0], [0, 0, 0]):
-            a[2] = other
-            with pytest.raises(obsynth.PreconditionError) as caught:
-                obsynth.eliminate_algebraic_states(obsynth.DescriptorSystem(make(e), make(a), C=[[1, 0, 0]]))
-            assert caught.value.condition == "regularity"
+        a[2] = [3, -2, 0]
+        with pytest.raises(obsynth.PreconditionError) as caught:
+            obsynth.eliminate_algebraic_states(obsynth.DescriptorSystem(make(e), make(a), C=[[1, 0, 0]]))
+        assert caught.value.condition == "regularity"
+
+    @pytest.mark.parametrize("make", FORMATS)
+    def test_an_isolated_variable(self, make):
+        e, a = np.diag([1.0, 0, 0]), np.array([[-1.0, 0, 0], [1, -1, 0], [0, 0, 0]])
+        found = obsynth.eliminate_algebraic_states(obsynth.DescriptorSystem(make(e), make(a), C=[[1, 0, 0]]))
+        assert found.dropped == ("x3",)
+        assert found.recovery.names == ("x1", "x2")
+        # 0 = f says something, and a measured variable acts on something.
+        for others in ({"C": [[1, 0, 0]], "Bf": [[0], [0], [1]]}, {"C": [[1, 0, 1]]}):
+            with pytest.raises(obsynth.PreconditionError, match=r"'x3' is in too few .* 3 \(of 'x3'\)"):
+                obsynth.eliminate_algebraic_states(obsynth.DescriptorSystem(make(e), make(a), **others))
+
+    @pytest.mark.parametrize("make", FORMATS)
+    def test_washouts_in_a_chain(self, make):
+        # 0 = x1 - x2, 0 = 9 (x1 - x2) for the output x3; 0 = x3 - x4, 0 = 2 (x3 - x4) for the output x5.
+        e, a = np.zeros((5, 5)), np.zeros((5, 5))
+        e[0, 0], a[0, 0] = 1.0, -1.0
+        a[1, :2], a[2, :2], a[3, 2:4], a[4, 2:4] = [1, -1], [9, -9], [1, -1], [2, -2]
+        units = 10.0 ** np.array([0, 6, -7, 5, -8])[:, None]
+        for rows in (np.ones((5, 1)), units):
+            plant = obsynth.DescriptorSystem(make(rows * e), make(rows * a), C=[[1, 0, 0, 0, 0]])
+            found = obsynth.eliminate_algebraic_states(plant)
+            assert found.dropped == ("x3", "x4", "x5")
+            np.testing.assert_allclose(found.plant.A, [[-1.0]])
+        with pytest.raises(obsynth.PreconditionError, match="not determine 'x3', 'x4'"):
+            obsynth.eliminate_algebraic_states(plant.replace(C=[[1, 0, 1, 0, 0]]))
+
+    @pytest.mark.parametrize("make", FORMATS)
+    def test_what_only_such_a_variable_drives(self, make):
+        # x4 is the derivative of x1, x5 a lag of it that nothing depends on.
+        e, a = np.diag([1.0, 1.0, 0, 0, 0.1]), np.zeros((5, 5))
+        a[:4, :4] = self.A
+        a[4, 3], a[4, 4] = 1.0, -1.0
+        plant = obsynth.DescriptorSystem(make(e), make(a), C=[[1, 0, 0, 0, 0]])
+        found = obsynth.eliminate_algebraic_states(plant)
+        assert found.dropped == ("x4", "x5")
+        np.testing.assert_allclose(found.plant.A, [[-1.0]])
+        with pytest.raises(obsynth.PreconditionError, match="index 2"):
+            obsynth.eliminate_algebraic_states(plant.replace(C=[[1, 0, 0, 0, 1]]))
+
+    @pytest.mark.parametrize("make", FORMATS)
+    def test_a_derivative_of_a_state_is_kept(self, make):
+        # x2 = x1' needs no differentiation; x3 has no equation.
+        e, a = np.array([[1.0, 0, 0], [1, 0, 0], [0, 0, 0]]), np.array([[-2.0, 0, 0], [0, 1, 0], [0, 0, 0]])
+        found = obsynth.eliminate_algebraic_states(obsynth.DescriptorSystem(make(e), make(a), C=[[1, 0, 0]]))
+        assert found.dropped == ("x3",)
+        np.testing.assert_allclose(found.recovery.from_state, [[1.0], [-2.0]])
+
+    @pytest.mark.parametrize("make", [sp.csr_array, np.array])
+    def test_numbers_are_those_of_the_plant_as_given(self, make):
+        # The first variable and the second equation are left out; measured x5 asks for a derivative.
+        e, a = np.zeros((6, 6)), np.zeros((6, 6))
+        e[1, 1], e[2, 2], e[5, 5], a[5, 5] = 1.0, 1.0, 1.0, -1.0
+        a[0, 2], a[0, 1], a[1, 0], a[2, 2], a[2, 4] = 1, -1, 1, -1, 1
+        a[3, 2], a[3, 3], a[4, 2], a[4, 3] = 1, -1, 3, -2
+        plant = obsynth.DescriptorSystem(make(e), make(a), C=[[0, 0, 0, 0, 1, 1]])
+        with pytest.raises(obsynth.PreconditionError, match=r"5 \(of 'x5'\).* not determine 'x5'") as caught:
+            obsynth.eliminate_algebraic_states(plant)
+        assert caught.value.condition == "index"
+
+    def test_a_large_singular_pencil_is_no_index(self):
+        network = random_network(200, 60, 2)
+        a = network.A.toarray()
+        row = network.names.index("v Bus 2")
+        a[row] = 2.0 * a[network.names.index("a Bus 2")]
+        plant = obsynth.DescriptorSystem(network.E.toarray(), a, C=list(network.outputs), state_names=network.names)
+        with pytest.raises(obsynth.PreconditionError, match=f"not regular.*{row + 1} ") as caught:
+            obsynth.eliminate_algebraic_states(plant)
+        assert caught.value.condition == "regularity"
 
     @pytest.mark.parametrize("make", FORMATS)
     def test_a_repetition_that_a_fault_enters_is_none(self, make):
@@ -181,6 +249,32 @@ class TestIdleVariables:
         with pytest.raises(obsynth.PreconditionError) as caught:
             obsynth.eliminate_algebraic_states(plant)
         assert caught.value.condition == "regularity"
+
+
+class TestUnits:
+    """Nothing is found singular, and no derivative lost, because of the units that equations and variables are in."""
+
+    @pytest.mark.parametrize(("rows", "columns"), [(10, 0), (0, 6), (6, 6), (10, 10)])
+    def test_decades(self, rows, columns):
+        network = random_network(300, 60, 11)
+        rng, count = np.random.default_rng(0), len(network.names)
+        left, right = (sp.diags_array(10.0 ** rng.uniform(-d, d, count)) for d in (rows, columns))
+        plant = network.plant(Bf=None, Bd=None, disturbance_names=None)
+        found = obsynth.eliminate_algebraic_states(plant.replace(E=left @ plant.E @ right, A=left @ plant.A @ right))
+        assert set(found.dropped) == set(network.idle)
+        assert found.plant.state_names == network.dynamic
+        units = right.diagonal()[[network.names.index(name) for name in network.dynamic]]
+        truth = network.truth()
+        np.testing.assert_allclose(units[:, None] * found.plant.A / units, truth, atol=1e-12 * np.max(np.abs(truth)))
+
+    def test_scales_by_all_entries(self):
+        rng = np.random.default_rng(1)
+        matrix = sp.random_array((60, 60), density=0.1, rng=rng) + sp.eye_array(60)
+        rows, columns = (2.0 ** rng.integers(-40, 40, 60) for _ in range(2))
+        plain = scales_by_all_entries(sp.csr_array(matrix))
+        other = scales_by_all_entries(sp.csr_array(rows[:, None] * matrix.toarray() * columns))
+        ratios = np.log2(np.outer(*other) * np.outer(rows, columns) / np.outer(*plain))
+        assert np.max(np.abs(ratios)) <= 2.0
 
 
 class TestMethods:

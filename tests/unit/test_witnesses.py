@@ -135,6 +135,11 @@ CASES: dict[str, tuple[Callable[[DescriptorSystem], tuple[Condition, ...]], Desc
         made([[1, 1], [1, 1 + LITTLE]], [[0.5, 0], [0.5, 0.2]], C=[[1, 1]], dt=0.1),
         "rank [E; C]",
     ),
+    "kalman: an algebraic state": (
+        kalman,
+        made([[1, 1], [0, 0]], [[0.5, 0], [0.25, 1]], C=[[1, 1 + LITTLE]], dt=0.1),
+        "rank [E; C]",
+    ),
     "adaptive: parameters": (
         adaptive,
         made(None, [[0.5, 0], [0.5, 0.2]], C=np.eye(2), Bf=[[1, 1], [1, 1 + LITTLE]], dt=0.1),

@@ -13,11 +13,7 @@ from obsynth.plants.descriptor import DescriptorSystem
 
 @dataclass(frozen=True)
 class Condition:
-    """One existence condition, as in its ``source``: whether ``value`` meets ``bound``, and the evidence (``detail``).
-
-    ``mode``: the eigenvalue or zero at which it fails; ``unclear``: why it holds or fails only as far as the data can
-    tell, where that is so.
-    """
+    """One existence condition: ``value`` against ``bound``, the evidence, the ``mode`` where it fails, a doubt."""
 
     name: str
     claim: str

@@ -193,10 +193,7 @@ LEADING_SHARE = 0.1
 
 @dataclass(frozen=True, eq=False)
 class IndexReport:
-    """Index of a DAE at one point: 1, 2, 3, ...; 0 where the matrix of (7) is singular for every step.
-
-    ``conditions``: of (7), equilibrated, at the shortened steps; ``equations``, ``states``: involved where it is not 1.
-    """
+    """Index of a DAE at a point, 0 where (7) is always singular; its conditions at short steps, and who is involved."""
 
     index: int
     conditions: tuple[float, ...]

@@ -24,10 +24,7 @@ IntArray: TypeAlias = NDArray[np.intp]
 
 
 class StepBlocks(NamedTuple):
-    """The matrices of one step as a filter uses them, without noise and inputs.
-
-    ``E, A (rows, nx)``, ``Phi (rows, nq)``: the equations of x(k + 1); ``C (outputs, nx)``, ``Psi (outputs, nq)``.
-    """
+    """The matrices of one step as a filter uses them: equations ``(rows, ...)`` of x(k + 1), and outputs."""
 
     E: FloatArray
     A: FloatArray

@@ -95,10 +95,7 @@ _PATH_TO_BOUNDARY = (1.0, 0.75, 0.5, 0.25)
 
 @dataclass(frozen=True, eq=False)
 class Zero:
-    """An invariant zero and the direction ``(nx,)``, ``(nu,)``, of unit norm, that stays invisible there.
-
-    ``input_share``: size of the input part when the pencil is equilibrated, so that units do not matter.
-    """
+    """An invariant zero, its direction of unit norm, and the input's share of that when the pencil is equilibrated."""
 
     value: complex
     state_direction: ComplexArray
@@ -187,10 +184,7 @@ def zero_at(E: FloatArray, A: FloatArray, value: complex, B: FloatArray, C: Floa
 
 
 def hidden_direction(plant: DescriptorSystem, *, missing: int) -> tuple[FloatArray, tuple[str, ...]]:
-    """Return the faults that never show, for a pencil from faults to outputs of which ``missing`` ranks are lost.
-
-    The direction ``(nf,)`` is the one in the null space at a generic point with the largest fault part.
-    """
+    """Return the faults that never show, and their direction ``(nf,)`` in the null space at a generic point."""
     pencil = equilibrate_pencil(*system_pencil(plant.E, plant.A, plant.Bf, plant.C, plant.Df))
     kernels = []
     for point in _GENERIC_POINTS:

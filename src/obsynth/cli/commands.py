@@ -191,7 +191,7 @@ def _structure_as_dict(structure: Structure) -> dict[str, Any]:
 
 def _is_alarm(path: Path) -> bool:
     """Whether a file begins like the certificate of an alarm."""
-    from obsynth.experiments.alarm_proofs.proof import CERTIFICATE
+    from obsynth.experiments.alarm_proof import CERTIFICATE
 
     if not path.is_file():  # who reads it says so
         return False
@@ -205,7 +205,7 @@ def _is_alarm(path: Path) -> bool:
 def run_verify(options: argparse.Namespace) -> int:
     """Run ``verify``: recheck a saved gain set, or the certificate of an alarm, without a solver."""
     if _is_alarm(options.gains):
-        from obsynth.experiments.alarm_proofs.certificate import verify_alarm
+        from obsynth.experiments.alarm_proof import verify_alarm
         from obsynth.results.layout import print_checks
 
         report = verify_alarm(options.gains)

@@ -83,7 +83,7 @@ def run_export(options: argparse.Namespace) -> int:
 
 def run_prove_alarm(options: argparse.Namespace) -> int:
     """Run ``prove-alarm``: 0 whether there is a proof or not; every failure is an error."""
-    from obsynth.experiments.alarm_proofs.proof import CERTIFICATE
+    from obsynth.experiments.alarm_proof import CERTIFICATE
     from obsynth.results.gain_sets import load
 
     design = load(options.gains)

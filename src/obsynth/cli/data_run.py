@@ -16,7 +16,7 @@ from obsynth.files.inputs import protect, protect_stream
 
 if TYPE_CHECKING:
     from obsynth.data.run import DataRun
-    from obsynth.experiments.alarm_proofs.proof import AlarmProof
+    from obsynth.experiments.alarm_proof import AlarmProof
     from obsynth.experiments.monitors.online import OnlineMonitor
     from obsynth.plants.uncertainty import Uncertainty
     from obsynth.results.design import ObserverDesign
@@ -200,7 +200,7 @@ def certificate_target(options: argparse.Namespace) -> Path | None:
     """Return where ``run --prove`` writes its certificate; refuse what cannot be proved before any work is done."""
     if options.prove is None:
         return None
-    from obsynth.experiments.alarm_proofs.proof import CERTIFICATE
+    from obsynth.experiments.alarm_proof import CERTIFICATE
 
     if options.monitor != "pointwise":
         raise SpecError("--prove is for alarms of --monitor pointwise.", path="--prove")

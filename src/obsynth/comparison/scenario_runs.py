@@ -12,7 +12,7 @@ from obsynth.numerics.continuous import driven
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.simulation.scenario import Scenario
-from obsynth.simulation.scenario_signals import resolve
+from obsynth.simulation.signals import resolve
 from obsynth.tolerances.exact_plant import plant_at
 
 #: Entries of A, B, Bf, Bd that tolerances do not touch: they are kinematics, not parameters.

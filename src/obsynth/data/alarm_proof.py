@@ -12,7 +12,7 @@ from obsynth.data.linear_log import DataObserver
 from obsynth.data.signals import Signals
 from obsynth.data.sources import Data, samples
 from obsynth.errors import SpecError
-from obsynth.experiments.alarm_proofs.proof import WINDOW, AlarmProof, proved_alarm
+from obsynth.experiments.alarm_proof import WINDOW, AlarmProof, proved_alarm
 from obsynth.numerics.arguments import is_whole, require_kind, require_mapping
 from obsynth.results.design import ObserverDesign
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.numerics.continuous import driven, first_order_hold
 from obsynth.numerics.ranks import covariance_factor
@@ -22,10 +21,9 @@ from obsynth.plants.sequences import MatrixSequence
 from obsynth.plants.validation import index_of
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.dae import simulate_dae
-from obsynth.simulation.linear import Stepper, make_stepper
-from obsynth.simulation.scenario import Scenario
-from obsynth.simulation.scenario_signals import Drive, resolve, resolve_parameters
-from obsynth.simulation.time_varying import varying_runs
+from obsynth.simulation.linear import Stepper, make_stepper, varying_runs
+from obsynth.simulation.scenario import Scenario, observer_start
+from obsynth.simulation.signals import Drive, resolve, resolve_parameters
 
 #: Warm-up ends when the effect of an error at the start has shrunk to this share of its largest, for good.
 WARM_UP_SHARE = 0.01
@@ -145,14 +143,11 @@ def make_bench(design: ObserverDesign, scenario: Scenario) -> LinearBench:
     drive = resolve(plant, scenario)
     start = np.array([scenario.initial_state.get(name, 0.0) for name in plant.state_names])
     stepper = make_stepper(plant, drive, initial_state=start, stabilise=scenario.stabilise)
-    given = scenario.observer_state
-    if given is not None and len(given) != observer.order:
-        raise SpecError(f"observer_state needs {observer.order} numbers, not {len(given)}.", path="observer_state")
+    begin = observer_start(scenario, observer.order)
     ramp = np.zeros((observer.order, len(observer.input_names) + len(observer.output_names)))
     if observer.dt <= 0.0:
         ramp = first_order_hold(observer.Az, np.hstack([observer.Bu, observer.By]), drive.dt)[2]
         observer = sample_observer(observer, drive.dt)
-    begin = np.zeros(observer.order) if given is None else np.array(given)
     said = ((not plant.is_discrete, BETWEEN_SAMPLES), (stepper.feedback is not None, STABILISED))
     return LinearBench(
         drive, observer, start, slice(plant.nu, plant.nu + plant.nf),

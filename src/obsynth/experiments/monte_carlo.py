@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from types import MappingProxyType
-from typing import cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.experiments.benches import Bench, LinearBench, Runs, bench_of, make_bench
-from obsynth.experiments.evaluation import Evaluation, Interval, mean, share
 from obsynth.experiments.monitors.monitor import Monitor
 from obsynth.experiments.simulation import aligned_errors
 from obsynth.numerics.arguments import OpenUnitInterval, checked_value, require_kind, whole_number
@@ -26,12 +25,100 @@ from obsynth.results.design import ObserverDesign
 from obsynth.simulation.scenario import Scenario
 from obsynth.tolerances.exact_plant import drawn_points, plant_at
 
+
+@dataclass(frozen=True)
+class Interval:
+    """A number estimated from runs.
+
+    Parameters
+    ----------
+    value : float
+        The share, or the mean; NaN without any run that counts.
+    low, high : float
+        Confidence interval; NaN where too few runs count.
+    count : int
+        Runs that count.
+    """
+
+    value: float
+    low: float
+    high: float
+    count: int
+
+
+def share(hits: int, count: int, confidence: float) -> Interval:
+    """Return a share with its exact (Clopper-Pearson) interval."""
+    from scipy.special import betaincinv
+
+    if count == 0:
+        return Interval(float("nan"), float("nan"), float("nan"), 0)
+    tail = (1.0 - confidence) / 2.0
+    low = 0.0 if hits == 0 else float(betaincinv(hits, count - hits + 1, tail))
+    high = 1.0 if hits == count else float(betaincinv(hits + 1, count - hits, 1.0 - tail))
+    return Interval(hits / count, low, high, count)
+
+
+def mean(values: FloatArray, confidence: float) -> Interval:
+    """Return a mean with Student's interval; NaN among the values does not count."""
+    from scipy.special import stdtrit
+
+    known = values[~np.isnan(values)]
+    centre = float(np.mean(known)) if known.size else float("nan")
+    if known.size < 2:
+        return Interval(centre, float("nan"), float("nan"), int(known.size))
+    half = float(stdtrit(known.size - 1, (1.0 + confidence) / 2.0) * np.std(known, ddof=1) / np.sqrt(known.size))
+    return Interval(centre, centre - half, centre + half, int(known.size))
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """What many runs of a scenario say, each number with its confidence interval.
+
+    Parameters
+    ----------
+    runs : int
+        Run i has the scenario's seed plus i.
+    confidence : float
+        Of the intervals.
+    false_alarm_rate : Interval
+        Share of the runs with an alarm before the first fault; of all runs where the scenario has none.
+    missed_detection_rate : Interval
+        Share of the runs without an alarm from the first fault on; of no runs without a fault.
+    detection_delay : Interval
+        Seconds from the first fault to the first alarm after it, mean over the runs that have one.
+    isolation_error_rate : Interval
+        Share of the detections that name a fault which did not act until then; of no runs where no fault of the plant
+        acts.
+    fault_rmse, state_rmse : mapping of str to Interval
+        Root mean square error after warm-up of each estimate, mean over runs; of recursive designs, which state how
+        uncertain they are from the start, over the whole record but its first row.
+    """
+
+    runs: int
+    confidence: float
+    false_alarm_rate: Interval
+    missed_detection_rate: Interval
+    detection_delay: Interval
+    isolation_error_rate: Interval
+    fault_rmse: Mapping[str, Interval]
+    state_rmse: Mapping[str, Interval]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return everything as plain data."""
+        found: dict[str, Any] = {}
+        for name, value in vars(self).items():
+            if isinstance(value, Mapping):
+                found[name] = {signal: asdict(item) for signal, item in value.items()}
+            else:
+                found[name] = asdict(value) if isinstance(value, Interval) else value
+        return found
+
+
 #: Numbers that a batch of runs may hold at once, per signal: what keeps memory small and one task worth sending.
 BATCH_SAMPLES = 100_000
 
 
-@dataclass(frozen=True, eq=False)
-class _Task:
+class _Task(NamedTuple):
     """What a worker needs; plain data and arrays."""
 
     bench: Bench
@@ -115,23 +202,22 @@ def evaluate(
     bench = bench_of(design, scenario)
     _require_fit(bench, monitor, plants)
     benches = [bench] if plants is None else _drawn_benches(design, scenario, plants)
-    share, size = -(-len(seeds) // len(benches)), max(1, BATCH_SAMPLES // bench.drive.steps)
+    size = max(1, BATCH_SAMPLES // bench.drive.steps)
     # The first row of a plant with parameters is what was known before: no sample has been used.
     states, faults = ((end or 0) if isinstance(bench, LinearBench) else 1 for end in bench.warm_ups())
     tasks = [
-        _Task(one, monitor, (states, faults), tuple(seeds[i : min(i + size, (number + 1) * share)]))
-        for number, one in enumerate(benches)
-        for i in range(number * share, min((number + 1) * share, len(seeds)), size)
+        _Task(one, monitor, (states, faults), tuple(seeds[i] for i in part[begin : begin + size]))
+        for one, part in zip(benches, np.array_split(np.arange(runs), len(benches)), strict=True)
+        for begin in range(0, len(part), size)
     ]
-    results: list[dict[str, FloatArray]] = [{} for _ in tasks]
-    finished = 0
+    results, finished = [dict[str, FloatArray]() for _ in tasks], 0
     with progress_of_runs(progress) as told:
         for i, found in as_they_come(_run, tasks, executor):
             results[i], finished = found, finished + len(found["false"])
             if told is not None:
                 told(finished, runs)
     parts = {name: np.concatenate([part[name] for part in results]) for name in results[0]}
-    return _summed(parts, design, bench.onset, bench.drive.dt, watched=monitor is not None, level=confidence)
+    return _summed(parts, design, bench, watched=monitor is not None, level=confidence)
 
 
 def _require_fit(bench: Bench, monitor: Monitor | ParameterMonitor | None, plants: int | None) -> None:
@@ -143,9 +229,8 @@ def _require_fit(bench: Bench, monitor: Monitor | ParameterMonitor | None, plant
     if plants is not None:
         raise SpecError("plants are drawn for linear designs of a plant with tolerances.", path="plants")
     if isinstance(monitor, Monitor):
-        raise SpecError(
-            "This design is recursive or nonlinear: give monitor=obsynth.ParameterMonitor(...).", path="monitor"
-        )
+        raise SpecError("This design is recursive or nonlinear: give monitor=obsynth.ParameterMonitor(...).",
+                        path="monitor")  # fmt: skip
 
 
 def _drawn_benches(design: ObserverDesign, scenario: Scenario, plants: int) -> list[Bench]:
@@ -192,30 +277,23 @@ def _judged_parameters(watched: ParameterMonitor, bench: Bench, estimates: Estim
 
 
 def _summed(
-    parts: Mapping[str, FloatArray],
-    design: ObserverDesign,
-    onset: int | None,
-    dt: float,
-    *,
-    watched: bool,
-    level: float,
+    parts: Mapping[str, FloatArray], design: ObserverDesign, bench: Bench, *, watched: bool, level: float
 ) -> Evaluation:
+    onset = bench.onset
     runs, observer = len(parts["false"]), design.observer
     detected, judged = ~np.isnan(parts["found"]), ~np.isnan(parts["wrong"])
     counted = runs if watched else 0
     faulty = counted if onset is not None else 0
-    delays = np.array([]) if not watched or onset is None else (parts["found"] - onset) * dt
+    delays = np.array([]) if not watched or onset is None else (parts["found"] - onset) * bench.drive.dt
 
     def errors(name: str, signals: tuple[str, ...]) -> Mapping[str, Interval]:
         return MappingProxyType({signal: mean(parts[name][:, i], level) for i, signal in enumerate(signals)})
 
     return Evaluation(
-        runs=runs,
-        confidence=level,
+        runs, level,
         false_alarm_rate=share(int(np.nansum(parts["false"])), counted, level),
         missed_detection_rate=share(faulty - int(np.sum(detected)) if faulty else 0, faulty, level),
         detection_delay=mean(delays, level),
         isolation_error_rate=share(int(np.nansum(parts["wrong"])), int(np.sum(judged)), level),
-        fault_rmse=errors("faults", observer.fault_names),
-        state_rmse=errors("states", observer.state_names),
-    )
+        fault_rmse=errors("faults", observer.fault_names), state_rmse=errors("states", observer.state_names),
+    )  # fmt: skip

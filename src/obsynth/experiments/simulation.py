@@ -24,10 +24,9 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.dae import simulate_dae
-from obsynth.simulation.linear import simulate_plant
+from obsynth.simulation.linear import simulate_plant, simulate_time_varying
 from obsynth.simulation.scenario import Scenario
-from obsynth.simulation.time_varying import simulate_time_varying
-from obsynth.simulation.trajectory import Trajectory
+from obsynth.simulation.signals import Trajectory
 
 #: A table that `Simulation.write_csv` has written: signals of the plant beside time, and no status of rows.
 SIGNALS = FileKind("a table of simulated signals", rb"\Atime,(?!status,)[^\n]*x(hat)?\[")

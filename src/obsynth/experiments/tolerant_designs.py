@@ -65,13 +65,13 @@ def with_model_error(
     begin = mean_thresholds(first, quiet)
     found = robustness(first)
     affine = affine_plant(plant)
-    directions = list(_directions(affine, plant, found.rows, found.blame))
-    size = _size(plant)
+    # Noise of the size of the largest disturbance or noise column; of one where there is none.
+    columns = np.hstack([plant.Bd, plant.Bw])
+    size = float(np.linalg.norm(columns, axis=0).max()) if columns.any() else float(np.sqrt(plant.nx))
     chosen: _Candidate | None = None
-    design, score, tried = first, 1.0, 1
-    todo = [_with_noise(plant, what, column, size) for what, column in directions]
+    design, score, tried, refined = first, 1.0, 1, False
+    todo = [_with_noise(plant, what, at, size) for what, at in _directions(affine, plant, found.rows, found.blame)]
     todo += list(_unknown_inputs(affine, plant, found.blame))
-    refined = False
     while todo:
         item = todo.pop(0)
         progress(f"designing with {item.what} ({len(todo)} more)")
@@ -117,12 +117,6 @@ def _scored(
         return None
 
 
-def _size(plant: DescriptorSystem) -> float:
-    """Return the size of the largest disturbance or noise column; one where there is none."""
-    columns = np.hstack([plant.Bd, plant.Bw]) if plant.Bd.any() or plant.Bw.any() else np.ones((plant.nx, 1))
-    return float(np.linalg.norm(columns, axis=0).max())
-
-
 def _directions(
     affine: AffinePlant, plant: DescriptorSystem, rows: Mapping[str, float], blamed: Mapping[str, float]
 ) -> Iterator[tuple[str, FloatArray]]:
@@ -130,8 +124,7 @@ def _directions(
     chosen = sorted(rows, key=lambda name: -rows[name])[:MOST_ROWS]
     for name in chosen:
         yield f"noise in the equation of {name}", np.eye(plant.nx)[:, [plant.state_names.index(name)]]
-    for name in _most_blamed(affine, blamed):
-        columns = _acting(affine, affine.box.names.index(name))
+    for name, _, columns in _most_blamed(affine, blamed):
         if columns.shape[1] == 1 and np.count_nonzero(columns) > 1:
             yield f"noise where {name} acts", columns
     if len(chosen) > 1:
@@ -139,17 +132,12 @@ def _directions(
         yield f"noise in the equations of {', '.join(chosen)}", columns
 
 
-def _most_blamed(affine: AffinePlant, blamed: Mapping[str, float]) -> list[str]:
-    return sorted((name for name in affine.box.names if blamed.get(name)), key=lambda name: -blamed[name])[
-        :MOST_CONSTANTS
-    ]
-
-
-def _acting(affine: AffinePlant, i: int) -> FloatArray:
-    """Return where a constant acts to first order: unit columns of the plant's equations."""
-    parts = np.hstack([affine.A.parts[i], affine.E.parts[i]])
-    left, values, _ = np.linalg.svd(parts)
-    return np.asarray(left[:, : int(np.sum(values > ACTING_TOLERANCE * max(values[0], SMALLEST)))])
+def _most_blamed(affine: AffinePlant, blamed: Mapping[str, float]) -> Iterator[tuple[str, int, FloatArray]]:
+    """Yield name and place of the constants most to blame, and where each acts to first order: unit columns."""
+    for name in sorted(filter(blamed.get, affine.box.names), key=lambda name: -blamed[name])[:MOST_CONSTANTS]:
+        i = affine.box.names.index(name)
+        left, values, _ = np.linalg.svd(np.hstack([affine.A.parts[i], affine.E.parts[i]]))
+        yield name, i, left[:, : int(np.sum(values > ACTING_TOLERANCE * max(values[0], SMALLEST)))]
 
 
 def _with_noise(plant: DescriptorSystem, what: str, columns: FloatArray, weight: float) -> _Candidate:
@@ -163,9 +151,8 @@ def _with_noise(plant: DescriptorSystem, what: str, columns: FloatArray, weight:
 def _unknown_inputs(affine: AffinePlant, plant: DescriptorSystem, blamed: Mapping[str, float]) -> Iterator[_Candidate]:
     """Yield plants with a constant's direction as an unknown input, where the exact test allows that."""
     told = told_from_faults(plant)
-    for name in _most_blamed(affine, blamed):
-        columns = _acting(affine, affine.box.names.index(name))
-        if told[name].separable and columns.shape[1] == 1 and not affine.C.parts[affine.box.names.index(name)].any():
+    for name, i, columns in _most_blamed(affine, blamed):
+        if told[name].separable and columns.shape[1] == 1 and not affine.C.parts[i].any():
             more = plant.replace(
                 Bd=np.hstack([plant.Bd, columns]), Dd=np.hstack([plant.Dd, np.zeros((plant.ny, 1))]),
                 disturbance_names=(*plant.disturbance_names, f"error of {name}"),

@@ -156,14 +156,9 @@ def _for_the_state(
     plant: DescriptorSystem, options: Mapping[str, Any], possible: list[str], maker: Maker
 ) -> ObserverDesign:
     """Return an observer of the state: there are no faults."""
-    order = (
-        ["ui-pi-observer", "descriptor-kalman"]
-        if plant.nd or not plant.nw
-        else [
-            "descriptor-kalman",
-            "ui-pi-observer",
-        ]
-    )
+    order = ["ui-pi-observer", "descriptor-kalman"]
+    if plant.nw and not plant.nd:
+        order.reverse()
     refusals = []
     for method in [name for name in order if name in possible]:
         try:

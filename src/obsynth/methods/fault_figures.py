@@ -63,12 +63,10 @@ class FaultFigures:
         return abs(self.at_horizon - 1.0) <= REACHED and np.isfinite(self.most)
 
 
-def on_the_clock(plant: DescriptorSystem, sample_time: float | None) -> DescriptorSystem:
-    """Return the plant sampled, without algebraic states."""
+def on_the_clock(plant: DescriptorSystem, sample_time: float) -> DescriptorSystem:
+    """Return the plant sampled, in its own time where it is so already, without algebraic states."""
     if plant.dt > 0.0:
         return eliminate_algebraic_states(plant).plant
-    if sample_time is None:
-        raise ValueError
     return discretise(plant, sample_time).plant
 
 

@@ -66,9 +66,14 @@ def plain(value: Any) -> Any:
     return [plain(part) for part in value] if isinstance(value, (list, tuple)) else value
 
 
-@cache
 def option_types(options: type[MethodOptions]) -> dict[str, Any]:
     """Return name -> annotated type of every option."""
+    kind: Any = options  # a dataclass is hashable, whatever type checkers say
+    return _option_types(kind)
+
+
+@cache
+def _option_types(options: Any) -> dict[str, Any]:
     hints = get_type_hints(options, include_extras=True)
     return {field.name: hints[field.name] for field in fields(options)}
 

@@ -115,6 +115,36 @@ def coarse_structure(pattern: Any) -> CoarseStructure:
     return CoarseStructure(row_of_column, over_rows, over_columns, under_rows, under_columns)
 
 
+def unmatched_instead(pattern: Any, found: CoarseStructure, rows: Indices) -> Indices | None:
+    """Return as many of some rows, the first ones if possible, as a maximum matching leaves unmatched.
+
+    ``None`` where no maximum matching leaves only such rows without a column.
+    """
+    row_of_column = found.row_of_column.copy()
+    unmatched = np.setdiff1d(np.arange(pattern.shape[0]), row_of_column)
+    chosen = list[int]()
+    for start in map(int, unmatched):
+        came_from = {start: (-1, -1)}
+        waiting = [start]
+        while waiting:
+            row = waiting.pop()
+            for column in map(int, pattern.indices[pattern.indptr[row] : pattern.indptr[row + 1]]):
+                other = int(row_of_column[column])
+                if other not in came_from:
+                    came_from[other] = (row, column)
+                    waiting.append(other)
+        end = next((row for row in map(int, rows) if row in came_from and row not in chosen), None)
+        if end is None:
+            return None
+        chosen.append(end)
+        # Each row on the way takes the column of the next one.
+        while end != start:
+            row, column = came_from[end]
+            row_of_column[column] = row
+            end = row
+    return np.array(sorted(chosen), dtype=np.int64)
+
+
 def _alternating(matrix: Any, start: Indices, back: Indices) -> tuple[Indices, Indices]:
     """Return rows and columns on paths from ``start`` (rows) along any entry to a column and back to its own row."""
     seen_rows, seen_columns = set(map(int, start)), set[int]()

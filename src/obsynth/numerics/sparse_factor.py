@@ -18,6 +18,8 @@ from obsynth.numerics.sparse import csr
 CHUNK = 256
 #: Sweeps of the scaling; two bring every largest entry near one.
 SCALING_SWEEPS = 3
+#: Steps and relative accuracy of the scaling by all entries, whose unknowns are exponents of two.
+SCALING_STEPS, SCALING_ACCURACY = 400, 1e-4
 #: Steps of inverse iteration for the smallest singular value: the gap to the next decides, and few are needed.
 INVERSE_STEPS = 6
 #: Relative size of what is added to the diagonal of a factor that SuperLU calls singular, to find its null vectors.
@@ -53,14 +55,18 @@ class NullVectors:
 
 
 class SparseFactor:
-    """LU factors of a square sparse matrix, with rows and columns scaled by powers of two."""
+    """LU factors of a square sparse matrix, with rows and columns scaled by powers of two.
 
-    def __init__(self, matrix: Any) -> None:
+    By their largest entries; with ``by_all`` such that all entries are near one first, whatever units they are in.
+    """
+
+    def __init__(self, matrix: Any, *, by_all: bool = False) -> None:
         from scipy.sparse import csc_array, diags_array, eye_array
         from scipy.sparse.linalg import splu
 
         given = csr(matrix)
-        self.rows, self.columns = np.ones(given.shape[0]), np.ones(given.shape[1])
+        ones = np.ones(given.shape[0]), np.ones(given.shape[1])
+        self.rows, self.columns = scales_by_all_entries(given) if by_all else ones
         for _ in range(SCALING_SWEEPS):
             self.rows /= power_of_two_below(_peaks(_scaled(given, self.rows, self.columns), axis=1))
             self.columns /= power_of_two_below(_peaks(_scaled(given, self.rows, self.columns), axis=0))
@@ -134,10 +140,6 @@ class SparseFactor:
             found[:, part] = self.columns[:, None] * unknown
         return found, worst
 
-    def solve_unrefined(self, right: FloatArray) -> FloatArray:
-        """Return ``matrix^-1 right`` as the factors give it: of a singular matrix, mostly its null vectors."""
-        return np.asarray(self.columns[:, None] * self._lu.solve(self.rows[:, None] * right))
-
     def solve_transposed(self, right: FloatArray) -> FloatArray:
         """Return ``matrix^-T right``, refined once."""
         if not self.size:
@@ -169,6 +171,38 @@ class SparseFactor:
         signs = np.random.default_rng(2).choice((-1.0, 1.0), (SAMPLES, *terms.shape))
         squares = [self._lu.solve(part * terms) ** 2 for part in signs]
         return np.asarray(self.columns[:, None] * np.sqrt(np.mean(squares, axis=0)))
+
+
+def sparse_factor(matrix: Any) -> SparseFactor:
+    """Return the factors of a matrix; scaled by all of its entries where it looks singular scaled by the largest."""
+    found = SparseFactor(matrix)
+    return SparseFactor(matrix, by_all=True) if found.singular else found
+
+
+def scales_by_all_entries(matrix: Any) -> tuple[FloatArray, FloatArray]:
+    """Return powers of two for rows and columns after which the logarithms of all entries are least in squares.
+
+    A matrix in other units has the same scaled form, but for roundings to powers of two.  Source: A. R. Curtis,
+    J. K. Reid, *On the automatic scaling of matrices for Gaussian elimination*, J. Inst. Maths Applics 10, 1972.
+    """
+    from scipy.sparse import block_array, coo_array, diags_array
+    from scipy.sparse.linalg import cg
+
+    count = matrix.shape[0]
+    entries = coo_array(matrix)
+    entries.eliminate_zeros()
+    sizes = np.log2(np.abs(entries.data))
+    pattern = coo_array((np.ones(len(sizes)), (entries.row, entries.col)), shape=matrix.shape)
+    sums = np.concatenate([
+        np.bincount(entries.row, weights=sizes, minlength=count),
+        np.bincount(entries.col, weights=sizes, minlength=matrix.shape[1]),
+    ])  # fmt: skip
+    numbers = np.asarray(pattern.sum(axis=1)).ravel(), np.asarray(pattern.sum(axis=0)).ravel()
+    system = csr(block_array([[diags_array(numbers[0]), pattern], [pattern.T, diags_array(numbers[1])]]))
+    weights = diags_array(1.0 / np.maximum(np.concatenate(numbers), 1.0))
+    found, _ = cg(system, -sums, rtol=SCALING_ACCURACY, maxiter=SCALING_STEPS, M=weights)
+    scales = np.exp2(np.round(found))
+    return scales[:count], scales[count:]
 
 
 def _chunks(count: int) -> Iterator[slice]:

@@ -171,10 +171,7 @@ def _size(given: Mapping[str, Any]) -> int:
 def _with_sensor_picks(
     asked: Mapping[str, Any], given: dict[str, FloatArray | None], outputs: Sequence[str]
 ) -> dict[str, tuple[str, ...]]:
-    """Append one signal for each sensor that Df or Dd names; return the names of the sensors by matrix.
-
-    ``given`` is changed: ``Df (ny, nf)`` and ``Bf (nx, nf)`` get a column for each, after those that are there.
-    """
+    """Append a column to Df, Bf (Dd, Bd) in ``given`` for each sensor that Df (Dd) names; return these."""
     found = {}
     for name, beside in SENSOR_PICKS.items():
         picked = asked[name]
@@ -192,10 +189,7 @@ def _with_sensor_picks(
 def _noise_of_sensors(
     sensor_noise: Any, given: dict[str, FloatArray | None], outputs: Sequence[str]
 ) -> tuple[str, ...]:
-    """Append one noise input for each sensor with a standard deviation; return the names of these.
-
-    ``given`` is changed: ``Bw (nx, nw)`` and ``Dw (ny, nw)`` get a column for each, after those that are there.
-    """
+    """Append a column to Bw, Dw in ``given`` for each sensor with a standard deviation; return their names."""
     if sensor_noise is None:
         return ()
     if not isinstance(sensor_noise, Mapping):

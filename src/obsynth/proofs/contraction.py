@@ -89,10 +89,7 @@ def column_norms(ball: Ball) -> FloatArray:
 
 
 def prove_contraction(matrix: FloatArray | Ball, *, discrete: bool, rate: float | None = None) -> Contraction | None:
-    """Return a proved contraction of every member of ``matrix (n, n)``; ``None`` where none is found.
-
-    With ``rate`` (modulus per step, or decay in 1/s) that rate alone is tried.
-    """
+    """Return a proved contraction of ``matrix (n, n)`` (with ``rate``, at that), or ``None`` where none is found."""
     ball = Ball.of(matrix)
     a = ball.midpoint
     if not a.size:
@@ -110,10 +107,7 @@ def prove_contraction(matrix: FloatArray | Ball, *, discrete: bool, rate: float 
 
 
 def proved_rate(matrix: FloatArray | Ball, known: Contraction | None = None) -> float | None:
-    """Return a modulus below one that is proved to contract in some norm, little above the spectral radius.
-
-    With ``known`` a contraction to fall back on is there already.
-    """
+    """Return a proved modulus below one, little above the spectral radius; at worst that of a ``known`` contraction."""
     ball = Ball.of(matrix)
     if not ball.midpoint.size:
         return 0.0

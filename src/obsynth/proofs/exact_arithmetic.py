@@ -207,10 +207,7 @@ class RootLocation:
 
 
 def locate_roots(polynomial: fmpz_poly, *, discrete: bool) -> RootLocation:
-    """Return the roots of a nonzero polynomial and where they are: exact, however close to the boundary.
-
-    ``discrete`` takes the open unit disk as the region of stability, and the open left half plane otherwise.
-    """
+    """Return the roots of a nonzero polynomial and where they are: exact, however close to the stability boundary."""
     if polynomial.degree() <= 0:
         return RootLocation(())
     coefficients = polynomial.coeffs()

@@ -104,10 +104,7 @@ class _Pivot(NamedTuple):
 
 
 def undecided_pivot(rows: list[list[Any]]) -> _Pivot | None:
-    """Return the first pivot of ``L D L'`` that is not certainly positive, ``None`` when all are.
-
-    Only the upper triangle is read: a symmetric member of the matrix lies in it.
-    """
+    """Return the first pivot of ``L D L'`` not certainly positive, if any; only the upper triangle is read."""
     size = len(rows)
     for k, pivot_row in enumerate(rows):
         pivot = pivot_row[k]

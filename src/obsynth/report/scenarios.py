@@ -12,8 +12,8 @@ from rich.console import Console
 from rich.text import Text
 
 from obsynth.comparison.result import Comparison
-from obsynth.experiments.evaluation import Evaluation, Interval
 from obsynth.experiments.monitors.monitor import Monitor
+from obsynth.experiments.monte_carlo import Evaluation, Interval
 from obsynth.experiments.simulation import Simulation
 from obsynth.observers.decisions import ParameterMonitor
 from obsynth.results.layout import headed_table, number, print_section

@@ -1,6 +1,6 @@
 """Simulated plants: exact recursions of discrete descriptor systems."""
 
 from obsynth.simulation.linear import simulate_plant
-from obsynth.simulation.trajectory import Trajectory
+from obsynth.simulation.signals import Trajectory
 
 __all__ = ["Trajectory", "simulate_plant"]

@@ -15,7 +15,7 @@ from obsynth.plants.dae.checks import checked_inputs, finite_vector, step_length
 from obsynth.plants.dae.functions import Compiled, DAEFunctions, take_samples
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.dae.step import ImplicitStep
-from obsynth.simulation.trajectory import Trajectory
+from obsynth.simulation.signals import Trajectory
 
 #: A step of backward Euler this much shorter than dt puts a state onto its constraint and moves it no further.
 PROJECTION_SHARE = 1e-6

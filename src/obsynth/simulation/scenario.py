@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any
 
+import numpy as np
+
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import is_finite_number, is_whole
+from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.validation import index_of
 from obsynth.simulation.profiles import KINDS, Additive, Failure, Profile, Random
@@ -99,8 +102,8 @@ class Scenario:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Return what makes it again in another process: read-only mappings do not travel."""
-        given = {item.name: getattr(self, item.name) for item in fields(self)}
-        return _made, ({name: dict(value) if isinstance(value, Mapping) else value for name, value in given.items()},)
+        given = {name: dict(value) if isinstance(value, Mapping) else value for name, value in vars(self).items()}
+        return _made, (given,)
 
     def replace(self, **changes: Any) -> Scenario:
         """Return the scenario with some fields changed, such as its seed.
@@ -163,6 +166,14 @@ class Scenario:
 def profiles_of(scenario: Scenario, group: str) -> list[tuple[str, Profile]]:
     """Return name and profile of everything that happens in a group of signals."""
     return [(name, profile) for name, profiles in getattr(scenario, group).items() for profile in profiles]
+
+
+def observer_start(scenario: Scenario, order: int) -> FloatArray:
+    """Return ``z(0)`` of an observer ``(order,)``."""
+    given = scenario.observer_state
+    if given is not None and len(given) != order:
+        raise SpecError(f"observer_state needs {order} numbers, not {len(given)}.", path="observer_state")
+    return np.zeros(order) if given is None else np.array(given)
 
 
 def _made(given: dict[str, Any]) -> Scenario:

@@ -14,7 +14,7 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.simulation.profiles import KINDS, Profile
 from obsynth.simulation.scenario import Scenario
-from obsynth.simulation.scenario_signals import check_parameters
+from obsynth.simulation.signals import check_parameters
 from obsynth.spec.documents import DocumentProblems, checked_plant, checked_spec, read_yaml
 from obsynth.spec.plants import boxed_constants, built_plant, joined, matlab_plant, read_value
 

@@ -26,10 +26,12 @@ from obsynth.proofs.affine import AffineMatrix
 from obsynth.results.design import ObserverDesign
 from obsynth.tolerances.error_structure import ErrorStructure, error_structure
 from obsynth.tolerances.exact_plant import (
+    Tracking,
     is_sampled,
     labels_of,
     moving_at,
     told_from_faults,
+    tracking_of,
     vertex_gains,
     written_matrices,
 )
@@ -44,7 +46,6 @@ from obsynth.tolerances.responses import (
 )
 from obsynth.tolerances.result import EXACT_MODEL, Robustness
 from obsynth.tolerances.subdivision import MOST_BOXES, BoxVerdict, index_one_on_box, proved_stable, values_at
-from obsynth.tolerances.tracking import Tracking, tracking_of
 
 #: Boxes for stability after which it is left open where most states are algebraic: each elimination takes long.
 FEW_BOXES = 40

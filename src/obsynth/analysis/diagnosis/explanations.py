@@ -67,10 +67,7 @@ def least_additions(
     plant: DescriptorSystem, sensors: Sequence[Sensor], reached: Callable[[DescriptorSystem], bool],
     *, most: tuple[int, int] = (MOST_FOR_ONE, MOST_FOR_PAIRS),
 ) -> tuple[tuple[str, ...], ...]:  # fmt: skip
-    """Return all single sensors that do it, or else all pairs; nothing where none of them does.
-
-    Plants of more than ``most`` states are not searched for one, and not for pairs.
-    """
+    """Return all single sensors that do it, or else all pairs; none for plants of more states than ``most``."""
     if plant.nx > most[0]:
         return ()
     for size in (1, 2) if plant.nx <= most[1] else (1,):

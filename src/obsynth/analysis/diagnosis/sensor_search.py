@@ -62,10 +62,7 @@ class SensorResponses:
         return cls(np.array(tables, dtype=np.complex128), plant.ny, plant.nd)
 
     def shows(self, sets: NDArray[np.int64], fault: int, beside: Sequence[int]) -> NDArray[np.float64]:
-        """Return how much of a fault shows free of d and the faults ``beside``, for each set of candidates ``(N, k)``.
-
-        The part of its column outside the span of theirs, relative to it, the larger of all points; zero for nothing.
-        """
+        """Return the share of a fault's column outside the span of d and ``beside``, for sets ``(N, k)``."""
         count = len(sets)
         fixed = np.broadcast_to(np.arange(self.outputs), (count, self.outputs))
         rows = np.hstack([fixed, self.outputs + sets])

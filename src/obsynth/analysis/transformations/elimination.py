@@ -91,11 +91,13 @@ def _has_few_entries(plant: DescriptorSystem) -> bool:
 def eliminated_by_sparsity(plant: DescriptorSystem) -> Transformation:
     """Leave out what acts on nothing, and solve the algebraic equations by a sparse factor."""
     from obsynth.analysis.transformations.idle_variables import active_part, active_variables
-    from obsynth.analysis.transformations.sparse_elimination import reduced_by_sparsity
+    from obsynth.analysis.transformations.sparse_elimination import not_index_one, reduced_by_sparsity
 
     active = active_variables(plant)
     part = active_part(plant, active)
     found = reduced_by_sparsity(part)
+    if found is None:
+        raise not_index_one(plant, active)
     new = with_states(part, found.names, E=None, **found.matrices)
     recovery = StateRecovery.from_operator(part.state_names, found.operator, np.eye(plant.nw), state_point(part))
     return Transformation(
@@ -107,19 +109,16 @@ def eliminated_by_sparsity(plant: DescriptorSystem) -> Transformation:
 def _without_idle_variables(plant: DescriptorSystem, refusal: PreconditionError) -> Transformation:
     """Leave out what acts on nothing where that helps; else say which equations and variables are at fault."""
     from obsynth.analysis.transformations.idle_variables import active_part, active_variables
-    from obsynth.analysis.transformations.sparse_elimination import culprits
+    from obsynth.analysis.transformations.sparse_elimination import not_index_one
 
     active = active_variables(plant)
-    if not active.dropped:
-        cause, variables = culprits(plant)
-        said = f" {cause[0].upper()}{cause[1:]}." if variables else ""
-        raise PreconditionError(f"{refusal}{said}", condition=refusal.condition, signals=variables) from refusal
     part = active_part(plant, active)
     try:
+        if not active.dropped:
+            raise refusal
         found = eliminated_exactly(part) or _eliminated_densely(part, _dynamic_count(part))
-    except PreconditionError:
-        # It did not help: what is wrong with the plant as written is what a user can mend.
-        raise refusal from None
+    except PreconditionError as error:
+        raise not_index_one(plant, active, error) from None
     return replace(
         found, source=plant, description=_description(part, found.plant.nx, active.dropped), dropped=active.dropped,
         notes=(active.note(),),

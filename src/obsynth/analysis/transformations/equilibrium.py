@@ -61,11 +61,7 @@ def nominal_point(model: DAEModel, given: Mapping[str, float], free: Sequence[st
 def equilibrium(
     model: DAEModel, given: Mapping[str, float], free: Sequence[str], start: Mapping[str, float] | None = None
 ) -> Point:
-    """Return the point where nothing moves, what is given holds, and what is free is as it must be.
-
-    `PreconditionError` ``no-equilibrium`` (with the combination of equations that nothing can satisfy) or
-    ``equilibrium-not-unique`` (with the direction).
-    """
+    """Return the point where nothing moves, what is given holds, what is free is as it must be, or why none is."""
     problem = _Problem(model, given, free, start or {})
     z = problem.solved()
     residual, jacobian = problem.scaled(z)
@@ -210,10 +206,7 @@ class _Problem:
 
 
 def consistent_point(model: DAEModel, point: Point, fixed: Collection[str] = ()) -> Point:
-    """Return a point near with derivatives that satisfy the equations; what is differentiated stays where possible.
-
-    States that are named by ``fixed`` stay in any case; if no others can satisfy the constraints, it is refused.
-    """
+    """Return a near point with derivatives that satisfy the equations; ``fixed`` states stay, differentiated may."""
     x, rates, sizes = np.array(point.x), np.zeros(model.nx), model.state_scales
     movable = np.array([name not in fixed for name in model.state_names])
     for _ in range(MOST_EVALUATIONS):

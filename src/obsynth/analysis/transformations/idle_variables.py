@@ -1,8 +1,9 @@
 """Variables that act on nothing: found by the pattern of a plant, named, and left out exactly.
 
 A filter whose time constants are zero may ask for the derivative of what it filters, or may leave its output free.
-When neither an output nor a state depends on such a variable, it can be left out together with its equation: what is
-left is determined by the other equations alone.  With it the plant would have index 2, or would not be regular.
+When no output depends on such a variable, nor on what depends on it, all of these can be left out together with their
+equations: what is left is determined by the other equations alone.  With them the plant would have index 2, or would
+not be regular.
 """
 
 from __future__ import annotations
@@ -15,14 +16,17 @@ import numpy as np
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import RANK_TOLERANCE
-from obsynth.numerics.sparse import Indices, blocks_of, coarse_structure, csr
-from obsynth.numerics.sparse_factor import SparseFactor
+from obsynth.numerics.scaling import equilibrate_pencil
+from obsynth.numerics.sparse import CoarseStructure, Indices, blocks_of, coarse_structure, csr, unmatched_instead
+from obsynth.numerics.sparse_factor import SparseFactor, scales_by_all_entries, sparse_factor
 from obsynth.plants.descriptor import DescriptorSystem
 
 #: A point without meaning, at which a pencil has its normal rank.
 GENERIC_POINT = 0.7391
-#: Steps of subspace iteration for left null vectors of a pencil, whose other singular values are far away.
-SUBSPACE_STEPS = 3
+#: Rank that a matrix may lack beyond what its shape says, to begin with half of it.
+BORDER = 4
+#: How much rather a repeated equation is left out whose own variable is left out.
+OTHERS_WEIGHT = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,9 +43,9 @@ class ActiveVariables:
         if not self.dropped:
             return ""
         return (
-            f"Left out, since they act on no state and no output: {', '.join(map(repr, self.dropped))} (with "
-            f"equation{'s' if len(self.equations) > 1 else ''} {', '.join(map(str, self.equations))}); nothing else "
-            "changes, and their values are not estimated."
+            f"Left out, since they act on nothing that stays and no output: {', '.join(map(repr, self.dropped))} (with "
+            f"{'equations' if len(self.equations) > 1 else 'equation'} {', '.join(map(str, self.equations))}); "
+            "nothing else changes, and their values are not estimated."
         )
 
 
@@ -52,11 +56,18 @@ def active_variables(plant: DescriptorSystem) -> ActiveVariables:
     if not plant.ny:
         # Without any output nothing says what a variable is there for.
         return ActiveVariables(rows, columns, (), ())
-    unused = np.flatnonzero(_empty_columns(e) & _empty_columns(a) & _empty_columns(c))
-    if unused.size:
-        gone = _repeated_equations(plant, e, a, unused)
-        rows, columns = np.delete(rows, gone), np.delete(columns, unused)
-    idle_rows, idle_columns = _idle(e[rows][:, columns], a[rows][:, columns], c[:, columns], plant, rows, columns)
+    pattern = csr(abs(e) + abs(a))
+    coarse = coarse_structure(pattern)
+    if coarse.structural_rank < plant.nx:
+        surplus = _surplus_equations(plant, coarse, e, a, c)
+        if surplus is None:
+            raise_structurally_singular(plant, coarse.over_rows, coarse.under_columns)
+        rows, columns = np.setdiff1d(rows, surplus), np.setdiff1d(columns, coarse.under_columns)
+        pattern = pattern[rows][:, columns]
+        coarse = coarse_structure(pattern)
+        if coarse.structural_rank < len(rows):
+            raise_structurally_singular(plant, rows[coarse.over_rows], columns[coarse.under_columns])
+    idle_rows, idle_columns = _idle(e[rows][:, columns], pattern, coarse, c[:, columns], plant, rows, columns)
     kept_rows, kept_columns = np.delete(rows, idle_rows), np.delete(columns, idle_columns)
     dropped, unneeded = (np.setdiff1d(np.arange(plant.nx), kept) for kept in (kept_columns, kept_rows))
     names, numbers = tuple(plant.state_names[i] for i in dropped), tuple(int(i) + 1 for i in unneeded)
@@ -75,70 +86,101 @@ def active_part(plant: DescriptorSystem, found: ActiveVariables) -> DescriptorSy
     return with_states(plant, [plant.state_names[i] for i in columns], C=plant.C[:, columns], **changes)
 
 
-def _empty_columns(matrix: Any) -> Any:
-    return np.bincount(matrix.indices, minlength=matrix.shape[1]) == 0
+def _surplus_equations(plant: DescriptorSystem, coarse: CoarseStructure, e: Any, a: Any, c: Any) -> Indices | None:
+    """Return the equations to leave out with variables in too few of them; nothing where that would not be exact.
 
-
-def _repeated_equations(plant: DescriptorSystem, e: Any, a: Any, unused: Indices) -> Indices:
-    """Return as many equations that follow from others as there are variables in no equation."""
-    from scipy.sparse import hstack
-
-    inputs = [csr(matrix) for matrix in (plant.B, plant.Bf, plant.Bd, plant.Bw) if matrix.shape[1]]
-    found = _left_null_space(csr(a - GENERIC_POINT * e), len(unused))
-    # A combination with constant coefficients, of known inputs, faults and noise as well: only then nothing is lost.
-    everything = csr(hstack([e, a, *inputs]))
-    left = np.abs(everything.T @ found)
-    sizes = np.abs(everything.T) @ np.abs(found)
-    # An equation without any term is no repetition: something is missing there.
-    empty = bool(np.any(np.diff(everything.indptr) == 0))
-    if empty or np.any(left > RANK_TOLERANCE * np.max(sizes, initial=0.0)):
-        names = [plant.state_names[i] for i in unused]
-        raise PreconditionError(
-            f"The plant is not regular, det(A - zE) is zero for every z: {listed(names)} "
-            f"{'is' if len(names) == 1 else 'are'} in no equation and no output, and no equation repeats others. Check "
-            "for missing terms.", condition="regularity", signals=names,
-        )  # fmt: skip
-    own = found[unused]
-    if np.linalg.svd(own, compute_uv=False)[-1] > np.sqrt(RANK_TOLERANCE) * np.max(np.abs(found)):
-        return unused
+    Those of these variables alone, and as many more as follow from others.
+    """
+    if c[:, coarse.under_columns].nnz or not _solvable(plant, coarse.under_rows, coarse.under_columns):
+        return None
+    rows = coarse.over_rows
+    combinations, scale = _left_null_space(csr(a - GENERIC_POINT * e)[rows][:, coarse.over_columns])
+    if not _say_nothing(plant, rows, scale, combinations):
+        return None
     from scipy.linalg import qr
 
-    _, _, order = qr(found.T, mode="economic", pivoting=True)
-    return np.sort(np.asarray(order[: len(unused)], dtype=np.int64))
+    # By convention the equation of a variable has its number, and goes with it.
+    weights = np.where(np.isin(rows, coarse.under_columns), 1.0, OTHERS_WEIGHT)
+    _, _, order = qr((weights[:, None] * combinations).T, mode="economic", pivoting=True)
+    # Where more equations are repeated than variables are in too few, those that the pattern can do without.
+    left_out = unmatched_instead(csr(abs(e) + abs(a)), coarse, rows[order[: combinations.shape[1]]])
+    return None if left_out is None else np.union1d(coarse.under_rows, left_out)
 
 
-def _left_null_space(matrix: Any, count: int) -> FloatArray:
-    """Return an orthonormal basis of ``count`` left null vectors, by subspace iteration."""
-    factor = SparseFactor(matrix)
-    basis = np.linalg.qr(np.random.default_rng(2).normal(size=(matrix.shape[0], count)))[0]
-    for _ in range(SUBSPACE_STEPS):
-        basis = np.linalg.qr(factor.solve_transposed(np.linalg.qr(factor.solve_unrefined(basis))[0]))[0]
-    return np.asarray(basis)
+def _say_nothing(plant: DescriptorSystem, rows: Indices, scale: FloatArray, combinations: FloatArray) -> bool:
+    """Whether combinations of scaled equations are ``0 = 0``, with known inputs, faults and noise as well."""
+    from scipy.sparse import diags_array, hstack
+
+    everything = [csr(getattr(plant, name))[rows] for name in ("E", "A", "B", "Bf", "Bd", "Bw")]
+    scaled = csr(diags_array(scale) @ hstack(everything))
+    peaks = np.zeros(scaled.shape[1])
+    np.maximum.at(peaks, scaled.indices, np.abs(scaled.data))
+    left = np.abs(scaled.T @ combinations)
+    return bool(np.all(left <= RANK_TOLERANCE * peaks[:, None] * np.max(np.abs(combinations), axis=0, initial=0.0)))
 
 
-def _idle(e: Any, a: Any, c: Any, plant: DescriptorSystem, rows: Indices, columns: Indices) -> tuple[Indices, Indices]:
+def _solvable(plant: DescriptorSystem, rows: Indices, columns: Indices) -> bool:
+    """Whether equations can be solved for some of their variables, whatever the others are."""
+    if not len(rows):
+        return True
+    part = csr(csr(plant.A) - GENERIC_POINT * csr(plant.E))[rows][:, columns]
+    if len(rows) == len(columns) and not sparse_factor(part).singular:
+        return True
+    arrays = part.toarray()
+    pencil = equilibrate_pencil(np.zeros_like(arrays), arrays)
+    left, values, _ = np.linalg.svd(pencil.A)
+    rank = int(np.sum(values > RANK_TOLERANCE * np.max(values, initial=np.finfo(float).tiny)))
+    # Else these combinations of them are a condition on the others, and leaving them out would not be exact.
+    return _say_nothing(plant, rows, pencil.rows, left[:, rank:])
+
+
+def _left_null_space(tall: Any) -> tuple[FloatArray, FloatArray]:
+    """Return an orthonormal left null basis of a matrix with scaled rows, and the scales: one solution, bordered.
+
+    With random G and H ``[M G; H 0]`` is nonsingular; its left solutions for the columns of G hold the null space.
+    """
+    from scipy.sparse import block_array, diags_array
+
+    (count, width), rng, more = tall.shape, np.random.default_rng(2), BORDER
+    rows, columns = scales_by_all_entries(tall)
+    scaled = csr(diags_array(rows) @ tall @ diags_array(columns))
+    while True:
+        more = min(2 * more, width)
+        wanted = count - width + more
+        border, below = rng.normal(size=(count, wanted)), rng.normal(size=(more, width))
+        factor = SparseFactor(block_array([[scaled, csr(border)], [csr(below), None]] if more else [[scaled, border]]))
+        right = np.eye(width + wanted)[:, width:]
+        basis = np.linalg.qr(factor.solve_transposed(right)[:count])[0]
+        _, values, turned = np.linalg.svd(np.linalg.qr(scaled.T @ basis)[1])
+        null = wanted - int(np.sum(values > RANK_TOLERANCE * max(1.0, np.max(np.abs(scaled.data), initial=0.0))))
+        if null < wanted or more == width:
+            return basis @ turned[wanted - null :].T, rows
+
+
+def _idle(
+    e: Any, pattern: Any, coarse: CoarseStructure, c: Any, plant: DescriptorSystem, rows: Indices, columns: Indices
+) -> tuple[Indices, Indices]:
     """Return the rows and columns of idle blocks that cannot be solved for without differentiating."""
-    pattern = csr(abs(e) + abs(a))
-    coarse = coarse_structure(pattern)
-    if coarse.structural_rank < pattern.shape[0]:
-        raise_structurally_singular(plant, rows[coarse.over_rows], columns[coarse.under_columns])
     count, block = blocks_of(pattern, coarse.row_of_column)
     block_of_row = np.empty(len(rows), dtype=np.int64)
     block_of_row[coarse.row_of_column] = block
-    acting = np.zeros(count, dtype=bool)
-    moving = e.tocoo()
-    inside = block_of_row[moving.row] == block[moving.col]
-    acting[block[moving.col[inside]]] = True
-    acting[block[np.unique(c.indices)]] = True
     links = pattern.tocoo()
     from_block, to_block = block[links.col], block_of_row[links.row]
-    acting = _spread(acting, to_block, from_block)
+    seen = np.zeros(count, dtype=bool)
+    seen[block[np.unique(c.indices)]] = True
+    seen = _spread(seen, to_block, from_block)
+    moving = e.tocoo()
+    inside = block_of_row[moving.row] == block[moving.col]
+    differentiated = np.zeros(len(columns), dtype=bool)
+    differentiated[moving.col[inside]] = True
     # What an idle block needs that is not known without differentiating makes it unknown as well.
     unknown = np.zeros(count, dtype=bool)
-    unknown[block_of_row[moving.row]] = True
-    unknown[_undetermined_blocks(plant, rows, columns, block_of_row, block, ~acting)] = True
-    unknown = _spread(unknown & ~acting, from_block, to_block, within=~acting) & ~acting
-    return np.flatnonzero(unknown[block_of_row]), np.flatnonzero(unknown[block])
+    unknown[block_of_row[moving.row[~differentiated[moving.col]]]] = True
+    unknown[_undetermined_blocks(plant, rows, columns, block_of_row, block, ~seen)] = True
+    unknown = _spread(unknown & ~seen, from_block, to_block, within=~seen) & ~seen
+    found = np.flatnonzero(unknown[block_of_row]), np.flatnonzero(unknown[block])
+    nothing = np.zeros(0, dtype=np.int64)
+    return found if _solvable(plant, rows[found[0]], columns[found[1]]) else (nothing, nothing)
 
 
 def _spread(marked: Any, source: Indices, target: Indices, *, within: Any = None) -> Any:
@@ -156,35 +198,33 @@ def _spread(marked: Any, source: Indices, target: Indices, *, within: Any = None
 def _undetermined_blocks(
     plant: DescriptorSystem, rows: Indices, columns: Indices, block_of_row: Indices, block: Indices, idle: Any
 ) -> list[int]:
-    """Return the idle blocks that their equations do not determine, but where these ask nothing of other variables."""
-    from scipy.sparse import hstack
-
-    found = []
-    # A block of one variable is its entry of A, which is there.
+    """Return the idle blocks that their equations do not determine."""
+    # A block of one variable is its entry, which is there.
     several = np.flatnonzero(idle & (np.bincount(block, minlength=len(idle)) > 1))
-    everything = csr(hstack([csr(getattr(plant, name)) for name in ("E", "A", "B", "Bf", "Bd", "Bw")]))
-    for number in several:
-        own, variables = rows[block_of_row == number], columns[block == number]
-        inner = csr(plant.A)[own][:, variables]
-        if SparseFactor(inner).singular:
-            left, values, _ = np.linalg.svd(inner.toarray())
-            free = left[:, values <= RANK_TOLERANCE * max(float(values[0]), np.finfo(float).tiny)]
-            terms = np.abs(everything[own].T) @ np.abs(free)
-            # Else they are a condition on the others, and leaving them out would not be exact.
-            if np.all(np.abs(everything[own].T @ free) <= RANK_TOLERANCE * np.max(terms, initial=0.0)):
-                found.append(int(number))
-    return found
+    if not several.size:
+        return []
+    pencil = csr(csr(plant.A) - GENERIC_POINT * csr(plant.E))
+    parts = ((number, rows[block_of_row == number], columns[block == number]) for number in several)
+    return [int(number) for number, own, variables in parts if sparse_factor(pencil[own][:, variables]).singular]
 
 
 def raise_structurally_singular(plant: DescriptorSystem, equations: Indices, variables: Indices) -> None:
     """Refuse a plant whose pattern alone leaves variables free, and name them and the surplus equations."""
+    equations, variables = own_first(equations, variables), own_first(variables, equations)
     names = [plant.state_names[i] for i in variables]
     raise PreconditionError(
         "The plant is not regular, det(A - zE) is zero for every z and whatever the numbers are: "
-        f"{listed(names)} {'is' if len(names) == 1 else 'are'} in too few equations, and equations "
-        f"{listed([equation_name(plant, i) for i in equations], quoted=False)} hold too few variables. Check for a "
-        "missing or repeated equation.", condition="regularity", signals=names,
-    )  # fmt: skip
+        + f"{listed(names)} {'is' if len(names) == 1 else 'are'} in too few equations, and equations "
+        + f"{listed([equation_name(plant, i) for i in equations], quoted=False)} hold too few variables. Check for a "
+        "missing or repeated equation.",
+        condition="regularity",
+        signals=names,
+    )
+
+
+def own_first(places: Indices, others: Indices) -> Indices:
+    """Return the places with those first that are among others: equations of such variables, or the reverse."""
+    return places[np.argsort(~np.isin(places, others), kind="stable")]
 
 
 def equation_name(plant: DescriptorSystem, row: int) -> str:

@@ -99,11 +99,7 @@ class StateRecovery:
 
 @dataclass(frozen=True, eq=False)
 class Transformation:
-    """A plant made from another one, in words, and the states of ``source`` from the signals of ``plant``.
-
-    ``dropped``: states of ``source`` that act on nothing and are not recovered; ``bounds``: how well the algebraic
-    equations were solved, where that was done by sparsity.
-    """
+    """A plant made from another; ``dropped`` states are not recovered; ``bounds``: of sparse solutions."""
 
     source: DescriptorSystem
     plant: DescriptorSystem

@@ -12,7 +12,7 @@ import numpy as np
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE
 from obsynth.numerics.sparse import csr
-from obsynth.numerics.sparse_factor import SAMPLED, SAMPLES, SparseFactor
+from obsynth.numerics.sparse_factor import SAMPLED, SAMPLES, SparseFactor, sparse_factor
 
 #: Signals in the order in which they stand in the algebraic equations.
 SIGNALS = ("state", "input", "fault", "disturbance", "noise")
@@ -37,7 +37,7 @@ class RecoveryOperator:
     @cached_property
     def factor(self) -> SparseFactor:
         """Factors of the algebraic equations."""
-        return SparseFactor(self.coupling)
+        return sparse_factor(self.coupling)
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave the factors behind: they belong to this process."""

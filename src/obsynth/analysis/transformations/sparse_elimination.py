@@ -7,14 +7,20 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.analysis.transformations.idle_variables import equation_name, listed, raise_structurally_singular
+from obsynth.analysis.transformations.idle_variables import (
+    ActiveVariables,
+    active_part,
+    equation_name,
+    listed,
+    own_first,
+)
 from obsynth.analysis.transformations.recovery_operator import RecoveryOperator, without_rounding
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, NAMED_SHARE, RANK_TOLERANCE
 from obsynth.numerics.scaling import power_of_two_below
 from obsynth.numerics.sparse import coarse_structure, components_of, csr, dense, selection
-from obsynth.numerics.sparse_factor import NullVectors, SolutionBounds, SparseFactor
+from obsynth.numerics.sparse_factor import NullVectors, SolutionBounds, scales_by_all_entries, sparse_factor
 from obsynth.plants.descriptor import DescriptorSystem
 
 #: Points without meaning, at which a pencil has its normal rank.
@@ -51,8 +57,8 @@ class SparseReduction:
     bounds: SolutionBounds
 
 
-def reduced_by_sparsity(plant: DescriptorSystem) -> SparseReduction:
-    """Solve the algebraic equations of an index-1 plant with sparse factors."""
+def reduced_by_sparsity(plant: DescriptorSystem) -> SparseReduction | None:
+    """Solve the algebraic equations of a plant with sparse factors; ``None`` where it does not have index 1."""
     split = split_by_derivatives(plant)
     count = split.dynamic.shape[1]
     if count == 0:
@@ -64,14 +70,15 @@ def reduced_by_sparsity(plant: DescriptorSystem) -> SparseReduction:
     counts = (count, plant.nu, plant.nf, plant.nd, plant.nw)
     signals = np.hstack([dense(matrix) for matrix in (plant.B, plant.Bf, plant.Bd, plant.Bw)])
     inner = csr(split.algebraic_rows @ a @ split.algebraic)
-    factor = SparseFactor(inner)
-    _require_index_one(plant, factor)
+    factor = sparse_factor(inner)
+    if factor.singular:
+        return None
     right = _side_by_side(split.algebraic_rows @ a @ split.dynamic, split.algebraic_rows @ csr(signals))
     found, backward = factor.solve_with_error(right.toarray())
     found[:, count:] = without_rounding(factor, found[:, count:])
     solution = -found
     kept = _side_by_side(split.dynamic_rows @ a @ split.dynamic, split.dynamic_rows @ csr(signals)).toarray()
-    mass = SparseFactor(split.dynamic_rows @ csr(plant.E) @ split.dynamic)
+    mass = sparse_factor(split.dynamic_rows @ csr(plant.E) @ split.dynamic)
     moved, backward_of_e = mass.solve_with_error(_sum(kept, csr(split.dynamic_rows @ a @ split.algebraic), solution))
     direct = np.hstack([(c @ split.dynamic).toarray(), *(dense(m) for m in (plant.D, plant.Df, plant.Dd, plant.Dw))])
     shown = _sum(direct, csr(c @ split.algebraic), solution)
@@ -86,10 +93,18 @@ def reduced_by_sparsity(plant: DescriptorSystem) -> SparseReduction:
 def split_by_derivatives(plant: DescriptorSystem) -> SparseCoordinates:
     """Return dynamic and algebraic equations and states: E is decomposed component by component of its pattern."""
     e, a = csr(plant.E), csr(plant.A)
-    row_scale, column_scale = _scales(e, a)
+    parts = _components(e)
+    pieces = _split(e, parts, _scales(e, a))
+    if len(pieces.dynamic) < coarse_structure(e).structural_rank:
+        # Small entries of E may be a matter of units: judged again with those that suit all entries.
+        pieces = _split(e, parts, scales_by_all_entries(csr(abs(e) + abs(a))))
+    return pieces.coordinates(plant.state_names)
+
+
+def _components(e: Any) -> list[tuple[Any, Any, FloatArray]]:
+    """Return rows, columns and entries of the connected components of a sparse matrix."""
     row_part, column_part = components_of(e)
     moving = e.tocoo()
-    pieces = _Pieces(e.shape[0])
     with_entries = np.unique(row_part[moving.row])
     order = np.argsort(row_part, kind="stable"), np.argsort(column_part, kind="stable")
     starts = [np.searchsorted(part[o], with_entries) for part, o in zip((row_part, column_part), order, strict=True)]
@@ -97,21 +112,28 @@ def split_by_derivatives(plant: DescriptorSystem) -> SparseCoordinates:
         np.searchsorted(part[o], with_entries, side="right")
         for part, o in zip((row_part, column_part), order, strict=True)
     ]
-    in_component = np.zeros(e.shape[0], dtype=bool), np.zeros(e.shape[0], dtype=bool)
     # Most components are single entries: slicing each would take most of the time.
     single = np.bincount(row_part[moving.row], weights=moving.data)[with_entries][:, None, None]
     blocks = []
     for k in range(len(with_entries)):
         rows = order[0][starts[0][k] : ends[0][k]]
         columns = order[1][starts[1][k] : ends[1][k]]
-        in_component[0][rows], in_component[1][columns] = True, True
         block = e[rows][:, columns].toarray() if len(rows) * len(columns) > 1 else single[k]
-        blocks.append((rows, columns, row_scale[rows][:, None] * block * column_scale[columns]))
+        blocks.append((rows, columns, block))
+    return blocks
+
+
+def _split(e: Any, parts: list[tuple[Any, Any, FloatArray]], scales: tuple[FloatArray, FloatArray]) -> _Pieces:
+    pieces, (row_scale, column_scale) = _Pieces(e.shape[0]), scales
+    blocks = [
+        (rows, columns, row_scale[rows][:, None] * block * column_scale[columns]) for rows, columns, block in parts
+    ]
     largest = max((float(np.linalg.norm(block, 2)) for _, _, block in blocks), default=0.0)
     for rows, columns, block in blocks:
         pieces.add(rows, columns, block, row_scale[rows], column_scale[columns], largest)
-    pieces.rest(np.flatnonzero(~in_component[0]), np.flatnonzero(~in_component[1]))
-    return pieces.coordinates(plant.state_names)
+    in_row, in_column = np.diff(e.indptr) > 0, np.bincount(e.indices, minlength=e.shape[1]) > 0
+    pieces.rest(np.flatnonzero(~in_row), np.flatnonzero(~in_column))
+    return pieces
 
 
 class _Pieces:
@@ -186,47 +208,45 @@ def _scales(e: Any, a: Any) -> tuple[FloatArray, FloatArray]:
     return rows, 1.0 / power_of_two_below(np.maximum(peaks(scaled[0]), peaks(scaled[1])))
 
 
-def culprits(plant: DescriptorSystem) -> tuple[str, tuple[str, ...]]:
-    """Return what keeps a plant from having index 1, in words, and its variables; nothing for one that has."""
-    whole = coarse_structure(abs(csr(plant.E)) + abs(csr(plant.A)))
-    if whole.structural_rank < plant.nx:
-        raise_structurally_singular(plant, whole.over_rows, whole.under_columns)
-    split = split_by_derivatives(plant)
-    inner = csr(split.algebraic_rows @ csr(plant.A) @ split.algebraic)
-    factor = SparseFactor(inner)
+def not_index_one(
+    plant: DescriptorSystem, active: ActiveVariables, said: PreconditionError | None = None
+) -> PreconditionError:
+    """Return the refusal of a plant that does not have index 1 without its idle variables either: which part, and why.
+
+    It goes on where ``said`` refused; its signals are the variables, none where nothing was found wrong.
+    """
+    part = active_part(plant, active)
+    split = split_by_derivatives(part)
+    inner = csr(split.algebraic_rows @ csr(part.A) @ split.algebraic)
+    factor = sparse_factor(inner)
     null = factor.null_vectors()
     if not factor.exactly_singular and null.smallest > RANK_TOLERANCE:
-        return "", ()
-    generic = _generic_factors(plant)
-    if any(not found.singular for found in generic):
+        return said or PreconditionError("", condition="index")
+    generic = [sparse_factor(csr(part.A) - point * csr(part.E)) for point in GENERIC_POINTS]
+    regular = any(not found.singular for found in generic)
+    if regular:
         equations, variables = _leading(split.algebraic_rows, split.algebraic, null, inner)
     else:
         null = generic[0].null_vectors()
         equations, variables = _named(null.rows), _named(null.columns)
+    # As the plant was given: equations and variables that were left out count.
+    variables = active.columns[variables]
+    equations = own_first(active.rows[equations], variables)
     names = tuple(plant.state_names[i] for i in variables)
-    said = listed([equation_name(plant, i) for i in equations], quoted=False)
-    does = f"equation {said} does" if len(equations) == 1 else f"equations {said} do"
-    return f"{does} not determine {listed(list(names))}", names
-
-
-def _generic_factors(plant: DescriptorSystem) -> list[SparseFactor]:
-    return [SparseFactor(csr(plant.A) - point * csr(plant.E)) for point in GENERIC_POINTS]
-
-
-def _require_index_one(plant: DescriptorSystem, factor: SparseFactor) -> None:
-    """Refuse a plant whose algebraic equations cannot be solved for its algebraic states; say which, and why."""
-    if not factor.singular:
-        return
-    said, names = culprits(plant)
-    if all(found.singular for found in _generic_factors(plant)):
-        raise PreconditionError(
-            f"The plant is not regular: det(A - zE) is zero for every z, and {said}. Check for a missing or repeated "
+    numbers = listed([equation_name(plant, i) for i in equations], quoted=False)
+    does = f"equation {numbers} does" if len(equations) == 1 else f"equations {numbers} do"
+    does = f"{does} not determine {listed(list(names))}"
+    if not regular:
+        return PreconditionError(
+            f"The plant is not regular: det(A - zE) is zero for every z, and {does}. Check for a missing or repeated "
             "equation.",
             condition="regularity",
             signals=names,
         )
-    raise PreconditionError(
-        f"The plant has index 2 or more: {said} without differentiating. Differentiate the constraints, or use a "
+    if said is not None and said.condition == "index":
+        return PreconditionError(f"{said} {does[0].upper()}{does[1:]}.", condition="index", signals=names)
+    return PreconditionError(
+        f"The plant has index 2 or more: {does} without differentiating. Differentiate the constraints, or use a "
         "method that takes the descriptor form.",
         condition="index",
         signals=names,

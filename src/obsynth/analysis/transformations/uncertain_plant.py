@@ -55,10 +55,7 @@ class AffinePlant:
 
 
 def affine_plant(plant: DescriptorSystem, box: ConstantsBox | None = None) -> AffinePlant:
-    """Return a plant over the box of its constants, or over another box of these.
-
-    Raises `PreconditionError` where the box makes an algebraic row dynamic, or a matrix that must be inverted singular.
-    """
+    """Return a plant over a box of its constants; refused where algebraic rows move or what is inverted is singular."""
     uncertain = plant.uncertainty
     if uncertain is None:
         exact = {name: AffineMatrix.exact(matrix, 0) for name, matrix in matrices_of(plant).items()}
@@ -81,10 +78,7 @@ def affine_plant(plant: DescriptorSystem, box: ConstantsBox | None = None) -> Af
 
 
 def moving_family(plant: DescriptorSystem, box: ConstantsBox, basis: FloatArray | None = None) -> AffineMatrix:
-    """Return A of the plant over a box, with its algebraic states eliminated, E inverted, and before it was sampled.
-
-    In coordinates ``basis`` of the dynamic state, such as those of `moving_basis`.
-    """
+    """Return A over a box, without algebraic states, E inverted, before sampling, in ``basis`` of the dynamic state."""
     uncertain = plant.uncertainty
     if uncertain is None:
         return AffineMatrix.exact(plant.A, 0)

@@ -20,11 +20,11 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.uncertainty import SAMPLED
 from obsynth.results.design import ObserverDesign
 from obsynth.tolerances.error_structure import ErrorStructure, error_structure
+from obsynth.tolerances.exact_plant import Tracking, tracking_of
 from obsynth.tolerances.responses import loop_radius
 from obsynth.tolerances.result import EXACT_MODEL
 from obsynth.tolerances.robustness import structure_of, with_tolerances
 from obsynth.tolerances.subdivision import index_one_on_box, values_at
-from obsynth.tolerances.tracking import Tracking, tracking_of
 
 #: Radii of a set are made larger by this share: more than the rounding of their sums.
 OUTWARD = 1e-12

@@ -17,11 +17,12 @@ from obsynth.experiments.monitors.adaptive_record import thresholds_of_records
 from obsynth.experiments.monitors.adaptive_rule import AdaptivePlan, record_columns
 from obsynth.experiments.monitors.adaptive_screening import Records, Screening, first_passed
 from obsynth.experiments.monitors.monitor import Detection, Monitor
+from obsynth.experiments.monitors.residual_model import noisy_plant
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.estimates import Estimates
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.scenario import Scenario
-from obsynth.simulation.scenario_signals import resolve
+from obsynth.simulation.signals import resolve
 
 
 def noisy_design(design: ObserverDesign, scenario: Scenario | None) -> ObserverDesign:
@@ -29,11 +30,7 @@ def noisy_design(design: ObserverDesign, scenario: Scenario | None) -> ObserverD
     if scenario is None:
         return design
     plant, _ = design.linear
-    drive = resolve(plant, scenario)
-    noise = plant.replace(
-        Bw=np.hstack([scenario.noise * plant.Bw, np.zeros((plant.nx, plant.ny))]),
-        Dw=np.hstack([scenario.noise * plant.Dw, np.diag(drive.deviations)]), noise_names=None,
-    )  # fmt: skip
+    noise = noisy_plant(plant, scenario, resolve(plant, scenario))
     kept = noise.Bw.any(axis=0) | noise.Dw.any(axis=0)
     return design.replace(plant=noise.replace(Bw=noise.Bw[:, kept], Dw=noise.Dw[:, kept], noise_names=None))
 

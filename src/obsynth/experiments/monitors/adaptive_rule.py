@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -34,19 +34,16 @@ class AdaptiveState:
     @classmethod
     def of(cls, bound: AdaptiveBound) -> AdaptiveState:
         """Return the state before the first sample."""
-        p, nz, *_ = bound.counts
-        length = bound.length
-        past = (length, bound.drive.shape[2]) if bound.varying else (0, 0)
+        (p, nz, *_), length = bound.counts, bound.length
+        shapes = (p, nz), (length, bound.width), (length, nz)
         largest = np.zeros(bound.rounding.shape[1])
         largest[-1] = 1.0
-        return cls(
-            np.zeros((p, nz)), np.zeros((length, bound.width)), np.zeros((length, nz)), largest, np.zeros(past),
-            np.zeros((length, nz) if bound.varying else (0, 0)),
-        )  # fmt: skip
+        memory = ((length, bound.drive.shape[2]), (length, nz)) if bound.varying else ((0, 0), (0, 0))
+        return cls(*map(np.zeros, shapes), largest, *map(np.zeros, memory))
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain data."""
-        return {item.name: getattr(self, item.name) for item in fields(self)}
+        return dict(vars(self))
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> AdaptiveState:
@@ -210,20 +207,18 @@ class AdaptiveRule(Rule):
             self.restart()
             self.waiting = FORGETTING_RINGS * self._bound.length
         self.waiting = max(self.waiting - 1, 0)
-        reading = self._bound.structure.reading
-        found = adaptive_step(self._bound, self._state, reading @ evidence.rows, evidence.inputs, evidence.outputs)
-        error = found
+        signals = evidence.inputs, evidence.outputs
+        found = error = adaptive_step(self._bound, self._state, self._bound.structure.reading @ evidence.rows, *signals)
         if self._faults is not None and self._fault_state is not None:
             estimates = self._faults.structure.reading @ evidence.rows
-            error = adaptive_step(self._faults, self._fault_state, estimates, evidence.inputs, evidence.outputs)
+            error = adaptive_step(self._faults, self._fault_state, estimates, *signals)
+        values, at = evidence.rows[len(evidence.rows) - len(found.total) :], self.plan.residuals
         if self.plan.sample_time is None:
             statistic, nominal, _ = self._nominal.take(time, residuals, evidence, deciding=deciding)
             threshold = (nominal + norm_beyond_nominal(self.plan, found)) * THRESHOLD_ROUNDING
         else:
-            watched = evidence.rows[len(evidence.rows) - len(found.total) :][self.plan.residuals]
-            statistic, threshold = math.hypot(*watched), math.hypot(*found.total[self.plan.residuals])
+            statistic, threshold = math.hypot(*values[at]), math.hypot(*found.total[at])
         nf = len(self.plan.fault_names)
-        values = evidence.rows[len(evidence.rows) - len(found.total) :]
         self.cells = self._cells(values[:nf], found, error)
         if self.waiting:
             return math.nan, math.nan, None

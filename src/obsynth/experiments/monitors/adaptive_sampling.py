@@ -31,7 +31,7 @@ from obsynth.plants.uncertainty import ELIMINATED, Uncertainty
 from obsynth.proofs.affine import AffineMatrix, affine_block, affine_zero_order_hold
 from obsynth.proofs.balls import rounded_up
 from obsynth.results.design import ObserverDesign
-from obsynth.tolerances.tracking import Tracking, tracking_of
+from obsynth.tolerances.exact_plant import Tracking, tracking_of
 
 #: Pieces of an interval in which a disturbance has a sign of its own.
 PIECES = 16

@@ -109,9 +109,8 @@ class Screening:
         shift = np.abs(np.tensordot(phi, bound.structure.offsets, axes=(2, 0)))
         largest = self._largest(records, begin, end)
         rest = largest @ self.rest.T
-        n, nu = records.estimates.shape[2], records.inputs.shape[2]
-        places = [*range(largest.shape[2] - 1 - n, largest.shape[2] - 1), *range(nu)]
-        slack = largest[:, :, places] @ self.slack.T
+        n, nu, last = records.estimates.shape[2], records.inputs.shape[2], largest.shape[2] - 1
+        slack = largest[:, :, [*range(last - n, last), *range(nu)]] @ self.slack.T
         start = np.array([bound.start_at(k)[m:] for k in range(begin, end)])[:, None]
         certain = bound.nominal[m:] + start + np.abs(phi).sum(axis=2) + shift
         values, norm = records.values[begin:end], records.norm[begin:end]

@@ -69,15 +69,9 @@ class BetweenSamples:
 
     @classmethod
     def of(
-        cls,
-        plant: DescriptorSystem,
-        observer: LinearObserver,
-        tracking: FloatArray,
-        dt: float,
-        *,
-        rows: slice,
+        cls, plant: DescriptorSystem, observer: LinearObserver, tracking: FloatArray, dt: float, *, rows: slice,
         endless: bool = True,
-    ) -> BetweenSamples:
+    ) -> BetweenSamples:  # fmt: skip
         """Return the design at samples ``dt`` apart, for ``tracking V (nz, nx)``; raise `SpecError` without a bound.
 
         Without ``endless`` a record of known length is bounded whether or not anything dies out.
@@ -90,22 +84,26 @@ class BetweenSamples:
                 "bound on the disturbances is one on the residual; use a statistical monitor (chi-square or cusum).",
                 path="monitor",
             ) from error
-        smooth = done.plant
+        smooth, exact = done.plant, Ball.exact
         t = np.asarray(tracking @ (plant.E @ done.recovery.from_state))
         az, g0, g1 = first_order_hold(observer.Az, observer.By, dt)
-        phi, c_plant = exponential(smooth.A, dt), Ball.exact(smooth.C)
-        earlier = Ball.exact(g0) - Ball.exact(g1)
-        ramp = Ball.exact(g1) @ c_plant
-        k = Ball.exact(az) @ Ball.exact(t) + earlier @ c_plant + ramp @ phi - Ball.exact(t) @ phi
-        j = Ball.exact(observer.Cz[rows]) @ Ball.exact(t) + Ball.exact(observer.Dy[rows]) @ c_plant
+        phi, c = exponential(smooth.A, dt), exact(smooth.C)
+        earlier, ramp = exact(g0) - exact(g1), exact(g1) @ c
+        k = exact(az) @ exact(t) + earlier @ c + ramp @ phi - exact(t) @ phi
+        j = exact(observer.Cz[rows]) @ exact(t) + exact(observer.Dy[rows]) @ c
         terms = np.abs(az) @ np.abs(t) + (np.abs(g0) + 2.0 * np.abs(g1)) @ np.abs(smooth.C) + np.abs(t)
-        parts = rows, (az, g1, earlier), t, (phi, k, j)
+        into = exact(g1) @ c - exact(t)
+
+        def split(kept: FloatArray, *, dies_out: bool) -> BetweenSamples:
+            found = _split(phi, k, j, into, kept, az, observer.Cz[rows], endless=dies_out)
+            return cls(smooth, dt, *found[:4], g1, earlier.midpoint, observer.Dy[rows], rows, found[4])
+
         try:
-            return _assembled(smooth, dt, observer, *parts, _kept(smooth, dt, k, terms), endless=True)
+            return split(_kept(smooth, dt, k, terms), dies_out=True)
         except SpecError:
             if endless:
                 raise
-            return _assembled(smooth, dt, observer, *parts, np.eye(smooth.nx), endless=False)
+            return split(np.eye(smooth.nx), dies_out=False)
 
     @classmethod
     def of_sampled(
@@ -133,10 +131,8 @@ class BetweenSamples:
         """Which disturbances reach the residual beyond rounding ``(nd,)``."""
         a, b = self.plant.A, self.plant.Bd
         held = np.abs(self.plant.C) @ (np.abs(b) * self.dt + np.abs(a @ b) * self.dt**2) + np.abs(self.plant.Dd)
-        scale = np.linalg.norm(
-            np.abs(self.direct) @ held + np.abs(self.c[:, len(a) :]) @ (np.abs(self.second) @ held), axis=0
-        )
-        return np.asarray(self.per_unit > UNREACHED * scale)
+        scale = np.abs(self.direct) @ held + np.abs(self.c[:, len(a) :]) @ (np.abs(self.second) @ held)
+        return np.asarray(self.per_unit > UNREACHED * np.linalg.norm(scale, axis=0))
 
     def of_disturbances(self, sizes: FloatArray, steps: int) -> tuple[FloatArray, FloatArray]:
         """Return the bounds at samples ``0 .. steps - 1``, and for ever ``(nd,)``, for ``|d_i(t)| <= sizes_i``."""
@@ -161,8 +157,7 @@ class BetweenSamples:
 
     def _at_samples(self, dd: FloatArray, steps: int) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return what the values at the samples do: at once ``(nd,)``, by later samples, and by all."""
-        n = len(self.plant.A)
-        above = np.zeros((n, dd.shape[1]))
+        above = np.zeros((len(self.plant.A), dd.shape[1]))
         now, later = np.vstack([above, self.first @ dd]), Ball.exact(np.vstack([above, self.second @ dd]))
         at_once = column_norms(Ball.exact(self.direct) @ Ball.exact(dd) + Ball.exact(self.c) @ Ball.exact(now))
         found = self._sums(self.M @ Ball.exact(now) + later, steps)
@@ -174,9 +169,8 @@ class BetweenSamples:
         rows, terms = self.c, []
         size = np.abs(columns.midpoint) + columns.radius
         for _ in range(max(steps, 1)):
-            terms.append(
-                np.linalg.norm(rows @ columns.midpoint, axis=0) + FINITE * np.linalg.norm(np.abs(rows) @ size, axis=0)
-            )
+            rounding = FINITE * np.linalg.norm(np.abs(rows) @ size, axis=0)
+            terms.append(np.linalg.norm(rows @ columns.midpoint, axis=0) + rounding)
             rows = rows @ self.M.midpoint
         partial = np.cumsum(np.array(terms), axis=0)
         return PeakSums(partial, np.full(partial.shape[1], np.inf))
@@ -277,18 +271,16 @@ def _dying(a: FloatArray, dt: float) -> FloatArray | None:
     return np.asarray(np.eye(n) - basis[:, :lasting] @ np.hstack([np.eye(lasting), -coupling]) @ basis.T)
 
 
-def _assembled(
-    plant: DescriptorSystem, dt: float, observer: LinearObserver, rows: slice,
-    held: tuple[FloatArray, FloatArray, Ball], t: FloatArray, found: tuple[Ball, Ball, Ball], kept: FloatArray,
-    *, endless: bool,
-) -> BetweenSamples:  # fmt: skip
-    (az, g1, earlier), (phi, k, j), n = held, found, plant.nx
-    exact = Ball.exact
+def _split(
+    phi: Ball, k: Ball, j: Ball, into: Ball, kept: FloatArray, az: FloatArray, cz: FloatArray, *, endless: bool
+) -> tuple[Ball, FloatArray, Contraction | None, Ball, float]:
+    """Return ``M, c, contraction, into, left`` for the projector ``kept (n, n)`` onto the modes that are followed."""
+    n, exact = len(kept), Ball.exact
     followed = kept.any()
     projector, others = exact(kept), exact(np.eye(n)) - exact(kept)
     moving = phi @ projector
     m = block([[moving, exact(np.zeros((n, len(az))))], [k if followed else exact(np.zeros(k.shape)), exact(az)]])
-    shown = np.hstack([j.midpoint if followed else np.zeros(j.shape), observer.Cz[rows]])
+    shown = np.hstack([j.midpoint if followed else np.zeros(j.shape), cz])
     contraction = prove_contraction(m, discrete=True) if endless else None
     if contraction is None and endless:
         raise SpecError(
@@ -296,17 +288,11 @@ def _assembled(
             "the plant that is not straight between samples, dies out too slowly. Sample the plant first "
             "(transform.sample_time), or use a statistical monitor.", path="sample_time",
         )  # fmt: skip
-    into = block([[projector], [exact(g1) @ exact(plant.C) - exact(t)]])
     # What the split misses, and the modes that it leaves: driven by the state, whatever it is.
     defect = projector @ phi - moving @ projector if followed else exact(np.zeros((n, n)))
     rest = block([[defect], [k @ others if followed else k]])
-    direct_left = j @ others if followed else j
-    if followed:
-        direct_left = Ball(direct_left.midpoint, direct_left.radius + j.radius)
-    sizes = np.abs(direct_left.midpoint) + direct_left.radius
+    direct = j @ others if followed else j
+    sizes = np.abs(direct.midpoint) + (direct.radius + (j.radius if followed else 0.0))
     driven = np.zeros_like(sizes) if contraction is None else contraction.gain(shown, rest.midpoint, rest.radius)
     left = float(np.linalg.norm(np.sum(rounded_up(driven + sizes, 4), axis=1)))
-    second = earlier.midpoint
-    return BetweenSamples(
-        plant, dt, m, shown, contraction, into, g1, second, observer.Dy[rows], rows, left,
-    )  # fmt: skip
+    return m, shown, contraction, block([[projector], [into]]), left

@@ -27,8 +27,8 @@ from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.profiles import Additive, Random
-from obsynth.simulation.scenario import Scenario
-from obsynth.simulation.scenario_signals import resolve
+from obsynth.simulation.scenario import Scenario, observer_start
+from obsynth.simulation.signals import Drive, resolve
 from obsynth.verification.error_system import ErrorSystem
 
 
@@ -203,24 +203,25 @@ def watches_estimates(design: ObserverDesign) -> bool:
     return "Phi" in design.certificate.matrices and bool(design.linear[1].fault_names)
 
 
+def noisy_plant(plant: DescriptorSystem, scenario: Scenario, drive: Drive) -> DescriptorSystem:
+    """Return a plant with the noise of a scenario: its own, as often, and that of the sensors."""
+    return plant.replace(
+        Bw=np.hstack([scenario.noise * plant.Bw, np.zeros((plant.nx, plant.ny))]),
+        Dw=np.hstack([scenario.noise * plant.Dw, np.diag(drive.deviations)]), noise_names=None,
+    )  # fmt: skip
+
+
 def residual_model(
     design: ObserverDesign, scenario: Scenario, *, endless: bool = False, estimates: bool = False
 ) -> ResidualModel:
     """Return the model of a design's residual on a scenario, or of its fault ``estimates``, zero but for errors."""
     plant, observer = design.linear
     drive = resolve(plant, scenario)
-    noisy = plant.replace(
-        Bw=np.hstack([scenario.noise * plant.Bw, np.zeros((plant.nx, plant.ny))]),
-        Dw=np.hstack([scenario.noise * plant.Dw, np.diag(drive.deviations)]),
-        noise_names=None,
-    )
+    noisy = noisy_plant(plant, scenario, drive)
     found = tracked_errors(design, noisy)
     errors = found.errors
     start = np.array([scenario.initial_state.get(name, 0.0) for name in plant.state_names])
-    begin = np.zeros(observer.order) if scenario.observer_state is None else np.array(scenario.observer_state)
-    if len(begin) != observer.order:
-        raise SpecError(f"observer_state needs {observer.order} numbers, not {len(begin)}.", path="observer_state")
-    initial = found.tracking @ (plant.E @ start) - begin
+    initial = found.tracking @ (plant.E @ start) - observer_start(scenario, observer.order)
     shown, _, direct_d, direct_w = errors.fault_output if estimates else errors.residual_output
     rows = observer.fault_rows if estimates else observer.residual_rows
     faults, _, faults_d, faults_w = errors.fault_output

@@ -50,23 +50,20 @@ def scaled_inputs(
         )  # fmt: skip
     sizes = np.where(reached, bounds, 0.0)
     factor = 0.0 if noise_bound is None else noise_bound
-    nothing = np.zeros(model.steps)
+    none = np.zeros((len(model.A), 0))
     if model.sampled is not None:
         table, limits = model.sampled.of_disturbances(sizes, model.steps)
-        none = np.zeros((len(model.A), 0))
         return ScaledInputs(factor * model.Bw, factor * model.Dw, table, float(np.sum(limits)), none)
-    if between is None or model.continuous is None or model.flow is None:
-        return ScaledInputs(
-            np.hstack([model.Bd * sizes, factor * model.Bw]), np.hstack([model.Dd * sizes, factor * model.Dw]), nothing,
-            0.0, np.zeros((len(model.A), 0)),
-        )  # fmt: skip
-    count = 0 if model.sensor_noise is None else model.sensor_noise[0].shape[1]
-    process = factor * model.continuous.gathered_noise(between.plant)
+    if between is None or model.continuous is None:
+        b, d = np.hstack([model.Bd * sizes, factor * model.Bw]), np.hstack([model.Dd * sizes, factor * model.Dw])
+        return ScaledInputs(b, d, np.zeros(model.steps), 0.0, none)
     if any_stamps:
         return _at_any_stamps(model, between, sizes, factor)
+    count = 0 if model.sensor_noise is None else model.sensor_noise[0].shape[1]
+    process = factor * model.continuous.gathered_noise(between.plant)
     table, limits = between.of_disturbances(sizes, model.steps)
     noise, noise_limits = between.of_process_noise(process, model.steps)
-    start = np.zeros((len(model.A), 0)) if model.start_noise is None else factor * model.start_noise
+    start = none if model.start_noise is None else factor * model.start_noise
     limit = float(np.sum(limits) + np.sum(noise_limits))
     return ScaledInputs(factor * model.Bw[:, :count], factor * model.Dw[:, :count], table + noise, limit, start)
 
@@ -99,12 +96,33 @@ def paper_threshold(model: ResidualModel, bounds: FloatArray, initial_error: flo
 
 def pointwise_threshold(model: ResidualModel, inputs: ScaledInputs, initial_error: float) -> FloatArray:
     """Return what the norm of the residual never passes: exact initial-error term and l1 (peak) gains of each input."""
-    powers = model.powers()
-    start = np.array([np.linalg.norm(model.C @ power, 2) for power in powers]) * initial_error
-    start += np.array([np.sum(np.linalg.norm(model.C @ power @ inputs.start, axis=0)) for power in powers])
-    gathered = np.array([np.sum(np.linalg.norm(model.C @ power @ inputs.B, axis=0)) for power in powers])
-    earlier = np.concatenate([[0.0], np.cumsum(gathered)[:-1]])
-    return np.asarray(start + earlier + np.sum(np.linalg.norm(inputs.D, axis=0)) + inputs.between)
+    shown = [model.C @ power for power in model.powers()]
+    start = np.array([np.linalg.norm(c, 2) for c in shown]) * initial_error
+    start += np.array([_columns(c @ inputs.start) for c in shown])
+    earlier = np.concatenate([[0.0], np.cumsum([_columns(c @ inputs.B) for c in shown])[:-1]])
+    return np.asarray(start + earlier + _columns(inputs.D) + inputs.between)
+
+
+def _columns(matrix: FloatArray) -> float:
+    """Return the sum of the norms of columns."""
+    return float(np.sum(np.linalg.norm(matrix, axis=0)))
+
+
+def _energy_roots(model: ResidualModel, powers: list[FloatArray]) -> list[FloatArray]:
+    """Return R with ``R'R = sum (C A^k)' C A^k`` for sums of one sample and more: what an error shows in these."""
+    energy, roots = np.zeros_like(model.A), []
+    for power in powers:
+        shown = model.C @ power
+        energy = energy + shown.T @ shown
+        values, vectors = np.linalg.eigh((energy + energy.T) / 2.0)
+        roots.append(np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T)
+    return roots
+
+
+def _window_gain(model: ResidualModel, inputs: ScaledInputs) -> tuple[float, int]:
+    """Return the l2 gain from the inputs to the residual, and how many of them there are."""
+    count = int(np.sum(np.any(inputs.B != 0.0, axis=0) | np.any(inputs.D != 0.0, axis=0)))
+    return hinf_norm(model.A, inputs.B, model.C, inputs.D).upper if count else 0.0, count
 
 
 def window_threshold(model: ResidualModel, inputs: ScaledInputs, initial_error: float, window: int) -> FloatArray:
@@ -118,28 +136,16 @@ def window_threshold(model: ResidualModel, inputs: ScaledInputs, initial_error: 
     summed = np.array([np.linalg.norm(one_by_one[max(k - window + 1, 0) : k + 1]) for k in range(model.steps)])
     if model.flow is not None or model.sampled is not None:
         return summed
-    B, D = inputs.B, inputs.D
-    powers = model.powers()
-    count = int(np.sum(np.any(B != 0.0, axis=0) | np.any(D != 0.0, axis=0)))
-    gain = hinf_norm(model.A, B, model.C, D).upper if count else 0.0
-    bound = np.empty(model.steps)
-    energy = np.zeros_like(model.A)
-    roots = []
-    for power in powers[:window]:
-        shown = model.C @ power
-        energy = energy + shown.T @ shown
-        values, vectors = np.linalg.eigh((energy + energy.T) / 2.0)
-        roots.append(np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T)
-    for k in range(model.steps):
-        length = min(window, k + 1)
-        bound[k] = gain * np.sqrt(length * count) + (
-            0.0 if k + 1 > window else float(np.linalg.norm(roots[length - 1], 2)) * initial_error
-        )
+    powers, (gain, count) = model.powers(), _window_gain(model, inputs)
+    roots = _energy_roots(model, powers[:window])
     full = roots[-1]
-    gathered = np.cumsum([0.0, *(np.sum(np.linalg.norm(full @ power @ B, axis=0)) for power in powers)])
-    for k in range(window, model.steps):
-        begin = k - window + 1
-        bound[k] += float(np.linalg.norm(full @ powers[begin], 2)) * initial_error + gathered[begin]
+    gathered = np.cumsum([0.0, *(_columns(full @ power @ inputs.B) for power in powers)])
+    bound = np.empty(model.steps)
+    for k in range(model.steps):
+        length, begin = min(window, k + 1), max(k - window + 1, 0)
+        # Before the window is full it begins with the record.
+        left = roots[k] if k + 1 <= window else full @ powers[begin]
+        bound[k] = gain * np.sqrt(length * count) + float(np.linalg.norm(left, 2)) * initial_error + gathered[begin]
     return np.asarray(np.minimum(bound, summed))
 
 
@@ -178,15 +184,10 @@ def unlimited_bound(
     left = float(np.linalg.norm(last, 2)) if last.size else 0.0
     shown = [float(np.linalg.norm(model.C @ power, 2)) for power in powers]
     # Of k = m N + j samples, m N shrink by left^m: inputs of that age, and the start, add no more than this.
-    aged = float(np.sum(np.linalg.norm(last @ inputs.B, axis=0))) * sum(shown) / (1.0 - left)
+    aged = _columns(last @ inputs.B) * sum(shown) / (1.0 - left)
     bare = pointwise_threshold(model, inputs, 0.0)
-    pointwise = (
-        float(bare[-1] - inputs.between[-1])
-        + inputs.limit
-        + shown[-1] * float(np.sum(np.linalg.norm(inputs.B, axis=0)))
-        + aged
-    )
-    begins = initial_error + float(np.sum(np.linalg.norm(inputs.start, axis=0)))
+    pointwise = float(bare[-1] - inputs.between[-1]) + inputs.limit + shown[-1] * _columns(inputs.B) + aged
+    begins = initial_error + _columns(inputs.start)
     start = max(shown) * left * begins
     if kind == "pointwise":
         return UnlimitedHorizonBound(_start_added(model, bare, initial_error), pointwise + start)
@@ -204,16 +205,12 @@ def _window_limit(
     model: ResidualModel, inputs: ScaledInputs, start_of: tuple[float, float, FloatArray], window: int
 ) -> float:
     """Return the l2 bound of a window that begins after the table, see `window_threshold`."""
-    initial_error, left, last = start_of
+    (initial_error, left, last), (gain, count) = start_of, _window_gain(model, inputs)
     powers = model.powers()
-    energy = sum((model.C @ power).T @ (model.C @ power) for power in powers[:window])
-    values, vectors = np.linalg.eigh(energy)
-    full = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
+    full = _energy_roots(model, powers[:window])[-1]
     sizes = [float(np.linalg.norm(full @ power, 2)) for power in powers]
-    gathered = sum(float(np.sum(np.linalg.norm(full @ power @ inputs.B, axis=0))) for power in powers)
-    aged = float(np.sum(np.linalg.norm(last @ inputs.B, axis=0))) * sum(sizes) / (1.0 - left)
-    count = int(np.sum(np.any(inputs.B != 0.0, axis=0) | np.any(inputs.D != 0.0, axis=0)))
-    gain = hinf_norm(model.A, inputs.B, model.C, inputs.D).upper if count else 0.0
+    gathered = sum(_columns(full @ power @ inputs.B) for power in powers)
+    aged = _columns(last @ inputs.B) * sum(sizes) / (1.0 - left)
     start = max(max(sizes) * left, max(sizes[-window:])) * initial_error
     return gain * float(np.sqrt(window * count)) + gathered + aged + start
 

@@ -14,6 +14,7 @@ from obsynth.methods.fault_estimation_filter.central_equation import CentralEqua
 from obsynth.methods.fault_estimation_filter.gamma_iteration import NEXT_TO, Descent
 from obsynth.methods.fault_estimation_filter.injection_problem import GainProblem, Injection
 from obsynth.numerics.arrays import SMALLEST
+from obsynth.numerics.norms import spectral_radius
 
 #: Artificial noise relative to the disturbance, in turn: the first is bisected, and each of the others only where it
 #: reaches a level below.
@@ -46,8 +47,8 @@ DECOUPLING_ATTEMPTS = ((1e-4, 1e-6), (1e-2, 1e-6), (1e-4, 1e-8), (1e-2, 1e-8))
 #: The same share where states are many: no gain that is shipped is smaller than ten times that.
 COARSELY_DECOUPLED = 1e-4
 GENERIC_POINT = 1.3247
-#: A point so far out that a combination which waits for samples is larger there than at the first by more than this.
-FAR_POINT, MOST_GROWTH = 1e6, 1e4
+#: Points so far out that a combination which waits for samples, or takes the last ones alone, is told by its growth.
+FAR_POINTS, MOST_GROWTH, LEAST_DECAY = (1e2, 1e3), 3.0, 0.3
 SAME_ROWS = 1e-8
 #: A level this far above anything a disturbance could do is no limit.
 WITHOUT_LIMIT = 1e4
@@ -135,12 +136,11 @@ def _decoupling_filter(problem: GainProblem, gain: float) -> tuple[Injection, fl
 
 def _follows_from_measurements(problem: GainProblem) -> bool:
     """Whether the rows of xi are combinations of those of state and measurements, without samples yet to come."""
-    generic, left = _combined(problem, GENERIC_POINT)
-    if left > SAME_ROWS:
+    if _combined(problem, GENERIC_POINT)[1] > SAME_ROWS:
         return False
-    # A sample yet to come is a factor of z.
-    far, _ = _combined(problem, FAR_POINT * max(1.0, float(np.linalg.norm(problem.A))))
-    return far <= MOST_GROWTH * generic
+    # A sample yet to come is a factor of z, and where no weight is free past ones alone are left: a factor of 1 / z.
+    near, far = (_combined(problem, point * max(1.0, spectral_radius(problem.A)))[0] for point in FAR_POINTS)
+    return far <= (MOST_GROWTH if problem.weight_is_free else LEAST_DECAY) * near
 
 
 def _combined(problem: GainProblem, point: float) -> tuple[float, float]:

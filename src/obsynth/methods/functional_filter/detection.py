@@ -159,25 +159,16 @@ def _verified(
     felt = transfer(np.hstack([smooth.Bd, smooth.Bw]), np.hstack([smooth.Dd, smooth.Dw]))
     proved = gain_is_proved(felt, gain)
     sensed = sensitivity == 0.0 or sensitivity_is_proved(transfer(smooth.Bf, smooth.Df), sensitivity, *band)
-    terms = ((observer.Az,), (injected, smooth.C), (smooth.A,))
+    identities = (
+        ("state in the error", "Az = A - By C", (observer.Az, injected @ smooth.C, -smooth.A),
+         ((observer.Az,), (injected, smooth.C), (smooth.A,))),
+        ("inputs in the error", "Bu = B - By D", (observer.Bu, injected @ smooth.D, -smooth.B),
+         ((injected, smooth.D), (smooth.B,))),
+        ("state in the residuals", "Cz = -Dy C", (observer.Cz, weight @ smooth.C), ((weight, smooth.C),)),
+        ("inputs in the residuals", "Du = -Dy D", (observer.Du, weight @ smooth.D), ((weight, smooth.D),)),
+    )  # fmt: skip
     return VerificationReport.of([
-        equality(
-            "state in the error", "Az = A - By C",
-            Identity((observer.Az, injected @ smooth.C, -smooth.A), terms).residual(), source,
-        ),
-        equality(
-            "inputs in the error", "Bu = B - By D",
-            Identity((observer.Bu, injected @ smooth.D, -smooth.B), ((injected, smooth.D), (smooth.B,))).residual(),
-            source,
-        ),
-        equality(
-            "state in the residuals", "Cz = -Dy C",
-            Identity((observer.Cz, weight @ smooth.C), ((weight, smooth.C),)).residual(), source,
-        ),
-        equality(
-            "inputs in the residuals", "Du = -Dy D",
-            Identity((observer.Du, weight @ smooth.D), ((weight, smooth.D),)).residual(), source,
-        ),
+        *(equality(name, claim, Identity(parts, terms).residual(), source) for name, claim, parts, terms in identities),
         Check(
             "disturbance gain", "the error dies out, and the H-infinity norm from unknown inputs and noise to the "
             "residuals is at most the claimed one", gain, gain, 0.0, proved, source, "proved",

@@ -145,9 +145,7 @@ class DelayCurve:
         )
 
 
-def delay_curve(
-    plant: DescriptorSystem, fault: int, rate: float | None = None, lags: Sequence[int] = LAGS
-) -> DelayCurve | None:
+def delay_curve(plant: DescriptorSystem, fault: int, rate: float | None = None) -> DelayCurve | None:
     """Return the curve of a fault of a sampled plant, free of all others; ``None`` where it cannot be estimated."""
     if not plant.dt > 0.0 or not plant.nw:
         return None
@@ -160,26 +158,26 @@ def delay_curve(
         rows = []
         for factor in FACTORS:
             walks = np.array([factor * middle])
-            gain = kalman_gain(model, walks, lag=max(lags))
+            gain = kalman_gain(model, walks, lag=max(LAGS))
             states = np.diag(np.r_[np.ones(model.order), np.zeros(len(model.A) - model.order)])
             process = model.N @ model.N.T + (model.drive * walks**2) @ model.drive.T + gain.added**2 * states
             p = riccati_solution(model.A, model.C, process, model.M @ model.M.T, model.N @ model.M.T)
             if p is None:
                 return None
-            rows.append(_smoothed(p, model.C, model.A - gain.K @ model.C, model.estimate, gain.lag, lags))
+            rows.append(_smoothed(p, model.C, model.A - gain.K @ model.C, model.estimate, gain.lag))
     except ObsynthError:
         return None
     rates = tuple(factor * middle for factor in FACTORS)
-    return DelayCurve(plant.fault_names[fault], rates, tuple(lags), np.array(rows))
+    return DelayCurve(plant.fault_names[fault], rates, LAGS, np.array(rows))
 
 
 def _smoothed(
-    p: FloatArray, c: FloatArray, closed: FloatArray, estimate: FloatArray, gains: Sequence[FloatArray],
-    lags: Sequence[int],
-) -> list[float]:  # fmt: skip
-    known, moved, found = np.zeros_like(p), p.copy(), {}
-    for lag in range(max(lags) + 1):
-        known = known + gains[lag] @ c @ moved
+    p: FloatArray, c: FloatArray, closed: FloatArray, estimate: FloatArray, gains: Sequence[FloatArray]
+) -> list[float]:
+    """Return the deviation of the estimate at each of `LAGS`."""
+    known, moved, found = np.zeros_like(p), p.copy(), []
+    for gain in gains[: max(LAGS) + 1]:
+        known = known + gain @ c @ moved
         moved = closed @ moved
-        found[lag] = float(np.sqrt(max((estimate @ (p - known) @ estimate.T)[0, 0], 0.0)))
-    return [found[lag] for lag in lags]
+        found.append(float(np.sqrt(max((estimate @ (p - known) @ estimate.T)[0, 0], 0.0))))
+    return [found[lag] for lag in LAGS]

@@ -108,16 +108,14 @@ def _with_noise(plant: DescriptorSystem, asked: FunctionalFilterOptions) -> tupl
 
 def _models(plant: DescriptorSystem, model: Exosystem, asked: FunctionalFilterOptions) -> list[FilterModel]:
     """Return a filter model for each group of faults that one filter serves."""
-    everything = range(plant.nf)
-    sets = asked.residual_sets(plant)
-    if sets is not None:
-        return [
-            filter_model(plant, model, removed=[j for j in everything if j not in seen], faults=()) for seen in sets
-        ]
-    chosen = asked.chosen_faults(plant)
-    groups = [chosen] if asked.joint else [[fault] for fault in chosen]
+    groups = sets = asked.residual_sets(plant)
+    if groups is None:
+        chosen = asked.chosen_faults(plant)
+        groups = [chosen] if asked.joint else [[fault] for fault in chosen]
+    others = ([j for j in range(plant.nf) if j not in group] for group in groups)
     return [
-        filter_model(plant, model, removed=[j for j in everything if j not in group], faults=group) for group in groups
+        filter_model(plant, model, removed=removed, faults=group if sets is None else ())
+        for group, removed in zip(groups, others, strict=True)
     ]
 
 

@@ -65,20 +65,17 @@ class SymmetricCertificate:
         return self.P3 + 0.5 * delta * self.weight
 
 
-def symmetric_certificate(Az: FloatArray, *, decay: float) -> SymmetricCertificate | None:
-    """Return a certificate of Theorem 2 in closed form; ``None`` when errors do not decay so fast.
+def symmetric_certificate(Az: FloatArray) -> SymmetricCertificate | None:
+    """Return a certificate of Theorem 2 in closed form for ``Az (n, n)``; ``None`` when errors do not decay.
 
     With ``P1 = P3 + (delta / 2) weight``, the lower left block of the inequality is delta times the skew part S of
     ``P3 A``, so that it holds when ``weight > (delta / 2) S' P3^-1 S``.
-
-    Shapes: ``Az (n, n)``.
     """
     from scipy.linalg import eigvalsh
 
-    moving = Az + decay * np.eye(len(Az))
-    if not spectral_abscissa(moving) < 0.0:
+    if not spectral_abscissa(Az) < 0.0:
         return None
-    balanced, units = balanced_matrix(moving)
+    balanced, units = balanced_matrix(Az)
     try:
         p = _gram(balanced)
         through = p @ balanced

@@ -8,7 +8,7 @@ paper supposes, is more than needed.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -112,50 +112,44 @@ def _explicit_conditions(plant: DescriptorSystem) -> Iterator[Condition]:
         f"{plant.nf} faults and {plant.ny} output(s). Measure more, or leave a fault out.",
         signals=plant.fault_names,
     )  # fmt: skip
-    units, terms = PlantUnits.of(plant).rounded(), sized_plant(plant)
-    natural, sizes = units.scaled_plant(plant), None if terms is None else units.scaled_plant(terms)
-    columns = np.vstack([natural.Bf, natural.Df])
-    acting = settled_rank(
-        decide_rank(columns, expected=plant.nf),
-        None if numbers is None else numbers.rank(numbers.blocks([[numbers.matrix("Bf")], [numbers.matrix("Df")]])),
-        np.inf if sizes is None else least_share(columns, np.vstack([sizes.Bf, sizes.Df])),
-    )
-    told_apart = rank_condition(
-        "rank F", acting, "some faults act nowhere, or in the same direction as others, and cannot be told apart.",
-        source="Filasova et al., eq. (3)", signals=_null_names(columns, plant.fault_names),
-    )  # fmt: skip
-    if acting.means == "unclear":
-        told_apart = told_apart.in_doubt(rank_doubt(plant, units, acting, [["Bf"], ["Df"]]), plant)
-    yield told_apart
+
+    def alike(columns: FloatArray) -> tuple[str, tuple[str, ...]]:
+        told = "some faults act nowhere, or in the same direction as others, and cannot be told apart."
+        return told, _null_names(columns, plant.fault_names)
+
+    def hidden(rosenbrock: FloatArray) -> tuple[str, tuple[str, ...]]:
+        names = leading_names(_null_vector(rosenbrock)[plant.nx :], plant.fault_names, most=MOST_NAMES)
+        told = (
+            f"there is a zero at s = 0, where a constant fault {', '.join(map(repr, names))} does not show in the "
+            "outputs once the states have settled. Measure another signal."
+        )
+        return told, names
+
+    yield _full_rank(plant, numbers, "rank F", [["Bf"], ["Df"]], alike)
     yield _detectability_in_floating_point(plant) if numbers is None else _detectability(plant, numbers)
-    yield _at_zero(plant, natural, sizes, numbers)
+    at_zero = _full_rank(plant, numbers, "rank [A F; C Df]", [["A", "Bf"], ["C", "Df"]], hidden)
+    yield at_zero if at_zero.holds else replace(at_zero, mode=0j)
 
 
-def _at_zero(
-    plant: DescriptorSystem, natural: DescriptorSystem, sizes: DescriptorSystem | None, numbers: PlantNumbers | None
-) -> Condition:
-    """Return the condition that no constant fault is hidden: natural and sizes in units of the plant's own."""
-    rosenbrock = np.block([[natural.A, natural.Bf], [natural.C, natural.Df]])
-    hidden = leading_names(_null_vector(rosenbrock)[plant.nx :], plant.fault_names, most=MOST_NAMES)
-    exact = None
+def _full_rank(
+    plant: DescriptorSystem, numbers: PlantNumbers | None, name: str, layout: list[list[str]],
+    failure: Callable[[FloatArray], tuple[str, tuple[str, ...]]],
+) -> Condition:  # fmt: skip
+    """Return the condition that blocks of the plant make up a matrix of full column rank, decided in its own units."""
+    units, terms = PlantUnits.of(plant).rounded(), sized_plant(plant)
+
+    def whole(part: DescriptorSystem) -> FloatArray:
+        scaled = units.scaled_plant(part)
+        return np.block([[getattr(scaled, key) for key in row] for row in layout])
+
+    matrix, exact = whole(plant), None
     if numbers is not None:
-        exact = numbers.rank(numbers.blocks([
-            [numbers.matrix("A"), numbers.matrix("Bf")], [numbers.matrix("C"), numbers.matrix("Df")],
-        ]))  # fmt: skip
-    decision = settled_rank(
-        decide_rank(rosenbrock, expected=plant.nx + plant.nf), exact,
-        np.inf if sizes is None else least_share(rosenbrock, np.block([[sizes.A, sizes.Bf], [sizes.C, sizes.Df]])),
-    )  # fmt: skip
-    found = rank_condition(
-        "rank [A F; C Df]", decision,
-        f"there is a zero at s = 0, where a constant fault {', '.join(map(repr, hidden))} does not show in the outputs "
-        "once the states have settled. Measure another signal.",
-        source="Filasova et al., eq. (3)", signals=hidden,
-    )  # fmt: skip
-    if decision.means == "unclear":
-        layout = [["A", "Bf"], ["C", "Df"]]
-        found = found.in_doubt(rank_doubt(plant, PlantUnits.of(plant).rounded(), decision, layout), plant)
-    return found if found.holds else replace(found, mode=0j)
+        exact = numbers.rank(numbers.blocks([[numbers.matrix(key) for key in row] for row in layout]))
+    share = np.inf if terms is None else least_share(matrix, whole(terms))
+    decision = settled_rank(decide_rank(matrix, expected=matrix.shape[1]), exact, share)
+    remedy, signals = failure(matrix)
+    found = rank_condition(name, decision, remedy, source="Filasova et al., eq. (3)", signals=signals)
+    return found.in_doubt(rank_doubt(plant, units, decision, layout), plant) if decision.means == "unclear" else found
 
 
 def _condition(

@@ -69,27 +69,13 @@ def with_faults_as_states(plant: DescriptorSystem, gain: FloatArray | None = Non
     g = np.eye(nf) if gain is None else gain
     a = np.zeros((nx + nf, nx + nf))
     a[:nx, :nx], a[:nx, nx:] = plant.A, plant.Bf @ g
-    faultless = np.zeros((nf, plant.nu)), np.zeros((nf, plant.nd)), np.zeros((nf, plant.nw))
-    inputs = [np.vstack(pair) for pair in zip((plant.B, plant.Bd, plant.Bw), faultless, strict=True)]
+    b, bd, bw = (np.vstack([part, np.zeros((nf, part.shape[1]))]) for part in (plant.B, plant.Bd, plant.Bw))
+    states = [*(f"state:{name}" for name in plant.state_names), *(f"fault:{name}" for name in plant.fault_names)]
     return DescriptorSystem(
-        None,
-        a,
-        inputs[0],
-        np.hstack([plant.C, plant.Df @ g]),
-        Bf=np.vstack([np.zeros((nx, nf)), np.eye(nf)]),
-        Bd=inputs[1],
-        Bw=inputs[2],
-        D=plant.D,
-        Dd=plant.Dd,
-        Dw=plant.Dw,
-        state_names=[
-            *(f"state:{name}" for name in plant.state_names),
-            *(f"fault:{name}" for name in plant.fault_names),
-        ],
-        input_names=plant.input_names,
-        output_names=plant.output_names,
+        None, a, b, np.hstack([plant.C, plant.Df @ g]), Bf=np.eye(nx + nf)[:, nx:], Bd=bd, Bw=bw, D=plant.D,
+        Dd=plant.Dd, Dw=plant.Dw, state_names=states, input_names=plant.input_names, output_names=plant.output_names,
         fault_names=[f"rate:{name}" for name in plant.fault_names],
-    )
+    )  # fmt: skip
 
 
 def with_sensor_noise(plant: DescriptorSystem) -> DescriptorSystem:

@@ -135,7 +135,7 @@ def _closed_form(task: PdTask, *, free_delta: bool) -> tuple[PdSolution, float]:
     record = {"what": _WHAT, "solver": "Riccati equation, LAPACK"}
     gain = _riccati_gain(shifted, c, record)
     moving = shifted - gain @ c
-    found = symmetric_certificate(moving, decay=0.0)
+    found = symmetric_certificate(moving)
     if found is None:
         raise SolverError("A Riccati equation gave gains that are not stable: nothing is known.", record=record)
     delta = min(task.delta, SHARE * found.limit) if free_delta else task.delta

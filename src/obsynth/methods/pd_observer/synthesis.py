@@ -210,10 +210,8 @@ def synthesis_from_gains(
         raise SpecError(f"decay is {decay}: give 0 or a positive number in 1/seconds.", path="decay")
     g = None if adaptation_gain is None else checked_adaptation_gain(adaptation_gain, work.nf)
     inner = np.eye(work.nf) if g is None else g
-    gain_j, gain_l = (
-        np.vstack([matrices["J"], inner @ matrices["M"]]),
-        np.vstack([matrices["L"], inner @ matrices["N"]]),
-    )
+    pairs = (("J", "M"), ("L", "N"))
+    gain_j, gain_l = (np.vstack([matrices[top], inner @ matrices[bottom]]) for top, bottom in pairs)
     observer = _realised(work, gain_j, gain_l)
     found = explicit_certificate(observer.Az, observer.Cz[: observer.order], decay=decay)
     if found is None:  # not stable, or too slow: the report will say so
@@ -230,9 +228,8 @@ def synthesis_from_gains(
 
 def _realised(plant: DescriptorSystem, gain_j: FloatArray, gain_l: FloatArray) -> LinearObserver:
     augmented = with_faults_as_states(plant)
-    singular = SpecError(
-        "I + L C is singular with these gains: the observer's equations do not determine its estimates.", path="L"
-    )
     if not np.linalg.cond(np.eye(augmented.nx) + gain_l @ augmented.C) < 1.0 / np.finfo(np.float64).eps:
-        raise singular
+        raise SpecError(
+            "I + L C is singular with these gains: the observer's equations do not determine its estimates.", path="L"
+        )
     return realise_pd_observer(plant, augmented, gain_j, gain_l)

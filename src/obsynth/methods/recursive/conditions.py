@@ -78,15 +78,15 @@ def _rank_of_steps(
     if condition.holds:
         return condition
     k = ranks.worst_k - 1
-    blocks = step_blocks(plant, k, early_rows(plant, early=early))
+    blocks = step_blocks(plant, k, late)
     H = np.vstack([blocks.E, blocks.C])
     names = _open_states(np.zeros_like(H), H, 0.0, plant)
     remedies = ["measure something that they act on"]
     if not early:
-        late = early_rows(plant, early=True)
-        if late.size and horizon_ranks(plant, early=True).worst.full:
+        algebraic = early_rows(plant, early=True).size
+        if algebraic and horizon_ranks(plant, early=True).worst.full:
             remedies.append("use the algebraic equations one step earlier (early_constraints: true)")
-        if late.size:
+        if algebraic:
             remedies.append("eliminate the algebraic states (transform: {eliminate_algebraic_states: true} in "
                             "continuous time, before sampling)")  # fmt: skip
     remedies.append("leave out states that nothing depends on")
@@ -161,7 +161,7 @@ def residual_condition(ranks: HorizonRanks) -> Condition:
     """Return the condition that (18) can learn at all, which the paper never states."""
     return Condition(
         "residual directions", "rank E_k + ny - nx >= 1 for every k", ranks.directions >= 1, float(ranks.directions),
-        1.0,         "our finding: missing in Moussa Ali, Zhang 2013",
+        1.0, "our finding: missing in Moussa Ali, Zhang 2013",
         f"at k = {ranks.directions_k} (18) sees only rank E + ny - nx = {ranks.directions} residual directions"
         + ("" if ranks.directions >= 1 else ": y - C xhat is zero whatever the parameters are, so it never learns. Use "
            "form 'innovation', which sees all the parity directions."),

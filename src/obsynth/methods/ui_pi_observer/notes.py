@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
+
 import numpy as np
 
-from obsynth.analysis.conditions import Condition
 from obsynth.methods.placement.kalman import NOISE_PRICE
+from obsynth.methods.ui_pi_observer.conditions import Existence
 from obsynth.methods.ui_pi_observer.options import UiPiOptions
 from obsynth.methods.ui_pi_observer.pencils import numbers
 from obsynth.methods.ui_pi_observer.placement_problem import PlacementProblem
@@ -15,52 +17,33 @@ from obsynth.numerics.spectra import decay_rates
 SLOW_DEFAULT = 1000.0
 
 
-def elimination_note(found: tuple[Condition, ...], eliminated: bool) -> tuple[str, ...]:
-    """Return a note where the method has eliminated the algebraic states by itself."""
-    if not eliminated:
-        return ()
-    detail = next(condition.detail for condition in found if condition.name.startswith("(D1)"))
-    return (f"(D1) holds only without the algebraic states, which were eliminated: {detail}.",)
-
-
-def fixed_mode_notes(problem: PlacementProblem, asked: UiPiOptions, dt: float) -> tuple[str, ...]:
-    """Return a note about poles that no gain moves."""
-    found = []
-    fixed = problem.fixed_modes
+def notes(
+    found: Existence, problem: PlacementProblem, asked: UiPiOptions, claims: Mapping[str, float]
+) -> Iterator[str]:
+    """Yield notes on eliminated states, fixed poles, a slow default and digits, where these matter."""
+    if found.transformation is not None:
+        detail = next(condition.detail for condition in found.conditions if condition.name.startswith("(D1)"))
+        yield f"(D1) holds only without the algebraic states, which were eliminated: {detail}."
+    fixed, dt = problem.fixed_modes, found.plant.dt
     if fixed.size:
-        text = ", ".join(numbers(fixed))
-        rates = decay_rates(fixed, dt)
-        slow = asked.slowest_asked(dt)
-        found.append(
-            f"{fixed.size} of {len(problem.F)} poles are fixed, whatever the gains: {text}"
-            + (
-                f"; the slowest decays at {np.min(rates):.3g} 1/s, slower than asked."
-                if slow is not None and np.min(rates) < slow
-                else "."
-            )
+        slow, least = asked.slowest_asked(dt), np.min(decay_rates(fixed, dt))
+        behind = slow is not None and least < slow
+        yield (
+            f"{fixed.size} of {len(problem.F)} poles are fixed, whatever the gains: {', '.join(numbers(fixed))}"
+            + (f"; the slowest decays at {least:.3g} 1/s, slower than asked." if behind else ".")
         )
-    return tuple(found)
-
-
-def slow_note(problem: PlacementProblem, asked: UiPiOptions, decay: float | None) -> tuple[str, ...]:
-    """Return a note where the default, for lack of noise to pay with, is far slower than the plant."""
-    own = problem.rate / problem.units.time
+    own, decay = problem.rate / problem.units.time, claims.get("decay")
     default = asked.poles is None and asked.decay is None and asked.region is None
-    if not default or decay is None or problem.fixed_modes.size or decay * SLOW_DEFAULT >= own:
-        return ()
-    return (
-        f"The slowest pole decays at {decay:.3g} 1/s, against {own:.3g} 1/s of the plant itself: what is faster costs "
-        f"more than {NOISE_PRICE:g} times the noise of a Kalman filter, or was not found. Parts of the fault models "
-        f"that can hardly be told apart ({', '.join(dict.fromkeys(problem.model.descriptions))}) do that: leave one "
-        "out, or give decay or poles.",
-    )
-
-
-def digits_note(digits: float | None) -> tuple[str, ...]:
-    """Return a note where fewer digits than a double has, but more than are commonly printed, keep Ahat stable."""
-    if digits is None:
-        return ()
-    return (
-        f"Ahat is stable with {digits:.0f} significant digits and more, and unstable with fewer: in the coordinates of "
-        "this plant its entries cancel. Copy the gain set or the exported code, not printed numbers.",
-    )
+    if default and decay is not None and not fixed.size and decay * SLOW_DEFAULT < own:
+        yield (
+            f"The slowest pole decays at {decay:.3g} 1/s, against {own:.3g} 1/s of the plant itself: what is faster "
+            f"costs more than {NOISE_PRICE:g} times the noise of a Kalman filter, or was not found. Parts of the fault "
+            f"models that can hardly be told apart ({', '.join(dict.fromkeys(problem.model.descriptions))}) do that: "
+            "leave one out, or give decay or poles."
+        )
+    if "digits" in claims:
+        # Fewer digits than a double has, but more than are commonly printed, keep Ahat stable.
+        yield (
+            f"Ahat is stable with {claims['digits']:.0f} significant digits and more, and unstable with fewer: in the "
+            "coordinates of this plant its entries cancel. Copy the gain set or the exported code, not printed numbers."
+        )

@@ -227,16 +227,11 @@ def kalman_problem(problem: PlacementProblem, weights: NoiseWeights) -> KalmanPr
 def _noise(problem: PlacementProblem, weights: NoiseWeights) -> tuple[FloatArray, FloatArray]:
     """Return the noise inputs of the scaled plant."""
     plant, units = problem.plant, problem.units
-    if weights.measurement is None:
-        if plant.Dw.any():
-            return plant.Bw, plant.Dw
-        return np.hstack([plant.Bw, np.zeros((plant.nx, plant.ny))]), np.hstack([
-            np.zeros((plant.ny, plant.nw)), np.eye(plant.ny),
-        ])  # fmt: skip
     given = weights.measurement
-    deviations = np.array([given[name] if isinstance(given, Mapping) else given for name in plant.output_names])
-    deviations = deviations * units.outputs / (1.0 if units.discrete else np.sqrt(units.time))
-    return (
-        np.hstack([plant.Bw, np.zeros((plant.nx, plant.ny))]),
-        np.hstack([np.zeros((plant.ny, plant.nw)), np.diag(deviations)]),
-    )
+    if given is None and plant.Dw.any():
+        return plant.Bw, plant.Dw
+    deviations, stated = np.ones(plant.ny), np.zeros((plant.ny, plant.nw))
+    if given is not None:
+        listed = [given[name] if isinstance(given, Mapping) else given for name in plant.output_names]
+        deviations = np.array(listed) * units.outputs / (1.0 if units.discrete else np.sqrt(units.time))
+    return np.hstack([plant.Bw, np.zeros((plant.nx, plant.ny))]), np.hstack([stated, np.diag(deviations)])

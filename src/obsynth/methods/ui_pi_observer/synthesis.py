@@ -34,7 +34,7 @@ from obsynth.methods.refusals import require_all_told
 from obsynth.methods.riccati import lyapunov_factor
 from obsynth.methods.ui_pi_observer.augmented_plant import ObserverGains, combinations_seen, realise
 from obsynth.methods.ui_pi_observer.conditions import existence
-from obsynth.methods.ui_pi_observer.notes import digits_note, elimination_note, fixed_mode_notes, slow_note
+from obsynth.methods.ui_pi_observer.notes import notes
 from obsynth.methods.ui_pi_observer.options import UiPiOptions, checked_poles
 from obsynth.methods.ui_pi_observer.pencils import number
 from obsynth.methods.ui_pi_observer.placement_problem import (
@@ -99,12 +99,7 @@ def synthesise(plant: DescriptorSystem, asked: UiPiOptions, *, progress: Callabl
         synthesis.observer,
         synthesis.certificate,
         {"runs": list(chosen.runs)},
-        (
-            *elimination_note(found.conditions, found.transformation is not None),
-            *fixed_mode_notes(problem, asked, plant.dt),
-            *slow_note(problem, asked, synthesis.certificate.claims.get("decay")),
-            *digits_note(synthesis.certificate.claims.get("digits")),
-        ),
+        tuple(notes(found, problem, asked, synthesis.certificate.claims)),
         found.transformation,
     )
 

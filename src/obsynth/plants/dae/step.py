@@ -36,9 +36,8 @@ BLOCKS = (4, 4, 8, MOST_ITERATIONS - 16)
 class StepGraph:
     """The functions of one implicit step of fixed length; ``small``: whether all is scalar operations.
 
-    ``newton``: from stages, state before, input and parameters to residual, row scales and Newton step;
-    ``sensitivities``: to F ``(nx, nx)`` of (8), G ``(nx, nq)`` of (9), that of what is added to the equations, and the
-    equilibrated matrix of (7); ``step``: from state, input, parameters to stages, residual, and one if it is trusted.
+    ``newton``: stages, state before, input, parameters to residual, row scales, step; ``sensitivities``: these to
+    F of (8), G of (9), that of what is added, and the matrix of (7); ``step``: to stages, residual, and 1 if trusted.
     """
 
     newton: Any
@@ -145,10 +144,7 @@ MOST_SUBSOLVES = 10_000
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """The state ``x (nx,)`` at the end of a step, its ``stages``, the largest residual in sizes of the states.
-
-    ``subsolves``: Newton iterations that were started: 1, or more where a homotopy was needed.
-    """
+    """The state ``x (nx,)`` after a step, its stages, the residual in sizes of the states, Newton iterations begun."""
 
     x: FloatArray
     stages: FloatArray
@@ -158,10 +154,7 @@ class Solution:
 
 @dataclass(frozen=True, eq=False)
 class Sensitivities:
-    """Derivatives of a step by the state before, F (8), the parameters, G (9), and what is added to the equations.
-
-    ``condition``: of the equilibrated matrix of (7).
-    """
+    """Derivatives of a step: F (8), G (9), of what is added to the equations; condition of the matrix of (7)."""
 
     F: FloatArray
     G: FloatArray

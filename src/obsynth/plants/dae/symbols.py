@@ -71,10 +71,7 @@ class DAEFields:
 
 @dataclass(frozen=True, eq=False)
 class DAESymbols:
-    """``F(q', x, u, theta) = 0`` and ``y = h(x, theta)`` with ``q = q(x, theta)``, as columns of CasADi's SX.
-
-    ``rates`` stands for q'; ``stored``: the quantities q whose derivatives occur.
-    """
+    """``F(q', x, u, theta) = 0``, ``y = h(x, theta)``, q ``stored``, as columns of CasADi's SX; ``rates`` is q'."""
 
     rates: Any
     x: Any

@@ -245,21 +245,16 @@ def _gain_rows(design: ObserverDesign, errors: PdErrorSystem) -> Iterator[Check]
             "gain bound", "norm of [J L], with the rows of M and N: at most as claimed", gain, claims["gain_bound"],
             source="ours",
         )  # fmt: skip
-    own = max(_size(design.linear[0].A), 1.0)
+    large = not gain <= LARGE_GAIN * max(_size(design.linear[0].A), 1.0)
     warning = (
         "WARNING: out of proportion to the plant: any error of the model or the sensors is multiplied by it. Ask for a "
         "slower decay."
-        if not gain <= LARGE_GAIN * own
-        else ""
     )
-    yield information(
-        "gain", "spectral norm of [J L], with the rows of M and N", gain, source="recomputed", detail=warning
-    )
+    claim = "spectral norm of [J L], with the rows of M and N"
+    yield information("gain", claim, gain, source="recomputed", detail=warning if large else "")
 
 
-def _size(matrix: np.ndarray) -> float:
-    return (
-        float(np.linalg.norm(matrix, 2))
-        if matrix.size and np.all(np.isfinite(matrix))
-        else float(0.0 if not matrix.size else np.inf)
-    )
+def _size(matrix: FloatArray) -> float:
+    if not np.all(np.isfinite(matrix)):
+        return float("inf")
+    return float(np.linalg.norm(matrix, 2)) if matrix.size else 0.0

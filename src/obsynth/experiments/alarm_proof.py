@@ -1,4 +1,7 @@
-"""From a record to a proof that it is not fault-free: the programme solved, its dual checked in exact arithmetic."""
+"""From a record to a proof that it is not fault-free: the programme solved, its dual checked in exact arithmetic.
+
+Certificates of alarms on disk, and their check without a solver.
+"""
 
 from __future__ import annotations
 
@@ -10,84 +13,21 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.analysis.transformations.uncertain_plant import AffinePlant, affine_plant
-from obsynth.errors import PreconditionError, SpecError
-from obsynth.experiments.alarm_proofs.window import OUTWARD, Window, WindowData, window_programme
-from obsynth.experiments.monitors.adaptive_bound import adaptive_bound
-from obsynth.experiments.monitors.adaptive_monitor import start_of
-from obsynth.experiments.monitors.adaptive_record import thresholds_of_records
+from obsynth.errors import ObsynthError, PreconditionError, SpecError
+from obsynth.experiments.alarm_window import Window, window_data, window_programme
+from obsynth.files.inputs import read_json
 from obsynth.files.outputs import FileKind, write_atomically
-from obsynth.numerics.arguments import is_finite_number, is_whole
+from obsynth.numerics.arguments import is_whole
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.validation import index_of
+from obsynth.results.checks import Check, VerificationReport
 from obsynth.results.design import ObserverDesign
-from obsynth.results.gain_sets import digest_of
+from obsynth.results.gain_sets import digest_of, loaded, restored
 from obsynth.tolerances.result import EXACT_MODEL
-from obsynth.tolerances.robustness import structure_of
-from obsynth.tolerances.tracking import tracking_of
-
-#: Where the bounds of the state come from.
-REPLAY, STATED = "replay from the start", "stated"
-
-
-def window_data(
-    design: ObserverDesign, u: FloatArray, y: FloatArray, length: int, *, bounds: FloatArray, noise_bound: float,
-    initial_set: Mapping[str, Any] | None, state_bounds: Mapping[str, Any] | None,
-) -> tuple[AffinePlant, WindowData, str]:  # fmt: skip
-    """Return the plant over its box, the last ``length`` samples with bounds of the state, and where these come from.
-
-    Without stated ones they come from the observer run again from the start, and its error.
-    """
-    affine = affine_plant(design.linear[0])
-    first = max(0, len(y) - length)
-    if initial_set is None:
-        low, high = _stated(affine, state_bounds or {}, len(y) - first)
-        return affine, WindowData(u[first:], y[first:], low, high), STATED
-    _, observer = design.linear
-    tracking = tracking_of(design, affine)
-    structure = structure_of(
-        design, affine, tracking, bounds=bounds, noise_bound=noise_bound, faults=False, states=True
-    )
-    start = start_of(affine, tracking, None, initial_set, np.zeros(observer.order))
-    bound = adaptive_bound(structure, observer, start, varying=affine.box.variation == "varying")
-    estimates = observer.run(y, u if u.shape[1] else None)
-    rows = np.hstack([estimates.states, estimates.faults, estimates.residuals])
-    read = rows @ structure.reading.T
-    found = thresholds_of_records(bound, read[None], u[None], y[None])
-    middle = read - found.shift[0]
-    width = (found.total - np.abs(found.shift))[0] + OUTWARD * (np.abs(read) + found.total[0])
-    low, high = (middle - width)[first:], (middle + width)[first:]
-    return affine, WindowData(u[first:], y[first:], low, high), REPLAY
-
-
-def _stated(affine: AffinePlant, given: Mapping[str, Any], steps: int) -> tuple[FloatArray, FloatArray]:
-    names = affine.plant.state_names
-    missing = [name for name in names if name not in given]
-    if missing:
-        raise SpecError(f"Nothing bounds the state {missing[0]!r}: give initial_set (--initial), or its bound.",
-                        path="initial_set")  # fmt: skip
-    sizes = []
-    for name in names:
-        if not (is_finite_number(given[name]) and given[name] >= 0.0):
-            raise SpecError(f"The bound of {name!r} is {given[name]!r}: give a number, 0 or more.", path="state_bounds")
-        sizes.append(float(given[name]))
-    back = np.abs(2.0 * np.eye(len(names)) - affine.coordinates) @ np.array(sizes)
-    high = np.tile(back, (steps, 1))
-    return -high, high
-
 
 SCHEMA_VERSION = 1
 KIND = "obsynth alarm certificate"
 CERTIFICATE = FileKind("an alarm certificate", b'"kind": "obsynth alarm certificate"')
-
-
-def document(certificate: Mapping[str, Any]) -> str:
-    """Return the text of the file."""
-    body = {"kind": KIND, "schema_version": SCHEMA_VERSION, "sha256": digest_of(certificate),
-            "certificate": certificate}  # fmt: skip
-    return json.dumps(body, indent=1, allow_nan=False) + "\n"
-
-
 #: Samples of a window.
 WINDOW = 20
 #: The solver of linear programmes may take so long; without an answer nothing is proved.
@@ -141,7 +81,9 @@ class AlarmProof:
         """
         if not self.proved:
             raise SpecError("There is no proof to write: the alarm cannot be proved.", path="certificate")
-        return write_atomically(path, document(self.certificate))
+        body = {"kind": KIND, "schema_version": SCHEMA_VERSION, "sha256": digest_of(self.certificate),
+                "certificate": self.certificate}  # fmt: skip
+        return write_atomically(path, json.dumps(body, indent=1, allow_nan=False) + "\n")
 
     def __str__(self) -> str:
         return self.statement
@@ -268,9 +210,83 @@ def solved(programme: Window) -> tuple[FloatArray, FloatArray] | None:
     )  # fmt: skip
     if found.status != 0:
         return None
-    y = np.asarray(found.eqlin.marginals) if programme.equal.right else np.zeros(0)
-    return _short(y), _short(np.minimum(found.ineqlin.marginals, 0.0))
+    multipliers = (found.eqlin.marginals if programme.equal.right else (), np.minimum(found.ineqlin.marginals, 0.0))
+    equal, below = (np.array([float(f"{value:.{MULTIPLIER_DIGITS}g}") for value in part]) for part in multipliers)
+    return equal, below
 
 
-def _short(values: FloatArray) -> FloatArray:
-    return np.array([float(f"{value:.{MULTIPLIER_DIGITS}g}") for value in values])
+#: The stated margin may differ from the one found again by this share: matrices are made anew.
+SAME_MARGIN = 1e-3
+
+
+def is_certificate(content: Any) -> bool:
+    """Whether a JSON document is a certificate of an alarm."""
+    return isinstance(content, dict) and content.get("kind") == KIND
+
+
+def verify_alarm(path: str | Path) -> VerificationReport:
+    """Check the certificate of an alarm again, without a solver.
+
+    Parameters
+    ----------
+    path : str or Path
+        What `prove_alarm` (or ``obsynth prove-alarm``) wrote.
+
+    Returns
+    -------
+    VerificationReport
+        It fails where the file was changed, or the multipliers prove nothing.
+
+    Raises
+    ------
+    SpecError
+        The file is no certificate.
+    """
+    source = Path(path)
+    content = read_json(source)
+    if not is_certificate(content):
+        raise SpecError(f"{source} is no certificate of an alarm.", path=str(source))
+    body = content.get("certificate")
+    if content.get("schema_version") != SCHEMA_VERSION or not isinstance(body, dict):
+        raise SpecError(f"{source} has an unknown schema version.", path=str(source))
+    intact = content.get("sha256") == digest_of(body)
+    checks = [_row("digest", "the file is as it was written", float(intact), 1.0, intact)]
+    try:
+        checks += _checked(body)
+    except (ObsynthError, KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+        checks.append(_row("contents", f"the certificate can be read ({error})", 0.0, 1.0, False))
+    return VerificationReport.of(checks)
+
+
+def _checked(body: Mapping[str, Any]) -> list[Check]:
+    data = restored({name: value for name, value in body.items() if name != "gain_set"})
+    design = loaded(json.dumps(body["gain_set"]).encode(), "the certificate's gain set")
+    plant, _ = design.linear
+    u = np.asarray(data["u"], dtype=np.float64).reshape(-1, plant.nu)
+    y = np.asarray(data["y"], dtype=np.float64).reshape(-1, plant.ny)
+    bounds = np.asarray(data["bounds"], dtype=np.float64)
+    question = Question.of(
+        design, dict(zip(plant.disturbance_names, bounds.tolist(), strict=True)), data["noise_bound"],
+        data["initial_set"], data["state_bounds"], data["window"],
+    )  # fmt: skip
+    programme, origin = question.programme(design, u, y)
+    equal, below = np.asarray(data["equal"]), np.asarray(data["below"])
+    fits = equal.shape == (len(programme.equal.right),) and below.shape == (len(programme.below.right),)
+    margin = float(programme.proved_least(equal, below)) if fits else float("nan")
+    said = statement(design, min(question.window, len(y)), origin)
+    rows = len(y) == data["row"] and len(u) == len(y)
+    stated = float(data["margin"])
+    return [
+        _row("rows", "the record ends at the stated row", float(rows), 1.0, rows),
+        _row("statement", "the sentence is that of these bounds", float(said == data["statement"]), 1.0,
+             said == data["statement"]),
+        _row("proof", "least excess over all bounds, from the multipliers, in exact arithmetic", margin, 0.0,
+             margin > 0.0, kind="proved"),
+        _row("margin", "the stated margin is not above what is proved", stated, margin * (1.0 + SAME_MARGIN),
+             bool(0.0 < stated <= margin * (1.0 + SAME_MARGIN))),
+    ]  # fmt: skip
+
+
+def _row(name: str, claim: str, value: float, bound: float, passed: bool, *, kind: Any = "computed") -> Check:
+    source = "linear programme with safe dual bounds (Neumaier and Shcherbina 2004)"
+    return Check(name, claim, value, bound, value - bound, bool(passed), source, kind)

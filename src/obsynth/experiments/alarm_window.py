@@ -10,11 +10,20 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 
-from obsynth.analysis.transformations.uncertain_plant import AffinePlant
+from obsynth.analysis.transformations.uncertain_plant import AffinePlant, affine_plant
+from obsynth.errors import SpecError
+from obsynth.experiments.monitors.adaptive_bound import adaptive_bound
+from obsynth.experiments.monitors.adaptive_monitor import start_of
+from obsynth.experiments.monitors.adaptive_record import thresholds_of_records
+from obsynth.numerics.arguments import is_finite_number
 from obsynth.numerics.arrays import FloatArray
+from obsynth.results.design import ObserverDesign
+from obsynth.tolerances.exact_plant import tracking_of
+from obsynth.tolerances.robustness import structure_of
 
 #: What rounding may take from a computed right side, relative to its terms.
 SUM_ROUNDING = 1e-15
@@ -124,28 +133,26 @@ class _Variables:
 def window_programme(plant: AffinePlant, bounds: FloatArray, data: WindowData) -> Window:
     """Return the programme of a window; ``bounds (nd + nw,)`` of disturbances and noise."""
     steps, n, p = len(data.y), plant.A.shape[0], plant.count
-    bd, dd = _with_noise(plant)
     pairs = [
         (i, j) for i in range(p) for j in range(n)
         if plant.A.parts[i][:, j].any() or plant.E.parts[i][:, j].any() or plant.C.parts[i][:, j].any()
     ]  # fmt: skip
-    at = _Variables(steps, n, bd.shape[1], p, len(pairs), varying=plant.box.variation == "varying")
+    at = _Variables(steps, n, len(bounds), p, len(pairs), varying=plant.box.variation == "varying")
     size = np.maximum(np.abs(data.low), np.abs(data.high))
     scales = _scales(at, size, bounds, [j for _, j in pairs])
-    equal, below = Rows(scales), Rows(scales)
-    builder = _Builder(plant, at, pairs, data, size, bounds, bd, dd)
+    builder = _Builder(plant, at, pairs, data, size, bounds, Rows(scales), Rows(scales))
     for k in range(steps):
-        builder.dynamics(k, equal, below)
-        builder.outputs(k, below)
-        builder.products(k, below)
-        builder.state(k, below)
+        builder.dynamics(k)
+        builder.outputs(k)
+        builder.products(k)
+        builder.state(k)
     # The bounds of the state are rows that t relaxes; the variables themselves have room for that.
     upper = np.full(at.count, LARGEST_RELAXATION)
     upper[at.d : at.q] = np.tile(bounds, steps) / scales[at.d : at.q]
     upper[at.q : at.products] = 1.0
     lower = -upper
     lower[at.t] = 0.0
-    return Window(equal, below, lower, upper)
+    return Window(builder.equal, builder.below, lower, upper)
 
 
 def _scales(at: _Variables, size: FloatArray, bounds: FloatArray, states: list[int]) -> FloatArray:
@@ -164,53 +171,50 @@ def _power_of_two(value: float) -> float:
     return math.ldexp(1.0, math.frexp(value)[1])
 
 
-def _with_noise(plant: AffinePlant) -> tuple[FloatArray, FloatArray]:
-    system = plant.plant
-    return np.hstack([plant.Bd.center, system.Bw]), np.hstack([plant.Dd.center, system.Dw])
-
-
 class _Builder:
     """Rows of one sample."""
 
     def __init__(
         self, plant: AffinePlant, at: _Variables, pairs: list[tuple[int, int]], data: WindowData, size: FloatArray,
-        bounds: FloatArray, bd: FloatArray, dd: FloatArray,
+        bounds: FloatArray, equal: Rows, below: Rows,
     ) -> None:  # fmt: skip
         self.plant, self.at, self.pairs, self.data, self.size = plant, at, pairs, data, size
-        self.bd, self.dd = bd, dd
-        e = plant.E
-        self.algebraic = (np.abs(e.center) + e.spread + e.radius).max(axis=1, initial=0.0) == 0.0
+        self.equal, self.below = equal, below
+        self.bd = np.hstack([plant.Bd.center, plant.plant.Bw])
+        self.dd = np.hstack([plant.Dd.center, plant.plant.Dw])
+        moving = np.abs(plant.E.center) + plant.E.spread + plant.E.radius
+        self.algebraic = moving.max(axis=1, initial=0.0) == 0.0
         nd = plant.Bd.shape[1]
         self.loose = (plant.Bd.spread + plant.Bd.radius) @ bounds[:nd]
         self.seen = (plant.Dd.spread + plant.Dd.radius) @ bounds[:nd]
 
-    def dynamics(self, k: int, equal: Rows, below: Rows) -> None:
+    def dynamics(self, k: int) -> None:
         """Add ``E x(k+1) - A x(k) - Bd d = B u``: exactly, or between bounds of the remainders."""
         plant, at, data = self.plant, self.at, self.data
         last = k + 1 == len(data.y)
         for r in range(at.n):
             if last and not self.algebraic[r]:
                 continue
-            entries: dict[int, float] = {}
+            entries = dict[int, float]()
             loose = float(self.loose[r] + plant.A.radius[r] @ self.size[k] + plant.B.radius[r] @ np.abs(data.u[k]))
             if not self.algebraic[r]:
                 entries |= {at.state(k + 1, i): plant.E.center[r, i] for i in range(at.n)}
                 entries |= {at.product(k + 1, j): plant.E.parts[i][r, c] for j, (i, c) in enumerate(self.pairs)}
                 loose += float(plant.E.radius[r] @ self.size[k + 1])
-            for i in range(at.n):
-                entries[at.state(k, i)] = -plant.A.center[r, i]
-            for j, (i, c) in enumerate(self.pairs):
-                entries[at.product(k, j)] = -plant.A.parts[i][r, c]
-            for i in range(at.p):
-                entries[at.constant(k, i)] = -float(plant.B.parts[i][r] @ data.u[k])
-            for i in range(at.nd):
-                entries[at.disturbance(k, i)] = -self.bd[r, i]
+            entries |= {at.state(k, i): -plant.A.center[r, i] for i in range(at.n)}
+            entries |= {at.product(k, j): -plant.A.parts[i][r, c] for j, (i, c) in enumerate(self.pairs)}
+            entries |= {at.constant(k, i): -float(plant.B.parts[i][r] @ data.u[k]) for i in range(at.p)}
+            entries |= {at.disturbance(k, i): -self.bd[r, i] for i in range(at.nd)}
             right = float(plant.B.center[r] @ data.u[k])
             # The right side is computed: what rounding may have taken from it counts as remainder.
             loose += SUM_ROUNDING * float(plant.B.magnitude[r] @ np.abs(data.u[k]))
-            self._between(equal, below, entries, right, loose)
+            if loose == 0.0:
+                self.equal.add(entries, right)
+            else:
+                self.below.add(entries, right + loose)
+                self.below.add({column: -value for column, value in entries.items()}, loose - right)
 
-    def outputs(self, k: int, below: Rows) -> None:
+    def outputs(self, k: int) -> None:
         """Add ``y = C x + D u + Dd d``, relaxed by t."""
         plant, at, data = self.plant, self.at, self.data
         for r in range(len(plant.C.center)):
@@ -223,27 +227,69 @@ class _Builder:
             loose += SUM_ROUNDING * float(abs(data.y[k, r]) + plant.D.magnitude[r] @ np.abs(data.u[k]))
             for sign in (1.0, -1.0):
                 row = {column: sign * value for column, value in entries.items()}
-                below.add(row, sign * right + loose, relaxed=True)
+                self.below.add(row, sign * right + loose, relaxed=True)
 
-    def state(self, k: int, below: Rows) -> None:
+    def state(self, k: int) -> None:
         """Add the bounds of the state, relaxed by t."""
         for i in range(self.at.n):
             place = self.at.state(k, i)
-            below.add({place: 1.0}, float(self.data.high[k, i]), relaxed=True)
-            below.add({place: -1.0}, -float(self.data.low[k, i]), relaxed=True)
+            self.below.add({place: 1.0}, float(self.data.high[k, i]), relaxed=True)
+            self.below.add({place: -1.0}, -float(self.data.low[k, i]), relaxed=True)
 
-    def products(self, k: int, below: Rows) -> None:
+    def products(self, k: int) -> None:
         """Add the four planes of McCormick of each product, relaxed by t."""
         at, data = self.at, self.data
         for j, (i, c) in enumerate(self.pairs):
             low, high = float(data.low[k, c]), float(data.high[k, c])
             for q, s, sign in ((-1.0, low, -1.0), (1.0, high, -1.0), (1.0, low, 1.0), (-1.0, high, 1.0)):
                 row = {at.product(k, j): sign, at.state(k, c): -sign * q, at.constant(k, i): -sign * s}
-                below.add(row, -sign * q * s, relaxed=True)
+                self.below.add(row, -sign * q * s, relaxed=True)
 
-    def _between(self, equal: Rows, below: Rows, entries: Mapping[int, float], right: float, loose: float) -> None:
-        if loose == 0.0:
-            equal.add(entries, right)
-            return
-        below.add(entries, right + loose)
-        below.add({column: -value for column, value in entries.items()}, -right + loose)
+
+#: Where the bounds of the state come from.
+REPLAY, STATED = "replay from the start", "stated"
+
+
+def window_data(
+    design: ObserverDesign, u: FloatArray, y: FloatArray, length: int, *, bounds: FloatArray, noise_bound: float,
+    initial_set: Mapping[str, Any] | None, state_bounds: Mapping[str, Any] | None,
+) -> tuple[AffinePlant, WindowData, str]:  # fmt: skip
+    """Return the plant over its box, the last ``length`` samples with bounds of the state, and where these come from.
+
+    Without stated ones they come from the observer run again from the start, and its error.
+    """
+    affine = affine_plant(design.linear[0])
+    first = max(0, len(y) - length)
+    if initial_set is None:
+        low, high = _stated(affine, state_bounds or {}, len(y) - first)
+        return affine, WindowData(u[first:], y[first:], low, high), STATED
+    _, observer = design.linear
+    tracking = tracking_of(design, affine)
+    structure = structure_of(
+        design, affine, tracking, bounds=bounds, noise_bound=noise_bound, faults=False, states=True
+    )
+    start = start_of(affine, tracking, None, initial_set, np.zeros(observer.order))
+    bound = adaptive_bound(structure, observer, start, varying=affine.box.variation == "varying")
+    estimates = observer.run(y, u if u.shape[1] else None)
+    rows = np.hstack([estimates.states, estimates.faults, estimates.residuals])
+    read = rows @ structure.reading.T
+    found = thresholds_of_records(bound, read[None], u[None], y[None])
+    middle = read - found.shift[0]
+    width = (found.total - np.abs(found.shift))[0] + OUTWARD * (np.abs(read) + found.total[0])
+    low, high = (middle - width)[first:], (middle + width)[first:]
+    return affine, WindowData(u[first:], y[first:], low, high), REPLAY
+
+
+def _stated(affine: AffinePlant, given: Mapping[str, Any], steps: int) -> tuple[FloatArray, FloatArray]:
+    names = affine.plant.state_names
+    missing = [name for name in names if name not in given]
+    if missing:
+        raise SpecError(f"Nothing bounds the state {missing[0]!r}: give initial_set (--initial), or its bound.",
+                        path="initial_set")  # fmt: skip
+    for name in names:
+        if not (is_finite_number(given[name]) and given[name] >= 0.0):
+            raise SpecError(f"The bound of {name!r} is {given[name]!r}: give a number, 0 or more.", path="state_bounds")
+    sizes = np.array([float(given[name]) for name in names])
+    back = np.abs(2.0 * np.eye(len(names)) - affine.coordinates) @ sizes
+    high = np.tile(back, (steps, 1))
+    return -high, high

@@ -1,1 +1,0 @@
-"""Proofs of alarms: a window of data that no plant within its tolerances explains without a fault."""
