@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 BoolArray = NDArray[np.bool_]
 #: Lags of the whiteness test, and their least number of rows each.
 LAGS, ROWS_PER_LAG = 10, 5
+#: Probability of the interval of a mean square.
+INTERVAL = 0.95
 #: A test fails below this probability.
 SIGNIFICANT = 0.01
 #: A change of the mean is told above this confidence, shared by all rows at which it may be.
@@ -65,7 +67,8 @@ def consistency(squares: float, count: int) -> Consistency:
 
     if not count:
         return Consistency(float("nan"), 0.0, float("inf"), 0)
-    low, high = chi2.ppf([0.025, 0.975], count) / count
+    share = (1.0 - INTERVAL) / 2.0
+    low, high = chi2.ppf([share, 1.0 - share], count) / count
     return Consistency(squares / count, float(low), float(high), count)
 
 

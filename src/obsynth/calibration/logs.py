@@ -51,19 +51,17 @@ EVEN = 12.0
 
 @dataclass(frozen=True, eq=False)
 class Log:
-    """Inputs and outputs on a regular grid. time : ``(n,)`` seconds; u : ``(n, nu)``; y : ``(n, ny)`` with NaN for what
-    is missing; dt : seconds. rows : first row and one past the last, of the data that were given; notes : what was
-    noticed and repaired."""
+    """Inputs and outputs on a regular grid."""
 
-    time: FloatArray
-    u: FloatArray
-    y: FloatArray
-    dt: float
+    time: FloatArray  # ``(n,)`` seconds
+    u: FloatArray  # ``(n, nu)``
+    y: FloatArray  # ``(n, ny)`` with NaN for what is missing
+    dt: float  # seconds
     input_names: tuple[str, ...]
     output_names: tuple[str, ...]
-    rows: tuple[int, int]
+    rows: tuple[int, int]  # first row and one past the last, of the data that were given
     source: str = ""
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  # what was noticed and repaired
 
     @property
     def samples(self) -> int:

@@ -123,7 +123,7 @@ class Objective:
 
 @dataclass(frozen=True, eq=False)
 class Maximum:
-    """Where the likelihood is greatest: free variables, value, Hessian, and the value that each start reached.
+    """Where the likelihood is greatest: free variables, value, Hessian.
     ``likeliest`` are the free variables before any variance was kept from zero."""
 
     z: FloatArray

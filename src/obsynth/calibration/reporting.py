@@ -40,13 +40,12 @@ COMPARED = 100
 
 @dataclass(frozen=True)
 class IntegrationError:
-    """Largest difference of one step of backward Euler from Radau, in deviations of a sensor, and where it is. moved :
-    by how much it moves a constant, in deviations of that, where it was asked."""
+    """Largest difference of one step of backward Euler from Radau, in deviations of a sensor, and where it is."""
 
     largest: float
     sensor: str
     row: int
-    moved: float = 0.0
+    moved: float = 0.0  # by how much it moves a constant, in deviations of that, where it was asked
 
     @property
     def matters(self) -> bool:

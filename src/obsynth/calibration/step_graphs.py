@@ -57,23 +57,19 @@ COMPILED_OPERATIONS = 200_000
 
 @dataclass(frozen=True, eq=False)
 class SampleGraphs:
-    """The functions of one sample; ``u (nu,)`` are the signals, ``t (nt,)`` the unknown constants. solve : from x, u, t
-    to the stages of all substeps and the scaled residual that is left. sensitivities : from x, u, t, stages to what
-    `local` takes as numbers: stages and their derivatives. local : from x, u, t and those numbers (with x itself) to
-    the state after, F, G by t, and the noise's way. outputs : from x, u, t to y, H and L by t. fast : `local`, to be
-    evaluated and not to be differentiated; in_c : whether functions are machine code."""
+    """The functions of one sample; ``u (nu,)`` are the signals, ``t (nt,)`` the unknown constants."""
 
-    solve: Any
-    sensitivities: Any
-    local: Any
-    outputs: Any
-    fast: Any
+    solve: Any  # from x, u, t to the stages of all substeps and the scaled residual that is left
+    sensitivities: Any  # from x, u, t, stages to what `local` takes as numbers: stages and their derivatives
+    local: Any  # from x, u, t, t and those numbers to the state after, F, G by t, and the noise's way
+    outputs: Any  # from x, u, t to y, H and L by t
+    fast: Any  # `local`, to be evaluated and not to be differentiated
     nx: int
     nu: int
     ny: int
     nt: int
     numbers: int
-    in_c: bool
+    in_c: bool  # whether functions are machine code
     made: dict[Any, Any] = field(default_factory=dict, repr=False)
 
 

@@ -36,15 +36,14 @@ from obsynth.results.design import ObserverDesign
 
 @dataclass(frozen=True, eq=False)
 class RecordedInnovations:
-    """Innovations ``(n, ny)`` and their deviations; sum of NIS and of its degrees; each parameter ``(n, 2)``. error :
-    What a step of backward Euler errs along the log, of a nonlinear observer that takes such steps."""
+    """Innovations ``(n, ny)`` and their deviations; sum of NIS and of its degrees; each parameter ``(n, 2)``."""
 
     innovations: FloatArray
     deviations: FloatArray
     squares: float
     degrees: int
     estimates: Mapping[str, FloatArray]
-    error: IntegrationError | None = None
+    error: IntegrationError | None = None  # of backward Euler along the log, where an observer takes such steps
 
     @property
     def standardised(self) -> FloatArray:

@@ -114,7 +114,7 @@ class Job:
         self.alarm_rows = dict[str, int]()
 
     def take(self, chunk: FloatArray) -> list[list[Any]]:
-        """Take rows ``[time, u, y]`` as read; return rows of output: ``chunk (rows, 1 + nu + ny)``."""
+        """Take rows ``[time, u, y]`` as read; return rows of output (``chunk (rows, 1 + nu + ny)``)."""
         if self.resumed_from is None:
             return self._taken(chunk)
         try:

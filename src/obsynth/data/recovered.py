@@ -66,7 +66,7 @@ class RecoveredStates:
         return found if found.names else None
 
     def take(self, row: Row, inputs: FloatArray) -> FloatArray:
-        """Return the recovered states, deviations; NaN where they are not known: ``inputs (nu,)``."""
+        """Return the recovered states, deviations; NaN where they are not known (``inputs (nu,)``)."""
         if row.skipped:
             self._rows.clear()
         self._known = np.where(np.isfinite(inputs), inputs, self._known)

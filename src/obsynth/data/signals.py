@@ -25,12 +25,11 @@ _NANO, _MICRO, _DAY, _MICROSECONDS = 1e-9, 1e-6, 86400.0, 1e6
 
 
 class Stamps:
-    """Which kind of stamps a log has, decided by its first one, and the zone in which they are written back.
-    Attributes: is_dated: Dates and times; zone: Of the first stamp, `None` where it names none (taken as UTC)."""
+    """Which kind of stamps a log has, decided by its first one, and the zone in which they are written back."""
 
     def __init__(self) -> None:
         self.is_dated: bool | None = None
-        self.zone: tzinfo | None = None
+        self.zone: tzinfo | None = None  # of the first stamp, `None` where it names none (taken as UTC)
 
     def read(self, text: str, row: int, column: str, *, comma: bool = False) -> float:
         """Return the seconds of one cell; ``comma`` takes a decimal comma."""

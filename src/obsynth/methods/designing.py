@@ -5,25 +5,23 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 
 from obsynth.analysis.conditions import Condition
 from obsynth.analysis.transformations.elimination import MANY_VARIABLES, eliminate_algebraic_states
 from obsynth.analysis.transformations.recovery import StateRecovery, Transformation, plant_and_recovery
-from obsynth.errors import PreconditionError, SpecError, VerificationError
+from obsynth.errors import PreconditionError, VerificationError
 from obsynth.extensions import extension
 from obsynth.methods.automatic import automatic_design
-from obsynth.methods.method_spec import MethodSpec, PlantKind, Synthesis
+from obsynth.methods.method_spec import Synthesis
 from obsynth.methods.refusals import require_above_rounding, rounding_notes, with_advice
-from obsynth.methods.registry import AUTO, REGISTRY, method_spec, methods_for
+from obsynth.methods.registry import AUTO, REGISTRY, Plant, kind_conditions, kind_of, method_spec
 from obsynth.methods.verifying import verify
 from obsynth.numerics.libraries import failed_computations, one_thread_if_small
 from obsynth.observers.linear.observer import LinearObserver
-from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.results.checks import VerificationReport
 from obsynth.results.design import Certificate, ObserverDesign
 from obsynth.results.plant_source import source_of
@@ -31,14 +29,6 @@ from obsynth.simulation.scenario import Scenario
 from obsynth.verification.claims import before_the_mean
 from obsynth.verification.plant import condition_rows
 from obsynth.verification.stored_numbers import StoredErrors
-
-Plant: TypeAlias = DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel
-
-_KINDS: Mapping[PlantKind, tuple[type, str]] = {
-    "time-invariant": (DescriptorSystem, "a linear plant with constant matrices"),
-    "time-varying": (TimeVaryingDescriptorSystem, "a linear plant whose matrices change with k"),
-    "nonlinear": (DAEModel, "a nonlinear DAEModel"),
-}
 
 
 def _silent(_: str) -> None:
@@ -127,7 +117,7 @@ def _designed(
     report_stage = progress
     spec = method_spec(method)
     asked = spec.read_options(options)
-    for condition in _kind_conditions(plant, spec):
+    for condition in kind_conditions(plant, spec):
         condition.require()
     with failed_computations(), one_thread_if_small(plant.nx):
         plant, recovery, notes = _with_arrays(plant, recovery, report_stage)
@@ -202,37 +192,11 @@ def _checked(plant: Plant, options: Mapping[str, Mapping[str, Any]]) -> dict[str
     for method in REGISTRY:
         spec = method_spec(method)
         asked = {} if method not in options else spec.read_options(options[method]).as_given()
-        conditions = _kind_conditions(plant, spec)
+        conditions = kind_conditions(plant, spec)
         if not conditions:
             conditions = tuple(spec.existence(asked)(plant))
         found[method] = VerificationReport.of(condition_rows(conditions))
     return found
-
-
-def kind_of(plant: Any) -> PlantKind:
-    """Return the kind of a plant; raise `SpecError` for anything else."""
-    for kind, (plant_type, _) in _KINDS.items():
-        if isinstance(plant, plant_type):
-            return kind
-    raise SpecError(
-        f"The plant is a {type(plant).__name__}: give an obsynth.DescriptorSystem, TimeVaryingDescriptorSystem or "
-        "DAEModel.",
-        path="plant",
-    )
-
-
-def _kind_conditions(plant: Plant, method: MethodSpec) -> tuple[Condition, ...]:
-    """Return the failing condition where a method does not take plants of this kind, else nothing."""
-    kind = kind_of(plant)
-    if kind in method.plants:
-        return ()
-    wanted = " or ".join(_KINDS[taken][1] for taken in method.plants)
-    return (
-        Condition(
-            "kind of plant", f"{method.id} needs {wanted}", False, 0.0, 1.0, method.id,
-            f"{_KINDS[kind][1]}; methods for such plants are: {', '.join(methods_for(kind))}.",
-        ),
-    )  # fmt: skip
 
 
 def draft_of(

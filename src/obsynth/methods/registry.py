@@ -1,11 +1,17 @@
-"""The registry of methods: one line each."""
+"""The registry of methods, one line each; and which of them take a plant of a kind."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from importlib import import_module
+from typing import Any, TypeAlias
 
+from obsynth.analysis.conditions import Condition
 from obsynth.errors import SpecError
 from obsynth.methods.method_spec import MethodSpec, PlantKind
+from obsynth.plants.dae.model import DAEModel
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 
 #: What a spec and `obsynth.design` call the choice between all methods that exist.
 AUTO = "auto"
@@ -18,6 +24,12 @@ REGISTRY: dict[str, str] = {
     "descriptor-kalman": "obsynth.methods.descriptor_kalman",
     "adaptive-observer": "obsynth.methods.adaptive_observer",
     "dae-adaptive-observer": "obsynth.methods.dae_adaptive_observer",
+}
+Plant: TypeAlias = DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel
+_KINDS: Mapping[PlantKind, tuple[type, str]] = {
+    "time-invariant": (DescriptorSystem, "a linear plant with constant matrices"),
+    "time-varying": (TimeVaryingDescriptorSystem, "a linear plant whose matrices change with k"),
+    "nonlinear": (DAEModel, "a nonlinear DAEModel"),
 }
 
 
@@ -32,3 +44,29 @@ def method_spec(method: str) -> MethodSpec:
 def methods_for(kind: PlantKind) -> tuple[str, ...]:
     """Return the ids of the methods that take plants of a kind."""
     return tuple(method for method in REGISTRY if kind in method_spec(method).plants)
+
+
+def kind_of(plant: Any) -> PlantKind:
+    """Return the kind of a plant; raise `SpecError` for anything else."""
+    for kind, (plant_type, _) in _KINDS.items():
+        if isinstance(plant, plant_type):
+            return kind
+    raise SpecError(
+        f"The plant is a {type(plant).__name__}: give an obsynth.DescriptorSystem, TimeVaryingDescriptorSystem or "
+        "DAEModel.",
+        path="plant",
+    )
+
+
+def kind_conditions(plant: Plant, method: MethodSpec) -> tuple[Condition, ...]:
+    """Return the failing condition where a method does not take plants of this kind, else nothing."""
+    kind = kind_of(plant)
+    if kind in method.plants:
+        return ()
+    wanted = " or ".join(_KINDS[taken][1] for taken in method.plants)
+    return (
+        Condition(
+            "kind of plant", f"{method.id} needs {wanted}", False, 0.0, 1.0, method.id,
+            f"{_KINDS[kind][1]}; methods for such plants are: {', '.join(methods_for(kind))}.",
+        ),
+    )  # fmt: skip

@@ -76,7 +76,7 @@ def quantile(degrees: FloatArray, probability: float) -> FloatArray:
 
 
 def alone(scores: FloatArray, information: FloatArray) -> int:
-    """Return the parameter whose change alone explains most: ``scores (nq,)``, ``information (nq,)``."""
+    """Return the parameter whose change alone explains most (``scores (nq,)``, ``information (nq,)``)."""
     return int(np.argmax(scores**2 / np.maximum(information, np.finfo(np.float64).tiny)))
 
 
@@ -89,8 +89,7 @@ SMALLEST_INFORMATION = float(np.finfo(np.float64).tiny / np.finfo(np.float64).ep
 
 
 def pull_of_the_start(observer: RecursiveObserver, estimates: Estimates, error: FloatArray) -> FloatArray:
-    """Return what is left, in the estimates at each sample, of an error of the initial parameters, ``(samples, nq)``:
-    ``error (nq,)``."""
+    """Return what is left at each sample of an error ``(nq,)`` of the initial parameters, ``(samples, nq)``."""
     adaptation, nx = observer.adaptation, observer.plant.nx
     if adaptation is not None and adaptation.reset:
         raise SpecError("chi-square with reset needs nominal parameters that are the observer's initial ones: what a "
@@ -111,7 +110,7 @@ def likelihood_ratio(
 ) -> Decision:
     """Return the generalised likelihood ratio of a jump at any of the last onsets. The signature of a jump starts at
     zero at its onset (the regressor that runs along has another past); where samples are missing it is that of the
-    record: ``gaps (samples, m)``."""
+    record (``gaps (samples, m)``)."""
     samples, nq = gaps.shape[0], estimates.parameters.shape[1]
     begin = 0 if observer.early_constraints else 1
     looks = max(samples * GLR_WINDOW * GLR_LOOKS, 1.0)

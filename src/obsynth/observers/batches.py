@@ -34,7 +34,7 @@ def run_dae_batch(
     observer: DAEObserver, y: ArrayLike, u: ArrayLike | None = None, *, compiled: bool | None = None,
     progress: bool | Callable[[int], None] | None = None,
 ) -> Estimates:  # fmt: skip
-    """Run many trials; see `obsynth.run_batch`: ``y (trials, samples, ny)``."""
+    """Run many trials; see `obsynth.run_batch` (``y (trials, samples, ny)``)."""
     outputs, inputs = batch_record(y, u, observer.model.ny, observer.model.input_names)
     trials, samples = outputs.shape[:2]
     alone = observer.outside_graph

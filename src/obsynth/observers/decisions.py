@@ -6,7 +6,7 @@ that a run of N samples raises a false alarm with at most about the stated proba
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -156,10 +156,7 @@ class ParameterMonitor:
         SpecError
             As for `obsynth.decide`.
         """
-        return decide(
-            observer, estimates, statistic=self.statistic, nominal=self.nominal, false_alarms=self.false_alarms,
-            change=self.change,
-        )  # fmt: skip
+        return decide(observer, estimates, **vars(self))
 
 
 def _chi_square(
@@ -176,19 +173,18 @@ def _chi_square(
     values = np.einsum("ki,kij,kj->k", gaps, np.linalg.pinv(estimates.parameter_covariances, hermitian=True), gaps)
     looks = len(values)
     thresholds = np.full(looks, float(quantile(np.array(float(nq)), false_alarms / looks)))
+    found = Decision("chi-square", read_only(values), read_only(thresholds), None)
     hits = np.flatnonzero(values > thresholds)
     if not hits.size:
-        return Decision("chi-square", read_only(values), read_only(thresholds), None)
+        return found
     k = int(hits[0])
     weights = np.linalg.pinv(estimates.parameter_covariances[k], hermitian=True)
     # The last sample at which the statistic was what it is without a change, on average or less.
     quiet = np.flatnonzero(values[:k] <= nq)
     onset = int(quiet[-1]) + 1 if quiet.size else 0
     confidence = 1.0 - min(1.0, looks * float(tail(np.array(float(nq)), values[k])))
-    alarm = Alarm(
-        k, estimates.parameter_names[alone(weights @ gaps[k], np.diag(weights))], onset, confidence, float(values[k])
-    )
-    return Decision("chi-square", read_only(values), read_only(thresholds), alarm)
+    name = estimates.parameter_names[alone(weights @ gaps[k], np.diag(weights))]
+    return replace(found, alarm=Alarm(k, name, onset, confidence, float(values[k])))
 
 
 def _nis(estimates: Estimates, squares: FloatArray, false_alarms: float) -> Decision:

@@ -129,7 +129,7 @@ def checked_state_bounds(value: Any, names: Sequence[str]) -> FloatArray | None:
 def projected(x: FloatArray, factor: FloatArray, bounds: FloatArray) -> FloatArray:
     """Return the point within bounds nearest to ``x`` in the metric of the covariance ``factor factor'``. The shortest
     e with ``low <= x + factor e <= high`` by nonnegative least squares (Lawson, Hanson, LDP), so that the covariance
-    may be singular. Shapes: ``x (n,)``, ``factor (n, any)``, ``bounds (n, 2)``."""
+    may be singular. The factor is ``(n, any)``."""
     if ((bounds[:, 0] <= x) & (x <= bounds[:, 1])).all():
         return x
     from scipy.optimize import nnls

@@ -25,52 +25,37 @@ PATIENCE = 2.0
 @contextmanager
 def shown_progress(
     progress: bool | Callable[[int], None] | None, total: int, what: str
-) -> Iterator[Callable[[int], None]]:
-    """Show how much of a long run is done."""
+) -> Iterator[Callable[[int], object]]:
+    """Show how much of a long run is done, by a bar that appears late and is gone at the end."""
     if callable(progress):
         yield progress
         return
     if progress not in (None, True, False):
         raise SpecError(f"progress is {progress!r}: give True, False, None, or a function.", path="progress")
     if progress is False or (progress is None and not sys.stderr.isatty()):
-        yield _nothing
+        yield bool
         return
-    bar = _Bar(total, what)
-    try:
-        yield bar.update
-    finally:
-        bar.close()
+    begin = time.monotonic()
+    shown: list[tuple[Progress, TaskID]] = []
 
-
-def _nothing(_: int) -> None:
-    """Progress that nobody watches."""
-
-
-class _Bar:
-    """A bar that appears late, and is gone at the end."""
-
-    def __init__(self, total: int, what: str) -> None:
-        self.total, self.what, self.begin = total, what, time.monotonic()
-        self.shown: tuple[Progress, TaskID] | None = None
-
-    def update(self, done: int) -> None:
-        """Show what is done."""
-        if self.shown is None:
-            if time.monotonic() - self.begin < PATIENCE:
+    def update(done: int) -> None:
+        if not shown:
+            if time.monotonic() - begin < PATIENCE:
                 return
             from rich.console import Console
             from rich.progress import Progress
 
             bar = Progress(console=Console(stderr=True), transient=True)
-            self.shown = bar, bar.add_task(self.what, total=self.total)
+            shown.append((bar, bar.add_task(what, total=total)))
             bar.start()
-        bar, task = self.shown
+        bar, task = shown[0]
         bar.update(task, completed=done)
 
-    def close(self) -> None:
-        """Take the bar away."""
-        if self.shown is not None:
-            self.shown[0].stop()
+    try:
+        yield update
+    finally:
+        for bar, _ in shown:
+            bar.stop()
 
 
 @contextmanager

@@ -129,24 +129,24 @@ class StepObserver(StepSettings, Generic[State, Known]):
         return found
 
     def advance(self, state: State, y: FloatArray, u: FloatArray) -> tuple[State, Known]:
-        """Return the next state and what is known at a sample, without checking it: ``y (ny,)``, ``u (nu,)``."""
+        """Return the next state and what is known at a sample, without checking it (``y (ny,)``, ``u (nu,)``)."""
         after, row = self.timing.advance(self._steps.advance, state, y, u)
         return after, self.shown(row)
 
     def accept(self, state: State, y: FloatArray, u: FloatArray) -> tuple[State, Known]:
-        """Return the same as `advance`, where the step is one that can be trusted: ``y (ny,)``, ``u (nu,)``."""
+        """Return the same as `advance`, where the step is one that can be trusted (``y (ny,)``, ``u (nu,)``)."""
         after, row = self.timing.advance(self.in_order, state, y, u)
         return after, self.shown(row)
 
     def in_order(self, state: State, y: FloatArray, u: FloatArray) -> tuple[State, Known]:
-        """Take a sample whose values are all of its own time, as `accept` takes it: ``y (ny,)``, ``u (nu,)``."""
+        """Take a sample whose values are all of its own time, as `accept` takes it (``y (ny,)``, ``u (nu,)``)."""
         self._allow(state)
         after, row = self._steps.advance(state, y, u)
         self._trust(row)
         return after, row
 
     def step(self, state: State, y: ArrayLike, u: ArrayLike = ()) -> tuple[State, Estimates]:
-        """Return the state after a sample, and the estimates at it: ``y (ny,)``, ``u (nu,)``."""
+        """Return the state after a sample, and the estimates at it (``y (ny,)``, ``u (nu,)``)."""
         after, row = self.accept(state, *self._sample(state, y, u))
         return after, self._estimates(getattr(after, "latest", after), row)
 

@@ -127,7 +127,7 @@ class SensorTiming:
         return WaitingState((), first, np.zeros((0, len(self.every))), np.zeros((0, self.inputs)))
 
     def advance(self, inner: Inner, state: Any, y: FloatArray, u: FloatArray) -> tuple[Any, Any]:
-        """Take a row as it arrives by the steps of an observer without delays: ``y (ny,)``, ``u (nu,)``."""
+        """Take a row as it arrives by the steps of an observer without delays (``y (ny,)``, ``u (nu,)``)."""
         if self.is_plain:
             return inner(state, y, u)
         heard = np.where(self.expected(state.k), y, np.nan)

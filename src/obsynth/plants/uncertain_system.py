@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -170,10 +171,10 @@ def _with_tolerances(
     written = as_written(plant, before)
     entries = {name: list(found) for name, found in before.entries.items()}
     stated = {key: value for key, value in options.items() if value is not None}
-    given = {"variation": constants.variation if isinstance(constants, ConstantsBox) else before.box.variation}
-    kept = {**given, **_kept_source(before.box, constants, stated)}
-    box, more = _boxed(constants, tolerance, before.box.constants, written, entries, kept | stated)
-    after = Uncertainty(box, _joined(entries, more), before.written, before.steps, before.shift)
+    variation = constants.variation if isinstance(constants, ConstantsBox) else before.box.variation
+    kept = {"variation": variation, **_kept_source(before.box, constants, stated), **stated}
+    box, more = _boxed(constants, tolerance, before.box.constants, written, entries, kept)
+    after = replace(before, box=box, entries=_joined(entries, more))
     _require_used(after, set(box.constants))
     moved = [name for name, item in before.box.constants.items() if name not in box.constants
              or abs(box.constants[name].nominal - item.nominal) > SAME_SHARE * abs(item.nominal)]  # fmt: skip
@@ -211,13 +212,12 @@ def _boxed(
                "digest": constants.digest, "calibrated": logged}  # fmt: skip
         options = own | {key: value for key, value in options.items() if value is not None}
         constants = constants.constants
-    given, shares = {}, dict(tolerance or {})
+    found, shares, more = dict[str, Any](), dict(tolerance or {}), dict[str, list[Entry]]()
     for name, value in (constants or {}).items():
         if name in UNCERTAIN_MATRICES and name not in known and isinstance(value, (str, int, float)):
             shares.setdefault(name, value)
         else:
-            given[name] = value
-    found, more = dict(given), dict[str, list[Entry]]()
+            found[name] = value
     for matrix, value in shares.items():
         if matrix not in UNCERTAIN_MATRICES:
             raise SpecError(f"{matrix!r} is no matrix: {', '.join(UNCERTAIN_MATRICES)} may have a tolerance.",

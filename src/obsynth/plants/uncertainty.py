@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
@@ -100,7 +100,7 @@ class Uncertainty:
         box : ConstantsBox
             Of the same constants.
         """
-        return Uncertainty(box, self.entries, self.written, self.steps, self.shift)
+        return replace(self, box=box)
 
     def then(self, matrices: Mapping[str, FloatArray], kind: str, size: float = 0.0) -> Uncertainty:
         """Return what is uncertain in a plant made from this one.
@@ -115,7 +115,7 @@ class Uncertainty:
             Seconds, for ``sample``.
         """
         written = {name: matrices[name] for name in UNCERTAIN_MATRICES} if self.written is None else self.written
-        return Uncertainty(self.box, self.entries, written, (*self.steps, (kind, size)), self.shift)
+        return replace(self, written=written, steps=(*self.steps, (kind, size)))
 
     def value(self, text: str, values: Mapping[str, float]) -> float:
         """Return the value of an entry for values of the constants.

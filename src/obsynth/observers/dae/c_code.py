@@ -150,7 +150,7 @@ def _integers(name: str, values: Sequence[int]) -> list[str]:
 
 
 def c_table(name: str, values: FloatArray) -> list[str]:
-    """Return a constant table of C; numbers are read back bit for bit: ``values (n,)``."""
+    """Return a constant table of C; numbers are read back bit for bit (``values (n,)``)."""
     texts = [repr(value) for value in values.tolist()] or ["0.0"]
     lines = [", ".join(texts[i : i + _NUMBERS_PER_LINE]) for i in range(0, len(texts), _NUMBERS_PER_LINE)]
     return [f"static const double {name}[{len(texts)}] = {{", "    " + ",\n    ".join(lines) + "};"]

@@ -146,7 +146,7 @@ class GatheredRows:
         require_regular(self.observer, rows, self.parts[-1]["conditions"])
 
     def estimates(self, informations: FloatArray | None = None) -> Estimates:
-        """Return what was gathered: ``informations (any, nq, nq)``."""
+        """Return what was gathered (``informations (any, nq, nq)``)."""
         whole = {name: np.concatenate([part[name] for part in self.parts]) for name in self.parts[0]}
         seen = whole["informations"]
         levels = _excitation(self.observer, seen if informations is None else informations)
@@ -157,7 +157,7 @@ class GatheredRows:
 
 
 def require_regular(observer: DAESettings, rows: DAERow, conditions: FloatArray) -> None:
-    """Raise `SolverError` where the matrix of (7) was singular to working precision: ``conditions (samples,)``."""
+    """Raise `SolverError` where the matrix of (7) was singular to working precision (``conditions (samples,)``)."""
     if not len(conditions) or conditions.max() <= SINGULAR_CONDITION:
         return
     rows, i = rows.several, int(np.argmax(conditions > SINGULAR_CONDITION))

@@ -158,11 +158,11 @@ class Layout:
         return sum(rows * columns for rows, columns in self.shapes.values())
 
     def part(self, vectors: FloatArray, name: str) -> FloatArray:
-        """Return one array of each of many vectors: ``vectors (..., size)``."""
+        """Return one array of each of many vectors (``vectors (..., size)``)."""
         return self.shaped(vectors[..., self.slices[name]], name)
 
     def shaped(self, flat: FloatArray, name: str) -> FloatArray:
-        """Return one array of each of many parts of vectors: ``flat (..., entries)``."""
+        """Return one array of each of many parts of vectors (``flat (..., entries)``)."""
         rows, columns = self.shapes[name]
         if columns == 1 and name not in MATRICES:
             return flat
@@ -224,7 +224,7 @@ def row_layout(observer: DAESettings) -> Layout:
 
 
 def initial_memory(observer: DAESettings, x: FloatArray) -> FloatArray:
-    """Return what is remembered before the first sample: ``x (nx,)``."""
+    """Return what is remembered before the first sample (``x (nx,)``)."""
     layout = memory_layout(observer)
     start = {name: np.zeros(shape) for name, shape in layout.shapes.items()}
     start |= {"posterior": x, "x": x, "theta": observer.initial_parameters, "P": observer.initial_covariance,

@@ -124,8 +124,7 @@ class Steps:
     def stretch(
         self, state: DAEState, y: FloatArray, u: FloatArray, run: Callable[..., tuple[FloatArray, ...]]
     ) -> tuple[DAEState, DAERow]:
-        """Advance over samples until a step is not solved, by `ObserverGraph.whole` over that many samples. Return what
-        was reached, which may be nothing. Shapes: ``y (samples, ny)``, ``u (samples, nu)``."""
+        """Advance until a step is not solved, by `ObserverGraph.whole` over so many samples; return what is reached."""
         seen = ~np.isnan(y)
         arriving = np.hstack([u, np.where(seen, y, 0.0), seen])
         after, said = (found.T for found in run(state.memory, arriving.ravel()))
@@ -141,8 +140,7 @@ class Steps:
         return state, rows
 
     def projected(self, state: DAEState, u: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Put the initial state onto the algebraic equations; return the memory and how far it moved: ``u (nu,)`` at k
-        = 0."""
+        """Put the initial state onto the algebraic equations; return the memory and how far it moved."""
         model, start = self.settings.model, self.part(state, "x")
         short = ImplicitStep(DAEFunctions(model), PROJECTION_SHARE * self.settings.dt)
         found = short.solve_carefully(start, u, self.part(state, "theta")).x

@@ -41,7 +41,7 @@ class GainStep(NamedTuple):
 def gain_steps(
     observer: RecursiveObserver, steps: int, *, received: NDArray[np.bool_] | None = None
 ) -> Iterator[GainStep]:
-    """Yield the gains of the first steps: ``received (samples, ny)``."""
+    """Yield the gains of the first steps (``received (samples, ny)``)."""
     recursion = observer.recursion
     start = recursion.first
     factor, Upsilon, parameters, diffuse = start.factor, start.Upsilon, start.parameters, start.diffuse

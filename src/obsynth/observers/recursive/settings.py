@@ -139,26 +139,21 @@ class RecursiveSettings(StepSettings):
 
     def as_dict(self) -> dict[str, Any]:
         """Return every field as data."""
-        adaptation = None
+        found = {field.name: getattr(self, field.name) for field in fields(self)}
         if self.adaptation is not None:
-            adaptation = {field.name: getattr(self.adaptation, field.name) for field in fields(self.adaptation)}
+            found["adaptation"] = {field.name: getattr(self.adaptation, field.name) for field in fields(Adaptation)}
         return {
-            "plant": self.plant.as_dict(), "Q": self.Q.as_data(), "R": self.R.as_data(),
+            **found, "plant": self.plant.as_dict(), "Q": self.Q.as_data(), "R": self.R.as_data(),
             "noise_constants": {**(self.Q.constants or {}), **(self.R.constants or {})},
-            "initial_state": self.initial_state, "initial_covariance": self.initial_covariance,
-            "adaptation": adaptation, "early_constraints": self.early_constraints, "outliers": self.outliers,
-            "outlier_limit": self.outlier_limit, "sensors": self.sensors, "state_bounds": self.state_bounds,
         }  # fmt: skip
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
         """Return the observer that `as_dict` described."""
-        constants = data["noise_constants"]
-        return cls(
-            TimeVaryingDescriptorSystem(**data["plant"]),
-            MatrixSequence.of(data["Q"], "Q", constants=constants),
-            MatrixSequence.of(data["R"], "R", constants=constants),
-            data["initial_state"], data["initial_covariance"],
-            None if data["adaptation"] is None else Adaptation(**data["adaptation"]), data["early_constraints"],
-            data.get("outliers", "none"), data.get("outlier_limit"), data.get("sensors"), data.get("state_bounds"),
-        )  # fmt: skip
+        given = dict(data)
+        constants, adaptation = given.pop("noise_constants"), given["adaptation"]
+        noise = {name: MatrixSequence.of(given[name], name, constants=constants) for name in ("Q", "R")}
+        return cls(**{
+            **given, **noise, "plant": TimeVaryingDescriptorSystem(**given["plant"]),
+            "adaptation": None if adaptation is None else Adaptation(**adaptation),
+        })  # fmt: skip

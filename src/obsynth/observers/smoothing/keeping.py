@@ -132,7 +132,7 @@ def checked_lag(lag: Any) -> int | None:
 
 
 def smoothed_record(observer: SmoothedObserver, y: ArrayLike, u: ArrayLike | None, lag: int | None) -> Estimates:
-    """Return smoothed estimates of a whole record of arrays: ``y (samples, ny)``, ``u (samples, nu)``."""
+    """Return smoothed estimates of a whole record of arrays (``y (samples, ny)``, ``u (samples, nu)``)."""
     if isinstance(observer, RecursiveObserver):
         outputs, inputs = whole_record(y, u, observer.plant.ny, observer.plant.nu)
     else:
