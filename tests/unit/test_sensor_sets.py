@@ -183,3 +183,15 @@ def test_bad_arguments() -> None:
         obsynth.sensor_sets(plant, cost={"theta l": -1.0})
     with pytest.raises(obsynth.PreconditionError, match="out of reach"):
         obsynth.sensor_sets(plant, candidates=["omega m"])
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [({"candidates": {"s": ["a", "b"]}}, "s: give a row of 2 numbers"), ({"candidates": {"s": [1.0]}}, "s: give a row"),
+     ({"candidates": {"s": [1.0, np.nan]}}, "s: give a row"), ({"copies": 0}, "copies is 0"),
+     ({"most": "x"}, "most is 'x'"), ({"largest": 1.5}, "largest is 1.5"), ({"largest": -1}, "largest is -1")],
+)  # fmt: skip
+def test_malformed_candidates_and_numbers_are_told(options, text):
+    plant = obsynth.DescriptorSystem(None, [[0.5, 0.1], [0, 0.7]], C=[[1, 0]], Bf=[[1], [0]], Bd=[[0], [1]], dt=1.0)
+    with pytest.raises(obsynth.SpecError, match=text):
+        obsynth.sensor_sets(plant, **options)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from concurrent.futures import ThreadPoolExecutor
 
 import matplotlib.pyplot as plt
@@ -83,6 +84,12 @@ def test_a_folder_is_gone_on_with(spec, tmp_path):
     third = obsynth.sweep(spec, values, folder=folder)
     assert third.results[0].claims["gamma"] != first.results[0].claims["gamma"]
     assert obsynth.load(third.results[0].file).report.passed
+    # So is a result without all that it must have.
+    result = folder / third.results[0].file.name.replace(".gains.", ".result.")
+    body = json.loads(result.read_text())
+    result.write_text(json.dumps({name: value for name, value in body.items() if name != "status"}))
+    assert outcomes(obsynth.sweep(spec, values, folder=folder)) == outcomes(third)
+    assert json.loads(result.read_text())["status"] == "designed"
 
 
 def test_plants_in_memory():

@@ -61,12 +61,12 @@ def run_linearise(options: argparse.Namespace) -> int:
         write_atomically(target, plant_document(linear, options.system.name))
     told = linear_plant_text(linear) if found is None else f"{linear_plant_text(linear)}\n{found}"
     answer(options, {
-        "system": str(options.system), "file": None if target is None else str(target),
-        "operating_point": dict(linear.operating_point), "validity": None if found is None else found.to_dict(),
+        "system": options.system, "file": target, "operating_point": dict(linear.operating_point),
+        "validity": None if found is None else found.to_dict(),
         **{name: getattr(linear, name) for name in ("E", "A", "B", "C", "Bf", "Df", "Bd")},
         **{name: list(getattr(linear, name)) for name in (
             "state_names", "input_names", "output_names", "fault_names", "disturbance_names")},
-    }, told, [target] if target else [])  # fmt: skip
+    }, told)  # fmt: skip
     return 0
 
 
@@ -97,8 +97,7 @@ def run_calibrate(options: argparse.Namespace) -> int:
         from obsynth.results.gain_sets import plain
 
         write_atomically(target, json.dumps(plain(data), indent=1, allow_nan=False) + "\n")
-    answer(options, {"file": None if target is None else str(target), **data},
-           f"{found}\n  digest of the log: {found.box.digest}", [target] if target else [])  # fmt: skip
+    answer(options, {"file": target, **data}, f"{found}\n  digest of the log: {found.box.digest}")
     return 0
 
 
@@ -136,5 +135,5 @@ def run_validate(options: argparse.Namespace) -> int:
     with progress(quiet=options.quiet) as report_stage:
         report_stage(f"running {options.gains} over {options.data}")
         found = validate(design, options.data, **_log_arguments(options))
-    answer(options, {"gains": str(options.gains), "data": str(options.data), **found.to_dict()}, str(found))
+    answer(options, {"gains": options.gains, "data": options.data, **found.to_dict()}, str(found))
     return 0 if found.passed else VerificationError.exit_code

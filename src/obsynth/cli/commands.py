@@ -159,7 +159,7 @@ def run_check(options: argparse.Namespace) -> int:
         print_methods(methods, own=spec.method, console=console)
 
     answer(options, {
-        "spec": str(spec.path), "method": spec.method, "passed": passed,
+        "spec": spec.path, "method": spec.method, "passed": passed,
         "transformation": done, "diagnosis": None if diagnosis is None else diagnosis.to_dict(),
         "structure": {name.replace(" ", "_"): _structure_as_dict(found) for name, found in structures.items()},
         "methods": {name: report.as_dict() for name, report in methods.items()},

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import io
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -78,7 +77,7 @@ def run_export(options: argparse.Namespace) -> int:
         design, options.to, sample_time=options.sample_time, fmi=options.fmi,
         thresholds=numbers_of(options.threshold) or None, warm_up=options.warm_up,
     )  # fmt: skip
-    answer(options, {"gains": str(options.gains), "files": [str(file) for file in files]}, "", files)
+    answer(options, {"gains": options.gains, "files": files})
     return 0
 
 
@@ -92,7 +91,7 @@ def run_prove_alarm(options: argparse.Namespace) -> int:
     found = proof_of(design, options, options.row, state_bounds=numbers_of(options.state_bound) or None)
     file = str(found.save(target)) if found.proved and target is not None else None
     answer(options, {
-        "gains": str(options.gains), "proved": found.proved, "row": found.row, "window": found.window,
+        "gains": options.gains, "proved": found.proved, "row": found.row, "window": found.window,
         "margin": found.margin, "statement": found.statement, "origin": found.origin, "file": file,
     }, found.statement + (f"\nCertificate: {file}" if file else ""))  # fmt: skip
     return 0
@@ -122,7 +121,7 @@ def run_report(options: argparse.Namespace) -> int:
         design, options.out, report=report, gains_file=options.gains.name, scenario=scenario, system_file=system,
         run=run, data_file=options.data, statement="" if watched is None else watched.statement, rows=options.rows,
     )  # fmt: skip
-    answer(options, {"gains": str(options.gains), "file": str(file), "passed": report.passed}, "", [file])
+    answer(options, {"gains": options.gains, "file": file, "passed": report.passed})
     return 0 if report.passed else VerificationError.exit_code
 
 
@@ -147,8 +146,6 @@ def _target(options: argparse.Namespace) -> Path | TextIO:
 
 #: Formats of pictures, with the mark by which an older one may be replaced.
 PICTURES = {".png": rb"\A\x89PNG", ".svg": rb"<svg", ".pdf": rb"\A%PDF"}
-#: Dots per inch of a picture made of dots.
-_RESOLUTION = 160
 
 
 def run_plot(options: argparse.Namespace) -> int:
@@ -166,8 +163,7 @@ def run_plot(options: argparse.Namespace) -> int:
     found = run_of(design, options, watched)
     _draw(found, design, parts, target)
     if options.json or not options.quiet:
-        answer(options, {"gains": str(options.gains), "file": None if target is None else str(target),
-                         **found.as_dict()}, summary_of_run(found, watched), [target] if target else [])  # fmt: skip
+        answer(options, {"gains": options.gains, "file": target, **found.as_dict()}, summary_of_run(found, watched))
     return 0
 
 
@@ -197,18 +193,6 @@ def picture_kind(target: Path) -> FileKind:
 
 def written_picture(target: Path, count: int, draw: Callable[[list[Any]], Any]) -> None:
     """Write a picture of so many panels, one above the other; ``draw`` fills them."""
-    from matplotlib.figure import Figure
+    from obsynth.plotting.panels import image_of
 
-    from obsynth.plotting.panels import PANEL_HEIGHT, WIDTH
-
-    figure = Figure(figsize=(WIDTH, PANEL_HEIGHT * max(count, 1) + 0.6), layout="constrained")
-    axes = list(figure.subplots(max(count, 1), 1, sharex=True, squeeze=False)[:, 0])
-    draw(axes[:count])
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format=target.suffix[1:].lower(), dpi=_RESOLUTION, metadata=_undated(target))
-    write_atomically(target, buffer.getvalue())
-
-
-def _undated(target: Path) -> dict[str, Any] | None:
-    """Return what keeps the date out of a file, so that the same data give the same picture."""
-    return {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}.get(target.suffix.lower())
+    write_atomically(target, image_of(count, draw, kind=target.suffix[1:].lower()))

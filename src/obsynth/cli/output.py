@@ -6,7 +6,7 @@ import argparse
 import json
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -39,12 +39,16 @@ def output_file(path: str | Path, kind: FileKind | None, options: argparse.Names
     return target
 
 
-def answer(
-    options: argparse.Namespace, data: Mapping[str, Any], told: Callable[[], Any] | str, files: Sequence[Path] = ()
-) -> None:
-    """Print the result of a verb: as JSON if asked for, else as a text or by a function, with the files written."""
+def answer(options: argparse.Namespace, data: Mapping[str, Any], told: Callable[[], Any] | str = "") -> None:
+    """Print the result of a verb: as JSON if asked for, else as a text or by a function, with the files written.
+
+    A path under ``file``, or paths under ``files``, are what was written.
+    """
+    files = [item for item in data.get("files", [data.get("file")]) if isinstance(item, Path)]
     if options.json:
-        print_json({"command": options.verb, **data})
+        texts = {name: str(item) for name, item in data.items() if isinstance(item, Path)}
+        several = {"files": [str(item) for item in files]} if "files" in data else {}
+        print_json({"command": options.verb, **data, **texts, **several})
         return
     if not isinstance(told, str):
         told()

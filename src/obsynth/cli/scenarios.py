@@ -52,7 +52,7 @@ def run_simulate(options: argparse.Namespace) -> int:
     from obsynth.report.scenarios import simulation_report
 
     answer(
-        options, {"spec": str(spec.path), "file": written, **found.summary()},
+        options, {"spec": spec.path, "file": written, **found.summary()},
         lambda: simulation_report(design.name, found, console=stdout_console(), units=design.plant.units, file=written),
     )  # fmt: skip
     return 0
@@ -77,8 +77,7 @@ def _run_tolerances(options: argparse.Namespace) -> int:
         from obsynth.plotting.trade_off import plot_tolerances
 
         written_picture(target, 2, lambda axes: plot_tolerances(found, axes=axes))
-    file = None if target is None else str(target)
-    answer(options, {"spec": str(spec.path), "file": file, **found.as_dict()}, str(found), [target] if target else [])
+    answer(options, {"spec": spec.path, "file": target, **found.as_dict()}, str(found))
     return 0
 
 
@@ -122,7 +121,7 @@ def run_evaluate(options: argparse.Namespace) -> int:
         kind, statement = described(watched)
         told = {"kind": kind, "statement": statement, "final_threshold": final_threshold(watched)}
     answer(
-        options, {"spec": str(spec.path), "monitor": told, **found.as_dict()},
+        options, {"spec": spec.path, "monitor": told, **found.as_dict()},
         lambda: evaluation_report(design.name, found, monitor=watched, console=stdout_console(),
                                   units=design.plant.units),
     )  # fmt: skip
@@ -151,7 +150,7 @@ def run_compare(options: argparse.Namespace) -> int:
             write_atomically(options.out, found.page())
     from obsynth.report.scenarios import comparison_report
 
-    answer(options, {"spec": str(spec.path), **found.to_dict()},
+    answer(options, {"spec": spec.path, **found.to_dict()},
            lambda: comparison_report(found, console=stdout_console(), file=options.out))  # fmt: skip
     return 0 if found.recommended else PreconditionError.exit_code
 

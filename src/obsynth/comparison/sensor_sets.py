@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from html import escape
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from annotated_types import Ge
 
 from obsynth.analysis.diagnosis.decoupled import fault_numbers
 from obsynth.analysis.diagnosis.explanations import Sensor, state_sensors
@@ -16,7 +18,7 @@ from obsynth.analysis.transformations.recovery import Transformation, linear_pla
 from obsynth.errors import ObsynthError, PreconditionError, SpecError
 from obsynth.files.tables import html_table, text_table
 from obsynth.methods.functional_filter.public import functional_filter
-from obsynth.numerics.arguments import is_finite_number
+from obsynth.numerics.arguments import Count, checked_value, is_finite_number, real_vector
 from obsynth.numerics.libraries import on_one_thread_if_small
 from obsynth.plants.descriptor import DescriptorSystem
 
@@ -82,12 +84,11 @@ class SensorSets:
 
     def rows(self) -> tuple[tuple[str, ...], ...]:
         """Return the table as texts: the header, then one row per set."""
-        body = [
-            (", ".join(found.sensors) or "nothing", f"{found.cost:g}", "-" if found.deviation is None
-             else f"{found.deviation:.3g}")
-            for found in self.sets
-        ]  # fmt: skip
-        return (("add", "cost", "deviation after design"), *body)
+        rows = [("add", "cost", "deviation after design")]
+        for found in self.sets:
+            deviation = "-" if found.deviation is None else f"{found.deviation:.3g}"
+            rows.append((", ".join(found.sensors) or "nothing", f"{found.cost:g}", deviation))
+        return tuple(rows)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result as plain data."""
@@ -95,10 +96,7 @@ class SensorSets:
             "goal": self.goal, "exact": self.exact, "out_of_reach": list(self.out_of_reach),
             "may_be_lost": list(self.may_be_lost),
             "lost_without": {name: list(lost) for name, lost in self.lost_without.items()}, "notes": list(self.notes),
-            "sets": [
-                {"sensors": list(found.sensors), "cost": found.cost, "deviation": found.deviation}
-                for found in self.sets
-            ],
+            "sets": [{**vars(found), "sensors": list(found.sensors)} for found in self.sets],
         }  # fmt: skip
 
     def __str__(self) -> str:
@@ -187,6 +185,8 @@ def sensor_sets(
         raise SpecError(f"goal is {goal!r}: use one of {', '.join(GOALS)}.", path="goal")
     if not chosen:
         raise SpecError("The plant has no faults to place sensors for.", path="faults")
+    for name, count in (("copies", copies), ("most", most), ("largest", largest)):
+        checked_value(count, name, Annotated[int, Ge(0)] | None if name == "largest" else Count)
     sensors = _candidates(plant, candidates, noise)
     _require_positive(cost or {}, sensors, "cost", whole=False)
     costs = [float((cost or {}).get(sensor.name, 1.0)) for sensor in sensors]
@@ -216,7 +216,12 @@ def sensor_sets(
     had = [task for task in wanted if reached(plant, task)]
     failing = {name: _lost_without(plant, had, i) for i, name in enumerate(plant.output_names)} if had else {}
     kept = tuple(name for name, faults in failing.items() if len(had) == len(wanted) and not faults)
-    return SensorSets(goal, ranked, exact, tuple(_in_words(plant, lost)), kept, failing, tuple(notes))
+    out_of_reach = []
+    for task in lost:
+        others = ", ".join(plant.fault_names[j] for j in task.beside)
+        said = f" (from {others})." if others else "."
+        out_of_reach.append(f"{plant.fault_names[task.fault]}: out of reach of all candidates{said}")
+    return SensorSets(goal, ranked, exact, tuple(out_of_reach), kept, failing, tuple(notes))
 
 
 def _candidates(
@@ -224,11 +229,12 @@ def _candidates(
 ) -> tuple[Sensor, ...]:
     if isinstance(given, Mapping):
         zero = (np.zeros(plant.nu), np.zeros(plant.nd), np.zeros(plant.nf))
-        rows = {name: np.asarray(row, dtype=np.float64) for name, row in given.items()}
-        wrong = [name for name, row in rows.items() if row.shape != (plant.nx,) or not np.all(np.isfinite(row))]
-        if wrong:
-            raise SpecError(f"{', '.join(wrong)}: give a row of {plant.nx} numbers for C.", path="candidates")
-        sensors: tuple[Sensor, ...] = tuple(Sensor(str(name), row, *zero) for name, row in rows.items())
+        sensors: tuple[Sensor, ...] = ()
+        for name, row in given.items():
+            try:
+                sensors += (Sensor(str(name), real_vector(row, plant.nx, str(name)), *zero),)
+            except SpecError:
+                raise SpecError(f"{name}: give a row of {plant.nx} numbers for C.", path="candidates") from None
     else:
         listed = None if given is None else list(given)
         unknown = [name for name in listed or () if name not in plant.state_names]
@@ -266,30 +272,21 @@ def _note(search: SensorSearch, exact: bool, bound: int, most: int, count: int) 
 def _ranked(
     search: SensorSearch, found: Sequence[tuple[int, ...]], costs: Sequence[float], with_design: bool
 ) -> tuple[SensorSet, ...]:
+    """Return the sets by cost and largest deviation after design, with the walks that the first got by default."""
     rates: dict[str, float] | None = None
     rows = []
     for chosen in found:
-        names = tuple(search.sensors[i].name for i in chosen)
-        deviation = None
+        names, deviation = tuple(search.sensors[i].name for i in chosen), None
         if with_design:
-            deviation, rates = _deviation(search, chosen, rates)
+            plant = search.equipped(chosen)
+            faults = [plant.fault_names[i] for i in search.faults]
+            with suppress(ObsynthError):
+                made = functional_filter(plant, faults=faults, fault_rate=rates)
+                deviation = float(np.max(made.certificate.matrices["deviations"][:, 1]))
+                if rates is None and made.options["fault_rate_found"] is not None:
+                    rates = dict(zip(made.observer.fault_names, made.options["fault_rate_found"], strict=True))
         rows.append(SensorSet(names, sum(costs[i] for i in chosen), deviation))
     return tuple(sorted(rows, key=lambda row: (row.cost, np.inf if row.deviation is None else row.deviation)))
-
-
-def _deviation(
-    search: SensorSearch, chosen: Sequence[int], rates: dict[str, float] | None
-) -> tuple[float | None, dict[str, float] | None]:
-    """Return the largest deviation after design, all sets with the walks that the first of them got by default."""
-    plant = search.equipped(chosen)
-    names = [plant.fault_names[i] for i in search.faults]
-    try:
-        made = functional_filter(plant, faults=names, fault_rate=rates)
-    except ObsynthError:
-        return None, rates
-    if rates is None and made.options["fault_rate_found"] is not None:
-        rates = dict(zip(made.observer.fault_names, made.options["fault_rate_found"], strict=True))
-    return float(np.max(made.certificate.matrices["deviations"][:, 1])), rates
 
 
 def _lost_without(plant: DescriptorSystem, had: Sequence[Task], output: int) -> tuple[str, ...]:
@@ -302,11 +299,3 @@ def _lost_without(plant: DescriptorSystem, had: Sequence[Task], output: int) -> 
         units={}, operating_point={},
     )  # fmt: skip
     return tuple(dict.fromkeys(plant.fault_names[task.fault] for task in had if not reached(fewer, task)))
-
-
-def _in_words(plant: DescriptorSystem, lost: Sequence[Task]) -> list[str]:
-    others = [", ".join(plant.fault_names[j] for j in task.beside) for task in lost]
-    return [
-        f"{plant.fault_names[task.fault]}: out of reach of all candidates" + (f" (from {beside})." if beside else ".")
-        for task, beside in zip(lost, others, strict=True)
-    ]

@@ -88,8 +88,7 @@ def estimate_gains(design: ObserverDesign, *, to: str = "faults") -> EstimateGai
         if to == "states":
             truth = _delayed(observer, points) * states
             seen, terms = seen - truth, terms + _sizes(truth)
-        found = np.linalg.svd(seen, compute_uv=False)
-        values = np.asarray(np.where(found > ROUNDING_SHARE * terms[:, None], found, 0.0), dtype=np.float64)
+        values = _above_rounding(np.linalg.svd(seen, compute_uv=False), terms[:, None])
         gains[name] = values[:, 0]
         if name == "faults":
             least = values[:, -1]
@@ -111,8 +110,7 @@ def fault_gains(design: ObserverDesign) -> FaultGains:
     leaks = np.zeros((len(observer.fault_names), plant.nd))
     if plant.nd:
         _, found, terms = _seen(plant, plant.Bd, plant.Dd, points, to_estimate)
-        sizes = np.abs(found)
-        leaks = np.where(sizes > ROUNDING_SHARE * terms[:, None, None], sizes, 0.0).max(axis=0)
+        leaks = _above_rounding(np.abs(found), terms[:, None, None]).max(axis=0)
     own = [plant.fault_names.index(name) for name in observer.fault_names]
     _, slowest, _ = _seen(plant, plant.Bf, plant.Df, points, to_estimate)
     steady = slowest[0].real[np.arange(len(own)), own]
@@ -133,6 +131,11 @@ def _seen(
     states = _state_response(plant, b, points)
     outputs = plant.C @ states + d
     return states, np.asarray(to_estimate @ outputs), _sizes(to_estimate) * _sizes(outputs)
+
+
+def _above_rounding(sizes: FloatArray, terms: FloatArray) -> FloatArray:
+    """Return sizes, and zero where only the rounding of terms is left."""
+    return np.asarray(np.where(sizes > ROUNDING_SHARE * terms, sizes, 0.0), dtype=np.float64)
 
 
 def _sizes(matrices: ComplexArray) -> FloatArray:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import io
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,6 +16,8 @@ if TYPE_CHECKING:
 #: Inches: the width of every figure, and the height of one panel.
 WIDTH = 7.5
 PANEL_HEIGHT = 2.2
+#: Dots per inch of a picture made of dots: sharp on a screen that shows two for each pixel.
+RESOLUTION = 160
 #: The true signal lies under the estimate: wide, grey, solid.  The estimate on it: thin, dark, dashed.
 TRUE_STYLE: dict[str, Any] = {"color": "0.72", "linewidth": 4.0, "linestyle": "-", "solid_capstyle": "butt"}
 #: Colours that are told apart in print and by most eyes that see no red, by Okabe and Ito.
@@ -53,6 +56,25 @@ def new_panels(axes: Iterable[Axes] | None, count: int, *, size: tuple[float, fl
         figsize=size or (WIDTH, PANEL_HEIGHT * count + 0.8),
     )  # fmt: skip
     return list(grid[:, 0])
+
+
+def image_of(
+    count: int, draw: Callable[[list[Axes]], Any], *, size: tuple[float, float] | None = None, kind: str = "png"
+) -> bytes:
+    """Return a picture of panels one above the other as it stands in a file; ``draw`` fills them, without a window."""
+    from matplotlib.figure import Figure
+
+    shown = max(count, 1)
+    figure = Figure(figsize=size or (WIDTH, PANEL_HEIGHT * shown + 0.6), layout="constrained")
+    axes = list(figure.subplots(shown, 1, sharex=True, squeeze=False)[:, 0])
+    draw(axes[:count])
+    for panel in axes:
+        names_as_they_are(panel)
+    buffer = io.BytesIO()
+    # Without a date the same data give the same picture.
+    undated = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(kind)
+    figure.savefig(buffer, format=kind, dpi=RESOLUTION, metadata=undated)
+    return buffer.getvalue()
 
 
 def tidy(panel: Axes) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import io
 from collections.abc import Callable, Iterator, Sequence
 from html import escape
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -19,7 +18,7 @@ from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.plotting.estimates import plot_states
 from obsynth.plotting.frequency import plot_gains
-from obsynth.plotting.panels import names_as_they_are
+from obsynth.plotting.panels import image_of
 from obsynth.plotting.simulation import plot_simulation
 from obsynth.plotting.spectra import plot_poles
 from obsynth.results.design import ObserverDesign
@@ -29,8 +28,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
-#: Dots per inch: sharp on a screen that shows two for each pixel.
-RESOLUTION = 160
 #: Inches: a picture beside another one, and one of a row of its own; small, so that texts stay readable on a phone.
 HALF, WIDE = 5.6, 6.6
 #: Inches: a panel of several, and what the axis of time takes.
@@ -147,13 +144,4 @@ def stacked(title: str, text: str, panels: int, draw: Callable[[Sequence[Axes]],
 
 def drawn(size: tuple[float, float], panels: int, draw: Callable[[Sequence[Axes]], Any]) -> str:
     """Return what ``draw`` puts on panels one above the other, as a data URL."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=size, layout="constrained")
-    axes = list(figure.subplots(panels, 1, sharex=True, squeeze=False)[:, 0])
-    draw(axes)
-    for panel in axes:
-        names_as_they_are(panel)
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=RESOLUTION)
-    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
+    return "data:image/png;base64," + base64.b64encode(image_of(panels, draw, size=size)).decode("ascii")

@@ -1,12 +1,12 @@
-"""How one signal of a scenario goes with time: steps, ramps, drifts, failing actuators and sensors, random signals.
+"""How one signal of a scenario goes with time; between samples it is held or linear, so that simulations are exact.
 
-A profile acts from the first sample at or after ``start`` until the last one before ``end``.  Between samples of a
-continuous plant it is held or linear, as its class says, so that a simulation of it is exact.
+A profile acts from the first sample at or after ``start`` until the last one before ``end``.
 """
 
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, fields
 from typing import ClassVar
 
@@ -50,32 +50,18 @@ def _require(condition: bool, text: str, path: str) -> None:
         raise SpecError(text, path=path)
 
 
-class Additive(Profile):
+class Additive(Profile, ABC):
     """A function of time, which is added to its signal."""
 
     def at(self, time: FloatArray) -> FloatArray:
-        """Return its values.
-
-        Parameters
-        ----------
-        time : FloatArray, seconds
-            When.
-        """
+        """Return its values at ``time``, seconds."""
         return self._at(time)
 
-    def _at(self, time: FloatArray) -> FloatArray:
-        raise NotImplementedError
+    @abstractmethod
+    def _at(self, time: FloatArray) -> FloatArray: ...
 
     def sampled(self, steps: int, dt: float) -> tuple[FloatArray, FloatArray]:
-        """Return its values at the left and right end of each interval between samples, ``(steps,)`` each.
-
-        Parameters
-        ----------
-        steps : int
-            Number of samples.
-        dt : float, seconds
-            Between them.
-        """
+        """Return its values at the left and right end of each interval between samples, ``(steps,)`` each."""
         acts, values = self.active(steps, dt), self.at(dt * np.arange(steps + 1, dtype=np.float64))
         left = np.where(acts, values[:-1], 0.0)
         return left, left.copy() if self.held else np.where(acts, values[1:], 0.0)
@@ -238,27 +224,19 @@ class LostEffectiveness(Failure):
         _require(0.0 < self.share <= 1.0, "share must be greater than 0 and at most 1.", "share")
 
 
-class Random(Profile):
+class Random(Profile, ABC):
     """Independent samples, held between samples."""
 
     def draw(self, rng: np.random.Generator, steps: int) -> FloatArray:
-        """Return its samples.
-
-        Parameters
-        ----------
-        rng : numpy.random.Generator
-            Source of the numbers.
-        steps : int
-            How many.
-        """
+        """Return ``steps`` samples, drawn with ``rng``."""
         return self._draw(rng, steps)
 
-    def _draw(self, rng: np.random.Generator, steps: int) -> FloatArray:
-        raise NotImplementedError
+    @abstractmethod
+    def _draw(self, rng: np.random.Generator, steps: int) -> FloatArray: ...
 
+    @abstractmethod
     def moments(self) -> tuple[float, float, float]:
         """Return the largest absolute value (infinite if there is none), the mean and the variance."""
-        raise NotImplementedError
 
 
 @dataclass(frozen=True, kw_only=True)

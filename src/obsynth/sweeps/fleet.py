@@ -18,12 +18,14 @@ from obsynth.errors import ObsynthError, SpecError
 from obsynth.files.inputs import input_file
 from obsynth.files.outputs import write_atomically
 from obsynth.results.gain_sets import load
-from obsynth.sweeps.work import STATUSES, ResultTable, all_of, carried_out, file_stem, folder_for, result_in
+from obsynth.sweeps.work import STATUSES, ResultFolder, ResultTable, all_of, carried_out
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _KIND = "obsynth fleet result"
+#: What is kept of a run in its file.
+_KEPT = ("name", "status", "message", "rows", "statuses", "alarms", "largest")
 #: Letters of a run's name in the names of its files.
 LONGEST_STEM = 80
 #: What ends the name of a gain set; logs by their suffix.
@@ -183,7 +185,7 @@ def run_fleet(
     if wrong:
         raise SpecError(f"{', '.join(wrong)}: use some of {', '.join(known)}.", path=wrong[0])
     pairs = _pairs(_files(gains, (GAINS_ENDING,), "gains"), _files(data, LOG_ENDINGS, "data"), options)
-    place = folder_for(Path(folder))
+    place = ResultFolder(folder, _KIND, _KEPT, letters=LONGEST_STEM)
     return Fleet(carried_out(
         pairs, _run, executor=executor, told=progress, known=lambda pair: _known(pair, place),
         kept=lambda pair, outcome: _kept(pair, *outcome, place),
@@ -241,31 +243,19 @@ def _largest(text: str) -> dict[str, float]:
     return {name: float(value) for name, value in values.items() if np.isfinite(value)}
 
 
-def _targets(pair: _Pair, folder: Path) -> tuple[Path, Path]:
-    stem = file_stem(pair.name, pair.key, most=LONGEST_STEM)
-    return folder / f"{stem}.csv", folder / f"{stem}.result.json"
-
-
-def _kept(pair: _Pair, run: FleetRun, text: str, folder: Path) -> FleetRun:
+def _kept(pair: _Pair, run: FleetRun, text: str, place: ResultFolder) -> FleetRun:
     """Write the estimates, then the result."""
-    table, result = _targets(pair, folder)
-    if text:
-        write_atomically(table, text)
-    body = {**{name: value for name, value in vars(run).items() if name != "file"}, "kind": _KIND, "key": pair.key,
-            "sha256": hashlib.sha256(text.encode()).hexdigest() if text else None}  # fmt: skip
-    write_atomically(result, json.dumps(body, indent=1) + "\n")
-    return replace(run, file=table) if text else run
+    table = write_atomically(place.file(pair.name, pair.key, ".csv"), text) if text else None
+    place.keep(pair.name, pair.key, run, sha256=hashlib.sha256(text.encode()).hexdigest() if text else None)
+    return replace(run, file=table)
 
 
-def _known(pair: _Pair, folder: Path) -> FleetRun | None:
+def _known(pair: _Pair, place: ResultFolder) -> FleetRun | None:
     """Return a run that is there already, whole and of the same files; a damaged one is made again."""
-    table, result = _targets(pair, folder)
-    body = result_in(result, _KIND, pair.key)
+    body, table = place.known(pair.name, pair.key), place.file(pair.name, pair.key, ".csv")
     if body is None:
         return None
-    if body["sha256"] is not None and (
-        not table.is_file() or hashlib.sha256(table.read_bytes()).hexdigest() != body["sha256"]
-    ):
+    digest = body.get("sha256")
+    if digest is not None and (not table.is_file() or hashlib.sha256(table.read_bytes()).hexdigest() != digest):
         return None
-    kept = {name: body[name] for name in ("name", "status", "message", "rows", "statuses", "alarms", "largest")}
-    return FleetRun(**kept, file=None if body["sha256"] is None else table)
+    return FleetRun(**{name: body[name] for name in _KEPT}, file=None if digest is None else table)

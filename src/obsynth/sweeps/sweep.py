@@ -9,7 +9,7 @@ from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 
@@ -18,22 +18,17 @@ from obsynth.files.outputs import write_atomically
 from obsynth.methods.designing import design
 from obsynth.methods.registry import Plant
 from obsynth.observers.progress import RunsProgress, progress_of_runs
-from obsynth.plants.dae.model import DAEModel
-from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.results.design import ObserverDesign
-from obsynth.results.gain_sets import gain_set_bytes, load, loaded, plain, restored
+from obsynth.results.gain_sets import gain_set_bytes, load, loaded, plain
 from obsynth.spec.loader import spec_of
 from obsynth.sweeps.work import (
     STATUSES,
+    ResultFolder,
     ResultTable,
     SweepCase,
     all_of,
     carried_out,
-    file_stem,
-    folder_for,
     plant_cases,
-    result_in,
     spec_cases,
 )
 
@@ -41,9 +36,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _KIND = "obsynth sweep result"
+#: What is kept of a result in its file.
+_KEPT = ("name", "parameters", "status", "message", "condition", "signals", "claims", "facts", "seconds")
 #: Letters of a case's name in the names of its files.
 LONGEST_STEM = 60
-_PLANTS = (DescriptorSystem, TimeVaryingDescriptorSystem, DAEModel)
+_PLANTS = get_args(Plant)
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,7 +203,7 @@ def sweep(
         The cases or parameters are malformed, or the folder cannot be written.
     """
     made = _cases(cases, parameters or {}, method)
-    place = None if folder is None else folder_for(Path(folder))
+    place = None if folder is None else ResultFolder(folder, _KIND, _KEPT, letters=LONGEST_STEM)
     with progress_of_runs(progress) as told:
         return Sweep(carried_out(
             made, run_case, executor=executor, told=told, at_start=True,
@@ -274,37 +271,28 @@ def _designed(case: SweepCase) -> ObserverDesign:
     return found.replace(notes=(*notes, *found.notes)) if notes else found
 
 
-def _files(case: SweepCase, folder: Path) -> tuple[Path, Path]:
-    name = file_stem(case.name, case.key, most=LONGEST_STEM)
-    return folder / f"{name}.result.json", folder / f"{name}.gains.json"
-
-
-def _kept(case: SweepCase, result: SweepResult, folder: Path) -> SweepResult:
+def _kept(case: SweepCase, result: SweepResult, place: ResultFolder) -> SweepResult:
     """Write a gain set, then its result, and return the result with the file."""
-    file, gains = _files(case, folder)
+    gains = place.file(case.name, case.key, ".gains.json")
     written = None if result.content is None else write_atomically(gains, result.content)
-    kept = {name: value for name, value in vars(result).items() if name not in ("file", "content")}
-    body = {"kind": _KIND, "key": case.key, **kept, "gains": None if written is None else written.name}
-    write_atomically(file, json.dumps(plain(body), indent=1) + "\n")
+    place.keep(case.name, case.key, result, gains=None if written is None else written.name)
     return replace(result, file=written, content=None)
 
 
-def _known(case: SweepCase, folder: Path) -> SweepResult | None:
+def _known(case: SweepCase, place: ResultFolder) -> SweepResult | None:
     """Return the result of a case that is there already, whole and of the same data; a damaged one is made again."""
-    found = result_in(_files(case, folder)[0], _KIND, case.key)
-    if found is None:
+    body = place.known(case.name, case.key)
+    if body is None:
         return None
-    body = restored(found)
-    gains = None if body["gains"] is None else folder / str(body["gains"])
+    gains = None if body.get("gains") is None else place.folder / str(body["gains"])
     if gains is not None:
         try:
             load(gains)
         except SpecError:
             return None
-    return SweepResult(
-        case.name, case.parameters, body["status"], body["message"], body["condition"], tuple(body["signals"]),
-        body["claims"], body["facts"], body["seconds"], gains,
-    )  # fmt: skip
+    kept = {name: body[name] for name in _KEPT}
+    own = {"name": case.name, "parameters": case.parameters, "signals": tuple(body["signals"])}
+    return SweepResult(**{**kept, **own}, file=gains)
 
 
 def _cell(value: Any) -> Any:

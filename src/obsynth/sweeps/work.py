@@ -15,12 +15,13 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from obsynth.errors import SpecError
 from obsynth.files.inputs import input_file, read_json
+from obsynth.files.outputs import write_atomically
 from obsynth.files.tables import TableWriter
 from obsynth.methods.registry import Plant
 from obsynth.observers.progress import as_they_come
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.validation import index_of
-from obsynth.results.gain_sets import plain
+from obsynth.results.gain_sets import plain, restored
 from obsynth.spec.documents import read_yaml
 from obsynth.spec.loader import changed_document
 
@@ -231,26 +232,36 @@ def carried_out(
     return tuple(found[i] for i in range(len(items)))
 
 
-def folder_for(folder: Path) -> Path:
-    """Return a folder for results, made where there is none."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise SpecError(f"{folder} cannot be used as a folder: {error.strerror}.", path=str(folder)) from error
-    return folder
+class ResultFolder:
+    """Results of pieces of work in files of a folder, by their names and digests; it is made where there is none.
 
+    ``fields``: what a result must have; ``letters``: so many of a name begin the names of its files.
+    """
 
-def file_stem(name: str, key: str, *, most: int) -> str:
-    """Return how the files of a piece of work begin: its name in letters that every file may have, and its digest."""
-    stem = "".join(letter if letter.isalnum() or letter in "-_." else "-" for letter in name)[:most]
-    return f"{stem}-{key[:DIGITS]}"
+    def __init__(self, folder: str | Path, kind: str, fields: tuple[str, ...], *, letters: int) -> None:
+        self.folder, self.kind, self.fields, self.letters = Path(folder), kind, fields, letters
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise SpecError(f"{folder} cannot be used as a folder: {error.strerror}.", path=str(folder)) from error
 
+    def file(self, name: str, key: str, ending: str) -> Path:
+        """Return a file of a piece of work: its name in letters that every file may have, and its digest."""
+        stem = "".join(letter if letter.isalnum() or letter in "-_." else "-" for letter in name)[: self.letters]
+        return self.folder / f"{stem}-{key[:DIGITS]}{ending}"
 
-def result_in(file: Path, kind: str, key: str) -> dict[str, Any] | None:
-    """Return the result in a file, `None` where it is missing, damaged, or of other work."""
-    try:
-        body = read_json(file, where=str(file)) if file.is_file() else None
-    except SpecError:
-        return None
-    whole = isinstance(body, dict) and body.get("kind") == kind and body.get("key") == key
-    return body if whole else None
+    def keep(self, name: str, key: str, result: object, **more: Any) -> None:
+        """Write the fields of a result, and what else is known of it."""
+        body = {"kind": self.kind, "key": key, **{item: getattr(result, item) for item in self.fields}, **more}
+        write_atomically(self.file(name, key, ".result.json"), json.dumps(plain(body), indent=1) + "\n")
+
+    def known(self, name: str, key: str) -> dict[str, Any] | None:
+        """Return the result that is there, `None` where it is missing, damaged, or of other work."""
+        file = self.file(name, key, ".result.json")
+        try:
+            body = read_json(file, where=str(file)) if file.is_file() else None
+        except SpecError:
+            return None
+        if not isinstance(body, dict) or not {"kind", "key", *self.fields} <= set(body):
+            return None
+        return restored(body) if (body["kind"], body["key"]) == (self.kind, key) else None
