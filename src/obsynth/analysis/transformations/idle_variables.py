@@ -153,7 +153,7 @@ def _left_null_space(tall: Any) -> tuple[FloatArray, FloatArray]:
         wanted = count - width + more
         border, below = rng.normal(size=(count, wanted)), rng.normal(size=(more, width))
         factor = SparseFactor(block_array([[scaled, csr(border)], [csr(below), None]] if more else [[scaled, border]]))
-        right = np.eye(width + wanted)[:, width:]
+        right = np.vstack([np.zeros((width, wanted)), np.eye(wanted)])
         basis = np.linalg.qr(factor.solve_transposed(right)[:count])[0]
         _, values, turned = np.linalg.svd(np.linalg.qr(scaled.T @ basis)[1])
         null = wanted - int(np.sum(values > RANK_TOLERANCE * max(1.0, np.max(np.abs(scaled.data), initial=0.0))))
