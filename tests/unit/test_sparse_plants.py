@@ -232,6 +232,13 @@ class TestIdleVariables:
             obsynth.eliminate_algebraic_states(plant)
         assert caught.value.condition == "index"
 
+    @pytest.mark.parametrize("make", FORMATS)
+    def test_where_no_state_would_be_left_the_index_is_told(self, make):
+        plant = obsynth.DescriptorSystem(make([[0.0, 1], [0, 0]]), make(np.eye(2)), C=[[0, 1.0]])
+        with pytest.raises(obsynth.PreconditionError, match=r"index 2.*'x1'") as caught:
+            obsynth.eliminate_algebraic_states(plant)
+        assert caught.value.condition == "index"
+
     def test_a_large_singular_pencil_is_no_index(self):
         network = random_network(200, 60, 2)
         a = network.A.toarray()

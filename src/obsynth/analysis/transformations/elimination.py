@@ -108,7 +108,7 @@ def eliminated_by_sparsity(plant: DescriptorSystem) -> Transformation:
 
 def _without_idle_variables(plant: DescriptorSystem, refusal: PreconditionError) -> Transformation:
     """Leave out what acts on nothing where that helps; else say which equations and variables are at fault."""
-    from obsynth.analysis.transformations.idle_variables import active_part, active_variables
+    from obsynth.analysis.transformations.idle_variables import active_part, active_variables, everything_active
     from obsynth.analysis.transformations.sparse_elimination import not_index_one
 
     active = active_variables(plant)
@@ -118,6 +118,9 @@ def _without_idle_variables(plant: DescriptorSystem, refusal: PreconditionError)
             raise refusal
         found = eliminated_exactly(part) or _eliminated_densely(part, _dynamic_count(part))
     except PreconditionError as error:
+        if error.condition == "dynamic states":
+            # It did not help: what is wrong with the plant as written is what a user can mend.
+            active, error = everything_active(plant), refusal
         raise not_index_one(plant, active, error) from None
     return replace(
         found, source=plant, description=_description(part, found.plant.nx, active.dropped), dropped=active.dropped,

@@ -55,7 +55,7 @@ def active_variables(plant: DescriptorSystem) -> ActiveVariables:
     rows, columns = np.arange(plant.nx), np.arange(plant.nx)
     if not plant.ny:
         # Without any output nothing says what a variable is there for.
-        return ActiveVariables(rows, columns, (), ())
+        return everything_active(plant)
     pattern = csr(abs(e) + abs(a))
     coarse = coarse_structure(pattern)
     if coarse.structural_rank < plant.nx:
@@ -72,6 +72,11 @@ def active_variables(plant: DescriptorSystem) -> ActiveVariables:
     dropped, unneeded = (np.setdiff1d(np.arange(plant.nx), kept) for kept in (kept_columns, kept_rows))
     names, numbers = tuple(plant.state_names[i] for i in dropped), tuple(int(i) + 1 for i in unneeded)
     return ActiveVariables(kept_rows, kept_columns, names, numbers)
+
+
+def everything_active(plant: DescriptorSystem) -> ActiveVariables:
+    """Return that all equations and variables stay."""
+    return ActiveVariables(np.arange(plant.nx), np.arange(plant.nx), (), ())
 
 
 def active_part(plant: DescriptorSystem, found: ActiveVariables) -> DescriptorSystem:

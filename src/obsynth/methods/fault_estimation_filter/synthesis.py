@@ -100,18 +100,8 @@ def synthesise(plant: DescriptorSystem, asked: FilterOptions, *, progress: Calla
         claims["gamma_min"] = min(max(least.gain, proved), level)
         if "gamma_bracket_high" in claims:
             claims["gamma_bracket_high"] = max(claims["gamma_bracket_high"], claims["gamma_min"])
-    resolved = {
-        "gamma": asked.gamma,
-        "gamma_search": asked.gamma_search,
-        "gamma_margin": asked.gamma_margin,
-        "free_residual_weight": free,
-        "residual_weight_limit": limit,
-        "S": None if s is None else s.tolist(),
-        "engine": asked.engine,
-        "solver": asked.solver,
-        "tolerance": asked.tolerance,
-        "mean": asked.mean,
-    }
+    resolved = asked.as_given() | {"free_residual_weight": free, "S": None if s is None else s.tolist()}
+    del resolved["model_error"]  # decided before this
     if asked.mean > 1:
         # Registers hold estimates, which see no state: nothing of the plant is tracked there.
         zeros = np.zeros(((asked.mean - 1) * plant.nf, tracking.shape[1]))

@@ -35,7 +35,7 @@ from obsynth.analysis.existence.verdicts import (
 from obsynth.analysis.existence.witnesses import Unclear
 from obsynth.analysis.plant_units import PlantUnits, sized_plant
 from obsynth.analysis.transformations.recovery import Transformation
-from obsynth.analysis.zeros import Zero, leading_names, system_pencil, zero_at, zeros_of_system
+from obsynth.analysis.zeros import Zero, leading_names, system_pencil, system_zeros, zero_at, zeros_of_system
 from obsynth.methods.ui_pi_observer.augmented_plant import AugmentedPlant
 from obsynth.methods.ui_pi_observer.decoupling_condition import (
     SOURCE,
@@ -242,7 +242,7 @@ def _fixed_modes(
             point = units.eigenvalue(verdict.distance.point)
             return zeros, lost_in_rounding(given, courses, units, point, augmented.order)
     else:
-        drops = finite_zeros(*pencil).values
+        drops = system_zeros(*pencil, nx=augmented.order).values
         zeros = units.eigenvalues(drops)
         # Rounding scatters a multiple mode around its mean.  (D2) and (D3) exclude an unstable one: it is none at all.
         bound = 1.0 if plant.dt > 0.0 else 0.0
