@@ -141,7 +141,7 @@ def compare(
         + (", a state feedback holds the unstable plant" if kept.feedback.any() else "")
         + f"; 90 % of a step wanted within {limit:.3g} s"
     )
-    times = np.arange(len(drawn.faults)) * float(dt) if log is None else log.times
+    times = _clock(len(drawn.faults), dt) if log is None else log.times
     truth = drawn.faults if log is None else log.truth
     best = next((entry for entry in compared if not entry.refused), None)
     return Comparison(
@@ -220,13 +220,12 @@ def _log(data: Any, plant: DescriptorSystem) -> _Log:
     truth = np.zeros((len(frame), plant.nf))
     for name in there:
         truth[:, plant.fault_names.index(name)] = _numbers(frame, [name])[:, 0]
-    return _Log(
-        np.arange(len(frame)) * float(plant.dt),
-        columns(plant.input_names),
-        columns(plant.output_names),
-        truth,
-        bool(there),
-    )
+    u, y = columns(plant.input_names), columns(plant.output_names)
+    return _Log(_clock(len(frame), plant.dt), u, y, truth, bool(there))
+
+
+def _clock(samples: int, dt: float) -> FloatArray:
+    return np.asarray(np.arange(samples) * float(dt), dtype=np.float64)
 
 
 def _numbers(frame: Any, names: list[str]) -> FloatArray:

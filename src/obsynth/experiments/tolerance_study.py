@@ -186,7 +186,7 @@ def _both(design: ObserverDesign, scenario: Scenario, fault: str, runs: int) -> 
 
 def _together(found: list[Runs]) -> Runs:
     signals = ("states", "outputs", "inputs", "faults", "disturbances", "rows")
-    joined = {name: np.concatenate([getattr(run, name) for run in found], axis=1) for name in signals}
+    joined: dict[str, Any] = {name: np.concatenate([getattr(run, name) for run in found], axis=1) for name in signals}
     return Runs(**joined, observer=found[0].observer)
 
 

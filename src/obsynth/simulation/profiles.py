@@ -6,6 +6,7 @@ A profile acts from the first sample at or after ``start`` until the last one be
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, fields
 from typing import ClassVar
 
@@ -49,15 +50,15 @@ def _require(condition: bool, text: str, path: str) -> None:
         raise SpecError(text, path=path)
 
 
-class Additive(Profile):
+class Additive(Profile, ABC):
     """A function of time, which is added to its signal."""
 
     def at(self, time: FloatArray) -> FloatArray:
         """Return its values at ``time``, seconds."""
         return self._at(time)
 
-    def _at(self, time: FloatArray) -> FloatArray:
-        raise NotImplementedError
+    @abstractmethod
+    def _at(self, time: FloatArray) -> FloatArray: ...
 
     def sampled(self, steps: int, dt: float) -> tuple[FloatArray, FloatArray]:
         """Return its values at the left and right end of each interval between samples, ``(steps,)`` each."""
@@ -223,19 +224,19 @@ class LostEffectiveness(Failure):
         _require(0.0 < self.share <= 1.0, "share must be greater than 0 and at most 1.", "share")
 
 
-class Random(Profile):
+class Random(Profile, ABC):
     """Independent samples, held between samples."""
 
     def draw(self, rng: np.random.Generator, steps: int) -> FloatArray:
         """Return ``steps`` samples, drawn with ``rng``."""
         return self._draw(rng, steps)
 
-    def _draw(self, rng: np.random.Generator, steps: int) -> FloatArray:
-        raise NotImplementedError
+    @abstractmethod
+    def _draw(self, rng: np.random.Generator, steps: int) -> FloatArray: ...
 
+    @abstractmethod
     def moments(self) -> tuple[float, float, float]:
         """Return the largest absolute value (infinite if there is none), the mean and the variance."""
-        raise NotImplementedError
 
 
 @dataclass(frozen=True, kw_only=True)

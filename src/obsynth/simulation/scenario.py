@@ -155,8 +155,8 @@ class Scenario:
         for group, names in _NAMES.items():
             if group == "faults" and not isinstance(plant, DescriptorSystem):
                 names = "parameter_names"
-            known = getattr(plant, names, None)
-            for name in getattr(self, group) if known is not None else ():
+            known: Sequence[str] = getattr(plant, names, ())
+            for name in getattr(self, group) if hasattr(plant, names) else ():
                 try:
                     index_of(name, known, what="The plant")
                 except SpecError as error:

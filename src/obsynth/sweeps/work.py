@@ -262,5 +262,6 @@ class ResultFolder:
             body = read_json(file, where=str(file)) if file.is_file() else None
         except SpecError:
             return None
-        whole = isinstance(body, dict) and body.get("kind") == self.kind and body.get("key") == key
-        return restored(body) if whole and body.keys() >= set(self.fields) else None
+        if not isinstance(body, dict) or not {"kind", "key", *self.fields} <= set(body):
+            return None
+        return restored(body) if (body["kind"], body["key"]) == (self.kind, key) else None

@@ -39,7 +39,8 @@ class AdaptiveState:
         largest = np.zeros(bound.rounding.shape[1])
         largest[-1] = 1.0
         memory = ((length, bound.drive.shape[2]), (length, nz)) if bound.varying else ((0, 0), (0, 0))
-        return cls(*map(np.zeros, shapes), largest, *map(np.zeros, memory))
+        psi, ring, eps, past, moved = (np.zeros(shape) for shape in (*shapes, *memory))
+        return cls(psi, ring, eps, largest, past, moved)
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain data."""
