@@ -454,7 +454,7 @@ TABLE: dict[str, tuple[str, Callable[[ObserverDesign], ObserverDesign], tuple[st
     "a proof of the least gain, of another": (
         "paper", lambda d: with_certificate(d, least_gain_pairs=d.certificate.matrices["least_gain_pairs"][::-1]),
         (LEAST,)),
-    "a proof of the least gain, cut": ("paper", certificate_cut("least_gain_last", slice(1, None)), (LEAST,)),
+    "a proof of the least gain, cut": ("paper", certificate_cut("least_gain_pairs", slice(1, None)), (LEAST,)),
     "gamma_min negative": ("chain", claim("gamma_min", -0.1), (ORDER, LEAST)),
     "gamma_min NaN": ("direct", claim("gamma_min", np.nan), (CLAIMS, ORDER)),
     "gamma_min without gamma": ("quiet", claim("gamma_min", 0.1), (ORDER,)),
