@@ -288,12 +288,8 @@ def hessian(
     if near is not None:
         steeper = np.sqrt(np.maximum(np.diag(near), 1.0))
         steps = np.clip(DIFFERENCE_SHARE / steeper, LEAST_DIFFERENCE, DIFFERENCE)
-    rows = []
-    for i in range(len(z)):
-        step = np.zeros(len(z))
-        step[i] = steps[i]
-        rows.append((both(z + step)[1] - both(z - step)[1]) / (2.0 * steps[i]))
-    found = np.array(rows)
+    found = np.array([(both(z + step)[1] - both(z - step)[1]) / (2.0 * size)
+                      for size, step in zip(steps, np.diag(steps), strict=True)])  # fmt: skip
     return np.asarray(0.5 * (found + found.T))
 
 

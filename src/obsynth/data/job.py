@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.analysis.transformations.recovery import StateRecovery
-from obsynth.data.log_estimator import DECIDING, Engine, Entry, Later, Row, delayed
+from obsynth.data.log_estimator import DECIDING, Engine, Entry, Later, Row
 from obsynth.data.recovered import LATE, RecoveredStates
 from obsynth.data.signals import TIME, Signals
 from obsynth.errors import SpecError
@@ -85,7 +85,7 @@ class Job:
             if not (is_finite_number(level) and level > 0.0):
                 raise SpecError(f"The threshold of {name!r} is {level!r}: give a positive number.", path="thresholds")
         self._levels = tuple((name, names.index(name), level) for name, level in thresholds.items())
-        lags = list(delayed(engine))
+        lags = engine.lags
         if self.recovered is not None and self.recovered.delay:
             lags.append((LATE, self.recovered.delay))
         self._lags = [delay * engine.dt for _, delay in lags]

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from obsynth.data.log_estimator import GAP, LONGEST_BRIDGE, OK, RECOVERING, WARM_UP, Engine, Row, estimate_columns
+from obsynth.data.log_estimator import GAP, LONGEST_BRIDGE, OK, RECOVERING, WARM_UP, Engine, Row
 from obsynth.errors import ObsynthError, PreconditionError, SpecError
 from obsynth.experiments.monitors.online import LinearSample
 from obsynth.numerics.arguments import is_finite_number
@@ -103,7 +103,7 @@ class DataObserver(Engine):
         self.options["gap"] = gap
         self.input_names, self.output_names = self.observer.input_names, self.observer.output_names
         self.point, self.scales = self.plant.operating_point, self.plant.scales
-        self.columns = estimate_columns(self.state_names, self.fault_names, self.observer.residual_names)
+        self.columns = self.observer.row_names
         lags = set(self.observer.state_delays) or {0}
         self.gap_model = None if len(lags) > 1 else GapModel.of(self.plant)
         self.nu = len(self.input_names)

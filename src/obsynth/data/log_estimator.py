@@ -145,6 +145,19 @@ class Engine(ABC):
         self.settled_at, self.phase = math.inf, WARM_UP
         self.options: dict[str, float | None] = {"warm_up": self.warm_up}
 
+    @property
+    def estimated(self) -> tuple[str, ...]:
+        """Columns of the estimates of states and faults."""
+        return (*(f"xhat[{name}]" for name in self.state_names), *(f"fhat[{name}]" for name in self.fault_names))
+
+    @property
+    def lags(self) -> list[tuple[str, int]]:
+        """Name and delay in samples of what lags: the states (together where they lag alike), and each fault."""
+        found = list(zip(self.estimated, (*self.state_delays, *self.fault_delays), strict=True))
+        if len(set(self.state_delays)) == 1:
+            found[: len(self.state_names)] = [("xhat", self.state_delays[0])]
+        return [(name, delay) for name, delay in found if delay]
+
     @abstractmethod
     def step(self, time: float, values: FloatArray, row: int) -> Row:
         """Take one row of data: its time, deviations ``(nu + ny,)``, and its number."""
@@ -170,22 +183,3 @@ class Engine(ABC):
     @abstractmethod
     def _resume_own(self, data: dict[str, Any]) -> None:
         """Go on from what `_own_data` returned."""
-
-
-def estimate_columns(
-    states: tuple[str, ...], faults: tuple[str, ...], residuals: tuple[str, ...], *, deviations: bool = False
-) -> tuple[str, ...]:
-    """Return the names of columns."""
-    estimated = (*(f"xhat[{name}]" for name in states), *(f"fhat[{name}]" for name in faults))
-    spread = tuple(f"sd {name}" for name in estimated) if deviations else ()
-    return (*estimated, *spread, *(f"r[{name}]" for name in residuals))
-
-
-def delayed(engine: Engine) -> tuple[tuple[str, int], ...]:
-    """Return name and delay in samples of what lags: the states (together where they lag alike), and each fault."""
-    states = set(engine.state_delays)
-    found = [(f"xhat[{name}]", delay) for name, delay in zip(engine.state_names, engine.state_delays, strict=True)]
-    if len(states) == 1:
-        found = [("xhat", engine.state_delays[0])]
-    found += [(f"fhat[{name}]", delay) for name, delay in zip(engine.fault_names, engine.fault_delays, strict=True)]
-    return tuple((name, delay) for name, delay in found if delay)

@@ -6,17 +6,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from obsynth.data.log_estimator import (
-    GAP,
-    LONGEST_BRIDGE,
-    OK,
-    PARTIAL,
-    RECOVERING,
-    WARM_UP,
-    Engine,
-    Row,
-    estimate_columns,
-)
+from obsynth.data.log_estimator import GAP, LONGEST_BRIDGE, OK, PARTIAL, RECOVERING, WARM_UP, Engine, Row
 from obsynth.errors import ObsynthError, PreconditionError, SolverError, SpecError
 from obsynth.experiments.monitors.online import Evidence
 from obsynth.numerics.arrays import FloatArray
@@ -56,7 +46,8 @@ class SteppingEngine(Engine):
             residuals = tuple(f"innovation {i + 1}" for i in range(self.observer.innovation_count))
             constant = model.is_time_invariant and Q.is_constant and R.is_constant
             self.may_restart = constant and model.horizon is None
-        self.columns = estimate_columns(self.state_names, self.fault_names, residuals, deviations=True)
+        self.columns = (*self.estimated, *(f"sd {name}" for name in self.estimated),
+                        *(f"r[{name}]" for name in residuals))  # fmt: skip
         self.directions = len(residuals)
         late = ", ".join(name for name, entry in (self.observer.sensors or {}).items() if entry["delay"])
         if late:

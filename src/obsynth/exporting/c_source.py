@@ -138,10 +138,8 @@ def _form(matrix: FloatArray) -> str:
 
 
 def _product(target: str, parts: dict[str, FloatArray]) -> list[str]:
-    """Return the product of the rows of a target: small ones row by row.
-
-    Large ones column by column, so that rows are independent and a compiler can use vectors; sums keep their order.
-    """
+    """Return the product of the rows of a target."""
+    # Large ones column by column, so that rows are independent and a compiler can use vectors; sums keep their order.
     rows = next(iter(parts.values())).shape[0]
     if not rows:
         return []

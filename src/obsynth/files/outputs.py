@@ -21,11 +21,7 @@ LOOKED_AT = 1 << 16
 
 @dataclass(frozen=True)
 class FileKind:
-    """A kind of file that obsynth writes: its name in messages, and by what it is known.
-
-    ``mark``: a regular expression for the beginning or the end of each; ``ending``: how these files, and no others, are
-    named.
-    """
+    """A kind of file that obsynth writes: its name, a regular expression for its beginning or end, how it is named."""
 
     name: str
     mark: bytes

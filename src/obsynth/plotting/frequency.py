@@ -133,7 +133,7 @@ def _seen(
     return states, np.asarray(to_estimate @ outputs), _sizes(to_estimate) * _sizes(outputs)
 
 
-def _above_rounding(sizes: FloatArray, terms: FloatArray) -> FloatArray:
+def _above_rounding(sizes: Any, terms: FloatArray) -> FloatArray:
     """Return sizes, and zero where only the rounding of terms is left."""
     return np.asarray(np.where(sizes > ROUNDING_SHARE * terms, sizes, 0.0), dtype=np.float64)
 

@@ -109,10 +109,7 @@ def names_as_they_are(panel: Axes) -> None:
 
 
 def legend_above(panel: Axes) -> None:
-    """Put the legend above a panel, where it hides nothing: in as few lines as fit its width.
-
-    A title has to stand higher then: ``panel.set_title(text, pad=20)``.
-    """
+    """Put the legend above a panel, where it hides nothing: in as few lines as fit its width."""
     _, labels = panel.get_legend_handles_labels()
     figure = panel.get_figure(root=True)
     inches = panel.get_position().width * (WIDTH if figure is None else float(figure.get_figwidth()))

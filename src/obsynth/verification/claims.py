@@ -126,12 +126,8 @@ def closed_claims(
     design: ObserverDesign, rows: Iterable[Check], covered: Mapping[str, str], meanings: Mapping[str, str],
     witnesses: frozenset[str],
 ) -> Iterator[Check]:  # fmt: skip
-    """Yield the row on claims that nothing covers, and one for each claim that is stated and not checked.
-
-    ``covered`` and ``meanings`` are by claim: the row that checks it, and what it means.
-
-    Where a row fails already nothing more is said: a report that ends early covers little.
-    """
+    """Yield the row on claims that no row covers (``covered``, by claim), and one for each that is only stated."""
+    # Where a row fails already nothing more is said: a report that ends early covers little.
     given = tuple(rows)
     if not all(row.passed for row in given):
         return

@@ -96,10 +96,8 @@ class ErrorSystem:
         lag: int,
         algebraic: FloatArray | None = None,
     ) -> ErrorSystem:
-        """Return the error system of ``observer`` on ``plant``, given the tracking map ``(nz, nx (lag + 1))``.
-
-        ``algebraic (rows, nx)``: equations that the outputs add, with ``Cz V E + Dy C = K + algebraic A``.
-        """
+        """Return the error system for a tracking map ``(nz, nx (lag + 1))``."""
+        # Equations that the outputs add, ``algebraic (rows, nx)``: Cz V E + Dy C = K + algebraic A.
         lagged = LaggedPlant.of(plant, lag)
 
         def driven(b: FloatArray, d: FloatArray) -> FloatArray:

@@ -23,8 +23,8 @@ from obsynth.plants.descriptor import DescriptorSystem
 
 #: A point without meaning, at which a pencil has its normal rank.
 GENERIC_POINT = 0.7391
-#: Rank that a matrix may lack beyond what its shape says, to begin with half of it.
-BORDER = 4
+#: Rank that a matrix may lack beyond what its shape says, to begin with.
+BORDER = 8
 #: How much rather a repeated equation is left out whose own variable is left out.
 OTHERS_WEIGHT = 1e-3
 
@@ -146,20 +146,21 @@ def _left_null_space(tall: Any) -> tuple[FloatArray, FloatArray]:
     """
     from scipy.sparse import block_array, diags_array
 
-    (count, width), rng, more = tall.shape, np.random.default_rng(2), BORDER
+    (count, width), rng, more = tall.shape, np.random.default_rng(2), 0
     rows, columns = scales_by_all_entries(tall)
     scaled = csr(diags_array(rows) @ tall @ diags_array(columns))
     while True:
-        more = min(2 * more, width)
         wanted = count - width + more
         border, below = rng.normal(size=(count, wanted)), rng.normal(size=(more, width))
         factor = SparseFactor(block_array([[scaled, csr(border)], [csr(below), None]] if more else [[scaled, border]]))
-        right = np.eye(width + wanted)[:, width:]
+        right = np.vstack([np.zeros((width, wanted)), np.eye(wanted)])
         basis = np.linalg.qr(factor.solve_transposed(right)[:count])[0]
         _, values, turned = np.linalg.svd(np.linalg.qr(scaled.T @ basis)[1])
         null = wanted - int(np.sum(values > RANK_TOLERANCE * max(1.0, np.max(np.abs(scaled.data), initial=0.0))))
-        if null < wanted or more == width:
+        # A border of rows costs fill, and is needed only where columns are dependent as well.
+        if (more == 0 and not factor.singular) or (more and null < wanted) or more == width:
             return basis @ turned[wanted - null :].T, rows
+        more = min(max(BORDER, 2 * more), width)
 
 
 def _idle(
