@@ -5,6 +5,7 @@ import pytest
 import slycot
 from scipy.linalg import block_diag, eigvals
 
+from obsynth.numerics import pencils
 from obsynth.numerics.pencils import finite_zeros, pencil_structure
 
 
@@ -272,3 +273,26 @@ def test_planted_zeros_of_many_states_are_neither_lost_nor_joined_by_others(extr
     # Outputs of their own, random ones, see every one of them.
     seen = np.vstack([A, np.hstack([rng.normal(size=(2, len(a))), np.zeros((2, channels))])])
     assert finite_zeros(np.vstack([E, np.zeros((2, E.shape[1]))]), seen).values.size == 0
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_zeros_beside_a_badly_conditioned_derivative_are_found_among_clear_candidates(seed, monkeypatch):
+    # Two modes that the outputs do not see, a pair and a real one; all others show, which eigenvectors tell.
+
+    rng = np.random.default_rng(seed)
+    n = 30
+    modes = -np.arange(1.0, n + 1.0)
+    a = np.diag(modes)
+    a[0, 0], a[0, 1], a[1, 0], a[1, 1] = -1.5, 2.0, -2.0, -1.5
+    c = rng.uniform(0.5, 1.5, (4, n))
+    c[:, :2] = 0.0
+    c[:, 7] = 0.0
+    turn = np.linalg.qr(rng.normal(size=(n, n)))[0]
+    e = turn @ np.diag(np.geomspace(1.0, 1e-6, n)) @ np.linalg.qr(rng.normal(size=(n, n)))[0]
+    counted = []
+    judged = pencils.PencilPoints.nullity
+    monkeypatch.setattr(pencils.PencilPoints, "nullity", lambda self, z: counted.append(z) or judged(self, z))
+    found = finite_zeros(np.vstack([e, np.zeros((4, n))]), np.vstack([e @ a, c])).values
+    assert np.allclose(sorted(found, key=lambda z: (z.real, z.imag)), [-8.0, -1.5 - 2.0j, -1.5 + 2.0j], atol=1e-5)
+    # Found by the staircase or not, few points are looked at: of a pair one.
+    assert len(counted) <= 10

@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import scipy.sparse as sp
+from scipy.sparse.csgraph import structural_rank
 
 import obsynth
 from obsynth.analysis.transformations.elimination import eliminated_by_sparsity
@@ -409,3 +410,15 @@ def test_a_part_of_a_sparse_plant_is_replaced(kind):
     np.testing.assert_allclose(
         np.sort_complex(np.linalg.eigvals(whole.A)), np.sort_complex(np.linalg.eigvals(expected.A))
     )
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_the_matching_is_a_largest_one(seed):
+    rng = np.random.default_rng([71, seed])
+    rows, columns = rng.integers(1, 12, 2)
+    matrix = rng.normal(size=(rows, columns)) * (rng.random((rows, columns)) < rng.uniform(0.0, 0.5))
+    found = coarse_structure(sp.csr_array(matrix))
+    matched = np.flatnonzero(found.row_of_column >= 0)
+    assert np.all(matrix[found.row_of_column[matched], matched] != 0.0)
+    assert len(set(found.row_of_column[matched])) == len(matched)
+    assert len(matched) == (structural_rank(sp.csr_array(matrix)) if matrix.any() else 0)

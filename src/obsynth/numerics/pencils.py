@@ -34,6 +34,8 @@ from obsynth.numerics.scaling import equilibrate_pencil
 #: From so many states on, a well-conditioned E is inverted: ordinary eigenvalues take a fraction of the time.
 MANY_STATES = 100
 SAFE_CONDITION = 1e5
+#: An eigenvalue belongs to the closest of others unless a second one is not further away than this many times that.
+TIE = 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,9 +163,14 @@ def _with_missed_zeros(found: ComplexArray, candidates: ComplexArray, points: Pe
     these candidates can be tested by itself.
     """
     zeros = list(found)
-    for candidate in _in_pairs(candidates):
+    nullities: dict[complex, int] = {}
+    for candidate in map(complex, _in_pairs(candidates)):
         near = sum(abs(zero - candidate) <= CLUSTER_TOLERANCE * max(1.0, abs(candidate)) for zero in zeros)
-        if points.nullity(complex(candidate)) > near:
+        # The pencil is real: of a pair one is judged.
+        upper = complex(candidate.real, abs(candidate.imag))
+        if upper not in nullities:
+            nullities[upper] = points.nullity(upper)
+        if nullities[upper] > near:
             zeros.append(candidate)
     return _in_pairs(np.array(zeros, dtype=np.complex128))
 
@@ -196,11 +203,38 @@ def _clearly_no_zeros(parts: _SquarePart, scales: tuple[float, float]) -> tuple[
         away, shown = np.sum(reach, axis=1), np.linalg.norm(rest @ vectors, axis=0)
         least = shown * (1.0 - away) - reach @ shown
         clear = np.asarray((away < 1.0) & (least > 2.0 * tolerances))
-    if not np.all(clear) and _safe_inverse(square_e) is None:
-        return _candidates(parts)
     pairs = np.flatnonzero(values.imag > 0.0)
     clear[pairs] &= clear[pairs + 1]
+    clear[pairs + 1] = clear[pairs]
+    if not np.all(clear) and _safe_inverse(square_e) is None:
+        return _by_qz(parts, values, clear) if np.any(clear) else _candidates(parts)
     return np.asarray(values, dtype=np.complex128), clear
+
+
+def _by_qz(
+    parts: _SquarePart, values: ComplexArray, clear: NDArray[np.bool_]
+) -> tuple[ComplexArray, NDArray[np.bool_]]:
+    """Return the eigenvalues of the square part by QZ, clear where those around are clear whose E was inverted.
+
+    A zero is closest to one that is not clear, and QZ has it nearby.  Where that is as good as a tie, nothing is clear.
+    """
+    better, unclear = _candidates(parts)
+    if len(better) < len(values):
+        # What is no number was left out.
+        return better, unclear
+    distances = np.abs(better[:, None] - values)
+    open_, known = distances[:, ~clear], distances[:, clear]
+    rounding = CLUSTER_TOLERANCE * np.maximum(1.0, np.abs(better))
+    # A distance that is no number leaves the question open.
+    still = np.asarray(np.min(open_, axis=1) > TIE * np.min(known, axis=1) + rounding)
+    still[np.argmin(open_, axis=0)] = False
+    still &= still[_conjugates(better)]
+    return better, still
+
+
+def _conjugates(values: ComplexArray) -> NDArray[np.int64]:
+    """Return the place of the conjugate of each value, where pairs follow each other."""
+    return np.arange(len(values)) + (values.imag > 0.0) - (values.imag < 0.0)
 
 
 def _candidates(parts: _SquarePart) -> tuple[ComplexArray, NDArray[np.bool_]]:

@@ -77,6 +77,9 @@ def selection(rows: Any, count: int) -> Any:
 
 Indices = NDArray[np.int64]
 
+#: What an entry that a row has beside the matrix costs in a matching, where any entry of the matrix costs one.
+OWN_ENTRY = 2.0
+
 
 @dataclass(frozen=True, eq=False)
 class CoarseStructure:
@@ -101,10 +104,8 @@ class CoarseStructure:
 
 def coarse_structure(pattern: Any) -> CoarseStructure:
     """Return the over- and underdetermined parts of a sparse matrix, by its pattern."""
-    from scipy.sparse.csgraph import maximum_bipartite_matching
-
     matrix = csr(pattern)
-    row_of_column = np.asarray(maximum_bipartite_matching(matrix, perm_type="row"), dtype=np.int64)
+    row_of_column = _maximum_matching(matrix)
     column_of_row = np.full(matrix.shape[0], -1, dtype=np.int64)
     matched = np.flatnonzero(row_of_column >= 0)
     column_of_row[row_of_column[matched]] = matched
@@ -113,6 +114,26 @@ def coarse_structure(pattern: Any) -> CoarseStructure:
     over_rows, over_columns = _alternating(matrix, free_rows, row_of_column)
     under_columns, under_rows = _alternating(csr(matrix.T), free_columns, column_of_row)
     return CoarseStructure(row_of_column, over_rows, over_columns, under_rows, under_columns)
+
+
+def _maximum_matching(matrix: Any) -> Indices:
+    """Return the row of each column in a maximum matching, -1 for none.
+
+    Every row may have an entry of its own beside the matrix, at a price: the cheapest full matching uses as few as
+    possible.  scipy's matching without weights took minutes with rows and columns in some orders.
+    """
+    from scipy.sparse import csr_array, eye_array, hstack
+    from scipy.sparse.csgraph import min_weight_full_bipartite_matching
+
+    rows, columns = matrix.shape
+    found = np.full(columns, -1, dtype=np.int64)
+    if not matrix.nnz:
+        return found
+    cheap = csr_array((np.ones(matrix.nnz), matrix.indices, matrix.indptr), shape=matrix.shape)
+    row, column = min_weight_full_bipartite_matching(csr(hstack([cheap, OWN_ENTRY * eye_array(rows)])))
+    inside = column < columns
+    found[column[inside]] = row[inside]
+    return found
 
 
 def unmatched_instead(pattern: Any, found: CoarseStructure, rows: Indices) -> Indices | None:

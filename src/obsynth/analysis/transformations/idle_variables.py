@@ -69,6 +69,9 @@ def active_variables(plant: DescriptorSystem) -> ActiveVariables:
             raise_structurally_singular(plant, rows[coarse.over_rows], columns[coarse.under_columns])
     idle_rows, idle_columns = _idle(e[rows][:, columns], pattern, coarse, c[:, columns], plant, rows, columns)
     kept_rows, kept_columns = np.delete(rows, idle_rows), np.delete(columns, idle_columns)
+    if not len(kept_columns):
+        # No output sees anything: what is wrong with the plant is not that some variable acts on nothing.
+        return everything_active(plant)
     dropped, unneeded = (np.setdiff1d(np.arange(plant.nx), kept) for kept in (kept_columns, kept_rows))
     names, numbers = tuple(plant.state_names[i] for i in dropped), tuple(int(i) + 1 for i in unneeded)
     return ActiveVariables(kept_rows, kept_columns, names, numbers)

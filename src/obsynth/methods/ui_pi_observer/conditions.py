@@ -22,7 +22,7 @@ import numpy as np
 
 from obsynth.analysis.conditions import Condition, is_doubted, is_refused
 from obsynth.analysis.existence.distance import drowned_zeros
-from obsynth.analysis.existence.numbers import numbers_of, reconsidered
+from obsynth.analysis.existence.numbers import decides_exactly, numbers_of, reconsidered
 from obsynth.analysis.existence.rational import SystemFacts
 from obsynth.analysis.existence.verdicts import (
     believed,
@@ -58,7 +58,7 @@ from obsynth.methods.ui_pi_observer.pencils import (
     number,
     numbers,
 )
-from obsynth.numerics.arrays import ComplexArray, FloatArray
+from obsynth.numerics.arrays import ComplexArray, FloatArray, remembered
 from obsynth.numerics.pencils import finite_zeros
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.fault_models import Exosystem
@@ -85,13 +85,33 @@ class Existence:
     fixed_modes: ComplexArray
 
 
+@remembered
+def _known(_plant: DescriptorSystem) -> dict[tuple[bool, *tuple[bytes, ...]], tuple[Condition, ...]]:
+    """Return a place for the conditions of a plant with a fault model: synthesis and verification ask for them."""
+    return {}
+
+
+def existence_conditions(plant: DescriptorSystem, model: Exosystem) -> tuple[Condition, ...]:
+    """Return the existence conditions of the unknown-input PI observer."""
+    return _known(plant).get(_key(model)) or existence(plant, model).conditions
+
+
 def existence(plant: DescriptorSystem, model: Exosystem) -> Existence:
     """Return the existence conditions of the unknown-input PI observer, and the plant to design for."""
-    plant = plant.dense()
-    return reconsidered(
-        lambda: _decided(plant, model), lambda found: is_refused(found.conditions),
+    dense = plant.dense()
+    found = reconsidered(
+        lambda: _decided(dense, model), lambda found: is_refused(found.conditions),
         lambda found: is_doubted(found.conditions),
     )  # fmt: skip
+    _known(plant)[_key(model)] = found.conditions
+    return found
+
+
+def _key(model: Exosystem) -> tuple[bool, *tuple[bytes, ...]]:
+    """Return what the conditions depend on besides the plant: the numbers of the fault model, to the last digit."""
+    parts = (model.Phi, model.Cw, model.eigenvalues)
+    # A negative zero is a zero.
+    return decides_exactly(), *((np.asarray(part) + 0.0).tobytes() for part in parts)
 
 
 def _decided(plant: DescriptorSystem, model: Exosystem) -> Existence:

@@ -14,7 +14,7 @@ from obsynth.methods.ui_pi_observer.augmented_plant import AugmentedPlant, shipp
 from obsynth.methods.ui_pi_observer.checks.decoupling import decoupling_norm
 from obsynth.methods.ui_pi_observer.checks.fault_response import tracking_rows
 from obsynth.methods.ui_pi_observer.checks.numbers import gain_rows, noise_rows, stability_rows
-from obsynth.methods.ui_pi_observer.conditions import existence
+from obsynth.methods.ui_pi_observer.conditions import existence_conditions
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
@@ -59,7 +59,7 @@ def _realisation_rows(design: ObserverDesign, printed_digits: int | None) -> Ite
         return
     tracking, phi, cw, poles, factor = (certificate.matrices[name] for name in _MATRICES)
     model = shipped_model(certificate.matrices, plant.nf)
-    *conditions, last = existence(plant, model).conditions
+    *conditions, last = existence_conditions(plant, model)
     yield from condition_rows(conditions)
     if last.name == "fixed modes":
         yield information(last.name, "poles that no gain moves", last.value, source=last.source, detail=last.detail)
