@@ -422,3 +422,16 @@ def test_the_matching_is_a_largest_one(seed):
     assert np.all(matrix[found.row_of_column[matched], matched] != 0.0)
     assert len(set(found.row_of_column[matched])) == len(matched)
     assert len(matched) == (structural_rank(sp.csr_array(matrix)) if matrix.any() else 0)
+
+
+def test_a_time_constant_that_is_taken_as_zero_is_told():
+    plant = random_network(300, 40, 3).plant()
+    whole = eliminated_by_sparsity(plant)
+    assert not any("Taken as algebraic" in note for note in whole.notes)
+    lag = plant.state_names.index("LAG_y TGOV1 1")
+    for factor, told in ((1e-6, False), (1e-14, True)):
+        e = sp.lil_array(plant.E)
+        e[lag, lag] *= factor
+        found = eliminated_by_sparsity(plant.replace(E=e.tocsr()))
+        assert found.plant.nx == whole.plant.nx - told
+        assert any("Taken as algebraic" in note and "'LAG_y TGOV1 1'" in note for note in found.notes) == told

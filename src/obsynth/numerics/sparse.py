@@ -125,14 +125,16 @@ def _maximum_matching(matrix: Any) -> Indices:
     from scipy.sparse import csr_array, eye_array, hstack
     from scipy.sparse.csgraph import min_weight_full_bipartite_matching
 
-    rows, columns = matrix.shape
-    found = np.full(columns, -1, dtype=np.int64)
+    found = np.full(matrix.shape[1], -1, dtype=np.int64)
     if not matrix.nnz:
         return found
-    cheap = csr_array((np.ones(matrix.nnz), matrix.indices, matrix.indptr), shape=matrix.shape)
-    row, column = min_weight_full_bipartite_matching(csr(hstack([cheap, OWN_ENTRY * eye_array(rows)])))
-    inside = column < columns
-    found[column[inside]] = row[inside]
+    # Most rows of E are empty.
+    own_rows, own_columns = np.flatnonzero(np.diff(matrix.indptr)), np.unique(matrix.indices)
+    part = csr(matrix[own_rows][:, own_columns])
+    cheap = csr_array((np.ones(part.nnz), part.indices, part.indptr), shape=part.shape)
+    row, column = min_weight_full_bipartite_matching(csr(hstack([cheap, OWN_ENTRY * eye_array(len(own_rows))])))
+    inside = column < len(own_columns)
+    found[own_columns[column[inside]]] = own_rows[row[inside]]
     return found
 
 

@@ -102,7 +102,7 @@ def eliminated_by_sparsity(plant: DescriptorSystem) -> Transformation:
     recovery = StateRecovery.from_operator(part.state_names, found.operator, np.eye(plant.nw), state_point(part))
     return Transformation(
         plant, new, _description(part, len(found.names), active.dropped), recovery, active.dropped,
-        (active.note(),) if active.dropped else (), found.bounds,
+        tuple(filter(None, (active.note(), found.note()))), found.bounds,
     )  # fmt: skip
 
 

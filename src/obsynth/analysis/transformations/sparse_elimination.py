@@ -33,7 +33,8 @@ class SparseCoordinates:
 
     Fields: dynamic_rows, algebraic_rows: ``(count, nx)`` and ``(nx - count, nx)``: combinations of equations; E has
     none of the latter; dynamic, algebraic: ``(nx, count)`` and ``(nx, nx - count)``: bases of states; E maps the latter
-    to zero; names: Of the dynamic states: their own, where these are whole states of the plant.
+    to zero; names: Of the dynamic states: their own, where these are whole states of the plant; neglected: States whose
+    derivative has a coefficient that counts as zero beside the others.
     """
 
     dynamic_rows: Any
@@ -41,6 +42,7 @@ class SparseCoordinates:
     dynamic: Any
     algebraic: Any
     names: tuple[str, ...]
+    neglected: tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,13 +50,23 @@ class SparseReduction:
     """A plant without its algebraic states: its matrices, and how the others follow from the states that are left.
 
     Fields: matrices: ``A, B, Bf, Bd, Bw, C, D, Df, Dd, Dw``; names: Of the states; operator: All states from these;
-    bounds: How well the algebraic equations were solved.
+    bounds: How well the algebraic equations were solved; neglected: States whose derivative was taken as zero.
     """
 
     matrices: dict[str, FloatArray]
     names: tuple[str, ...]
     operator: RecoveryOperator
     bounds: SolutionBounds
+    neglected: tuple[str, ...]
+
+    def note(self) -> str:
+        """Return one sentence about derivatives that were taken as zero; empty where there are none."""
+        if not self.neglected:
+            return ""
+        return (
+            f"Taken as algebraic, since the coefficients of their derivatives in E are less than {RANK_TOLERANCE:g} of "
+            f"the largest in suitable units: {listed(list(self.neglected))}. Give E zeros there, or larger entries."
+        )
 
 
 def reduced_by_sparsity(plant: DescriptorSystem) -> SparseReduction | None:
@@ -87,7 +99,7 @@ def reduced_by_sparsity(plant: DescriptorSystem) -> SparseReduction | None:
     matrices |= dict(zip(("C", "D", "Df", "Dd", "Dw"), np.split(shown, ends, axis=1), strict=True))
     operator = RecoveryOperator(split.dynamic, split.algebraic, inner, right, counts)
     bounds = SolutionBounds(max(factor.condition, mass.condition), max(backward, backward_of_e))
-    return SparseReduction(matrices, split.names, operator, bounds)
+    return SparseReduction(matrices, split.names, operator, bounds, split.neglected)
 
 
 def split_by_derivatives(plant: DescriptorSystem) -> SparseCoordinates:
@@ -146,17 +158,22 @@ class _Pieces:
         self.algebraic_rows: list[tuple[int, Any, FloatArray]] = []
         self.dynamic: list[tuple[int, Any, FloatArray]] = []
         self.algebraic: list[tuple[int, Any, FloatArray]] = []
+        # States whose derivative has a coefficient, but one too small beside the others.
+        self.neglected: list[int] = []
 
     def add(self, rows: Any, columns: Any, block: FloatArray, row_scale: Any, column_scale: Any, norm: float) -> None:
         """Split one component by its singular values, beside the norm of all of E."""
         if block.shape == (1, 1):
             whole_rows = whole_columns = abs(block[0, 0]) > RANK_TOLERANCE * norm
             rank = int(whole_rows)
-            left, right = np.ones((1, 1)), np.ones((1, 1))
+            left, right, values = np.ones((1, 1)), np.ones((1, 1)), np.abs(block[0])
         else:
             left, values, right = np.linalg.svd(block)
             rank = int(np.sum(values > RANK_TOLERANCE * norm))
             whole_rows, whole_columns = rank == len(rows), rank == len(columns)
+        for k in range(rank, len(values)):
+            if values[k] > len(values) * np.finfo(float).eps * values[0]:
+                self.neglected.append(int(columns[np.argmax(np.abs(right[k]))]))
         self._put(self.dynamic_rows, self.algebraic_rows, rows, left.T * row_scale, rank, whole=whole_rows)
         self._put(self.dynamic, self.algebraic, columns, right * column_scale, rank, whole=whole_columns)
 
@@ -180,7 +197,7 @@ class _Pieces:
         )
         return SparseCoordinates(
             self._matrix(self.dynamic_rows), self._matrix(self.algebraic_rows), csr(self._matrix(self.dynamic).T),
-            csr(self._matrix(self.algebraic).T), names,
+            csr(self._matrix(self.algebraic).T), names, tuple(state_names[i] for i in sorted(set(self.neglected))),
         )  # fmt: skip
 
     def _matrix(self, pieces: list[tuple[int, Any, FloatArray]]) -> Any:
