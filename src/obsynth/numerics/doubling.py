@@ -169,11 +169,6 @@ def _solved_in_place(matrix: FloatArray, rows: FloatArray) -> bool:
     return not failed
 
 
-def gain_is_below(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, level: float) -> bool:
-    """Return whether a Riccati equation says that the H-infinity norm of a stable system is at most ``level``."""
-    return compared_gain(a, b, c, d, level) is True
-
-
 def compared_gain(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, level: float) -> bool | None:
     """Return whether the H-infinity norm of a stable system is at most ``level``; ``None`` where that is not told.
 
