@@ -213,7 +213,7 @@ class NormalisedProblem:
 
 
 def normalise(
-    problem: GainProblem, *, solver: str, start: Injection | None = None, gain: float | None = None
+    problem: GainProblem, *, solver: str = "auto", start: Injection | None = None, gain: float | None = None
 ) -> NormalisedProblem:
     """Return the problem in coordinates that suit the solver; ``gain`` is that of ``start``, where known."""
     start = start if start is not None else _starting_filter(problem)
