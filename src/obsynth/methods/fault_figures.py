@@ -96,9 +96,9 @@ def held(plant: DescriptorSystem, steps: int) -> Held:
 def step_responses(
     plant: DescriptorSystem, observer: LinearObserver, steps: int, feedback: FloatArray | None = None
 ) -> tuple[FloatArray, FloatArray]:
-    """Return impulse responses ``(steps, faults, nf + nd + nw)`` and step responses ``(steps, faults, nf)``.
+    """Return responses to impulses ``(steps, faults, nf + nd + nw)`` and to steps ``(steps, faults, nf)``.
 
-    A feedback ``u = -feedback x`` is known to the observer, so that it changes no estimate; it keeps numbers small.
+    A feedback ``u = -feedback x`` changes no estimate; it keeps numbers small.
     """
     order, rows = observer.order, observer.fault_rows
     # Where no noise is stated, every output has one of its own, of deviation one.
