@@ -155,6 +155,5 @@ class Synthesis:
     solver: Mapping[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     transformation: Transformation | None = None  # before the design, which is then for its plant, with the way back
-    plant: DescriptorSystem | TimeVaryingDescriptorSystem | None = (
-        None  # as recursive methods see it, or with the noise designed for
-    )
+    # As the recursive methods see it, where given another kind; or with the noise that the design is for.
+    plant: DescriptorSystem | TimeVaryingDescriptorSystem | None = None

@@ -223,7 +223,7 @@ class Told:
 def told_from_faults(plant: DescriptorSystem) -> dict[str, Told]:
     """Return the verdict for each constant with a tolerance, from the plant as written; empty without faults.
 
-    Decoupling exists where the pencil from faults and directions to outputs has full normal rank and stable zeros.
+    Decoupling: the pencil from faults and directions to outputs has full normal rank and stable zeros.
     """
     uncertain = plant.uncertainty
     if uncertain is None or not plant.nf:

@@ -112,7 +112,7 @@ def _advice(asked: PdOptions) -> str:
 def _units(
     plant: DescriptorSystem, asked: PdOptions, *, balanced_first: bool
 ) -> Iterable[tuple[FloatArray, FloatArray]]:
-    """Return units of augmented states and outputs: the user's, balancing ones, those in which the plant is near one."""
+    """Return units of augmented states and outputs: the user's, balancing ones, those with the plant near one."""
     found = [*_candidate_units(plant, asked)]
     if asked.gain_bound is not None:
         return found

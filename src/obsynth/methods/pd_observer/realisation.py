@@ -111,7 +111,7 @@ class PdErrorSystem:
         return continuous_hinf_norm(self.Az, driven[0], self.estimate[: self.nx], driven[1][: self.nx])
 
     def separate_noise_norm(self, process: FloatArray, sensor: FloatArray) -> ContinuousHinfNorm:
-        """Return the H-infinity norm from ``[w; w']``, both free; ``process (nx, nw)``, ``sensor (ny, nw)``: where w enters."""
+        """Return the H-infinity norm from ``[w; w']``, both free, with ``process (nx, nw)`` and ``sensor (ny, nw)``."""
         n = len(self.Az)
         padded = np.vstack([process, np.zeros((n - self.nx, process.shape[1]))])
         # (I + L C) e' = Ae e + Bw w - J Dw w - L Dw w', and eps = (I + L C) e.

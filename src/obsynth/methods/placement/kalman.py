@@ -53,7 +53,7 @@ class KalmanProblem:
         return best
 
     def solved(self, decay: float, change: FloatArray) -> tuple[FloatArray | None, FloatArray]:
-        """Return the gain of a rate, and coordinates (like ``change``) in which its error covariance is the identity."""
+        """Return the gain of a rate, and coordinates (like ``change``) in which its error covariance is one."""
         if not self.F.size:
             return np.zeros((0, self.C.shape[0])), change
         # The part of the process noise that the measurements carry is taken out first.

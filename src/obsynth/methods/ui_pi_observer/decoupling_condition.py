@@ -111,7 +111,7 @@ def decoupling_data(plant: DescriptorSystem) -> tuple[DescriptorSystem, Transfor
 def _eliminated(plant: DescriptorSystem) -> Transformation:
     """Eliminate the algebraic states in units of the plant's own, and return the result in those given.
 
-    Where the dynamic states are orthogonal combinations, these must not depend on the units of what they combine.
+    Orthogonal combinations, as the dynamic states may be, must not depend on the units of what they combine.
     """
     units = PlantUnits.of(plant)
     basis = dynamic_coordinates(units.scaled_plant(plant))

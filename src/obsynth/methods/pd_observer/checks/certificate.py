@@ -82,7 +82,7 @@ def error_inputs(
 
 
 def prove_gain(a: FloatArray, b: Ball, c: FloatArray, P: FloatArray, gain: float) -> DefinitenessProof:
-    """Try to prove that ``x' = a x + b v``, ``z = c x`` is stable with an l2 gain below ``gain``; P > 0 is supposed.
+    """Try to prove that ``x' = a x + b v``, ``z = c x`` is stable with an l2 gain below ``gain``, and that P > 0.
 
     ``a' P + P a + c' c + P b b' P / gain^2 < 0`` before its Schur complements.
     """
