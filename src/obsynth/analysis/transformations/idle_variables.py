@@ -7,7 +7,7 @@ the plant would have index 2, or would not be regular.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -207,7 +207,7 @@ def _undetermined_blocks(
     return [int(number) for number, own, variables in parts if sparse_factor(pencil[own][:, variables]).singular]
 
 
-def raise_structurally_singular(plant: DescriptorSystem, equations: Indices, variables: Indices) -> None:
+def raise_structurally_singular(plant: DescriptorSystem, equations: Indices, variables: Indices) -> NoReturn:
     """Refuse a plant whose pattern alone leaves variables free, and name them and the surplus equations."""
     equations, variables = own_first(equations, variables), own_first(variables, equations)
     names = [plant.state_names[i] for i in variables]
