@@ -40,16 +40,14 @@ class Candidate:
     refused: str
 
     def rank(self, leaky: bool, settling: float = np.inf) -> tuple[float, ...]:
-        """Return what sorts candidates, best first; ``settling``: the plant's time (s); ``leaky``: with unknown inputs.
-
-        A mean over time T divides noise by the root of T: averaging cannot change deviation times the root of delay.
-        """
+        """Return what sorts candidates, best first; ``settling``: the plant's time (s); ``leaky``: unknown inputs."""
         if not self.figures:
             return (2.0, 0.0, 0.0, np.inf)
         missed = float(not all(found.reaches for found in self.figures))
         leak = float(leaky and any(found.leak > DECOUPLED for found in self.figures))
         slow = float(any(found.most > SLOW * settling for found in self.figures))
         dt = self.observer.dt if self.observer is not None else 0.0
+        # A mean over time T divides noise by the root of T: it cannot change deviation times the root of delay.
         prices = [found.deviation * np.sqrt(max(found.most, dt)) for found in self.figures]
         price = float(np.prod(prices) ** (1.0 / len(prices))) if np.all(np.isfinite(prices)) else np.inf
         return (missed, leak, slow, price)

@@ -27,10 +27,7 @@ CONDITION_LIMIT = 1e-20
 
 
 def stabilising_gain(a: FloatArray, c: FloatArray, noise_a: FloatArray, noise_c: FloatArray) -> FloatArray | None:
-    """Return R ``(n, m)`` with ``A - R C`` Schur stable, from ``noise_a (n, k)``, ``noise_c (m, k)``, or ``None``.
-
-    The first regularisation that forgets fast enough is taken, or the fastest filter of all.
-    """
+    """Return R ``(n, m)``, ``A - R C`` Schur stable, of the first regularisation fast enough, or the fastest."""
     n, m = a.shape[0], c.shape[0]
     if m == 0:
         return np.zeros((n, 0)) if spectral_radius(a) < 1.0 else None
@@ -167,10 +164,7 @@ def _by_qz(
 def continuous_solution(
     a: FloatArray, h: FloatArray, process: FloatArray, weight: FloatArray, cross: FloatArray | None = None
 ) -> FloatArray | None:
-    """Return P with ``a P + P a' - (P h' + cross) weight^-1 (P h' + cross)' + process = 0`` by SciPy, or ``None``.
-
-    What an ill-conditioned equation gives is judged by its user: by the poles, or by whether it proves anything.
-    """
+    """Return P with ``a P + P a' - (P h' + cross) weight^-1 (P h' + cross)' + process = 0`` by SciPy, or ``None``."""
     from scipy.linalg import solve_continuous_are
 
     try:
@@ -179,6 +173,7 @@ def continuous_solution(
             p = np.asarray(solve_continuous_are(a.T, h.T, process, weight, s=cross))
     except (np.linalg.LinAlgError, ValueError):
         return None
+    # What an ill-conditioned equation gives is judged by its user: by poles, or by whether it proves anything.
     return p if np.all(np.isfinite(p)) else None
 
 

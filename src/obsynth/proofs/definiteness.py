@@ -110,12 +110,10 @@ def _as_formula(matrix: Formula | Ball | FloatArray) -> Formula:
 
 
 def _symmetric(ball: Ball) -> Ball:
-    """Return a ball with symmetric midpoint that holds every symmetric member of ``ball``.
-
-    They lie in its transpose too: the difference of the midpoints more than covers the rounding of the average.
-    """
+    """Return a ball with symmetric midpoint and all symmetric members of ``ball``: they lie in its transpose too."""
     with np.errstate(over="ignore", invalid="ignore"):
         middle = 0.5 * (ball.midpoint + ball.midpoint.T)
+        # The difference of the midpoints more than covers the rounding of their average.
         radius = np.maximum(ball.radius, ball.radius.T) + np.abs(ball.midpoint - ball.midpoint.T)
         return Ball(middle, rounded_up(radius, 4))
 

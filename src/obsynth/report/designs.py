@@ -229,10 +229,7 @@ def followed_steps(design: ObserverDesign, horizon: float | None = None) -> Foll
 def design_warnings(
     design: ObserverDesign, horizon: float | None = None, *, told: Collection[str] = (), steps: Followed | None = None
 ) -> tuple[str, ...]:
-    """Return what to know before trusting the fault estimates; ``horizon`` in s, ``steps`` from `followed_steps`.
-
-    Of faults that are ``told`` of already, no step is.
-    """
+    """Return what to know before trusting the fault estimates; ``horizon`` in s, ``steps`` from `followed_steps`."""
     pair = _estimating(design)
     if pair is None:
         return ()

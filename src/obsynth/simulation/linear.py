@@ -238,10 +238,7 @@ def varying_runs(
     plant: TimeVaryingDescriptorSystem, *, parameters: FloatArray, inputs: FloatArray, initial_state: FloatArray,
     equation_noise: FloatArray, output_noise: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:  # fmt: skip
-    """Simulate many runs at once, which differ in their noise: one factorisation a step serves all of them.
-
-    ``equation_noise (samples, runs, ne)``, ``output_noise (samples - 1, runs, ny)``.
-    """
+    """Simulate many runs with ``equation_noise (samples, runs, ne)`` and ``output_noise (samples - 1, runs, ny)``."""
     if plant.ne != plant.nx:
         raise SpecError(f"{plant.ne} equations do not determine {plant.nx} states.", path="E")
     samples, runs = equation_noise.shape[:2]

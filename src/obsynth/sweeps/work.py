@@ -230,10 +230,7 @@ def carried_out(
 
 
 class ResultFolder:
-    """Results of pieces of work in files of a folder by name and digest; ``fields``: what a result must have.
-
-    ``letters``: so many of a name begin the names of its files.
-    """
+    """Results of pieces of work, in files of a folder by the first ``letters`` of their names and digests."""
 
     def __init__(self, folder: str | Path, kind: str, fields: tuple[str, ...], *, letters: int) -> None:
         self.folder, self.kind, self.fields, self.letters = Path(folder), kind, fields, letters

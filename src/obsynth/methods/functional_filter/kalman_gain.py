@@ -127,10 +127,7 @@ def exact_rows(model: FilterModel) -> FloatArray:
 
 
 def require_noise(model: FilterModel, plant_outputs: tuple[str, ...], noise: FloatArray) -> None:
-    """Raise `PreconditionError` where a combination of outputs is free of noise, ``noise (ny, nw)``.
-
-    Equations without any output (those of an index of two and more) are exact, and may be.
-    """
+    """Raise `PreconditionError` where a combination of outputs is free of noise; equations without any may be."""
     measured = model.L[:, model.L.shape[1] - len(plant_outputs) :]
     trusted = exact_rows(model) @ measured
     if not trusted.size or float(np.max(np.abs(trusted))) <= RANK_TOLERANCE * float(np.max(np.abs(measured))):

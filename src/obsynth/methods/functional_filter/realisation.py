@@ -98,10 +98,7 @@ def filter_part(model: FilterModel, gain: KalmanGain, shown: FloatArray, *, dela
 
 
 def _plain_coordinates(a: FloatArray) -> FloatArray | None:
-    """Return coordinates in which A is about as large as its eigenvalues; ``None`` if it is already.
-
-    Gains for noises of very different size have entries that cancel each other; a balanced real Schur form has none.
-    """
+    """Return coordinates in which A has entries as small as its eigenvalues (balanced real Schur); ``None``: it has."""
     if not len(a) or not np.all(np.isfinite(a)):
         return None
     largest = float(np.max(np.abs(np.linalg.eigvals(a))))

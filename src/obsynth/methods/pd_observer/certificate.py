@@ -89,15 +89,12 @@ def coupled_certificate(a: FloatArray, delta: float) -> tuple[FloatArray, FloatA
 
 
 def gain_certificate(a: FloatArray, b: Ball, c: FloatArray, gain: float) -> FloatArray | None:
-    """Return P ``(n, n)`` that proves the l2 gain of ``x' = a x + b v``, ``z = c x`` below ``gain``, or ``None``.
-
-    The Riccati solution with the largest slack that gives a proof.
-    """
+    """Return P ``(n, n)`` that proves the l2 gain of ``x' = a x + b v``, ``z = c x`` below ``gain``, or ``None``."""
     balanced, units = balanced_matrix(a)
     entering, shown = b.midpoint / units[:, None], c * units
     weight = max(float(np.linalg.norm(shown, 2)) ** 2, np.finfo(np.float64).tiny)
     spare = None
-    for slack in SLACKS:
+    for slack in SLACKS:  # the largest that gives a proof
         out = shown.T @ shown + slack * weight * np.eye(len(a))
         p = continuous_solution(balanced.T, entering.T, out, -(gain**2) * np.eye(entering.shape[1]))
         if p is None:

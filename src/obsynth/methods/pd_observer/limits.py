@@ -22,10 +22,7 @@ FAR_BEYOND = 100.0
 
 
 def fastest_mode(a: FloatArray) -> float:
-    """Return the largest modulus of an eigenvalue to follow, 1/seconds; 1 for a plant of integrators.
-
-    A well-damped mode far beyond all others (that of a sensor, say) is left aside: it dies out by itself.
-    """
+    """Return the largest modulus of an eigenvalue to follow, damped ones far beyond left out; 1 for integrators."""
     balanced = balanced_matrix(a)[0]
     modes = np.linalg.eigvals(balanced)
     sizes = np.abs(modes)

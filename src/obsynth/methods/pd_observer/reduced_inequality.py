@@ -77,10 +77,7 @@ def reduced_lmi(task: PdTask, *, solver: str) -> PdSolution:
 
 
 def closed_form(task: PdTask, *, free_delta: bool, once: bool = False) -> tuple[PdSolution, float]:
-    """Return gains from a Riccati equation, with L = 0, their certificate, and the delta that it is for.
-
-    J for unit noise on all states and outputs; in states with solution near one where modes show too little.
-    """
+    """Return gains for unit noise from a Riccati equation, L = 0, their certificate, and the delta that it is for."""
     try:
         return _closed_form(task, free_delta=free_delta)
     except SolverError as error:

@@ -170,10 +170,7 @@ class Compromise:
 
 
 def compromise(problem: KalmanProblem, rate: float) -> Compromise | None:
-    """Return the fastest gain, up to ``rate`` (1/s), that costs at most `NOISE_PRICE` in noise.
-
-    The plain filter leaves modes slow that cost much to see; a fixed rate may cost any amount of noise.
-    """
+    """Return the fastest gain, up to ``rate`` (1/s), that costs at most `NOISE_PRICE` in noise."""
     start = np.eye(problem.F.shape[0])
     plain, change = problem.solved(0.0, start)
     if plain is None:

@@ -107,10 +107,7 @@ def _hidden_directions(f: FloatArray, c: FloatArray, value: complex, size: float
 
 
 def _balancing(f: FloatArray, c: FloatArray) -> FloatArray:
-    """Return factors of the states with which the entries of F, and of C, are alike: least squares on the logarithms.
-
-    The common size of F is free, so that it does not run away where F is reducible, as that of a fault model is.
-    """
+    """Return state factors that make entries of F, and of C, alike; F's size is free, as it may be reducible."""
     n = f.shape[0]
     problem = LogBalance(n + 2)
     states = range(n)

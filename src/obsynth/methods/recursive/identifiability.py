@@ -141,10 +141,7 @@ class _Kernel(NamedTuple):
 def identifiability_condition(
     plant: TimeVaryingDescriptorSystem, *, early: bool = False, constant: ConstantPlant | None = None
 ) -> Condition:
-    """Return the condition that outputs tell the parameters from each other and from the state.
-
-    Constant matrices: ``[A - E, Phi; C, Psi]`` keeps rank; else the outputs of each parameter along the horizon.
-    """
+    """Return the condition that outputs tell the parameters from each other and from the state."""
     still = all(matrix.is_constant for matrix in (plant.E, plant.A, plant.C, plant.Phi, plant.Psi))
     decision, kernel = _steady(plant) if still else _along(plant, early=early)
     if still and constant is not None:

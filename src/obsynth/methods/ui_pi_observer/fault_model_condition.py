@@ -146,10 +146,7 @@ def _model_doubt(
 def order_conditions(
     given: DescriptorSystem, courses: Exosystem, plant: DescriptorSystem, model: Exosystem, units: PlantUnits
 ) -> list[Condition]:
-    """Test that the fault model is not lost in rounding, at the zeros where faults can hide longest.
-
-    At a zero z0 of (f, d) -> y a polynomial model of order n is seen with a strength of about abs(z0)^(n + 1) only.
-    """
+    """Test that the fault model is not lost in rounding: at a zero z0 order n shows with about abs(z0)^(n + 1) only."""
     inputs, direct = np.hstack([plant.Bf, plant.Bd]), np.hstack([plant.Df, plant.Dd])
     wide_e, wide_a = system_pencil(plant.E, plant.A, inputs, plant.C, direct)
     zeros = finite_zeros(wide_e, wide_a)

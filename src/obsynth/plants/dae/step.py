@@ -159,10 +159,7 @@ class Sensitivities:
 
 
 class ImplicitStep:
-    """Steps of a fixed length dt in s; moves beyond ``largest_move`` (in sizes of the states) along a homotopy.
-
-    No part of it is longer, so that of several roots the one connected with the last is found.
-    """
+    """Steps of dt s; moves beyond ``largest_move`` in parts along a homotopy, to the root connected with the last."""
 
     def __init__(self, functions: DAEFunctions, dt: float, *, largest_move: float | None = None) -> None:
         self.functions, self.dt = functions, dt

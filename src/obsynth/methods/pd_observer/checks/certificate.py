@@ -82,10 +82,7 @@ def error_inputs(
 
 
 def prove_gain(a: FloatArray, b: Ball, c: FloatArray, P: FloatArray, gain: float) -> DefinitenessProof:
-    """Try to prove that ``x' = a x + b v``, ``z = c x`` is stable with an l2 gain below ``gain``, and that P > 0.
-
-    ``a' P + P a + c' c + P b b' P / gain^2 < 0`` before its Schur complements.
-    """
+    """Try to prove ``P > 0``, ``a' P + P a + c' c + P b b' P / gain^2 < 0``: stable, l2 gain below ``gain``."""
     positive = prove_symmetric_positive(P)
     if not positive.proved:
         return unproved(f"P itself: {positive.reason}")

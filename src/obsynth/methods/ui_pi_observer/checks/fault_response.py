@@ -91,10 +91,7 @@ class SteadyError:
 def steady_errors(
     plant: DescriptorSystem, observer: LinearObserver, tracking: FloatArray, phi: FloatArray, cw: FloatArray
 ) -> tuple[SteadyError, ...]:
-    """Return, for each fault, the error for a polynomial of the least order that its model does not hold.
-
-    Shapes: ``tracking (nz, nx + nw)``, ``phi (nw, nw)``, ``cw (nf, nw)``.
-    """
+    """Return, for each fault, the error for a polynomial of the least order that its model does not hold."""
     a, b, c, d = _system(plant, observer, tracking)
     shift = np.eye(len(a)) if plant.dt > 0.0 else np.zeros_like(a)
     step = plant.dt if plant.dt > 0.0 else 1.0
