@@ -83,7 +83,7 @@ def wanted_faults(
 def estimate_deviations(
     plant: DescriptorSystem, observer: LinearObserver, matrices: Mapping[str, FloatArray]
 ) -> FloatArray:
-    """Return deviations ``(faults, 2)`` of fhat under noise and of ``fhat - f`` with walks; dt = 0: for samples of 1 s."""
+    """Return deviations ``(faults, 2)`` of fhat under noise and of ``fhat - f`` with walks; dt = 0: per sqrt(s)."""
     errors = FunctionalErrors.of(plant, observer, matrices["T"], matrices["T0"])
     rows = observer.fault_rows
     discrete = float(plant.dt > 0.0)
