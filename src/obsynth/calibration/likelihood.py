@@ -1,10 +1,7 @@
 """The innovations likelihood of a log and its exact gradient, and the outputs of a simulation with sensitivities.
 
-    x- = f(x, u, t),  P- = F P F' + N Q N',  e = y - h,  S = H P- H' + R,
-    nll = 1/2 sum(e' S^-1 e + log det 2 pi S)
-
-with x(0) ~ N(x0, P0) integrated out, Q diagonal on named equations and R per sensor, both as logarithms of variances.
-The gradient goes back through the filter by hand: CasADi differentiates one sample, and two accumulations do the rest.
+``nll = 1/2 sum(e' S^-1 e + log det 2 pi S)``, x(0) ~ N(x0, P0) integrated out; Q on named equations and R as logarithms
+of variances.  CasADi differentiates one sample; two accumulations take the gradient back through the filter.
 """
 
 from __future__ import annotations

@@ -65,8 +65,10 @@ class SparseFactor:
         from scipy.sparse.linalg import splu
 
         given = csr(matrix)
-        ones = np.ones(given.shape[0]), np.ones(given.shape[1])
-        self.rows, self.columns = scales_by_all_entries(given) if by_all else ones
+        self.rows: FloatArray = np.ones(given.shape[0])
+        self.columns: FloatArray = np.ones(given.shape[1])
+        if by_all:
+            self.rows, self.columns = scales_by_all_entries(given)
         for _ in range(SCALING_SWEEPS):
             self.rows /= power_of_two_below(_peaks(_scaled(given, self.rows, self.columns), axis=1))
             self.columns /= power_of_two_below(_peaks(_scaled(given, self.rows, self.columns), axis=0))

@@ -1,8 +1,7 @@
 """Elimination of algebraic states in rational arithmetic: every entry of the result is rounded once.
 
-With N a basis of ker E, L one of its left null space, and D and P unit vectors that complete them, ``x = D z + N v``,
-``L A N v = -L (A D z + B u + ...)`` and ``P E D z+ = P (A D z + A N v + B u + ...)``: index 1 is ``L A N`` nonsingular.
-Where the dynamic states are combinations of those given, ``z`` is changed to the orthogonal ones afterwards.
+With bases N of ker E, L of its left null space, completed by unit vectors D and P, ``x = D z + N v``,
+``L A N v = -L (A D z + B u)`` and ``P E D z+ = P (A D z + A N v + B u)``: index 1 is ``L A N`` nonsingular.
 """
 
 from __future__ import annotations
@@ -34,20 +33,14 @@ _DIRECT = ("D", "Df", "Dd", "Dw")
 
 @dataclass(frozen=True, eq=False)
 class ExactElimination:
-    """The reduced plant and the recovery of its states, in rational coordinates.
+    """The reduced plant and the recovery of its states, in rational coordinates."""
 
-    Fields: matrices: ``A, B, Bf, Bd, Bw, C, D, Df, Dd, Dw`` of the reduced plant; recovery: ``x`` from the new states
-    (``A``) and from the signals (``B, Bf, Bd, Bw``); pivots: States that stand for the dynamic ones; computed: Whether
-    some of the data were computed in floating point; sizes: Of ``matrices``, the sums of the sizes of all terms;
-    uncleaned: What ``matrices`` were before what rounding may have left was set to zero, where that was done.
-    """
-
-    matrices: Mapping[str, fmpq_mat]
-    recovery: Mapping[str, fmpq_mat]
-    pivots: tuple[int, ...]
-    computed: bool
-    sizes: Mapping[str, FloatArray]
-    uncleaned: Mapping[str, fmpq_mat] | None = None
+    matrices: Mapping[str, fmpq_mat]  # ``A, B, Bf, Bd, Bw, C, D, Df, Dd, Dw`` of the reduced plant
+    recovery: Mapping[str, fmpq_mat]  # ``x`` from the new states (``A``) and the signals (``B, Bf, Bd, Bw``)
+    pivots: tuple[int, ...]  # states that stand for the dynamic ones
+    computed: bool  # whether some of the data were computed in floating point
+    sizes: Mapping[str, FloatArray]  # of ``matrices``, the sums of the sizes of all terms
+    uncleaned: Mapping[str, fmpq_mat] | None = None  # ``matrices`` before what may be rounding was set to zero
 
     def origin(self, sizes: Mapping[str, FloatArray]) -> PlantOrigin:
         """Return what the reduced plant remembers of it, with the sizes of the terms in its own coordinates."""
