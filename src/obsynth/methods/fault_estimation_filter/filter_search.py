@@ -66,11 +66,7 @@ MOST_STATES_TO_POLISH = 64
 
 @dataclass(frozen=True, eq=False)
 class FoundGains:
-    """What the search for gains found.
-
-    Fields: problem: What it was about in the end; least: The least gain found; gamma: The gain that is claimed; chosen:
-    The gains that are shipped; records: Solver runs of the choice of small gains.
-    """
+    """The problem in the end, its least gain, the gain that is claimed, and the gains that are shipped."""
 
     problem: GainProblem
     least: LeastGain

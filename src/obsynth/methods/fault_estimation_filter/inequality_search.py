@@ -42,11 +42,10 @@ NOTHING_TO_POLISH = "reached: the disturbance does as much before any measuremen
 
 @dataclass(frozen=True, eq=False)
 class LeastGain:
-    """The outcome of the search for the least gain.
+    """The outcome of the search: the true norm of the best filter (0 without d), and its gains.
 
-    Fields: gain: True norm of the best filter found (0 without disturbance); first: Coordinates made from the starting
-    (Kalman) filter; injection: Its gains, in the original coordinates; starting_gain: Norm of the starting filter, the
-    natural scale; bracket: Bisection: the final bracket; direct search: the same number twice; records: Solver records.
+    ``first``: coordinates of the starting (Kalman) filter, ``starting_gain``: its norm; ``bracket``: of a bisection,
+    else the gain twice.
     """
 
     gain: float

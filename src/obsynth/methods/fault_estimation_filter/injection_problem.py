@@ -1,12 +1,6 @@
-r"""The convex core: bound the gain from a disturbance to an output by output injection.
+"""The convex core: bound the gain from a disturbance to an output by output injection R, with a weight V free or zero:
 
-The error system of every filter of this kind is
-
-.. math::
-    e^+ = (A - R C) e + (B - R D) d + (B_n - R D_n) w, \qquad
-    \xi = (Z + V C) e + (Z_d + V D) d + (Z_n + V D_n) w
-
-with the injection gain R free, and the weight V free or fixed at zero.
+``e+ = (A - R C) e + (B - R D) d + (Bn - R Dn) w``, ``xi = (Z + V C) e + (Zd + V D) d + (Zn + V Dn) w``.
 """
 
 from __future__ import annotations
@@ -39,10 +33,7 @@ ROUNDING = 1e-12
 
 @dataclass(frozen=True, eq=False)
 class WeightLimit:
-    """A bound on the spectral norm of the weight ``fixed + V free``.
-
-    Fields: fixed, free: ``(q, ny)`` and ``(m, ny)``; bound: Positive.
-    """
+    """A positive bound on the spectral norm of the weight ``fixed (q, ny) + V free (m, ny)``."""
 
     fixed: FloatArray
     free: FloatArray
@@ -62,12 +53,11 @@ class WeightLimit:
 
 @dataclass(frozen=True, eq=False)
 class GainProblem:
-    """Data of the problem: find R (and V) so that the gain d -> xi is small.
+    """Find R (and V) so that the gain d -> xi is small; noise has unit covariance.
 
-    Fields: A, C, Z: ``(n, n)``, ``(m, n)``, ``(q, n)``; B, D, Zd: Disturbance: ``(n, nd)``, ``(m, nd)``, ``(q, nd)``;
-    Bn, Dn, Zn: Noise of unit covariance: ``(n, nw)``, ``(m, nw)``, ``(q, nw)``; free_weight: Whether V ``(q, m)`` is
-    free; weight_limit: Bound on the weight that V is a part of; judged_exactly: Whether the norms of filters
-    are told (of many states, that they are below a level), and not the largest peaks found.
+    With ``judged_exactly`` the norms of filters are told (of many states, that they are below a level), else the
+    largest peaks found. A, C, Z: ``(n, n)``, ``(m, n)``, ``(q, n)``; B, D, Zd of the disturbance and Bn, Dn, Zn of the
+    noise likewise.
     """
 
     A: FloatArray
@@ -167,10 +157,7 @@ class GainProblem:
 
 @dataclass(frozen=True, eq=False)
 class Injection:
-    """Gains of the error system.
-
-    Fields: R: ``(n, m)``; V: ``(q, m)``; zero when the weight is fixed.
-    """
+    """Gains of the error system, R ``(n, m)`` and V ``(q, m)``, zero when the weight is fixed."""
 
     R: FloatArray
     V: FloatArray
@@ -183,16 +170,10 @@ class Injection:
 
 @dataclass(frozen=True, eq=False)
 class NormalisedProblem:
-    """A `GainProblem` in coordinates in which the matrix inequality is well scaled.
+    """A `GainProblem` whose inequality is solved near the identity: old state = ``states`` times the new one.
 
-    States are changed by the inverse root of a rough Riccati solution, so that the solution of the
-    inequality is close to the identity; the disturbance is scaled so that the gain is close to one; the
-    measurements are made orthonormal.
-
-    Fields: problem: In the new coordinates; states: ``S (n, n)``, old state = S new state; measurements: ``K (m, m)``,
-    new measurement = K old measurement; gain: Gain of the starting filter: old gain = gain * new gain (1 without
-    disturbance); start: The starting filter in the original coordinates; stable; start_gain: Its true gain (0 without
-    disturbance).
+    ``measurements (m, m)`` maps old ones to orthonormal ones, and old gains are ``gain`` times new ones (1 without
+    disturbance). ``start``: a stable filter in the original coordinates; ``start_gain``: its true gain (0 without).
     """
 
     problem: GainProblem

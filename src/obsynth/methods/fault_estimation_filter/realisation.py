@@ -113,10 +113,7 @@ def notes(
     *,
     largest_zero: float = np.inf,
 ) -> tuple[str, ...]:
-    """Return what a user should know: slow zeros, ill-conditioned faults, amplified noise, slow filters.
-
-    ``largest_zero`` is the largest modulus of a fault zero, where that is known already.
-    """
+    """Return what a user should know; ``largest_zero`` is the largest modulus of a fault zero, where known already."""
     found = list(sampling_zero_warnings(plant)) if largest_zero > SLOW_ZERO_RADIUS else []
     if detectability.condition_number > WARN_CONDITION:
         found.append(

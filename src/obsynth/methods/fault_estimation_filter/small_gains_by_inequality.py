@@ -1,9 +1,4 @@
-"""Small gains by the whole inequality, in the coordinates in which it is solved well.
-
-No number of a solver is believed: the true gain and the spectral radius of the closed loop decide.
-
-What the second stage asks of a filter, by its true gain, its true variance and its spectral radius.
-"""
+"""Small gains by the whole inequality, and what a filter must meet: true gain, variance and spectral radius decide."""
 
 from __future__ import annotations
 
@@ -25,10 +20,9 @@ from obsynth.methods.fault_estimation_filter.injection_problem import (
 
 @dataclass(frozen=True, eq=False)
 class Goal:
-    """What a filter must meet, and what it shall cost little of.
+    """What a filter must meet (true gain, spectral radius ``slowest``), and what it shall cost little of.
 
-    Fields: problem: In the original coordinates; gain: Bound on the true gain; slowest: Spectral radius above which a
-    filter forgets too slowly; judged: Filters that were asked for before, by identity.
+    ``judged``: filters that were asked for before, by identity.
     """
 
     problem: GainProblem
@@ -86,8 +80,7 @@ WORTH_REPEATING = 0.95
 def gains_by_inequality(goal: Goal, least: LeastGain, records: list[dict[str, Any]], *, solver: str) -> list[Injection]:
     """Return what the inequality gives, in different coordinates until one is good and fast enough.
 
-    The bounds on P mean something else in other coordinates, and those of the least gain can be extreme: as long as
-    that gains much, the inequality is solved again in the coordinates of what it gave.
+    The bounds on P mean something else in other coordinates, and those of the least gain can be extreme.
     """
     problem, gain, fresh = goal.problem, goal.gain, least.first
     candidates: list[Injection] = []
@@ -149,10 +142,9 @@ def _small_gains_in(
 def _small_gains_step_by_step(
     goal: Goal, normalised: NormalisedProblem, records: list[dict[str, Any]], *, solver: str
 ) -> Injection | None:
-    """Walk from the filter of ``normalised`` down to the goal, each filter giving the coordinates for the next level.
+    """Go from the filter of ``normalised`` down to the goal, each filter giving the next coordinates.
 
-    Far below the starting filter's gain its coordinates are too bad for one jump, and those of the least gain can
-    be extreme (a decoupled disturbance).
+    Far below the starting filter's gain its coordinates are too bad for one jump.
     """
     problem = goal.problem
     reached = problem.achieved_gain(normalised.start)

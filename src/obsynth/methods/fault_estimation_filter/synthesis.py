@@ -239,10 +239,7 @@ def _gains(prepared: PreparedPlant, parts: _Parts, chosen: Injection) -> dict[st
 
 
 def centred(problem: GainProblem, prepared: PreparedPlant, parts: _Parts) -> tuple[GainProblem, _Parts]:
-    """Return the problem with a free weight written so that V = 0 is the W of least norm in the user's output units.
-
-    In balanced outputs another W has the least norm, which may be outside a limit that this one keeps.
-    """
+    """Return the problem written so that V = 0 is the W of least norm in the user's output units, not balanced ones."""
     outputs = prepared.scaling.outputs
     w0 = _left_inverse(prepared.detectability.Upsilon / outputs[:, None]) / outputs
     v = (w0 - parts.W0) @ parts.V
