@@ -52,10 +52,7 @@ def real_vector(value: Any, size: int, name: str) -> FloatArray:
 
 
 def real_array(value: Any, name: str) -> FloatArray:
-    """Return real numbers of any shape, NaN and infinities among them; raise `SpecError` for anything else.
-
-    Masked entries become NaN: what lies under a mask is no number.
-    """
+    """Return real numbers of any shape, NaN (masked entries too) and infinities among them; else raise `SpecError`."""
     try:
         raw = np.asarray(unmasked(value))
     except (TypeError, ValueError):

@@ -56,11 +56,7 @@ def holds_truth(value: Any) -> bool:
 
 
 def as_matrix(value: Any, name: str) -> FloatArray:
-    """Convert nested lists or an array to a finite, read-only matrix; raise `SpecError` naming it.
-
-    A scalar is read as a 1-by-1 matrix.  Text, booleans, complex numbers, ragged rows, NaN and
-    infinities are refused.
-    """
+    """Convert nested lists, an array or a scalar to a finite, read-only real matrix; raise `SpecError` naming it."""
     try:
         raw = np.asarray(unmasked(value))
     except ValueError:

@@ -1,9 +1,7 @@
-"""The square-root step over many samples as one compiled loop.  Needs numba (`obsynth[fast]`); import it only then.
+"""The square-root step over many samples as one compiled loop. Needs numba (`obsynth[fast]`); import it only then.
 
-It takes the reflections that LAPACK takes in `obsynth.numerics.least_squares_step.projected_step`, in the same order,
-so that even the signs of the innovations agree.  numba compiles it at the first import of an installation, for some
-seconds, and keeps the result beside this file, or in the user's cache directory where that cannot be written
-(``NUMBA_CACHE_DIR`` in the environment chooses another place).
+The reflections are those of `obsynth.numerics.least_squares_step.projected_step`, in the same order, so that even signs
+agree. Compiled at the first import, for seconds, and kept beside this file, or where ``NUMBA_CACHE_DIR`` says.
 """
 
 from __future__ import annotations

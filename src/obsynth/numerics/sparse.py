@@ -1,9 +1,6 @@
-"""Sparse matrices of scipy as checked, read-only data, and dense arrays where they are needed.
+"""Sparse matrices of scipy as checked, read-only data; their structure by pattern: matching, parts, blocks.
 
-Structure of sparse matrices by their pattern alone: matching, over- and underdetermined parts, blocks.
-
-Source: A. L. Dulmage and N. S. Mendelsohn, *Coverings of bipartite graphs*, Canadian J. Math. 10, 1958; the matching
-and the strongly connected components are scipy's.
+Source: A. L. Dulmage and N. S. Mendelsohn, *Coverings of bipartite graphs*, Canadian J. Math. 10, 1958.
 """
 
 from __future__ import annotations
@@ -80,11 +77,9 @@ Indices = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class CoarseStructure:
-    """The Dulmage-Mendelsohn parts of a pattern.
+    """The Dulmage-Mendelsohn parts of a pattern: more rows than columns (over), more columns than rows (under).
 
-    Fields: row_of_column: ``(columns,)``: the row that a maximum matching gives to each column, -1 for none; over_rows,
-    over_columns: The overdetermined part: more rows than columns, or empty; under_rows, under_columns: The
-    underdetermined part: more columns than rows, or empty.
+    ``row_of_column``: the row that a maximum matching gives to each column, -1 for none.
     """
 
     row_of_column: Indices
@@ -116,10 +111,7 @@ def coarse_structure(pattern: Any) -> CoarseStructure:
 
 
 def unmatched_instead(pattern: Any, found: CoarseStructure, rows: Indices) -> Indices | None:
-    """Return as many of some rows, the first ones if possible, as a maximum matching leaves unmatched.
-
-    ``None`` where no maximum matching leaves only such rows without a column.
-    """
+    """Return as many of some rows, the first ones if possible, as a maximum matching leaves free; else ``None``."""
     row_of_column = found.row_of_column.copy()
     unmatched = np.setdiff1d(np.arange(pattern.shape[0]), row_of_column)
     chosen = list[int]()
