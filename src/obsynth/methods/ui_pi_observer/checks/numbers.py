@@ -79,10 +79,7 @@ def _digits_rows(ahat: FloatArray, dt: float, poles: list[complex], claims: Mapp
 
 
 def _missed(a: FloatArray, claimed: list[complex], dt: float) -> float:
-    """Return by how much the claimed poles are missed, groups by their means where no pole is missed itself.
-
-    Of ill-conditioned poles more digits tell.
-    """
+    """Return by how much the claimed poles are missed, groups by their means; more digits tell ill-conditioned ones."""
     missed = farthest_pole(eigenvalues(a), claimed, dt)
     if missed > SPECTRUM_TOLERANCE and len(claimed) == len(a) and (enclosed := enclosed_eigenvalues(a)) is not None:
         return farthest_pole([middle_of(ball) for ball in enclosed], claimed, dt)
