@@ -138,7 +138,12 @@ def _steps(
     x: FloatArray, factor: FloatArray, moved: FloatArray, known: FloatArray, head: FloatArray, data: FloatArray,
     states: FloatArray, innovations: FloatArray, deviations: FloatArray, covariances: FloatArray, share: float,
 ) -> int:  # fmt: skip
-    """See `square_root_steps`."""
+    """Take steps of the square-root recursion until one needs a decision about a rank; return how many were taken.
+
+    Arrays in C order, writeable; what does not change with k has one entry along its first axis.  Shapes: ``x (n,),
+    factor (n, n), moved (., n, rows), known (., any, rows), head (., n, n), data (steps, rows), states (steps, n),
+    innovations (steps, rows - n), deviations (steps, nx), covariances (steps, n - nx, n - nx)``.
+    """
     n, rows = moved.shape[1], moved.shape[2]
     m = rows - n
     work = np.zeros((max(n + known.shape[1], rows), rows))
@@ -164,20 +169,4 @@ def _steps(
     return len(data)
 
 
-_compiled_steps = compiled(_steps, SIGNATURE)
-
-
-def square_root_steps(
-    x: FloatArray, factor: FloatArray, moved: FloatArray, known: FloatArray, head: FloatArray, data: FloatArray,
-    states: FloatArray, innovations: FloatArray, deviations: FloatArray, covariances: FloatArray, share: float,
-) -> int:  # fmt: skip
-    """Take steps of the square-root recursion until one needs a decision about a rank; return how many were taken.
-
-    All arrays are of double precision, in C order, and writeable.  What does not change with k has one entry along its
-    first axis.
-
-    Shapes: ``x (n,)``, ``factor (n, n)``, ``moved (1 or steps, n, rows)``, ``known (1 or steps, any, rows)``, ``head (1
-    or steps, n, n)``, ``data (steps, rows)``, ``states (steps, n)``, ``innovations (steps, rows - n)``, ``deviations
-    (steps, nx)``, ``covariances (steps, n - nx, n - nx)``.
-    """
-    return _compiled_steps(x, factor, moved, known, head, data, states, innovations, deviations, covariances, share)
+square_root_steps = compiled(_steps, SIGNATURE)

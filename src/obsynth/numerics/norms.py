@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from obsynth.numerics.arrays import ComplexArray, FloatArray
-from obsynth.numerics.doubling import compared_gain, gain_is_below
+from obsynth.numerics.doubling import compared_gain
 from obsynth.numerics.modal_response import ModalResponse, Modes, level_crossings
 from obsynth.numerics.scaling import balancing_factors
 
@@ -176,7 +176,7 @@ def _norm_of_many_states(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatAr
     if not np.isfinite(best) or best == 0.0:
         return None
     for tolerance in WIDER_TOLERANCES:
-        if gain_is_below(a, b, c, d, best * (1.0 + tolerance)):
+        if compared_gain(a, b, c, d, best * (1.0 + tolerance)):
             return HinfNorm(best, best * (1.0 + tolerance), angle, np.nan)
     return None
 
@@ -214,7 +214,7 @@ def _highest_peak(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, mo
 
 def balanced_realisation(a: FloatArray, b: FloatArray, c: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the realisation with its states scaled by powers of two, which is exact: units must not cost digits."""
-    scale = _state_units(a, b, c)
+    scale = state_units(a, b, c)
     return a * scale / scale[:, None], b / scale[:, None], c * scale
 
 
@@ -222,12 +222,13 @@ def _balanced(
     a: FloatArray, b: FloatArray, c: FloatArray, modes: Modes
 ) -> tuple[FloatArray, FloatArray, FloatArray, Modes]:
     """Return the realisation of `balanced_realisation` and its modes."""
-    scale = _state_units(a, b, c)
+    scale = state_units(a, b, c)
     moved = Modes(modes.values, modes.vectors / scale[:, None])
     return a * scale / scale[:, None], b / scale[:, None], c * scale, moved
 
 
-def _state_units(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
+def state_units(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
+    """Return powers of two ``(n,)``, the units of the states in which a realisation is balanced."""
     n, inputs, outputs = a.shape[0], b.shape[1], c.shape[0]
     system = np.zeros((n + inputs + outputs, n + inputs + outputs))
     system[:n, :n], system[:n, n : n + inputs], system[n + inputs :, :n] = a, b, c

@@ -165,7 +165,7 @@ def least_level(problem: GainProblem) -> float:
 
 def least_noise_filter(problem: GainProblem) -> Injection | None:
     """Return the filter with the least variance of xi under the noise of the problem: a level without limit."""
-    noise = replace(with_least_weight(problem), B=problem.Bn, D=problem.Dn, Zd=problem.Zn)
+    noise = with_least_weight(problem).noise_as_disturbance()
     if noise.order == 0 or noise.measured == 0:
         return None
     found = central_injection(noise, WITHOUT_LIMIT * max(noise.disturbance_size, 1.0), noise=NOISES[0])
@@ -193,8 +193,7 @@ def noise_weighted_filters(
         best = None
         while low < high:
             middle = (low + high) // 2
-            equation = CentralEquation.of(_with_noise(work, weights[middle]), noise=NOISES[0])
-            found = equation.filter_at(factor * gain)
+            found = central_injection(_with_noise(work, weights[middle]), factor * gain, noise=NOISES[0])
             if found is not None and (factor == 1.0 or reaches(found)):
                 best, low = found, middle + 1
             else:

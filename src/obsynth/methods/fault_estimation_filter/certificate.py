@@ -9,8 +9,7 @@ import numpy as np
 
 from obsynth.methods.riccati import bounded_real_matrix, normalising_change
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.norms import output_covariance
-from obsynth.numerics.scaling import balancing_factors
+from obsynth.numerics.norms import output_covariance, state_units
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.verification.certificates import prove_bounded_real
@@ -71,10 +70,7 @@ def _changes(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> Iter
 
 def _balanced(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
     """Return a diagonal state change, powers of two, in which units cost no digits."""
-    n, inputs, outputs = a.shape[0], b.shape[1], c.shape[0]
-    system = np.zeros((n + inputs + outputs,) * 2)
-    system[:n, :n], system[:n, n : n + inputs], system[n + inputs :, :n] = a, b, c
-    return np.diag(balancing_factors(system)[:n])
+    return np.diag(state_units(a, b, c))
 
 
 def _unchanged(a: FloatArray, _b: FloatArray, _c: FloatArray) -> FloatArray:

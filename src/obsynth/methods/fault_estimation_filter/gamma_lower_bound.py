@@ -65,9 +65,7 @@ def proved_lower_bound(
     """
     bound = 0.0
     for work, start in product(_with_fewer_disturbances(problem), (None,) if best is None else (None, best)):
-        bound = max(
-            bound, _bound_in(normalise(work, start=start, rotate=solver not in lmi.FIRST_ORDER_SOLVERS), solver)
-        )
+        bound = max(bound, _bound_in(normalise(work, solver=solver, start=start), solver))
         if bound > enough:
             break
     return bound

@@ -17,6 +17,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from obsynth.errors import SolverError
+from obsynth.methods.conic.lmi import FIRST_ORDER_SOLVERS
 from obsynth.methods.riccati import bounded_real_matrix, normalising_change, stabilising_gain
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.modal_response import Modes
@@ -47,9 +48,13 @@ class WeightLimit:
     free: FloatArray
     bound: float
 
+    def norm(self, v: FloatArray) -> float:
+        """Return the norm of the weight."""
+        return float(np.linalg.norm(self.fixed + v @ self.free, 2))
+
     def kept(self, v: FloatArray) -> FloatArray:
         """Return V, drawn towards zero by as much as a solver's rounding has let the weight out of the bound."""
-        least, found = (float(np.linalg.norm(self.fixed + part, 2)) for part in (0.0, v @ self.free))
+        least, found = float(np.linalg.norm(self.fixed, 2)), self.norm(v)
         if found <= self.bound or least >= self.bound:
             return v
         return np.asarray((1.0 - ROUNDING) * (self.bound - least) / (found - least) * v)
@@ -114,6 +119,10 @@ class GainProblem:
         """Return the problem without its disturbance."""
         return replace(self, B=self.B[:, :0], D=self.D[:, :0], Zd=self.Zd[:, :0])
 
+    def noise_as_disturbance(self) -> GainProblem:
+        """Return the problem with its noise in the disturbance's place."""
+        return replace(self, B=self.Bn, D=self.Dn, Zd=self.Zn)
+
     def with_state_noise(self, size: float) -> GainProblem:
         """Return the problem with independent noise of this size on each state besides its own."""
         n, m, q = self.order, self.measured, self.Z.shape[0]
@@ -129,14 +138,9 @@ class GainProblem:
         r, v = solution.R, solution.V
         return self.A - r @ self.C, self.B - r @ self.D, self.Z + v @ self.C, self.Zd + v @ self.D
 
-    def noise_loop(self, solution: Injection) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Return the error system w -> xi with the given gains."""
-        r, v = solution.R, solution.V
-        return self.A - r @ self.C, self.Bn - r @ self.Dn, self.Z + v @ self.C, self.Zn + v @ self.Dn
-
     def noise_variance(self, solution: Injection) -> float:
         """Return the true total variance of xi under the noise of the problem, with the given gains."""
-        return float(np.trace(output_covariance(*self.noise_loop(solution))))
+        return float(np.trace(output_covariance(*self.noise_as_disturbance().closed_loop(solution))))
 
     def modes(self, solution: Injection) -> Modes:
         """Return the modes of the closed loop; those of the last filter are kept."""
@@ -209,9 +213,9 @@ class NormalisedProblem:
 
 
 def normalise(
-    problem: GainProblem, *, start: Injection | None = None, gain: float | None = None, rotate: bool = True
+    problem: GainProblem, *, solver: str = "auto", start: Injection | None = None, gain: float | None = None
 ) -> NormalisedProblem:
-    """Return the problem in well-scaled coordinates."""
+    """Return the problem in coordinates that suit the solver; ``gain`` is that of ``start``, where known."""
     start = start if start is not None else _starting_filter(problem)
     # As a scale, a gain that is attained is as good as the largest one, and for many states much cheaper.
     gain = problem.achieved_gain(start) if gain is None else gain
@@ -223,7 +227,7 @@ def normalise(
         p = bounded_real_matrix(a, b[:, :0], z, zd[:, :0], 1.0, slack=tail)
     if p is None:
         states = np.eye(problem.order)
-    elif rotate:
+    elif solver not in FIRST_ORDER_SOLVERS:
         states = normalising_change(p)
     else:
         states = np.eye(problem.order) / np.sqrt(np.trace(p) / problem.order)

@@ -14,8 +14,13 @@ import numpy as np
 
 from obsynth.errors import SolverError
 from obsynth.methods.fault_estimation_filter import inequality_solutions
-from obsynth.methods.fault_estimation_filter.inequality_search import LeastGain, coordinates
-from obsynth.methods.fault_estimation_filter.injection_problem import GainProblem, Injection, NormalisedProblem
+from obsynth.methods.fault_estimation_filter.inequality_search import LeastGain
+from obsynth.methods.fault_estimation_filter.injection_problem import (
+    GainProblem,
+    Injection,
+    NormalisedProblem,
+    normalise,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,8 +49,14 @@ class Goal:
         """Return whether the true gain is within the level, and the weight within its limit."""
         # A filter is asked for more than once, and for many states each answer takes a Riccati equation.
         if id(injection) not in self.judged:
-            self.judged[id(injection)] = (injection, _reaches(self.problem, injection, self.gain))
+            self.judged[id(injection)] = (injection, self._reached(injection))
         return self.judged[id(injection)][1]
+
+    def _reached(self, injection: Injection) -> bool:
+        problem, limit = self.problem, self.problem.weight_limit
+        if limit is not None and limit.norm(injection.V) > limit.bound:
+            return False
+        return problem.reaches(injection, self.gain) if problem.disturbances else problem.radius(injection) < 1.0
 
     def is_fast(self, injection: Injection) -> bool:
         """Return whether the filter forgets fast enough."""
@@ -60,15 +71,6 @@ class Goal:
         if self.noisy:
             return self.problem.noise_variance(injection)
         return float(np.linalg.norm(np.vstack([injection.R, injection.V])))
-
-
-def _reaches(problem: GainProblem, injection: Injection, gain: float) -> bool:
-    limit = problem.weight_limit
-    if limit is not None and float(np.linalg.norm(limit.fixed + injection.V @ limit.free, 2)) > limit.bound:
-        return False
-    if problem.disturbances == 0:
-        return problem.radius(injection) < 1.0
-    return problem.reaches(injection, gain)
 
 
 #: Descent in steps: ratios of successive levels, tried in turn, and how many steps at most.
@@ -89,7 +91,7 @@ def gains_by_inequality(goal: Goal, least: LeastGain, records: list[dict[str, An
     """
     problem, gain, fresh = goal.problem, goal.gain, least.first
     candidates: list[Injection] = []
-    close = coordinates(problem, solver=solver, start=least.injection, gain=least.gain)
+    close = normalise(problem, solver=solver, start=least.injection, gain=least.gain)
     attempts = ((close, 1.0), (fresh, 1.0), (None, 1.0), (close, goal.slowest), (fresh, goal.slowest))
     for normalised, decay in attempts:
         if normalised is None:
@@ -116,7 +118,7 @@ def _again(
     for _ in range(MOST_REPETITIONS):
         if found and cost > WORTH_REPEATING * before:
             break
-        normalised = coordinates(goal.problem, solver=solver, start=injection)
+        normalised = normalise(goal.problem, solver=solver, start=injection)
         better = _small_gains_in(goal.problem, normalised, goal.gain, records, solver=solver, decay=decay)
         if better is None or not goal.met_fast(better):
             break
@@ -165,7 +167,7 @@ def _small_gains_step_by_step(
         if goal.met(injection):
             return injection
         reached = problem.achieved_gain(injection)
-        normalised = coordinates(problem, solver=solver, start=injection)
+        normalised = normalise(problem, solver=solver, start=injection)
     return None
 
 
