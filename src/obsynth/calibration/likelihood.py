@@ -169,12 +169,9 @@ def _backward(graphs: SampleGraphs, later: Any, size: int) -> Any:
     seed = ca.MX.zeros(later.size1_out(1))
     seed[0] = 1.0
     nothing = [ca.MX(later.size1_out(i), 1) for i in range(2)]
-    outputs = nothing if _ignores_outputs(reverse) else list(later(packed, data, v, v[: graphs.nt], numbers))
+    # The derivative of scalar operations takes its function's results as arguments without using them.
+    unused = all(reverse.nnz_in(i) == 0 for i in (5, 6))
+    outputs = nothing if unused else list(later(packed, data, v, v[: graphs.nt], numbers))
     found = reverse(packed, data, v, v[: graphs.nt], numbers, *outputs, costate[:size], seed)
     after = ca.vertcat(found[0], costate[size:] + found[2])
     return ca.Function("backward", [costate, packed, numbers, data, v], [after])
-
-
-def _ignores_outputs(reverse: Any) -> bool:
-    """Whether a derivative of scalar operations takes its function's results as arguments without using them."""
-    return all(reverse.nnz_in(i) == 0 for i in (5, 6))

@@ -134,7 +134,7 @@ def rounded_once(
     import flint
 
     from obsynth.proofs.enclosed_pencils import enclosed
-    from obsynth.proofs.exact_arithmetic import nearest_doubles, written_matrix
+    from obsynth.proofs.exact_arithmetic import nearest_doubles, pivot_columns, written_matrix
 
     if dynamic is None:
         return (
@@ -143,7 +143,7 @@ def rounded_once(
             dict(found.sizes),
         )
     e = written_matrix(plant.E)
-    rows = _independent_rows(e, found.pivots)
+    rows = pivot_columns((e * _units(plant.nx, found.pivots)).transpose())
     with flint.ctx.workprec(COORDINATE_BITS):
         # E dynamic z = E (unit vectors) z_rational
         change = flint.arb_mat(enclosed(_rows(e * written_matrix(dynamic), rows))).solve(
@@ -203,12 +203,6 @@ def _sizes(matrix: fmpq_mat) -> FloatArray:
 def _doubles(matrix: Any) -> FloatArray:
     rows = [[0.0 if value.contains(0) else float(value) for value in row] for row in matrix.tolist()]
     return np.array(rows, dtype=np.float64)
-
-
-def _independent_rows(e: fmpq_mat, pivots: tuple[int, ...]) -> list[int]:
-    from obsynth.proofs.exact_arithmetic import pivot_columns
-
-    return pivot_columns((e * _units(int(e.ncols()), pivots)).transpose())
 
 
 def _rows(matrix: fmpq_mat, chosen: list[int]) -> fmpq_mat:

@@ -130,23 +130,19 @@ def _dynamic(plant: DescriptorSystem, uncertain: Uncertainty) -> FloatArray:
 def _pieces(a: AffineMatrix, bd: AffineMatrix, dt: float) -> list[AffineMatrix]:
     """Return what a disturbance of one sign does in each piece of an interval, newest first ``(n, nd)``.
     The remainder holds a change of sign inside a piece: at most a quarter of its length, squared, times the slope."""
+    from scipy.linalg import expm
+
     width = dt / PIECES
     step, gathered = affine_zero_order_hold(a, bd, width)
     size = a.magnitude
-    growth = np.eye(len(size)) + size * width @ _exponential_bound(size * width)
+    # ``exp(S)`` bounds ``sum_k S^k / (k + 1)!`` for ``S >= 0``.
+    growth = np.eye(len(size)) + size * width @ (expm(size * width) * SERIES_SLACK)
     found, piece, value = [], gathered, bd
     for _ in range(PIECES):
         slope = size @ (growth @ value.magnitude)
         found.append(piece.enlarged(rounded_up(0.25 * width**2 * slope, 6)))
         piece, value = step @ piece, step @ value
     return found
-
-
-def _exponential_bound(size: FloatArray) -> FloatArray:
-    """Return an upper bound of ``sum_k size^k / (k + 1)!`` for a nonnegative matrix."""
-    from scipy.linalg import expm
-
-    return np.asarray(expm(size) * SERIES_SLACK)
 
 
 def _noise(smooth: DescriptorSystem, back: FloatArray, dt: float) -> tuple[FloatArray, FloatArray]:

@@ -41,7 +41,8 @@ def design_gains(plant: DescriptorSystem, asked: PdOptions) -> tuple[PdGains, li
     """Return the gains to ship and the records of all solver runs."""
     plain = gains_for(plant, asked, decay=0.0 if asked.decay is None else float(asked.decay))
     records = [plain.record]
-    target = _default_decay(plant)
+    slowest = max((mode.real for mode in analyse_structure(plant).unobservable_modes), default=-np.inf)
+    target = float(min(DECAY_SHARE * fastest_mode(plant.A), -HIDDEN_SHARE * slowest))
     if asked.decay is not None or asked.disk is not None or plain.abscissa <= -target:
         return plain, records
     if plant.nx + plant.nf > MANY_STATES:
@@ -73,11 +74,6 @@ def _faster_at_little_cost(plant: DescriptorSystem, asked: PdOptions, plain: PdG
         except (SolverError, InfeasibleError):
             break  # nobody asked for this rate
     return found
-
-
-def _default_decay(plant: DescriptorSystem) -> float:
-    slowest = max((mode.real for mode in analyse_structure(plant).unobservable_modes), default=-np.inf)
-    return float(min(DECAY_SHARE * fastest_mode(plant.A), -HIDDEN_SHARE * slowest))
 
 
 def gains_for(plant: DescriptorSystem, asked: PdOptions, *, decay: float, most: float | None = None) -> PdGains:

@@ -116,8 +116,8 @@ class PdErrorSystem:
         padded = np.vstack([process, np.zeros((n - self.nx, process.shape[1]))])
         # (I + L C) e' = Ae e + Bw w - J Dw w - L Dw w', and eps = (I + L C) e.
         b = np.hstack([padded - self.J @ sensor, -self.L @ sensor])
-        # The estimate is S of eps + L noise: in terms of the error itself no feedthrough is left.
-        inner = _similar(self.Az, self.estimate)
+        # The estimate is S of eps + L noise: in terms of the error itself (S Az S^-1) no feedthrough is left.
+        inner = solved(self.estimate.T, (self.estimate @ self.Az).T).T
         shown = np.eye(n)[self.nx :]
         return continuous_hinf_norm(inner, self.estimate @ b, shown, np.zeros((len(shown), b.shape[1])))
 
@@ -128,8 +128,3 @@ def solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
         return np.asarray(np.linalg.solve(matrix, right))
     except np.linalg.LinAlgError:
         return np.full_like(right, np.nan)
-
-
-def _similar(a: FloatArray, s: FloatArray) -> FloatArray:
-    """Return ``s a s^-1``; NaN when s is singular."""
-    return solved(s.T, (s @ a).T).T

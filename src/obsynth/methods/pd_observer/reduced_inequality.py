@@ -66,7 +66,8 @@ class ReducedPlant:
 
 def reduced_lmi(task: PdTask, *, solver: str) -> PdSolution:
     """Return gains by the smaller inequality, for a task of stability and a decay rate."""
-    plant = _shifted(task)
+    a, c = task.plants[0]
+    plant = ReducedPlant.of(a + task.decay * np.eye(len(a)), c)
     a11, _, a21, _ = plant.blocks()
     if plant.hidden == 0:
         none = np.zeros((0, 0))
@@ -136,11 +137,6 @@ def _closed_form(task: PdTask, *, free_delta: bool) -> tuple[PdSolution, float]:
 
 
 _WHAT = "a PD observer with L = 0"
-
-
-def _shifted(task: PdTask) -> ReducedPlant:
-    a, c = task.plants[0]
-    return ReducedPlant.of(a + task.decay * np.eye(len(a)), c)
 
 
 def _riccati_gain(a: FloatArray, c: FloatArray, record: Mapping[str, Any]) -> FloatArray:
