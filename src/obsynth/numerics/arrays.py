@@ -55,6 +55,11 @@ def holds_truth(value: Any) -> bool:
     return isinstance(value, (bool, np.bool_)) or (isinstance(value, (list, tuple)) and any(map(holds_truth, value)))
 
 
+def kind_of_entries(dtype: np.dtype[Any]) -> str:
+    """Return what an array holds that does not hold real numbers, for a message."""
+    return {"b": "booleans", "c": "complex numbers", "U": "text"}.get(dtype.kind, "entries that are no numbers")
+
+
 def as_matrix(value: Any, name: str) -> FloatArray:
     """Convert nested lists, an array or a scalar to a finite, read-only real matrix; raise `SpecError` naming it."""
     try:
@@ -66,13 +71,7 @@ def as_matrix(value: Any, name: str) -> FloatArray:
         if raw.size == 0:
             raw = raw.astype(np.float64)
         else:
-            kind = (
-                "booleans"
-                if truths
-                else {"b": "booleans", "c": "complex numbers", "U": "text"}.get(
-                    raw.dtype.kind, "entries that are no numbers"
-                )
-            )
+            kind = "booleans" if truths else kind_of_entries(raw.dtype)
             raise SpecError(f"{name} holds {kind}: every entry must be a real number.", path=name)
     if raw.ndim == 0:
         raw = raw.reshape(1, 1)

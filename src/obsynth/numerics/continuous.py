@@ -73,6 +73,8 @@ MOST_LENGTHS = 60
 
 def peak_gain(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
     """Return an upper bound on the integral of the Euclidean norm of the response to each input."""
+    from scipy.linalg import expm
+
     if not a.size or not b.shape[1]:
         return np.zeros(b.shape[1])
     if not spectral_abscissa(a) < 0.0:
@@ -80,7 +82,7 @@ def peak_gain(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
     a, b, c = _in_lyapunov_norm(a, b, c)
     second = a @ a
     step = FIRST_LENGTH / float(np.linalg.norm(a, 2))
-    transition = _exponential(a, step)
+    transition = np.asarray(expm(a * step))
     # Columns of b at the start of the interval, and the whole state transition, for what is left in the end.
     columns = np.hstack([b, np.eye(len(a))])
     total = np.zeros(columns.shape[1])
@@ -101,12 +103,6 @@ def peak_gain(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
                 return np.asarray(total[:inputs] + left)
         step, transition = 2.0 * step, transition @ transition
     raise SpecError("The observer forgets too slowly for a bound on its residual.", path="observer")
-
-
-def _exponential(a: FloatArray, step: float) -> FloatArray:
-    from scipy.linalg import expm
-
-    return np.asarray(expm(a * step))
 
 
 def _in_lyapunov_norm(a: FloatArray, b: FloatArray, c: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.arrays import FloatArray, kind_of_entries, read_only
 
 
 def is_sparse(value: Any) -> TypeGuard[Any]:
@@ -23,8 +23,7 @@ def is_sparse(value: Any) -> TypeGuard[Any]:
 def as_sparse_matrix(value: Any, name: str) -> Any:
     """Return a private, finite, read-only float copy of a sparse matrix in CSR form, or in CSC where that was given."""
     if value.dtype.kind not in "fiu":
-        kind = {"b": "booleans", "c": "complex numbers"}.get(value.dtype.kind, "entries that are no numbers")
-        raise SpecError(f"{name} holds {kind}: every entry must be a real number.", path=name)
+        raise SpecError(f"{name} holds {kind_of_entries(value.dtype)}: every entry must be a real number.", path=name)
     if value.ndim != 2:
         raise SpecError(f"{name} has {value.ndim} dimension(s): give a matrix.", path=name)
     copy = (value.copy() if value.format in ("csr", "csc") else value.tocsr(copy=True)).astype(np.float64)

@@ -67,13 +67,10 @@ def synthesise(plant: DescriptorSystem, asked: FilterOptions, *, progress: Calla
     problem, parts = gain_problem(prepared, free_weight=free)
     # Where nothing disturbs the estimates, a small share of what disturbances could do is proved.
     nominal = NOMINAL_GAIN * max(problem.disturbance_size, NOMINAL_GAIN)
-    if s is not None and limit is None:
+    if s is not None or limit is not None:
         # With the paper's S the weight is its W = Upsilon^+ too, which is that of the outputs as given.
         problem, parts = centred(problem, prepared, parts)
-    limited = None
-    if limit is not None:
-        problem, parts = centred(problem, prepared, parts)
-        limited = with_weight_limit(problem, prepared, parts, limit)
+    limited = None if limit is None else with_weight_limit(problem, prepared, parts, limit)
     search = partial(_found, problem, limited, asked, noisy=plant.nw > 0, progress=progress)
     found = search(exactly=False)
     progress("building the realisation and its certificate")
