@@ -113,30 +113,16 @@ def shown(value: Any) -> str:
 
 
 Positive = Annotated[float, Gt(0.0)]
-
-
 NonNegative = Annotated[float, Ge(0.0)]
-
-
 #: lambda: 1 forgets nothing.
 ForgettingFactor = Annotated[float, Gt(0.0), Le(1.0)]
-
-
 #: Per sample; 0 never.
 Probability = Annotated[float, Ge(0.0), Lt(1.0)]
-
-
 OpenUnitInterval = Annotated[float, Gt(0.0), Lt(1.0)]
-
-
 #: More than the upper ends is a mistake that would fill the memory.
 Count = Annotated[int, Ge(1), Le(1_000_000)]
-
-
 #: Samples that are kept as states.
 FewSamples = Annotated[int, Ge(0), Le(1000)]
-
-
 #: Mark -> its attribute, the comparison it stands for, and how a message says it.
 _BOUNDS: Mapping[type, tuple[str, Callable[[Any, Any], bool], str]] = {
     Gt: ("gt", operator.gt, "above"), Ge: ("ge", operator.ge, "at least"), Lt: ("lt", operator.lt, "below"),

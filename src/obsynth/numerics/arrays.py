@@ -17,8 +17,6 @@ ComplexArray: TypeAlias = NDArray[np.complex128]
 
 #: Stands for a size that may be zero, where something is divided by it.
 SMALLEST = 1e-300
-
-
 Made = TypeVar("Made")
 
 

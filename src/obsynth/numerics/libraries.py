@@ -63,11 +63,7 @@ def imported(module: str, *, extra: str | None, what: str = "This") -> Any:
 #: Problems with fewer states than this run on one BLAS thread: two took more time wherever they were measured, up to
 #: twelve times as much at 100 states (``benchmarks/README.md``).
 STATES_WORTH_THREADS = 1000
-
-
 _Function = TypeVar("_Function", bound=Callable[..., Any])
-
-
 #: Held by the block that has set the number of threads.
 _SETTING = threading.Lock()
 

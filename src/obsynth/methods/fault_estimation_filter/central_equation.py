@@ -71,8 +71,7 @@ class CentralEquation:
     def filter_and_margin(self, level: float) -> tuple[Injection | None, float]:
         """Return the gains of the central filter at ``level``, or ``None``, and how far the level is from the least.
 
-        The least eigenvalue of what must be negative, relative to ``-g^2 I``: about twice the relative distance, or
-        more.
+        The least eigenvalue of what must be negative, relative to ``-g^2 I``: twice the relative distance, or more.
         """
         try:
             y = self.solution(level)

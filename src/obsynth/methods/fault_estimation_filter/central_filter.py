@@ -80,8 +80,7 @@ def search_central_filter(
 ) -> tuple[Injection, float]:
     """Return the best central filter found, and (a bound on) its true gain.
 
-    The least level with little noise first; other noises, cheaper or less sensitive, where they reach a level just
-    below.
+    The least level with little noise first; other noises, cheaper or less sensitive, where they reach one below.
     """
     tolerance = LEVEL_TOLERANCE if problem.order <= FEW_STATES else COARSE_LEVEL_TOLERANCE
     best, gain = start, problem.achieved_gain(start) if gain is None else gain

@@ -131,15 +131,14 @@ REFUSE_CONDITION = 1e12
 class FaultDetectability:
     """Indexes ``rho_i`` (``None``: never shows) and matrices of ``(TA, C)`` for the fault directions ``TF``.
 
-    ``Psi (nx, nf)``: columns ``(TA)^(rho_i - 1) T f_i``, else zero; ``Upsilon = C Psi``, its rank, and its condition
-    number with columns of unit length.
+    ``Psi (nx, nf)``: columns ``(TA)^(rho_i - 1) T f_i``, else zero; ``Upsilon = C Psi``.
     """
 
     indexes: tuple[int | None, ...]
     Psi: FloatArray
     Upsilon: FloatArray
     rank: RankDecision
-    condition_number: float
+    condition_number: float  # of Upsilon with columns of unit length
 
     @property
     def finite(self) -> bool:

@@ -218,10 +218,7 @@ def least_gain_certificate(
 
 
 def _is_hopeless(problem: GainProblem, gain: float) -> bool:
-    """Return whether so many states are reached that two steps alone are tried, and these show too little.
-
-    In double precision: exact null spaces take most of a second at 32 states.
-    """
+    """Return whether two steps alone are tried, as many states are reached, and show too little in double precision."""
     if not MOST_REACHED < problem.order <= MOST_STATES:
         return False
     top, bottom, image = invisible_pairs(problem)

@@ -44,8 +44,7 @@ NOTHING_TO_POLISH = "reached: the disturbance does as much before any measuremen
 class LeastGain:
     """The outcome of the search: the true norm of the best filter (0 without d), and its gains.
 
-    ``first``: coordinates of the starting (Kalman) filter, ``starting_gain``: its norm; ``bracket``: of a bisection,
-    else the gain twice.
+    ``first``: coordinates of the starting (Kalman) filter; ``starting_gain``: its norm; ``bracket``: of a bisection.
     """
 
     gain: float

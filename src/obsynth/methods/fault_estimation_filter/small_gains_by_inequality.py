@@ -20,10 +20,7 @@ from obsynth.methods.fault_estimation_filter.injection_problem import (
 
 @dataclass(frozen=True, eq=False)
 class Goal:
-    """What a filter must meet (true gain, spectral radius ``slowest``), and what it shall cost little of.
-
-    ``judged``: filters that were asked for before, by identity.
-    """
+    """What a filter must meet (true gain, spectral radius ``slowest``), and what it shall cost little of."""
 
     problem: GainProblem
     gain: float
