@@ -161,10 +161,8 @@ def identifiability(
 def _sensitivities(
     model: DAEModel, step: ImplicitStep, inputs: FloatArray, x: FloatArray, theta: FloatArray, scales: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the derivatives of every output with respect to free directions and parameters, and the directions.
-
-    The first step leads onto the algebraic equations: the range of its F holds the directions that are free there.
-    """
+    """Return derivatives of all outputs by free directions and parameters, and these directions.
+    The first step leads onto the algebraic equations: the range of its F holds the directions that are free there."""
     moved = free = np.zeros((model.nx, 0))
     found = []
     for k in range(1, len(inputs)):

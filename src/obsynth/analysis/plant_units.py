@@ -1,11 +1,7 @@
-r"""Units in which a plant, its faults and its time are near one: decisions and gains must not depend on those given.
+r"""Units in which a plant, its faults and its time are near one, whatever units it came in.
 
-With ``x = S x'``, ``t = tau t'``, ``f = Phi_f f'``, ``w = W w'`` and so on the scaled plant is
-
-    E' = Q E S,  A' = tau Q A S,  Bf' = tau Q Bf Phi_f,  C' = Y C S,  Df' = Y Df Phi_f,  Phi' = tau W^-1 Phi W
-
-(no tau in discrete time).  The factors are those of a least-squares problem in the logarithms of all entries, so that
-the scaled plant is the same whatever units the plant came in.
+With ``x = S x'``, ``t = tau t'`` (no tau in discrete time): ``E' = Q E S``, ``A' = tau Q A S``, ``C' = Y C S``,
+``Bf' = tau Q Bf Phi_f``, ``Phi' = tau W^-1 Phi W``; the factors are least squares in the logarithms of all entries.
 """
 
 from __future__ import annotations
@@ -33,18 +29,15 @@ _KINDS = ("equations", "states", "outputs", "faults", "disturbances", "model")
 @dataclass(frozen=True, eq=False)
 class PlantUnits:
     """Factors between a plant as given and the scaled one.
+    Equations and outputs are multiplied by theirs; a state, fault, ... is its factor times the scaled one."""
 
-    Equations ``(nx,)`` and outputs ``(ny,)`` are multiplied by theirs; a state ``(nx,)``, fault ``(nf,)``, disturbance
-    ``(nd,)`` or state of the fault model ``(nw,)`` is its factor times the scaled one; ``time``: tau or ``dt``.
-    """
-
-    time: float
+    time: float  # tau, or ``dt``
     equations: FloatArray
     states: FloatArray
     outputs: FloatArray
     faults: FloatArray
     disturbances: FloatArray
-    model: FloatArray
+    model: FloatArray  # ``(nw,)``: of the states of the fault model
     discrete: bool
 
     @classmethod
@@ -115,9 +108,7 @@ class PlantUnits:
 
     def for_decoupling(self, plant: DescriptorSystem) -> PlantUnits:
         """Return the same with each equation that holds a derivative scaled by its row of E.
-
-        How much of a state is read from the outputs and how much is integrated then does not depend on how fast it is.
-        """
+        How much of a state is read and how much integrated then does not depend on how fast it is."""
         rows = np.max(np.abs(plant.E) * self.states, axis=1, initial=0.0)
         moving = rows * self.equations > RANK_TOLERANCE * np.max(rows * self.equations, initial=0.0)
         return replace(self, equations=read_only(np.where(moving, 1.0 / np.where(moving, rows, 1.0), self.equations)))

@@ -22,27 +22,22 @@ from obsynth.plants.descriptor import DescriptorSystem
 
 @dataclass(frozen=True, eq=False)
 class Structure:
-    """What kind of plant this is, with the evidence: every rank decided on the way is among the ``decisions``.
-
-    ``index``: size of the largest block at infinity, None unless regular; ``admissible``: regular, impulse-free (at
-    most 1) and stable; ``observability_normal_rank``: of ``[A - z E; C]`` at almost every z; ``impulse_observable``:
-    ``rank [E A; 0 E; 0 C] = nx + rank E``; ``causally_observable``: ``rank [E; C] = nx``.
-    """
+    """What kind of plant this is, with the evidence: every rank decided on the way is among the ``decisions``."""
 
     regular: bool
-    index: int | None
+    index: int | None  # size of the largest block at infinity, ``None`` unless regular
     finite_eigenvalues: ComplexArray
     infinite_block_sizes: tuple[int, ...]
     impulse_free: bool
     stable: bool
-    admissible: bool
-    observability_normal_rank: int
+    admissible: bool  # regular, impulse-free and stable
+    observability_normal_rank: int  # of ``[A - z E; C]`` at almost every z
     unobservable_modes: tuple[complex, ...]
     undetectable_modes: tuple[complex, ...]
     finitely_observable: bool
     detectable: bool
-    impulse_observable: bool
-    causally_observable: bool
+    impulse_observable: bool  # ``rank [E A; 0 E; 0 C] = nx + rank E``
+    causally_observable: bool  # ``rank [E; C] = nx``
     rank_of_E: RankDecision
     decisions: Mapping[str, RankDecision]
 

@@ -49,17 +49,14 @@ def step_blocks(plant: TimeVaryingDescriptorSystem, k: int, late: IntArray) -> S
 @dataclass(frozen=True, eq=False)
 class HorizonRanks:
     """Where rank and condition of ``H_k = [E_k; C_k]``, and the residual directions of (18), are worst on a horizon.
-
-    With early constraints H_k holds them among the outputs.  ``condition``: as given, in the units of the data;
-    ``directions``: the least ``rank E_k + ny - nx``.
-    """
+    With early constraints H_k holds them among the outputs."""
 
     steps: int
     worst: RankDecision
     worst_k: int
-    condition: float
+    condition: float  # as given, in the units of the data
     condition_k: int
-    directions: int
+    directions: int  # the least ``rank E_k + ny - nx``
     directions_k: int
 
 

@@ -31,10 +31,8 @@ NEWTON_STEPS = 4
 
 def system_zeros(E: FloatArray, A: FloatArray, *, nx: int) -> FiniteZeros:
     """Return the finite zeros of a system pencil ``(nx + ny, nx + nu)`` without those that are only nearly infinite.
-
-    Far out a pencil with zeros at infinity is nearly singular everywhere, beside ``z E``: a chain of k states shows
-    with ``z^-k``.  A candidate there counts only when the pencil is singular to rounding in units that suit its size.
-    """
+    Far out a pencil with zeros at infinity is nearly singular beside ``z E`` (a chain of k states shows with ``z^-k``):
+    there a candidate counts only when the pencil is singular to rounding in units that suit its size."""
     found = finite_zeros(E, A, to_the_end=False)
     if not found.values.size:
         return found
@@ -76,10 +74,8 @@ def _is_singular(E: FloatArray, A: FloatArray, value: complex, normal_rank: int,
 
 
 def equilibrated_at(E: FloatArray, A: FloatArray, value: complex, *, nx: int) -> EquilibratedPencil:
-    """Return the pencil with states, equations and outputs in units that suit a point of this modulus.
-
-    Beside a large ``z E`` the inputs and outputs would vanish: the states are measured in the units that ``z x`` has.
-    """
+    """Return the pencil in units that suit a point of this modulus: states in those that ``z x`` has.
+    Beside a large ``z E`` the inputs and outputs would vanish."""
     size = float(power_of_two_below(np.array(max(1.0, abs(value)))))
     columns = np.where(np.arange(E.shape[1]) < nx, 1.0 / size, 1.0)
     # Scaled with the modulus at that point, then taken apart again, so that the factors are those of A - z E.
@@ -110,16 +106,12 @@ class Zero:
 
 @dataclass(frozen=True, eq=False)
 class FaultZeros:
-    """What faults a plant can hide from its outputs.
-
-    ``zeros`` of ``[A - z E, Bf; C, Df]``; ``outside``: those not strictly stable; ``normal_rank_full``: rank nx + nf at
-    almost every z; if not, ``hidden_direction (nf,)`` of ``hidden_faults`` never shows.
-    """
+    """What faults a plant can hide from its outputs: zeros of ``[A - z E, Bf; C, Df]``."""
 
     zeros: tuple[Zero, ...]
-    outside: tuple[Zero, ...]
-    normal_rank_full: bool
-    hidden_direction: FloatArray | None
+    outside: tuple[Zero, ...]  # those not strictly stable
+    normal_rank_full: bool  # rank nx + nf at almost every z
+    hidden_direction: FloatArray | None  # ``(nf,)``: never shows, unless that rank is full
     hidden_faults: tuple[str, ...]
     decisions: tuple[RankDecision, ...]
 
@@ -133,11 +125,8 @@ def is_outside(value: complex, dt: float) -> bool:
 
 def are_outside(E: FloatArray, A: FloatArray, zeros: FiniteZeros, dt: float) -> tuple[bool, ...]:
     """Decide for each finite zero of ``A - z E`` whether it counts as not strictly stable.
-
-    A zero of multiplicity k moves by ``eps^(1/k)`` under rounding, so distance alone may put a double
-    zero on the boundary safely inside.  Near the boundary a zero therefore also counts as outside when
-    the pencil itself is singular to working precision all the way to the nearest boundary point.
-    """
+    One of multiplicity k moves by ``eps^(1/k)``: near the boundary it also counts as outside when the pencil is
+    singular to working precision all the way to the nearest boundary point."""
     judged: PencilPoints | EquilibratedPencil | None = None
     found: dict[complex, bool] = {}
     for value in map(complex, zeros.values):

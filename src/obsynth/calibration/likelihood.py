@@ -1,10 +1,7 @@
 """The innovations likelihood of a log and its exact gradient, and the outputs of a simulation with sensitivities.
 
-    x- = f(x, u, t),  P- = F P F' + N Q N',  e = y - h,  S = H P- H' + R,
-    nll = 1/2 sum(e' S^-1 e + log det 2 pi S)
-
-with x(0) ~ N(x0, P0) integrated out, Q diagonal on named equations and R per sensor, both as logarithms of variances.
-The gradient goes back through the filter by hand: CasADi differentiates one sample, and two accumulations do the rest.
+``nll = 1/2 sum(e' S^-1 e + log det 2 pi S)``, x(0) ~ N(x0, P0) integrated out; Q on named equations and R as logarithms
+of variances.  CasADi differentiates one sample; two accumulations take the gradient back through the filter.
 """
 
 from __future__ import annotations
@@ -172,12 +169,9 @@ def _backward(graphs: SampleGraphs, later: Any, size: int) -> Any:
     seed = ca.MX.zeros(later.size1_out(1))
     seed[0] = 1.0
     nothing = [ca.MX(later.size1_out(i), 1) for i in range(2)]
-    outputs = nothing if _ignores_outputs(reverse) else list(later(packed, data, v, v[: graphs.nt], numbers))
+    # The derivative of scalar operations takes its function's results as arguments without using them.
+    unused = all(reverse.nnz_in(i) == 0 for i in (5, 6))
+    outputs = nothing if unused else list(later(packed, data, v, v[: graphs.nt], numbers))
     found = reverse(packed, data, v, v[: graphs.nt], numbers, *outputs, costate[:size], seed)
     after = ca.vertcat(found[0], costate[size:] + found[2])
     return ca.Function("backward", [costate, packed, numbers, data, v], [after])
-
-
-def _ignores_outputs(reverse: Any) -> bool:
-    """Whether a derivative of scalar operations takes its function's results as arguments without using them."""
-    return all(reverse.nnz_in(i) == 0 for i in (5, 6))

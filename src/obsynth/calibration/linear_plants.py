@@ -1,7 +1,5 @@
 """Linear descriptor plants for calibration: constants in their matrices, continuous, discrete, or varying with k.
 
-    E(p) x' = A(p) x + B(p) u + Bf(p) f,  or  E_{k+1} x(k+1) = A_k x(k) + B_k u(k) + Phi_k theta
-
 An algebraic equation of a discrete plant (a row of zeros in E) is taken with the state it constrains, one sample later.
 """
 

@@ -56,10 +56,7 @@ class IntegrationError:
 def integration_error(
     model: DAEModel, states: FloatArray, u: FloatArray, theta: FloatArray, deviations: FloatArray, dt: float
 ) -> IntegrationError | None:
-    """Compare one step from each state ``(n, nx)`` with the input that leads on, ``u (n, nu)``, k + 1 for state k.
-
-    Where Radau has no solution there is nothing to compare.
-    """
+    """Compare one step from each state ``(n, nx)``, where Radau has a solution, with the input that leads on."""
     steps = [ImplicitStep(DAEFunctions(model, method), dt) for method in ("backward-euler", "radau")]
     worst = IntegrationError(0.0, model.output_names[0], 0)
     for k in np.unique(np.linspace(0, max(len(states) - 2, 0), min(COMPARED, max(len(states) - 1, 1))).astype(int)):

@@ -1,9 +1,7 @@
 """One sample of a nonlinear plant as CasADi functions of state, input and unknown constants, with derivatives.
 
-The derivative of a likelihood needs that of F and of the noise's way, but not of Newton's iterations: the solved stages
-and their first derivatives enter the differentiated part as numbers, and the implicit function theorem does the rest.
-
-CasADi functions as machine code, where a C compiler is there and the work is long enough to wait for it.
+Newton's iterations are not differentiated: the solved stages and their first derivatives enter as numbers, and the
+implicit function theorem does the rest.  Machine code where a C compiler is there and the work is long enough.
 """
 
 from __future__ import annotations

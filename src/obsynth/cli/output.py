@@ -29,10 +29,8 @@ _TITLES = {
 
 def output_file(path: str | Path, kind: FileKind | None, options: argparse.Namespace, *, option: str = "--out") -> Path:
     """Return where to write a file of some kind, or raise `SpecError` before any work is done.
-
-    A file that the command has read, under whatever name, is never written; what is read later is checked again when
-    the file is put in its place.  An existing file of another kind (of any, if that is `None`) needs ``--force``.
-    """
+    A file that the command has read, under whatever name, is never written (checked again when the file is put in its
+    place).  An existing file of another kind (of any, if that is `None`) needs ``--force``."""
     target = check_output(path, option=option)
     if not options.force:
         check_replaceable(target, kind)
@@ -40,10 +38,7 @@ def output_file(path: str | Path, kind: FileKind | None, options: argparse.Names
 
 
 def answer(options: argparse.Namespace, data: Mapping[str, Any], told: Callable[[], Any] | str = "") -> None:
-    """Print the result of a verb: as JSON if asked for, else as a text or by a function, with the files written.
-
-    A path under ``file``, or paths under ``files``, are what was written.
-    """
+    """Print the result of a verb, as JSON or as told, with what was written: the paths under ``file`` or ``files``."""
     files = [item for item in data.get("files", [data.get("file")]) if isinstance(item, Path)]
     if options.json:
         texts = {name: str(item) for name, item in data.items() if isinstance(item, Path)}

@@ -110,9 +110,7 @@ def alarms(
     found: FloatArray, quiet: FloatArray, fault: FloatArray, response: FloatArray, false_alarms: float, dt: float
 ) -> tuple[float, float, float]:
     """Return threshold (passed in a share of the fault-free runs), median detection delay (s) and smallest fault found.
-
-    ``found, quiet (runs, steps)``: estimates with and without the fault; ``response (steps,)``: to a unit step.
-    """
+    ``found, quiet (runs, steps)``: estimates with and without the fault; ``response (steps,)``: to a unit step."""
     level = float(np.quantile(np.max(np.abs(quiet), axis=1), 1.0 - false_alarms))
     acts = np.flatnonzero(fault)
     if not acts.size:

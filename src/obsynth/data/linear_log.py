@@ -29,9 +29,7 @@ _Part = TypeVar("_Part")
 
 class GapModel:
     """The plant model that stands in for the sensors during a gap: faults held, unknown inputs zero, ``E = I``.
-
-    ``into (nx, nx_source)``: the dynamic states in an estimate of all states.
-    """
+    ``into (nx, nx_source)``: the dynamic states in an estimate of all states."""
 
     def __init__(self, plant: DescriptorSystem, into: FloatArray) -> None:
         self.plant, self.into = plant, into

@@ -20,12 +20,9 @@ LATE = "recovered states"
 
 
 class RecoveredStates:
-    """Estimates of the states that a transformation took away, all of one moment.
-
-    ``x_source = from_state x + from_input u + from_fault f``: what disturbances and noise add is not known.  Where the
-    fault estimate lags more than that of the state, both are taken of the older moment.  Faults that the observer does
-    not estimate count as zero.
-    """
+    """Estimates of states that a transformation took away: ``x_source = from_state x + from_input u + from_fault f``.
+    Disturbances, noise and faults that are not estimated count as zero.  Where the fault estimate lags more than that
+    of the state, both are taken of the older moment."""
 
     def __init__(self, recovery: StateRecovery, engine: Engine, names: Sequence[str]) -> None:
         wanted = set(names)

@@ -106,9 +106,7 @@ class ParquetSink:
 @contextmanager
 def sink_for(out: str | Path | TextIO | None, header: Sequence[str], stamps: Stamps) -> Iterator[Sink]:
     """Give a sink for a data frame, a stream, or a file that replaces ``out`` when all went well, and not at all else.
-
-    In a Parquet file times are seconds, since 1970 where the log has dates.
-    """
+    In a Parquet file times are seconds, since 1970 where the log has dates."""
     if out is None:
         yield FrameSink(header, stamps)
         return

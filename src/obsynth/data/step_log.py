@@ -22,11 +22,9 @@ StepRow: TypeAlias = RawEstimate | DAERow
 
 
 class SteppingEngine(Engine):
-    """A running observer with deviations on measured data; the first row is k = 0.
-
-    Signals of a nonlinear plant are absolute values, as its model's.  By default there is no warm-up, as covariances
-    of the start say how uncertain the estimates are, and a gate for outliers where the observer says nothing of them.
-    """
+    """A running observer with deviations on measured data (nonlinear plants: absolute values); the first row is k = 0.
+    By default no warm-up, as covariances of the start say how uncertain the estimates are, and a gate for outliers
+    where the observer says nothing of them."""
 
     def __init__(self, design: ObserverDesign, *, warm_up: float | None = None, outliers: str | None = None) -> None:
         observer: Any = design.observer

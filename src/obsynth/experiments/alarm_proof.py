@@ -219,11 +219,6 @@ def solved(programme: Window) -> tuple[FloatArray, FloatArray] | None:
 SAME_MARGIN = 1e-3
 
 
-def is_certificate(content: Any) -> bool:
-    """Whether a JSON document is a certificate of an alarm."""
-    return isinstance(content, dict) and content.get("kind") == KIND
-
-
 def verify_alarm(path: str | Path) -> VerificationReport:
     """Check the certificate of an alarm again, without a solver.
 
@@ -244,7 +239,7 @@ def verify_alarm(path: str | Path) -> VerificationReport:
     """
     source = Path(path)
     content = read_json(source)
-    if not is_certificate(content):
+    if not isinstance(content, dict) or content.get("kind") != KIND:
         raise SpecError(f"{source} is no certificate of an alarm.", path=str(source))
     body = content.get("certificate")
     if content.get("schema_version") != SCHEMA_VERSION or not isinstance(body, dict):

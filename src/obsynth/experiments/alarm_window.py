@@ -78,10 +78,7 @@ class Window:
 
     def proved_least(self, equal: FloatArray, below: FloatArray) -> Fraction:
         """Return a lower bound of the least t from any multipliers (of inequalities: 0 or less), in exact arithmetic.
-
-        A. Neumaier, O. Shcherbina, "Safe bounds in linear and mixed-integer linear programming", Math. Programming 99,
-        2004.
-        """
+        Neumaier, Shcherbina, "Safe bounds in linear and mixed-integer linear programming", Math. Prog. 99, 2004."""
         reduced: dict[int, Fraction] = {len(self.lower) - 1: Fraction(1)}
         total = Fraction(0)
         for rows, multipliers in ((self.equal, equal), (self.below, np.minimum(below, 0.0))):
@@ -255,9 +252,7 @@ def window_data(
     initial_set: Mapping[str, Any] | None, state_bounds: Mapping[str, Any] | None,
 ) -> tuple[AffinePlant, WindowData, str]:  # fmt: skip
     """Return the plant over its box, the last ``length`` samples with bounds of the state, and where these come from.
-
-    Without stated ones they come from the observer run again from the start, and its error.
-    """
+    Without stated ones they come from the observer run again from the start, and its error."""
     affine = affine_plant(design.linear[0])
     first = max(0, len(y) - length)
     if initial_set is None:

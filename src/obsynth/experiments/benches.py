@@ -42,20 +42,16 @@ CONSISTENCY_TOLERANCE = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Runs:
-    """What happened in several runs, ``(steps, runs, signals)`` each; rows: the observer's states, faults, residuals.
-
-    Outputs are as measured; faults are the parameters of a plant that has some; ``kept``: estimates that say more than
-    rows.
-    """
+    """What happened in several runs, ``(steps, runs, signals)`` each."""
 
     states: FloatArray
-    outputs: FloatArray
+    outputs: FloatArray  # as measured
     inputs: FloatArray
-    faults: FloatArray
+    faults: FloatArray  # the parameters of a plant that has some
     disturbances: FloatArray
-    rows: FloatArray
+    rows: FloatArray  # the observer's states, faults, residuals
     observer: LinearObserver | RecursiveObserver | DAEObserver
-    kept: tuple[Estimates, ...] = ()
+    kept: tuple[Estimates, ...] = ()  # estimates that say more than rows
 
     @property
     def estimates(self) -> tuple[Estimates, ...]:
@@ -67,16 +63,13 @@ class Runs:
 
 @dataclass(frozen=True, eq=False)
 class Bench(ABC):
-    """A design and a scenario, ready to run; it can be sent to another process, with a model that is data.
-
-    The observer is in discrete time; ``estimated``: which of the true faults are estimated; ``notes`` for readers.
-    """
+    """A design and a scenario, ready to run; it can be sent to another process, with a model that is data."""
 
     drive: Drive
-    observer: LinearObserver | RecursiveObserver | DAEObserver
+    observer: LinearObserver | RecursiveObserver | DAEObserver  # in discrete time
     initial_state: FloatArray
     fault_signals: slice
-    estimated: tuple[int, ...]
+    estimated: tuple[int, ...]  # which of the true faults are estimated
     notes: tuple[str, ...]
 
     @abstractmethod

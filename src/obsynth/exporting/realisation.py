@@ -19,14 +19,6 @@ from obsynth.plants.dae.model import DAEModel
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import gain_set_digest
 
-
-def require_plain_steps(name: str, option: str) -> None:
-    """Raise `SpecError` where an option of a design is in use that exported code does not know."""
-    if option:
-        raise SpecError(f"Design {name!r} uses the option {option!r}, which exported code does not know: design it "
-                        "without, or run it with obsynth run.", path=option)  # fmt: skip
-
-
 #: What a file says about the steady state of a recursion.
 STEADY = (
     "The steady state of a recursive design: its estimates are those of the recursion once the covariances have "
@@ -50,7 +42,11 @@ class Realisation:
         require_kind(design, ObserverDesign, "design", "an ObserverDesign, such as obsynth.load(path)")
         digest = gain_set_digest(design)
         if isinstance(design.observer, RecursiveObserver):
-            require_plain_steps(design.name, "outliers" if design.observer.outliers != "none" else "")
+            if design.observer.outliers != "none":
+                raise SpecError(
+                    f"Design {design.name!r} uses the option 'outliers', which exported code does not know: design it "
+                    "without, or run it with obsynth run.", path="outliers",
+                )  # fmt: skip
             found = steady_observer(design.observer)
             if sample_time is not None:
                 raise SpecError("A recursive design is sampled already: leave the sample time out.", path="sample_time")

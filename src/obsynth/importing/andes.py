@@ -123,6 +123,10 @@ def _dense(matrix: Any) -> FloatArray:
     return np.asarray(matrix, dtype=np.float64)
 
 
+#: Devices that a message lists.
+_SHOWN = 12
+
+
 def _names(picked: Picked, known: Sequence[str], what: str) -> list[str]:
     """Return names of variables; devices are spelled as ANDES does, ``omega GENCLS 1``."""
     if isinstance(picked, str):
@@ -133,18 +137,11 @@ def _names(picked: Picked, known: Sequence[str], what: str) -> list[str]:
     for device, variables in picked.items():
         own = [name.removesuffix(f" {device}") for name in known if name.endswith(f" {device}")]
         if not own:
-            raise SpecError(f"{what}: the network has no device {device!r}; it has {_devices(known)}.", path=what)
+            devices = list(dict.fromkeys(name.partition(" ")[2] for name in known))
+            shown = ", ".join(devices[:_SHOWN]) + (", ..." if len(devices) > _SHOWN else "")
+            raise SpecError(f"{what}: the network has no device {device!r}; it has {shown}.", path=what)
         for variable in variables:
             if variable not in own:
                 raise SpecError(f"{what}: {device} has no variable {variable!r}; it has {', '.join(own)}.", path=what)
             listed.append(f"{variable} {device}")
     return listed
-
-
-#: Devices that a message lists.
-_SHOWN = 12
-
-
-def _devices(known: Sequence[str]) -> str:
-    devices = list(dict.fromkeys(name.partition(" ")[2] for name in known))
-    return ", ".join(devices[:_SHOWN]) + (", ..." if len(devices) > _SHOWN else "")

@@ -71,7 +71,10 @@ def from_fmu(
             raise SpecError(f"at[{name!r}] is {value!r}: give a finite number.", path="at")
     with _instance(Path(path)) as instance:
         used = _used(instance.input_names, inputs, "inputs"), _used(instance.output_names, outputs, "outputs")
-        _require_known(at or {}, instance)
+        for name in at or {}:
+            if name not in instance.settable:
+                close = suggestion(name, instance.settable)
+                raise SpecError(f"at: the FMU has no real variable {name!r} that can be set.{close}", path="at")
         instance.begin(at or {})
         states = np.array([dict(at or {}).get(name, value) for name, value in
                            zip(instance.state_names, instance.states(), strict=True)])  # fmt: skip
@@ -154,13 +157,6 @@ def _used(known: Sequence[str], picked: Sequence[str] | None, what: str) -> list
         if name not in known:
             raise SpecError(f"{what}: the FMU has no {name!r} among its {what}.{suggestion(name, known)}", path=what)
     return list(picked)
-
-
-def _require_known(at: Mapping[str, float], instance: Instance) -> None:
-    for name in at:
-        if name not in instance.settable:
-            close = suggestion(name, instance.settable)
-            raise SpecError(f"at: the FMU has no real variable {name!r} that can be set.{close}", path="at")
 
 
 def _equilibrium(instance: Instance, states: FloatArray) -> FloatArray:

@@ -22,10 +22,8 @@ def plant_of(
     units: Mapping[str, str] | None = None,
 ) -> DescriptorSystem:  # fmt: skip
     """Return the plant of matrices ``E, A, B, C, D`` whose inputs are shared out among known, faults and unknown.
-
-    ``labels`` holds ``state_names``, ``input_names``, ``output_names``; ``plant`` the roles and arguments of
-    `DescriptorSystem`, which go before ``dt``, and entry by entry before operating point and units.
-    """
+    ``labels``: ``state_names``, ``input_names``, ``output_names``; ``plant``: roles and arguments of the plant, which
+    go before ``dt``, and entry by entry before operating point and units."""
     more = {"dt": dt, **plant}
     for name, stated in (("operating_point", point), ("units", units)):
         if stated is not None:

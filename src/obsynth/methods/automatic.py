@@ -30,31 +30,24 @@ SLOW = 0.25
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A method for a plant: its design and figures, or why there is none.
-
-    Fields: method; design; observer: on the clock; figures: of each fault; milliseconds: to design; refused.
-    """
+    """A method for a plant: its design and figures, or why there is none."""
 
     method: str
     design: ObserverDesign | None
-    observer: LinearObserver | None
-    figures: tuple[FaultFigures, ...]
-    milliseconds: float
+    observer: LinearObserver | None  # on the clock
+    figures: tuple[FaultFigures, ...]  # of each fault
+    milliseconds: float  # to design
     refused: str
 
     def rank(self, leaky: bool, settling: float = np.inf) -> tuple[float, ...]:
-        """Return what sorts candidates by closed-form figures, the best first; ``leaky``: there are unknown inputs.
-
-        Steps that are reached first, then decoupled estimates, then those that show a step well within the plant's
-        settling time (s); among these a mean over time T divides noise by the root of T: the deviation times the root
-        of the delay is what averaging cannot change.
-        """
+        """Return what sorts candidates, best first; ``settling``: the plant's time (s); ``leaky``: unknown inputs."""
         if not self.figures:
             return (2.0, 0.0, 0.0, np.inf)
         missed = float(not all(found.reaches for found in self.figures))
         leak = float(leaky and any(found.leak > DECOUPLED for found in self.figures))
         slow = float(any(found.most > SLOW * settling for found in self.figures))
         dt = self.observer.dt if self.observer is not None else 0.0
+        # A mean over time T divides noise by the root of T: it cannot change deviation times the root of delay.
         prices = [found.deviation * np.sqrt(max(found.most, dt)) for found in self.figures]
         price = float(np.prod(prices) ** (1.0 / len(prices))) if np.all(np.isfinite(prices)) else np.inf
         return (missed, leak, slow, price)
@@ -132,10 +125,7 @@ FAULT_METHODS = ("fault-estimation-filter", "pd-observer", "ui-pi-observer", "fu
 
 
 def automatic_design(plant: Any, options: Mapping[str, Any], maker: Maker, refusing: Maker) -> ObserverDesign:
-    """Return the design of the method chosen, with a note that says why.
-
-    ``maker(plant, method, options)`` designs; ``refusing`` does too, and says what would help where it refuses.
-    """
+    """Return the design of the method chosen; ``maker(plant, method, options)``; ``refusing`` says what would help."""
     if isinstance(plant, DAEModel):
         return maker(plant, "dae-adaptive-observer", options)
     if isinstance(plant, TimeVaryingDescriptorSystem):

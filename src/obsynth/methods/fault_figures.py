@@ -96,16 +96,14 @@ def held(plant: DescriptorSystem, steps: int) -> Held:
 def step_responses(
     plant: DescriptorSystem, observer: LinearObserver, steps: int, feedback: FloatArray | None = None
 ) -> tuple[FloatArray, FloatArray]:
-    """Return impulse responses ``(steps, faults, nf + nd + nw)`` and step responses ``(steps, faults, nf)``.
-
-    A feedback ``u = -feedback x`` is known to the observer, so that it changes no estimate; it keeps numbers small.
-    """
+    """Return responses to impulses ``(steps, faults, nf + nd + nw)`` and to steps ``(steps, faults, nf)``."""
     order, rows = observer.order, observer.fault_rows
     # Where no noise is stated, every output has one of its own, of deviation one.
     silent = not plant.Dw.any() and not plant.Bw.any()
     driven, measured = (np.zeros((plant.nx, plant.ny)), np.eye(plant.ny)) if silent else (plant.Bw, plant.Dw)
     inputs = np.hstack([plant.Bf, plant.Bd, driven])
     direct = np.hstack([plant.Df, plant.Dd, measured])
+    # A feedback u = -feedback x is known to the observer: it changes no estimate, and keeps numbers small.
     gain = np.zeros((plant.nu, plant.nx)) if feedback is None else feedback
     seen = plant.C - plant.D @ gain
     moved, into = plant.A - plant.B @ gain, observer.By @ seen - observer.Bu @ gain

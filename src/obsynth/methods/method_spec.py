@@ -80,46 +80,32 @@ def _option_types(options: Any) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class ClaimMeaning:
-    """A number that a method may claim: its unit (empty: dimensionless), what it means, and the row that checks it.
+    """A number that a method may claim; ``row`` checks it, or is `obsynth.verification.claims.STATED`: none can."""
 
-    Without a row the claim is refused; `obsynth.verification.claims.STATED` is for numbers of a search that no
-    check recomputes: these get a row that says so.
-    """
-
-    unit: str
+    unit: str  # empty: dimensionless
     meaning: str
     row: str = ""
 
 
 @dataclass(frozen=True)
 class MethodSpec:
-    """One method; callables are named by path ``module:name`` and loaded when they are used.
-
-    A path that begins with a dot is in the method's folder; what stands where it usually does need not be said.
-
-    Fields: id: As in specs and gain sets; plants: Kinds of plants it takes; time: In words, for lists of methods;
-    summary: One line; source: The paper whose letters its gains have; public: The function of `obsynth`; options: A
-    `MethodOptions`; conditions: Existence, from the plant; synthesise: ``(plant, options, progress=)`` -> `Synthesis`;
-    checks: ``(design, printed_digits)`` -> rows; claims: Every claim that it may make; witnesses: Matrices that its
-    certificate may hold; tracked: ``(design)`` -> `TrackedPlant`, of a linear observer; folder: Its package;
-    averaged: Its option ``mean`` puts registers behind the observer, which the checks are not about.
-    """
+    """One method; paths ``module:name`` are loaded when used, those with a leading dot from the method's folder."""
 
     id: str
     plants: tuple[PlantKind, ...]
-    time: str
+    time: str  # in words, for lists of methods
     summary: str
-    source: str
-    options: str
+    source: str  # the paper whose letters its gains have
+    options: str  # a `MethodOptions`
     claims: Mapping[str, ClaimMeaning]
     public: str = ""
-    conditions: str = ".synthesis:conditions"
-    synthesise: str = ".synthesis:synthesise"
-    checks: str = ".checks:checks"
+    conditions: str = ".synthesis:conditions"  # existence, from the plant
+    synthesise: str = ".synthesis:synthesise"  # (plant, options, progress=) -> `Synthesis`
+    checks: str = ".checks:checks"  # (design, printed_digits) -> rows
     folder: str | None = None
-    witnesses: frozenset[str] = frozenset()
-    tracked: str = ""
-    averaged: bool = False
+    witnesses: frozenset[str] = frozenset()  # matrices that its certificate may hold
+    tracked: str = ""  # (design) -> `TrackedPlant`, of a linear observer
+    averaged: bool = False  # its option ``mean`` puts registers behind the observer, which the checks are not about
 
     def load(
         self, part: Literal["public", "options", "conditions", "synthesise", "checks", "tracked"]
@@ -160,14 +146,7 @@ class MethodSpec:
 
 @dataclass(frozen=True, eq=False)
 class Synthesis:
-    """The unverified outcome of a method.
-
-    Fields: options: Options as resolved, plain data; gains: Gains with the paper's letters; observer: The realisation;
-    certificate: Witnesses and claims; solver: Records of the solver runs; notes: What a user should know;
-    transformation: What the method did to the plant before it designed for it (such as the elimination of algebraic
-    states): the design is then for the transformed plant, with the way back; plant: The plant as the recursive methods
-    see it, where they were given another kind; or with the noise that the design is for.
-    """
+    """The unverified outcome of a method."""
 
     options: Mapping[str, Any]
     gains: Mapping[str, FloatArray]
@@ -175,5 +154,6 @@ class Synthesis:
     certificate: Certificate
     solver: Mapping[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
-    transformation: Transformation | None = None
+    transformation: Transformation | None = None  # before the design, which is then for its plant, with the way back
+    # As the recursive methods see it, where given another kind; or with the noise that the design is for.
     plant: DescriptorSystem | TimeVaryingDescriptorSystem | None = None

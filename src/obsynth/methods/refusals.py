@@ -1,9 +1,8 @@
 """What would make a refused design possible, found by asking again; and designs that rounding makes useless.
 
-With ``y = G f`` the response of the outputs to one fault, an estimate is ``(Cz (s - Az)^-1 By + Dy) G f``, and outputs
-that are right to their last digit change it by up to ``u (|Cz| |(s - Az)^-1| |By| + |Dy|) |G| |f|``, u the unit
-roundoff, whatever the units.  The observer's own numbers, right to their last digit, change it by up to
-``u (|Cz| |(s - Az)^-1| (|Az| |z| + |By| |y|) + |Cz| |z| + |Dy| |y|)``, z its state, which is said where it matters.
+Outputs ``y = G f`` right to the last digit change an estimate by up to ``u (|Cz| |(s - Az)^-1| |By| + |Dy|) |G| |f|``,
+u the unit roundoff, in any units; the observer's own numbers, with z its state, by up to
+``u (|Cz| |(s - Az)^-1| (|Az| |z| + |By| |y|) + |Cz| |z| + |Dy| |y|)``.
 """
 
 from __future__ import annotations

@@ -27,12 +27,7 @@ CONDITION_LIMIT = 1e-20
 
 
 def stabilising_gain(a: FloatArray, c: FloatArray, noise_a: FloatArray, noise_c: FloatArray) -> FloatArray | None:
-    """Return R ``(n, m)`` such that ``A - R C`` is Schur stable, by a Kalman filter Riccati equation.
-
-    The first regularisation that forgets fast enough is taken, or the fastest filter of all.
-
-    Shapes: ``a (n, n)``, ``c (m, n)``, ``noise_a (n, k)``, ``noise_c (m, k)``.
-    """
+    """Return R ``(n, m)``, ``A - R C`` Schur stable, of the first regularisation fast enough, or the fastest."""
     n, m = a.shape[0], c.shape[0]
     if m == 0:
         return np.zeros((n, 0)) if spectral_radius(a) < 1.0 else None
@@ -64,12 +59,9 @@ def stabilising_gain(a: FloatArray, c: FloatArray, noise_a: FloatArray, noise_c:
 def bounded_real_matrix(
     a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, level: float, *, slack: float
 ) -> FloatArray | None:
-    """Return P > 0 with the bounded real inequality strict at ``level``, or ``None``.
+    """Return P > 0 with the bounded real inequality strict at ``level``, or ``None``; ``a (n, n)``, ``d (p, m)``.
 
-    Solves ``P = A'PA + C'C + slack*I + (A'PB + C'D)(level^2 I - D'D - B'PB)^-1 (A'PB + C'D)'`` for its
-    stabilising solution; the slack makes the inequality strict.
-
-    Shapes: ``a (n, n)``, ``b (n, m)``, ``c (p, n)``, ``d (p, m)``.
+    Of ``P = A'PA + C'C + slack*I + (A'PB + C'D)(level^2 I - D'D - B'PB)^-1 (A'PB + C'D)'``, the stabilising solution.
     """
     n = a.shape[0]
     if n == 0:
@@ -87,10 +79,7 @@ def bounded_real_matrix(
 
 
 class _Exceeded:
-    """Says whether the gain is above the level over as many steps as a solution stands for, beyond rounding.
-
-    Fields: b, gap: ``(n, m)``, and ``D'D - level^2 I (m, m)``.
-    """
+    """Says whether the gain exceeds the level over the steps of a solution; ``b (n, m)``, ``gap``: D'D - level^2 I."""
 
     def __init__(self, b: FloatArray, gap: FloatArray) -> None:
         self.b, self.gap = b, gap
@@ -175,10 +164,7 @@ def _by_qz(
 def continuous_solution(
     a: FloatArray, h: FloatArray, process: FloatArray, weight: FloatArray, cross: FloatArray | None = None
 ) -> FloatArray | None:
-    """Return P with ``a P + P a' - (P h' + cross) weight^-1 (P h' + cross)' + process = 0`` by SciPy, or ``None``.
-
-    What an ill-conditioned equation gives is judged by its user: by the poles, or by whether it proves anything.
-    """
+    """Return P with ``a P + P a' - (P h' + cross) weight^-1 (P h' + cross)' + process = 0`` by SciPy, or ``None``."""
     from scipy.linalg import solve_continuous_are
 
     try:
@@ -187,6 +173,7 @@ def continuous_solution(
             p = np.asarray(solve_continuous_are(a.T, h.T, process, weight, s=cross))
     except (np.linalg.LinAlgError, ValueError):
         return None
+    # What an ill-conditioned equation gives is judged by its user: by poles, or by whether it proves anything.
     return p if np.all(np.isfinite(p)) else None
 
 
@@ -249,10 +236,7 @@ def _factor(a: FloatArray, dt: float, share: float, rounds: int, edge: float) ->
 
 
 def _modal_factor(a: FloatArray) -> FloatArray | None:
-    """Return the factor whose coordinates are the modes, from no equation: its accuracy does not suffer from P's size.
-
-    Fault models of high order, or with eigenvalues close to each other, have a P beyond double precision otherwise.
-    """
+    """Return the factor whose coordinates are the modes, whose accuracy does not suffer from the size of a P."""
     balance = balancing_factors(a)
     values, vectors = np.linalg.eig(a * balance / balance[:, None])
     # A pair has the real and the imaginary part of its eigenvector as coordinates.

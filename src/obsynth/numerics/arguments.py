@@ -52,10 +52,7 @@ def real_vector(value: Any, size: int, name: str) -> FloatArray:
 
 
 def real_array(value: Any, name: str) -> FloatArray:
-    """Return real numbers of any shape, NaN and infinities among them; raise `SpecError` for anything else.
-
-    Masked entries become NaN: what lies under a mask is no number.
-    """
+    """Return real numbers of any shape, NaN (masked entries too) and infinities among them; else raise `SpecError`."""
     try:
         raw = np.asarray(unmasked(value))
     except (TypeError, ValueError):
@@ -116,30 +113,16 @@ def shown(value: Any) -> str:
 
 
 Positive = Annotated[float, Gt(0.0)]
-
-
 NonNegative = Annotated[float, Ge(0.0)]
-
-
 #: lambda: 1 forgets nothing.
 ForgettingFactor = Annotated[float, Gt(0.0), Le(1.0)]
-
-
 #: Per sample; 0 never.
 Probability = Annotated[float, Ge(0.0), Lt(1.0)]
-
-
 OpenUnitInterval = Annotated[float, Gt(0.0), Lt(1.0)]
-
-
 #: More than the upper ends is a mistake that would fill the memory.
 Count = Annotated[int, Ge(1), Le(1_000_000)]
-
-
 #: Samples that are kept as states.
 FewSamples = Annotated[int, Ge(0), Le(1000)]
-
-
 #: Mark -> its attribute, the comparison it stands for, and how a message says it.
 _BOUNDS: Mapping[type, tuple[str, Callable[[Any, Any], bool], str]] = {
     Gt: ("gt", operator.gt, "above"), Ge: ("ge", operator.ge, "at least"), Lt: ("lt", operator.lt, "below"),

@@ -17,8 +17,6 @@ ComplexArray: TypeAlias = NDArray[np.complex128]
 
 #: Stands for a size that may be zero, where something is divided by it.
 SMALLEST = 1e-300
-
-
 Made = TypeVar("Made")
 
 
@@ -55,12 +53,13 @@ def holds_truth(value: Any) -> bool:
     return isinstance(value, (bool, np.bool_)) or (isinstance(value, (list, tuple)) and any(map(holds_truth, value)))
 
 
-def as_matrix(value: Any, name: str) -> FloatArray:
-    """Convert nested lists or an array to a finite, read-only matrix; raise `SpecError` naming it.
+def kind_of_entries(dtype: np.dtype[Any]) -> str:
+    """Return what an array holds that does not hold real numbers, for a message."""
+    return {"b": "booleans", "c": "complex numbers", "U": "text"}.get(dtype.kind, "entries that are no numbers")
 
-    A scalar is read as a 1-by-1 matrix.  Text, booleans, complex numbers, ragged rows, NaN and
-    infinities are refused.
-    """
+
+def as_matrix(value: Any, name: str) -> FloatArray:
+    """Convert nested lists, an array or a scalar to a finite, read-only real matrix; raise `SpecError` naming it."""
     try:
         raw = np.asarray(unmasked(value))
     except ValueError:
@@ -70,13 +69,7 @@ def as_matrix(value: Any, name: str) -> FloatArray:
         if raw.size == 0:
             raw = raw.astype(np.float64)
         else:
-            kind = (
-                "booleans"
-                if truths
-                else {"b": "booleans", "c": "complex numbers", "U": "text"}.get(
-                    raw.dtype.kind, "entries that are no numbers"
-                )
-            )
+            kind = "booleans" if truths else kind_of_entries(raw.dtype)
             raise SpecError(f"{name} holds {kind}: every entry must be a real number.", path=name)
     if raw.ndim == 0:
         raw = raw.reshape(1, 1)

@@ -1,9 +1,7 @@
-"""The square-root step over many samples as one compiled loop.  Needs numba (`obsynth[fast]`); import it only then.
+"""The square-root step over many samples as one compiled loop. Needs numba (`obsynth[fast]`); import it only then.
 
-It takes the reflections that LAPACK takes in `obsynth.numerics.least_squares_step.projected_step`, in the same order,
-so that even the signs of the innovations agree.  numba compiles it at the first import of an installation, for some
-seconds, and keeps the result beside this file, or in the user's cache directory where that cannot be written
-(``NUMBA_CACHE_DIR`` in the environment chooses another place).
+The reflections are those of `obsynth.numerics.least_squares_step.projected_step`, in the same order, so that even signs
+agree. Compiled at the first import, for seconds, and kept beside this file, or where ``NUMBA_CACHE_DIR`` says.
 """
 
 from __future__ import annotations
@@ -138,7 +136,12 @@ def _steps(
     x: FloatArray, factor: FloatArray, moved: FloatArray, known: FloatArray, head: FloatArray, data: FloatArray,
     states: FloatArray, innovations: FloatArray, deviations: FloatArray, covariances: FloatArray, share: float,
 ) -> int:  # fmt: skip
-    """See `square_root_steps`."""
+    """Take steps of the square-root recursion until one needs a decision about a rank; return how many were taken.
+
+    Arrays in C order, writeable; what does not change with k has one entry along its first axis.  Shapes: ``x (n,),
+    factor (n, n), moved (., n, rows), known (., any, rows), head (., n, n), data (steps, rows), states (steps, n),
+    innovations (steps, rows - n), deviations (steps, nx), covariances (steps, n - nx, n - nx)``.
+    """
     n, rows = moved.shape[1], moved.shape[2]
     m = rows - n
     work = np.zeros((max(n + known.shape[1], rows), rows))
@@ -164,20 +167,4 @@ def _steps(
     return len(data)
 
 
-_compiled_steps = compiled(_steps, SIGNATURE)
-
-
-def square_root_steps(
-    x: FloatArray, factor: FloatArray, moved: FloatArray, known: FloatArray, head: FloatArray, data: FloatArray,
-    states: FloatArray, innovations: FloatArray, deviations: FloatArray, covariances: FloatArray, share: float,
-) -> int:  # fmt: skip
-    """Take steps of the square-root recursion until one needs a decision about a rank; return how many were taken.
-
-    All arrays are of double precision, in C order, and writeable.  What does not change with k has one entry along its
-    first axis.
-
-    Shapes: ``x (n,)``, ``factor (n, n)``, ``moved (1 or steps, n, rows)``, ``known (1 or steps, any, rows)``, ``head (1
-    or steps, n, n)``, ``data (steps, rows)``, ``states (steps, n)``, ``innovations (steps, rows - n)``, ``deviations
-    (steps, nx)``, ``covariances (steps, n - nx, n - nx)``.
-    """
-    return _compiled_steps(x, factor, moved, known, head, data, states, innovations, deviations, covariances, share)
+square_root_steps = compiled(_steps, SIGNATURE)

@@ -1,9 +1,8 @@
-r"""Continuous-time systems: H-infinity norms by the bilinear transform, peak (l1) gains from above, exact steps.
+"""Continuous time: H-infinity norms by the bilinear transform, peak (l1) gains from above, exact steps.
 
-The peak gain bounds ``\int_0^\infty |C e^{At} b| dt``: on an interval of length h from a point where ``e^{At} b`` is
-known, the response differs from the straight line between its ends by at most ``s (h - s) / 2`` times the largest
-second derivative, which in the norm of a Lyapunov function is known at the interval's start; what is left after the
-last interval decays with the transition over all of them.  Everything but rounding is accounted for.
+The peak gain bounds ``int |C e^{At} b| dt``: on an interval of length h the response is off the line between its ends
+by at most ``s (h - s) / 2`` times the largest second derivative, known at the start in a Lyapunov norm; what is left
+decays with the transition over all intervals. Everything but rounding is accounted for.
 """
 
 from __future__ import annotations
@@ -20,11 +19,9 @@ from obsynth.numerics.scaling import balanced_matrix, power_of_two_below
 
 @dataclass(frozen=True)
 class ContinuousHinfNorm:
-    """The H-infinity norm of a stable continuous-time system.
+    """The H-infinity norm in continuous time: ``value`` is attained, at ``frequency`` in rad/s (infinite: feedthrough).
 
-    Fields: value: Largest singular value found on the imaginary axis: a lower bound that is attained; upper: Level that
-    no singular value exceeds, as far as double precision can tell (computed, not proved); frequency: Where the peak is,
-    rad/s; infinite when it is the feedthrough.
+    ``upper``: not exceeded as far as double precision can tell (computed, not proved).
     """
 
     value: float
@@ -42,12 +39,9 @@ def spectral_abscissa(a: FloatArray) -> float:
 
 
 def continuous_hinf_norm(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> ContinuousHinfNorm:
-    r"""Return the H-infinity norm of a continuous-time system.
+    """Return the H-infinity norm of a continuous-time system, by ``s = w (z - 1) / (z + 1)``, which keeps every gain.
 
-    The substitution ``s = w (z - 1) / (z + 1)`` takes the imaginary axis to the unit circle and keeps every gain, so
-    the norm is that of a discrete-time system; w is the geometric mean of the moduli of the eigenvalues.
-
-    Shapes: ``a (n, n)``, ``b (n, m)``, ``c (p, n)``, ``d (p, m)``.
+    w is the geometric mean of the moduli of the eigenvalues.
     """
     if b.shape[1] == 0 or c.shape[0] == 0:
         return ContinuousHinfNorm(0.0, 0.0, 0.0)
@@ -78,10 +72,9 @@ MOST_LENGTHS = 60
 
 
 def peak_gain(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
-    r"""Return an upper bound on the integral of the Euclidean norm of the response to each input.
+    """Return an upper bound on the integral of the Euclidean norm of the response to each input."""
+    from scipy.linalg import expm
 
-    Shapes: ``a (n, n)``, ``b (n, m)``, ``c (p, n)``.
-    """
     if not a.size or not b.shape[1]:
         return np.zeros(b.shape[1])
     if not spectral_abscissa(a) < 0.0:
@@ -89,7 +82,7 @@ def peak_gain(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
     a, b, c = _in_lyapunov_norm(a, b, c)
     second = a @ a
     step = FIRST_LENGTH / float(np.linalg.norm(a, 2))
-    transition = _exponential(a, step)
+    transition = np.asarray(expm(a * step))
     # Columns of b at the start of the interval, and the whole state transition, for what is left in the end.
     columns = np.hstack([b, np.eye(len(a))])
     total = np.zeros(columns.shape[1])
@@ -110,12 +103,6 @@ def peak_gain(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
                 return np.asarray(total[:inputs] + left)
         step, transition = 2.0 * step, transition @ transition
     raise SpecError("The observer forgets too slowly for a bound on its residual.", path="observer")
-
-
-def _exponential(a: FloatArray, step: float) -> FloatArray:
-    from scipy.linalg import expm
-
-    return np.asarray(expm(a * step))
 
 
 def _in_lyapunov_norm(a: FloatArray, b: FloatArray, c: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -144,10 +131,7 @@ def zero_order_hold(a: FloatArray, inputs: FloatArray, step: float) -> tuple[Flo
 
 
 def first_order_hold(a: FloatArray, inputs: FloatArray, step: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return Phi, Gamma0 and Gamma1 of ``x(h) = Phi x(0) + Gamma0 s(0) + Gamma1 (s(h) - s(0))``.
-
-    Shapes: ``a (n, n)``, ``inputs (n, m)``.
-    """
+    """Return Phi, Gamma0 and Gamma1 of ``x(h) = Phi x(0) + Gamma0 s(0) + Gamma1 (s(h) - s(0))``."""
     from scipy.linalg import expm
 
     n, m = inputs.shape
@@ -169,10 +153,7 @@ def _in_like_sizes(a: FloatArray, inputs: FloatArray) -> tuple[FloatArray, Float
 
 
 def driven(a: FloatArray, start: FloatArray, drive: FloatArray) -> FloatArray:
-    """Return ``x(0), x(1), ...`` of ``x+ = a x + drive`` for one or many runs; infinite where the states overflow.
-
-    Shapes: ``drive (steps, ..., n)``.
-    """
+    """Return ``x(0), x(1), ...`` of ``x+ = a x + drive (steps, ..., n)``; infinite where the states overflow."""
     x, turned = np.empty_like(drive), np.ascontiguousarray(a.T)
     x[:1] = start
     with np.errstate(over="ignore", invalid="ignore"):

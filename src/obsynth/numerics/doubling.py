@@ -44,15 +44,9 @@ def doubled_riccati_solution(
     possible: Callable[[FloatArray], bool] | None = None,
     most_jumps: int = MOST_DOUBLINGS,
 ) -> FloatArray | None:
-    """Return the stabilising solution of a filtering Riccati equation with an indefinite weight, by doubling.
+    """Return the stabilising solution of ``Y = A Y A' - (A Y H' + S) (W + H Y H')^-1 (A Y H' + S)' + Q``.
 
-    ``Y = A Y A' - (A Y H' + S) (W + H Y H')^-1 (A Y H' + S)' + Q``.
-
-    Shapes: ``a (n, n)``, ``h (p, n)``, ``process (n, n)``, ``weight (p, p)``, ``cross (n, p)``.
-
-    Notes
-    -----
-    Structure-preserving doubling of Chu, Fan, Lin and Wang (2004); it needs no definite weight, but may break down.
+    Doubling of Chu, Fan, Lin and Wang (2004); it needs no definite weight W, but may break down: ``None``.
     """
     n = a.shape[0]
     if n == 0:
@@ -65,14 +59,8 @@ def doubled_riccati_solution(
 def continuous_riccati_solution(
     a: FloatArray, c: FloatArray, process: FloatArray, measured: FloatArray
 ) -> FloatArray | None:
-    """Return the stabilising solution of the Kalman filter's Riccati equation in continuous time, by doubling.
+    """Return the stabilising solution of ``A Y + Y A' - Y C' R^-1 C Y + Q = 0``, by doubling.
 
-    ``A Y + Y A' - Y C' R^-1 C Y + Q = 0``.
-
-    Shapes: ``a (n, n)``, ``c (p, n)``, ``process (n, n)``, ``measured (p, p)``.
-
-    Notes
-    -----
     A Cayley transform makes it an equation in discrete time with the same solution (Chu, Fan and Lin 2005).
     """
     n, one = a.shape[0], np.eye(a.shape[0])
@@ -101,10 +89,7 @@ def _doubled(
     possible: Callable[[FloatArray], bool] | None = None,
     most_jumps: int = MOST_DOUBLINGS,
 ) -> FloatArray | None:
-    """Double an equation without cross term and ``back = H' W^-1 H`` from its first step; see the callers.
-
-    ``power`` (transposed in the papers) is in C order, so that its transpose is what LAPACK works on in place.
-    """
+    """Double an equation without cross term from its first step; ``power`` (transposed in the papers) in C order."""
     back, solution = 0.5 * (back + back.T), 0.5 * (solution + solution.T)
     error, jumps, full = np.inf, 0, solution
     watch, lifts = RankWatch(), Lifts()
@@ -157,10 +142,7 @@ def _doubled_once(
 
 
 def _solved_in_place(matrix: FloatArray, rows: FloatArray) -> bool:
-    """Replace ``rows`` (k, n) by ``rows @ inv(matrix)``, both in C order; false where the matrix is singular.
-
-    NumPy's solve would copy both, which for small matrices takes longer than the factorisation.
-    """
+    """Replace ``rows (k, n)`` by ``rows @ inv(matrix)``, both in C order, uncopied; false where singular."""
     from scipy.linalg.lapack import dgesv
 
     _, _, found, failed = dgesv(matrix.T, rows.T, overwrite_a=1, overwrite_b=1)
@@ -169,19 +151,11 @@ def _solved_in_place(matrix: FloatArray, rows: FloatArray) -> bool:
     return not failed
 
 
-def gain_is_below(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, level: float) -> bool:
-    """Return whether a Riccati equation says that the H-infinity norm of a stable system is at most ``level``."""
-    return compared_gain(a, b, c, d, level) is True
-
-
 def compared_gain(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, level: float) -> bool | None:
     """Return whether the H-infinity norm of a stable system is at most ``level``; ``None`` where that is not told.
 
-    Any symmetric solution with ``W = level^2 I - D'D - B'PB > 0`` factors ``level^2 I - G~G`` as ``M~ W M >= 0``; its
-    residual is judged against what it is made of.  Over finitely many steps the gain is no larger, so that W > 0 fails
-    there only if the norm is above the level.
-
-    Shapes: ``a (n, n)``, ``b (n, m)``, ``c (p, n)``, ``d (p, m)``.
+    A symmetric solution with ``W = level^2 I - D'D - B'PB > 0`` factors ``level^2 I - G~G`` as ``M~ W M >= 0``; W > 0
+    fails over finitely many steps only if the norm is above the level.
     """
     process, cross = c.T @ c, c.T @ d
     gap = d.T @ d - level**2 * np.eye(b.shape[1])

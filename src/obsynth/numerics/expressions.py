@@ -55,11 +55,7 @@ def _as_it_is(operation: Callable[..., Any]) -> Callable[..., Any]:
 
 @dataclass(frozen=True)
 class Expression:
-    """An expression that was parsed and can be evaluated.
-
-    Fields: text: As written; names: The names whose values are needed; rates: What ``der(...)`` is taken of, by the
-    name under which the value of the derivative is looked up.
-    """
+    """An expression that was parsed: its text, the names whose values it needs, and what ``der(...)`` is taken of."""
 
     text: str
     names: frozenset[str]

@@ -32,11 +32,9 @@ CONSISTENCY = 1e-9
 
 
 class LeastSquaresStep(NamedTuple):
-    """What one step gives.
+    """``estimate (n, columns)``, ``P = factor factor'``, the whitened parity ``innovation (m, columns)``, and
 
-    Fields: estimate: ``(n, columns of Y)``: the linear map applied to each column of Y; factor: ``(n, n)`` with ``P =
-    factor factor'``; innovation: ``(m, columns of Y)``, the whitened parity: for the column that holds the data it is
-    N(0, I); diffuse: ``(n, r)``: directions of x about which nothing is known; r = 0 unless samples are missing.
+    ``diffuse (n, r)``: directions of x about which nothing is known, none unless samples are missing.
     """
 
     estimate: FloatArray
@@ -46,11 +44,7 @@ class LeastSquaresStep(NamedTuple):
 
 
 class Projection(NamedTuple):
-    """The orthogonal factorisation of H, which may serve many steps.
-
-    Fields: rotation: ``(rows, rows)``: ``[Q_2'; Q_1']``, parity first; head: ``(n, n)``: R_H, upper triangular; lower:
-    ``(n, n)``: ones on and below the diagonal.
-    """
+    """The QR factorisation of H: ``rotation [Q_2'; Q_1']``, ``head`` R_H, ``lower`` ones on and below the diagonal."""
 
     rotation: FloatArray
     head: FloatArray
@@ -58,10 +52,7 @@ class Projection(NamedTuple):
 
 
 def projection_of(H: FloatArray, *, least: float = DEPENDENT_COLUMN) -> Projection | None:
-    """Return the factorisation of H, or ``None`` where its rank has to be decided.
-
-    Shapes: ``H (rows, n)``; ``least`` is the share of its length that a column must keep beside the others.
-    """
+    """Return the factorisation of ``H (rows, n)``, or ``None`` where its rank has to be decided."""
     from scipy.linalg.lapack import dgeqrf, dormqr
 
     rows, n = H.shape
@@ -89,11 +80,10 @@ def noise_triangle(noise: FloatArray) -> FloatArray:
 def projected_step(
     projection: Projection, noise: FloatArray, data: FloatArray, *, known: FloatArray | None = None
 ) -> LeastSquaresStep | None:
-    """Solve one step from rotated noise and data, or return ``None`` where the rank of the noise has to be decided.
+    """Solve one step from rotated noise ``(s, rows)`` and data; ``None`` where the rank of the noise is to be decided.
 
-    Noise that outgrows double precision is left to the caller too.
-
-    Shapes: ``noise (s, rows)``, ``data (rows, columns)``; ``known (rows, rows)``: triangular factor of more noise.
+    ``known (rows, rows)``: triangular factor of more noise. Noise that outgrows double precision is left to the caller
+    too.
     """
     from scipy.linalg.lapack import dgeqrf, dtpqrt, dtrtrs
 
@@ -126,14 +116,10 @@ def projected_step(
 def least_squares_step(
     H: FloatArray, S: FloatArray, Y: FloatArray, *, least: float = DEPENDENT_COLUMN
 ) -> LeastSquaresStep | None:
-    r"""Solve one step by LAPACK alone, or return ``None`` where a rank has to be decided.
+    """Solve one step by LAPACK alone, or return ``None`` where a rank has to be decided.
 
-    .. math::
-        H = [Q_1\ Q_2]\begin{bmatrix} R_H \\ 0 \end{bmatrix}, \quad
-        \begin{bmatrix} Q_2^T S \\ Q_1^T S \end{bmatrix} = \begin{bmatrix} L & 0 \\ X & T \end{bmatrix} Z^T, \quad
-        v = L^{-1} Q_2^T Y, \quad x = R_H^{-1} (Q_1^T Y - X v), \quad P = R_H^{-1} T T^T R_H^{-T}
-
-    Shapes: ``H (rows, n)``, ``S (rows, s)``, ``Y (rows, columns)``.
+    With ``H = [Q_1 Q_2] [R_H; 0]`` and ``[Q_2'; Q_1'] S = [L 0; X T] Z'``: ``v = L^-1 Q_2' Y``, ``x = R_H^-1 (Q_1' Y -
+    X v)`` and ``P = R_H^-1 T T' R_H^-T``.
     """
     projection = projection_of(H, least=least)
     if projection is None:
@@ -144,10 +130,7 @@ def least_squares_step(
 def rank_revealing_step(
     H: FloatArray, S: FloatArray, Y: FloatArray, unknown: FloatArray, *, mapped: int = 0
 ) -> LeastSquaresStep:
-    """Solve one step in which x may be undetermined, noise may be missing, and earlier directions are unknown.
-
-    Shapes: ``unknown (rows, r)``.
-    """
+    """Solve one step in which x may be undetermined, noise missing, and earlier directions ``unknown (rows, r)``."""
     from scipy.linalg import qr, solve_triangular
 
     n = H.shape[1]
@@ -175,10 +158,7 @@ def rank_revealing_step(
 
 
 def _basis(null: FloatArray, lengths: FloatArray) -> FloatArray:
-    """Return an orthonormal basis of what the null space leaves open in x, beside the earlier unknowns.
-
-    Where those alone are left open, the part of x is rounding, which must not pass for a direction.
-    """
+    """Return an orthonormal basis of what the null space leaves open in x, not counting rounding."""
     n = len(lengths)
     if not null.shape[1]:
         return np.zeros((n, 0))

@@ -63,21 +63,14 @@ def imported(module: str, *, extra: str | None, what: str = "This") -> Any:
 #: Problems with fewer states than this run on one BLAS thread: two took more time wherever they were measured, up to
 #: twelve times as much at 100 states (``benchmarks/README.md``).
 STATES_WORTH_THREADS = 1000
-
-
 _Function = TypeVar("_Function", bound=Callable[..., Any])
-
-
 #: Held by the block that has set the number of threads.
 _SETTING = threading.Lock()
 
 
 @lru_cache(maxsize=1)
 def _libraries(_modules: int) -> ThreadpoolController:
-    """Return the libraries loaded by so many modules: finding them takes longer than a small design, so only once.
-
-    A library comes with a module that is imported, and they are looked for again when there are more.
-    """
+    """Return the libraries loaded by so many modules: looked for again only when there are more, as that takes long."""
     from threadpoolctl import ThreadpoolController
 
     return ThreadpoolController()
@@ -85,10 +78,7 @@ def _libraries(_modules: int) -> ThreadpoolController:
 
 @contextmanager
 def one_thread_if_small(states: int) -> Iterator[None]:
-    """Run a block on one BLAS thread if the problem has fewer than `STATES_WORTH_THREADS` states.
-
-    While another such block runs, inside this one or beside it, nothing is set: the number is that one's business.
-    """
+    """Run a block on one BLAS thread below `STATES_WORTH_THREADS` states; inside or beside another, nothing is set."""
     if states >= STATES_WORTH_THREADS or not _SETTING.acquire(blocking=False):
         yield
         return

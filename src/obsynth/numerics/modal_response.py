@@ -1,7 +1,4 @@
-"""Where a frequency response peaks, in coordinates of eigenvectors: a place to look, judged by others.
-
-Where the gain of a discrete-time system crosses a level: eigenvalues of a symplectic pencil on the unit circle.
-"""
+"""Where a frequency response peaks, by its modes, and where it crosses a level, by a symplectic pencil."""
 
 from __future__ import annotations
 
@@ -26,10 +23,7 @@ POWER_STEPS, ROUGH_STEPS = 8, 4
 
 
 class Modes(NamedTuple):
-    """Eigenvalues and eigenvectors of a matrix.
-
-    Fields: values: ``(n,)``; vectors: ``(n, n)``, as columns.
-    """
+    """Eigenvalues ``(n,)`` and eigenvectors of a matrix, as columns."""
 
     values: ComplexArray
     vectors: ComplexArray
@@ -50,10 +44,7 @@ class Modes(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ModalResponse:
-    """``C (z I - A)^-1 B + D`` with ``A = V diag(poles) V^-1``: cheap at many points, exact as far as V is regular.
-
-    Fields: poles: ``(n,)``; shown, driven: ``C V (p, n)`` and ``V^-1 B (n, m)``; direct: D ``(p, m)``.
-    """
+    """``C (z I - A)^-1 B + D``, ``A = V diag(poles) V^-1``: ``shown`` is C V ``(p, n)``, ``driven`` V^-1 B."""
 
     poles: ComplexArray
     shown: ComplexArray
@@ -76,7 +67,7 @@ class ModalResponse:
     def gains(self, angles: FloatArray, *, roughly: bool = False) -> FloatArray:
         """Return the largest singular value at each angle, zero where it is no number; an estimate for many states.
 
-        Roughly it may be the eighth root of the sum of the eighth powers of all singular values, or further below.
+        Roughly: at most the eighth root of the sum of the eighth powers of all singular values.
         """
         factors = 1.0 / (np.exp(1j * angles)[:, None] - self.poles)
         order = min(self.direct.shape)
@@ -160,11 +151,8 @@ def level_crossings(
 ) -> tuple[FloatArray, float]:
     """Return the angles in [0, pi] at which a singular value equals ``level``, and the distance of the closest miss.
 
-    The transfer function has the singular value g at e^{jw} exactly when the pencil
-    ``z [I 0; C'C + C'D R^-1 D'C, A' + C'D R^-1 B'] - [A + B R^-1 D'C, B R^-1 B'; 0 I]``, with
-    ``R = g^2 I - D'D``, is singular at z = e^{jw}.
-
-    Shapes: ``a (n, n)``, ``b (n, m)``, ``c (p, n)``, ``d (p, m)``.
+    There ``z [I 0; C'C + C'D R^-1 D'C, A' + C'D R^-1 B'] - [A + B R^-1 D'C, B R^-1 B'; 0 I]``, ``R = g^2 I - D'D``, is
+    singular.
     """
     root = np.sqrt(level)
     b, c, d = b / root, c / root, d / level
@@ -187,9 +175,8 @@ def level_crossings(
 def _pencil_eigenvalues(right: FloatArray, left: FloatArray) -> tuple[ComplexArray, ComplexArray]:
     """Return alpha and beta of the eigenvalues ``z = alpha / beta`` of ``right - z left``.
 
-    With ``z = (1 + s) / (1 - s)`` these are ordinary ones, of ``(right + left)^-1 (right - left)``, where that can be
-    inverted without harm, which it cannot if there is one close to -1; or the same with ``-left`` and -z, and +1.  The
-    circle becomes the imaginary axis.
+    With ``z = (1 + s) / (1 - s)`` ordinary ones, of ``(right + left)^-1 (right - left)``, where none is close to -1; or
+    with ``-left``, -z and +1. The circle becomes the imaginary axis.
     """
     from scipy.linalg import eigvals
     from scipy.linalg.lapack import dgecon, dgetrf, dgetrs

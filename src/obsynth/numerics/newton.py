@@ -27,10 +27,7 @@ MOST_HALVINGS = 12
 
 @dataclass(frozen=True, eq=False)
 class ScaledMatrix:
-    """A square matrix with columns scaled by given sizes and rows scaled to a largest entry of one.
-
-    Fields: matrix: ``diag(rows) J diag(columns)``; rows, columns: ``(n,)``.
-    """
+    """A square matrix ``diag(rows) J diag(columns)``: columns in given sizes, a largest entry of one in each row."""
 
     matrix: FloatArray
     rows: FloatArray
@@ -38,10 +35,7 @@ class ScaledMatrix:
 
     @classmethod
     def of(cls, jacobian: FloatArray, columns: FloatArray) -> ScaledMatrix:
-        """Scale a matrix.
-
-        Shapes: ``jacobian (n, n)``, ``columns (n,)``.
-        """
+        """Scale a matrix ``(n, n)`` by columns ``(n,)``."""
         scaled = jacobian * columns
         peaks = np.abs(scaled).max(axis=1)
         rows = 1.0 / np.where(peaks > 0.0, peaks, 1.0)
@@ -59,10 +53,7 @@ class ScaledMatrix:
 
 
 def condition_number(matrix: FloatArray) -> float:
-    """Return the condition number of a matrix; infinite where it is singular or not finite.
-
-    Shapes: ``matrix (n, n)``.
-    """
+    """Return the condition number of a matrix ``(n, n)``; infinite where it is singular or not finite."""
     if not np.isfinite(matrix).all():
         return float("inf")
     values = np.linalg.svd(matrix, compute_uv=False)
@@ -71,11 +62,7 @@ def condition_number(matrix: FloatArray) -> float:
 
 @dataclass(frozen=True, eq=False)
 class NewtonResult:
-    """Where an iteration ended.
-
-    Fields: x: ``(n,)``; converged: The verdict; iterations: Steps taken; residuals: ``(n,)``: the last residuals in
-    units of the unknowns' sizes.
-    """
+    """Where an iteration ended; ``residuals (n,)``: the last ones in units of the unknowns' sizes."""
 
     x: FloatArray
     converged: bool
@@ -96,10 +83,7 @@ class NewtonResult:
 def newton(
     evaluate: Callable[[FloatArray], tuple[FloatArray, FloatArray]], start: FloatArray, sizes: FloatArray
 ) -> NewtonResult:
-    """Solve ``f(x) = 0``.
-
-    Shapes: ``start (n,)``, ``sizes (n,)``.
-    """
+    """Solve ``f(x) = 0`` from a start and sizes of the unknowns ``(n,)``."""
     x = start.copy()
     value, jacobian = evaluate(x)
     residuals = np.full(len(x), np.inf)
@@ -146,12 +130,7 @@ SINGULAR = 1e-16
 
 
 def equilibrated(matrix: Any, columns: FloatArray) -> tuple[Any, Any]:
-    """Return ``diag(rows) J diag(columns)`` with a largest entry of one in each row, and ``rows``.
-
-    The same scaling as `obsynth.numerics.newton.ScaledMatrix`.
-
-    Shapes: ``matrix (n, n)``, ``columns (n,)``.
-    """
+    """Return ``diag(rows) J diag(columns)`` and ``rows``: the scaling of `ScaledMatrix` inside a graph."""
     import casadi as ca
 
     scaled = ca.densify(matrix) @ ca.diag(ca.DM(columns))
@@ -172,18 +151,12 @@ def largest_entries(matrix: Any) -> Any:
 
 
 def solved(matrix: Any, right: Any) -> Any:
-    """Return ``A^-1 B`` with row pivots; not finite where A is singular.
-
-    Shapes: ``matrix (n, n)``, ``right (n, m)``.
-    """
+    """Return ``A^-1 B`` with row pivots; not finite where A is singular."""
     return _solution(matrix, right, pivots=True)
 
 
 def definite_solved(matrix: Any, right: Any) -> Any:
-    """Return ``A^-1 B`` for a positive definite A, scaled to a unit diagonal first.
-
-    Shapes: ``matrix (n, n)``, ``right (n, m)``.
-    """
+    """Return ``A^-1 B`` for a positive definite A, scaled to a unit diagonal first."""
     import casadi as ca
 
     scale = 1.0 / ca.sqrt(ca.diag(matrix))

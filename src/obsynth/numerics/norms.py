@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from obsynth.numerics.arrays import ComplexArray, FloatArray
-from obsynth.numerics.doubling import compared_gain, gain_is_below
+from obsynth.numerics.doubling import compared_gain
 from obsynth.numerics.modal_response import ModalResponse, Modes, level_crossings
 from obsynth.numerics.scaling import balancing_factors
 
@@ -35,13 +35,10 @@ MAXIMUM_DOUBLINGS = 64
 
 @dataclass(frozen=True)
 class HinfNorm:
-    """The H-infinity norm of a stable discrete-time system.
+    """The H-infinity norm of a stable discrete-time system: ``value`` is attained, at ``angle`` in radians per sample.
 
-    Fields: value: Largest singular value found on the unit circle: a lower bound that is attained; upper: Level at
-    which the symplectic pencil has no eigenvalue on the unit circle or, for many states, a Riccati equation has a
-    solution: the norm is below it, as far as double precision can tell (computed, not proved); angle: Where the peak
-    is, radians per sample; distance: Distance of the closest eigenvalue of that pencil from the unit circle; NaN where
-    there was none.
+    ``upper``: level at which the symplectic pencil has no eigenvalue on the circle, or a Riccati equation a solution
+    (computed, not proved); ``distance``: of the closest eigenvalue from the circle, NaN without a pencil.
     """
 
     value: float
@@ -77,12 +74,9 @@ def resolved(e: FloatArray, a: FloatArray, b: FloatArray, points: ComplexArray) 
 
 
 def hinf_norm(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, *, modes: Modes | None = None) -> HinfNorm:
-    """Return the H-infinity norm of a discrete-time system.
+    """Return the H-infinity norm of a discrete-time system: Bruinsma and Steinbuch's iteration.
 
-    Bruinsma and Steinbuch's iteration: raise the level to the largest gain found, ask the symplectic pencil
-    where the gain crosses that level, look between the crossings, until there are none.
-
-    Shapes: ``a (n, n)``, ``b (n, m)``, ``c (p, n)``, ``d (p, m)``.
+    Raise the level to the largest gain found and look between the crossings of that level, until there are none.
     """
     if b.shape[1] == 0 or c.shape[0] == 0:
         return HinfNorm(0.0, 0.0, 0.0, np.inf)
@@ -118,12 +112,7 @@ def hinf_norm(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, *, mod
 def norm_is_at_most(
     a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, level: float, *, modes: Modes | None = None
 ) -> bool:
-    """Return whether the H-infinity norm of a discrete-time system is at most ``level``, as cheaply as can be told.
-
-    By a Riccati equation or, where that leaves it open, by the norm.
-
-    Shapes: ``a (n, n)``, ``b (n, m)``, ``c (p, n)``, ``d (p, m)``.
-    """
+    """Return whether the H-infinity norm is at most ``level``: by a Riccati equation, else by the norm."""
     if a.shape[0] == 0 or b.shape[1] == 0 or c.shape[0] == 0:
         return hinf_norm(a, b, c, d).upper <= level
     if not all(np.all(np.isfinite(part)) for part in (a, b, c, d)):
@@ -142,19 +131,13 @@ def norm_is_at_most(
 def highest_gain_found(
     a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, *, modes: Modes | None = None
 ) -> float:
-    """Return the H-infinity norm or, for many states, the largest gain that a modal response shows: it is attained.
-
-    Shapes: ``a (n, n)``, ``b (n, m)``, ``c (p, n)``, ``d (p, m)``.
-    """
+    """Return the H-infinity norm or, for many states, the largest gain that a modal response shows: attained."""
     many = a.shape[0] > STATES_OF_PENCIL
     return largest_peak(a, b, c, d, modes=modes) if many else hinf_norm(a, b, c, d, modes=modes).upper
 
 
 def largest_peak(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, *, modes: Modes | None = None) -> float:
-    """Return the largest gain that a modal response shows, the H-infinity norm where that is not to be believed.
-
-    Shapes: ``a (n, n)``, ``b (n, m)``, ``c (p, n)``, ``d (p, m)``.
-    """
+    """Return the largest gain that a modal response shows, the H-infinity norm where that is not to be believed."""
     modes = Modes.of(a) if modes is None else modes
     if modes.radius >= 1.0:
         return float("inf")
@@ -168,15 +151,12 @@ def largest_peak(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, *, 
 
 
 def _norm_of_many_states(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, modes: Modes) -> HinfNorm | None:
-    """Return the norm from the highest peak of a modal response and a Riccati equation just above it.
-
-    ``None`` where the equation has no solution there: the peak was missed, or the data are too hard for doubling.
-    """
+    """Return the norm from the highest modal peak and a Riccati equation just above; ``None`` where that has none."""
     best, angle = _modal_peak(a, b, c, d, modes, points=MANY_GRID_POINTS)
     if not np.isfinite(best) or best == 0.0:
         return None
     for tolerance in WIDER_TOLERANCES:
-        if gain_is_below(a, b, c, d, best * (1.0 + tolerance)):
+        if compared_gain(a, b, c, d, best * (1.0 + tolerance)):
             return HinfNorm(best, best * (1.0 + tolerance), angle, np.nan)
     return None
 
@@ -214,7 +194,7 @@ def _highest_peak(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, mo
 
 def balanced_realisation(a: FloatArray, b: FloatArray, c: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the realisation with its states scaled by powers of two, which is exact: units must not cost digits."""
-    scale = _state_units(a, b, c)
+    scale = state_units(a, b, c)
     return a * scale / scale[:, None], b / scale[:, None], c * scale
 
 
@@ -222,12 +202,13 @@ def _balanced(
     a: FloatArray, b: FloatArray, c: FloatArray, modes: Modes
 ) -> tuple[FloatArray, FloatArray, FloatArray, Modes]:
     """Return the realisation of `balanced_realisation` and its modes."""
-    scale = _state_units(a, b, c)
+    scale = state_units(a, b, c)
     moved = Modes(modes.values, modes.vectors / scale[:, None])
     return a * scale / scale[:, None], b / scale[:, None], c * scale, moved
 
 
-def _state_units(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
+def state_units(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
+    """Return powers of two ``(n,)``, the units of the states in which a realisation is balanced."""
     n, inputs, outputs = a.shape[0], b.shape[1], c.shape[0]
     system = np.zeros((n + inputs + outputs, n + inputs + outputs))
     system[:n, :n], system[:n, n : n + inputs], system[n + inputs :, :n] = a, b, c
@@ -245,10 +226,7 @@ def _peak(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, angles: Fl
 
 
 def output_covariance(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> FloatArray:
-    """Return the stationary covariance ``(p, p)`` of the output under white input of unit covariance.
-
-    Infinite when ``a`` is not Schur stable, or when the numbers overflow.
-    """
+    """Return the covariance ``(p, p)`` of the output under unit white noise; infinite if unstable or on overflow."""
     infinite = np.full((c.shape[0], c.shape[0]), np.inf)
     if not np.all(np.isfinite(a)) or spectral_radius(a) >= 1.0:
         return infinite

@@ -1,8 +1,7 @@
 """Whether a tall pencil loses rank at given points, and the staircase (Van Dooren) of its infinite and singular parts.
 
-In the Schur basis of the part on the range of E a pencil is ``[T - z I; W]`` with T triangular and few rows W: the
-Schur form is taken once, and the QR factorisation at a point is that of a triangle with a few rows below (``tpqrt``).
-Smallest singular values come from one QR factorisation and inverse iteration, in a tenth of the time of all of them.
+In the Schur basis of the part on the range of E it is ``[T - z I; W]``, T triangular, few rows W: one Schur form, then
+a cheap QR (``tpqrt``) at each point and inverse iteration, in a tenth of the time of all singular values.
 """
 
 from __future__ import annotations
@@ -33,10 +32,7 @@ class SmallestSingular(NamedTuple):
 
 
 def smallest_singular(matrix: NDArray[Any], count: int = 1) -> SmallestSingular:
-    """Return the smallest singular values of a matrix ``(m, n)``, ``m >= n``, with right singular vectors.
-
-    What is returned for a value is the length of the matrix times a unit vector: never less than the smallest one.
-    """
+    """Return the smallest singular values of a matrix ``(m, n)``, ``m >= n``, or more, with right singular vectors."""
     if matrix.shape[1] < FEW_COLUMNS:
         _, values, right = np.linalg.svd(matrix)
         order = slice(None, -count - 1, -1)

@@ -1,14 +1,7 @@
-r"""Structure of matrix pencils ``A - z E`` of any shape, by orthogonal transformations only.
+"""Structure of matrix pencils ``A - z E`` of any shape, by orthogonal transformations only.
 
-The staircase reduction of Van Dooren: compress the columns of ``E``; the part of ``A`` on its null
-space, compressed by rows, is infinite or singular structure and is deflated; repeat; then do the
-same with the transposed pencil.  What is left is square with nonsingular ``E`` and holds exactly the
-finite zeros, so no generalised eigenvalue has to be recognised as infinite by its size.
-
-References
-----------
-.. [VanDooren1979] P. Van Dooren, "The computation of Kronecker's canonical form of a singular
-   pencil", Linear Algebra and its Applications 27, 1979.
+P. Van Dooren, Linear Algebra and its Applications 27, 1979: what the staircase leaves is square with nonsingular E and
+holds the finite zeros, so that no generalised eigenvalue has to be recognised as infinite by its size.
 """
 
 from __future__ import annotations
@@ -40,13 +33,10 @@ TIE = 4.0
 
 @dataclass(frozen=True, eq=False)
 class PencilStructure:
-    """What a pencil ``A - z E`` looks like.
+    """What a pencil ``A - z E`` looks like; finite eigenvalues with multiplicity, conjugate pairs exact.
 
-    Fields: rows, columns: Its shape; regular: Square with a determinant that is not identically zero; normal_rank: Rank
-    of ``A - z E`` at almost every ``z``; index: Size of the largest infinite block, 0 for nonsingular ``E``; None when
-    not regular; finite_eigenvalues: ``(k,)``, finite zeros with multiplicity, read-only; conjugate pairs are exact;
-    infinite_block_sizes: Sizes of the Jordan blocks at infinity, largest first; decisions: Every rank decided on the
-    way, in order, relative to the norm of the equilibrated pencil.
+    ``index``: size of the largest infinite block, 0 for nonsingular E, None when not regular; ``infinite_block_sizes``:
+    largest first; ``decisions``: every rank decided on the way, relative to the norm of the equilibrated pencil.
     """
 
     rows: int
@@ -61,11 +51,7 @@ class PencilStructure:
 
 @dataclass(frozen=True, eq=False)
 class FiniteZeros:
-    """The points where a pencil loses rank.
-
-    Fields: values: ``(k,)``, with multiplicity, read-only; conjugate pairs are exact; normal_rank: Rank of the pencil
-    at almost every point; decisions: Every rank decided on the way.
-    """
+    """The points where a pencil loses rank, with multiplicity; conjugate pairs are exact."""
 
     values: ComplexArray
     normal_rank: int
@@ -73,12 +59,7 @@ class FiniteZeros:
 
 
 def pencil_structure(E: FloatArray, A: FloatArray) -> PencilStructure:
-    """Return the structure of ``A - z E`` for matrices ``(m, n)`` of any size, including zero.
-
-    References
-    ----------
-    .. [VanDooren1979] Algorithms 3.1 and 4.1.
-    """
+    """Return the structure of ``A - z E (m, n)`` of any size, including zero (Algorithms 3.1 and 4.1)."""
     right, left = reduce_pencil(equilibrate_pencil(E, A))
     rows, columns = E.shape
     regular = _is_regular(E, right)
@@ -98,14 +79,7 @@ def pencil_structure(E: FloatArray, A: FloatArray) -> PencilStructure:
 
 
 def finite_zeros(E: FloatArray, A: FloatArray, *, to_the_end: bool = True) -> FiniteZeros:
-    """Return the points where ``rank (A - z E)`` drops below the normal rank, with multiplicity.
-
-    Shapes: ``E (m, n)``, ``A (m, n)``.
-
-    References
-    ----------
-    .. [VanDooren1979] Algorithms 3.1 and 4.1.
-    """
+    """Return the points where ``rank (A - z E)``, ``(m, n)``, drops below the normal rank, with multiplicity."""
     # A tall pencil leaves the long chains to the second pass, whose findings can be checked below.
     tall = equilibrate_pencil(E, A) if E.shape[0] >= E.shape[1] else equilibrate_pencil(E.T, A.T)
     scales, right = without_infinite_part(tall)
@@ -139,10 +113,7 @@ def _confirmed_zeros(found: ComplexArray, points: PencilPoints) -> ComplexArray:
 
 
 class _SquarePart(NamedTuple):
-    """A tall pencil, ``E`` of full column rank, in an orthonormal basis of the range of ``E`` and of what is beside it.
-
-    ``E`` and ``A`` are square; ``rest`` holds the rows of A beside, where E has none.
-    """
+    """A tall pencil in orthonormal bases of the range of E (``E``, ``A`` square) and beside it (``rest``)."""
 
     E: FloatArray
     A: FloatArray
@@ -156,11 +127,9 @@ class _SquarePart(NamedTuple):
 
 
 def _with_missed_zeros(found: ComplexArray, candidates: ComplexArray, points: PencilPoints) -> ComplexArray:
-    """Add zeros of a tall pencil, ``E`` of full column rank, that a long staircase lost.
+    """Add zeros of a tall pencil, E of full column rank, that a long staircase lost.
 
-    A chain of many steps, each with a modest singular value, may hide that the pencil is singular at
-    some point.  All zeros are among the eigenvalues of the part on the range of ``E``, and each of
-    these candidates can be tested by itself.
+    All zeros are among the eigenvalues of the part on the range of E, and each can be tested by itself.
     """
     zeros = list(found)
     nullities: dict[complex, int] = {}
@@ -244,10 +213,7 @@ def _candidates(parts: _SquarePart) -> tuple[ComplexArray, NDArray[np.bool_]]:
 
 
 def regularity(E: FloatArray, A: FloatArray) -> tuple[bool, int]:
-    """Return whether ``A - z E`` is regular, and its normal rank; what `pencil_structure` says without eigenvalues.
-
-    Shapes: ``E (m, n)``, ``A (m, n)``.
-    """
+    """Return whether ``A - z E (m, n)`` is regular, and its normal rank, without eigenvalues."""
     right, left = reduce_pencil(equilibrate_pencil(E, A))
     return _is_regular(E, right), normal_rank_of(right, left)
 

@@ -87,14 +87,11 @@ def rounding_rank(matrix: FloatArray) -> int:
 
 @dataclass(frozen=True, eq=False)
 class RankDecision:
-    """A numerical rank, with the evidence for it.
+    """A numerical rank with the evidence: all singular values, largest first, as decided upon (rows, columns scaled).
 
-    Fields: rank: The decided rank; expected: Full rank for the purpose at hand (usually the smaller dimension);
-    singular_values: All singular values, largest first, of the matrix as decided upon (rows and columns scaled);
-    smallest_kept, largest_dropped: The singular values on both sides of the cut, relative to the largest (0 where there
-    is none); gap: ``smallest_kept / largest_dropped``; infinite when nothing, or only an exact zero, was dropped; when
-    the rank is full, the distance to the tolerance instead; share: The last singular value beside the terms that the
-    entries are sums of, where those are known.
+    ``smallest_kept``, ``largest_dropped``: relative to the largest; ``gap``: their ratio, infinite when only exact
+    zeros were dropped, the distance to the tolerance when the rank is full; ``share``: the last value beside the terms
+    it is a sum of.
     """
 
     rank: int
@@ -183,7 +180,7 @@ def rank_from(
 def covariance_factor(covariance: FloatArray, name: str) -> FloatArray:
     """Return ``F (n, n)`` with ``F F' = covariance``; zero variances and singular matrices are allowed.
 
-    The factor is taken of the correlation matrix, so that variances of 1e-30 beside 1 keep all their digits.
+    Of the correlation matrix, so that variances of 1e-30 beside 1 keep all their digits.
     """
     if covariance.ndim != 2 or covariance.shape[0] != covariance.shape[1]:
         raise SpecError(f"{name} has shape {covariance.shape}: a covariance must be square.", path=name)
@@ -220,10 +217,7 @@ def covariance_factor(covariance: FloatArray, name: str) -> FloatArray:
 
 
 def is_definite(covariance: FloatArray, factor: FloatArray) -> bool:
-    """Return whether a covariance is positive definite, judged by its correlations so that units do not matter.
-
-    Shapes: ``covariance (n, n)``.
-    """
+    """Return whether a covariance is positive definite, by its correlations, so that units do not matter."""
     variances = np.diag(covariance)
     if not np.all(variances > 0.0):
         return False

@@ -1,10 +1,6 @@
-"""Balancing by powers of two: exact in floating point, so that mapping back loses nothing.
+"""Balancing by powers of two, exact in floating point; units by least squares on the logarithms of the entries.
 
-Units in which the entries of several matrices are near one, by robust least squares on their logarithms.
-
-Changing the units of the data only shifts the unknowns, and every pass keeps it at that, so that the scaled matrices
-are the same whatever units the data came in.  Rounding the factors to powers of two makes the scaling exact, at the
-price of a factor of two in that.
+The unknowns only shift with the units of the data: up to the rounding of exponents, the result does not depend on them.
 """
 
 from __future__ import annotations
@@ -24,14 +20,9 @@ SMALL_RIDGE = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Scaling:
-    """Power-of-two factors for the equations, states and outputs of a plant.
+    """Powers of two for a plant: ``diag(equations) E diag(states)``, ``diag(outputs) C diag(states)`` and so on.
 
-    The scaled plant is ``diag(equations) E diag(states)``, ``diag(outputs) C diag(states)`` and so
-    on; its state ``z`` is ``x = diag(states) z``, its output ``diag(outputs) y``.
-
-    Fields: equations: ``(nx,)``, multiplies the rows of ``E``, ``A`` and every input-like matrix; states: ``(nx,)``,
-    multiplies the columns of ``E``, ``A`` and every output-like matrix; outputs: ``(ny,)``, multiplies the rows of the
-    stacked output-like matrices.
+    ``equations (nx,)``, ``states (nx,)``, ``outputs (ny,)``; the plant's state is ``x = diag(states) z``.
     """
 
     equations: FloatArray
@@ -57,11 +48,7 @@ class Scaling:
 
 @dataclass(frozen=True, eq=False)
 class EquilibratedPencil:
-    """A pencil ``A - z E`` with rows and columns scaled to largest entries near one.
-
-    Fields: E, A: ``(m, n)``, the scaled pencil ``diag(rows) (A - z E) diag(columns)``; rows, columns: ``(m,)`` and
-    ``(n,)``, powers of two.
-    """
+    """The pencil ``diag(rows) (A - z E) diag(columns)``, its largest entries near one: ``E, A (m, n)``."""
 
     E: FloatArray
     A: FloatArray
@@ -93,12 +80,9 @@ def power_of_two_below(sizes: FloatArray) -> FloatArray:
 
 
 def equilibrate_pencil(E: FloatArray, A: FloatArray) -> EquilibratedPencil:
-    """Scale the rows, then the columns, of ``A - z E`` by powers of two to largest entries in [1, 2).
+    """Scale the rows, then the columns, of ``A - z E (m, n)`` by powers of two to largest entries in [1, 2).
 
-    Zeros and Kronecker structure do not change.  One pass is enough: scaling a column up to its
-    largest entry cannot lift an entry above those that already rule their rows.
-
-    Shapes: ``E (m, n)``, ``A (m, n)``.
+    One pass is enough: scaling a column up cannot lift an entry above those that already rule their rows.
     """
     size = np.maximum(np.abs(E), np.abs(A))
     rows = 1.0 / power_of_two_below(_row_peaks(size))
@@ -114,18 +98,10 @@ def equilibrate_pencil(E: FloatArray, A: FloatArray) -> EquilibratedPencil:
 def balance_system(
     E: FloatArray, A: FloatArray, inputs: Sequence[FloatArray] = (), outputs: Sequence[FloatArray] = ()
 ) -> Scaling:
-    """Find power-of-two factors that bring the largest entries of a plant near one.
+    """Find power-of-two factors that bring the largest entries of rows and columns of a plant near one.
 
-    Equations are scaled by the largest entry of the row of ``[E A]`` (of the input-like matrices where
-    that is zero), outputs by their own rows, and states by the column of ``[E; C]``, or of ``A`` where
-    that is zero.  A plant whose rows and columns have largest entries in [1, 2) is left unchanged.
-
-    Shapes: ``E (nx, nx)``, ``A (nx, nx)``, ``inputs (nx, *)``, ``outputs (*, nx)``.
-
-    Notes
-    -----
-    A fast state cannot have both ``E`` and ``A`` near one, so repeated sweeps may drift; a sweep is
-    kept only when it improves the columns.
+    Equations go by the row of ``[E A]`` (else of the inputs), outputs by their rows, states by the column of ``[E; C]``
+    (else of A). A fast state cannot have both E and A near one: a sweep is kept only when it improves the columns.
     """
     nx = E.shape[0]
     e, a = np.abs(E), np.abs(A)
@@ -149,13 +125,8 @@ def balance_by_least_squares(
 ) -> Scaling:
     """Find power-of-two factors that bring all entries of a plant, on the whole, near one.
 
-    The sum of the squared logarithms of all nonzero entries of the scaled ``E``, ``A``, input-like (their columns
-    are free as well) and output-like matrices is least.  The result does not depend on the units of the plant, up
-    to one rounding of each exponent: changing them only shifts the unknowns.
-
-    References
-    ----------
-    R. C. Ward, *Balancing the generalized eigenvalue problem*, SIAM J. Sci. Stat. Comput. 2, 1981.
+    The squared logarithms of all nonzero entries are least; input columns are free. The result does not depend on
+    units. Source: R. C. Ward, *Balancing the generalized eigenvalue problem*, SIAM J. Sci. Stat. Comput. 2, 1981.
     """
     ne, nx = E.shape
     b, c = np.hstack([np.zeros((ne, 0)), *inputs]), np.vstack([np.zeros((0, nx)), *outputs])
@@ -205,10 +176,7 @@ PASSES = 3
 
 @dataclass(eq=False)
 class LogBalance:
-    """Minimise ``log2 abs(M[i, j]) + row[i] + column[j] + common`` over all nonzero entries of matrices.
-
-    Fields: count: Number of unknowns: binary logarithms of factors.
-    """
+    """Minimise ``log2 abs(M[i, j]) + row[i] + column[j] + common`` over all nonzero entries of matrices."""
 
     count: int
     _terms: list[_Term] = field(default_factory=list)
@@ -224,10 +192,7 @@ class LogBalance:
         common: int | None = None,
         weight: float = 1.0,
     ) -> None:
-        """Ask for entries near one.
-
-        Shapes: ``matrix (m, n)``.
-        """
+        """Ask for entries of a matrix ``(m, n)`` near one."""
         there = matrix != 0.0
         sizes = np.log2(np.abs(np.where(there, matrix, 1.0)))
         places = slice(rows.start, rows.stop), slice(columns.start, columns.stop)

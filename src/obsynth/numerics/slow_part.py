@@ -1,11 +1,8 @@
-"""Powers of a stable matrix that have lost rank: the rest of a doubling takes place in fewer states.
+"""Powers of a stable matrix that have lost rank, down to rounding: the rest of a doubling takes place in fewer states.
 
-Doubling squares the dynamics again and again, and what forgets fast is soon gone from the power, down to rounding.
-With ``P = U V'`` of less rank, the equation ``X = H + P (X^-1 + G)^-1 P'`` has the solution ``X = H + U Z U'``, where
-
-``Z = h + p (Z^-1 + g)^-1 p'``, ``p = V' M^-1 U``, ``g = U' G M^-1 U``, ``h = V' M^-1 H V``, ``M = I + H G``,
-
-is of the same form in a lower order; so is the sum ``X = H + P X P'``, where G is zero.
+With ``P = U V'``, ``X = H + P (X^-1 + G)^-1 P'`` is solved by ``X = H + U Z U'``, ``Z = h + p (Z^-1 + g)^-1 p'``, with
+``p = V' M^-1 U``, ``g = U' G M^-1 U``, ``h = V' M^-1 H V``, ``M = I + H G``; so is the sum ``X = H + P X P'``, where G
+is zero.
 """
 
 from __future__ import annotations
@@ -95,10 +92,7 @@ class Lifts:
     def balanced(
         self, power: FloatArray, back: FloatArray, solution: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the three matrices in units in which the diagonal of the solution is near one, which is exact.
-
-        What counts as rounding beside the largest number of a power is then no matter of units.
-        """
+        """Return the matrices in units in which the solution's diagonal is near one, so that rounding has one size."""
         sizes = np.abs(np.diagonal(solution))
         least = LEAST_SIZE * float(np.max(sizes, initial=0.0))
         if not 0.0 < least < np.inf:

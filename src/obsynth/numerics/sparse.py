@@ -1,9 +1,6 @@
-"""Sparse matrices of scipy as checked, read-only data, and dense arrays where they are needed.
+"""Sparse matrices of scipy as checked, read-only data; their structure by pattern: matching, parts, blocks.
 
-Structure of sparse matrices by their pattern alone: matching, over- and underdetermined parts, blocks.
-
-Source: A. L. Dulmage and N. S. Mendelsohn, *Coverings of bipartite graphs*, Canadian J. Math. 10, 1958; the matching
-and the strongly connected components are scipy's.
+Source: A. L. Dulmage and N. S. Mendelsohn, *Coverings of bipartite graphs*, Canadian J. Math. 10, 1958.
 """
 
 from __future__ import annotations
@@ -15,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.arrays import FloatArray, kind_of_entries, read_only
 
 
 def is_sparse(value: Any) -> TypeGuard[Any]:
@@ -26,8 +23,7 @@ def is_sparse(value: Any) -> TypeGuard[Any]:
 def as_sparse_matrix(value: Any, name: str) -> Any:
     """Return a private, finite, read-only float copy of a sparse matrix in CSR form, or in CSC where that was given."""
     if value.dtype.kind not in "fiu":
-        kind = {"b": "booleans", "c": "complex numbers"}.get(value.dtype.kind, "entries that are no numbers")
-        raise SpecError(f"{name} holds {kind}: every entry must be a real number.", path=name)
+        raise SpecError(f"{name} holds {kind_of_entries(value.dtype)}: every entry must be a real number.", path=name)
     if value.ndim != 2:
         raise SpecError(f"{name} has {value.ndim} dimension(s): give a matrix.", path=name)
     copy = (value.copy() if value.format in ("csr", "csc") else value.tocsr(copy=True)).astype(np.float64)
@@ -83,11 +79,9 @@ OWN_ENTRY = 2.0
 
 @dataclass(frozen=True, eq=False)
 class CoarseStructure:
-    """The Dulmage-Mendelsohn parts of a pattern.
+    """The Dulmage-Mendelsohn parts of a pattern: more rows than columns (over), more columns than rows (under).
 
-    Fields: row_of_column: ``(columns,)``: the row that a maximum matching gives to each column, -1 for none; over_rows,
-    over_columns: The overdetermined part: more rows than columns, or empty; under_rows, under_columns: The
-    underdetermined part: more columns than rows, or empty.
+    ``row_of_column``: the row that a maximum matching gives to each column, -1 for none.
     """
 
     row_of_column: Indices
@@ -139,10 +133,7 @@ def _maximum_matching(matrix: Any) -> Indices:
 
 
 def unmatched_instead(pattern: Any, found: CoarseStructure, rows: Indices) -> Indices | None:
-    """Return as many of some rows, the first ones if possible, as a maximum matching leaves unmatched.
-
-    ``None`` where no maximum matching leaves only such rows without a column.
-    """
+    """Return as many of some rows, the first ones if possible, as a maximum matching leaves free; else ``None``."""
     row_of_column = found.row_of_column.copy()
     unmatched = np.setdiff1d(np.arange(pattern.shape[0]), row_of_column)
     chosen = list[int]()

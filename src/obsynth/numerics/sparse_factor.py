@@ -30,11 +30,7 @@ SAMPLES, SAMPLED = 8, 8.0
 
 @dataclass(frozen=True, eq=False)
 class SolutionBounds:
-    """How well a sparse system was solved.
-
-    Fields: condition: Estimate of the 1-norm condition number of the scaled matrix; backward_error: Largest
-    componentwise backward error that refinement left.
-    """
+    """How well a sparse system was solved: estimated 1-norm condition, scaled, and componentwise backward error."""
 
     condition: float
     backward_error: float
@@ -55,9 +51,9 @@ class NullVectors:
 
 
 class SparseFactor:
-    """LU factors of a square sparse matrix, with rows and columns scaled by powers of two.
+    """LU factors of a square sparse matrix, with rows and columns scaled by powers of two by their largest entries.
 
-    By their largest entries; with ``by_all`` such that all entries are near one first, whatever units they are in.
+    With ``by_all`` such that all entries are near one first, whatever units they are in.
     """
 
     def __init__(self, matrix: Any, *, by_all: bool = False) -> None:
@@ -65,8 +61,10 @@ class SparseFactor:
         from scipy.sparse.linalg import splu
 
         given = csr(matrix)
-        ones = np.ones(given.shape[0]), np.ones(given.shape[1])
-        self.rows, self.columns = scales_by_all_entries(given) if by_all else ones
+        self.rows: FloatArray = np.ones(given.shape[0])
+        self.columns: FloatArray = np.ones(given.shape[1])
+        if by_all:
+            self.rows, self.columns = scales_by_all_entries(given)
         for _ in range(SCALING_SWEEPS):
             self.rows /= power_of_two_below(_peaks(_scaled(given, self.rows, self.columns), axis=1))
             self.columns /= power_of_two_below(_peaks(_scaled(given, self.rows, self.columns), axis=0))
@@ -162,10 +160,9 @@ class SparseFactor:
         return self.columns[wanted][:, None] * found
 
     def usual_size_of_terms(self, solution: FloatArray) -> FloatArray:
-        """Return an estimate of `size_of_terms` of all rows with sums of squares for sums: terms of random signs.
+        """Return an estimate of `size_of_terms` of all rows, with sums of squares: terms of random signs.
 
-        The sum itself lies between it and its product with the root of ``size``; eight samples are within a factor of
-        `SAMPLED` of the truth.
+        The sum is at most the root of ``size`` times it; eight samples are within `SAMPLED` of the truth.
         """
         terms = abs(self.matrix) @ (np.abs(solution) / self.columns[:, None])
         signs = np.random.default_rng(2).choice((-1.0, 1.0), (SAMPLES, *terms.shape))
@@ -180,10 +177,9 @@ def sparse_factor(matrix: Any) -> SparseFactor:
 
 
 def scales_by_all_entries(matrix: Any) -> tuple[FloatArray, FloatArray]:
-    """Return powers of two for rows and columns after which the logarithms of all entries are least in squares.
+    """Return powers of two for rows and columns by least squares on the logarithms of all entries: units do not matter.
 
-    A matrix in other units has the same scaled form, but for roundings to powers of two.  Source: A. R. Curtis,
-    J. K. Reid, *On the automatic scaling of matrices for Gaussian elimination*, J. Inst. Maths Applics 10, 1972.
+    Source: A. R. Curtis, J. K. Reid, J. Inst. Maths Applics 10, 1972.
     """
     from scipy.sparse import block_array, coo_array, diags_array
     from scipy.sparse.linalg import cg

@@ -30,9 +30,7 @@ def eigenvalues(matrix: FloatArray) -> ComplexArray:
 def spectrum_error(matrix: FloatArray, wanted: Sequence[complex] | ComplexArray, dt: float) -> float:
     """Return how far the eigenvalues of ``matrix (n, n)`` are from n wanted ones, relative to their size.
 
-    In discrete time (``dt > 0``) the size is that of the unit circle: near zero, relative distances mean nothing.
-
-    Eigenvalues are assigned to wanted ones with the least total distance, and the means of groups are compared.
+    In discrete time that of the unit circle. Assigned with the least total distance; means of groups are compared.
     """
     goal = np.asarray(wanted, dtype=np.complex128)
     if matrix.shape[0] != goal.size or not np.all(np.isfinite(matrix)):
@@ -44,10 +42,7 @@ def spectrum_error(matrix: FloatArray, wanted: Sequence[complex] | ComplexArray,
 def farthest_pole(
     found: Sequence[complex] | ComplexArray, wanted: Sequence[complex] | ComplexArray, dt: float
 ) -> float:
-    """Return how far the worst of some eigenvalues is from the wanted one it belongs to, relative as `spectrum_error`.
-
-    Nothing is a mean here: each eigenvalue counts.
-    """
+    """Return how far the worst eigenvalue is from its wanted one, relative as `spectrum_error`; nothing is a mean."""
     values, goal = (np.asarray(given, dtype=np.complex128) for given in (found, wanted))
     if values.size != goal.size or not np.all(np.isfinite(values)):
         return float("inf")
@@ -119,10 +114,9 @@ def speeds(values: ComplexArray | Sequence[complex], dt: float) -> FloatArray:
 
 
 def noise_covariance(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, dt: float) -> FloatArray:
-    """Return the stationary covariance of the output under unit white noise, in either time.
+    """Return the stationary covariance of the output under unit white noise; infinite near instability.
 
-    In continuous time the noise has unit intensity, and ``d`` must be left out by the caller: white noise that reaches
-    an output directly has no variance.  Infinite when ``a`` is not stable, or within rounding of it.
+    In continuous time of unit intensity, and ``d`` does not count: white noise in an output has no variance.
     """
     if dt > 0.0:
         return output_covariance(a, b, c, d)
@@ -146,11 +140,7 @@ def noise_covariance(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray,
 
 
 def certain_noise_covariance(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, dt: float) -> FloatArray:
-    """Return `noise_covariance`, or NaN where another way of computing its trace disagrees: all digits are rounding.
-
-    The other way is by what the output shows of each state, where `noise_covariance` goes by what the noise moves.
-    For matrices far from normal neither may have a digit left.
-    """
+    """Return `noise_covariance`, or NaN where the trace by observability disagrees: all digits are rounding."""
     found = noise_covariance(a, b, c, d, dt)
     # A variance below zero is rounding as well.
     variance, again = float(np.trace(found)), float(np.trace(noise_covariance(a.T, c.T, b.T, d.T, dt)))

@@ -1,15 +1,8 @@
-r"""Estimation in square roots: smoothing, and recursive least squares with forgetting on whitened data.
+"""Estimation in square roots: smoothing, and recursive least squares with forgetting on whitened data.
 
-A filter knows ``x = m + F c + D d`` with ``c ~ N(0, I)`` and d unknown.  From the coordinates ``(c, d)`` of a sample
-and those of the next one, the orthogonal factorisations of the step give
-
-.. math::
-    \begin{bmatrix} c_k \\ d_k \end{bmatrix} = j_0 + J_1 \begin{bmatrix} c_{k+1} \\ d_{k+1} \end{bmatrix}
-    + J_2 b + J_3 w, \quad b \sim N(0, I), \quad w \text{ unknown},
-
-in which b and w are independent of everything later.  No covariance is formed, and nothing is inverted but triangles,
-so that covariances may be singular: the smoother of Rauch, Tung and Striebel without its inverse of the predicted
-covariance.
+With ``x = m + F c + D d``, ``c ~ N(0, I)`` and d unknown, the factorisations of a step give the way back ``[c; d]_k =
+j_0 + J_1 [c; d]_k+1 + J_2 b + J_3 w``, ``b ~ N(0, I)`` and w unknown, independent of everything later: the smoother of
+Rauch, Tung and Striebel without an inverse, so that covariances may be singular.
 """
 
 from __future__ import annotations
@@ -29,10 +22,9 @@ from obsynth.numerics.ranks import PERFECT_PARITY, RANK_TOLERANCE
 
 
 class Gaussian(NamedTuple):
-    """Coordinates of a sample as far as they are known: ``mean + factor e + diffuse w``.
+    """Coordinates as far as they are known: ``mean (c, columns) + factor (c, any) e + diffuse (c, any) w``, w unknown.
 
-    Fields: mean: ``(c, columns)``: the first column is the mean, the others its derivatives by parameters; factor:
-    ``(c, any)``; diffuse: ``(c, any)``: directions about which nothing is known.
+    The first column is the mean, the others its derivatives by parameters.
     """
 
     mean: FloatArray
@@ -41,11 +33,7 @@ class Gaussian(NamedTuple):
 
 
 class WayBack(NamedTuple):
-    """The coordinates of one sample from those of the next.
-
-    Fields: offset: ``(c, columns)``: j_0; from_next: ``(c, c_next)``: J_1; noise: ``(c, any)``: J_2; unknown: ``(c,
-    any)``: J_3.
-    """
+    """The way back: j_0 ``offset (c, columns)``, J_1 ``from_next (c, c_next)``, J_2 and J_3 ``(c, any)``."""
 
     offset: FloatArray
     from_next: FloatArray
@@ -54,11 +42,7 @@ class WayBack(NamedTuple):
 
 
 class JointStep(NamedTuple):
-    """A step of a filter and the way back.
-
-    Fields: estimate: ``(n, columns)``; factor: ``(n, any)``: square root of the covariance; diffuse: ``(n, r)``;
-    back: From the coordinates after the step to those before it.
-    """
+    """A step: ``estimate (n, columns)``, square root ``factor (n, any)``, ``diffuse (n, r)``, and the way back."""
 
     estimate: FloatArray
     factor: FloatArray
@@ -77,8 +61,7 @@ def joint_step(
 ) -> JointStep:  # fmt: skip
     """Solve ``H x = right + [known noise] e + unknown d``, where known and unknown multiply the coordinates before.
 
-    Shapes: ``H (rows, n)``, ``known (rows, c)``, ``noise (rows, any)``, ``right (rows, columns)``, ``unknown (rows,
-    r)``.  The rank of H may be short where samples are missing: where the step is not complete.
+    Where the step is not complete, as samples are missing, the rank of H may be short.
     """
     S = np.hstack((known, noise))
     if S.shape[1] < len(H):
@@ -155,10 +138,7 @@ def _by_rank(H: FloatArray, S: FloatArray, width: int, right: FloatArray, unknow
 
 
 def _whitened(q2: FloatArray, S: FloatArray, right: FloatArray) -> tuple[FloatArray, FloatArray, int]:
-    """Return what the parity says of some directions of e, an orthogonal matrix that has these first, and how many.
-
-    Rows that are free of noise are those of perfect equations, which the filter has found to agree.
-    """
+    """Return what the parity says of some directions of e, an orthogonal matrix that has these first, their number."""
     from scipy.linalg import qr, solve_triangular
 
     if not q2.shape[1]:
@@ -197,11 +177,7 @@ WORTH_FORGETTING = 0.1
 
 
 class ParameterState(NamedTuple):
-    """The estimate of constant parameters and two different spreads.
-
-    Fields: theta: ``(nq,)``; triangle: ``(nq, nq)``, upper: ``S = (triangle' triangle)^-1`` sets the gain; it is no
-    covariance of theta; spread: ``(nq, nq)``: ``spread spread'`` is the covariance of theta.
-    """
+    """``theta (nq,)``, its covariance ``spread spread'``, and ``triangle (nq, nq)``, upper, which sets the gain."""
 
     theta: FloatArray
     triangle: FloatArray
@@ -209,10 +185,7 @@ class ParameterState(NamedTuple):
 
 
 def start_of(theta: FloatArray, factor: FloatArray) -> ParameterState:
-    """Return the state before any data.
-
-    Shapes: ``theta (nq,)``, ``factor (nq, nq)``.
-    """
+    """Return the state before any data from ``theta (nq,)`` and a square root ``factor (nq, nq)``."""
     triangle = np.linalg.qr(np.linalg.inv(factor), mode="r") if factor.size else factor
     return ParameterState(theta.copy(), np.asarray(triangle), factor.copy())
 
@@ -227,16 +200,10 @@ def update(
     directional: bool = False,
     noise: FloatArray | None = None,
 ) -> tuple[ParameterState, FloatArray]:
-    r"""Take in ``v = G theta + noise``; return the new state and the gain.
+    """Take in ``v = G theta + noise``; return the new state and the gain.
 
-    .. math::
-        M^+ = \lambda M + (1 - \lambda) M_{reg} + G^T G, \quad \Theta = (M^+)^{-1} G^T, \quad
-        \theta^+ = \theta + \Theta (v - G \theta), \quad
-        P^+ = (I - \Theta G) P (I - \Theta G)^T + \Theta W W^T \Theta^T
-
-    with ``M = S^-1``.  The second term is a guard against wind-up: it bounds S by the inverse of M_reg.
-
-    Shapes: ``v (m,)``, ``G (m, nq)``, ``regular (nq, nq)``, ``noise (m, any)``.
+    ``M+ = lambda M + (1 - lambda) M_reg + G'G``, ``Theta = M+^-1 G'``, ``theta+ = theta + Theta (v - G theta)``, ``P+ =
+    (I - Theta G) P (I - Theta G)' + Theta W W' Theta'``; M_reg bounds ``M^-1`` against wind-up.
     """
     from scipy.linalg.lapack import dgeqrf, dtrtrs
 

@@ -1,11 +1,7 @@
 """What an observer does about samples that its prediction excludes, and about estimates beyond bounds of the states.
 
-A sensor whose sample is further from its prediction than `limit` standard deviations is left out (``gate``), but at
-most `LONGEST` times in a row: what stays away has changed, and is no outlier.  With ``huber`` the sample is taken at
-the limit instead, which is Huber's weight: its influence grows no further (Huber 1964; Masreliez 1975).
-
-With a truth inside the bounds, the projection brings the error nowhere further in that metric, so that the covariance
-stays an upper bound in the sense of the squared error it normalises (Simon, Chia 2002).
+Beyond the limit a sensor is left out (``gate``) or taken at the limit (``huber``; Huber 1964, Masreliez 1975).  A
+projection brings the error nowhere further in its metric: the covariance stays an upper bound (Simon, Chia 2002).
 """
 
 from __future__ import annotations
@@ -62,9 +58,8 @@ def robust_advance(
     u: FloatArray, *, foreseen: Callable[[State, FloatArray], tuple[FloatArray, FloatArray]] | None = None,
 ) -> tuple[State, Row]:  # fmt: skip
     """Take a step; where its innovation is too long, ask each sensor and take the step again without the outliers.
-    ``predicted(state, heard, u)`` returns mean and deviation of each output ``(ny,)`` from the samples that are heard.
-    An output that a step needs to determine its state has no innovation there; ``foreseen(state, u)`` says what the
-    equations of the model expect of it, and what is `BLIND` times further off than the limit is left out as well."""
+    ``predicted(state, heard, u)``: mean and deviation of each output ``(ny,)`` from the samples that are heard;
+    ``foreseen(state, u)``: of outputs that determine the state; these may be `BLIND` times further off."""
     failed, mean, deviation, far = False, y, y, np.zeros(len(y), dtype=bool)
     try:
         with np.errstate(all="ignore"):

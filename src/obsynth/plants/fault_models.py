@@ -1,8 +1,7 @@
-"""What is known about the course of faults: an exosystem ``w+ = Phi w, f = Cw w`` for each, and all of them stacked.
+"""What is known about the course of faults: an exosystem ``w+ = Phi w, f = Cw w`` for each, stacked block-diagonally.
 
-Source: Share Pasand, Aliyari, Taghirad, eqs. (2), (5), (6).  Differences: each fault has its own exosystem and the
-faults are stacked block-diagonally (the row of (6) would add them up); ``f = Cw w``, not ``f' = Phi f``; the states of
-a polynomial are f, f', f'', ... (so their initial values are ``i! f_i``, not ``f_i``).
+Share Pasand, Aliyari, Taghirad, (2), (5), (6), where the row of (6) would add faults up.  ``f = Cw w``, not
+``f' = Phi f``; the states of a polynomial are f, f', f'', ..., initial values ``i! f_i``.
 """
 
 from __future__ import annotations

@@ -27,18 +27,13 @@ DECISIVE = ("E", "A", "Bf", "Bd", "C", "Df", "Dd")
 
 @dataclass(frozen=True, eq=False)
 class PlantOrigin:
-    """Rational matrices (`DECISIVE`) of a plant in some coordinates, or of the continuous plant that was sampled.
-
-    ``computed``: whether some were computed in floating point; ``sizes``: of the terms that each entry is a sum of, to
-    which rounding of the data is relative; ``states``: of the plant as written, 0 where unknown; ``uncleaned``: the
-    matrices before what elimination left of computed data by rounding alone was set to zero.
-    """
+    """Rational matrices (`DECISIVE`) of a plant in some coordinates, or of the continuous plant that was sampled."""
 
     exact: Mapping[str, tuple[tuple[Fraction, ...], ...]]
     sample_time: Fraction | None = None
-    computed: bool = False
-    sizes: Mapping[str, FloatArray] | None = None
-    states: int = 0
+    computed: bool = False  # some were computed in floating point
+    sizes: Mapping[str, FloatArray] | None = None  # of the terms of entries, to which rounding is relative
+    states: int = 0  # of the plant as written, 0 where unknown
     uncleaned: Mapping[str, tuple[tuple[Fraction, ...], ...]] | None = None
 
 

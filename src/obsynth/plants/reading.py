@@ -35,10 +35,7 @@ _FIELDS = {"x": "state_names", "u": "input_names", "y": "output_names", "f": "fa
 def _without_frames(
     matrices: Mapping[str, Any], names: Mapping[str, Sequence[str] | None]
 ) -> tuple[dict[str, Any], dict[str, Sequence[str] | None]]:
-    """Return matrices and names ``{"state_names": ...}`` in which the labels of pandas' frames are used, in one order.
-
-    The rows of the dynamics are the equations of the states of the same name.  Numbered labels are no names.
-    """
+    """Return matrices and names ``{"state_names": ...}``, labels of frames in one order; numbers are no names."""
     plain, labels = dict(matrices), dict(names)
     # A names the states, C the outputs; the first frame with a label decides on an order.
     for name, rows_of, columns_of in sorted(MATRIX_LAYOUT, key=lambda row: (row[0] != "A", row[0] != "C")):

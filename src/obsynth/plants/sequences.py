@@ -26,21 +26,17 @@ INDEX_NAME = "k"
 
 @dataclass(frozen=True, eq=False)
 class MatrixSequence:
-    """A matrix for each k = 0 ... length - 1, or for every k where ``length`` is None.
-
-    ``values``: one matrix, or a stack ``(length, rows, columns)``; or ``function`` of k; or rows of ``entries`` with
-    ``constants``, of which ``still`` holds those that do not depend on k, and ``moving`` the places of the others.
-    """
+    """A matrix for each k = 0 ... length - 1, or for every k where ``length`` is None."""
 
     name: str
     shape: tuple[int, int]
     length: int | None
-    values: FloatArray | None = None
-    function: Callable[[int], ArrayLike] | None = None
-    entries: tuple[tuple[Expression, ...], ...] | None = None
+    values: FloatArray | None = None  # one matrix, or (length, rows, columns)
+    function: Callable[[int], ArrayLike] | None = None  # of k
+    entries: tuple[tuple[Expression, ...], ...] | None = None  # with ``constants``
     constants: Mapping[str, float] | None = None
-    still: FloatArray | None = None
-    moving: tuple[tuple[int, int], ...] = ()
+    still: FloatArray | None = None  # entries that do not depend on k
+    moving: tuple[tuple[int, int], ...] = ()  # places of the others
 
     @classmethod
     def of(

@@ -1,13 +1,9 @@
-r"""Matrices with guaranteed error bounds: midpoint and radius, rounding included.
+r"""Matrices with guaranteed error bounds: sums and products of balls contain those of every member, in any BLAS order.
 
-A `Ball` stands for every real matrix within ``radius`` of ``midpoint``, entry by entry.  Sums and products
-of balls contain every sum and product of members, whatever the order in which BLAS adds up.  A ball that overflowed
-has an entry that is not finite, and every product with it too: nothing is claimed about it.
-
-The bound (Higham, *Accuracy and Stability of Numerical Algorithms*, 2nd ed., section 3.1): with unit
-roundoff :math:`u = 2^{-53}` and :math:`\gamma_k = k u / (1 - k u)`, a dot product of length k computed in
-any order, with or without fused multiply-add, differs from the exact one by at most
-:math:`\gamma_k |x|^T |y|`, plus :math:`k\,2^{-1074}` where products underflow.
+A `Ball` is every real matrix within ``radius`` of ``midpoint``, entry by entry; an overflow leaves entries that are not
+finite, about which nothing is claimed.  Higham, *Accuracy and Stability*, 2nd ed., section 3.1, with
+:math:`u = 2^{-53}`, :math:`\gamma_k = k u / (1 - k u)`: a dot product of length k in any order, with or without fused
+multiply-add, misses at most :math:`\gamma_k |x|^T |y|`, plus :math:`k\,2^{-1074}` where products underflow.
 """
 
 from __future__ import annotations

@@ -1,14 +1,10 @@
 r"""A norm in which a stable matrix contracts, proved, and what follows for sums over all time.
 
-With P = Q'Q and a rate :math:`\rho < 1` (:math:`\alpha > 0` in continuous time), the proved inequality
-
 .. math::
     \rho^2 P - A^T P A > 0 \qquad (\text{continuous: } -(A + \alpha I)^T P - P (A + \alpha I) > 0)
 
-gives :math:`\|Q A^j b\| \le \rho^j \|Q b\|`, so that
-:math:`\sum_j \|c A^j b\| \le \|c Q^{-1}\| \|Q b\| / (1 - \rho)` (:math:`/ \alpha` for the integral).  Every norm below
-is rounded up.
-
+with P = Q'Q gives :math:`\|Q A^j b\| \le \rho^j \|Q b\|`, so that
+:math:`\sum_j \|c A^j b\| \le \|c Q^{-1}\| \|Q b\| / (1 - \rho)` (:math:`/ \alpha` for the integral), norms rounded up.
 Nonnegative matrices: proved bounds of the spectral radius, of ``(I - M)^-1``, and of sums of powers.
 """
 
@@ -33,14 +29,11 @@ TIGHT_RATES = (0.01, 0.1)
 
 @dataclass(frozen=True, eq=False)
 class Contraction:
-    """A proved contraction ``|Q A b| <= rate |Q b|`` (continuous: ``|Q e^{At} b| <= e^{-rate t} |Q b|``).
-
-    Q ``(n, n)`` is triangular; ``inverse`` is near its inverse, and ``defect`` bounds ``|Q inverse - I|``.
-    """
+    """A proved ``|Q A b| <= rate |Q b|`` (continuous: ``|Q e^{At} b| <= e^{-rate t} |Q b|``), Q triangular."""
 
     Q: FloatArray
-    inverse: FloatArray
-    defect: float
+    inverse: FloatArray  # near that of Q
+    defect: float  # bounds |Q inverse - I|
     rate: float
     discrete: bool
 
@@ -55,10 +48,7 @@ class Contraction:
         return column_norms(Ball.exact(self.Q) @ ball)
 
     def seen(self, rows: FloatArray, radius: FloatArray | None = None, summed: bool = False) -> float:
-        """Return an upper bound on the norm of ``c Q^-1`` for rows ``c (p, n)``, known to within ``radius``.
-
-        With ``summed`` the radius is a sum over many such rows, and so is the bound.
-        """
+        """Return an upper bound on the norm of ``c Q^-1``, c known to ``radius``; ``summed``: a sum over many c."""
         if not rows.size:
             return 0.0
         ball = Ball.exact(rows) if radius is None else Ball(np.asarray(rows, dtype=np.float64), radius)

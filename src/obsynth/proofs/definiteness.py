@@ -1,35 +1,26 @@
-r"""Proofs that a symmetric matrix, known up to rounding, is positive definite.
+r"""Proofs that a symmetric matrix, known up to rounding, is positive definite: a Cholesky factorisation that completes.
 
-An eigenvalue computed in floating point proves nothing near zero.  A Cholesky factorisation that runs to completion
-does (S. M. Rump, *Verification of positive definiteness*, BIT 46, 2006; formally proved, with the constants below, by
-P. Roux in Coq).  With unit roundoff :math:`u`, :math:`\gamma_k = k u / (1 - k u)`, and R the computed factor of the
-floating-point matrix :math:`\tilde A` of order n:
+S. M. Rump, *Verification of positive definiteness*, BIT 46, 2006 (formally proved by P. Roux in Coq).  With
+:math:`\gamma_k = k u / (1 - k u)`, and R the computed factor of :math:`\tilde A` of order n:
 
-1. For :math:`i \le j`, :math:`r_{ij}` is the rounded quotient (or root) of
-   :math:`\tilde a_{ij} - \sum_{k<i} r_{ki} r_{kj}`.  Each of these terms goes through one product, at most i - 1 sums
-   and the quotient, whatever the order: at most i + 1 roundings.  So
-   :math:`|\tilde a_{ij} - \sum_{k \le i} r_{ki} r_{kj}| \le \gamma_{n+1} \sum_{k \le i} |r_{ki}| |r_{kj}|
-   \le \gamma_{n+1} \|r_i\| \|r_j\|` with the columns r of R (Cauchy, Schwarz).
-2. On the diagonal this reads :math:`\|r_j\|^2 \le \tilde a_{jj} + \gamma_{n+1} \|r_j\|^2`, so that
-   :math:`\|r_j\|^2 \le \tilde a_{jj} / (1 - \gamma_{n+1})`.
-3. Hence :math:`R^T R = \tilde A + \Delta` with :math:`|\Delta| \le \frac{\gamma_{n+1}}{1 - \gamma_{n+1}} d d^T`,
-   :math:`d_j = \sqrt{\tilde a_{jj}}`, whose norm is :math:`d^T d`:
-   :math:`\lambda_{\min}(\tilde A) \ge -\frac{\gamma_{n+1}}{1 - \gamma_{n+1}} \mathrm{tr}\,\tilde A - \eta`.
-   Underflow adds to an entry at most :math:`4 (n + 1 + \max_i \tilde a_{ii}) 2^{-1074}`, n times that to the norm.
+1. :math:`r_{ij}` is the rounded quotient (or root) of :math:`\tilde a_{ij} - \sum_{k<i} r_{ki} r_{kj}`: at most i + 1
+   roundings a term, in any order.  So :math:`|\tilde a_{ij} - \sum_{k \le i} r_{ki} r_{kj}| \le \gamma_{n+1}
+   \sum_{k \le i} |r_{ki}| |r_{kj}| \le \gamma_{n+1} \|r_i\| \|r_j\|` (Cauchy, Schwarz).
+2. On the diagonal: :math:`\|r_j\|^2 \le \tilde a_{jj} / (1 - \gamma_{n+1})`.
+3. Hence :math:`R^T R = \tilde A + \Delta`, :math:`|\Delta| \le \frac{\gamma_{n+1}}{1 - \gamma_{n+1}} d d^T`,
+   :math:`d_j = \sqrt{\tilde a_{jj}}`, of norm :math:`d^T d`:
+   :math:`\lambda_{\min}(\tilde A) \ge -\frac{\gamma_{n+1}}{1 - \gamma_{n+1}} \mathrm{tr}\,\tilde A - \eta`, where
+   underflow adds at most :math:`4 (n + 1 + \max_i \tilde a_{ii}) 2^{-1074}` an entry, n times that to the norm.
 
-We take 2 (n + 4) for n + 1, since kernels may multiply by a rounded reciprocal, and twice the underflow.  Arithmetic is
-supposed to round to nearest with gradual underflow, and kernels to form products as sums of products (no Strassen).
-So, with :math:`\tilde A = \mathrm{fl}(A - c I)`, completion proves
+We take 2 (n + 4) for n + 1 (kernels may multiply by a rounded reciprocal) and twice the underflow; arithmetic rounds to
+nearest with gradual underflow, and products are sums of products (no Strassen).  With
+:math:`\tilde A = \mathrm{fl}(A - c I)`, completion proves
 
 .. math::
     \lambda_{\min}(A) \ge c - \frac{\gamma_k}{1-\gamma_k} \mathrm{tr}\,\tilde A - u \max_i |\tilde a_{ii}| - \eta .
 
-The error of forming A enters as the largest row sum of its radii, a bound on the spectral norm of any
-symmetric perturbation within them.
-
-Where that is too much, a congruence brings the matrix near the identity and the same is tried again; and where the
-margin is below the rounding errors of double precision altogether, the matrix is formed and factored in more digits
-(`obsynth.proofs.extended_balls`).
+The error of forming A enters as the largest row sum of its radii, a bound on the norm of any symmetric perturbation
+within them.  Then follow a congruence that brings the matrix near the identity, and more digits (`extended_balls`).
 """
 
 from __future__ import annotations
@@ -56,18 +47,13 @@ Means = Literal["Cholesky", "preconditioned Cholesky", "ball arithmetic", "none"
 
 @dataclass(frozen=True)
 class DefinitenessProof:
-    """The outcome of an attempt to prove that every symmetric member of a ball is positive definite.
-
-    ``lower_bound``: proved, on the smallest eigenvalue after a congruence (scaling, or preconditioning to near the
-    identity); without a proof, the computed one less the error bounds, or zero; ``error_bound``: of rounding in double
-    precision and forming; ``reason``: with ball arithmetic its precision, else why there is none.
-    """
+    """The outcome of an attempt to prove that every symmetric member of a ball is positive definite."""
 
     proved: bool
-    lower_bound: float
-    error_bound: float
+    lower_bound: float  # proved, after a congruence; unproved: the computed one less the error bounds, or zero
+    error_bound: float  # of rounding in double precision, and forming
     means: Means = "none"
-    reason: str = ""
+    reason: str = ""  # precision of ball arithmetic, or why there is no proof
 
     @property
     def in_double_precision(self) -> bool:
@@ -124,13 +110,10 @@ def _as_formula(matrix: Formula | Ball | FloatArray) -> Formula:
 
 
 def _symmetric(ball: Ball) -> Ball:
-    """Return a ball with symmetric midpoint that holds every symmetric member of ``ball``.
-
-    Such members lie in the ball and in its transpose, so averaging the midpoints loses none; the difference of the
-    midpoints more than covers the rounding of the average.
-    """
+    """Return a ball with symmetric midpoint and all symmetric members of ``ball``: they lie in its transpose too."""
     with np.errstate(over="ignore", invalid="ignore"):
         middle = 0.5 * (ball.midpoint + ball.midpoint.T)
+        # The difference of the midpoints more than covers the rounding of their average.
         radius = np.maximum(ball.radius, ball.radius.T) + np.abs(ball.midpoint - ball.midpoint.T)
         return Ball(middle, rounded_up(radius, 4))
 
@@ -175,11 +158,9 @@ def _smallest_eigenvalue(factor: FloatArray) -> float:
 
 
 def _by_preconditioning(ball: Ball) -> DefinitenessProof | None:
-    """Prove ``C' X C`` instead, with C close to the inverse Cholesky factor; ``None`` when that does not help.
+    """Prove ``C' X C`` near I instead, formed with error bounds: for condition numbers up to 1e12; else ``None``.
 
-    A congruence with any nonsingular C keeps definiteness, and this one makes the matrix close to the identity, so
-    that a condition number up to about 1e12 no longer eats the margin.  C is triangular with a nonzero diagonal,
-    hence nonsingular exactly; the product is formed with error bounds.
+    C is close to the inverse Cholesky factor, triangular with a nonzero diagonal, hence nonsingular exactly.
     """
     factor = _cholesky_factor(ball.midpoint)
     if factor is None:

@@ -1,9 +1,7 @@
-r"""Pencils ``A - z E`` of irrational numbers, known to hundreds of digits: those of sampled plants.
+"""Pencils ``A - z E`` of irrational numbers, known to hundreds of digits: those of sampled plants.
 
-A number that is not zero is told from zero for certain, by an enclosure that does not hold it.  One whose enclosure
-holds zero although it is known to hundreds of digits counts as zero: such decisions are *to digits*, not exact.
-Ranks are found by elimination with the surest pivots, common divisors of polynomials by Euclid's algorithm, and
-stability by the recursion of Schur and Cohn (Jury), none of which needs a root.
+An enclosure without zero tells a number from zero for certain; one with zero counts as zero: *to digits*, not exact.
+Elimination with the surest pivots, Euclid's algorithm and the recursion of Schur and Cohn (Jury): none needs a root.
 """
 
 from __future__ import annotations

@@ -1,12 +1,9 @@
 """Exact arithmetic: what a stored double was written as, matrices of rational numbers, and roots of polynomials.
 
-A double holds a decimal of up to 15 digits without loss, and ``repr`` gives that decimal back.  A double with more
-digits is a short multiple of a power of two (data scaled by powers of two are exact), or it was computed: then the
-shortest decimal that rounds to it stands for it, known only to its last digit.
-
-A root on the boundary is also a root of the mirrored polynomial, ``p(-s)`` or ``z^n p(1/z)``; so is every pair of
-roots that mirror each other, of which one is unstable.  So the greatest common divisor of both decides whether there is
-any such root, and all others are told from the boundary by isolating them in enough digits.
+A double holds a decimal of up to 15 digits, which ``repr`` gives back; one with more is a short multiple of a power of
+two, or was computed: the shortest decimal that rounds to it stands for it, known only to its last digit.
+A root on the boundary, and every pair that mirror each other (one is unstable), is a root of the greatest common
+divisor with ``p(-s)`` or ``z^n p(1/z)``; all others are told from the boundary by isolating them in enough digits.
 """
 
 from __future__ import annotations

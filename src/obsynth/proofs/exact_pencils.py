@@ -1,12 +1,10 @@
-r"""Pencils ``A - s E`` of rational numbers, decided exactly: normal rank, zeros, index, left null space.
+"""Pencils ``A - s E`` of rational numbers, decided exactly: normal rank, zeros, index, left null space.
 
-The greatest common divisor of all r-minors, r the normal rank, has the finite zeros as its roots.  Two random integer
-compressions of rows (and columns) to r by r give two determinants that both are combinations of all these minors
-(Cauchy, Binet): their greatest common divisor is the wanted one unless chance adds a factor, which a third compression
-then removes.  Determinants are polynomials of degree rank E at most, found from their values at integers.
-
-A normal rank is bounded from below by the rank at any point (modulo a prime), and from above where it is not full: all
-(r + 1)-minors are polynomials of degree rank E at most, so rank r or less at one point more than that proves it.
+The greatest common divisor of all r-minors, r the normal rank, has the finite zeros as its roots.  Determinants of two
+random integer compressions to r by r combine all these minors (Cauchy, Binet): so does their greatest common divisor,
+unless chance adds a factor, which a third removes.  They are of degree rank E at most: values at integers give them.
+The rank at any point (modulo a prime) bounds r from below; rank r or less at one point more than rank E, from above,
+as all (r + 1)-minors are polynomials of that degree.
 """
 
 from __future__ import annotations

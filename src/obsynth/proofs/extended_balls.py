@@ -1,9 +1,7 @@
-r"""Matrices of real balls in any precision, and the signs of a quadratic form decided with them: python-flint's Arb.
+"""Matrices of real balls in any precision (python-flint's Arb), and the signs of a quadratic form decided with them.
 
-Where the margin of an inequality is below the rounding errors of double precision, the matrix is formed again from the
-same numbers with more digits, and factored as :math:`L D L^T`.  If every pivot is a ball to the right of zero, each
-symmetric member of the matrix is positive definite (Sylvester's law of inertia holds for every member, and each pivot
-of a member lies in the ball).  More digits are taken until the pivots are decided, or all `PRECISIONS` are tried.
+Formed again with more digits and factored as :math:`L D L^T` until the pivots are decided: if every one is a ball to
+the right of zero, each symmetric member is positive definite (Sylvester's law of inertia holds for every member).
 """
 
 from __future__ import annotations
@@ -74,10 +72,7 @@ def prove_by_ball_arithmetic(formula: Formula) -> ExtendedProof:
 
 
 def enclosed_eigenvalues(matrix: FloatArray) -> tuple[Any, ...] | None:
-    """Return balls (``flint.acb``), each with one eigenvalue of ``matrix (n, n)`` as stored; ``None`` without a proof.
-
-    Stored numbers hardly ever have a multiple eigenvalue: what was placed as one is a tight cluster, and told apart.
-    """
+    """Return balls (``flint.acb``), each with one eigenvalue of ``matrix`` as stored; ``None`` without a proof."""
     order = len(matrix)
     if not 0 < order <= MOST_ENCLOSED or not np.all(np.isfinite(matrix)):
         return None

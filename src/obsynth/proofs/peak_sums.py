@@ -1,12 +1,10 @@
 r"""Sums over all time of what a system makes of its inputs, from above, every rounding accounted for.
 
-``c_{j+1} = fl(c_j M)`` misses ``c_j M`` by a defect that is known; with a proved contraction (`Contraction`) the
-defects add no more than ``sum |defect Q^-1| |Q b| / (1 - rate)`` to all later terms together, and what follows the last
-term that is computed no more than that of ``|c_N Q^-1|``.
-
-Where an input acts for an interval of length h, ``\int_0^h |g(s)| ds`` of ``g(s) = c M^j e^{A s} b`` is the trapezoidal
-sum over p pieces of length ``p d = h``, plus ``d^3 / 12`` times the largest second derivative of each piece; that is at
-most its value at the left end plus d times the largest third derivative, which the contraction bounds.
+``c_{j+1} = fl(c_j M)`` misses ``c_j M`` by a known defect; with a proved `Contraction` all later terms gain no more
+than ``sum |defect Q^-1| |Q b| / (1 - rate)``, and what follows the last computed one is that of ``|c_N Q^-1|``.
+``\int_0^h |g(s)| ds`` of ``g(s) = c M^j e^{A s} b`` is the trapezoidal sum over p pieces, ``p d = h``, plus
+``d^3 / 12`` times the largest second derivative of each: at most that at its left end plus d times the largest third,
+which the contraction bounds.
 """
 
 from __future__ import annotations
@@ -46,10 +44,9 @@ def peak_sums(
     matrix: Ball, rows: FloatArray, columns: Ball, contraction: Contraction, *, least: int = 0, left: float = LEFT,
     each: bool = False, most: int = MOST_STEPS,
 ) -> PeakSums:  # fmt: skip
-    """Return bounds on the sums over j of ``|c M^j b|`` of every column ``b``, for ``c (p, n)``.
+    """Return bounds on the sums over j of ``|c M^j b|`` (Euclidean; ``each``: by row) of columns ``b``, ``c (p, n)``.
 
-    Euclidean norms, or with ``each`` the absolute value of each row.  At least ``least`` terms are summed up one by
-    one, and more until the rest is bounded by the share ``left``, or ``most`` are.
+    From ``least`` to ``most`` terms one by one, until the rest is bounded by the share ``left``.
     """
     moving, n, growth = matrix.midpoint, len(matrix.midpoint), gamma(len(matrix.midpoint) + 2)
     driven, sizes = columns.midpoint, contraction.sizes(columns.midpoint, columns.radius)

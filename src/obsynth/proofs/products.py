@@ -1,12 +1,9 @@
 r"""Exponentials and long products of matrices, as balls of double precision.
 
-In many states a Taylor polynomial of a short interval, with a bound on its remainder, is squared (doubled) in balls;
-where its radius is no share of it any more, python-flint has the word, with the digits that takes.
-
-Products of balls grow with the products of absolute values, and say nothing after a few hundred steps.  So a product
-:math:`F_N \cdots F_1` is followed in moving coordinates, as Lohner does for initial values: with orthogonal factors of
-:math:`F_k U_{k-1} = U_k R_k` found in double precision, :math:`U_k^{-1} F_k U_{k-1}` is near a triangle, and
-products of the absolute values of triangles grow no faster than their diagonals, up to powers of N:
+Exponentials: a Taylor polynomial with a bounded remainder, squared in balls, or python-flint where the radius is no
+share of it.  Products :math:`F_N \cdots F_1` in moving coordinates (Lohner), or their balls say nothing after a few
+hundred steps: with orthogonal factors of :math:`F_k U_{k-1} = U_k R_k`, :math:`U_k^{-1} F_k U_{k-1}` is near a
+triangle, whose products grow no faster than their diagonals, up to powers of N:
 
 .. math::
     |U_N^{-1} F_N \cdots F_1| \le |R_N| \cdots |R_1|, \qquad
@@ -145,10 +142,7 @@ LOGARITHMS = 1e-14
 
 
 def logarithm_of_product(factors: Sequence[Ball], units: FloatArray | None = None) -> float:
-    """Return an upper bound on ``log |F_N ... F_1|`` (2-norm) of balls ``(n, n)``, the first to act standing first.
-
-    With ``units (n,)``, powers of two, the norm is that of ``F`` in these units: ``diag(1 / units) F diag(units)``.
-    """
+    """Return an upper bound on ``log |F_N ... F_1|`` (2-norm), F_1 first; with F in ``units (n,)``, powers of two."""
     if not factors:
         return 0.0
     size = factors[0].shape[0]

@@ -229,10 +229,7 @@ def followed_steps(design: ObserverDesign, horizon: float | None = None) -> Foll
 def design_warnings(
     design: ObserverDesign, horizon: float | None = None, *, told: Collection[str] = (), steps: Followed | None = None
 ) -> tuple[str, ...]:
-    """Return what a user should know before trusting the fault estimates; ``horizon`` in s, of the spec's scenario.
-
-    Of faults that are ``told`` of already, no step is; ``steps``: from `followed_steps`, where they are known.
-    """
+    """Return what to know before trusting the fault estimates; ``horizon`` in s, ``steps`` from `followed_steps`."""
     pair = _estimating(design)
     if pair is None:
         return ()

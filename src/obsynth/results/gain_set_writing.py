@@ -162,10 +162,7 @@ def count_of_numbers(value: Any) -> int:
 
 
 def plain(value: Any, arrays: dict[str, FloatArray] | None = None) -> Any:
-    """Return ``value`` as JSON data; arrays, NaN and infinities are marked so that `restored` finds them.
-
-    With ``arrays``, large ones are put there and named in their place.
-    """
+    """Return ``value`` as JSON data, arrays (large ones in ``arrays``), NaN, infinities marked for `restored`."""
     if isinstance(value, np.ndarray):
         if arrays is not None and value.size >= SMALL_ARRAY and value.dtype == np.float64:
             name = f"array{len(arrays):05d}"

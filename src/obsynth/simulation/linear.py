@@ -1,8 +1,7 @@
-"""Simulation of linear descriptor systems of index 0 or 1: many runs at once, and exact between samples.
+"""Simulation of linear descriptor systems of index 0 or 1: many runs ``(steps, runs, signals)`` at once.
 
-The algebraic equations are solved first; what is left steps by a recursion (discrete plants) or by the matrix
-exponential (continuous ones), exact for signals that are constant or linear between samples.  Arrays of runs are
-``(steps, runs, signals)``.
+Algebraic equations are solved first; continuous plants step by the matrix exponential, exact for signals that are
+constant or linear between samples.
 """
 
 from __future__ import annotations
@@ -90,20 +89,16 @@ def _require_finite(states: FloatArray, advice: str, path: str) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Stepper:
-    """A plant that steps: ``x+ = transition x + held s + ramped (s_right - s_left) + noisy w``, s = [u; f; d].
-
-    x are the dynamic states; ``state_of, output_of``: plant states and outputs from x, s and w; ``feedback (nu, n)``:
-    ``u = s_u - feedback x``, already inside the other matrices.
-    """
+    """A plant that steps: ``x+ = transition x + held s + ramped (s_right - s_left) + noisy w``, s = [u; f; d]."""
 
     transition: FloatArray
     held: FloatArray
     ramped: FloatArray
     noisy: FloatArray
-    state_of: tuple[FloatArray, FloatArray, FloatArray]
-    output_of: tuple[FloatArray, FloatArray, FloatArray]
+    state_of: tuple[FloatArray, FloatArray, FloatArray]  # plant states from x, s and w
+    output_of: tuple[FloatArray, FloatArray, FloatArray]  # outputs from them
     start: FloatArray
-    feedback: FloatArray | None
+    feedback: FloatArray | None  # (nu, n): u = s_u - feedback x, inside the other matrices
 
     def run(
         self, signals: FloatArray, differences: FloatArray, noise: FloatArray
@@ -243,10 +238,7 @@ def varying_runs(
     plant: TimeVaryingDescriptorSystem, *, parameters: FloatArray, inputs: FloatArray, initial_state: FloatArray,
     equation_noise: FloatArray, output_noise: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:  # fmt: skip
-    """Simulate many runs at once, which differ in their noise: one factorisation a step serves all of them.
-
-    ``equation_noise (samples, runs, ne)``, ``output_noise (samples - 1, runs, ny)``; the rest as one run has it.
-    """
+    """Simulate many runs with ``equation_noise (samples, runs, ne)`` and ``output_noise (samples - 1, runs, ny)``."""
     if plant.ne != plant.nx:
         raise SpecError(f"{plant.ne} equations do not determine {plant.nx} states.", path="E")
     samples, runs = equation_noise.shape[:2]

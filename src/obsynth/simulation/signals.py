@@ -23,18 +23,15 @@ MAXIMUM_SAMPLES = 5_000_000
 
 @dataclass(frozen=True, eq=False)
 class Drive:
-    """A scenario for one plant, in arrays, apart from its random numbers: column and profile of each of those.
-
-    ``left, right (steps, nu + nf + nd)``: [u, f, d] at both ends of each interval; ``deviations (ny,)`` of more noise.
-    """
+    """A scenario for one plant, in arrays, apart from its random numbers: column and profile of each of those."""
 
     dt: float
-    left: FloatArray
-    right: FloatArray
+    left: FloatArray  # (steps, nu + nf + nd): [u, f, d] where each interval begins
+    right: FloatArray  # where it ends
     random: tuple[tuple[int, Random], ...]
     sensors: tuple[tuple[int, Profile], ...]
     noise: float
-    deviations: FloatArray
+    deviations: FloatArray  # (ny,) of more noise
 
     @property
     def steps(self) -> int:

@@ -39,14 +39,11 @@ MOST_CASES = 100_000
 
 @dataclass(frozen=True, eq=False)
 class SweepCase:
-    """One design to be made: a spec and the changes to the plant in its file, or a plant, method and options in memory.
-
-    ``key``: digest of all that the design depends on; ``parameters``: what was put in place, by name.
-    """
+    """One design to be made: a spec and changes to the plant in its file, or a plant, method and options in memory."""
 
     name: str
-    parameters: Mapping[str, Any]
-    key: str
+    parameters: Mapping[str, Any]  # what was put in place, by name
+    key: str  # digest of all that the design depends on
     source: Path | None = None
     document: Mapping[str, Any] = field(default_factory=dict)
     plant_changes: Mapping[str, Any] = field(default_factory=dict)
@@ -233,10 +230,7 @@ def carried_out(
 
 
 class ResultFolder:
-    """Results of pieces of work in files of a folder, by their names and digests; it is made where there is none.
-
-    ``fields``: what a result must have; ``letters``: so many of a name begin the names of its files.
-    """
+    """Results of pieces of work, in files of a folder by the first ``letters`` of their names and digests."""
 
     def __init__(self, folder: str | Path, kind: str, fields: tuple[str, ...], *, letters: int) -> None:
         self.folder, self.kind, self.fields, self.letters = Path(folder), kind, fields, letters

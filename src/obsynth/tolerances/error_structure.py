@@ -1,8 +1,6 @@
 """How an uncertain plant drives the error of a fixed observer: robust.md, sections 1, 2 and 8.
 
-With ``eps = z - T E(q) x`` and the plant ``E x+ = A x + B u + Bd d``, ``y = C x + D u + Dd d``, on every trajectory
-
-    eps+ = Az eps + (Az T E + By C - T A) x + (Bu + By D - T B) u + (By Dd - T Bd) d
+    eps+ = Az eps + (Az T E + By C - T A) x + (Bu + By D - T B) u + (By Dd - T Bd) d,   eps = z - T E(q) x
     xhat - x = Cx eps + (Cx T E + Dyx C + T0x A - I) x + ...      (fault estimates, residuals: without I)
 
 The brackets vanish at the nominal plant; over the box ``x = xhat - e`` drives them: what is known, and the error.
@@ -29,13 +27,7 @@ ROUNDING_SHARE = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class ErrorStructure:
-    """The error system over a box, in rows ``[eps; e; outputs]`` (nz, n, no) and columns of the state and the inputs.
-
-    What is uncertain acts through channels, ``|c e|`` of a row c: those of constants first (``owner`` says whose), then
-    one for each state with a remainder; rows after the first ``single`` share one channel, the largest of them.
-    ``effects (nz + n + no, m)`` is what a channel does.  ``reading`` takes xhat (and fhat) from the rows of the
-    observer.
-    """
+    """The error system over a box: rows ``[eps; e; outputs]`` (nz, n, no), columns of the state and the inputs."""
 
     Az: FloatArray
     Cx: FloatArray
@@ -44,12 +36,12 @@ class ErrorStructure:
     inputs: AffineMatrix
     disturbances: AffineMatrix
     bounds: FloatArray
-    channel_rows: FloatArray
-    single: int
-    effects: FloatArray
-    owner: tuple[int, ...]
+    channel_rows: FloatArray  # |c e| of a row c each: of constants, then of states with a remainder
+    single: int  # rows after these share one channel, the largest of them
+    effects: FloatArray  # (nz + n + no, m): what a channel does
+    owner: tuple[int, ...]  # the constant of each channel
     offsets: FloatArray
-    reading: FloatArray
+    reading: FloatArray  # xhat (and fhat) from the rows of the observer
     watching: FloatArray
 
     @property
@@ -82,11 +74,9 @@ def error_structure(
 ) -> ErrorStructure:  # fmt: skip
     """Return the error system of an observer over a box; ``bounds (nd,)``, ``noise_bound`` in standard deviations.
 
-    With ``faults`` these are unknown signals that are estimated like states, and outputs are the errors of their
-    estimates; else there is no fault, and outputs are fault estimates and residuals, or (``states``) errors of the
-    state estimates. ``reading (n, states of the observer)``: that of a continuous design on samples; what its
-    identities miss counts as one more constant, the last, of known value.  What a fault that is estimated late did in a
-    plant whose constants are ``varying``, it did with those of that sample: they count as further constants.
+    With ``faults`` these are estimated like states; else outputs are fault estimates and residuals, or (``states``)
+    errors of states.  ``reading (n, states of the observer)`` is that of a continuous design on samples: what its
+    identities miss counts as one more constant, the last.  ``varying``: those of the sample of a late fault count too.
     """
     plant, count = affine.plant, affine.count
     t, t0 = tracking
@@ -174,10 +164,7 @@ def _missed(matrix: AffineMatrix, offsets: FloatArray) -> FloatArray:
 def _fault_columns(
     direct: AffineMatrix, observer: LinearObserver, c: FloatArray, n: int, offsets: FloatArray
 ) -> AffineMatrix:
-    """Return the columns of faults as signals that are estimated, each at its delay: robust.md, correction 8.1.
-
-    What a fault that is estimated one sample late does to eps by then is taken out of eps.
-    """
+    """Return the columns of faults as signals that are estimated, each at its delay: robust.md, correction 8.1."""
     nz, nf = observer.order, direct.shape[1]
     target = np.zeros((nz + len(c), nf))
     target[nz + n : nz + n + nf] = np.eye(nf)

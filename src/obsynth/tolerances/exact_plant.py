@@ -221,10 +221,7 @@ class Told:
 
 
 def told_from_faults(plant: DescriptorSystem) -> dict[str, Told]:
-    """Return the verdict for each constant with a tolerance, from the plant as written; empty without faults.
-
-    Decoupling exists where the pencil from faults and directions to outputs has full normal rank and stable zeros.
-    """
+    """Return the verdict for each constant with a tolerance, from the plant as written; empty without faults."""
     uncertain = plant.uncertainty
     if uncertain is None or not plant.nf:
         return {}
@@ -246,6 +243,7 @@ def _told(matrices: Mapping[str, FloatArray], directions: FloatArray, dt: float)
     both = np.hstack([faults / np.linalg.norm(faults, axis=0), directions])
     if np.linalg.matrix_rank(both, tol=DIRECTION_SHARE) < both.shape[1]:
         return Told(True, False, "it acts where a fault acts")
+    # Decoupling exists where the pencil from both to the outputs has full normal rank and stable zeros.
     n = len(matrices["A"])
     try:
         zeros, _, outside = zeros_of_system(

@@ -23,17 +23,13 @@ OUTWARD = 1.0 + 1e-12
 
 @dataclass(frozen=True, eq=False)
 class Responses:
-    """What channels do: ``kernels (L, m, m + no + nz)`` to channels, outputs and eps, j + 1 samples later.
-
-    ``same (m, m)`` and ``direct (no, m)``: at the same sample.  ``powers (L + 1, nz, nz)`` of Az.  What is older than L
-    samples goes on through bounds of eps: ``tail_channels, tail_outputs, tail_eps``.
-    """
+    """What channels do, L samples long; what is older goes on through bounds of eps, the three ``tail`` matrices."""
 
     structure: ErrorStructure
-    powers: FloatArray
-    kernels: FloatArray
-    same: FloatArray
-    direct: FloatArray
+    powers: FloatArray  # (L + 1, nz, nz), of Az
+    kernels: FloatArray  # (L, m, m + no + nz): to channels, outputs and eps, j + 1 samples later
+    same: FloatArray  # (m, m), at the same sample
+    direct: FloatArray  # (no, m)
     tail_channels: FloatArray
     tail_outputs: FloatArray
     tail_eps: FloatArray
@@ -68,7 +64,7 @@ class Responses:
 
 
 def power_rounding(left: FloatArray, powers: FloatArray) -> FloatArray:
-    """Return a bound of what rounding of the computed powers changes in ``left Az^j``, for all j.
+    """Return a bound of what rounding of the powers changes in ``left Az^j``, for all j.
 
     With ``P(j+1) = Az P(j) + F(j)`` as computed, ``Az^j - P(j)`` is the sum of ``Az^(j-1-i) F(i)``.
     """

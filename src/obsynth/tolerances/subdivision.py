@@ -47,10 +47,7 @@ def subdivided(
     build: Build, count: int, holds_on: Callable[[AffineMatrix], bool], fails_at: Callable[[FloatArray], bool],
     exact_at: Callable[[FloatArray], FloatArray], *, most: int = MOST_BOXES,
 ) -> BoxVerdict:  # fmt: skip
-    """Cut the box along the constant that matters most.
-
-    ``build``: the matrix over a part, made anew so that its remainder shrinks; ``exact_at``: the true one at a point.
-    """
+    """Cut the box along the constant that matters most; ``build``: the matrix over a part, ``exact_at``: at a point."""
     if count <= MOST_VERTEX_CONSTANTS:
         for corner in itertools.product((-1.0, 1.0), repeat=count):
             point = np.array(corner)

@@ -1,16 +1,13 @@
 r"""The bounded real inequality and the stability of a shipped observer, proved with bounds on every rounding error.
 
-With ``e+ = M e + B d``, the fault error ``-C e + D d`` and the certificate P = Q'Q, the gain d -> fault error is below
-g, and M is Schur stable, if
+With ``e+ = M e + B d``, fault error ``-C e + D d``, P = Q'Q, the gain is below g, and M is Schur stable, if
 
 .. math::
-    \begin{bmatrix} P & 0 & (QM)^T & C^T \\ & g^2 I & (QB)^T & -D^T \\ & & I & 0 \\ & & & I \end{bmatrix} > 0 .
+    \begin{bmatrix} P & 0 & (QM)^T & C^T \\ & g^2 I & (QB)^T & -D^T \\ & & I & 0 \\ & & & I \end{bmatrix} > 0
 
-This is the paper's (45) before its Schur complements (Wang 2015), with its P on the third diagonal block divided out,
-and extended by D.  Stable is a matrix A with ``-S^T (A^T Q^T Q + Q^T Q A) S > 0`` (``z' = A z``), or with
-``[[(QS)^T QS, (QAS)^T], [QAS, I]] > 0`` (``z+ = A z``).  The certificate is the triangular factor Q: P itself, rounded,
-would lose definiteness where its condition number nears 1e16.  S, triangular and close to the inverse of Q, is a
-congruence whatever it is.
+((45) of Wang 2015 before its Schur complements, P divided out of the third block, with D).  Stable is A with
+``-S^T (A^T Q^T Q + Q^T Q A) S > 0`` (``z' = A z``), or ``[[(QS)^T QS, (QAS)^T], [QAS, I]] > 0`` (``z+ = A z``), for any
+congruence S (here close to the inverse of Q).  Q is stored: P, rounded, loses definiteness near condition 1e16.
 """
 
 from __future__ import annotations

@@ -1,16 +1,9 @@
 r"""The error system of a shipped observer, from the plant and the realisation alone; what stored numbers add to it.
 
-For the plant ``E x+ = A x + B u + b s``, ``y = C x + D u + d s`` (s a fault, disturbance or noise) and the observer
-``z+ = Az z + Bu u + By y``, suppose a tracking map V satisfies
-
-    Az V E + By C = V A,   Bu + By D = V B.
-
-Then ``e = V E x - z`` obeys ``e+ = Az e + (V b - By d) s``, whatever x, u and s do.  An output ``Cz z + Du u + Dy y``
-that satisfies ``Cz V E + Dy C = K`` and ``Du + Dy D = 0`` equals ``K x - Cz e + Dy d s``.  Estimates that lag by some
-samples are covered by appending the past states to the plant.
-
-In stored numbers the identities miss a little, which is one more channel, driven by x and u.  Whatever T and T0 are
-(``T0 E = 0``: algebraic rows, which an estimate may use), ``eps = z - T E x`` obeys
+If ``Az V E + By C = V A``, ``Bu + By D = V B``, then ``e = V E x - z`` obeys ``e+ = Az e + (V b - By d) s`` for every
+fault, disturbance or noise s that enters by b and d, and an output with ``Cz V E + Dy C = K``, ``Du + Dy D = 0`` is
+``K x - Cz e + Dy d s`` (estimates that lag: past states appended).  Stored numbers miss a little: for any T, and T0
+with ``T0 E = 0``, ``eps = z - T E x`` obeys
 
 .. math::
     \varepsilon^+ = A_z \varepsilon + K x + U u + \ldots, \qquad
@@ -19,8 +12,7 @@ In stored numbers the identities miss a little, which is one more channel, drive
     K = A_z T E + B_y C - T A, \quad U = B_u + B_y D - T B, \quad
     J = C_z T E + D_y C + T_0 A - G, \quad L = D_u + D_y D + T_0 B
 
-with each of K, U, J and L a `Ball` around its rounded value, which is zero in exact arithmetic.  What they drive stays
-within the bounds of `errors_per_unit`.  Source: `robust.md`, theorem 1, with the corrections 3 and 7.
+with balls K, U, J, L, zero in exact arithmetic: `errors_per_unit` (`robust.md`, theorem 1, corrections 3 and 7).
 """
 
 from __future__ import annotations
@@ -118,23 +110,19 @@ class ErrorSystem:
 
 @dataclass(frozen=True, eq=False)
 class TrackedPlant:
-    """A plant as an observer sees it, and what each row of its output stands for.
+    """A plant as an observer sees it, and what each row of its output stands for."""
 
-    Shapes: E, A ``(ne, n)``; B, Bd ``(ne, *)``; C ``(ny, n)``; D, Dd ``(ny, *)``; T ``(nz, ne)``; goal ``(rows, n)``;
-    T0 ``(rows, ne)`` or ``None``.  Bd and Dd hold the disturbances from which the estimates are decoupled, if any.
-    """
-
-    E: FloatArray
-    A: FloatArray
-    B: FloatArray
-    C: FloatArray
-    D: FloatArray
-    T: FloatArray
-    goal: FloatArray
+    E: FloatArray  # (ne, n)
+    A: FloatArray  # (ne, n)
+    B: FloatArray  # (ne, nu)
+    C: FloatArray  # (ny, n)
+    D: FloatArray  # (ny, nu)
+    T: FloatArray  # (nz, ne)
+    goal: FloatArray  # (rows, n)
     state_names: tuple[str, ...]
-    T0: FloatArray | None = None
-    Bd: FloatArray | None = None
-    Dd: FloatArray | None = None
+    T0: FloatArray | None = None  # (rows, ne)
+    Bd: FloatArray | None = None  # (ne, nd), of the disturbances that are decoupled
+    Dd: FloatArray | None = None  # (ny, nd)
 
     @classmethod
     def of(
@@ -151,23 +139,19 @@ class TrackedPlant:
 
 @dataclass(frozen=True, eq=False)
 class RemainderChannel:
-    """What the identities miss, as balls: K ``(nz, n)``, U ``(nz, nu)``, J ``(rows, n)``, L ``(rows, nu)``.
+    """What the identities miss, as balls."""
 
-    W ``(nz, nd)`` and V ``(rows, nd)`` are those of decoupled disturbances; without columns where there are none.
-    """
-
-    K: Ball
-    U: Ball
-    J: Ball
-    L: Ball
-    W: Ball
-    V: Ball
+    K: Ball  # (nz, n)
+    U: Ball  # (nz, nu)
+    J: Ball  # (rows, n)
+    L: Ball  # (rows, nu)
+    W: Ball  # (nz, nd), of decoupled disturbances
+    V: Ball  # (rows, nd)
 
     def errors_per_unit(self, observer: LinearObserver, contraction: Contraction) -> tuple[FloatArray, ...]:
-        """Return upper bounds on the error of every output row per unit of each state, input and disturbance.
+        """Return upper bounds on each output row's error for each state, input and disturbance always within one.
 
-        For signals that stay within one at all times: ``sum_j |c Az^j k| + |direct|``, outward rounded.  Shapes
-        ``(rows, n)``, ``(rows, nu)``, ``(rows, nd)``.
+        ``sum_j |c Az^j k| + |direct|``, outward rounded; ``(rows, n)``, ``(rows, nu)``, ``(rows, nd)``.
         """
         pairs = ((self.K, self.J), (self.U, self.L), (self.W, self.V))
         rows = observer.fault_rows

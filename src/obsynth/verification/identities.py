@@ -52,18 +52,14 @@ class Residual:
 
 @dataclass(frozen=True, eq=False)
 class Identity:
-    """A sum of terms of one shape that must vanish; ``factors``, the products inside them, say what rounding can do.
-
-    Entries of a row compare in ``units`` of their columns, known to within the factor ``rough``; ``entrywise`` each is
-    judged by its own terms.  ``also``: the same with other units: both must hold.
-    """
+    """A sum of terms of one shape that must vanish."""
 
     terms: tuple[FloatArray, ...]
-    factors: tuple[tuple[FloatArray, ...], ...] = ()
-    units: FloatArray | None = None
-    entrywise: bool = False
-    rough: float = 1.0
-    also: Identity | None = None
+    factors: tuple[tuple[FloatArray, ...], ...] = ()  # products in the terms: what rounding can do
+    units: FloatArray | None = None  # of the columns, in which entries of a row compare
+    entrywise: bool = False  # each entry judged by its own terms
+    rough: float = 1.0  # units are known to within this factor
+    also: Identity | None = None  # the same with other units; both must hold
 
     @property
     def total(self) -> FloatArray:

@@ -1,8 +1,7 @@
-"""What the stored numbers of a linear design add to the errors, whatever the identities are in exact arithmetic.
+"""What the stored numbers of a linear design add to the errors: the identities hold to rounding, not exactly.
 
-The identities hold to rounding, not exactly: what they miss is driven by the plant's state and its known inputs (see
-`obsynth.verification.error_system`).  The rows bound the errors per unit of each; where the plant does not forget,
-its state has no bound, no finite gain from the disturbances exists, and what can be said is after how long it matters.
+Rows bound the errors per unit of states and known inputs; where the plant does not forget, no finite gain from the
+disturbances exists, and what can be said is after how long it matters.
 """
 
 from __future__ import annotations
@@ -258,8 +257,7 @@ class _Composite:
 def _when_it_matters(system: _Composite, level: float, unit: float, beyond: float) -> tuple[str, float]:
     """Return what to say of disturbances that last, and for how many seconds they may.
 
-    ``beyond`` is the largest distance from a pole on the boundary (in units of ``unit``) at which the gain is above the
-    level; zero where it is not.
+    ``beyond``: distance (in ``unit``) from a pole on the boundary at which the gain still exceeds the level; or zero.
     """
     dt, poles = system.plant.dt, system.poles
     per_unit = dt if dt > 0.0 else 1.0 / unit

@@ -91,15 +91,12 @@ MOST_NAMED = 6
 
 @dataclass(frozen=True, eq=False)
 class HiddenMotion:
-    """States, unknown inputs and other faults that, with a fault of 1, leave every output at zero.
-
-    All go like ``exp(point t)`` (``point^k``); ``values``: the amplitudes, first those of the ``causes`` (a count).
-    """
+    """Amplitudes of states, unknown inputs and other faults that, with a fault of 1, leave every output at zero."""
 
     fault: str
-    point: complex
+    point: complex  # all go like ``exp(point t)``, or ``point^k``
     values: dict[str, complex]
-    causes: int
+    causes: int  # how many of the values, the first ones, are inputs
     dt: float
 
     def __str__(self) -> str:

@@ -1,8 +1,7 @@
 """One fault on a decoupled plant: whether it shows, where it does not, and how fast it does.
 
-With N a minimal polynomial basis of the left null space of the unknowns' pencil, ``g = N [bf; df]``; the zeros of the
-fault are the roots of the greatest common divisor of the entries of g.  On the decoupled plant g vanishes at a point
-exactly where ``[F; G]`` lies in the range of ``[A - sE; C]``, which has full column rank everywhere.
+With N a minimal polynomial basis of the left null space of the unknowns' pencil, the zeros of the fault are those of
+the greatest common divisor of ``g = N [bf; df]``; decoupled: where ``[F; G]`` lies in the range of ``[A - sE; C]``.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """The left singular part of a pencil, by orthogonal transformations, with the rows it is made of.
 
-What is left of ``A - sE`` of any shape without its finite zeros, its infinite part and its right singular part is
-``[A_o - s E_o; C_o]``, E_o regular and (E_o, A_o, C_o) observable: its left null space is that of the whole pencil.
-The pencil must come balanced, and is not balanced again on the way, which would blow rounding up.
+Without finite zeros, infinite and right singular part, ``[A_o - s E_o; C_o]`` is left: observable, with the left null
+space of the whole.  The pencil must come balanced; balancing again on the way would blow rounding up.
 """
 
 from __future__ import annotations
@@ -40,17 +39,14 @@ class PencilUnits:
 
 @dataclass(frozen=True, eq=False)
 class LeftPart:
-    """What is left of a pencil: ``left @ (A - sE) = [A_o - s E_o; C_o] @ right``; Ez, Az: that of the finite zeros.
+    """What is left of a pencil: ``left @ (A - sE) = [A_o - s E_o; C_o] @ right``."""
 
-    E, A ``(k, k)``, C ``(p, k)``; left ``(k + p, m)``, right ``(k, n)``.
-    """
-
-    E: FloatArray
+    E: FloatArray  # ``(k, k)``, as A
     A: FloatArray
-    C: FloatArray
-    left: FloatArray
-    right: FloatArray
-    Ez: FloatArray
+    C: FloatArray  # ``(p, k)``
+    left: FloatArray  # ``(k + p, m)``
+    right: FloatArray  # ``(k, n)``
+    Ez: FloatArray  # of the finite zeros, as Az
     Az: FloatArray
     decisions: tuple[RankDecision, ...]
 

@@ -1,9 +1,7 @@
 """Least sets of sensors for detecting, isolating or estimating faults.
 
-Feasible sets grow with every sensor (none hurts), except where added sensors may fail themselves.  Few sets are
-enumerated, which is exact; of many, what greedy choices find is inclusion-minimal, and said to be that only (y = (d1,
-d2, d1 + f): {1, 3} suffices, greedy takes three).  Sets are screened at generic points s0, where every question of
-normal rank is one on rows of ``[C, D] (s0 E - A)^-1 [Bd, Bf]``, asked of many sets at once.
+Few sets are enumerated; of many, greedy choices find inclusion-minimal ones, and say so: with y = (d1, d2, d1 + f)
+{1, 3} suffices, greedy takes three.  Screening at points s0 is by rows of ``[C, D] (s0 E - A)^-1 [Bd, Bf]``.
 """
 
 from __future__ import annotations
@@ -107,17 +105,14 @@ class Task:
 
 @dataclass(frozen=True, eq=False)
 class SensorSearch:
-    """A search over sets of candidate sensors, for the columns ``faults``.
-
-    ``may_fail``: an added sensor brings a fault of its own, to be told as well; ``copies``: how often it may be taken.
-    """
+    """A search over sets of candidate sensors, for the columns ``faults``."""
 
     plant: DescriptorSystem
     sensors: tuple[Sensor, ...]
     goal: str
     faults: tuple[int, ...]
-    may_fail: bool
-    copies: int
+    may_fail: bool  # an added sensor brings a fault of its own, to be told as well
+    copies: int  # how often a sensor may be taken
 
     def tasks(self, plant: DescriptorSystem, faults: Sequence[int]) -> list[Task]:
         """Return everything that the goal asks of a plant."""

@@ -43,10 +43,8 @@ def distance_to_loss(
     E: FloatArray, A: FloatArray, *, nx: int, discrete: bool, zeros: tuple[complex, ...] = (),
     sizes: FloatArray | None = None,
 ) -> Distance:  # fmt: skip
-    """Return how far ``A - s E (m, n)``, nx states, is from losing column rank on or outside the stability boundary.
-
-    ``sizes (m, n)`` of the terms of A: what rounding of the data behind it may change is relative to those.
-    """
+    """Return how far ``A - s E (m, n)`` is from losing column rank on or outside the stability boundary.
+    ``sizes (m, n)`` of the terms of A: what rounding of the data behind it may change is relative to those."""
     candidates = [*_boundary(E, A, discrete), *(_to_boundary(zero, discrete) for zero in zeros)]
     if A.shape[0] > A.shape[1]:
         candidates += _compressed_points(E, A, discrete)
@@ -75,10 +73,7 @@ def drowned_zeros(
 def relative_singular_value(
     E: FloatArray, A: FloatArray, point: complex, *, nx: int, sizes: FloatArray | None = None
 ) -> float:
-    """Return the least singular value of the pencil at a point relative to the largest, in units that suit it.
-
-    With ``sizes`` in units that suit the terms which the entries of A are sums of.
-    """
+    """Return the least singular value at a point over the largest, in units that suit A, or ``sizes`` of its terms."""
     pencil = equilibrated_at(E, A if sizes is None else sizes, point, nx=nx)
     scaled = pencil.A if sizes is None else pencil.rows[:, None] * A * pencil.columns
     matrix: NDArray[Any] = scaled - (point if point.imag else point.real) * pencil.E

@@ -1,8 +1,7 @@
 """Pencils whose entries know where in the plant they stand, and the nearest plants for which they lose rank.
 
-A matrix that nearly loses column rank has a vector v with ``M v`` small.  With v rounded to a few digits, one entry in
-each row where ``(M v)_i`` is not zero is changed (two where v is complex) so that it is, in rational arithmetic: the
-changed matrix loses rank exactly, and the changed entries are named.
+For v with ``M v`` small, rounded to a few digits, one entry (two if v is complex) in each row of M is changed in
+rational arithmetic so that ``M v = 0``: the changed matrix loses rank exactly, and the changed entries are named.
 """
 
 from __future__ import annotations
@@ -42,18 +41,14 @@ Cell = str | None
 
 @dataclass(frozen=True, eq=False)
 class NamedPencil:
-    """``A - s E`` with the entry of the plant that stands at each place of A: ``owners (m, n)``, ``None`` for none.
-
-    Fields: A, E: Rational, ``(m, n)``; owners; rows, columns: Powers of two in which entries are of like size; terms:
-    Sizes of the terms that the entries of A are sums of, ``(m, n)``, where these are known.
-    """
+    """``A - s E (m, n)`` with the entry of the plant that stands at each place of A."""
 
     A: Rational
     E: Rational
-    owners: Rational
-    rows: FloatArray
+    owners: Rational  # ``None`` for no entry
+    rows: FloatArray  # powers of two, as columns, in which entries are of like size
     columns: FloatArray
-    terms: FloatArray | None = None
+    terms: FloatArray | None = None  # sizes of what the entries of A are sums of, where known
 
     @property
     def transposed(self) -> NamedPencil:
@@ -65,10 +60,7 @@ class NamedPencil:
         self, tolerance: float, point: complex | None = None, *, dt: float | None = None, last: bool = False
     ) -> Witness | None:
         """Return a plant for which this loses column rank at a point: within the tolerance, or the nearest one found.
-
-        With ``dt`` the point may move, but stays on or outside the stability boundary.  With ``last`` the last column
-        becomes a combination of the others, whatever the rank of those.
-        """
+        With ``dt`` the point may move, but not become stable.  ``last``: the last column is to depend on the others."""
         at = 0j if point is None else complex(point)
         matrix = nearest(self.A) - (at if at.imag else at.real) * nearest(self.E)
         sizes = np.abs(matrix) if self.terms is None else self.terms + abs(at) * np.abs(nearest(self.E))
@@ -185,9 +177,7 @@ def named_pencil(
     kept: Mapping[str, Sequence[int]] | None = None,
 ) -> NamedPencil:  # fmt: skip
     """Return a block matrix of the plant's matrices by name, such as ``[["A", "Bf"], ["C", "Df"]]``, minus s times E.
-
-    ``kept``: the columns of a matrix that are taken, all by default.  Where E is named it stands for itself, not for s.
-    """
+    ``kept``: the columns of a matrix that are taken, all by default.  E by name stands for itself, not for s."""
     exact, chosen, sized = rational_matrices(plant), kept or {}, sized_plant(plant)
     scale = {"x": units.states, "f": units.faults, "d": units.disturbances}
     kinds = {"E": "x", "A": "x", "C": "x", "Bf": "f", "Df": "f", "Bd": "d", "Dd": "d"}

@@ -15,20 +15,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class SystemFacts:
-    """What was decided about a pencil ``[A - s E, B; C, D]``; ``exact`` or to hundreds of digits.
-
-    Fields: normal_rank, columns: They are equal when no combination of inputs and initial states is hidden at all
-    times; outside, zeros: Finite zeros on or outside the stability boundary, the most unstable first, and all of them;
-    exact: Whether all was decided in rational arithmetic; computed: Whether some of the data were computed in floating
-    point.
-    """
+    """What was decided about ``[A - s E, B; C, D]``, in rational arithmetic (``exact``) or to hundreds of digits."""
 
     normal_rank: int
     columns: int
-    outside: tuple[complex, ...]
+    outside: tuple[complex, ...]  # finite zeros that are not stable, the most unstable first
     zeros: tuple[complex, ...]
     exact: bool
-    computed: bool = False
+    computed: bool = False  # whether some of the data were computed in floating point
 
     @property
     def full(self) -> bool:

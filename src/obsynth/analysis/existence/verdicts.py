@@ -1,9 +1,6 @@
-"""Three answers from exact decisions and floating point: no, yes with its distance, and unclear.
+"""Three answers: no (exact, on the numbers as written), yes with its distance from another answer, and unclear.
 
-*No* is exact on the numbers as written.  *Yes* is exact too, and comes with how far the data are from another answer.
-Where that is no more than what rounding of the data or of any gains can bridge, the answer is *unclear*.
-
-Modes that no output shows: those of the numbers as written, and those that only rounding of the data shows.
+It is unclear where that distance is no more than what rounding of the data or of any gains can bridge.
 """
 
 from __future__ import annotations
@@ -36,9 +33,7 @@ from obsynth.proofs.balls import UNIT_ROUNDOFF
 
 def settled_rank(decision: RankDecision, exact_rank: int | None, share: float = np.inf) -> RankDecision:
     """Return a rank decision with the exact rank in place of that by a tolerance, or unclear.
-
-    ``share``: the least singular value beside the terms that the entries are sums of, where those are known.
-    """
+    ``share``: the least singular value beside the terms that the entries are sums of, where those are known."""
     if exact_rank is None:
         return decision
     if exact_rank < decision.expected:
@@ -63,14 +58,11 @@ SCATTER = 1e-2
 
 @dataclass(frozen=True)
 class ZeroVerdict:
-    """What is known of the zeros of a pencil outside the region of stability.
+    """What is known of the zeros of a pencil outside the region of stability."""
 
-    ``answer`` is no, yes or unclear; ``distance`` is there unless the answer is no.
-    """
-
-    answer: str
+    answer: str  # no, yes or unclear
     facts: SystemFacts
-    distance: Distance | None = None
+    distance: Distance | None = None  # there unless the answer is no
 
     @property
     def means(self) -> str:
@@ -147,9 +139,7 @@ def verdict_condition(
     seen: Callable[[], Sequence[complex]],
 ) -> Condition:  # fmt: skip
     """Return the condition of a verdict: as it holds; lost, with the gain that anything else would need; or in doubt.
-
-    ``lost(zeros)`` says what hides there, ``seen()`` which zeros floating point has outside, ``what`` would exist.
-    """
+    ``lost(zeros)`` says what hides there, ``seen()`` which zeros floating point has outside, ``what`` would exist."""
     if verdict.answer == "no":
         found = lost(verdict.facts.outside)
         return replace(found, detail=f"{found.detail} {gain(found.mode or 0j)}".rstrip())
@@ -180,9 +170,7 @@ def zero_doubt(
 
 def needed_gain(plant: DescriptorSystem, units: PlantUnits, point: complex, *, inputs: str = "") -> str:
     """Return which gain any observer would need, were the last digits of data off that hide something only exactly.
-
-    Empty where no digits would help: with as many inputs as outputs (``inputs``: Bf, Bd or none) a zero stays.
-    """
+    Empty where no digits would help: with as many inputs as outputs (``inputs``: Bf, Bd or none) a zero stays."""
     entering = getattr(plant, inputs) if inputs else np.zeros((plant.nx, 0))
     direct = getattr(plant, f"D{inputs[1:]}") if inputs else np.zeros((plant.ny, 0))
     if plant.ny <= entering.shape[1]:

@@ -61,14 +61,11 @@ class EntryChange:
 
 @dataclass(frozen=True)
 class Witness:
-    """Changes of entries after which the answer is another one, and the size of the largest beside scaled entries.
-
-    Fields: changes; size; point: Where the changed pencil loses rank (``None`` for a matrix without s).
-    """
+    """Changes of entries after which the answer is another one."""
 
     changes: tuple[EntryChange, ...]
-    size: float
-    point: complex | None = None
+    size: float  # of the largest change, beside scaled entries
+    point: complex | None = None  # where the changed pencil loses rank; ``None`` for a matrix without s
 
     def described(self, plant: DescriptorSystem, *, parameters: bool = False) -> str:
         """Return the changes in words."""
@@ -97,18 +94,13 @@ class Witness:
 
 @dataclass(frozen=True)
 class Unclear:
-    """Why rounding of the data could change an answer.
+    """Why rounding of the data could change an answer."""
 
-    Fields: tolerance: What the data are known to, relative to the largest scaled entry; witness: A plant within it that
-    has the other answer, ``None`` where none was found; other: What that plant is, in words; decider: What would
-    decide it; parameters: Whether what stands as faults are parameters, in Phi and Psi.
-    """
-
-    tolerance: float
-    witness: Witness | None
-    other: str
-    decider: str
-    parameters: bool = False
+    tolerance: float  # what the data are known to, relative to the largest scaled entry
+    witness: Witness | None  # a plant within it that has the other answer, where one was found
+    other: str  # what that plant is, in words
+    decider: str  # what would decide it
+    parameters: bool = False  # whether what stands as faults are parameters, in Phi and Psi
 
     def described(self, plant: DescriptorSystem) -> str:
         """Return all of it in words."""

@@ -138,9 +138,7 @@ def _description(plant: DescriptorSystem, count: int, dropped: Sequence[str] = (
 
 def eliminated_exactly(plant: DescriptorSystem, basis: FloatArray | None = None) -> Transformation | None:
     """Return the elimination in rational arithmetic, rounded once; ``None`` where it must be left to floating point.
-
-    ``basis (nx, count)`` are the dynamic states to take, where they are combinations of those given.
-    """
+    ``basis (nx, count)`` are the dynamic states to take, where they are combinations of those given."""
     exact = exact_elimination(plant)
     if exact is not None and computed_entries(plant.E) and _dynamic_count(plant) != len(exact.pivots):
         return None

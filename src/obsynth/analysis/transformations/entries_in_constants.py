@@ -71,11 +71,9 @@ def at_nominal(model: DAEModel, box: ConstantsBox) -> DAEModel:
 def entries_in_constants(
     model: DAEModel, point: Point, box: ConstantsBox, columns: Mapping[str, Sequence[int]], *, moving: bool
 ) -> tuple[dict[str, list[Entry]], list[Entry], list[Entry]]:
-    """Return entries of the matrices that depend on the box, and those of the equilibrium's shift (equations, outputs).
-
-    ``columns``: numbers of the inputs that are known (``B``) and not (``Bd``), and of the parameters that are faults
-    (``Bf``); ``moving``: the motion of the point is an input after the known ones.
-    """
+    """Return entries of the matrices that depend on the box, and of the equilibrium's shift in equations and outputs.
+    ``columns``: inputs, known (``B``) and not (``Bd``), and parameters that are faults (``Bf``); ``moving``: the
+    motion of the point is an input after the known ones."""
     import casadi as ca
 
     symbols = {name: ca.SX.sym(name) for name in box.names}

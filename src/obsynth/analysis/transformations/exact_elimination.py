@@ -1,8 +1,7 @@
 """Elimination of algebraic states in rational arithmetic: every entry of the result is rounded once.
 
-With N a basis of ker E, L one of its left null space, and D and P unit vectors that complete them, ``x = D z + N v``,
-``L A N v = -L (A D z + B u + ...)`` and ``P E D z+ = P (A D z + A N v + B u + ...)``: index 1 is ``L A N`` nonsingular.
-Where the dynamic states are combinations of those given, ``z`` is changed to the orthogonal ones afterwards.
+With bases N of ker E, L of its left null space, completed by unit vectors D and P, ``x = D z + N v``,
+``L A N v = -L (A D z + B u)`` and ``P E D z+ = P (A D z + A N v + B u)``: index 1 is ``L A N`` nonsingular.
 """
 
 from __future__ import annotations
@@ -34,20 +33,14 @@ _DIRECT = ("D", "Df", "Dd", "Dw")
 
 @dataclass(frozen=True, eq=False)
 class ExactElimination:
-    """The reduced plant and the recovery of its states, in rational coordinates.
+    """The reduced plant and the recovery of its states, in rational coordinates."""
 
-    Fields: matrices: ``A, B, Bf, Bd, Bw, C, D, Df, Dd, Dw`` of the reduced plant; recovery: ``x`` from the new states
-    (``A``) and from the signals (``B, Bf, Bd, Bw``); pivots: States that stand for the dynamic ones; computed: Whether
-    some of the data were computed in floating point; sizes: Of ``matrices``, the sums of the sizes of all terms;
-    uncleaned: What ``matrices`` were before what rounding may have left was set to zero, where that was done.
-    """
-
-    matrices: Mapping[str, fmpq_mat]
-    recovery: Mapping[str, fmpq_mat]
-    pivots: tuple[int, ...]
-    computed: bool
-    sizes: Mapping[str, FloatArray]
-    uncleaned: Mapping[str, fmpq_mat] | None = None
+    matrices: Mapping[str, fmpq_mat]  # ``A, B, Bf, Bd, Bw, C, D, Df, Dd, Dw`` of the reduced plant
+    recovery: Mapping[str, fmpq_mat]  # ``x`` from the new states (``A``) and the signals (``B, Bf, Bd, Bw``)
+    pivots: tuple[int, ...]  # states that stand for the dynamic ones
+    computed: bool  # whether some of the data were computed in floating point
+    sizes: Mapping[str, FloatArray]  # of ``matrices``, the sums of the sizes of all terms
+    uncleaned: Mapping[str, fmpq_mat] | None = None  # ``matrices`` before what may be rounding was set to zero
 
     def origin(self, sizes: Mapping[str, FloatArray]) -> PlantOrigin:
         """Return what the reduced plant remembers of it, with the sizes of the terms in its own coordinates."""
@@ -141,7 +134,7 @@ def rounded_once(
     import flint
 
     from obsynth.proofs.enclosed_pencils import enclosed
-    from obsynth.proofs.exact_arithmetic import nearest_doubles, written_matrix
+    from obsynth.proofs.exact_arithmetic import nearest_doubles, pivot_columns, written_matrix
 
     if dynamic is None:
         return (
@@ -150,7 +143,7 @@ def rounded_once(
             dict(found.sizes),
         )
     e = written_matrix(plant.E)
-    rows = _independent_rows(e, found.pivots)
+    rows = pivot_columns((e * _units(plant.nx, found.pivots)).transpose())
     with flint.ctx.workprec(COORDINATE_BITS):
         # E dynamic z = E (unit vectors) z_rational
         change = flint.arb_mat(enclosed(_rows(e * written_matrix(dynamic), rows))).solve(
@@ -210,12 +203,6 @@ def _sizes(matrix: fmpq_mat) -> FloatArray:
 def _doubles(matrix: Any) -> FloatArray:
     rows = [[0.0 if value.contains(0) else float(value) for value in row] for row in matrix.tolist()]
     return np.array(rows, dtype=np.float64)
-
-
-def _independent_rows(e: fmpq_mat, pivots: tuple[int, ...]) -> list[int]:
-    from obsynth.proofs.exact_arithmetic import pivot_columns
-
-    return pivot_columns((e * _units(int(e.ncols()), pivots)).transpose())
 
 
 def _rows(matrix: fmpq_mat, chosen: list[int]) -> fmpq_mat:

@@ -1,15 +1,13 @@
-"""Variables that act on nothing: found by the pattern of a plant, named, and left out exactly.
+"""Variables that act on nothing (as in filters whose time constants are zero), found by the pattern of a plant.
 
-A filter whose time constants are zero may ask for the derivative of what it filters, or may leave its output free.
-When no output depends on such a variable, nor on what depends on it, all of these can be left out together with their
-equations: what is left is determined by the other equations alone.  With them the plant would have index 2, or would
-not be regular.
+No output depends on them nor on what depends on them: they are left out exactly, with as many equations.  With them
+the plant would have index 2, or would not be regular.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -95,10 +93,7 @@ def active_part(plant: DescriptorSystem, found: ActiveVariables) -> DescriptorSy
 
 
 def _surplus_equations(plant: DescriptorSystem, coarse: CoarseStructure, e: Any, a: Any, c: Any) -> Indices | None:
-    """Return the equations to leave out with variables in too few of them; nothing where that would not be exact.
-
-    Those of these variables alone, and as many more as follow from others.
-    """
+    """Return the equations of these variables alone, and as many more as follow from others, if that is exact."""
     if c[:, coarse.under_columns].nnz or not _solvable(plant, coarse.under_rows, coarse.under_columns):
         return None
     rows = coarse.over_rows
@@ -144,9 +139,7 @@ def _solvable(plant: DescriptorSystem, rows: Indices, columns: Indices) -> bool:
 
 def _left_null_space(tall: Any) -> tuple[FloatArray, FloatArray]:
     """Return an orthonormal left null basis of a matrix with scaled rows, and the scales: one solution, bordered.
-
-    With random G and H ``[M G; H 0]`` is nonsingular; its left solutions for the columns of G hold the null space.
-    """
+    With random G and H ``[M G; H 0]`` is nonsingular; its left solutions for the columns of G hold the null space."""
     from scipy.sparse import block_array, diags_array
 
     (count, width), rng, more = tall.shape, np.random.default_rng(2), 0
@@ -217,7 +210,7 @@ def _undetermined_blocks(
     return [int(number) for number, own, variables in parts if sparse_factor(pencil[own][:, variables]).singular]
 
 
-def raise_structurally_singular(plant: DescriptorSystem, equations: Indices, variables: Indices) -> None:
+def raise_structurally_singular(plant: DescriptorSystem, equations: Indices, variables: Indices) -> NoReturn:
     """Refuse a plant whose pattern alone leaves variables free, and name them and the surplus equations."""
     equations, variables = own_first(equations, variables), own_first(variables, equations)
     names = [plant.state_names[i] for i in variables]

@@ -32,11 +32,7 @@ _MAPS = {
 
 @dataclass(frozen=True, eq=False)
 class StateRecovery:
-    """``x_source = from_state x + from_input u + from_fault f + from_disturbance d + from_noise w``.
-
-    Maps ``(nx_source, nx)``, ``(nx_source, nu)`` and so on, read-only; ``noise_kept (nw_source, nw)``: the noise of the
-    source as far as the transformed plant still has it; ``operating_point``: of the source states.
-    """
+    """``x_source = from_state x + from_input u + from_fault f + from_disturbance d + from_noise w``, read-only maps."""
 
     names: tuple[str, ...]
     from_state: FloatArray
@@ -44,8 +40,8 @@ class StateRecovery:
     from_fault: FloatArray
     from_disturbance: FloatArray
     from_noise: FloatArray
-    noise_kept: FloatArray
-    operating_point: Mapping[str, float] = field(default_factory=dict)
+    noise_kept: FloatArray  # ``(nw_source, nw)``: the source's noise as far as it is left
+    operating_point: Mapping[str, float] = field(default_factory=dict)  # of the source states
 
     def __post_init__(self) -> None:
         for name in (*_MAPS, "noise_kept"):

@@ -20,18 +20,14 @@ SIGNALS = ("state", "input", "fault", "disturbance", "noise")
 
 @dataclass(frozen=True, eq=False)
 class RecoveryOperator:
-    """``x = dynamic xi + algebraic z`` with ``coupling z + right [xi; u; f; d; w] = 0``, all sparse.
+    """``x = dynamic xi + algebraic z`` with ``coupling z + right [xi; u; f; d; w] = 0``, all sparse."""
 
-    ``dynamic (nx, count)``, ``coupling (nx - count, nx - count)`` nonsingular; ``counts`` of states, inputs, faults,
-    disturbances, noise; ``states``: ``xi`` from each signal of the plant now, where later transformations changed it.
-    """
-
-    dynamic: Any
+    dynamic: Any  # ``(nx, count)``
     algebraic: Any
-    coupling: Any
+    coupling: Any  # ``(nx - count, nx - count)``, nonsingular
     right: Any
-    counts: tuple[int, ...]
-    states: Mapping[str, FloatArray] = field(default_factory=dict)
+    counts: tuple[int, ...]  # of states, inputs, faults, disturbances, noise
+    states: Mapping[str, FloatArray] = field(default_factory=dict)  # ``xi`` from the plant's signals now
     noise_kept: FloatArray | None = None
 
     @cached_property

@@ -29,35 +29,25 @@ GENERIC_POINTS = (0.7391, -1.3247)
 
 @dataclass(frozen=True, eq=False)
 class SparseCoordinates:
-    """Equations and states of a plant, split into dynamic and algebraic ones by what E does.
+    """Equations and states of a plant, split into dynamic and algebraic ones by what E does."""
 
-    Fields: dynamic_rows, algebraic_rows: ``(count, nx)`` and ``(nx - count, nx)``: combinations of equations; E has
-    none of the latter; dynamic, algebraic: ``(nx, count)`` and ``(nx, nx - count)``: bases of states; E maps the latter
-    to zero; names: Of the dynamic states: their own, where these are whole states of the plant; neglected: States whose
-    derivative has a coefficient that counts as zero beside the others.
-    """
-
-    dynamic_rows: Any
-    algebraic_rows: Any
-    dynamic: Any
-    algebraic: Any
-    names: tuple[str, ...]
-    neglected: tuple[str, ...]
+    dynamic_rows: Any  # ``(count, nx)``: combinations of equations
+    algebraic_rows: Any  # ``(nx - count, nx)``: those without E
+    dynamic: Any  # ``(nx, count)``: basis of states
+    algebraic: Any  # ``(nx, nx - count)``: basis of ker E
+    names: tuple[str, ...]  # of the dynamic states: their own, where these are whole states of the plant
+    neglected: tuple[str, ...]  # states whose derivative has a coefficient that counts as zero beside the others
 
 
 @dataclass(frozen=True, eq=False)
 class SparseReduction:
-    """A plant without its algebraic states: its matrices, and how the others follow from the states that are left.
+    """A plant without its algebraic states: its matrices, and how the others follow from the states that are left."""
 
-    Fields: matrices: ``A, B, Bf, Bd, Bw, C, D, Df, Dd, Dw``; names: Of the states; operator: All states from these;
-    bounds: How well the algebraic equations were solved; neglected: States whose derivative was taken as zero.
-    """
-
-    matrices: dict[str, FloatArray]
-    names: tuple[str, ...]
+    matrices: dict[str, FloatArray]  # ``A, B, Bf, Bd, Bw, C, D, Df, Dd, Dw``
+    names: tuple[str, ...]  # of the states
     operator: RecoveryOperator
-    bounds: SolutionBounds
-    neglected: tuple[str, ...]
+    bounds: SolutionBounds  # how well the algebraic equations were solved
+    neglected: tuple[str, ...]  # states whose derivative was taken as zero
 
     def note(self) -> str:
         """Return one sentence about derivatives that were taken as zero; empty where there are none."""
@@ -229,9 +219,7 @@ def not_index_one(
     plant: DescriptorSystem, active: ActiveVariables, said: PreconditionError | None = None
 ) -> PreconditionError:
     """Return the refusal of a plant that does not have index 1 without its idle variables either: which part, and why.
-
-    It goes on where ``said`` refused; its signals are the variables, none where nothing was found wrong.
-    """
+    It goes on where ``said`` refused; its signals are the variables, none where nothing was found wrong."""
     part = active_part(plant, active)
     split = split_by_derivatives(part)
     inner = csr(split.algebraic_rows @ csr(part.A) @ split.algebraic)

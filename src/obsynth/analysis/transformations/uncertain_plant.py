@@ -26,11 +26,7 @@ _INPUTS, _DIRECT = ("B", "Bf", "Bd"), ("D", "Df", "Dd")
 
 @dataclass(frozen=True, eq=False)
 class AffinePlant:
-    """The matrices of a plant over a box, for the state ``x'`` with ``x = coordinates x'``.
-
-    Columns of the state are those of x'; rows are those of the plant.  ``matrices`` has E, A, ..., Dd; ``offsets (p,)``
-    is where the nominal plant is in the unknowns.
-    """
+    """The matrices ``E, A, ..., Dd`` of a plant over a box, for the state ``x'`` with ``x = coordinates x'``."""
 
     plant: DescriptorSystem
     box: ConstantsBox
@@ -108,9 +104,7 @@ def moving_basis(plant: DescriptorSystem, box: ConstantsBox) -> FloatArray:
 
 def untouched_states(columns: FloatArray, sizes: FloatArray) -> list[int]:
     """Return states that drive none but each other: ``columns (m, n)`` of what they do, rows of A first.
-
-    ``sizes (m,)``: of the rows; what is below `ROUNDING_SHARE` of these is rounding.
-    """
+    ``sizes (m,)``: of the rows; what is below `ROUNDING_SHARE` of these is rounding."""
     n = columns.shape[1]
     acting = np.abs(columns) > ROUNDING_SHARE * np.maximum(sizes, np.finfo(np.float64).tiny)[:, None]
     found = [j for j in range(n) if not acting[n:, j].any()]
@@ -123,11 +117,8 @@ def untouched_states(columns: FloatArray, sizes: FloatArray) -> list[int]:
 
 
 def untouched_coordinates(matrices: Mapping[str, AffineMatrix]) -> FloatArray:
-    """Return ``V (n, n)``: columns of E V, A V, C V that the constants do not touch, where there are any.
-
-    V is the identity but for some columns, so that its inverse is exact: ``2 I - V``.  States whose own equations the
-    constants move most become relative to those that they move least.
-    """
+    """Return ``V (n, n)``, with inverse ``2 I - V``: columns of E V, A V, C V that the constants do not touch, if any.
+    States whose own equations the constants move most become relative to those that they move least."""
     from scipy.linalg import qr
 
     # What the constants multiply the state with, all rows of all of them.
@@ -172,10 +163,7 @@ def _reduced(
     written: Mapping[str, FloatArray], matrices: Mapping[str, AffineMatrix], basis: FloatArray | None
 ) -> dict[str, AffineMatrix]:
     """Return the plant with its algebraic states eliminated and E inverted, in coordinates of its dynamic state.
-
-    With ``x2 = X0 z + xi``, X0 the solution at the middle and z the dynamic state and the inputs, only what the
-    constants change is multiplied by the inverse that depends on them: what they do not touch stays untouched.
-    """
+    ``x2 = X0 z + xi``, X0 that of the middle, z dynamic state and inputs: what constants do not touch stays so."""
     n, count = len(written["A"]), matrices["A"].count
     rows, dynamic, algebraic = algebraic_coordinates(DescriptorSystem(written["E"], written["A"], C=np.zeros((1, n))))
     nd = dynamic.shape[1]

@@ -1,10 +1,7 @@
-r"""A bound of residuals and fault estimates over the box of the plant's constants: what does not change online.
+r"""A bound of residuals and fault estimates over the box of the plant's constants (robust.md, theorems 1 and 2).
 
-    tau_k = nominal + start_k + sum_i |phi_i| + rest_k + rounding_k
-
-``phi_i`` are filters driven by the measured signals, one for each constant (first order); ``rest`` is the second order
-and all remainders, through a recursion of nonnegative numbers: ``h`` bounds the channels, a ring of L samples of it is
-kept, what is older is bounded through eps.  See robust.md, theorems 1 and 2.
+``tau_k = nominal + start_k + sum_i |phi_i| + rest_k + rounding_k``: ``phi_i`` filters of the measured signals, one for
+each constant (first order), ``rest`` all higher orders, by a recursion of nonnegative numbers over a ring of L samples.
 """
 
 from __future__ import annotations
@@ -36,32 +33,25 @@ START_RINGS = 4
 
 @dataclass(frozen=True, eq=False)
 class AdaptiveBound:
-    """What a threshold over a box needs online, for ``v = [xhat; u]``; the ring holds ``w`` numbers of each sample.
-
-    ``drive (p, nz + rows + no, nv)``: what each constant does to eps, channel rows and outputs; ``shown (rows + no,
-    nz)``: what eps does to them.  ``kernels (L w, m + no + nz)``, oldest sample first: what the ring adds to channels
-    (solved for the loop at one sample), outputs and eps; ``same (w, m + no)`` at the same sample.  ``rounding (m + no,
-    nu + ny + n + 1)``, for the largest signals so far.  ``first (nz, nu)``: first inputs to the last sensitivity
-    (continuous designs).
-    """
+    """What a threshold over a box needs online, for ``v = [xhat; u]``; the ring holds ``w`` numbers of each sample."""
 
     structure: ErrorStructure
     responses: Responses
     varying: bool
-    drive: FloatArray
-    shown: FloatArray
-    kernels: FloatArray
-    same: FloatArray
-    solved: FloatArray
+    drive: FloatArray  # ``(p, nz + rows + no, nv)``: constants to eps, channel rows and outputs
+    shown: FloatArray  # ``(rows + no, nz)``: eps to channel rows and outputs
+    kernels: FloatArray  # ``(L w, m + no + nz)``, oldest first: ring to channels, outputs and eps
+    same: FloatArray  # ``(w, m + no)``: the same at one sample
+    solved: FloatArray  # for the loop of the channels at one sample
     tail: FloatArray
     nominal: FloatArray
     more: FloatArray
-    rounding: FloatArray
+    rounding: FloatArray  # ``(m + no, nu + ny + n + 1)``, for the largest signals so far
     start: FloatArray
     start_later: tuple[float, FloatArray]
     spans: FloatArray
     remainder_inputs: tuple[int, ...]
-    first: FloatArray | None = None
+    first: FloatArray | None = None  # ``(nz, nu)``: first inputs to the last sensitivity (continuous designs)
 
     @property
     def length(self) -> int:

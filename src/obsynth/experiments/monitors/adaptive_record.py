@@ -16,14 +16,11 @@ CACHED_SAMPLES = 4000
 
 
 class Thresholds(NamedTuple):
-    """Bounds ``(runs, steps, no)`` of fault estimates, then residuals: ``nominal + start + sum of first + rest``.
-
-    ``first (runs, steps, p, no)``: of each constant; ``shift`` where the interval's middle is, for a box off centre.
-    """
+    """Bounds ``(runs, steps, no)`` of fault estimates, then residuals: ``nominal + start + sum of first + rest``."""
 
     total: FloatArray
-    first: FloatArray
-    shift: FloatArray
+    first: FloatArray  # ``(runs, steps, p, no)``: of each constant
+    shift: FloatArray  # where the interval's middle is, for a box off centre
     start: FloatArray
     rest: FloatArray
     channels: FloatArray

@@ -18,18 +18,15 @@ from obsynth.numerics.arrays import FloatArray
 
 @dataclass
 class AdaptiveState:
-    """What goes from sample to sample: sensitivities ``psi (p, nz)``, ``ring (L, w)``, ``eps (L, nz)``, oldest first.
+    """What goes from sample to sample, rings with the oldest first."""
 
-    For varying constants ``past (L, nv)`` signals and ``moved (L, nz)`` bounds; ``k`` samples since the start.
-    """
-
-    psi: FloatArray
-    ring: FloatArray
-    eps: FloatArray
+    psi: FloatArray  # ``(p, nz)``: sensitivities
+    ring: FloatArray  # ``(L, w)``
+    eps: FloatArray  # ``(L, nz)``
     largest: FloatArray
-    past: FloatArray
-    moved: FloatArray
-    k: int = 0
+    past: FloatArray  # ``(L, nv)``: signals, for varying constants
+    moved: FloatArray  # ``(L, nz)``: bounds, for varying constants
+    k: int = 0  # samples since the start
 
     @classmethod
     def of(cls, bound: AdaptiveBound) -> AdaptiveState:
@@ -126,15 +123,12 @@ FORGETTING_RINGS = 3
 
 @dataclass(frozen=True, eq=False)
 class AdaptivePlan:
-    """What an adaptive monitor is made of: ``bound`` without a fault, ``faults`` of fault estimates during one.
+    """What an adaptive monitor is made of."""
 
-    ``faults`` is `None` where there is none (``reason`` says why), or where it is the ``same`` as without a fault.
-    """
-
-    bound: AdaptiveBound
-    faults: AdaptiveBound | None
+    bound: AdaptiveBound  # without a fault
+    faults: AdaptiveBound | None  # of fault estimates during a fault; ``None`` if there is none, or the same
     same: bool
-    reason: str
+    reason: str  # why there is none
     start_beyond_nominal: bool
     estimates: bool
     names: tuple[str, ...]

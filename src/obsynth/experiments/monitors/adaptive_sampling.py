@@ -1,13 +1,7 @@
-r"""Thresholds over a box for continuous designs, whose observer runs on samples: the sampled error system.
+"""Thresholds over a box for continuous designs on samples, for ``eps = z - Gamma_1 v - T x`` at these.
 
-The observer takes outputs as straight lines between samples, which the plant does not follow: in the coordinates
-``zeta = z - Gamma_1 v`` that a sampled observer keeps, and with ``eps = zeta - T x`` at the samples,
-
-    eps+ = Az eps + (Az T + By C - T Phi) x + (Bu + By D - T Gamma) u + (By Dd d - T q) + By v
-
-where ``Phi, Gamma`` are those of a zero-order hold over the box, and q what the disturbance does in between.  The
-brackets do not vanish at the nominal plant: what is left there acts like one more constant, ``sampling``, whose value
-is known.  The disturbance may take any course within its bound: each piece of an interval is a signal of its own.
+``eps+ = Az eps + (Az T + By C - T Phi) x + (Bu + By D - T Gamma) u + (By Dd d - T q) + By v``, q of d of any course;
+what the brackets leave at the nominal plant acts like one more constant, ``sampling``.
 """
 
 from __future__ import annotations
@@ -42,20 +36,16 @@ SAMPLING = "sampling"
 
 
 class SampledProblem(NamedTuple):
-    """The error system of a continuous design at the samples of its data; ``bounds`` of all pieces.
-
-    ``reading (n, nx)``: the dynamic state from the plant's; ``first (nz, nu)``, ``unknown (nz,)``: what first inputs,
-    and at most first disturbance and noise, do to eps at the start.
-    """
+    """The error system of a continuous design at the samples of its data."""
 
     affine: AffinePlant
     observer: LinearObserver
     tracking: Tracking
-    bounds: FloatArray
-    reading: FloatArray
-    first: FloatArray
+    bounds: FloatArray  # of all pieces
+    reading: FloatArray  # ``(n, nx)``: the dynamic state from the plant's
+    first: FloatArray  # ``(nz, nu)``: first inputs to eps at the start
     ramp: FloatArray
-    unknown: FloatArray
+    unknown: FloatArray  # ``(nz,)``: first disturbance and noise to eps at the start, at most
 
     def start(self, known: Start, box: tuple[FloatArray, FloatArray] | None) -> Start:
         """Return what is known of eps at the start; ``box`` of the plant's state, middle and half width."""
@@ -139,26 +129,20 @@ def _dynamic(plant: DescriptorSystem, uncertain: Uncertainty) -> FloatArray:
 
 def _pieces(a: AffineMatrix, bd: AffineMatrix, dt: float) -> list[AffineMatrix]:
     """Return what a disturbance of one sign does in each piece of an interval, newest first ``(n, nd)``.
+    The remainder holds a change of sign inside a piece: at most a quarter of its length, squared, times the slope."""
+    from scipy.linalg import expm
 
-    The remainder holds a change of sign inside a piece: at most a quarter of its length, squared, times the slope.
-    """
     width = dt / PIECES
     step, gathered = affine_zero_order_hold(a, bd, width)
     size = a.magnitude
-    growth = np.eye(len(size)) + size * width @ _exponential_bound(size * width)
+    # ``exp(S)`` bounds ``sum_k S^k / (k + 1)!`` for ``S >= 0``.
+    growth = np.eye(len(size)) + size * width @ (expm(size * width) * SERIES_SLACK)
     found, piece, value = [], gathered, bd
     for _ in range(PIECES):
         slope = size @ (growth @ value.magnitude)
         found.append(piece.enlarged(rounded_up(0.25 * width**2 * slope, 6)))
         piece, value = step @ piece, step @ value
     return found
-
-
-def _exponential_bound(size: FloatArray) -> FloatArray:
-    """Return an upper bound of ``sum_k size^k / (k + 1)!`` for a nonnegative matrix."""
-    from scipy.linalg import expm
-
-    return np.asarray(expm(size) * SERIES_SLACK)
 
 
 def _noise(smooth: DescriptorSystem, back: FloatArray, dt: float) -> tuple[FloatArray, FloatArray]:

@@ -1,8 +1,7 @@
 """Which runs pass a threshold over a box, without computing all of it.
 
-It lies between what the first order gives and a bound of the rest that is linear in the largest signals so far; only
-runs with a value in between are computed in full.  What counts is a pass before something is wrong, and the first
-after.
+It lies between its first order and a bound that is linear in the largest signals so far; only runs in between are
+computed in full.  What counts is a pass before something is wrong, and the first after.
 """
 
 from __future__ import annotations
@@ -55,14 +54,11 @@ class Records(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Screening:
-    """Bounds of a threshold: ``rest (no, nu + ny + n + 1)``, all but the first order, per largest signal so far.
-
-    ``slack (no, n + nu)``: what rounding may change in the first order.
-    """
+    """Bounds of a threshold, per largest signal so far."""
 
     plan: AdaptivePlan
-    rest: FloatArray
-    slack: FloatArray
+    rest: FloatArray  # ``(no, nu + ny + n + 1)``: all but the first order
+    slack: FloatArray  # ``(no, n + nu)``: what rounding may change in the first order
     _memory: dict[int, FloatArray] = field(default_factory=dict, repr=False)
 
     @classmethod

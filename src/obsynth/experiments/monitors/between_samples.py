@@ -1,19 +1,7 @@
-r"""What disturbances of any course do to the residual of a continuous design at the samples of its data, from above.
+"""What disturbances of any course do to the residual of a continuous design at the samples of its data, from above.
 
-The observer takes known inputs and outputs as straight lines between samples; the plant does not follow straight lines.
-In the coordinates of the error, ``eps = z - T x`` with ``T = V E``, and with ``x+ = Phi x + q``, ``y = C x + Dd d``,
-
-.. math::
-    \varepsilon^+ = \Phi_z \varepsilon + K x + (\Gamma_1 C - T) q + (\Gamma_0 - \Gamma_1) D_d d + \Gamma_1 D_d d^+,
-
-    r = C_r \varepsilon + D_r D_d d
-
-    K = \Phi_z T + (\Gamma_0 - \Gamma_1) C + \Gamma_1 C \Phi - T \Phi, \qquad
-    q = \int_0^h e^{A s} B_d\, d(t + h - s)\, ds
-
-K is what straight lines miss of a free motion of the plant: of third order in h, and zero for constants and ramps.  So
-x enters with a small factor, and only as far as it dies out: what is left of the modes that do not die out is rounding,
-or there is no bound.  All sums are proved (`obsynth.proofs.peak_sums`).
+The observer takes outputs as straight lines, which the plant does not follow.  x enters the error by what these miss of
+a free motion, as far as it dies out: the other modes leave rounding, or there is no bound.
 """
 
 from __future__ import annotations
@@ -49,23 +37,19 @@ FINITE = 1e-12
 
 @dataclass(frozen=True, eq=False)
 class BetweenSamples:
-    """A continuous design on samples: ``s+ = M s``, ``r = c s``, ``s = [x; eps]`` with the part of x that is forgotten.
-
-    ``into (n + nz, n)``: how q enters s; ``first, second``: how ``y`` of a sample enters it at that sample and the
-    next; ``left (nr,)``: what the modes that are not forgotten add per unit of each state, at most.
-    """
+    """A design on samples: ``s+ = M s``, ``r = c s``, ``s = [x; eps]`` with the part of x that is forgotten."""
 
     plant: DescriptorSystem
     dt: float
     M: Ball
     c: FloatArray
     contraction: Contraction | None
-    into: Ball
-    first: FloatArray
-    second: FloatArray
+    into: Ball  # ``(n + nz, n)``: how q enters s
+    first: FloatArray  # how ``y`` of a sample enters s at that sample
+    second: FloatArray  # the same at the next sample
     direct: FloatArray
     rows: slice
-    left: float
+    left: float  # what modes that are not forgotten add per unit of each state, at most
 
     @classmethod
     def of(
@@ -73,9 +57,7 @@ class BetweenSamples:
         endless: bool = True,
     ) -> BetweenSamples:  # fmt: skip
         """Return the design at samples ``dt`` apart, for ``tracking V (nz, nx)``; raise `SpecError` without a bound.
-
-        Without ``endless`` a record of known length is bounded whether or not anything dies out.
-        """
+        Without ``endless`` a record of known length is bounded whether or not anything dies out."""
         try:
             done = eliminate_algebraic_states(plant)
         except PreconditionError as error:
@@ -89,6 +71,8 @@ class BetweenSamples:
         az, g0, g1 = first_order_hold(observer.Az, observer.By, dt)
         phi, c = exponential(smooth.A, dt), exact(smooth.C)
         earlier, ramp = exact(g0) - exact(g1), exact(g1) @ c
+        # eps+ = Az eps + K x + (G1 C - T) q + (G0 - G1) Dd d + G1 Dd d+, r = Cz eps + J x + Dy Dd d: K is what straight
+        # lines miss of a free motion of the plant, of third order in dt, and zero for constants and ramps.
         k = exact(az) @ exact(t) + earlier @ c + ramp @ phi - exact(t) @ phi
         j = exact(observer.Cz[rows]) @ exact(t) + exact(observer.Dy[rows]) @ c
         terms = np.abs(az) @ np.abs(t) + (np.abs(g0) + 2.0 * np.abs(g1)) @ np.abs(smooth.C) + np.abs(t)

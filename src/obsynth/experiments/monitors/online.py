@@ -25,17 +25,14 @@ class Seen(NamedTuple):
 
 
 class Evidence(NamedTuple):
-    """What a recursive observer learnt from a sample: theta ``(nq,)``, its covariance, innovation ``(m,)``, regressor.
+    """What a recursive observer learnt from a sample."""
 
-    Innovation less regressor times the true parameters is white, N(0, I); ``score (nq,)`` and ``information (nq, nq)``.
-    """
-
-    theta: FloatArray
+    theta: FloatArray  # ``(nq,)``
     covariance: FloatArray
-    innovation: FloatArray
+    innovation: FloatArray  # ``(m,)``; less regressor times true parameters: white, N(0, I)
     regressor: FloatArray
-    score: FloatArray
-    information: FloatArray
+    score: FloatArray  # ``(nq,)``
+    information: FloatArray  # ``(nq, nq)``
 
 
 class LinearSample(NamedTuple):
@@ -198,9 +195,7 @@ class OnlineMonitor:
 
 
 def share_of_look(look: int) -> float:
-    """Return the share of the probability of a false alarm that look ``look`` (from 1) may take; all sum up to one.
-
-    Looks ``2^j`` to ``2^(j+1) - 1`` share ``6 / (pi (j + 1))^2`` evenly.
-    """
+    """Return the share of the probability of a false alarm for look ``look`` (from 1); all sum up to one.
+    Looks ``2^j`` to ``2^(j+1) - 1`` share ``6 / (pi (j + 1))^2`` evenly."""
     epoch = look.bit_length() - 1
     return 6.0 / (math.pi * (epoch + 1.0)) ** 2 / 2.0**epoch

@@ -1,10 +1,7 @@
-"""What reaches the residual of a design when nothing is wrong: disturbances, noise, an error at the start.
+"""What reaches the residual of a design when nothing is wrong: ``e = V E x - z`` at the samples.
 
-A continuous observer takes known inputs and outputs as straight lines between samples: at these its state is that in
-continuous time, and the noise of a sample goes through the sampled observer.  With ``e = V E x - z``, held disturbances
-d, process noise w gathered over an interval, and sensor noise n,
-
-    e+ = Phi e + Gamma d + w - By_h n,   r = -C e + Dd d + Dy_h n,   e(0) = V E x(0) - z(0) + Gamma_1 n(0)
+``e+ = Phi e + Gamma d + w - By_h n``, ``r = -C e + Dd d + Dy_h n``, ``e(0) = V E x(0) - z(0) + Gamma_1 n(0)``: held
+d, process noise w gathered over an interval, sensor noise n.
 """
 
 from __future__ import annotations
@@ -68,17 +65,13 @@ def tracked_errors(design: ObserverDesign, plant: DescriptorSystem) -> TrackedEr
 
 @dataclass(frozen=True, eq=False)
 class SampledErrors:
-    """The recursion of the module's text; w is noise of unit covariance, sensors first, ``gathered`` others after them.
-
-    ``sensor_outputs``: ``Dy_h Dw``, to states, faults and residuals at once; ``start (n, sensors)``: noise at the
-    start.
-    """
+    """The recursion of the module's text; w is noise of unit covariance: sensors first, then ``gathered`` others."""
 
     A: FloatArray
     Bd: FloatArray
     Bw: FloatArray
-    sensor_outputs: FloatArray
-    start: FloatArray
+    sensor_outputs: FloatArray  # ``Dy_h Dw``, to states, faults and residuals at once
+    start: FloatArray  # ``(n, sensors)``: noise at the start
     gathered: int
 
     def direct(self, rows: slice) -> FloatArray:
@@ -108,13 +101,7 @@ def sampled_errors(plant: DescriptorSystem, observer: LinearObserver, found: Tra
 
 @dataclass(frozen=True, eq=False)
 class ResidualModel:
-    """``e+ = A e + Bd d + Bw w``, ``r = C e + Dd d + Dw w`` at the samples, without faults, w of unit covariance.
-
-    ``start (n,)``: e there; ``bounds, means, deviations (nd,)``: largest absolute value of each disturbance (or
-    infinite), mean and deviation of what is random in it; ``steady``: nothing but that, all the time.  Of a continuous
-    design: ``flow``: A and Bd in continuous time; ``start_noise``: what the noise of the first sample adds to e there;
-    ``sensor_noise``: what noise of the sensors, drawn as straight lines between samples, does to e' and r.
-    """
+    """``e+ = A e + Bd d + Bw w``, ``r = C e + Dd d + Dw w`` at the samples, without faults, w of unit covariance."""
 
     A: FloatArray
     C: FloatArray
@@ -126,14 +113,14 @@ class ResidualModel:
     fault_Dd: FloatArray
     fault_Dw: FloatArray
     steps: int
-    start: FloatArray
-    bounds: FloatArray
-    means: FloatArray
+    start: FloatArray  # ``(n,)``: e there
+    bounds: FloatArray  # ``(nd,)``: largest absolute values of disturbances, or infinite
+    means: FloatArray  # ``(nd,)``: of what is random in them, as deviations
     deviations: FloatArray
-    steady: tuple[bool, ...]
-    flow: tuple[FloatArray, FloatArray] | None = None
-    start_noise: FloatArray | None = None
-    sensor_noise: tuple[FloatArray, FloatArray] | None = None
+    steady: tuple[bool, ...]  # nothing but what is random, all the time
+    flow: tuple[FloatArray, FloatArray] | None = None  # A and Bd in continuous time
+    start_noise: FloatArray | None = None  # noise of the first sample to e
+    sensor_noise: tuple[FloatArray, FloatArray] | None = None  # noise drawn as straight lines, to e' and r
     continuous: ContinuousDesign | None = None
     sampled: BetweenSamples | None = None
 

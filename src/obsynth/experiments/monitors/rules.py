@@ -31,10 +31,8 @@ ROUNDING = 1e-9
 
 class NormRule(Rule):
     """The norm of the residual, or of a window of it, against a bound by the number of samples since the start.
-
     Continuous designs: ``irregular`` holds where samples are not all ``dt`` apart, but none further; ``driven``: what
-    known inputs add.  ``watched``: rows of the observer that take the place of the residual.
-    """
+    known inputs add.  ``watched``: rows of the observer that take the place of the residual."""
 
     KEPT = ("norms", "begin", "last", "regular", "added", "states", "inputs", "moved", "late")
     SAME = "limit"
@@ -112,9 +110,7 @@ class NormRule(Rule):
 
 class WhitenedRule(Rule):
     """A window of residuals in the metric of its covariance: chi-square, or cumulative sums for a ``change``.
-
-    ``whitener (m, window nr)``, oldest sample first; ``white``: see `whitening.cusum_whitener`.
-    """
+    ``whitener (m, window nr)``, oldest sample first; ``white``: see `whitening.cusum_whitener`."""
 
     KEPT = ("window", "levels", "looks", "last")
 
@@ -188,11 +184,9 @@ _PARAMETER_STATEMENTS = {
 
 
 class ParameterRule(Rule):
-    """Parameters against their nominal values, or innovations against what noise explains, in a run of any length.
-
-    ``chi-square`` of theta in the metric of its covariance; ``cusum`` of the innovations for a ``change (nq,)``;
-    ``nis``, squares of the innovations over 20 samples, for all that the model does not explain.
-    """
+    """Parameters against nominal values, or innovations against what noise explains, in a run of any length.
+    ``chi-square`` of theta by its covariance; ``cusum`` of the innovations for a ``change (nq,)``; ``nis``, squares of
+    the innovations over 20 samples, for all that the model does not explain."""
 
     KEPT = ("levels", "looks", "squares")
 

@@ -18,17 +18,13 @@ from obsynth.numerics.norms import hinf_norm
 
 
 class ScaledInputs(NamedTuple):
-    """What drives a residual, each input scaled to at most one: ``B (n, m)``, ``D (nr, m)`` from sample to sample.
-
-    ``between (steps,)``, and later ``limit``: what signals that may do anything between samples add to the norm, at
-    most; ``start (n, any)``: inputs of the first sample alone, straight to the error.
-    """
+    """What drives a residual, each input scaled to at most one: ``B (n, m)``, ``D (nr, m)`` from sample to sample."""
 
     B: FloatArray
     D: FloatArray
-    between: FloatArray
-    limit: float
-    start: FloatArray
+    between: FloatArray  # ``(steps,)``: what signals that do anything between samples add to the norm
+    limit: float  # what they add later, at most
+    start: FloatArray  # ``(n, any)``: inputs of the first sample alone, straight to the error
 
 
 def scaled_inputs(
@@ -127,11 +123,8 @@ def _window_gain(model: ResidualModel, inputs: ScaledInputs) -> tuple[float, int
 
 def window_threshold(model: ResidualModel, inputs: ScaledInputs, initial_error: float, window: int) -> FloatArray:
     """Return what the l2 norm of the residual over the last ``window`` samples never passes.
-
-    The inputs give at most their l2 gain times ``sqrt(window m)``; the error at the window's start the root of its
-    energy. The pointwise bounds of its samples, summed up in squares, are used where less, and for what moves between
-    samples.
-    """
+    Inputs: l2 gain times ``sqrt(window m)``; the error at the start: the root of its energy.  Or the pointwise bounds
+    summed up in squares, where less, and for what moves between samples."""
     one_by_one = pointwise_threshold(model, inputs, initial_error)
     summed = np.array([np.linalg.norm(one_by_one[max(k - window + 1, 0) : k + 1]) for k in range(model.steps)])
     if model.flow is not None or model.sampled is not None:

@@ -94,7 +94,12 @@ def adaptive_observer(
 
     Notes
     -----
-    Differs from the paper: see the module `obsynth.methods.adaptive_observer.synthesis`.
+    Differs from (18): by default it learns from the whitened parity innovation, all ``rank`` directions of it, where
+    (18f) sees only ``rank E + ny - nx`` (none in the paper's own example; the paper does not state this condition); as
+    printed it is form ``literal``, refused where it has no residual direction.  States are those after the correction
+    ``xhat + Upsilon (theta(k+1) - theta(k))``, as (18a) lags by one update.  The covariance of theta is carried besides
+    S, which is none.  S is a triangle, bounded where excitation ends.  Parameters may walk randomly (the augmented
+    Kalman filter).  Those that leave no trace, or none of their own, are refused: (26) cannot hold for them.
 
     References
     ----------

@@ -1,18 +1,4 @@
-"""Method ``adaptive-observer``: states and parameters of a time-varying descriptor plant.
-
-Source: A. Moussa Ali, Q. Zhang, Fault diagnosis for linear time-varying descriptor systems, IFAC ALCOSP 2013, (18).
-
-Deviations:
-
-1. The default learns from the whitened parity innovation of the filter: all ``rank`` directions of it, where (18f) sees
-   only ``rank E + ny - nx`` of them (none in the paper's own example; the paper does not state this condition).
-2. (18) as printed is form ``literal``: with the paper's values, refused where it has no residual direction.
-3. States are reported after the correction ``xhat + Upsilon (theta(k+1) - theta(k))``; (18a) lags by one update.
-4. The covariance of theta is carried besides S, which is none (4.8 times too large in the audit's example).
-5. S is a triangle; a term ``(1 - lambda) M_reg`` or directional forgetting bounds it where excitation ends.
-6. Parameters may walk randomly instead (the augmented Kalman filter).
-7. Parameters that leave no trace, or none of their own, are refused: (26) cannot hold for them.
-"""
+"""Method ``adaptive-observer``: A. Moussa Ali, Q. Zhang, IFAC ALCOSP 2013, (18)."""
 
 from __future__ import annotations
 

@@ -1,23 +1,12 @@
-r"""A primal-dual interior-point method for programmes with a few dense semidefinite blocks and few unknowns.
+r"""A primal-dual method for programmes with a few dense semidefinite blocks and few unknowns.
 
 .. math:: \min_x c^T x, \quad s = b - A x \in K, \qquad \max_z -b^T z, \quad A^T z + c = 0, \quad z \in K
 
-with K a product of cones of semidefinite matrices, stored as in `SemidefiniteBlock`; a number that is not negative is
-a matrix of order one.
-
-General solvers factor a matrix as large as the cones, n(n + 1)/2 for a block of order n, which for the dense blocks of
-our inequalities costs n^6.  Here only the unknowns are left (the Schur complement).  A Nesterov-Todd scaling R of a
-block has ``R^-1 S R^-T = R'ZR = diag(l)``; with a tilde for ``R^-1 U R^-T`` (for z: ``R'UR``), ``G`` the columns of A
-after it, ``r_x = A'z + c``, ``r_s = A x + s - b`` and ``q`` from the linearised ``s z = sigma mu``, Newton's equations
-
-.. math:: A^T dz = -r_x, \qquad A\,dx + ds = -r_s, \qquad \tilde{ds} + \tilde{dz} = q
-
-become ``G'G dx = -r_x - G'(q + r_s~)``, ``dz~ = G dx + q + r_s~``, ``ds~ = q - dz~``: one product and one Cholesky
-factorisation of the order of x, shared by Mehrotra's predictor and corrector.
-
-Sources: Todd, Toh and Tutuncu, SIAM J. Optim. 8 (1998) 769-796; Andersen, Dahl, Liu and Vandenberghe, "Interior-point
-methods for large-scale cone programming", in Optimization for Machine Learning (2011), whose start we take.  Primal and
-dual steps have lengths of their own.  Nobody believes the numbers that come out: callers judge what is made of them.
+Only the unknowns are factored (Schur complement): general solvers pay n^6 for a dense block of order n.  With ``~``
+for ``R^-1 U R^-T`` (z: ``R'UR``) of the scaling R, G the columns of A after it, ``r_x = A'z + c``,
+``r_s = A x + s - b`` and ``ds~ + dz~ = q``, Newton's equations become ``G'G dx = -r_x - G'(q + r_s~)``,
+``dz~ = G dx + q + r_s~``, ``ds~ = q - dz~``.  Sources: Todd, Toh, Tutuncu, SIAM J. Optim. 8 (1998) 769-796 (scaling);
+Andersen, Dahl, Liu, Vandenberghe, in Optimization for Machine Learning (2011), whose start we take.
 """
 
 from __future__ import annotations
@@ -92,16 +81,12 @@ START_MARGIN = 1e-8
 
 @dataclass(frozen=True, eq=False)
 class ConeSolution:
-    """Where a search ended.
+    """Where a search ended."""
 
-    Fields: x, z: Unknowns ``(n,)`` and multipliers ``(m,)``; status: Whether the gap and the residuals are as small as
-    asked, nearly, because there is no x (as far as numbers can tell), or not; iterations: Number of factorisations.
-    """
-
-    x: FloatArray
-    z: FloatArray
+    x: FloatArray  # unknowns (n,)
+    z: FloatArray  # multipliers (m,)
     status: str
-    iterations: int
+    iterations: int  # number of factorisations
 
 
 def _joined(parts: Iterable[FloatArray]) -> FloatArray:
@@ -110,18 +95,15 @@ def _joined(parts: Iterable[FloatArray]) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """A point, the residuals of both equations, the relative gap, and the larger relative residual.
-
-    ``ray`` is ``|A'z| / -b'z``: zero for z in the cone shows that there is no x.
-    """
+    """A point, the residuals of both equations, and the relative gap."""
 
     x: FloatArray
     z: FloatArray
     dual: FloatArray
     primal: FloatArray
     gap: float
-    residual: float
-    ray: float
+    residual: float  # the larger relative one
+    ray: float  # |A'z| / -b'z: zero for z in the cone shows that there is no x
 
     @property
     def distance(self) -> float:

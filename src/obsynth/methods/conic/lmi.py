@@ -1,9 +1,7 @@
 """The LMI layer: the only place that writes matrix inequalities and calls a solver.
 
-Three traps are closed here.  ``X >> scalar`` in cvxpy promotes the scalar to a full matrix, so margins are
-always ``margin * I``.  A block matrix that is symmetric only in exact arithmetic gives a different cone, so
-every block is symmetrised.  A solver may end in a panic that is no ``Exception``: whatever it does becomes
-a `SolverError` with a record.
+Margins are ``margin * I`` (``X >> scalar`` in cvxpy promotes to a full matrix) and every block is symmetrised.
+A solver may end in a panic that is no ``Exception``: whatever it does becomes a `SolverError` with a record.
 """
 
 from __future__ import annotations

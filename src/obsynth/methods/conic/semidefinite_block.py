@@ -11,17 +11,9 @@ PART = 1 << 22
 
 
 class SemidefiniteBlock:
-    """A pair of semidefinite matrices of one order, and the scaling in which both are the same diagonal matrix.
+    """Two semidefinite matrices with their Nesterov-Todd scaling R: ``R^-1 S R^-T = R'ZR = diag(values)``.
 
-    With R the Nesterov-Todd scaling, ``R^-1 S R^-T = R'ZR = diag(values)``.  It is carried on as a product, without
-    forming S and Z again, which keeps their small eigenvalues: with ``diag(values) + ds = L1 L1'``,
-    ``diag(values) + dz = L2 L2'`` and ``L2'L1 = U diag(new) V'`` the next one is ``R L1 V diag(new)^-1/2``, and its
-    inverse ``diag(new)^-1/2 U'L2' R^-1``.
-
-    A matrix is stored as its lower triangle, row by row, with off-diagonal entries times sqrt(2), so that inner
-    products are kept.
-
-    Fields: order: Order of the matrices; first: Where they begin in the vectors of a whole programme.
+    Stored are lower triangles, row by row, off-diagonal entries times sqrt(2), so that inner products are kept.
     """
 
     def __init__(self, order: int, first: int) -> None:
@@ -80,6 +72,8 @@ class SemidefiniteBlock:
 
     def move(self, s: FloatArray, z: FloatArray) -> None:
         """Go to a new pair, given in the present scaling."""
+        # With L2'L1 = U diag(new) V' the next scaling is R L1 V diag(new)^-1/2: S and Z are not formed again, which
+        # keeps their small eigenvalues.
         first, second = np.linalg.cholesky(self.matrix(s)), np.linalg.cholesky(self.matrix(z))
         left, values, right = np.linalg.svd(second.T @ first)
         roots = np.sqrt(values)

@@ -109,7 +109,13 @@ def dae_adaptive_observer(
 
     Notes
     -----
-    Differs from the paper: see the module `obsynth.methods.dae_adaptive_observer.synthesis`.
+    Differs from the paper: (12a)-(12c), (22), (23) need theta(k) to compute theta(k); here the innovation is taken
+    before any update, the state is corrected by ``Upsilon (theta(k) - theta(k-1))``, and H, L, K follow at the result.
+    ``N_k = G_k - F_k K_{k-1} L_{k-1}``, where (24) prints ``L_k`` and (15) leaves N undefined.  (18) uses the
+    covariance of the innovation where R is printed (option ``weight``): with lambda = 1 it is then the extended Kalman
+    filter with constant parameters.  Reported is the state after the measurement of k, not a prediction.  S stays below
+    S_0 where excitation is missing (``guard``), parameters have bounds, missing samples do not forget, and the
+    covariance of theta is carried besides S.  Radau IIA beside backward Euler; stored quantities in conservative form.
 
     References
     ----------

@@ -1,20 +1,4 @@
-"""Method ``dae-adaptive-observer``: states and parameters of a nonlinear differential-algebraic plant.
-
-Source: A. Moussa Ali, Q. Zhang, Adaptive observer based fault diagnosis applied to differential-algebraic systems, IFAC
-SSSC 2013, (5)-(23).
-
-Deviations:
-
-1. (12a)-(12c), (22) and (23) are circular as printed: they need theta(k) to compute theta(k).  The innovation is taken
-   before any update, the state is corrected by ``Upsilon (theta(k) - theta(k-1))``, and H, L, K follow at the result.
-2. ``N_k = G_k - F_k K_{k-1} L_{k-1}``; (24) prints ``L_k``, and (15) leaves N undefined.
-3. (18) uses the covariance of the innovation where R is printed (option ``weight``): with lambda = 1 the observer then
-   equals the extended Kalman filter with constant parameters.
-4. What is reported is the state after the measurement of k; the paper's is a prediction.
-5. S is kept below S_0 where excitation is missing (option ``guard``), parameters have bounds, missing samples are
-   skipped without forgetting, and the covariance of theta is carried besides S.
-6. Radau IIA beside backward Euler; derivatives of stored quantities are discretised in conservative form.
-"""
+"""Method ``dae-adaptive-observer``: A. Moussa Ali, Q. Zhang, IFAC SSSC 2013, (5)-(23)."""
 
 from __future__ import annotations
 

@@ -1,26 +1,12 @@
-r"""Method ``descriptor-kalman``: the Kalman filter of a time-varying descriptor plant.
+r"""Method ``descriptor-kalman``: Nikoukhah, Willsky, Levy, IEEE TAC 37 (9), 1992; Moussa Ali, Zhang, IFAC ALCOSP 2013.
 
-Source: R. Nikoukhah, A. Willsky, B. Levy, Kalman filtering and Riccati equations for descriptor systems, IEEE TAC 37
-(9), 1992, as used by A. Moussa Ali, Q. Zhang, Fault diagnosis for linear time-varying descriptor systems, IFAC ALCOSP
-2013.
-
-Deviations:
-
-1. Square-root covariance step instead of (9)-(11): nothing is inverted but triangles, so Q, R and P_0 may be singular.
-2. The algebraic equations of step k + 1 may be used one step earlier (``early_constraints``).
-3. Missing samples; states that they leave undetermined are said to be so.
-4. Detectability is asked for before any gain: the paper's Lemma 3.1 takes a stable product of L_k A_k for granted.
-5. Unknown inputs: removed or estimated, with nothing assumed about them (below).
-6. (14) and (15) have misprints (indexes, a transpose); we need neither.
-
-With ``[V1 V2]`` orthonormal and ``Dd V2 = 0``, the part ``d1 = V1' d`` shows in the outputs at once and becomes a state
-without an equation of its own; the part ``d2 = V2' d`` is removed with an orthonormal N, ``N Bd V2 = 0``:
+With ``[V1 V2]`` orthonormal and ``Dd V2 = 0``, ``d1 = V1' d`` becomes a state without an equation of its own, and
+``d2 = V2' d`` is removed with an orthonormal N, ``N Bd V2 = 0``:
 
 .. math::
     N [E \; 0] [x; d_1]^+ = N [A \; B_d V_1] [x; d_1] + N B u + N \mu, \qquad y = [C \; D_d V_1] [x; d_1] + \nu.
 
-Nothing else is known about d, so nothing is lost: this is the maximum-likelihood estimate for an input of which any
-value is as likely.  It exists when ``[N E 0; C Dd V1]`` has full column rank: (D1) of the unknown-input observer.
+Nothing else is known about d, so nothing is lost.  It exists when ``[N E 0; C Dd V1]`` has full column rank: (D1).
 """
 
 from __future__ import annotations
@@ -49,17 +35,13 @@ UNKNOWN = 1e4
 
 @dataclass(frozen=True, eq=False)
 class WithoutUnknownInputs:
-    """A plant without unknown inputs.
-
-    Fields: plant: As the filter takes it; equations: N ``(ne, nx)``; shown: ``V1 (nd, n1)``; names: of the states d1;
-    scale: of the prior deviations of d1, ``(n1,)``; note: for a reader.
-    """
+    """A plant without unknown inputs."""
 
     plant: TimeVaryingDescriptorSystem
-    equations: FloatArray
-    shown: FloatArray
-    names: tuple[str, ...]
-    scale: FloatArray
+    equations: FloatArray  # N (ne, nx)
+    shown: FloatArray  # V1 (nd, n1)
+    names: tuple[str, ...]  # of the states d1
+    scale: FloatArray  # of the prior deviations of d1, (n1,)
     note: str
 
     def process_covariance(self, given: object) -> object:

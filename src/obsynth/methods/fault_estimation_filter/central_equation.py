@@ -1,22 +1,8 @@
-r"""The equation of central H-infinity filters: a gain of a `GainProblem` for each level, without matrix inequalities.
+"""The Riccati equation of central H-infinity filters: gains of a `GainProblem` for each level g.
 
-For a level g the filtering equation, with :math:`h = [C; Z]`, :math:`k = [D; Z_d]`,
-
-.. math::
-    Y = A Y A^T - (A Y h^T + B k^T)(k k^T - \mathrm{diag}(0, g^2 I) + h Y h^T)^{-1}(\cdot)^T + B B^T,
-
-has a stabilising solution with the right signs exactly when a filter of gain below g exists, and then gives one.  A
-little artificial noise on states and measurements makes the equation regular; it can only raise the gain, and the true
-gain of the true problem decides whether a level counts as reached.
-
-Where the disturbance is in no measurement, ``C e`` is known exactly and only the error on null C is left: with an
-orthonormal basis N of it, M one of its complement and F = A N,
-
-.. math::
-    Y = F K F^T + B B^T, \qquad K = S - S N^T Z^T (Z N S N^T Z^T - g^2 I)^{-1} Z N S,
-
-where S solves an equation of the same form, of as many states as null C has dimensions, with the matrices ``N'F``,
-``[M'F; ZN]``, ``N'BB'N``, ``diag(M'BB'M, -g^2 I)`` and ``[N'BB'M, 0]``.  No noise on the measurements is needed.
+With ``h = [C; Z]``, ``k = [D; Zd]``, ``Y = A Y A' - (A Y h' + B k') (k k' - diag(0, g^2 I) + h Y h')^-1 (.)' + B B'``
+has a stabilising solution with the right signs exactly when a filter of gain below g exists, and gives one. A little
+artificial noise makes it regular; it can only raise the gain, and the true gain of the true problem decides.
 """
 
 from __future__ import annotations
@@ -32,12 +18,12 @@ from obsynth.numerics.doubling import MOST_JUMPS, doubled_riccati_solution, is_p
 
 @dataclass(frozen=True, eq=False)
 class CentralEquation:
-    """The equation of a problem for every level, in as few states as it takes.
+    """The equation of a problem with measurements for every level, in as few states as it takes; no limit on V.
 
-    Fields: problem: With measurements; a limit on the weight is not looked at; a, h, process, weight, cross: Of the
-    Riccati equation to be solved, without ``-g^2 I`` in the last block of ``weight``; full_process, full_weight,
-    full_cross: Of the equation in all states; lift: F ``(n, k)`` where the measurements are exact; outputs: ``[C; Z] (m
-    + q, n)``; last: ``diag(0, I) (m + q, m + q)``.
+    Where the disturbance is in no measurement, only the error on null C is left: with an orthonormal basis N of it, M
+    one of its complement and ``F = A N`` (``lift``), ``Y = F K F' + B B'``, ``K = S - S N'Z' (Z N S N'Z' - g^2 I)^-1 Z
+    N S``, where S solves the equation with ``N'F``, ``[M'F; ZN]``, ``N'BB'N``, ``diag(M'BB'M, -g^2 I)`` and ``[N'BB'M,
+    0]``.
     """
 
     problem: GainProblem
@@ -85,8 +71,7 @@ class CentralEquation:
     def filter_and_margin(self, level: float) -> tuple[Injection | None, float]:
         """Return the gains of the central filter at ``level``, or ``None``, and how far the level is from the least.
 
-        The margin is the least eigenvalue of what must be negative, relative to ``-g^2 I``: about twice the relative
-        distance, or more, and zero at the least level.
+        The least eigenvalue of what must be negative, relative to ``-g^2 I``: twice the relative distance, or more.
         """
         try:
             y = self.solution(level)

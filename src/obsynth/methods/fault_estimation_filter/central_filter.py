@@ -80,8 +80,7 @@ def search_central_filter(
 ) -> tuple[Injection, float]:
     """Return the best central filter found, and (a bound on) its true gain.
 
-    The least level of the equation with little noise is found.  Less of it may cost less, and with more of it the
-    equation is less sensitive to rounding: a level just below is tried, and if that is reached, the least from there.
+    The least level with little noise first; other noises, cheaper or less sensitive, where they reach one below.
     """
     tolerance = LEVEL_TOLERANCE if problem.order <= FEW_STATES else COARSE_LEVEL_TOLERANCE
     best, gain = start, problem.achieved_gain(start) if gain is None else gain
@@ -113,10 +112,7 @@ def search_central_filter(
 
 
 def _decoupling_filter(problem: GainProblem, gain: float) -> tuple[Injection, float] | None:
-    """Return a filter that no disturbance reaches, and its gain, from a solution or two; ``None`` where there is none.
-
-    It exists only if what xi shows follows from the measurements at almost every point, whatever the disturbance does.
-    """
+    """Return a filter that no disturbance reaches, and its gain; ``None`` where there is none."""
     if not _follows_from_measurements(problem):
         return None
     # The artificial noise has a gain of its own, which in many states may be above the first level; next to a zero on
@@ -165,7 +161,7 @@ def least_level(problem: GainProblem) -> float:
 
 def least_noise_filter(problem: GainProblem) -> Injection | None:
     """Return the filter with the least variance of xi under the noise of the problem: a level without limit."""
-    noise = replace(with_least_weight(problem), B=problem.Bn, D=problem.Dn, Zd=problem.Zn)
+    noise = with_least_weight(problem).noise_as_disturbance()
     if noise.order == 0 or noise.measured == 0:
         return None
     found = central_injection(noise, WITHOUT_LIMIT * max(noise.disturbance_size, 1.0), noise=NOISES[0])
@@ -177,9 +173,7 @@ def noise_weighted_filters(
 ) -> Iterator[Injection]:
     """Yield central filters that promise a gain of at most ``gain``, for which the noise counts as much as it can.
 
-    The noise of the problem, times a weight, is one more disturbance.  At the level ``gain`` for both together the gain
-    of the true disturbance alone is lower; at a higher level the weight may be larger, and must then be searched with
-    the true gain.
+    The noise, times a weight, is one more disturbance; at a level above ``gain`` the true gain finds the weight.
     """
     work = with_least_weight(problem)
     sizes = [float(np.linalg.norm(np.vstack(pair))) for pair in ((work.B, work.D), (work.Bn, work.Dn))]
@@ -193,8 +187,7 @@ def noise_weighted_filters(
         best = None
         while low < high:
             middle = (low + high) // 2
-            equation = CentralEquation.of(_with_noise(work, weights[middle]), noise=NOISES[0])
-            found = equation.filter_at(factor * gain)
+            found = central_injection(_with_noise(work, weights[middle]), factor * gain, noise=NOISES[0])
             if found is not None and (factor == 1.0 or reaches(found)):
                 best, low = found, middle + 1
             else:

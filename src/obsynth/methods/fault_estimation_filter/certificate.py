@@ -9,8 +9,7 @@ import numpy as np
 
 from obsynth.methods.riccati import bounded_real_matrix, normalising_change
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.norms import output_covariance
-from obsynth.numerics.scaling import balancing_factors
+from obsynth.numerics.norms import output_covariance, state_units
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.verification.certificates import prove_bounded_real
@@ -32,10 +31,9 @@ def bounded_real_certificate(
     plant: DescriptorSystem, observer: LinearObserver, tracking: FloatArray, gain: float, *, core: int, lag: int,
     tries: int | None = None,
 ) -> tuple[FloatArray, bool]:  # fmt: skip
-    """Return Q ``(core, core)``, upper triangular with P = Q'Q, for the shipped observer at level ``gain``.
+    """Return Q ``(core, core)``, upper triangular with P = Q'Q, at level ``gain``, and whether it proves.
 
-    The Riccati solution with the largest slack that gives a proof, and true; the last try when none does, for the
-    report, and false.  At most ``tries`` coordinates are tried.
+    The Riccati solution with the largest slack that does, else the last try; at most ``tries`` coordinates are tried.
     """
     errors = ErrorSystem.of(plant, observer, tracking, lag)
     a, b = observer.Az[:core, :core], errors.disturbance[:core] / gain
@@ -71,10 +69,7 @@ def _changes(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> Iter
 
 def _balanced(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
     """Return a diagonal state change, powers of two, in which units cost no digits."""
-    n, inputs, outputs = a.shape[0], b.shape[1], c.shape[0]
-    system = np.zeros((n + inputs + outputs,) * 2)
-    system[:n, :n], system[:n, n : n + inputs], system[n + inputs :, :n] = a, b, c
-    return np.diag(balancing_factors(system)[:n])
+    return np.diag(state_units(a, b, c))
 
 
 def _unchanged(a: FloatArray, _b: FloatArray, _c: FloatArray) -> FloatArray:
@@ -85,8 +80,7 @@ def _unchanged(a: FloatArray, _b: FloatArray, _c: FloatArray) -> FloatArray:
 def _contracted(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
     """Return a state change in which the norm of ``a``, far above its spectral radius, is at most about one.
 
-    In coordinates where the Lyapunov matrix of ``a / s`` is the identity the norm of ``a`` is below s.  From the norm
-    down to one s shrinks in steps, smaller ones close to one, so that each Lyapunov equation is well conditioned.
+    Where the Lyapunov matrix of ``a / s`` is the identity it is below s; s shrinks in steps, each well conditioned.
     """
     change, identity = _balanced(a, b, c), np.eye(a.shape[0])
     moved = np.linalg.solve(change, a @ change)
@@ -105,10 +99,9 @@ def _contracted(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
 def _coordinates(
     a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, *, path: tuple[float, ...], tail: float
 ) -> FloatArray | None:
-    """Return a state change in which a rough Riccati solution is the identity, approached over the levels of ``path``.
+    """Return a change in which a rough Riccati solution is the identity, over the levels of ``path``; else ``None``.
 
-    ``tail`` weighs states that the output does not show: little enough that the disturbance on them does not count,
-    and otherwise as much as possible, for the sake of the condition number.  ``None`` when there is no solution.
+    ``tail`` weighs states that the output does not show: as much as possible, short of what d does to them.
     """
     change = np.eye(a.shape[0])
     for level in path:

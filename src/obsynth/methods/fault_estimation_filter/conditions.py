@@ -1,14 +1,10 @@
-"""When a fault-estimation filter exists, decided before any solver runs.
-
-Source: Wang, Rodrigues, Theilliol, Shen 2015, section 2 and Theorem 2 (i), and the condition that the paper never
-states: detectability of (A1, C1), which holds when every invariant zero from the faults to the outputs lies strictly
-inside the unit circle.
-"""
+"""When a fault-estimation filter exists: Wang et al. 2015, section 2 and Theorem 2 (i); the zero condition is ours."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -41,8 +37,13 @@ from obsynth.plants.descriptor import DescriptorSystem
 
 #: At most this many signals are named in a failed condition.
 MOST_NAMES = 4
-_CLAIM = "every invariant zero from the faults to the outputs strictly inside the unit circle"
-_SOURCE = "never stated in Wang 2015: detectability of (A1, C1)"
+_fault_zeros = partial(
+    Condition,
+    name="fault zeros",
+    claim="every invariant zero from the faults to the outputs strictly inside the unit circle",
+    bound=1.0,
+    source="never stated in Wang 2015: detectability of (A1, C1)",
+)
 
 
 @remembered
@@ -67,29 +68,25 @@ def examine_fault_filter(plant: DescriptorSystem) -> tuple[tuple[Condition, ...]
 
 
 def _examined(plant: DescriptorSystem) -> tuple[tuple[Condition, ...], PreparedPlant | None]:
-    prepared: PreparedPlant | None = None
+    found, prepared = list[Condition](), list[PreparedPlant]()
+    for condition in _in_order(plant, prepared):
+        found.append(condition)
+        if not condition.holds:
+            break
+    return tuple(found), prepared[0] if prepared else None
 
-    def visibility_conditions() -> list[Condition]:
-        nonlocal prepared
-        prepared = prepare(plant)
-        seen = prepared.detectability
-        *first, last = detectability_conditions(seen, plant.fault_names, prepared.scaling.outputs)
-        doubt = None if last.holds else index_doubt(plant, seen)
-        return [*first, last if doubt is None else last.in_doubt(doubt, plant)]
 
-    groups: tuple[Callable[[], list[Condition]], ...] = (
-        lambda: _form_conditions(plant),
-        lambda: _rank_conditions(plant),
-        visibility_conditions,
-        lambda: _zero_conditions(plant),
-    )
-    found: list[Condition] = []
-    for group in groups:
-        for condition in group():
-            found.append(condition)
-            if not condition.holds:
-                return tuple(found), prepared
-    return tuple(found), prepared
+def _in_order(plant: DescriptorSystem, made: list[PreparedPlant]) -> Iterator[Condition]:
+    """Yield the conditions, each group examined when it is asked for; the prepared plant is appended to ``made``."""
+    yield from _form_conditions(plant)
+    yield from _rank_conditions(plant)
+    prepared = prepare(plant)
+    made.append(prepared)
+    *first, last = detectability_conditions(prepared.detectability, plant.fault_names, prepared.scaling.outputs)
+    yield from first
+    doubt = None if last.holds else index_doubt(plant, prepared.detectability)
+    yield last if doubt is None else last.in_doubt(doubt, plant)
+    yield from _zero_conditions(plant)
 
 
 def _form_conditions(plant: DescriptorSystem) -> list[Condition]:
@@ -135,20 +132,19 @@ def _form_conditions(plant: DescriptorSystem) -> list[Condition]:
 
 
 def _rank_conditions(plant: DescriptorSystem) -> list[Condition]:
-    enough = Condition(
+    enough = plant.nf <= plant.ny
+    first = Condition(
         "nf <= ny",
         "no more faults than outputs (nf <= ny)",
-        plant.nf <= plant.ny,
+        enough,
         float(plant.nf),
         float(plant.ny),
         "Wang 2015, below eq. (1)",
-        ""
-        if plant.nf <= plant.ny
-        else f"{plant.nf} faults and {plant.ny} output(s). Measure more, or leave a fault out.",
-        signals=() if plant.nf <= plant.ny else plant.fault_names,
+        "" if enough else f"{plant.nf} faults and {plant.ny} output(s). Measure more, or leave a fault out.",
+        signals=() if enough else plant.fault_names,
     )
     numbers = numbers_with_fault_states(plant)
-    ranks = [enough, _fault_rank(plant, numbers)]
+    ranks = [first, _fault_rank(plant, numbers)]
     if not all(condition.holds for condition in ranks):
         return ranks
     try:
@@ -251,30 +247,31 @@ def _zero_conditions(plant: DescriptorSystem) -> list[Condition]:
         detail = unclear_detail(verdict, "A filter")
         doubt = zero_doubt(plant, units, verdict, [["A", "Bf"], ["C", "Df"]], what="filter")
         outside = fault_zeros(plant).outside
-        lost = Condition("fault zeros", _CLAIM, False, largest, 1.0, _SOURCE, detail)
+        lost = _fault_zeros(holds=False, value=largest, detail=detail)
         if outside:
             lost = _zero_failure(plant, max(outside, key=lambda zero: abs(zero.value)))
             lost = replace(lost, detail=f"{detail} In floating point, {lost.detail}")
         return [lost.in_doubt(doubt, plant)]
-    detail = f"{len(facts.zeros)} zero(s)" + (f", largest modulus {largest:.6g}" if facts.zeros else "")
-    detail += f"; {described_distance(verdict)}"
-    return [Condition("fault zeros", _CLAIM, True, largest, 1.0, _SOURCE, detail)]
+    return [_all_inside(len(facts.zeros), largest, f"; {described_distance(verdict)}")]
+
+
+def _all_inside(count: int, largest: float, distance: str = "") -> Condition:
+    largest_one = f", largest modulus {largest:.6g}" if count else ""
+    return _fault_zeros(holds=True, value=largest, detail=f"{count} zero(s){largest_one}{distance}")
 
 
 def _never_shown(names: tuple[str, ...]) -> Condition:
     detail = f"faults {', '.join(map(repr, names))} can act together without showing in any output."
-    return Condition("fault zeros", _CLAIM, False, np.inf, 1.0, _SOURCE, detail, signals=names)
+    return _fault_zeros(holds=False, value=np.inf, detail=detail, signals=names)
 
 
 def _zero_conditions_in_floating_point(plant: DescriptorSystem) -> list[Condition]:
     zeros = fault_zeros(plant)
-    largest = max((abs(zero.value) for zero in zeros.zeros), default=0.0)
     if not zeros.normal_rank_full:
         return [_never_shown(zeros.hidden_faults)]
     if zeros.outside:
         return [_zero_failure(plant, max(zeros.outside, key=lambda zero: abs(zero.value)))]
-    detail = f"{len(zeros.zeros)} zero(s)" + (f", largest modulus {largest:.6g}" if zeros.zeros else "")
-    return [Condition("fault zeros", _CLAIM, True, float(largest), 1.0, _SOURCE, detail)]
+    return [_all_inside(len(zeros.zeros), float(max((abs(zero.value) for zero in zeros.zeros), default=0.0)))]
 
 
 def _zero_failure(plant: DescriptorSystem, zero: Zero) -> Condition:
@@ -291,9 +288,7 @@ def _zero_failure(plant: DescriptorSystem, zero: Zero) -> Condition:
             f"at the zero z = {value} the fault {', '.join(map(repr, signals))} can follow z^k without showing "
             "in any output, so no filter can estimate it. Measure another signal."
         )
-    return Condition(
-        "fault zeros", _CLAIM, False, abs(zero.value), 1.0, _SOURCE, detail, mode=zero.value, signals=signals
-    )
+    return _fault_zeros(holds=False, value=abs(zero.value), detail=detail, mode=zero.value, signals=signals)
 
 
 def _dependent_columns(plant: DescriptorSystem) -> tuple[str, ...]:

@@ -1,12 +1,6 @@
-"""Fault detectability indexes and matrix, and when a fault-estimation filter exists.
+"""Fault detectability indexes and matrix: bounded and relative in floating point, exact on the numbers as written.
 
-Source: Wang, Rodrigues, Theilliol, Shen 2015, Definitions 2 and 3, assumptions around eq. (2), Theorem 2 (i).
-Differences: the search for the indexes is bounded and relative; the condition that the paper never states (every
-invariant zero from the faults to the outputs strictly inside the unit circle) is tested before any solver.
-
-Detectability indexes and the rank of Upsilon on the numbers of the plant as written, without any tolerance.
-
-They are the same for every nonsingular T with ``T E + N C = I``: a rational one is taken.
+Source: Wang 2015, Definitions 2 and 3, Theorem 2 (i). They are the same for every nonsingular T with ``T E + N C = I``.
 """
 
 from __future__ import annotations
@@ -135,18 +129,16 @@ REFUSE_CONDITION = 1e12
 
 @dataclass(frozen=True, eq=False)
 class FaultDetectability:
-    """Detectability indexes and matrices of the pair ``(TA, C)`` for the fault directions ``TF``.
+    """Indexes ``rho_i`` (``None``: never shows) and matrices of ``(TA, C)`` for the fault directions ``TF``.
 
-    Fields: indexes: ``rho_i``: steps from fault i to the outputs; ``None`` when it never reaches them; Psi: ``(nx,
-    nf)``, columns ``(TA)^(rho_i - 1) T f_i``; zero for infinite indexes; Upsilon: ``C Psi (ny, nf)``; rank: Rank of
-    Upsilon; condition_number: Of Upsilon, columns scaled to unit length.
+    ``Psi (nx, nf)``: columns ``(TA)^(rho_i - 1) T f_i``, else zero; ``Upsilon = C Psi``.
     """
 
     indexes: tuple[int | None, ...]
     Psi: FloatArray
     Upsilon: FloatArray
     rank: RankDecision
-    condition_number: float
+    condition_number: float  # of Upsilon with columns of unit length
 
     @property
     def finite(self) -> bool:
@@ -164,10 +156,7 @@ class FaultDetectability:
 def fault_detectability(
     ta: FloatArray, c: FloatArray, tf: FloatArray, *, exact: ExactIndexes | None = None
 ) -> FaultDetectability:
-    """Return the detectability indexes (19) and matrices (20), with the exact ones where these are known.
-
-    Shapes: ``ta (nx, nx)``, ``c (ny, nx)``, ``tf (nx, nf)``.
-    """
+    """Return the detectability indexes (19) and matrices (20), with the exact ones where these are known."""
     size = float(np.linalg.norm(c, 2))
     if exact is None:
         results = [_first_visible(ta, c, tf[:, i], size) for i in range(tf.shape[1])]
@@ -195,10 +184,7 @@ def _at_index(ta: FloatArray, direction: FloatArray, index: int | None) -> tuple
 
 
 def _first_visible(ta: FloatArray, c: FloatArray, direction: FloatArray, size: float) -> tuple[int | None, FloatArray]:
-    """Return the index of one fault and the vector that becomes visible; by Cayley-Hamilton nx steps suffice.
-
-    ``size`` is the norm of ``c``.
-    """
+    """Return the index of one fault and the vector that shows; by Cayley-Hamilton nx steps suffice."""
     growth: float | None = None
     vector, bound = direction, float(np.linalg.norm(direction))
     for step in range(1, ta.shape[0] + 1):
@@ -215,10 +201,7 @@ def _first_visible(ta: FloatArray, c: FloatArray, direction: FloatArray, size: f
 def detectability_conditions(
     detectability: FaultDetectability, fault_names: tuple[str, ...], output_scales: FloatArray
 ) -> tuple[Condition, ...]:
-    """Return the conditions on indexes and matrix: finite indexes, ``rank Upsilon = nf`` with its condition number.
-
-    ``output_scales (ny,)`` are the factors by which the outputs were balanced, to give norms in the user's units.
-    """
+    """Return the conditions on indexes and matrix; ``output_scales (ny,)`` give norms in the user's units."""
     hidden = tuple(name for name, index in zip(fault_names, detectability.indexes, strict=True) if index is None)
     largest = max((index for index in detectability.indexes if index is not None), default=0)
     finite = Condition(

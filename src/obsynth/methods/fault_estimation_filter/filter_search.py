@@ -9,14 +9,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
-
 from obsynth.errors import InfeasibleError, SolverError
-from obsynth.methods.fault_estimation_filter import inequality_search, inequality_solutions
+from obsynth.methods.fault_estimation_filter import inequality_solutions
 from obsynth.methods.fault_estimation_filter.central_filter import central_filter_at
 from obsynth.methods.fault_estimation_filter.gamma_lower_bound import BOUND_MARGIN, proved_lower_bound
-from obsynth.methods.fault_estimation_filter.inequality_search import LeastGain, coordinates
-from obsynth.methods.fault_estimation_filter.injection_problem import GainProblem, Injection, WeightLimit
+from obsynth.methods.fault_estimation_filter.inequality_search import SMALLEST_USEFUL_GAIN, LeastGain, search_least_gain
+from obsynth.methods.fault_estimation_filter.injection_problem import GainProblem, Injection, WeightLimit, normalise
 from obsynth.methods.fault_estimation_filter.options import FilterOptions
 from obsynth.methods.fault_estimation_filter.small_gains import small_gain_design
 
@@ -24,50 +22,31 @@ from obsynth.methods.fault_estimation_filter.small_gains import small_gain_desig
 BRACKET_SHARE = 0.1
 
 
-def bisected_gain(
-    problem: GainProblem, start: Injection, *, tolerance: float, solver: str, polish: bool
-) -> tuple[float, float, Injection, list[dict[str, Any]]]:
-    """Return ``(high, low, gains, records)``: the final bracket of a bisection on the gain, and the best filter.
+def search_by_bisection(problem: GainProblem, *, tolerance: float, solver: str, polish: bool = True) -> LeastGain:
+    """Minimise the gain by bisection: the paper's Algorithm 1, made to end.
 
-    Algorithm 1 of the paper, made to end: every upper end of the bracket is the true norm of a filter in hand, and
-    the lower end is a level at which none was found.
+    Every upper end of the bracket is the true norm of a filter in hand, the lower end a level at which none was found.
     """
-    best, high, low = start, problem.achieved_gain(start), 0.0
-    records = []
+    problem = replace(problem, judged_exactly=True)
+    normalised = normalise(problem, solver=solver)
+    gain = normalised.start_gain
+    if problem.measured == 0 or gain == 0.0:
+        return LeastGain(gain, normalised, normalised.start, gain, (gain, gain))
+    work, best = normalised.problem, normalised.contracted(normalised.start)
+    high, low, records = work.achieved_gain(best), 0.0, list[dict[str, Any]]()
     while high - low > BRACKET_SHARE * tolerance * high:
         middle = 0.5 * (low + high)
-        better = central_filter_at(problem, middle)
+        better = central_filter_at(work, middle)
         if better is None and polish:
-            found = inequality_solutions.feasible_point(problem, middle, solver=solver)
+            found = inequality_solutions.feasible_point(work, middle, solver=solver)
             better = None if found is None else found.injection
             records += [] if found is None else [found.record]
         if better is None:
             low = middle
         else:
-            best, high = better, min(middle, problem.achieved_gain(better))
-    return high, low, best, records
-
-
-def search_by_bisection(problem: GainProblem, *, tolerance: float, solver: str, polish: bool = True) -> LeastGain:
-    """Minimise the gain by bisection (the paper's Algorithm 1, made to end)."""
-    problem = replace(problem, judged_exactly=True)
-    normalised = coordinates(problem, solver=solver)
-    gain = normalised.start_gain
-    if problem.measured == 0 or gain == 0.0:
-        return LeastGain(gain, normalised, normalised.start, gain, (gain, gain))
-    start = normalised.contracted(normalised.start)
-    high, low, found, records = bisected_gain(
-        normalised.problem, start, tolerance=tolerance, solver=solver, polish=polish
-    )
-    injection = normalised.restore(found)
-    return LeastGain(
-        problem.achieved_gain(injection),
-        normalised,
-        injection,
-        gain,
-        (low * normalised.gain, high * normalised.gain),
-        records,
-    )
+            best, high = better, min(middle, work.achieved_gain(better))
+    injection, bracket = normalised.restore(best), (low * normalised.gain, high * normalised.gain)
+    return LeastGain(problem.achieved_gain(injection), normalised, injection, gain, bracket, records)
 
 
 #: Asking for a gain above this multiple of the starting filter's adds nothing but bad scaling.
@@ -87,22 +66,17 @@ MOST_STATES_TO_POLISH = 64
 
 @dataclass(frozen=True, eq=False)
 class FoundGains:
-    """What the search for gains found.
-
-    Fields: problem: What it was about in the end; least: The least gain found; gamma: The gain that is claimed; chosen:
-    The gains that are shipped; records: Solver runs of the choice of small gains.
-    """
+    """The problem in the end, its least gain, the gain that is claimed, and the gains that are shipped."""
 
     problem: GainProblem
-    least: inequality_search.LeastGain
+    least: LeastGain
     gamma: float
     chosen: Injection
     records: list[dict[str, Any]]
 
     def within(self, limit: WeightLimit) -> bool:
         """Whether the weights of both, the least gain and what is shipped, keep a limit."""
-        weights = (limit.fixed + found.V @ limit.free for found in (self.least.injection, self.chosen))
-        return all(float(np.linalg.norm(weight, 2)) <= limit.bound for weight in weights)
+        return all(limit.norm(found.V) <= limit.bound for found in (self.least.injection, self.chosen))
 
 
 def found_gains(
@@ -148,10 +122,10 @@ def found_within(
     return found_gains(limited, asked, engine, noisy=noisy, progress=progress)
 
 
-def _least_gain(problem: GainProblem, asked: FilterOptions, engine: str) -> inequality_search.LeastGain:
+def _least_gain(problem: GainProblem, asked: FilterOptions, engine: str) -> LeastGain:
     polish = engine == "lmi"
     if asked.gamma_search == "direct":
-        return inequality_search.search_least_gain(problem, solver=asked.solver, polish=polish)
+        return search_least_gain(problem, solver=asked.solver, polish=polish)
     return search_by_bisection(problem, tolerance=asked.tolerance, solver=asked.solver, polish=polish)
 
 
@@ -161,10 +135,8 @@ def _leaves_little(gamma: float, least: float, problem: GainProblem) -> bool:
     return near and problem.disturbances > 0 and problem.order <= MOST_STATES_TO_POLISH
 
 
-def _gain_to_ship(
-    asked: FilterOptions, problem: GainProblem, least: inequality_search.LeastGain, *, noisy: bool
-) -> float:
-    floor = inequality_search.SMALLEST_USEFUL_GAIN * least.starting_gain
+def _gain_to_ship(asked: FilterOptions, problem: GainProblem, least: LeastGain, *, noisy: bool) -> float:
+    floor = SMALLEST_USEFUL_GAIN * least.starting_gain
     if problem.disturbances == 0:
         return NOMINAL_GAIN
     if asked.gamma is None and noisy:
@@ -178,7 +150,7 @@ def _gain_to_ship(
     return min(asked.gamma, ceiling) if ceiling > 0.0 else asked.gamma
 
 
-def _require_reachable(problem: GainProblem, least: inequality_search.LeastGain, gain: float, *, solver: str) -> None:
+def _require_reachable(problem: GainProblem, least: LeastGain, gain: float, *, solver: str) -> None:
     """Raise unless ``gain`` is within reach of the best filter found."""
     best = least.gain
     if problem.disturbances == 0 or best <= gain:

@@ -1,8 +1,7 @@
 """The least level of a central H-infinity equation: where the margin of its solutions vanishes.
 
-With u the square of a level and m(u) u the least eigenvalue of what must be positive there, ``m(u) u`` grows at least
-as fast as u (the solution of the equation shrinks as u grows).  So ``u (1 - m)`` is a lower bound, and a parabola
-through the last levels that were reached leads to the least in a few steps.
+With u the squared level and m(u) u the margin, which grows at least as fast as u, ``u (1 - m)`` is a lower bound, and a
+parabola through the last levels reached leads to the least in a few steps.
 """
 
 from __future__ import annotations
@@ -34,10 +33,7 @@ HALVINGS = 2
 
 @dataclass(frozen=True, eq=False)
 class Reached:
-    """A level at which the equation has a solution of the right signs.
-
-    Fields: level, margin: See `CentralEquation.filter_and_margin`; injection: The central filter.
-    """
+    """A level at which the equation has a solution of the right signs, and its margin and central filter."""
 
     level: float
     margin: float
@@ -46,13 +42,10 @@ class Reached:
 
 @dataclass(eq=False)
 class Descent:
-    """The way down from ``high`` to the least level of an equation.
+    """The way down from ``high`` to the least level; low and high are the bracket, tolerance its relative width.
 
-    Fields: equation: For all levels; low, high: No gain is below ``low``; nothing at or above ``high`` is of use.  The
-    bracket, as it shrinks; tolerance: Relative width of the bracket at which to stop; reached: Levels with a solution,
-    from the highest to the lowest; settled: Whether the margin tells that nothing is below the last level; wary:
-    Whether to expect rounding: the first filter is judged, and a few failures in a narrow bracket end the descent;
-    judged: Whether a level counts only when its filter keeps its promise.
+    ``settled``: the margin tells that nothing is below; ``wary``: rounding is expected, the first filter is judged and
+    a few failures in a narrow bracket end it; ``judged``: a level counts only when its filter keeps its promise.
     """
 
     equation: CentralEquation
@@ -114,10 +107,9 @@ class Descent:
         return level if self.low < level < self.high * (1.0 - 0.5 * self.tolerance) else middle
 
     def best(self) -> tuple[Injection, float] | None:
-        """Return the filter of the lowest level that keeps its promise, and its true gain.
+        """Return the filter of the lowest level that keeps its promise, and its true gain; ``None`` if there is none.
 
-        Rounding may break the promise of the equation next to its least level, where the margin vanishes; ``None``
-        where it is broken far above, too.
+        Rounding may break the promise of the equation next to its least level, where the margin vanishes.
         """
         if not self.reached:
             return None

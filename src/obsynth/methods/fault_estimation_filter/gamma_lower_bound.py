@@ -53,21 +53,13 @@ def proved_lower_bound(
 ) -> float:
     """Return a lower bound on the gain of every filter, from a dual point that passes our own check; 0 without one.
 
-    The dual is solved in the coordinates of the starting filter, then in those of the best one; and in turn without the
-    disturbances that are negligible beside the largest, which only make the bound lower.
-
-    Notes
-    -----
-    For ``Z1 >= 0`` in the null basis N of [C D] with ``Q = G N Z1 N'G' - Nx Z1 Nx' >= 0`` and, for a fixed weight,
-    ``Z2 = [Q, *; *, *] >= 0``: multiplying the two eliminated inequalities by Z1 and Z2 cancels P, and leaves
-    ``g^2 (tr Nd Z1 Nd' + tr Z2_22) > tr H N Z1 N'H' + tr H Z2 H'`` (for a free weight without Z2).  The check is in
-    floating point with margins, on data in which a strictly feasible dual point is the identity.
+    For ``Z1 >= 0`` in the null basis N of [C D] with ``Q = G N Z1 N'G' - Nx Z1 Nx' >= 0`` and, for a fixed weight, ``Z2
+    = [Q, *; *, *] >= 0``, ``g^2 (tr Nd Z1 Nd' + tr Z2_22) > tr H N Z1 N'H' + tr H Z2 H'``: the eliminated inequalities
+    times Z1, Z2.
     """
     bound = 0.0
     for work, start in product(_with_fewer_disturbances(problem), (None,) if best is None else (None, best)):
-        bound = max(
-            bound, _bound_in(normalise(work, start=start, rotate=solver not in lmi.FIRST_ORDER_SOLVERS), solver)
-        )
+        bound = max(bound, _bound_in(normalise(work, solver=solver, start=start), solver))
         if bound > enough:
             break
     return bound
@@ -107,10 +99,9 @@ def _direct_bound(work: GainProblem) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _DualProblem:
-    """Data of the dual inequalities, in coordinates in which a strictly feasible point is about the identity.
+    """Dual inequalities, ``Q = image Z1 image' - top Z1 top'``, where a strictly feasible point is near the identity.
 
-    ``Q = image Z1 image' - top Z1 top'``; ``shown`` and ``bottom`` are xi and d on the output-nulling directions,
-    ``outputs`` is xi on states and disturbance.
+    ``shown``, ``bottom``: xi and d on the output-nulling directions; ``outputs``: xi on states and disturbance.
     """
 
     top: FloatArray
@@ -162,7 +153,7 @@ def _best_dual_point(dual: _DualProblem, *, solver: str) -> tuple[FloatArray, Fl
 def _checked_bound(dual: _DualProblem, z1: FloatArray, corner: FloatArray, last: FloatArray) -> float:
     """Recompute the bound of a dual point from the data; 0 unless it is strictly feasible.
 
-    What the solver left short of feasibility is made up for by a little of the strict point, which is the identity.
+    What the solver left short of that is made up for by a little of the strict point, the identity.
     """
     z1, last = 0.5 * (z1 + z1.T), 0.5 * (last + last.T)
     short = 0.0
@@ -187,9 +178,9 @@ def least_gain_certificate(
     problem: GainProblem, work: DescriptorSystem, gains: Mapping[str, FloatArray], factor: FloatArray, *, gain: float,
     solver: str,
 ) -> tuple[dict[str, FloatArray], float]:  # fmt: skip
-    """Return the matrices of a proof that no such filter has a gain below ``gain``, and what they prove; else none.
+    """Return a proof that no such filter has a gain below ``gain``, and what it proves; else none.
 
-    Shapes: ``factor (n, n)`` maps errors to coordinates in which they are of natural sizes.
+    ``factor (n, n)`` maps errors to coordinates in which they are of natural sizes.
     """
     free_weight = problem.weight_is_free
     if _is_hopeless(problem, gain):
@@ -227,10 +218,7 @@ def least_gain_certificate(
 
 
 def _is_hopeless(problem: GainProblem, gain: float) -> bool:
-    """Return whether so many states are reached that two steps alone are tried, and these show too little.
-
-    In double precision, before the exact null spaces of many states, which take most of a second at 32 states.
-    """
+    """Return whether two steps alone are tried, as many states are reached, and show too little in double precision."""
     if not MOST_REACHED < problem.order <= MOST_STATES:
         return False
     top, bottom, image = invisible_pairs(problem)
@@ -244,10 +232,7 @@ def _is_hopeless(problem: GainProblem, gain: float) -> bool:
 def _first_two(
     top: FloatArray, bottom: FloatArray, image: FloatArray, shown: FloatArray, z: FloatArray, zd: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the invisible pairs at rest in units of the disturbance, and what they and one disturbance more show.
-
-    The pairs show at once, in the first rows, and through the error they lead to, in the last.
-    """
+    """Return the invisible pairs at rest in units of d, and what they (at once, then later) and one more d show."""
     starts = null_space(top) if top.shape[0] else np.eye(bottom.shape[1])
     sizes = np.linalg.pinv(np.linalg.qr(bottom @ starts, mode="r")) if starts.shape[1] else np.zeros((0, 0))
     starts = starts @ sizes

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SolverError
-from obsynth.methods.conic import lmi
 from obsynth.methods.fault_estimation_filter import inequality_solutions
 from obsynth.methods.fault_estimation_filter.central_filter import (
     least_level,
@@ -43,11 +42,9 @@ NOTHING_TO_POLISH = "reached: the disturbance does as much before any measuremen
 
 @dataclass(frozen=True, eq=False)
 class LeastGain:
-    """The outcome of the search for the least gain.
+    """The outcome of the search: the true norm of the best filter (0 without d), and its gains.
 
-    Fields: gain: True norm of the best filter found (0 without disturbance); first: Coordinates made from the starting
-    (Kalman) filter; injection: Its gains, in the original coordinates; starting_gain: Norm of the starting filter, the
-    natural scale; bracket: Bisection: the final bracket; direct search: the same number twice; records: Solver records.
+    ``first``: coordinates of the starting (Kalman) filter; ``starting_gain``: its norm; ``bracket``: of a bisection.
     """
 
     gain: float
@@ -58,16 +55,9 @@ class LeastGain:
     records: list[dict[str, Any]] = field(default_factory=list)
 
 
-def coordinates(
-    problem: GainProblem, *, solver: str, start: Injection | None = None, gain: float | None = None
-) -> NormalisedProblem:
-    """Return the problem in the coordinates that suit the solver; ``gain`` is that of ``start``, where known."""
-    return normalise(problem, start=start, gain=gain, rotate=solver not in lmi.FIRST_ORDER_SOLVERS)
-
-
 def search_least_gain(problem: GainProblem, *, solver: str, polish: bool = True) -> LeastGain:
     """Minimise the gain directly, improving the coordinates between passes."""
-    first = normalised = coordinates(problem, solver=solver)
+    first = normalised = normalise(problem, solver=solver)
     best, gain = first.start, first.start_gain
     starting = gain
     records: list[dict[str, Any]] = []
@@ -79,7 +69,7 @@ def search_least_gain(problem: GainProblem, *, solver: str, polish: bool = True)
             if gain <= least_level(problem) * (1.0 + PASS_IMPROVEMENT):
                 break  # nothing is below
             if best is not normalised.start:
-                normalised = coordinates(problem, solver=solver, start=best, gain=gain)
+                normalised = normalise(problem, solver=solver, start=best, gain=gain)
             better = improve(normalised, best, gain, records, solver=solver, first=number == 0)
             if better is None:
                 reached = np.inf

@@ -1,20 +1,9 @@
-r"""Solving a normalised `GainProblem`: least gain, gains of least size at a given gain, feasibility.
+"""Solving a normalised `GainProblem` by the bounded real inequality in P, ``Y = P R`` and V, with g the gain level,
 
-The bounded real inequality in P, Y = P R and V, with g the gain level,
-
-.. math::
-    \begin{bmatrix} P & 0 & (PA - YC)^T & (Z + VC)^T \\ & g^2 I & (PB - YD)^T & (Z_d + VD)^T \\
-    & & P & 0 \\ & & & I \end{bmatrix} > 0
-
-is used in two forms.  The *eliminated* form has no Y (elimination lemma; N a basis of null [C D], M = [C D],
-G = [A B], H = [Z Zd]):
-
-.. math:: N^T(\mathrm{diag}(P, g^2 I) - G^T P G - H^T H) N > 0, \quad
-          \mathrm{diag}(P, g^2 I) - (H + VM)^T (H + VM) > 0,
-
-where V is zero when the weight is fixed, a variable when it has a limit, and eliminated as well when it is free,
-which leaves P > 0 of the second condition.  The gains come in closed form, so that nothing is lost: they minimise the
-residual in the Loewner order.
+``[P, *, *, *; 0, g^2 I, *, *; PA - YC, PB - YD, P, *; Z + VC, Zd + VD, 0, I] > 0``. Its *eliminated* form, with N a
+basis of null M, ``M = [C D]``, ``G = [A B]``, ``H = [Z Zd]``, has no Y: ``N'(diag(P, g^2 I) - G'PG - H'H) N > 0``,
+``diag(P, g^2 I) - (H + VM)'(H + VM) > 0``; V is zero when fixed, a variable when it has a limit, and eliminated as well
+when it is free, which leaves P > 0 of the second condition.
 """
 
 from __future__ import annotations
@@ -40,11 +29,7 @@ RECOVERY_ROOM = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class GainSolution:
-    """A solution in normalised coordinates.
-
-    Fields: gain: The level g of the inequality; P: Lyapunov matrix ``(n, n)``; injection: Gains; record: Record of the
-    solver run.
-    """
+    """A solution in normalised coordinates: the level g of the inequality, P ``(n, n)``, and the gains."""
 
     gain: float
     P: FloatArray
@@ -139,9 +124,9 @@ def _full_inequality(problem: GainProblem, p: Any, squared: Any, *, decay: float
 def injection_for(problem: GainProblem, p: FloatArray, gain: float, *, v: FloatArray | None = None) -> Injection:
     """Return the gains that P allows at level ``gain``, in closed form, with the given V or the best there is.
 
-    ``(G - R M) S^-1 (G - R M)' < P^-1`` with ``M = [C D]`` is least, in the Loewner order, at
-    ``R = G S^-1 M' (M S^-1 M')^-1``; S is diag(P, g^2 I), less ``(H + V M)'(H + V M)`` when V is given or fixed at
-    zero, and V comes out of the same formula with H stacked under G when it is free.
+    ``(G - R M) S^-1 (G - R M)' < P^-1`` is least, in the Loewner order, at ``R = G S^-1 M' (M S^-1 M')^-1``; S is
+    diag(P, g^2 I), less ``(H + V M)'(H + V M)`` when V is given or zero; a free V comes out likewise with H stacked
+    under G.
     """
     n, m, q = problem.order, problem.measured, problem.Z.shape[0]
     if m == 0:
@@ -174,8 +159,7 @@ def least_gain(problem: GainProblem, *, solver: str, ceiling: float = P_CEILING)
 def feasible_point(problem: GainProblem, gain: float, *, solver: str) -> GainSolution | None:
     """Look for a filter at level ``gain`` and return it when its true norm is below; ``None`` otherwise.
 
-    The slack of the inequality is maximised (up to one) instead of asking for bare feasibility, which ends in
-    solver errors below the optimum.
+    The slack is maximised (up to one): bare feasibility ends in solver errors below the optimum.
     """
     slack = lmi.scalar_variable()
     # A slack of t is the same as asking for the level g^2 - t in the disturbance block.
@@ -192,9 +176,8 @@ def feasible_point(problem: GainProblem, gain: float, *, solver: str) -> GainSol
 def small_gains(problem: GainProblem, gain: float, *, solver: str, decay: float = 1.0) -> GainSolution:
     """Return gains of least size (or least noise) at level ``gain``, by the full inequality.
 
-    Minimises the trace of X, a bound on ``(Bn - R Dn)' P (Bn - R Dn) + (Zn + V Dn)'(Zn + V Dn)``: the variance of
-    xi under the noise of the problem.  Without a noise model the caller gives unit noise on the free
-    measurements, and the objective is then the size of R (and V) itself.
+    The trace of a bound on ``(Bn - R Dn)' P (Bn - R Dn) + (Zn + V Dn)'(Zn + V Dn)``, the variance of xi, is minimised;
+    unit noise on the free measurements makes it the size of R (and V) itself.
     """
     n, q, nw = problem.order, problem.Z.shape[0], problem.Bn.shape[1]
     p, x = lmi.symmetric_variable(n), lmi.symmetric_variable(nw)

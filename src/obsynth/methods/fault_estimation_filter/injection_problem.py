@@ -1,12 +1,6 @@
-r"""The convex core: bound the gain from a disturbance to an output by output injection.
+"""The convex core: bound the gain from a disturbance to an output by output injection R, with a weight V free or zero:
 
-The error system of every filter of this kind is
-
-.. math::
-    e^+ = (A - R C) e + (B - R D) d + (B_n - R D_n) w, \qquad
-    \xi = (Z + V C) e + (Z_d + V D) d + (Z_n + V D_n) w
-
-with the injection gain R free, and the weight V free or fixed at zero.
+``e+ = (A - R C) e + (B - R D) d + (Bn - R Dn) w``, ``xi = (Z + V C) e + (Zd + V D) d + (Zn + V Dn) w``.
 """
 
 from __future__ import annotations
@@ -17,6 +11,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from obsynth.errors import SolverError
+from obsynth.methods.conic.lmi import FIRST_ORDER_SOLVERS
 from obsynth.methods.riccati import bounded_real_matrix, normalising_change, stabilising_gain
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.modal_response import Modes
@@ -38,18 +33,19 @@ ROUNDING = 1e-12
 
 @dataclass(frozen=True, eq=False)
 class WeightLimit:
-    """A bound on the spectral norm of the weight ``fixed + V free``.
-
-    Fields: fixed, free: ``(q, ny)`` and ``(m, ny)``; bound: Positive.
-    """
+    """A positive bound on the spectral norm of the weight ``fixed (q, ny) + V free (m, ny)``."""
 
     fixed: FloatArray
     free: FloatArray
     bound: float
 
+    def norm(self, v: FloatArray) -> float:
+        """Return the norm of the weight."""
+        return float(np.linalg.norm(self.fixed + v @ self.free, 2))
+
     def kept(self, v: FloatArray) -> FloatArray:
         """Return V, drawn towards zero by as much as a solver's rounding has let the weight out of the bound."""
-        least, found = (float(np.linalg.norm(self.fixed + part, 2)) for part in (0.0, v @ self.free))
+        least, found = float(np.linalg.norm(self.fixed, 2)), self.norm(v)
         if found <= self.bound or least >= self.bound:
             return v
         return np.asarray((1.0 - ROUNDING) * (self.bound - least) / (found - least) * v)
@@ -57,12 +53,11 @@ class WeightLimit:
 
 @dataclass(frozen=True, eq=False)
 class GainProblem:
-    """Data of the problem: find R (and V) so that the gain d -> xi is small.
+    """Find R (and V) so that the gain d -> xi is small; noise has unit covariance.
 
-    Fields: A, C, Z: ``(n, n)``, ``(m, n)``, ``(q, n)``; B, D, Zd: Disturbance: ``(n, nd)``, ``(m, nd)``, ``(q, nd)``;
-    Bn, Dn, Zn: Noise of unit covariance: ``(n, nw)``, ``(m, nw)``, ``(q, nw)``; free_weight: Whether V ``(q, m)`` is
-    free; weight_limit: Bound on the weight that V is a part of; judged_exactly: Whether the norms of filters
-    are told (of many states, that they are below a level), and not the largest peaks found.
+    With ``judged_exactly`` the norms of filters are told (of many states, that they are below a level), else the
+    largest peaks found. A, C, Z: ``(n, n)``, ``(m, n)``, ``(q, n)``; B, D, Zd of the disturbance and Bn, Dn, Zn of the
+    noise likewise.
     """
 
     A: FloatArray
@@ -114,6 +109,10 @@ class GainProblem:
         """Return the problem without its disturbance."""
         return replace(self, B=self.B[:, :0], D=self.D[:, :0], Zd=self.Zd[:, :0])
 
+    def noise_as_disturbance(self) -> GainProblem:
+        """Return the problem with its noise in the disturbance's place."""
+        return replace(self, B=self.Bn, D=self.Dn, Zd=self.Zn)
+
     def with_state_noise(self, size: float) -> GainProblem:
         """Return the problem with independent noise of this size on each state besides its own."""
         n, m, q = self.order, self.measured, self.Z.shape[0]
@@ -129,14 +128,9 @@ class GainProblem:
         r, v = solution.R, solution.V
         return self.A - r @ self.C, self.B - r @ self.D, self.Z + v @ self.C, self.Zd + v @ self.D
 
-    def noise_loop(self, solution: Injection) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Return the error system w -> xi with the given gains."""
-        r, v = solution.R, solution.V
-        return self.A - r @ self.C, self.Bn - r @ self.Dn, self.Z + v @ self.C, self.Zn + v @ self.Dn
-
     def noise_variance(self, solution: Injection) -> float:
         """Return the true total variance of xi under the noise of the problem, with the given gains."""
-        return float(np.trace(output_covariance(*self.noise_loop(solution))))
+        return float(np.trace(output_covariance(*self.noise_as_disturbance().closed_loop(solution))))
 
     def modes(self, solution: Injection) -> Modes:
         """Return the modes of the closed loop; those of the last filter are kept."""
@@ -163,10 +157,7 @@ class GainProblem:
 
 @dataclass(frozen=True, eq=False)
 class Injection:
-    """Gains of the error system.
-
-    Fields: R: ``(n, m)``; V: ``(q, m)``; zero when the weight is fixed.
-    """
+    """Gains of the error system, R ``(n, m)`` and V ``(q, m)``, zero when the weight is fixed."""
 
     R: FloatArray
     V: FloatArray
@@ -179,16 +170,10 @@ class Injection:
 
 @dataclass(frozen=True, eq=False)
 class NormalisedProblem:
-    """A `GainProblem` in coordinates in which the matrix inequality is well scaled.
+    """A `GainProblem` whose inequality is solved near the identity: old state = ``states`` times the new one.
 
-    States are changed by the inverse root of a rough Riccati solution, so that the solution of the
-    inequality is close to the identity; the disturbance is scaled so that the gain is close to one; the
-    measurements are made orthonormal.
-
-    Fields: problem: In the new coordinates; states: ``S (n, n)``, old state = S new state; measurements: ``K (m, m)``,
-    new measurement = K old measurement; gain: Gain of the starting filter: old gain = gain * new gain (1 without
-    disturbance); start: The starting filter in the original coordinates; stable; start_gain: Its true gain (0 without
-    disturbance).
+    ``measurements (m, m)`` maps old ones to orthonormal ones, and old gains are ``gain`` times new ones (1 without
+    disturbance). ``start``: a stable filter in the original coordinates; ``start_gain``: its true gain (0 without).
     """
 
     problem: GainProblem
@@ -209,9 +194,9 @@ class NormalisedProblem:
 
 
 def normalise(
-    problem: GainProblem, *, start: Injection | None = None, gain: float | None = None, rotate: bool = True
+    problem: GainProblem, *, solver: str = "auto", start: Injection | None = None, gain: float | None = None
 ) -> NormalisedProblem:
-    """Return the problem in well-scaled coordinates."""
+    """Return the problem in coordinates that suit the solver; ``gain`` is that of ``start``, where known."""
     start = start if start is not None else _starting_filter(problem)
     # As a scale, a gain that is attained is as good as the largest one, and for many states much cheaper.
     gain = problem.achieved_gain(start) if gain is None else gain
@@ -223,7 +208,7 @@ def normalise(
         p = bounded_real_matrix(a, b[:, :0], z, zd[:, :0], 1.0, slack=tail)
     if p is None:
         states = np.eye(problem.order)
-    elif rotate:
+    elif solver not in FIRST_ORDER_SOLVERS:
         states = normalising_change(p)
     else:
         states = np.eye(problem.order) / np.sqrt(np.trace(p) / problem.order)

@@ -1,19 +1,12 @@
-r"""Proof that no filter of a family has a smaller gain: a mixture of disturbances that its gains cannot see.
+"""Proof that no filter of a family has a smaller gain: a mixture of disturbances that its gains cannot see.
 
-The filters with these T and N, and W unless it is free, differ from the shipped one by ``L' - L`` and ``W' - W`` that
-vanish on Upsilon.  So a pair (e, d) with ``C e + D d`` in the range of Upsilon leads to the next error ``A e + B d``
-and to ``xi = Z e + Zd d`` whatever the gains: it is invisible.  With columns S of the errors that invisible pairs reach
-from rest, and of the pairs that stay there ``top`` and ``image`` (in S) and ``bottom`` (d), each F with
-
-.. math::
-    Q = \mathrm{image}\, F F^T \mathrm{image}^T - \mathrm{top}\, F F^T \mathrm{top}^T \ge 0
-
-is a mixture of pairs that can follow each other.  Summed over it, the dissipation inequality of any filter with gain g
-gives ``g^2 |bottom F|^2 >= |xi of F|^2 + tr P Q`` with ``P >= 0``; where W is fixed, one more disturbance ``d = K e``
-(and M, from rest) shows before any gain can act: ``tr P Q >= |xi of (e, K e)|^2 - g^2 |K e|^2`` over Q.
-
-S and the pairs are found in rational arithmetic from the stored numbers, so nothing is nearly invisible; the sums are
-in ball arithmetic.  Source: ours, the dual of the eliminated form of Wang 2015, eq. (45).
+The filters with these T and N (and W unless it is free) differ by ``L' - L`` and ``W' - W`` that vanish on Upsilon: a
+pair (e, d) with ``C e + D d`` in the range of Upsilon leads to the next error and to xi whatever the gains. Each F with
+``Q = image F F' image' - top F F' top' >= 0`` is a mixture of pairs that can follow each other, so that ``g^2 |bottom
+F|^2 >= |xi of F|^2 + tr P Q``, ``P >= 0``; where W is fixed, one more disturbance ``d = K e`` (and M, from rest) shows
+before any gain can act: ``tr P Q >= |xi of (e, K e)|^2 - g^2 |K e|^2`` over Q. S and the pairs are rational, from the
+stored numbers, so that nothing is nearly invisible; the sums are in ball arithmetic. Source: ours, the dual of Wang
+2015, eq. (45).
 """
 
 from __future__ import annotations
@@ -44,10 +37,10 @@ NORM_TOLERANCE = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class InvisiblePairs:
-    """What no gain sees, as rational matrices (``flint.fmpq_mat``).
+    """What no gain sees (``flint.fmpq_mat``): errors S ``(n, s)`` that pairs reach from rest, pairs that stay there.
 
-    ``S (n, s)``; ``top (s, k)``, ``bottom (nd, k)``, ``image (s, k)``; ``shown (nf, k)`` is xi of the pairs, ``Z (nf,
-    s)`` and ``Zd (nf, nd)`` that of any error in S and any disturbance.
+    ``top (s, k)``, ``image (s, k)`` (in S), ``bottom (nd, k)`` (d), ``shown (nf, k)`` (xi); Z, Zd: xi of any error in
+    S, any d.
     """
 
     S: Any

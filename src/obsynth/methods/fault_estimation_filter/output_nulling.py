@@ -1,8 +1,6 @@
-"""What no measurement sees: the states that a disturbance can move, or that can grow, with the measurement at zero.
+"""What no measurement sees: output-nulling pairs (x, d), ``C x + D d = 0``, lead to ``A x + B d`` whatever the gains.
 
-An output-nulling pair is (x, d) with ``C x + D d = 0``; it leads to the state ``A x + B d`` whatever the gains.  Two
-kinds of states matter for what no filter can do better: those reached from rest by output-nulling pairs, and those
-that grow unseen from far back in time (invariant zeros from d to the measurement outside the unit circle).
+States reached from rest by them matter, and those that grow unseen (zeros from d outside the unit circle).
 """
 
 from __future__ import annotations
@@ -76,10 +74,7 @@ def _growing(top: FloatArray, image: FloatArray, reached: FloatArray) -> FloatAr
 
 
 def output_nulling_part(problem: GainProblem) -> GainProblem:
-    """Return the problem on the states that matter for what no filter can do better.
-
-    Outside of them the dual inequalities have no strict solution; restricted to them they lose nothing.
-    """
+    """Return the problem on the states that matter: outside the dual inequalities have no strict solution."""
     top, _, image = invisible_pairs(problem)
     reached = reached_from_rest(top, image)
     subspace = _range(np.hstack([reached, _growing(top, image, reached)]))
@@ -95,10 +90,7 @@ def output_nulling_part(problem: GainProblem) -> GainProblem:
 
 
 def strict_point(top: FloatArray, image: FloatArray) -> FloatArray:
-    """Return ``Z1 > 0`` with ``image Z1 image' - top Z1 top' > 0``: what output-nulling pairs of all kinds add up to.
-
-    Shapes: ``top (n, k)``, ``image (n, k)``.
-    """
+    """Return ``Z1 > 0`` with ``image Z1 image' - top Z1 top' > 0``, from pairs of all kinds."""
     point, reached = _pairs_from_rest(top, image)
     outside = null_space(reached.T) if reached.shape[1] else np.eye(top.shape[0])
     if outside.shape[1] == 0:
@@ -109,7 +101,7 @@ def strict_point(top: FloatArray, image: FloatArray) -> FloatArray:
 def _pairs_from_rest(top: FloatArray, image: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return sequences from rest of every length, summed up, and a basis of the states they reach.
 
-    Step by step, half of what the states have reached goes on invisibly, and the other half is left as slack.
+    Step by step, half of what is reached goes on invisibly; the other half is slack.
     """
     n, size = top.shape
     point, reached = np.zeros((size, size)), np.zeros((n, 0))

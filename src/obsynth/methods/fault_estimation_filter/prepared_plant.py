@@ -1,18 +1,9 @@
-r"""Preparing a plant for the fault-estimation filter.
+"""Preparing a plant for the fault-estimation filter: sensor faults as states, units, T and N with ``T E + N C = I``.
 
-Source: Wang, Rodrigues, Theilliol, Shen 2015.  Differences: feedthrough, which the paper does not have.  Sensor
-faults become algebraic states.  Disturbances and noise in the outputs enter through the error coordinate
-``e = T E x - z`` instead of ``x - xhat``: the future sample ``N Dd d(k+1)`` then drops out, and the error system
-
-    e(k+1) = (TA - L C) e + (T Bd - TA N Dd - L (I - C N) Dd) d,   residual = W (C e + (I - C N) Dd d)
-
-is exact, where treating d(k) and d(k+1) as independent would be conservative.
-
-The matrices T and N with ``T E + N C = I``, which turn a descriptor plant into an explicit one.
-
-Source: Wang, Rodrigues, Theilliol, Shen 2015, eqs. (7), (16)-(17).  Differences: the paper's choice
-``S = [I, C']`` gives a singular T in 13 of 276 random systems, and a singular T loses the information in the
-algebraic equations; `restricted_equivalent` uses a T that is nonsingular by construction unless S is given.
+Source: Wang 2015, eqs. (7), (16)-(17). Differences: ``S = [I, C']`` gives a singular T, which loses algebraic
+equations, in 13 of 276 random systems: ours is nonsingular by construction. Feedthrough is exact in ``e = T E x - z``,
+since ``N Dd d(k+1)`` drops out: ``e+ = (TA - L C) e + (T Bd - TA N Dd - L (I - C N) Dd) d``, ``r = W (C e + (I - C N)
+Dd d)``.
 """
 
 from __future__ import annotations
@@ -37,13 +28,10 @@ from obsynth.plants.descriptor import DescriptorSystem
 
 
 def restricted_equivalent(e: FloatArray, c: FloatArray) -> tuple[FloatArray, FloatArray]:
-    r"""Return ``T (nx, nx)``, nonsingular, and ``N (nx, ny)`` with ``T E + N C = I``.
+    """Return ``T (nx, nx)``, nonsingular, and ``N (nx, ny)`` with ``T E + N C = I``.
 
-    With :math:`W = E^T E + C^T C`: :math:`T = W^{-1} E^T + K Q U^T`, :math:`N = W^{-1} C^T`, where the columns
-    of U span the null space of :math:`E^T`, those of K span :math:`C^T C \ker E`, and Q is the orthogonal polar
-    factor of :math:`K^T U`.
-
-    Shapes: ``e (nx, nx)``, ``c (ny, nx)``.
+    ``W = E'E + C'C``, ``T = W^-1 E' + K Q U'``, ``N = W^-1 C'``: U spans null E', K spans ``C'C ker E``, Q is the
+    orthogonal polar factor of ``K'U``.
     """
     stacked = np.vstack([e, c])
     # W^-1 [E' C'] is the pseudo-inverse; by QR, and one refinement, it is accurate where forming W is not.
@@ -62,10 +50,7 @@ def restricted_equivalent(e: FloatArray, c: FloatArray) -> tuple[FloatArray, Flo
 
 
 def restricted_equivalent_from(e: FloatArray, c: FloatArray, s: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return T and N by the paper's general solution (16)-(17) with its free matrix S.
-
-    Shapes: ``e (nx, nx)``, ``c (ny, nx)``, ``s (nx, nx + ny)``.
-    """
+    """Return T and N by the paper's general solution (16)-(17) with its free matrix ``S (nx, nx + ny)``."""
     nx, ny = e.shape[0], c.shape[0]
     if s.shape != (nx, nx + ny):
         raise SpecError(f"S is {s.shape[0]} by {s.shape[1]}, but {nx} by {nx + ny} is needed.", path="S")
@@ -91,13 +76,10 @@ MOST_CONDITION = 256.0
 
 @dataclass(frozen=True, eq=False)
 class PreparedPlant:
-    """A plant in the form the filter's theory works on: sensor faults as states, balanced, ``T E + N C = I``.
+    """A plant in the form the theory works on: ``plant`` has sensor faults as states, and is not balanced.
 
-    Fields: plant: With sensor faults appended as algebraic states; not balanced; scaling: Power-of-two factors of the
-    balanced coordinates, in which everything below is given; T, N: ``(na, na)`` and ``(na, ny)``, na states after
-    appending; TA, C, TF: ``(na, na)``, ``(ny, na)``, ``(na, nf)``; Bd, Dd: Disturbance in the error system ``(na, nd)``
-    and in the innovation ``(ny, nd)``; Bw, Dw: Noise likewise, ``(na, nw)`` and ``(ny, nw)``; detectability: Indexes,
-    Psi and Upsilon.
+    The rest is in the coordinates of ``scaling``: T, N, TA, C, TF, and disturbance and noise as they enter the error
+    system (``Bd``, ``Bw``) and the innovation (``Dd``, ``Dw``).
     """
 
     plant: DescriptorSystem
@@ -123,7 +105,7 @@ def with_sensor_faults_as_states(plant: DescriptorSystem) -> DescriptorSystem:
 def _units(work: DescriptorSystem) -> Iterator[Scaling]:
     """Yield units to try in turn: balanced, natural, and balanced with the rows of E of one size.
 
-    Where A is far larger than E, an equation is scaled by A: T would lose it beside an output of the same state.
+    The last where A is far larger than E: T would lose an equation scaled by A beside an output of the same state.
     """
     balanced = balance_system(work.E, work.A, inputs=[work.Bf], outputs=[work.C])
     yield balanced
@@ -147,10 +129,7 @@ def _equivalent(work: DescriptorSystem) -> tuple[Scaling, FloatArray, FloatArray
 
 
 def prepare(plant: DescriptorSystem, s: FloatArray | None = None) -> PreparedPlant:
-    """Return the prepared plant; the rank conditions must hold.
-
-    Shapes: ``s (na, na + ny)``.
-    """
+    """Return the prepared plant, with T from ``s (na, na + ny)`` where given; the rank conditions must hold."""
     work = with_sensor_faults_as_states(plant)
     scaling, t, n = _equivalent(work)
     a, c = scaling.scale_dynamics(work.A), scaling.scale_output(work.C)

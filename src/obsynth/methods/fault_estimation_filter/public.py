@@ -178,7 +178,7 @@ def fault_estimation_filter_from_gains(
     ----------
     .. [Wang2015] Fault estimation filter design for discrete-time descriptor systems, eq. (23).
     """
-    from obsynth.methods.fault_estimation_filter.given_gains import synthesis_from_gains
+    from obsynth.methods.fault_estimation_filter.realisation import synthesis_from_gains
 
     if linear_plant(plant).nd and gamma is None:
         raise SpecError(

@@ -39,10 +39,9 @@ COARSEST_LINE_STEPS = 2
 def small_gain_design(
     problem: GainProblem, least: LeastGain, gain: float, *, solver: str, engine: str
 ) -> tuple[Injection, list[dict[str, Any]]]:
-    """Return gains of least size or least noise whose true norm is at most ``gain``.
+    """Return gains of least size or noise whose true norm is at most ``gain``, and records of what was tried.
 
-    Central filters that weigh the noise, and solutions of the inequality, compete; where both fail, the filter of the
-    search is left.  The records say what was tried.
+    Central filters that weigh the noise compete with the inequality; where both fail, the search's filter is left.
     """
     records: list[dict[str, Any]] = []
     if problem.measured == 0:
@@ -93,10 +92,9 @@ def small_gain_design(
 
 
 def _lively_filters(goal: Goal) -> list[Injection]:
-    """Return fast filters that meet the goal, the best first, where those that weigh the noise alone are slow.
+    """Return fast filters that meet the goal, the fastest first, where those that weigh the noise alone are slow.
 
-    Noise on every state makes a filter trust its measurements more.  Of those that cost little more noise than the
-    least, the one that forgets fastest is the best.
+    Noise on every state makes a filter trust its measurements more; little more noise than the least may be paid.
     """
     problem = goal.problem
     size = float(np.linalg.norm(np.vstack([problem.Bn, problem.Dn]), 2))

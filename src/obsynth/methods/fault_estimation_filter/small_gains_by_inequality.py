@@ -1,9 +1,4 @@
-"""Small gains by the whole inequality, in the coordinates in which it is solved well.
-
-No number of a solver is believed: the true gain and the spectral radius of the closed loop decide.
-
-What the second stage asks of a filter, by its true gain, its true variance and its spectral radius.
-"""
+"""Small gains by the whole inequality, and what a filter must meet: true gain, variance and spectral radius decide."""
 
 from __future__ import annotations
 
@@ -14,17 +9,18 @@ import numpy as np
 
 from obsynth.errors import SolverError
 from obsynth.methods.fault_estimation_filter import inequality_solutions
-from obsynth.methods.fault_estimation_filter.inequality_search import LeastGain, coordinates
-from obsynth.methods.fault_estimation_filter.injection_problem import GainProblem, Injection, NormalisedProblem
+from obsynth.methods.fault_estimation_filter.inequality_search import LeastGain
+from obsynth.methods.fault_estimation_filter.injection_problem import (
+    GainProblem,
+    Injection,
+    NormalisedProblem,
+    normalise,
+)
 
 
 @dataclass(frozen=True, eq=False)
 class Goal:
-    """What a filter must meet, and what it shall cost little of.
-
-    Fields: problem: In the original coordinates; gain: Bound on the true gain; slowest: Spectral radius above which a
-    filter forgets too slowly; judged: Filters that were asked for before, by identity.
-    """
+    """What a filter must meet (true gain, spectral radius ``slowest``), and what it shall cost little of."""
 
     problem: GainProblem
     gain: float
@@ -44,8 +40,14 @@ class Goal:
         """Return whether the true gain is within the level, and the weight within its limit."""
         # A filter is asked for more than once, and for many states each answer takes a Riccati equation.
         if id(injection) not in self.judged:
-            self.judged[id(injection)] = (injection, _reaches(self.problem, injection, self.gain))
+            self.judged[id(injection)] = (injection, self._reached(injection))
         return self.judged[id(injection)][1]
+
+    def _reached(self, injection: Injection) -> bool:
+        problem, limit = self.problem, self.problem.weight_limit
+        if limit is not None and limit.norm(injection.V) > limit.bound:
+            return False
+        return problem.reaches(injection, self.gain) if problem.disturbances else problem.radius(injection) < 1.0
 
     def is_fast(self, injection: Injection) -> bool:
         """Return whether the filter forgets fast enough."""
@@ -62,15 +64,6 @@ class Goal:
         return float(np.linalg.norm(np.vstack([injection.R, injection.V])))
 
 
-def _reaches(problem: GainProblem, injection: Injection, gain: float) -> bool:
-    limit = problem.weight_limit
-    if limit is not None and float(np.linalg.norm(limit.fixed + injection.V @ limit.free, 2)) > limit.bound:
-        return False
-    if problem.disturbances == 0:
-        return problem.radius(injection) < 1.0
-    return problem.reaches(injection, gain)
-
-
 #: Descent in steps: ratios of successive levels, tried in turn, and how many steps at most.
 STEP_RATIOS = (0.6, 0.9)
 MOST_STEPS = 24
@@ -84,12 +77,11 @@ WORTH_REPEATING = 0.95
 def gains_by_inequality(goal: Goal, least: LeastGain, records: list[dict[str, Any]], *, solver: str) -> list[Injection]:
     """Return what the inequality gives, in different coordinates until one is good and fast enough.
 
-    The bounds on P mean something else in other coordinates, and those of the least gain can be extreme: as long as
-    that gains much, the inequality is solved again in the coordinates of what it gave.
+    The bounds on P mean something else in other coordinates, and those of the least gain can be extreme.
     """
     problem, gain, fresh = goal.problem, goal.gain, least.first
     candidates: list[Injection] = []
-    close = coordinates(problem, solver=solver, start=least.injection, gain=least.gain)
+    close = normalise(problem, solver=solver, start=least.injection, gain=least.gain)
     attempts = ((close, 1.0), (fresh, 1.0), (None, 1.0), (close, goal.slowest), (fresh, goal.slowest))
     for normalised, decay in attempts:
         if normalised is None:
@@ -116,7 +108,7 @@ def _again(
     for _ in range(MOST_REPETITIONS):
         if found and cost > WORTH_REPEATING * before:
             break
-        normalised = coordinates(goal.problem, solver=solver, start=injection)
+        normalised = normalise(goal.problem, solver=solver, start=injection)
         better = _small_gains_in(goal.problem, normalised, goal.gain, records, solver=solver, decay=decay)
         if better is None or not goal.met_fast(better):
             break
@@ -147,10 +139,9 @@ def _small_gains_in(
 def _small_gains_step_by_step(
     goal: Goal, normalised: NormalisedProblem, records: list[dict[str, Any]], *, solver: str
 ) -> Injection | None:
-    """Walk from the filter of ``normalised`` down to the goal, each filter giving the coordinates for the next level.
+    """Go from the filter of ``normalised`` down to the goal, each filter giving the next coordinates.
 
-    Far below the starting filter's gain its coordinates are too bad for one jump, and those of the least gain can
-    be extreme (a decoupled disturbance).
+    Far below the starting filter's gain its coordinates are too bad for one jump.
     """
     problem = goal.problem
     reached = problem.achieved_gain(normalised.start)
@@ -165,7 +156,7 @@ def _small_gains_step_by_step(
         if goal.met(injection):
             return injection
         reached = problem.achieved_gain(injection)
-        normalised = coordinates(problem, solver=solver, start=injection)
+        normalised = normalise(problem, solver=solver, start=injection)
     return None
 
 

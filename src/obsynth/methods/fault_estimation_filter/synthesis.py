@@ -67,13 +67,10 @@ def synthesise(plant: DescriptorSystem, asked: FilterOptions, *, progress: Calla
     problem, parts = gain_problem(prepared, free_weight=free)
     # Where nothing disturbs the estimates, a small share of what disturbances could do is proved.
     nominal = NOMINAL_GAIN * max(problem.disturbance_size, NOMINAL_GAIN)
-    if s is not None and limit is None:
+    if s is not None or limit is not None:
         # With the paper's S the weight is its W = Upsilon^+ too, which is that of the outputs as given.
         problem, parts = centred(problem, prepared, parts)
-    limited = None
-    if limit is not None:
-        problem, parts = centred(problem, prepared, parts)
-        limited = with_weight_limit(problem, prepared, parts, limit)
+    limited = None if limit is None else with_weight_limit(problem, prepared, parts, limit)
     search = partial(_found, problem, limited, asked, noisy=plant.nw > 0, progress=progress)
     found = search(exactly=False)
     progress("building the realisation and its certificate")
@@ -239,10 +236,7 @@ def _gains(prepared: PreparedPlant, parts: _Parts, chosen: Injection) -> dict[st
 
 
 def centred(problem: GainProblem, prepared: PreparedPlant, parts: _Parts) -> tuple[GainProblem, _Parts]:
-    """Return the problem with a free weight written so that V = 0 is the W of least norm in the user's output units.
-
-    In balanced outputs another W has the least norm, which may be outside a limit that this one keeps.
-    """
+    """Return the problem written so that V = 0 is the W of least norm in the user's output units, not balanced ones."""
     outputs = prepared.scaling.outputs
     w0 = _left_inverse(prepared.detectability.Upsilon / outputs[:, None]) / outputs
     v = (w0 - parts.W0) @ parts.V

@@ -1,12 +1,11 @@
-r"""The two norms of a detection filter, proved in outward rounding on its stored numbers.
+"""The two norms of a detection filter, proved in outward rounding on its stored numbers.
 
-The gain: a bounded real inequality.  The sensitivity: the least singular value of ``G(jw) = C (jw - A)^-1 B + D`` is
-above a level on a whole range of frequencies if it is at one of them, and if
+The gain: a bounded real inequality.  The least singular value of ``G(jw) = C (jw - A)^-1 B + D`` is above a level on a
+range of frequencies if it is at one of them, and if
 
     [A - jw, 0, B; -C'C, -A' - jw, -C'D; D'C, B', D'D - level^2]
 
-is singular at none.  An approximate inverse at one frequency excludes singularity on an interval around it, as long as
-what it misses is less than one; intervals are laid side by side until the range is covered.
+is singular at none: excluded around a frequency by an approximate inverse, as long as what it misses is below one.
 """
 
 from __future__ import annotations

@@ -24,26 +24,23 @@ from obsynth.plants.fault_models import Exosystem
 
 @dataclass(frozen=True, eq=False)
 class FilterModel:
-    r"""``xi+ = A xi + B v + N w``, ``0 = C xi - L v + M w`` with ``v = [u; y]``; some faults are ``estimate @ xi``.
+    """``xi+ = A xi + B v + N w``, ``0 = C xi - L v + M w`` with ``v = [u; y]``; some faults are ``estimate @ xi``.
 
-    Fields: A ``(n, n)``; C ``(p, n)``; B, L ``(n, nu + ny)``, ``(p, nu + ny)``; N, M ``(n, nw)``, ``(p, nw)``; estimate
-    ``(faults, n)``; drive ``(n, model states)``: where the fault models are driven; T, T0 ``(n, nx)``, ``(p, nx)``:
-    xi follows ``T E x`` and the states of the fault models, and ``L v - C xi`` is T0 times the plant's equations;
-    faults: columns of the plant; order: states without those of the fault models; dt.
+    xi follows ``T E x`` and the states of the fault models, and ``L v - C xi`` is T0 times the plant's equations.
     """
 
-    A: FloatArray
-    C: FloatArray
-    B: FloatArray
-    L: FloatArray
-    N: FloatArray
-    M: FloatArray
-    estimate: FloatArray
-    drive: FloatArray
-    T: FloatArray
-    T0: FloatArray
-    faults: tuple[int, ...]
-    order: int
+    A: FloatArray  # (n, n)
+    C: FloatArray  # (p, n)
+    B: FloatArray  # (n, nu + ny)
+    L: FloatArray  # (p, nu + ny)
+    N: FloatArray  # (n, nw)
+    M: FloatArray  # (p, nw)
+    estimate: FloatArray  # (faults, n)
+    drive: FloatArray  # (n, model states): where the fault models are driven
+    T: FloatArray  # (n, nx)
+    T0: FloatArray  # (p, nx)
+    faults: tuple[int, ...]  # columns of the plant
+    order: int  # states without those of the fault models
     fault_sizes: FloatArray
     dt: float
 
@@ -112,16 +109,12 @@ PROVABLE = 1e-10
 
 @dataclass(frozen=True, eq=False)
 class KalmanGain:
-    """A stable gain.
+    """A stable gain."""
 
-    Fields: K ``(n, p)``: gain of the prediction; lag ``(n, p)`` each: gain of xi(k) from the innovation at k + j;
-    innovation ``(p, p)``: its covariance (intensity in continuous time); added: noise given to every state besides.
-    """
-
-    K: FloatArray
-    lag: tuple[FloatArray, ...]
-    innovation: FloatArray
-    added: float
+    K: FloatArray  # (n, p), of the prediction
+    lag: tuple[FloatArray, ...]  # (n, p) each: gain of xi(k) from the innovation at k + j
+    innovation: FloatArray  # (p, p), its covariance; intensity in continuous time
+    added: float  # noise given to every state besides
 
 
 def exact_rows(model: FilterModel) -> FloatArray:
@@ -134,10 +127,7 @@ def exact_rows(model: FilterModel) -> FloatArray:
 
 
 def require_noise(model: FilterModel, plant_outputs: tuple[str, ...], noise: FloatArray) -> None:
-    """Raise `PreconditionError` where a combination of outputs is free of noise.
-
-    Equations without any output (those of an index of two and more) are exact, and may be.  Shapes: ``noise (ny, nw)``.
-    """
+    """Raise `PreconditionError` where a combination of outputs is free of noise; equations without any may be."""
     measured = model.L[:, model.L.shape[1] - len(plant_outputs) :]
     trusted = exact_rows(model) @ measured
     if not trusted.size or float(np.max(np.abs(trusted))) <= RANK_TOLERANCE * float(np.max(np.abs(measured))):
@@ -153,10 +143,7 @@ def require_noise(model: FilterModel, plant_outputs: tuple[str, ...], noise: Flo
 
 
 def kalman_gain(model: FilterModel, rates: FloatArray, *, lag: int = 0, decay: float = 0.0) -> KalmanGain:
-    """Return the gain for walks of the fault models' states, ``rates (model states,)``, by one Riccati equation.
-
-    With a ``decay`` (1/s) every error decays at this rate or faster.
-    """
+    """Return the gain for walks of the fault models, ``rates (model states,)``; errors decay at ``decay`` (1/s)."""
     n, p = model.A.shape[0], model.C.shape[0]
     if n == 0:
         return KalmanGain(np.zeros((0, p)), (np.zeros((0, p)),) * (lag + 1), model.M @ model.M.T, 0.0)

@@ -1,11 +1,8 @@
 """The shipped observer of a functional filter, and the matrices T and T0 that prove it.
 
-With eps = z - T E x, and rows of the plant's equations multiplied by T and T0,
-
-    eps+ = Az eps + (By Df - T Bf) f,    estimates = Cz eps + (Dy Df - T0 Bf) f
-
-when ``Az T E + By C = T A``, ``By Dd = T Bd``, ``Bu + By D = T B``, ``T0 E = 0``, ``Cz T E + Dy C = T0 A``,
-``Dy Dd = T0 Bd``, ``Du + Dy D = T0 B``: neither the state, nor u, nor an unknown input is left.
+eps = z - T E x obeys ``eps+ = Az eps + (By Df - T Bf) f``, ``estimates = Cz eps + (Dy Df - T0 Bf) f`` when
+``Az T E + By C = T A``, ``By Dd = T Bd``, ``Bu + By D = T B``, ``T0 E = 0``, ``Cz T E + Dy C = T0 A``,
+``Dy Dd = T0 Bd``, ``Du + Dy D = T0 B``.
 """
 
 from __future__ import annotations
@@ -77,10 +74,7 @@ class FilterPart:
 
 
 def filter_part(model: FilterModel, gain: KalmanGain, shown: FloatArray, *, delay: int, mean: int) -> FilterPart:
-    """Return the filter of a gain; its estimates lag by ``delay`` samples and are means of ``mean`` of them.
-
-    Shapes: ``shown (rows, p)``: combinations of the innovation that are shipped as residuals.
-    """
+    """Return the filter of a gain, ``delay`` samples late; ``shown (rows, p)``: innovations shipped as residuals."""
     dynamics = Dynamics(model.A - gain.K @ model.C, model.B + gain.K @ model.L, model.T + gain.K @ model.T0)
     innovation = Rows(-model.C, model.L, model.T0)
     count, nx = len(model.estimate), model.T.shape[1]
@@ -104,11 +98,7 @@ def filter_part(model: FilterModel, gain: KalmanGain, shown: FloatArray, *, dela
 
 
 def _plain_coordinates(a: FloatArray) -> FloatArray | None:
-    """Return coordinates in which A is about as large as its eigenvalues; ``None`` if it is already.
-
-    Of gains for noises of very different size the entries cancel each other: a real Schur form, balanced, has none that
-    do.
-    """
+    """Return coordinates in which A has entries as small as its eigenvalues (balanced real Schur); ``None``: it has."""
     if not len(a) or not np.all(np.isfinite(a)):
         return None
     largest = float(np.max(np.abs(np.linalg.eigvals(a))))
@@ -119,10 +109,7 @@ def _plain_coordinates(a: FloatArray) -> FloatArray | None:
 
 
 def _rounded_once(model: FilterModel, gain: KalmanGain, coordinates: FloatArray) -> Dynamics:
-    """Return the dynamics in other coordinates, each entry computed with digits to spare.
-
-    The entries that cancelled would leave their rounding errors in the small rows.
-    """
+    """Return the dynamics in other coordinates; with digits to spare, for the small rows of entries that cancel."""
     import flint
 
     with flint.ctx.workprec(BITS):

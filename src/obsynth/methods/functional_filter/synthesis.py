@@ -1,10 +1,7 @@
-r"""Functional filter: estimates of the faults asked for, or residuals that show them, and nothing else.
+"""Functional filter: estimates of the faults asked for, or residuals that show them, and nothing else.
 
-All other methods insist on the whole state.  Here the unknown inputs are taken out of the plant first (`decouple`);
-what is left is an ordinary plant with known inputs u *and* y, and on that one a Kalman filter with the faults as walks
-of their models, or poles as asked.  It exists for every plant on which the fault can be told at all.
-
-Source: ours; the null space is that of Frisk and Nyberg (2001), the fixed lag that of Anderson and Moore (1979, ch. 7).
+After `decouple` a Kalman filter on inputs u *and* y, faults as walks of their models.  Source: ours; null space: Frisk,
+Nyberg (2001); fixed lag: Anderson, Moore (1979, ch. 7).
 """
 
 from __future__ import annotations

@@ -69,10 +69,7 @@ def _with_digits_to_spare(a: FloatArray, phi: FloatArray, entering: FloatArray) 
 def wanted_faults(
     plant: DescriptorSystem, observer: LinearObserver, matrices: Mapping[str, FloatArray], *, mean: int
 ) -> FloatArray:
-    """Return what each row should make of the models' states ``(rows, nw)``: the fault as late as claimed, or nothing.
-
-    A mean of ``mean`` values is the mean of the fault's own values: for a step, the fault.
-    """
+    """Return what rows should make of the models' states ``(rows, nw)``: the fault as late as claimed, or nothing."""
     phi, cw = matrices["Phi"], matrices["Cw"]
     rows = np.zeros((len(observer.Cz), len(phi)))
     for row, (name, delay) in enumerate(zip(observer.fault_names, observer.fault_delays, strict=True)):
@@ -86,10 +83,7 @@ def wanted_faults(
 def estimate_deviations(
     plant: DescriptorSystem, observer: LinearObserver, matrices: Mapping[str, FloatArray]
 ) -> FloatArray:
-    """Return ``(faults estimated, 2)``: deviation of fhat under the stated noise, and of ``fhat - f`` with the walks.
-
-    In continuous time for a sample time of 1 s (times its root for others), the direct part left out.
-    """
+    """Return deviations ``(faults, 2)`` of fhat under noise and of ``fhat - f`` with walks; dt = 0: per sqrt(s)."""
     errors = FunctionalErrors.of(plant, observer, matrices["T"], matrices["T0"])
     rows = observer.fault_rows
     discrete = float(plant.dt > 0.0)

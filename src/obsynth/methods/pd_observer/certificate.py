@@ -1,8 +1,7 @@
-r"""A certificate of Theorem 1 for gains in hand, without a solver.
+"""A certificate of Theorem 1 for gains in hand, without a solver.
 
-For a stable observer a solution P1, P3 of the inequality exists for every delta > 0 (elimination lemma): with P from a
-Lyapunov equation and coordinates in which the two factors around P3 are unit columns, P3 only has to cancel the
-off-diagonal block of what P1 contributes.
+A solution P1, P3 exists for every delta > 0 (elimination lemma): P1 from a Lyapunov equation, and in coordinates in
+which the factors around P3 are unit columns, P3 cancels its off-diagonal block.
 """
 
 from __future__ import annotations
@@ -50,15 +49,11 @@ def explicit_certificate(
 
 @dataclass(frozen=True, eq=False)
 class SymmetricCertificate:
-    """A certificate with a symmetric P3 for an observer with L = 0, for every delta below a limit.
+    """A certificate with a symmetric P3 for an observer with L = 0, for every delta below a limit."""
 
-    Fields: P3: ``(n, n)``, positive definite: ``A' P3 + P3 A = -weight`` for the observer's dynamics A; weight: ``(n,
-    n)``, positive definite; limit: The delta from which it does not serve; infinite where it always does.
-    """
-
-    P3: FloatArray
-    weight: FloatArray
-    limit: float
+    P3: FloatArray  # (n, n), positive definite: A' P3 + P3 A = -weight
+    weight: FloatArray  # (n, n), positive definite
+    limit: float  # the delta from which it does not serve; infinite where it always does
 
     def P1(self, delta: float) -> FloatArray:
         """Return P1 ``(n, n)`` for a delta below the limit."""
@@ -66,11 +61,7 @@ class SymmetricCertificate:
 
 
 def symmetric_certificate(Az: FloatArray) -> SymmetricCertificate | None:
-    """Return a certificate of Theorem 2 in closed form for ``Az (n, n)``; ``None`` when errors do not decay.
-
-    With ``P1 = P3 + (delta / 2) weight``, the lower left block of the inequality is delta times the skew part S of
-    ``P3 A``, so that it holds when ``weight > (delta / 2) S' P3^-1 S``.
-    """
+    """Return a certificate of Theorem 2 in closed form for ``Az (n, n)``; ``None`` when errors do not decay."""
     from scipy.linalg import eigvalsh
 
     if not spectral_abscissa(Az) < 0.0:
@@ -83,15 +74,14 @@ def symmetric_certificate(Az: FloatArray) -> SymmetricCertificate | None:
         largest = float(eigvalsh(skew.T @ np.linalg.solve(p, skew), weight)[-1])
     except np.linalg.LinAlgError:
         return None
+    # With P1 = P3 + (delta / 2) weight the lower left block is delta times S, the skew part of P3 A: it holds when
+    # weight > (delta / 2) S' P3^-1 S.
     limit = 2.0 / largest if largest > 0.0 else np.inf
     return SymmetricCertificate(p / units[:, None] / units, weight / units[:, None] / units, limit)
 
 
 def coupled_certificate(a: FloatArray, delta: float) -> tuple[FloatArray, FloatArray]:
-    """Return P1 and P3 ``(n, n)`` of Theorem 1 for a stable observer with L = 0 and this delta.
-
-    Nothing but noise where ``-1 / delta`` is an eigenvalue: the inequality is then another one.
-    """
+    """Return P1 and P3 ``(n, n)`` of Theorem 1 for a stable observer, L = 0; noise where ``-1 / delta`` is a pole."""
     balanced, units = balanced_matrix(a)
     p = _gram(balanced)
     x = _coupling(balanced, p, delta)
@@ -99,17 +89,12 @@ def coupled_certificate(a: FloatArray, delta: float) -> tuple[FloatArray, FloatA
 
 
 def gain_certificate(a: FloatArray, b: Ball, c: FloatArray, gain: float) -> FloatArray | None:
-    """Return P ``(n, n)`` that proves the l2 gain of ``x' = a x + b v``, ``z = c x`` below ``gain``, or ``None``.
-
-    The Riccati solution with the largest slack that gives a proof.
-
-    Shapes: ``a (n, n)``, ``c (p, n)``, ``b (n, m)``.
-    """
+    """Return P ``(n, n)`` that proves the l2 gain of ``x' = a x + b v``, ``z = c x`` below ``gain``, or ``None``."""
     balanced, units = balanced_matrix(a)
     entering, shown = b.midpoint / units[:, None], c * units
     weight = max(float(np.linalg.norm(shown, 2)) ** 2, np.finfo(np.float64).tiny)
     spare = None
-    for slack in SLACKS:
+    for slack in SLACKS:  # the largest that gives a proof
         out = shown.T @ shown + slack * weight * np.eye(len(a))
         p = continuous_solution(balanced.T, entering.T, out, -(gain**2) * np.eye(entering.shape[1]))
         if p is None:
@@ -148,11 +133,9 @@ def _good_delta(a: FloatArray) -> float:
 
 
 def _coupling(a: FloatArray, p: FloatArray, delta: float) -> FloatArray:
-    """Return X with ``He([a'; -I] X [I, delta I]) + [0, p; p, 0] < 0`` for a stable ``a`` with Gram matrix p.
-
-    With ``[xi1; xi2] = T [alpha; beta]``, ``alpha = a xi1 - xi2`` and ``beta = xi1 + delta xi2``, the first term is
-    ``2 alpha' X beta``; the second is negative on alpha = 0 and on beta = 0, whatever delta is.
-    """
+    """Return X with ``He([a'; -I] X [I, delta I]) + [0, p; p, 0] < 0`` for a stable ``a`` with Gram matrix p."""
+    # With alpha = a xi1 - xi2, beta = xi1 + delta xi2 the first term is 2 alpha' X beta; the second is negative on
+    # alpha = 0 and on beta = 0, whatever delta is.
     n, one = len(a), np.eye(len(a))
     change = np.linalg.inv(np.block([[a, -one], [one, delta * one]]))
     form = change.T @ np.block([[np.zeros((n, n)), p], [p, np.zeros((n, n))]]) @ change

@@ -1,9 +1,7 @@
-"""When a PD observer for states and faults exists, decided before any solver runs.
+"""When a PD observer exists, before any solver runs.  Source: Filasova, Krokavec, Serbak, section 2.
 
-Source: Filasova, Krokavec, Serbak, section 2.  Our finding: Theorem 1 has a solution, for every delta > 0, exactly when
-the plant with its faults as states is detectable; away from s = 0 this is detectability of (A, C), and at s = 0, where
-the model of a constant fault has its modes, it is the paper's rank condition (3).  Observability of (A, C), which the
-paper supposes, is more than needed.
+Theorem 1 has a solution, for every delta > 0, exactly when the plant with its faults as states is detectable: (A, C)
+is, and at s = 0 rank condition (3) holds.  Observability of (A, C), which the paper supposes, is more than needed.
 """
 
 from __future__ import annotations

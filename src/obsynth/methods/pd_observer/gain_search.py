@@ -41,7 +41,8 @@ def design_gains(plant: DescriptorSystem, asked: PdOptions) -> tuple[PdGains, li
     """Return the gains to ship and the records of all solver runs."""
     plain = gains_for(plant, asked, decay=0.0 if asked.decay is None else float(asked.decay))
     records = [plain.record]
-    target = _default_decay(plant)
+    slowest = max((mode.real for mode in analyse_structure(plant).unobservable_modes), default=-np.inf)
+    target = float(min(DECAY_SHARE * fastest_mode(plant.A), -HIDDEN_SHARE * slowest))
     if asked.decay is not None or asked.disk is not None or plain.abscissa <= -target:
         return plain, records
     if plant.nx + plant.nf > MANY_STATES:
@@ -75,16 +76,8 @@ def _faster_at_little_cost(plant: DescriptorSystem, asked: PdOptions, plain: PdG
     return found
 
 
-def _default_decay(plant: DescriptorSystem) -> float:
-    slowest = max((mode.real for mode in analyse_structure(plant).unobservable_modes), default=-np.inf)
-    return float(min(DECAY_SHARE * fastest_mode(plant.A), -HIDDEN_SHARE * slowest))
-
-
 def gains_for(plant: DescriptorSystem, asked: PdOptions, *, decay: float, most: float | None = None) -> PdGains:
-    """Return gains for one decay rate: of the first coordinates in which the answer is proved.
-
-    With ``most``, a bound on their size, of the first coordinates alone.
-    """
+    """Return gains of the first coordinates whose answer is proved; with a bound ``most``, of the first alone."""
     delta = default_delta(plant, asked, decay)
     require_possible(plant, asked, delta=delta, decay=decay)
     failure = SolverError("The gains that the solver returned could not be proved to be stable: nothing is known.")
@@ -115,10 +108,7 @@ def _advice(asked: PdOptions) -> str:
 def _units(
     plant: DescriptorSystem, asked: PdOptions, *, balanced_first: bool
 ) -> Iterable[tuple[FloatArray, FloatArray]]:
-    """Return units of the augmented states and of the outputs: the user's, then those that balance the plant.
-
-    Where these are far from those in which the plant is near one, the latter come next.
-    """
+    """Return units of augmented states and outputs: the user's, balancing ones, those with the plant near one."""
     found = [*_candidate_units(plant, asked)]
     if asked.gain_bound is not None:
         return found
@@ -151,11 +141,7 @@ def _candidate_units(plant: DescriptorSystem, asked: PdOptions) -> Iterator[tupl
 
 
 def _inner_gain(plant: DescriptorSystem, asked: PdOptions) -> FloatArray | None:
-    """Return the G to design with.
-
-    A design for F G is one for F in other coordinates of the fault: any gains in the loop can be listed with any G.  A
-    bound on the gains is one on those in the loop, so that it takes the fault's own coordinates.
-    """
+    """Return the G to design with; a bound on the gains is on those in the loop, in the fault's own coordinates."""
     return None if asked.gain_bound is not None else asked.gain_matrix(plant.nf)
 
 

@@ -27,29 +27,20 @@ from obsynth.plants.descriptor import DescriptorSystem
 
 @dataclass(frozen=True, eq=False)
 class PdGains:
-    """Gains in the loop with what proves them.
+    """Gains in the loop with what proves them."""
 
-    Fields: J, L: ``(nx + nf, ny)``: the paper's ``[J; G M]`` and ``[L; G N]``; P1, P3: Certificate ``(nx + nf, nx +
-    nf)`` for the state ``[x; f]``; ends: P1 at the ends of the range of adaptation gains, empty without one;
-    gain_certificates: ``P_rate`` and ``P_noise`` ``(nx + nf, nx + nf)``, for the bounds on l2 gains that were asked
-    for; theorem: The theorem that the certificate belongs to; asked_delta, delta, decay: The delta that the gains were
-    designed with and that of the certificate (seconds), and alpha (1/seconds); observer: The realisation; proved:
-    Whether the certificate was proved; record: Of the solver run; proved_in_double_precision: Whether that took no more
-    digits; engine: The engine that found the gains.
-    """
-
-    J: FloatArray
-    L: FloatArray
-    P1: FloatArray
+    J: FloatArray  # (nx + nf, ny), the paper's [J; G M]
+    L: FloatArray  # (nx + nf, ny), [L; G N]
+    P1: FloatArray  # (nx + nf, nx + nf), for the state [x; f]
     P3: FloatArray
     theorem: int
-    asked_delta: float
+    asked_delta: float  # seconds, of the design; ``delta``: of the certificate
     delta: float
-    decay: float
+    decay: float  # alpha, 1/seconds
     observer: LinearObserver
     record: Mapping[str, Any]
-    ends: tuple[FloatArray, ...] = ()
-    gain_certificates: Mapping[str, FloatArray] = field(default_factory=dict)
+    ends: tuple[FloatArray, ...] = ()  # P1 at the ends of the range of adaptation gains
+    gain_certificates: Mapping[str, FloatArray] = field(default_factory=dict)  # P_rate, P_noise (nx + nf, nx + nf)
     proved: bool = False
     proved_in_double_precision: bool = False
     engine: str = ""
@@ -68,10 +59,7 @@ class PdGains:
 def certified(
     plant: DescriptorSystem, asked: PdOptions, found: PdSolution, *, delta: float, decay: float
 ) -> PdGains | None:
-    """Return the gains with a certificate: the solver's, or else one that is computed from the gains.
-
-    ``None`` when there is no realisation; not ``proved`` when there is no certificate.
-    """
+    """Return the gains with the solver's certificate or a computed one; ``None`` without a realisation."""
     augmented = with_faults_as_states(plant)
     try:
         observer = realise_pd_observer(plant, augmented, found.J, found.L)
@@ -126,10 +114,7 @@ def _judged(gains: PdGains) -> PdGains:
 
 
 def _certified_range(plant: DescriptorSystem, gains: PdGains, ends: tuple[float, float]) -> PdGains:
-    """Certify every adaptation gain ``g I`` of a range by its ends: the inequality is affine in g.
-
-    What is shipped has g = 1 where the range holds it, else the end nearer to it; P1 is interpolated.
-    """
+    """Certify every ``g I`` of a range by its ends (affine in g); ships g = 1 or the nearer end, P1 interpolated."""
     p1 = tuple(map(symmetric, gains.ends))
     plants = [with_faults_as_states(plant, end * np.eye(plant.nf)) for end in ends]
     proved = all(

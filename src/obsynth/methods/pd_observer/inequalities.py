@@ -1,15 +1,12 @@
 r"""The matrix inequalities of the PD observer, in coordinates of our choice.
 
-With Y = P3' J, Z = P3' L and ``T = P3' D = P3' + Z C``, every requirement is one inequality of the form
-
 .. math::
     \begin{bmatrix} M + M^T & \cdot \\ \delta M - T^T & -\delta (T + T^T) \end{bmatrix}
     + \begin{bmatrix} a P & b P \\ b P & c P \end{bmatrix} < 0, \qquad P > 0
 
-for the pencil ``Ae - s D``: M = P3' Ae and (a, b, c) = (0, 1, 0) for stability, M = P3' (Ae + alpha D) for a decay
-rate, and (c^2 - r^2, c, 1) for a disk of centre -c and radius r.  P3, Y and Z are common, P belongs to each.  Theorem 2
-asks for a symmetric positive definite P3.  What is minimised keeps P3 away from singular: the paper's own inequalities
-do not (plain feasibility gave gains of 1e9, a maximal margin 3e13).
+with Y = P3' J, Z = P3' L, ``T = P3' + Z C``: M = P3' Ae and (a, b, c) = (0, 1, 0) for stability, M = P3' (Ae + alpha D)
+for a decay rate, (c^2 - r^2, c, 1) for a disk of centre -c and radius r.  P3, Y, Z are common, P belongs to each.
+What is minimised keeps P3 from singular: plain feasibility gave gains of 1e9, a maximal margin 3e13.
 """
 
 from __future__ import annotations
@@ -30,44 +27,32 @@ MARGIN = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class PdTask:
-    """What is asked of the gains, in the coordinates in which it is solved.
+    """What is asked of the gains, in the coordinates in which it is solved."""
 
-    Fields: plants: Augmented ``A (n, n)`` and ``C (ny, n)``; more than one for a range of adaptation gains; theorem:
-    Which theorem; delta, decay: delta and alpha; disk: c and r: every eigenvalue within r of -c; gain_bound: Bound on
-    the norm of ``[gain_unit J, L]``; gain_unit: Factor from J here to the J that is bounded; rate_gain: Bound on the l2
-    gain from the rate of the fault to the fault error; noise_gain: Bound on the l2 gain from noise and its derivative,
-    as separate inputs, to the fault error; rate: ``(n, nf)``, where the rate enters; shown: ``(nf, n)``, from the error
-    to the fault error; process, sensor, sensor_rate: ``(n, nw)``, ``(ny, nw)``, ``(ny, nw)``: where the noise enters
-    the states and the outputs, and its derivative the outputs; has_derivative: False for L = 0.
-    """
-
-    plants: tuple[tuple[FloatArray, FloatArray], ...]
+    plants: tuple[tuple[FloatArray, FloatArray], ...]  # augmented A (n, n), C (ny, n); several for a range
     theorem: int
     delta: float
     decay: float
-    disk: tuple[float, float] | None
-    gain_bound: float | None
-    gain_unit: float
-    rate_gain: float | None
-    noise_gain: float | None
-    rate: FloatArray
-    shown: FloatArray
-    process: FloatArray
-    sensor: FloatArray
-    sensor_rate: FloatArray
-    has_derivative: bool = True
+    disk: tuple[float, float] | None  # c and r: every eigenvalue within r of -c
+    gain_bound: float | None  # on the norm of [gain_unit J, L]
+    gain_unit: float  # from J here to the J that is bounded
+    rate_gain: float | None  # l2 gain from the fault's rate to the fault error
+    noise_gain: float | None  # from noise and its derivative, separate inputs
+    rate: FloatArray  # (n, nf), where the rate enters
+    shown: FloatArray  # (nf, n), error to fault error
+    process: FloatArray  # (n, nw)
+    sensor: FloatArray  # (ny, nw)
+    sensor_rate: FloatArray  # (ny, nw), of the noise's derivative
+    has_derivative: bool = True  # False for L = 0
 
 
 @dataclass(frozen=True, eq=False)
 class PdSolution:
-    """Gains and certificate in the coordinates of the task.
+    """Gains and certificate in the coordinates of the task."""
 
-    Fields: J, L: ``(n, ny)``; P1: One per plant, ``(n, n)``; P3: ``(n, n)``; record: Of the solver run.
-    """
-
-    J: FloatArray
+    J: FloatArray  # (n, ny), as L
     L: FloatArray
-    P1: tuple[FloatArray, ...]
+    P1: tuple[FloatArray, ...]  # one per plant, (n, n), as P3
     P3: FloatArray
     record: Mapping[str, Any]
 

@@ -22,11 +22,7 @@ FAR_BEYOND = 100.0
 
 
 def fastest_mode(a: FloatArray) -> float:
-    """Return the largest modulus of an eigenvalue that an observer has to follow, 1/seconds.
-
-    A well-damped mode far beyond all others (that of a sensor, say) is left aside: it dies out by itself.  1 for a
-    plant of integrators, which has no time scale.
-    """
+    """Return the largest modulus of an eigenvalue to follow, damped ones far beyond left out; 1 for integrators."""
     balanced = balanced_matrix(a)[0]
     modes = np.linalg.eigvals(balanced)
     sizes = np.abs(modes)
@@ -107,10 +103,10 @@ def _require_disk(disk: tuple[float, float], hidden: tuple[complex, ...], delta:
 
 
 def least_noise_gain(plant: DescriptorSystem) -> float:
-    """Return a lower bound on the gain from constant sensor noise to the fault estimate, for any unbiased observer.
+    """Return a lower bound, for any unbiased observer, on the gain from constant sensor noise to the fault estimate.
 
-    At standstill every pair ``A x + Bf f = 0`` must be read correctly from ``C x + Df f``; the least linear map that
-    does so is taken.  Zero where sensor noise alone does not reach every output.
+    That of the least linear map that reads every pair ``A x + Bf f = 0`` from ``C x + Df f``; zero where sensor noise
+    alone does not reach every output.
     """
     noisy = with_sensor_noise(plant)
     noise = noisy.Dw[:, ~np.any(noisy.Bw != 0.0, axis=0)]

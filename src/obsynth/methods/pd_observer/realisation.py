@@ -1,23 +1,14 @@
-r"""The derivative-free realisation of a PD observer, the gains that it stands for, and its error system.
+"""The derivative-free realisation of a PD observer, its gains, and its error system.
 
-Source: Filasova, Krokavec, Serbak, eqs. (29)-(32), with feedthrough carried: ``C_o = [C Df]``.
+Filasova, Krokavec, Serbak, eqs. (29)-(32), with feedthrough, ``C_o = [C Df]``.  With ``T = I + L C``, ``S = T^-1 L``,
+``K = J + (A - J C) S`` and the augmented ``A, B, C, D``, the state ``nu = T xi - L (y - D u)`` has no derivative:
 
-With the augmented plant ``A, B, C, D`` and ``T = I + L C``, the PD observer
+    nu' = (A - K C) nu + B u + K (y - D u),   xi = nu + S (y - D u - C nu)
 
-    xi' = A xi + B u + J (y - D u - C xi) + L d/dt (y - D u - C xi)
-
-has the state ``nu = T xi - L (y - D u)``, in which no derivative is left:
-
-    nu' = (A - K C) nu + B u + K (y - D u),   xi = nu + S (y - D u - C nu),   S = T^-1 L,   K = J + (A - J C) S
-
-So a PD observer is a Luenberger observer with gain K whose estimate is corrected by S times its own residual, and any
-K and any S with ``I - S C`` nonsingular come from gains: ``L = (I - S C)^-1 S`` and ``J = K - (A - K C) L``.
-
-The error, with ``eps = [x; f] - nu`` and the estimates ``S nu + T (y - D u)``, ``S + T C = I``:
+Any K and S with ``I - S C`` nonsingular come from gains: ``L = (I - S C)^-1 S``, ``J = K - (A - K C) L``.  With
+``eps = [x; f] - nu`` and the estimates ``S nu + T (y - D u)``, ``S + T C = I``, no derivative of the noise is left:
 
     eps' = Az eps + [0; I] f' + (Bd - By Dd) d + (Bw - By Dw) w,   error = S eps - T (Dd d + Dw w)
-
-No derivative of the noise is left in it: this is the whole transfer, high frequencies included.
 """
 
 from __future__ import annotations
@@ -61,10 +52,7 @@ def realise_pd_observer(
 
 
 def with_faults_as_states(plant: DescriptorSystem, gain: FloatArray | None = None) -> DescriptorSystem:
-    """Return the plant with state ``[x; phi]``, f = G phi, ``phi' = v``: what drives it is the rate v of the fault.
-
-    Shapes: ``gain (nf, nf)``.
-    """
+    """Return the plant with state ``[x; phi]``, f = G phi, ``gain (nf, nf)``, driven by the rate ``phi' = v``."""
     nx, nf = plant.nx, plant.nf
     g = np.eye(nf) if gain is None else gain
     a = np.zeros((nx + nf, nx + nf))
@@ -87,19 +75,14 @@ def with_sensor_noise(plant: DescriptorSystem) -> DescriptorSystem:
 
 @dataclass(frozen=True, eq=False)
 class PdErrorSystem:
-    """The error system of a shipped PD observer; see the module's text.
+    """The error system of a shipped PD observer; f', d and w by input matrix and feedthrough to the error."""
 
-    Fields: Az: ``(n, n)``, n = nx + nf; estimate: ``(nx + nf, n)``: error = ``estimate eps``; rate, disturbance, noise:
-    Input matrix ``(n, *)`` and feedthrough to the error ``(nx + nf, *)`` of f', d and w; J, L: ``(n, ny)``, recovered
-    from the realisation; nx: Number of states of the plant.
-    """
-
-    Az: FloatArray
-    estimate: FloatArray
-    rate: tuple[FloatArray, FloatArray]
+    Az: FloatArray  # (n, n), n = nx + nf
+    estimate: FloatArray  # (nx + nf, n): error = ``estimate eps``
+    rate: tuple[FloatArray, FloatArray]  # (n, *), (nx + nf, *)
     disturbance: tuple[FloatArray, FloatArray]
     noise: tuple[FloatArray, FloatArray]
-    J: FloatArray
+    J: FloatArray  # (n, ny), recovered from the realisation, as L
     L: FloatArray
     nx: int
 
@@ -128,16 +111,13 @@ class PdErrorSystem:
         return continuous_hinf_norm(self.Az, driven[0], self.estimate[: self.nx], driven[1][: self.nx])
 
     def separate_noise_norm(self, process: FloatArray, sensor: FloatArray) -> ContinuousHinfNorm:
-        """Return the H-infinity norm to the fault error from ``[w; w']`` taken as two inputs that are free.
-
-        ``process (nx, nw)`` and ``sensor (ny, nw)`` say where w enters.
-        """
+        """Return the H-infinity norm from ``[w; w']``, both free, with ``process (nx, nw)`` and ``sensor (ny, nw)``."""
         n = len(self.Az)
         padded = np.vstack([process, np.zeros((n - self.nx, process.shape[1]))])
         # (I + L C) e' = Ae e + Bw w - J Dw w - L Dw w', and eps = (I + L C) e.
         b = np.hstack([padded - self.J @ sensor, -self.L @ sensor])
-        # The estimate is S of eps + L noise: in terms of the error itself no feedthrough is left.
-        inner = _similar(self.Az, self.estimate)
+        # The estimate is S of eps + L noise: in terms of the error itself (S Az S^-1) no feedthrough is left.
+        inner = solved(self.estimate.T, (self.estimate @ self.Az).T).T
         shown = np.eye(n)[self.nx :]
         return continuous_hinf_norm(inner, self.estimate @ b, shown, np.zeros((len(shown), b.shape[1])))
 
@@ -148,8 +128,3 @@ def solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
         return np.asarray(np.linalg.solve(matrix, right))
     except np.linalg.LinAlgError:
         return np.full_like(right, np.nan)
-
-
-def _similar(a: FloatArray, s: FloatArray) -> FloatArray:
-    """Return ``s a s^-1``; NaN when s is singular."""
-    return solved(s.T, (s @ a).T).T

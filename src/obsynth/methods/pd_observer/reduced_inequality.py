@@ -1,23 +1,16 @@
 r"""PD observers of plants with many states: a smaller inequality with the way back in closed form, or none at all.
 
-By the elimination lemma, Y and Z can be removed from the inequality of the theorems.  In coordinates in which
-``C = [0 R]``, R of full column rank, what is left is ``P1 > 0`` and the same inequality with Z = 0 for the smaller
-plant ``(A11, A21)``, with the leading blocks of P1 and P3 and a gain G: the reduced-order observer of the states that
-the outputs do not show.  Blocks here are those of ``A + alpha I``.
-
-The way back: in the states ``[x1 - G x2; x2]`` the gains
+By the elimination lemma, where ``C = [0 R]``, R of full column rank, what is left is ``P1 > 0`` and the same inequality
+with Z = 0 for ``(A11, A21)`` (blocks of ``A + alpha I``): a reduced-order observer with gain G.  The way back,
 
 .. math::
     L = 0, \qquad J = \begin{bmatrix} A_{12} + (A_{11} + \kappa I) G \\ A_{22} + A_{21} G + \kappa I \end{bmatrix} R^+
 
-leave the error dynamics ``[F, 0; A21, -kappa I]``, ``F = A11 - G A21``.  With block diagonal P1 and P3, whose second
-blocks are ``p (1 + delta kappa) I`` and ``p I``, the inequality is that of F beside ``-2 p diag(kappa, delta)``, and
-the two are coupled by ``p [A21; delta A21]``.  Its Schur complement is negative when ``p h (1 / kappa + delta) < 2``,
-where h is the norm of ``A21 K A21'`` and K the leading block of the inverse of minus the inequality of F.  So p is
-known, the gains do not depend on it, and every delta > 0 serves for which the smaller inequality was solved.  (The
-general formula of the elimination lemma gives gains 40 to 100 times larger than those of the whole inequality.)
-
-Without any inequality a Riccati equation gives gains with L = 0, and a Lyapunov equation their certificate.
+leaves ``[F, 0; A21, -kappa I]``, ``F = A11 - G A21``, in the states ``[x1 - G x2; x2]``.  With second blocks
+``p (1 + delta kappa) I``, ``p I`` of block diagonal P1, P3, the inequality is that of F beside
+``-2 p diag(kappa, delta)``, coupled by ``p [A21; delta A21]``: negative when ``p h (1 / kappa + delta) < 2``, h the
+norm of ``A21 K A21'``, K the leading block of the inverse of minus the inequality of F.  Gains do not depend on p.
+(The general formula of the lemma gives gains 40 to 100 times larger than those of the whole inequality.)
 """
 
 from __future__ import annotations
@@ -49,17 +42,12 @@ MOST_STATES_FOR_QZ = 200
 
 @dataclass(frozen=True, eq=False)
 class ReducedPlant:
-    """A plant in coordinates in which its outputs show the last states alone.
+    """A plant in coordinates in which its outputs show the last states alone."""
 
-    Fields: A: ``(n, n)``, of the shifted plant in these coordinates; hidden: Number of leading states that the outputs
-    do not show; basis: ``(n, n)``, orthogonal: old states = basis times new ones; inverse: ``(n - hidden, ny)``, the
-    pseudoinverse of R.
-    """
-
-    A: FloatArray
-    hidden: int
-    basis: FloatArray
-    inverse: FloatArray
+    A: FloatArray  # (n, n), of the shifted plant
+    hidden: int  # leading states that the outputs do not show
+    basis: FloatArray  # (n, n), orthogonal: old states = basis times new
+    inverse: FloatArray  # (n - hidden, ny), pseudoinverse of R
 
     @classmethod
     def of(cls, a: FloatArray, c: FloatArray) -> ReducedPlant:
@@ -78,7 +66,8 @@ class ReducedPlant:
 
 def reduced_lmi(task: PdTask, *, solver: str) -> PdSolution:
     """Return gains by the smaller inequality, for a task of stability and a decay rate."""
-    plant = _shifted(task)
+    a, c = task.plants[0]
+    plant = ReducedPlant.of(a + task.decay * np.eye(len(a)), c)
     a11, _, a21, _ = plant.blocks()
     if plant.hidden == 0:
         none = np.zeros((0, 0))
@@ -89,11 +78,7 @@ def reduced_lmi(task: PdTask, *, solver: str) -> PdSolution:
 
 
 def closed_form(task: PdTask, *, free_delta: bool, once: bool = False) -> tuple[PdSolution, float]:
-    """Return gains from a Riccati equation, with their certificate, and the delta that it is for.
-
-    The gain J is that of a Kalman filter for unit noise on all states and outputs, and L = 0.  Where modes show so
-    little that this is lost in rounding, the states are those in which the solution of the equation is near one.
-    """
+    """Return gains for unit noise from a Riccati equation, L = 0, their certificate, and the delta that it is for."""
     try:
         return _closed_form(task, free_delta=free_delta)
     except SolverError as error:
@@ -154,16 +139,10 @@ def _closed_form(task: PdTask, *, free_delta: bool) -> tuple[PdSolution, float]:
 _WHAT = "a PD observer with L = 0"
 
 
-def _shifted(task: PdTask) -> ReducedPlant:
-    a, c = task.plants[0]
-    return ReducedPlant.of(a + task.decay * np.eye(len(a)), c)
-
-
 def _riccati_gain(a: FloatArray, c: FloatArray, record: Mapping[str, Any]) -> FloatArray:
-    """Return the gain of a Kalman filter for unit noise on all states and outputs.
+    """Return the gain of a Kalman filter for unit noise: of many states by doubling, else from the Hamiltonian matrix.
 
-    Of many states by doubling; else from the stable invariant subspace of the Hamiltonian matrix; where that is not
-    found, or too inaccurate for a stable filter, by the QZ algorithm on a pencil, which takes several times as long.
+    Where that is not found, or not stable, by the QZ algorithm on a pencil, which takes several times as long.
     """
     from scipy.linalg import schur
 

@@ -1,22 +1,7 @@
-r"""PD observer for states and actuator faults of continuous-time plants.
+"""PD observer: A. Filasova, D. Krokavec, V. Serbak, (4)-(6), Theorem 1 (40)-(44), Theorem 2 (61)-(65).
 
-Source: A. Filasova, D. Krokavec, V. Serbak, *Application of descriptor approaches in design of PD observer-based
-actuator fault estimation*: observer (4)-(6), Theorem 1 (40)-(44), Theorem 2 (61)-(65).
-
-Our deviations
-    1. Both P and Q are variables in Theorem 2; its statement declares Q alone.
-    2. What is minimised, ``||[Y Z]||_F + ||P3||_F`` with ``P3 + P3' >= 2 I``: the inequalities alone allow P3 close to
-       singular, and solvers go there (gains of 1e9, called optimal).
-    3. Existence is decided before any solver: (A, C) detectable and (3); observability is more than needed.
-    4. The matrix G of (25) acts inside the loop, as G M and G N, and is in no theorem: it is designed for, with F G in
-       place of F, or for a whole range.
-    5. Decay rate, disk, bounds on the gains and on two l2 gains, all as inequalities with the same P3, Y, Z.
-    6. Feedthrough of inputs, faults, disturbances and noise; singular E of index 1, by elimination.
-    7. What is shipped never differentiates the outputs (see `obsynth.methods.pd_observer.realisation`).
-    8. The inequality is proved for the shipped realisation; where the solver's certificate does not do, one is
-       computed from the gains.
-    9. For hundreds of states the gains come from a smaller inequality or in closed form (see
-       `obsynth.methods.pd_observer.reduced_inequality`), with L = 0.
+Unlike the paper: P and Q are both variables in Theorem 2; the G of (25), which is in no theorem, acts inside the loop;
+what is minimised, ``||[Y Z]||_F + ||P3||_F`` with ``P3 + P3' >= 2 I``, keeps solvers from P3 close to singular.
 """
 
 from __future__ import annotations

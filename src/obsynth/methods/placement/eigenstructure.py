@@ -1,18 +1,9 @@
-r"""Pole placement by a Sylvester equation, with repeated poles of any multiplicity.
+"""Pole placement by a Sylvester equation, with repeated poles of any multiplicity.
 
-Source: Share Pasand, Aliyari, Taghirad ask for "a simple pole placement algorithm"; those of scipy and python-control
-refuse poles repeated more often than there are outputs, and may miss others without a word ({-4, -4, -5, -5, -6} on the
-paper's example, error 4.3), because they look for as many eigenvectors as the multiplicity.  Here each repeated pole
-has one Jordan chain, which every observable pair allows: with L in real Jordan form and any G,
-
-    F' X - X L = C' G,   K = (G X^{-1})'   gives   spectrum(F - K C) = spectrum(L).
-
-G is chosen by L-BFGS for well-conditioned X or for a small K; the gradient is one adjoint Sylvester equation.
-
-References
-----------
-.. [BhattacharyyaDeSouza1982] S. P. Bhattacharyya, E. de Souza, "Pole assignment via Sylvester's equation", Systems &
-   Control Letters 1, 1982.
+One Jordan chain for each repeated pole, which every observable pair allows: with L in real Jordan form and any G,
+``F' X - X L = C' G``, ``K = (G X^{-1})'`` gives ``spectrum(F - K C) = spectrum(L)`` (S. P. Bhattacharyya, E. de Souza,
+Systems & Control Letters 1, 1982); G by L-BFGS, its gradient by one adjoint equation.  scipy and python-control look
+for as many eigenvectors as the multiplicity: they refuse, or miss poles without a word (error 4.3 for the paper's).
 """
 
 from __future__ import annotations
@@ -45,15 +36,11 @@ PLACEMENT_TOLERANCE = 1e-5
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """Gains that place poles.
+    """Gains that place poles."""
 
-    Fields: K: ``(n, ny)``; condition: Condition number of the (generalised) eigenvectors; error: Largest relative miss
-    of a wanted pole, of the mean for a multiple one.
-    """
-
-    K: FloatArray
-    condition: float
-    error: float
+    K: FloatArray  # (n, ny)
+    condition: float  # of the (generalised) eigenvectors
+    error: float  # largest relative miss; of the mean for a multiple pole
 
 
 def jordan_form(poles: Sequence[complex]) -> FloatArray:

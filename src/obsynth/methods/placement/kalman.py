@@ -25,23 +25,16 @@ MOST_STEPS = 12
 
 @dataclass(frozen=True, eq=False)
 class KalmanProblem:
-    """A pair with noise: ``e+ = F e + B w + drive v``, innovation ``C e + D w + background n``.
+    """An observable pair with noise: ``e+ = F e + B w + drive v``, innovation ``C e + D w + background n``."""
 
-    Fields: F, C: ``(n, n)`` and ``(ny, n)``, observable; B, D: ``(n, k)`` and ``(ny, k)``: how the noise that counts,
-    of unit covariance (intensity for ``dt == 0``), enters; drive: ``(n, p)``: what the states are driven by besides, so
-    that the filter stays awake; background: ``(ny, q)``: keeps the equation regular where an innovation has no noise;
-    estimates: ``(k, n)``: what the noise is counted in, the fault estimates; dt: Seconds between samples, 0 for
-    continuous time.
-    """
-
-    F: FloatArray
-    C: FloatArray
-    B: FloatArray
-    D: FloatArray
-    drive: FloatArray
-    background: FloatArray
-    estimates: FloatArray
-    dt: float
+    F: FloatArray  # (n, n)
+    C: FloatArray  # (ny, n)
+    B: FloatArray  # (n, k), for noise that counts, of unit covariance (dt = 0: intensity)
+    D: FloatArray  # (ny, k)
+    drive: FloatArray  # (n, p): so that the filter stays awake
+    background: FloatArray  # (ny, q): regular where an innovation has no noise
+    estimates: FloatArray  # (k, n): what the noise is counted in, the fault estimates
+    dt: float  # s, 0 for continuous time
 
     def gain(self, decay: float, *, persistent: bool = False) -> FloatArray | None:
         """Return the gain whose poles all decay at ``decay`` (1/s) or faster; ``None`` when the equation has none."""
@@ -60,10 +53,7 @@ class KalmanProblem:
         return best
 
     def solved(self, decay: float, change: FloatArray) -> tuple[FloatArray | None, FloatArray]:
-        """Return the gain of a rate, and coordinates in which its error covariance is the identity.
-
-        Shapes: ``change (n, n)``.
-        """
+        """Return the gain of a rate, and coordinates (like ``change``) in which its error covariance is one."""
         if not self.F.size:
             return np.zeros((0, self.C.shape[0])), change
         # The part of the process noise that the measurements carry is taken out first.
@@ -86,10 +76,7 @@ class KalmanProblem:
         return best, change
 
     def deviations(self, gain: FloatArray, change: FloatArray) -> FloatArray:
-        """Return the standard deviation of each estimate under the noise that counts (for unit intensity, dt = 0).
-
-        Shapes: ``gain (n, ny)``, ``change (n, n)``.
-        """
+        """Return the deviation of each estimate (unit intensity where dt = 0); ``gain (n, ny)``, ``change (n, n)``."""
         entering = np.asarray(np.linalg.solve(change, self.B - gain @ self.D), dtype=np.float64)
         moved = np.asarray(np.linalg.solve(change, (self.F - gain @ self.C) @ change), dtype=np.float64)
         direct = np.zeros((self.estimates.shape[0], entering.shape[1]))
@@ -109,10 +96,7 @@ def _filtered(
     asked: tuple[float, float],
     change: FloatArray,
 ) -> tuple[FloatArray, FloatArray] | None:
-    """Return the gain of a Kalman filter, and states in which its error covariance is the identity.
-
-    Shapes: ``change (n, n)``.
-    """
+    """Return the gain of a Kalman filter, and states in which its error covariance is the identity."""
     bound, dt = asked
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         # What a badly conditioned equation gives is judged by its poles.
@@ -178,23 +162,15 @@ MOST_HALVINGS = 40
 
 @dataclass(frozen=True, eq=False)
 class Compromise:
-    """What the default found.
+    """What the default found."""
 
-    Fields: K: ``(n, ny)``; decay: 1/s; price: Largest ratio of the standard deviation of an estimate to that with the
-    Kalman gain without a rate.
-    """
-
-    K: FloatArray
-    decay: float
-    price: float
+    K: FloatArray  # (n, ny)
+    decay: float  # 1/s
+    price: float  # largest deviation of an estimate over that of the Kalman gain without a rate
 
 
 def compromise(problem: KalmanProblem, rate: float) -> Compromise | None:
-    """Return the fastest gain, up to ``rate`` (1/s), that costs at most `NOISE_PRICE` in noise.
-
-    The plain Kalman filter leaves modes slow that cost much to see (-0.0085 on the Kundur network); a fixed rate may
-    cost any amount of noise.
-    """
+    """Return the fastest gain, up to ``rate`` (1/s), that costs at most `NOISE_PRICE` in noise."""
     start = np.eye(problem.F.shape[0])
     plain, change = problem.solved(0.0, start)
     if plain is None:

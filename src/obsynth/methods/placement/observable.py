@@ -1,9 +1,7 @@
-"""Splitting a pair into its observable part and the modes that no gain moves.
+"""Splitting a pair into its observable part and the modes that no gain moves: Share Pasand et al., procedure 1, step 7.
 
-Source: Share Pasand, Aliyari, Taghirad, step 7 of procedure 1.  Difference: Lemma 6 promises that the pair is always
-observable, which is false; a library that places the poles of a pair that is not returns garbage without a word.  A
-staircase of rank decisions loses its way on large stiff pairs (three of four fixed modes of the Kundur network); the
-fixed modes are known from the zeros of the plant's pencil, so they are peeled off one eigenspace at a time instead.
+Lemma 6 (always observable) is false.  A staircase of rank decisions loses its way on large stiff pairs; the fixed modes
+are known from the zeros of the plant's pencil, so they are peeled off one eigenspace at a time.
 """
 
 from __future__ import annotations
@@ -25,19 +23,13 @@ SAME_MODE = 1e-5
 
 @dataclass(frozen=True, eq=False)
 class ObservableSplit:
-    """A pair in coordinates that show its observable part.
+    """``x = units * basis @ [observable; hidden]``: ``F = [F_o 0; F_ho F_h]`` and ``C = [C_o 0]``."""
 
-    With ``x = units * basis @ [observable; hidden]``: ``F = [F_o 0; F_ho F_h]`` and ``C = [C_o 0]``.
-
-    Fields: basis: ``(n, n)``, orthogonal; units: ``(n,)``: the states are balanced first; F, C: The observable part,
-    ``(no, no)`` and ``(ny, no)``; fixed_modes: Eigenvalues of the hidden part.
-    """
-
-    basis: FloatArray
-    units: FloatArray
-    F: FloatArray
-    C: FloatArray
-    fixed_modes: ComplexArray
+    basis: FloatArray  # (n, n), orthogonal
+    units: FloatArray  # (n,): the states are balanced first
+    F: FloatArray  # F_o (no, no)
+    C: FloatArray  # C_o (ny, no)
+    fixed_modes: ComplexArray  # of the hidden part
 
     @property
     def order(self) -> int:
@@ -115,11 +107,7 @@ def _hidden_directions(f: FloatArray, c: FloatArray, value: complex, size: float
 
 
 def _balancing(f: FloatArray, c: FloatArray) -> FloatArray:
-    """Return factors of the states with which the entries of F, and those of C, are alike.
-
-    Least squares on the logarithms, with the common size of F free: unlike the usual balancing it does not run away
-    where F is reducible, as that of a fault model is.
-    """
+    """Return state factors that make entries of F, and of C, alike; F's size is free, as it may be reducible."""
     n = f.shape[0]
     problem = LogBalance(n + 2)
     states = range(n)

@@ -1,10 +1,4 @@
-"""Gains that put all poles into a region, by a matrix inequality, with the least noise in the estimates.
-
-References
-----------
-.. [ChilaliGahinet1996] M. Chilali, P. Gahinet, "H-infinity design with pole placement constraints: an LMI approach",
-   IEEE TAC 41, 1996.
-"""
+"""Gains that put all poles into a region (M. Chilali, P. Gahinet, IEEE TAC 41, 1996), with little noise."""
 
 from __future__ import annotations
 
@@ -34,16 +28,11 @@ LARGE = 20
 
 @dataclass(frozen=True)
 class Region:
-    """Where all movable poles must lie.
+    """Where all movable poles must lie; ``radius`` and ``damping`` in continuous time only."""
 
-    Fields: decay: Every mode decays at least as ``exp(-decay t)``; radius: No mode is faster than this: ``abs(s) <=
-    radius``; continuous time only; damping: Least damping ratio, between 0 and 1: a cone around the negative real axis;
-    continuous time only.
-    """
-
-    decay: float = 0.0
-    radius: float | None = None
-    damping: float | None = None
+    decay: float = 0.0  # every mode decays at least as exp(-decay t)
+    radius: float | None = None  # abs(s) <= radius
+    damping: float | None = None  # least ratio, 0 to 1
 
     @classmethod
     def of(cls, data: Mapping[str, Any], dt: float) -> Region:
@@ -95,7 +84,7 @@ class Region:
 
 
 def region_gain(problem: KalmanProblem, region: Region, *, solver: str) -> tuple[FloatArray, dict[str, Any]]:
-    """Return K ``(n, ny)`` with all poles of ``F - K C`` in the region and little noise, and the solver's record.
+    """Return K ``(n, ny)`` with the poles of ``F - K C`` in the region and little noise, and the solver's record.
 
     Above `LARGE` states a Kalman gain of the region's rate comes first, and the record is empty where it is enough.
     """
@@ -123,8 +112,7 @@ def region_gain(problem: KalmanProblem, region: Region, *, solver: str) -> tuple
 def _partly(problem: KalmanProblem, region: Region, *, solver: str) -> tuple[FloatArray, dict[str, Any]]:
     """Move only those poles into the region that a Kalman gain of the same rate leaves outside.
 
-    With ``F - K C = V diag(T1, T2) V^-1``, the poles of T1 inside, a further gain ``V [0; K2]`` keeps these and moves
-    the others to those of ``T2 - K2 C V2``: the inequality has the size of T2.
+    With ``F - K C = V diag(T1, T2) V^-1``, T1 inside, a gain ``V [0; K2]`` makes ``T2 - K2 C V2`` of T2.
     """
     from scipy.linalg import schur, solve_sylvester
 

@@ -131,25 +131,17 @@ _TRACES_SOURCE = "our finding: (26) needs it, Moussa Ali, Zhang 2013"
 
 
 class _Kernel(NamedTuple):
-    """Constant parameters, in their own units, that leave no trace, and the states that hide them.
+    """Constant parameters, in their own units, that leave no trace, and the states that hide them."""
 
-    ``parameters (nq,)`` and ``shares (nq,)`` (free of units), ``states``: names.
-    """
-
-    parameters: FloatArray
-    shares: FloatArray
-    states: tuple[str, ...]
+    parameters: FloatArray  # (nq,)
+    shares: FloatArray  # (nq,), free of units
+    states: tuple[str, ...]  # names
 
 
 def identifiability_condition(
     plant: TimeVaryingDescriptorSystem, *, early: bool = False, constant: ConstantPlant | None = None
 ) -> Condition:
-    """Return the condition that outputs tell the parameters from each other and from the state.
-
-    Where these matrices are constant, parameters and state may stay constant together without a trace exactly where
-    ``[A - E, Phi; C, Psi]`` loses rank.  Of others, the outputs that each parameter alone leads to are compared along
-    the horizon.
-    """
+    """Return the condition that outputs tell the parameters from each other and from the state."""
     still = all(matrix.is_constant for matrix in (plant.E, plant.A, plant.C, plant.Phi, plant.Psi))
     decision, kernel = _steady(plant) if still else _along(plant, early=early)
     if still and constant is not None:

@@ -1,16 +1,11 @@
-r"""Faults as states and unknown inputs removed: the plant behind an unknown-input PI observer, and its realisation.
+"""The plant behind an unknown-input PI observer: faults as states, unknown inputs removed; and its realisation.
 
-Source: Share Pasand, Aliyari, Taghirad, eqs. (4), (10)-(13), (19), (20).  Differences: sensor faults (Df); disturbances
-in the outputs (Dd); ``decouple`` instead of the Moore-Penrose ``E#``, with which ``U`` loses rank and the unobservable
-modes change.
-
-With the augmented plant ``Ea xa+ = Aa xa + Ba u + Bda d``, ``y = Ca xa + D u + Dd d``, ``xa = [x; w]``, the observer
-``z+ = Ahat z + Jhat u + Bhat y``, ``xahat = z + D_a y`` is unbiased and sees no disturbance if
+Share Pasand, Aliyari, Taghirad, (4), (10)-(13), (19), (20), with Df and Dd, and without the Moore-Penrose ``E#``, with
+which U loses rank.  With ``xa = [x; w]``, ``z+ = Ahat z + Jhat u + Bhat y``, ``xahat = z + D_a y`` is unbiased if
 
     U_a Ea + D_a Ca = I,   D_a Dd = 0,   U_a Bda = K_a Dd,   Ahat = U_a Aa - K_a Ca,   Bhat = Ahat D_a + K_a.
 
-Where ``Dd != 0``, the outputs that show d directly are solved for it: ``d1 = Dd^+ (y - C x - Df f)`` is put into the
-equations of the states, and what is left is a plant without ``Dd`` (`Decoupled.injection` keeps that step).
+Outputs that show d directly are solved for it: ``d1 = Dd^+ (y - C x - Df f)`` is put into the equations of the states.
 """
 
 from __future__ import annotations
@@ -31,20 +26,16 @@ from obsynth.plants.fault_models import Exosystem, stated_eigenvalues
 
 @dataclass(frozen=True, eq=False)
 class AugmentedPlant:
-    """A plant whose state holds the exosystem of its faults: ``xa = [x; w]``.
+    """A plant whose state holds the exosystem of its faults: ``xa = [x; w]``, ``na = nx + nw``."""
 
-    Fields: E, A: ``(na, na)``, ``na = nx + nw``; B, Bd: ``(na, nu)`` and ``(na, nd)``; C, D, Dd: ``(ny, na)``, ``(ny,
-    nu)``, ``(ny, nd)``; names: Names of the states.
-    """
-
-    E: FloatArray
-    A: FloatArray
-    B: FloatArray
-    Bd: FloatArray
-    C: FloatArray
-    D: FloatArray
-    Dd: FloatArray
-    names: tuple[str, ...]
+    E: FloatArray  # (na, na)
+    A: FloatArray  # (na, na)
+    B: FloatArray  # (na, nu)
+    Bd: FloatArray  # (na, nd)
+    C: FloatArray  # (ny, na)
+    D: FloatArray  # (ny, nu)
+    Dd: FloatArray  # (ny, nd)
+    names: tuple[str, ...]  # of the states
 
     @classmethod
     def of(cls, plant: DescriptorSystem, model: Exosystem) -> AugmentedPlant:
@@ -74,21 +65,14 @@ def shipped_model(matrices: Mapping[str, FloatArray], faults: int) -> Exosystem:
 
 @dataclass(frozen=True, eq=False)
 class Decoupled:
-    """A solution of ``U E + Dhat C = I``, ``Dhat Dd = 0``, and all others.
+    """A solution of ``U E + Dhat C = I``, ``Dhat Dd = 0``; with any Z so are ``U + Z free_U``, ``Dhat + Z free_D``."""
 
-    Every solution is ``U + Z free_U``, ``Dhat + Z free_D`` with any Z ``(nx, n_free)``: the freedom that the paper has
-    in G.  ``injection`` is the part ``Bd Dd^+`` of the equations that is fed with y.
-
-    Fields: U, Dhat: ``(nx, nx)`` and ``(nx, ny)``; free_U, free_D: ``(n_free, nx)`` and ``(n_free, ny)``; seen: ``(ny2,
-    ny)``, orthonormal rows: the combinations of outputs that no disturbance reaches directly; injection: ``(nx, ny)``.
-    """
-
-    U: FloatArray
-    Dhat: FloatArray
-    free_U: FloatArray
-    free_D: FloatArray
-    seen: FloatArray
-    injection: FloatArray
+    U: FloatArray  # (nx, nx)
+    Dhat: FloatArray  # (nx, ny)
+    free_U: FloatArray  # (n_free, nx)
+    free_D: FloatArray  # (n_free, ny)
+    seen: FloatArray  # (ny2, ny), orthonormal rows: outputs that no disturbance reaches directly
+    injection: FloatArray  # (nx, ny): the part Bd Dd^+ of the equations that is fed with y
 
 
 def direct_part(plant: DescriptorSystem) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -132,9 +116,7 @@ def decouple(plant: DescriptorSystem) -> Decoupled:
 def _completing(ut: FloatArray, nu: FloatArray, wanted: FloatArray) -> FloatArray:
     """Return Z such that ``ut + Z nu`` has full column rank; ``[ut; nu]`` has, so what ut lacks, nu sees.
 
-    Kernel directions of ut (all those whose singular value is small) are sent to directions outside its range: as
-    nearly as can be to where ``wanted`` (like ut, the transposed equations) sends them, so that the choice does not
-    hang on rounding.
+    Kernel directions of ut go outside its range, near where ``wanted`` sends them: no choice hangs on rounding.
     """
     rows, columns = ut.shape
     if columns == 0 or nu.shape[0] == 0:
@@ -160,10 +142,7 @@ def _nearest_isometry(matrix: FloatArray) -> FloatArray:
 def paper_decoupling(
     plant: DescriptorSystem, *, e_sharp: FloatArray, c_sharp: FloatArray, g: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return L, U and Dhat of the paper, eqs. (10), (11), for given ``E#``, ``C#`` and ``G``.
-
-    Shapes: ``e_sharp (nx, nx)``, ``c_sharp (nx, ny)``, ``g (nx, ny)``.
-    """
+    """Return L, U and Dhat, (10), (11), for ``e_sharp (nx, nx)``, ``c_sharp (nx, ny)`` and ``g (nx, ny)``."""
     nx, ny = plant.nx, plant.ny
     shapes = {"E_sharp": (e_sharp, (nx, nx)), "C_sharp": (c_sharp, (nx, ny)), "G": (g, (nx, ny))}
     for name, (matrix, shape) in shapes.items():
@@ -200,14 +179,11 @@ def paper_decoupling(
 
 @dataclass(frozen=True, eq=False)
 class ObserverGains:
-    """Gains for the augmented plant.
+    """Gains for the augmented plant."""
 
-    Fields: U, D, K: ``(na, na)``, ``(na, ny)``, ``(na, ny)``.
-    """
-
-    U: FloatArray
-    D: FloatArray
-    K: FloatArray
+    U: FloatArray  # (na, na)
+    D: FloatArray  # (na, ny)
+    K: FloatArray  # (na, ny)
 
 
 def realise(

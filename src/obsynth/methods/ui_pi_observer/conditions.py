@@ -1,16 +1,11 @@
-r"""When an unknown-input PI observer exists, decided before any gain is looked for.
+"""When an unknown-input PI observer exists, on the plant's own data.
 
-Source: Share Pasand, Aliyari, Taghirad, Lemma 4, Theorems 1 and 2, Lemma 6, all four replaced: Theorems 1 and 2 and
-Lemma 6 are false as printed (the column of ``Bd`` is missing from the test of the fault model), and ``rank C E# Bd``
-depends on the choice of ``E#``.  On the plant's own data:
-
+In place of Share Pasand, Aliyari, Taghirad, Lemma 4, Theorems 1 and 2, Lemma 6 (the last three are false as printed):
 (D1) ``rank [E 0 Bd; C Dd 0; 0 0 Dd] = nx + rank Dd + rank [Bd; Dd]``,
 (D2) ``rank [sE - A, -Bd; C, Dd] = nx + rank [Bd; Dd]`` for every s on or outside the boundary of stability,
 (D3) at each unstable eigenvalue of Phi, tested exactly there, with V a basis of ``ker (lambda I - Phi)``:
 ``rank [lambda E - A, -Bf Cw V, -Bd; C, Df Cw V, Dd] = nx + dim V + rank [Bd; Dd]``.
-
-(D2) and (D3) are necessary for any observer of state and fault; (D1) for any that does not differentiate.  Neither
-regularity nor index 1 is needed.
+(D2), (D3) are necessary for any observer of state and fault; (D1) for any that does not differentiate.
 """
 
 from __future__ import annotations
@@ -71,18 +66,12 @@ __all__ = ["Existence", "decoupling_rank", "existence"]
 
 @dataclass(frozen=True, eq=False)
 class Existence:
-    """What was decided about a plant.
+    """What was decided about a plant."""
 
-    Fields: conditions: In order; after a failed (D2) there is no (D3), and fixed modes come last, when all others hold;
-    plant: For which they were decided: the plant as given, or without its algebraic states; transformation: The
-    elimination, where there was one; fixed_modes: Poles that every such observer has; all stable when the conditions
-    hold.
-    """
-
-    conditions: tuple[Condition, ...]
-    plant: DescriptorSystem
-    transformation: Transformation | None
-    fixed_modes: ComplexArray
+    conditions: tuple[Condition, ...]  # after a failed (D2) there is no (D3); fixed modes come last
+    plant: DescriptorSystem  # as given, or without its algebraic states
+    transformation: Transformation | None  # the elimination
+    fixed_modes: ComplexArray  # poles of every such observer
 
 
 @remembered

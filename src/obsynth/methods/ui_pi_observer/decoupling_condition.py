@@ -109,10 +109,7 @@ def decoupling_data(plant: DescriptorSystem) -> tuple[DescriptorSystem, Transfor
 
 
 def _eliminated(plant: DescriptorSystem) -> Transformation:
-    """Eliminate the algebraic states in units of the plant's own, and return the result in those given.
-
-    Where the dynamic states are orthogonal combinations, these must not depend on the units of what they combine.
-    """
+    """Eliminate algebraic states in the plant's own units (orthogonal combinations depend on them), then undo these."""
     units = PlantUnits.of(plant)
     basis = dynamic_coordinates(units.scaled_plant(plant))
     found = eliminated_exactly(plant, None if basis is None else units.states[:, None] * basis)

@@ -1,9 +1,4 @@
-"""Whether a fault model can be told from states and unknown inputs: (D3), and the order of the model.
-
-Source: in place of Share Pasand, Aliyari, Taghirad, Theorems 1 and 2, which are false as printed: (D3) has the column
-of ``Bd``, and is tested exactly at the eigenvalues of Phi. Decided on numbers as written
-where that is possible.
-"""
+"""Whether a fault model can be told from states and unknown inputs: (D3), and the order of the model."""
 
 from __future__ import annotations
 
@@ -151,11 +146,7 @@ def _model_doubt(
 def order_conditions(
     given: DescriptorSystem, courses: Exosystem, plant: DescriptorSystem, model: Exosystem, units: PlantUnits
 ) -> list[Condition]:
-    """Test that the fault model is not lost in rounding, at the zeros where faults can hide longest.
-
-    At a zero z0 of (f, d) -> y outside the region of stability, a polynomial model of order n is seen with a strength
-    of about abs(z0)^(n + 1) only: a high order is observable on paper and lost in double precision.
-    """
+    """Test that the fault model is not lost in rounding: at a zero z0 order n shows with about abs(z0)^(n + 1) only."""
     inputs, direct = np.hstack([plant.Bf, plant.Bd]), np.hstack([plant.Df, plant.Dd])
     wide_e, wide_a = system_pencil(plant.E, plant.A, inputs, plant.C, direct)
     zeros = finite_zeros(wide_e, wide_a)

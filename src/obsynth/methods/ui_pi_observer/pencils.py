@@ -128,10 +128,7 @@ def exact_drops(plant: DescriptorSystem, model: Exosystem) -> ExactDrops | None:
 
 
 def exact_loss(plant: DescriptorSystem, model: Exosystem, value: complex) -> int | None:
-    """Return by how much the pencil of (D3) falls short of its columns at an eigenvalue of Phi.
-
-    ``None`` where that is left to floating point: irrational eigenvalues of sampled plants, or too many states.
-    """
+    """Return by how much (D3) falls short of its columns at an eigenvalue of Phi; ``None``: left to floating point."""
     numbers = numbers_of(plant)
     factor = _factor_of(model, value)
     if numbers is None or factor is None:

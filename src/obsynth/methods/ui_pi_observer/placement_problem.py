@@ -1,8 +1,7 @@
 """The pair behind an unknown-input PI observer: what is decoupled, what can be placed, and the noise on it.
 
-Source: Share Pasand, Aliyari, Taghirad, Lemma 5 and procedure 1; the joint design over K and Z is ours: their free
-matrix G is itself an output injection, from the rows ``N_U A`` that the decoupling leaves over.  They mention "the
-optimal estimation scheme of Kalman" and no noise; the weights are ours.
+Share Pasand, Aliyari, Taghirad, Lemma 5, procedure 1; ours are the weights and the joint design over K and Z: their
+free matrix G is itself an output injection, from the rows ``N_U A`` that the decoupling leaves over.
 """
 
 from __future__ import annotations
@@ -43,26 +42,19 @@ MOST_PER_SAMPLE = 2.0
 
 @dataclass(frozen=True, eq=False)
 class PlacementProblem:
-    """A decoupled plant in units of its own, and the pair whose poles are to be placed.
-
-    Fields: plant: Scaled; model: Of its faults, scaled; units: Between the user's plant and the scaled one; decoupled:
-    Of the scaled plant; U, D: ``(na, na)`` and ``(na, ny)`` of the scaled augmented plant, without the free part; F, C:
-    The pair ``(na, na)`` and ``(rows, na)``; the first ``free`` rows of C are those of the free part Z; free: Number of
-    rows of the free part; 0 unless K and Z are designed together; split: Of the pair; rate: The plant's own speed, in
-    scaled time: the median of ``abs(s)`` over its modes.
-    """
+    """A decoupled plant in units of its own, and the pair whose poles are to be placed."""
 
     plant: DescriptorSystem
-    model: Exosystem
-    units: PlantUnits
+    model: Exosystem  # of its faults, scaled
+    units: PlantUnits  # between the user's plant and the scaled one
     decoupled: Decoupled
-    U: FloatArray
-    D: FloatArray
-    F: FloatArray
-    C: FloatArray
-    free: int
-    split: ObservableSplit
-    rate: float
+    U: FloatArray  # (na, na), of the scaled augmented plant, without the free part
+    D: FloatArray  # (na, ny)
+    F: FloatArray  # (na, na)
+    C: FloatArray  # (rows, na); its first ``free`` rows are those of the free part Z
+    free: int  # 0 unless K and Z are designed together
+    split: ObservableSplit  # of the pair
+    rate: float  # median of abs(s) over the plant's modes, in scaled time
 
     def gains(self, placed: FloatArray) -> ObserverGains:
         """Return the gains in the user's units for one of the observable part ``(no, rows)``."""
@@ -179,16 +171,11 @@ BACKGROUND_NOISE = 0.1
 
 @dataclass(frozen=True)
 class NoiseWeights:
-    """What the Kalman filter believes, beside what the plant states.
+    """What the Kalman filter believes, beside what the plant states."""
 
-    Fields: measurement: Standard deviation of each output's noise, one number or by name, in the output's unit (times
-    the square root of a second in continuous time); the plant's own noise, or one in scaled units, by default; process,
-    fault: How strongly states and fault models are driven, relative to the default.
-    """
-
-    measurement: Any = None
-    process: float = 1.0
-    fault: float = 1.0
+    measurement: Any = None  # deviation of each output's noise, a number or by name; continuous time: times sqrt(s)
+    process: float = 1.0  # relative to the default
+    fault: float = 1.0  # relative to the default
 
 
 def kalman_problem(problem: PlacementProblem, weights: NoiseWeights) -> KalmanProblem:

@@ -1,17 +1,7 @@
-r"""Unknown-input PI observer for descriptor systems, continuous or discrete time.
+"""Unknown-input PI observer: M. M. Share Pasand, M. Aliyari Sh., H. D. Taghirad, (4), (19), procedures 1 and 2.
 
-Source: M. M. Share Pasand, M. Aliyari Sh., H. D. Taghirad, *Unknown Input-Proportional Integral Observer for Singular
-Systems: Application to fault detection*: observer (4), identities (19), procedures 1 and 2.
-
-Our deviations
-    1. Existence by (D1)-(D3) on the plant's own data; Theorems 1 and 2 and Lemma 6 are false as printed.
-    2. Vector faults, each with its own exosystem, block-diagonal (6); faults and disturbances in the outputs.
-    3. U with full rank by construction; ``E#, C#, G`` (10), (11) only on request: with the Moore-Penrose ``E#`` U loses
-       rank and the unobservable modes change.
-    4. Poles of the observable part only; fixed modes are kept and named; repeated poles by Jordan chains.
-    5. Poles in a region, Kalman gains with a prescribed rate, and a default that needs no numbers.
-    6. K and the free part of the decoupling (the paper's G) can be designed together.
-    7. Where (D1) fails on the plant as written and it has index 1, its algebraic states are eliminated first.
+Unlike the paper: existence by (D1)-(D3); each fault has its own exosystem; ``E#, C#, G`` (10), (11) only on request; K
+and the free part of the decoupling (the paper's G) can be designed together; where (D1) fails at index 1, elimination.
 """
 
 from __future__ import annotations
@@ -160,10 +150,7 @@ def _chosen(
 def _in_region(
     kalman: KalmanProblem, region: Region, rate: float, asked: UiPiOptions
 ) -> tuple[FloatArray, dict[str, Any]]:
-    """Return a gain for the region; one without a decay gets that of the default, as far as that can be had.
-
-    Least noise alone would make an observer that hardly moves.
-    """
+    """Return a gain for the region; without a decay, with that of the default: least noise alone hardly moves."""
     if asked.region.get("decay") is None:
         fair = compromise(kalman, rate)
         most = np.inf if region.radius is None else RADIUS_SHARE * region.radius
@@ -240,10 +227,7 @@ def _assembled(
 
 
 def _shipped_poles(observer: LinearObserver, asked: ComplexArray | None) -> ComplexArray:
-    """Return the poles as asked for where the stored numbers have them, else those that they have.
-
-    A multiple pole is scattered by the rounding of its gains: what is claimed is what is shipped.
-    """
+    """Return the poles as asked for where the stored numbers have them, else those that they have: what is shipped."""
     found = eigenvalues(observer.Az)
     if asked is not None and farthest_pole(found, asked, observer.dt) <= SAME_AS_ASKED:
         return asked
@@ -263,8 +247,7 @@ def _shipped_poles(observer: LinearObserver, asked: ComplexArray | None) -> Comp
 def noise_amplification(observer: LinearObserver) -> float:
     """Return the largest H2 norm from unit white noise on every output to a fault estimate, the direct part left out.
 
-    Times the square root of the sample time it is a standard deviation, for dt = 0 and noise held between samples.  NaN
-    where rounding leaves no digit of it.
+    NaN where rounding leaves no digit of it.  For dt = 0 times the root of the time for which noise is held.
     """
     rows = observer.Cz[observer.fault_rows]
     direct = observer.Dy[observer.fault_rows] * (observer.dt > 0.0)

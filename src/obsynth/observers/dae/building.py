@@ -42,11 +42,6 @@ def largest_turn(model: DAEModel, dt: float) -> float:
     return float(turns.max(initial=0.0))
 
 
-def chosen_integration(model: DAEModel, dt: float) -> str:
-    """Return Radau where a mode turns too far in a step, and backward Euler elsewhere."""
-    return "radau" if largest_turn(model, dt) > LARGEST_TURN else "backward-euler"
-
-
 #: Deviation of an initial state that is not stated, as a share of its nominal size.
 DEFAULT_STATE_SHARE = 0.01
 #: Deviation of an initial parameter that is not stated, as a share of its nominal value.
@@ -69,7 +64,8 @@ def dae_observer_from_options(model: DAEModel, options: Mapping[str, Any]) -> DA
     if form == "auto":
         form = "forgetting" if options["random_walk"] is None else "random-walk"
     if integration == "auto":
-        integration = chosen_integration(model, step_length(options["dt"]))
+        turns_far = largest_turn(model, step_length(options["dt"])) > LARGEST_TURN
+        integration = "radau" if turns_far else "backward-euler"
     bounds = named_bounds(options["bounds"], parameters, "bounds")
     return DAEObserver(
         model=model, dt=options["dt"],

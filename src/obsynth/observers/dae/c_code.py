@@ -1,9 +1,7 @@
-"""An observer of a DAE as C99: CasADi writes its graph, and around it stands the loop of Newton and its homotopy.
+"""An observer of a DAE as C99 or a shared library: CasADi writes its graph, around it stands the loop of Newton.
 
-The loop is that of `obsynth.numerics.newton` and `obsynth.plants.dae.step`, with the same constants; what is done about
-outliers, jumps, bounds of states and sensors of their own times is that of `obsynth.observers.dae.steps`.
-
-The C of an observer as a shared library of this process, where a compiler is there.
+The loop is that of `obsynth.numerics.newton` and `obsynth.plants.dae.step`; outliers, jumps, bounds of states and
+sensors of their own times are those of `obsynth.observers.dae.steps`.
 """
 
 from __future__ import annotations

@@ -208,14 +208,13 @@ def memory_layout(observer: DAESettings) -> Layout:
 
 
 def row_layout(observer: DAESettings) -> Layout:
-    """Return what is said of one sample besides what is remembered. ``score`` and ``information``: to first order the
-    score less the information times the true parameters has mean zero and covariance ``information``, of parameters
-    that stay as they are. ``expected`` is the covariance of the innovation, that of the identity for what is not seen;
-    ``noise`` is the derivative by what is added to the equations, ``kept`` F (I - K H) with K and H of the sample
-    before, ``scaled`` the equilibrated matrix of (7), and ``trusted`` one where the step of the compiled graph was
-    solved."""
+    """Return what is said of one sample besides what is remembered."""
     nx, ny, nq = observer.model.nx, observer.model.ny, observer.model.nq
     n = nx * len(BUTCHER[observer.integration])
+    # score less information times the true parameters (which stay as they are): to first order mean zero and covariance
+    # ``information``; expected: covariance of the innovation, the identity for what is not seen; noise: derivative by
+    # what is added to the equations; kept: F (I - K H) with K and H of the sample before; scaled: the equilibrated
+    # matrix of (7); trusted: one where the step of the compiled graph was solved
     return Layout({
         "innovation": (ny, 1), "expected": (ny, ny), "nis": (1, 1), "information": (nq, nq), "score": (nq, 1),
         "covariance": (nx, nx), "F": (nx, nx), "G": (nx, nq), "noise": (nx, nx), "kept": (nx, nx), "scaled": (n, n),

@@ -1,13 +1,7 @@
-"""Whole records: step by step, or through the compiled kernel with single steps where it does not reach.
+"""Whole records: step by step, or through the compiled kernel (numba) with single steps where it does not reach.
 
-The kernel (`obsynth.numerics.compiled_steps`, numba) covers filters of every plant, with early constraints too, without
-parameters or with parameters as a random walk; not the forms that learn by least squares.  It propagates square roots
-at each step as the normal path does, with equal results up to rounding.  Steps with missing samples, with undetermined
-states, or where a rank has to be decided (perfect equations) are taken by the normal path.  It is used unasked when
-numba is installed, the record has `LONG_RECORD` samples and the observer no more than `SMALL_ORDER` states.  The first
-use of an installation compiles for some seconds; numba keeps the result.
-
-Many steps of a model as stacks of arrays, factorised together: what a compiled loop needs.
+The kernel takes filters with a random walk of parameters or none, and gives equal results up to rounding.  Unasked it
+is used from `LONG_RECORD` samples and up to `SMALL_ORDER` states.  Its first use compiles for some seconds.
 """
 
 from __future__ import annotations
@@ -79,9 +73,7 @@ def _products(matrices: FloatArray, rows: FloatArray) -> FloatArray:
 
 def stacked_steps(step: StepMatrices, before: FloatArray, y: FloatArray, u: FloatArray) -> StepStack | None:
     """Return steps with H factorised and everything rotated, up to the first H whose rank has to be decided.
-
-    Shapes: ``before (steps, nu)``, ``y (steps, measured)``, ``u (steps, nu)``.
-    """
+    Shapes: ``before (steps, nu)``, ``y (steps, measured)``, ``u (steps, nu)``."""
     ne, rows, n = step.A.shape[1], step.H.shape[1], step.H.shape[2]
     if rows < n:
         return None
@@ -138,10 +130,7 @@ def kernel_is_chosen(observer: RecursiveSettings, samples: int, compiled: bool |
 
 
 def run_compiled(recursion: Recursion, y: FloatArray, u: FloatArray) -> Estimates:
-    """Run over a whole record with the kernel: ``y (samples, ny)``, ``u (samples, nu)``.
-
-    Single steps are taken where samples are missing or a rank has to be decided.
-    """
+    """Run over a record ``y (samples, ny)``: by single steps where samples are missing or a rank has to be decided."""
     state, observer, samples = recursion.first, recursion.settings, len(y)
     nx, nq, rows = observer.plant.nx, len(observer.fault_names), observer.innovation_count + observer.order
     # Innovations are padded by NaN.

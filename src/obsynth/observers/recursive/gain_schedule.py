@@ -145,17 +145,7 @@ class SteadyObserver(NamedTuple):
 
 
 def steady_observer(observer: RecursiveObserver) -> SteadyObserver:
-    r"""Return the steady state of a recursive observer.
-
-    Once the covariances have settled, every gain of the recursion is constant.  With ``z(k) = A x(k-1) + B u(k-1)`` and
-    the gains ``[L K M]`` of the rows ``[z; y; Dn u]`` (the last ones with early constraints only),
-
-    .. math::
-        \bar x(k) = L z(k) + K y(k) + M D_n u(k), \qquad z(k+1) = A \bar x(k) + B u(k)
-
-    and parameters that are learnt by least squares follow ``theta(k) = F theta(k-1) + learn [z; y; Dn u]``, with
-    ``x = \bar x + \Upsilon \theta``.
-    """
+    """Return the steady state of a recursive observer: its gains once the covariances have settled."""
     require_plain(observer, "A steady filter")
     _require_constant(observer)
     settled, steps = _settled(observer)
@@ -225,7 +215,9 @@ def _realised(observer: RecursiveObserver, found: GainStep) -> tuple[LinearObser
     gain, parity = [found.gain[:, part] for part in parts], [found.parity[:, part] for part in parts]
     learn, q = [found.learn[:, part] for part in parts], len(found.forget)
     random_walk = found.gain.shape[0] - nx
-    # States: z, then the parameters of one sample before.
+    # With z(k) = A x(k-1) + B u(k-1) and the gains [L K M] of the rows [z; y; Dn u] (the last with early constraints):
+    # xbar = L z + K y + M Dn u, z(k+1) = A xbar + B u, and theta = forget theta(k-1) + learn [z; y; Dn u] by least
+    # squares, x = xbar + Upsilon theta.  States: z, then the parameters of one sample before.
     state = np.hstack([gain[0], np.zeros((len(gain[0]), q))])
     theta = np.hstack([learn[0], found.forget])
     az = np.vstack([step.A @ state, theta])

@@ -67,9 +67,7 @@ def posterior_residual(
     columns: int = 1,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return what (18f) learns from: ``y - C x`` weighted by R, its regressor (18d), and a root of its covariance.
-
-    That covariance is not R but one of rank ``rank E + ny - nx`` (Moussa Ali et al. 2013, (18b), (18d), (18f)).
-    """
+    That covariance is not R but one of rank ``rank E + ny - nx`` (Moussa Ali et al. 2013, (18b), (18d), (18f))."""
     gaps = right[ne:] - H[ne:] @ found.estimate
     triangle = np.asarray(np.linalg.qr(S[ne:].T, mode="r")).T
     if not np.all(np.abs(np.diag(triangle)) > 0.0):

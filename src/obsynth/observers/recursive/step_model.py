@@ -199,11 +199,8 @@ class EarlyConstraintSteps(StepModel):
 
 @dataclass
 class RandomWalkParameterSteps(StepModel):
-    """The steps of a model with its parameters among the states, as a random walk.
-
-    The state at k + 1 is ``[x(k+1); theta(k)]``: the parameters that acted in the step that led there.  Their increment
-    then is noise of an equation of its own, and no noise is correlated in time.
-    """
+    """The steps of a model with its parameters among the states, as a random walk: ``[x(k+1); theta(k)]`` at k + 1.
+    theta(k) acted in the step to k + 1: its increment is noise of its own equation, not correlated in time."""
 
     model: StepModel  # with parameters
     walk: FloatArray  # ``(nq, nq)``: square root of the covariance of one step of the walk
@@ -215,11 +212,8 @@ class RandomWalkParameterSteps(StepModel):
 
 @dataclass
 class WalkingEarlySteps(EarlyConstraintSteps):
-    """Both at once: early constraints, and parameters that walk.
-
-    An early equation of k + 1 holds for the parameters of k + 1, so the state at k + 1 is ``[x(k+1); theta(k+1)]``.
-    The outputs still hold theta(k), which is theta(k + 1) without its last increment: that noise they share.
-    """
+    """Both: an early equation of k + 1 holds for theta(k + 1), so the state at k + 1 is ``[x(k+1); theta(k+1)]``.
+    The outputs still hold theta(k), which is theta(k + 1) without its last increment: that noise they share."""
 
     walk: FloatArray  # ``(nq, nq)``: square root of the covariance of one step of the walk
 

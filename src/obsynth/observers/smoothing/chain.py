@@ -49,9 +49,7 @@ class Smoothed(NamedTuple):
 
 class LaterLessons:
     """Constant parameters from the samples after one, with weights that fall by the forgetting factor.
-
-    They are independent of what the sample itself has learnt, and of the errors of the states at given parameters.
-    """
+    They are independent of what the sample itself has learnt, and of the errors of the states at given parameters."""
 
     def __init__(self, forgetting: float, nq: int) -> None:
         self.forgetting = forgetting

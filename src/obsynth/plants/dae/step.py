@@ -34,16 +34,12 @@ BLOCKS = (4, 4, 8, MOST_ITERATIONS - 16)
 
 @dataclass(frozen=True, eq=False)
 class StepGraph:
-    """The functions of one implicit step of fixed length; ``small``: whether all is scalar operations.
+    """The functions of one implicit step of fixed length."""
 
-    ``newton``: stages, state before, input, parameters to residual, row scales, step; ``sensitivities``: these to
-    F of (8), G of (9), that of what is added, and the matrix of (7); ``step``: to stages, residual, and 1 if trusted.
-    """
-
-    newton: Any
-    sensitivities: Any
-    step: Any
-    small: bool
+    newton: Any  # (stages, state before, input, parameters) -> residual, row scales, step
+    sensitivities: Any  # the same -> F of (8), G of (9), that of what is added, the matrix of (7)
+    step: Any  # the same -> stages, residual, 1 if trusted
+    small: bool  # all is scalar operations
 
 
 def step_graph(functions: DAEFunctions, dt: float, largest_move: float) -> StepGraph:
@@ -163,11 +159,7 @@ class Sensitivities:
 
 
 class ImplicitStep:
-    """Steps of a fixed length dt in s.
-
-    A solution further away than ``largest_move`` (in sizes of the states) is taken only along a homotopy none of whose
-    parts is longer, so that of several roots the one connected with the last is found.
-    """
+    """Steps of dt s; moves beyond ``largest_move`` in parts along a homotopy, to the root connected with the last."""
 
     def __init__(self, functions: DAEFunctions, dt: float, *, largest_move: float | None = None) -> None:
         self.functions, self.dt = functions, dt

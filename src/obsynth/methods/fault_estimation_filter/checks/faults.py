@@ -1,15 +1,9 @@
-"""The whole transfer from the faults, and the filter that a set of gains stands for.
+"""The whole transfer from the faults, and the filter that a set of gains stands for: a second route to synthesis.
 
-A fault passes to its estimate as a pure delay, and not at all to the state error: the error's response to an impulse is
-followed for one step more than the largest delay; that it is zero from there on makes the transfer function complete.
-
-The filter of the gains is found by running its equations on unit vectors.  Source: Wang 2015, eq. (23), with ``T A``
-for the dynamics of the estimate ``x0 = z + N y``:
-
-    z+ = T A x0 + L (y - C x0) + T B u,   r = W (y - C x0),
-
-the input's feedthrough subtracted from y, and the state estimate corrected by the faults that r makes known: fault i
-has moved the state of age a by ``(TA)^(rho_i - 1 - a) T f_i``.  A second route to what synthesis writes down in blocks.
+The error's response to an impulse is followed for one step more than the largest delay; zero from there on makes the
+transfer complete. The equations (Wang 2015, eq. (23)) are run on unit vectors: ``x0 = z + N y``, ``z+ = T A x0 + L (y -
+C x0) + T B u``, ``r = W (y - C x0)``, ``D u`` subtracted from y, and the state of age a corrected by ``(TA)^(rho_i - 1
+- a) T f_i``.
 """
 
 from __future__ import annotations
@@ -107,10 +101,7 @@ def _trace_sizes(
     traces: list[FloatArray],
     scaling: Scaling | None,
 ) -> FloatArray:
-    """Return, per error state and fault, the size of the terms from which its traces were formed ``(nz, nf)``.
-
-    What is left after a cancellation is judged against these terms: Az itself is the difference of V A and By C.
-    """
+    """Return the size of the terms from which traces were formed ``(nz, nf)``: Az is the difference of V A and By C."""
     lagged = LaggedPlant.of(plant, tracking.shape[1] // plant.nx - 1)
     formed = np.abs(tracking) @ np.abs(lagged.A) + np.abs(observer.By) @ np.abs(lagged.C)
     sizes = np.abs(tracking) @ np.abs(lagged.input(plant.Bf)) + np.abs(observer.By) @ np.abs(plant.Df)
@@ -140,10 +131,9 @@ MATRICES = ("Az", "Bu", "By", "Cz", "Du", "Dy")
 
 @dataclass(frozen=True, eq=False)
 class Equations:
-    """The matrices from which the filter's equations are made.
+    """The matrices of the filter's equations; A, B, C, F are those of the plant with its sensor faults as states.
 
-    Fields: A, B, C, F: Of the plant with its sensor faults as states: ``(na, na)``, ``(na, nu)``, ``(ny, na)``, ``(na,
-    nf)``; D: ``(ny, nu)``; nx: States of the plant itself; delays: ``rho_i``, 1 or more.
+    ``nx``: states of the plant itself; ``delays``: ``rho_i``, 1 or more.
     """
 
     A: FloatArray

@@ -1,13 +1,7 @@
-"""The gain set beside the realisation: letters that are not those of what is shipped would mislead a reader.
+"""The gain set beside the realisation, and what the rounding of printed gains can do to each identity.
 
-Source: Wang 2015, eqs. (8) and (17) for T and N, (20) for Psi and Upsilon, (23) for the filter, (60) for L.
-
-What the rounding of printed gains can do to each identity.
-
-A gain printed to k decimals is off by up to half a unit of the k-th.  The identities are polynomials in the entries
-of T, N, L and W, and vanish at the gains before rounding; to first order an identity at the printed gains is
-therefore at most half a unit times the sum, over all entries of the gains, of the sizes of their cofactors.  Each
-cofactor times half a unit is found by moving its entry by as much, either way, and forming the filter again.
+Source: Wang 2015, eqs. (8), (17), (20), (23), (60). To first order an identity at gains printed to k decimals is off by
+half a unit times the sizes of its cofactors, each found by moving an entry of the gains by as much, either way.
 """
 
 from __future__ import annotations

@@ -1,18 +1,15 @@
-r"""The certificate of a PD observer: what it must hold, and proofs of its inequalities with all rounding bounded.
+r"""What the certificate of a PD observer must hold, and proofs of its inequalities with all rounding bounded.
 
-Theorem 1 of Filasova, Krokavec, Serbak is, with ``D = I + L C`` and ``Ae = A - J C`` of the augmented plant,
+Theorem 1 of Filasova, Krokavec, Serbak, (40)-(43) with Y = P3' J, Z = P3' L, ``D = I + L C``, ``Ae = A - J C``:
 
 .. math::
     \mathrm{He}\left(\begin{bmatrix} A_e^T \\ -D^T \end{bmatrix} P_3 \begin{bmatrix} I & \delta I \end{bmatrix}\right)
-    + \begin{bmatrix} 0 & P_1 \\ P_1 & 0 \end{bmatrix} < 0, \qquad P_1 > 0 ,
+    + \begin{bmatrix} 0 & P_1 \\ P_1 & 0 \end{bmatrix} < 0, \qquad P_1 > 0 .
 
-their (40)-(43) with Y = P3' J and Z = P3' L put back.  If ``(Ae - s D) x = 0``, then [x; s x] makes of it
-``2 Re(s) x' P1 x < 0``; and ``D x = 0`` contradicts the second diagonal block.  So D is nonsingular and every
-eigenvalue of ``D^-1 Ae`` lies to the left.  A decay rate is the same inequality for ``Ae + alpha D``.
-
-What is shipped is ``Az = Ae D^-1`` and ``S = D^-1``.  A congruence with diag(S, S) gives the inequality for
-``Az + alpha I`` and ``I`` with ``X = P3 S`` and ``P = S' P1 S``: no inverse is formed, and its lower right block proves
-that S is nonsingular, so that the congruence is one.
+If ``(Ae - s D) x = 0``, [x; s x] makes of it ``2 Re(s) x' P1 x < 0``; ``D x = 0`` contradicts the second diagonal
+block.  A decay rate is the same for ``Ae + alpha D``.  Shipped are ``Az = Ae D^-1`` and ``S = D^-1``: the congruence
+diag(S, S) gives it for ``Az + alpha I`` and ``I`` with ``X = P3 S`` and ``P = S' P1 S``, without an inverse, and its
+lower right block proves that S is nonsingular.
 """
 
 from __future__ import annotations
@@ -37,10 +34,7 @@ from obsynth.verification.certificates import proof_row
 def prove_shipped_stability(
     observer: LinearObserver, P1: FloatArray, P3: FloatArray, *, delta: float, decay: float
 ) -> DefinitenessProof:
-    """Try to prove that the shipped observer's errors decay faster than ``exp(-decay t)``.
-
-    Shapes: ``P1 (nz, nz)``, ``P3 (nz, nz)``.
-    """
+    """Try to prove errors decay faster than ``exp(-decay t)``, with ``P1, P3 (nz, nz)``."""
     size = observer.order
 
     def formula(kind: type[Enclosed]) -> Enclosed:
@@ -79,10 +73,7 @@ def prove_symmetric_positive(matrix: FloatArray) -> DefinitenessProof:
 def error_inputs(
     plant: DescriptorSystem, J: FloatArray, L: FloatArray, kind: Literal["rate", "noise"]
 ) -> Ball:  # fmt: skip
-    """Return where the rate of the faults, or ``[w; w']``, enters ``eps' = Az eps + B v``, with rounding bounds.
-
-    Shapes: ``J (nx + nf, ny)``, ``L (nx + nf, ny)``.
-    """
+    """Return B ``(nx + nf, *)`` of f', or of ``[w; w']``, in ``eps' = Az eps + B v``; ``J, L (nx + nf, ny)``."""
     if kind == "rate":
         return Ball.exact(np.vstack([np.zeros((plant.nx, plant.nf)), np.eye(plant.nf)]))
     process = Ball.exact(np.vstack([plant.Bw, np.zeros((plant.nf, plant.nw))]))
@@ -91,13 +82,7 @@ def error_inputs(
 
 
 def prove_gain(a: FloatArray, b: Ball, c: FloatArray, P: FloatArray, gain: float) -> DefinitenessProof:
-    """Try to prove that ``x' = a x + b v``, ``z = c x`` is stable with an l2 gain below ``gain``.
-
-    The bounded real inequality ``a' P + P a + c' c + P b b' P / gain^2 < 0`` before its Schur complements; that P is
-    positive definite is a proof of its own.
-
-    Shapes: ``a (n, n)``, ``c (p, n)``, ``b (n, m)``, ``P (n, n)``.
-    """
+    """Try to prove ``P > 0``, ``a' P + P a + c' c + P b b' P / gain^2 < 0``: stable, l2 gain below ``gain``."""
     positive = prove_symmetric_positive(P)
     if not positive.proved:
         return unproved(f"P itself: {positive.reason}")

@@ -54,10 +54,7 @@ def batch_residuals(stated: RecursiveObserver, shipped: RecursiveObserver) -> di
 def _terms(
     step: StepMatrices, before: tuple[FloatArray, FloatArray, FloatArray], data: tuple[FloatArray, ...]
 ) -> FloatArray:
-    """Return what state (with its deviation) and regressor of the last step are made of, ``(nx, 1 + nq)``.
-
-    A deviation or a regressor that tends to zero is a difference of such terms, and rounds as they do.
-    """
+    """Return the terms of deviation and regressor ``(nx, 1 + nq)``: what tends to zero rounds as they do."""
     (x, factor, upsilon), (y, u, after) = before, data
     driven = np.abs(step.A) @ np.abs(x) + np.abs(step.B) @ np.abs(u)
     values = np.concatenate([driven, np.abs(y), np.abs(step.Dn) @ np.abs(after)]) + data_deviations(step, factor)

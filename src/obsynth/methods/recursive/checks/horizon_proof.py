@@ -1,8 +1,7 @@
 """What is proved of a recursive observer, in outward rounding: of its gains as they are computed, on the stated plant.
 
-With gains ``[L_k K_k]`` and ``H_k = [E_k; C_k]`` an error obeys ``e_k = L_k A e_(k-1) + ([L_k K_k] H_k - I) x_k`` and
-noise.  Proved are: that the last term is rounding (the row "unbiased"), that the product of the ``L_k A`` makes errors
-smaller over the horizon ("contraction"), and that the covariance is definite.
+With gains ``[L_k K_k]``, ``H_k = [E_k; C_k]``: ``e_k = L_k A e_(k-1) + ([L_k K_k] H_k - I) x_k`` and noise.  Proved:
+the last term is rounding ("unbiased"), products of ``L_k A`` shrink ("contraction"), the covariance is definite.
 """
 
 from __future__ import annotations
@@ -34,19 +33,14 @@ _SOURCE = "Moussa Ali, Zhang 2013"
 
 @dataclass(frozen=True, eq=False)
 class HorizonProof:
-    """What is proved along the horizon.
-
-    Fields: steps: How many; bias: Largest entry of ``[L K] H - I``, in units of its terms; contraction: Upper bound on
-    the mean factor per step of the product of L A; span: Over which part of the horizon; with_parameters: The same for
-    errors of states and parameters together; NaN without parameters; last: The gains of the last step.
-    """
+    """What is proved along the horizon."""
 
     steps: int
-    bias: float
-    contraction: float
-    span: str
-    with_parameters: float
-    last: GainStep
+    bias: float  # largest entry of [L K] H - I, in units of its terms
+    contraction: float  # upper bound on the mean factor per step of the product of L A
+    span: str  # over which part of the horizon
+    with_parameters: float  # of states and parameters together; NaN without
+    last: GainStep  # the gains of the last step
 
 
 def horizon_proof(stated: RecursiveObserver, shipped: RecursiveObserver, steps: int) -> HorizonProof | None:
@@ -246,9 +240,9 @@ def covariance_row(stated: RecursiveObserver, shipped: RecursiveObserver, last: 
 
 
 def definite_by_its_noise(name: str, claim: str, gain: FloatArray, H: FloatArray, units: FloatArray) -> Check:
-    """Return the row that errors are never less than the last noise makes them: ``P >= [L K] diag(Q, R) [L K]'``.
+    """Return the row ``P >= [L K] diag(Q, R) [L K]'``: errors are never less than the last noise makes them.
 
-    Where Q and R are definite, that is definite if ``[L K]`` has full row rank, as it has with ``[L K] H`` near I.
+    Where Q, R are definite, that is definite if ``[L K]`` has full row rank, as it has with ``[L K] H`` near I.
     """
     units = units[: len(gain)]
     missed = Ball.exact(gain) @ Ball.exact(H) - Ball.exact(np.eye(len(gain)))

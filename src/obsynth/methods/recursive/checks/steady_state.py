@@ -82,11 +82,10 @@ def _steady_covariance(
     stated: RecursiveObserver, transition: Ball, gains: tuple[FloatArray, FloatArray], contraction: Contraction,
     variances: FloatArray,
 ) -> Check:  # fmt: skip
-    r"""Return the row on the covariance that errors reach with gains that are kept.
+    """Return the row on the covariance that errors reach with kept gains; ``variances (nx,)`` after the last step.
 
-    With an approximation X and ``D = F X F' + L Q L' + K R K' - X`` the true one is ``X + sum F^j D F'^j``, and the sum
-    is at most ``|Q D Q'| / (1 - rate^2)`` in the norm of the contraction.  ``variances (nx,)`` are those of the filter
-    after its last step: an enclosure that is wide beside them says nothing.
+    Of X, with ``D = F X F' + L Q L' + K R K' - X``, the true one is ``X + sum F^j D F'^j``; the sum is at most
+    ``|Q D Q'| / (1 - rate^2)`` in the norm of the contraction.
     """
     from scipy.linalg import solve_discrete_lyapunov
 

@@ -28,15 +28,11 @@ UNMOVED = 1e-4
 
 @dataclass(frozen=True)
 class DecouplingNorm:
-    """The largest gain found from the unknown inputs to the errors of the estimates.
+    """The largest gain found from the unknown inputs to the errors of the estimates."""
 
-    Fields: relative: Largest error of an estimate, relative to the terms it is computed from; fault_gain: Largest error
-    of a fault estimate for unit size of the trajectory ``(x, d)`` in scaled units; frequency: Where, rad/s.
-    """
-
-    relative: float
-    fault_gain: float
-    frequency: float
+    relative: float  # error of an estimate over the terms it is computed from
+    fault_gain: float  # error of a fault estimate for unit (x, d) in scaled units
+    frequency: float  # where, rad/s
 
 
 def frequency_grid(observer: LinearObserver) -> FloatArray:
@@ -80,10 +76,7 @@ def decoupling_norm(plant: DescriptorSystem, observer: LinearObserver) -> Decoup
 
 
 def trajectories_at(pencil: ComplexArray) -> tuple[ComplexArray, int]:
-    """Return the right singular vectors ``(n, n)``, least singular value last, and how many are null vectors.
-
-    Equations and signals are scaled by powers of two first: fast and slow ones meet at every frequency.
-    """
+    """Return right singular vectors ``(n, n)``, least value last, and how many are null, scaled by powers of two."""
     scaled, columns = equilibrated(pencil)
     _, values, right = np.linalg.svd(scaled)
     rank = int(np.sum(values > RANK_TOLERANCE * values[0]))

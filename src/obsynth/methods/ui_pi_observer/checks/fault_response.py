@@ -1,8 +1,7 @@
-r"""What an observer makes of faults that its model does not describe: fhat/f, steady errors, and what no gain can do.
+"""What an observer makes of faults that its model does not describe: fhat/f, steady errors, and what no gain can do.
 
-For any fault, whatever its course, the estimate is ``fhat = T(s) f`` once the start is forgotten (see
-`obsynth.verification.error_system`).  At a zero of (f, d) -> y outside the region of stability T(s) f0 = 0 for every
-stable decoupled observer: a step is then first answered in the wrong direction.
+For any fault, fhat = T(s) f once the start is forgotten.  At a zero of (f, d) -> y outside the region of stability
+T(s) f0 = 0 for every stable decoupled observer: a step is then first answered in the wrong direction.
 """
 
 from __future__ import annotations
@@ -83,23 +82,16 @@ def _transfer(
 
 @dataclass(frozen=True)
 class SteadyError:
-    """The constant error of a fault estimate when the fault is one order higher than its model.
+    """The constant error of a fault estimate when the fault is one order higher than its model."""
 
-    Fields: order: The fault is ``t^order / order!``: 0 a step, 1 a ramp; error: ``fhat - f`` in the end, in units of
-    that derivative.
-    """
-
-    order: int
-    error: float
+    order: int  # the fault is t^order / order!
+    error: float  # fhat - f in the end, in units of that derivative
 
 
 def steady_errors(
     plant: DescriptorSystem, observer: LinearObserver, tracking: FloatArray, phi: FloatArray, cw: FloatArray
 ) -> tuple[SteadyError, ...]:
-    """Return, for each fault, the error for a polynomial of the least order that its model does not hold.
-
-    Shapes: ``tracking (nz, nx + nw)``, ``phi (nw, nw)``, ``cw (nf, nw)``.
-    """
+    """Return, for each fault, the error for a polynomial of the least order that its model does not hold."""
     a, b, c, d = _system(plant, observer, tracking)
     shift = np.eye(len(a)) if plant.dt > 0.0 else np.zeros_like(a)
     step = plant.dt if plant.dt > 0.0 else 1.0

@@ -33,6 +33,8 @@ from obsynth.verification.identities import Residual, equality, residual, worst
 #: Recomputed poles may miss the claimed ones by this, relative to their size; claimed rates and norms likewise.
 SPECTRUM_TOLERANCE = 1e-4
 CLAIM_TOLERANCE = 1e-4
+#: Poles that a row lists.
+LISTED = 8
 
 
 def stability_rows(design: ObserverDesign, poles: FloatArray, factor: FloatArray) -> Iterator[Check]:
@@ -41,13 +43,14 @@ def stability_rows(design: ObserverDesign, poles: FloatArray, factor: FloatArray
     dt = plant.dt
     yield stability_row(observer.Az, factor, dt, "Share Pasand, eq. (7)")
     claimed = [complex(*row) for row in poles]
+    slowest = numbers(sorted(claimed, key=lambda pole: -pole.real))[:LISTED]
     yield upper_bound_check(
         "poles",
         "the eigenvalues of Ahat are the claimed ones, each within this share of its size",
         _missed(observer.Az, claimed, dt),
         SPECTRUM_TOLERANCE,
         source="Share Pasand, procedure 1, step 7",
-        detail=_some(claimed),
+        detail="slowest " + ", ".join(slowest) if slowest else "none",
     )
     if "decay" in claims:
         yield decay_row(observer.Az, dt, claims["decay"])
@@ -79,19 +82,11 @@ def _digits_rows(ahat: FloatArray, dt: float, poles: list[complex], claims: Mapp
 
 
 def _missed(a: FloatArray, claimed: list[complex], dt: float) -> float:
-    """Return by how much the claimed poles are missed, groups by their means where no pole is missed itself.
-
-    Of ill-conditioned poles more digits tell.
-    """
+    """Return by how much the claimed poles are missed, groups by their means; more digits tell ill-conditioned ones."""
     missed = farthest_pole(eigenvalues(a), claimed, dt)
     if missed > SPECTRUM_TOLERANCE and len(claimed) == len(a) and (enclosed := enclosed_eigenvalues(a)) is not None:
         return farthest_pole([middle_of(ball) for ball in enclosed], claimed, dt)
     return missed if missed > SPECTRUM_TOLERANCE else spectrum_error(a, claimed, dt)
-
-
-def _some(poles: list[complex], most: int = 8) -> str:
-    shown = numbers(sorted(poles, key=lambda pole: -pole.real))
-    return "slowest " + ", ".join(shown[:most]) if shown else "none"
 
 
 def noise_rows(design: ObserverDesign) -> Iterator[Check]:
