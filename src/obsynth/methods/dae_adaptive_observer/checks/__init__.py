@@ -56,7 +56,7 @@ _SOURCE = "Moussa Ali, Zhang 2013 (DAE)"
 
 
 def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
-    """Yield every check of ``design``; see `obsynth.verification.verify`."""
+    """Yield every check of ``design``; see `obsynth.verify`."""
     plant, observer = design.nonlinear
     conditions = tuple(dae_conditions(plant, observer.dt))
     yield from condition_rows(conditions)

@@ -50,7 +50,7 @@ _IDENTITIES = {
 
 
 def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
-    """Yield every check of ``design``; see `obsynth.verification.verify`."""
+    """Yield every check of ``design``; see `obsynth.verify`."""
     (plant, observer), claims = design.linear, design.certificate.claims
     structure = pencil_structure(plant.E, plant.A)
     yield from plant_information(plant, structure)

@@ -39,7 +39,7 @@ _IDENTITIES = {
 
 
 def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
-    """Yield every check of ``design``; see `obsynth.verification.verify`."""
+    """Yield every check of ``design``; see `obsynth.verify`."""
     plant, observer = design.linear
     yield from plant_information(plant)
     yield from condition_rows(pd_observer_conditions(plant))

@@ -49,7 +49,7 @@ _SOURCE = "Moussa Ali, Zhang 2013"
 
 
 def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
-    """Yield every check of ``design``; see `obsynth.verification.verify`."""
+    """Yield every check of ``design``; see `obsynth.verify`."""
     plant, observer = design.recursive
     form = None if observer.adaptation is None else observer.adaptation.form
     yield information("plant: steps", "length of the horizon (0: without end)", float(plant.horizon or 0),

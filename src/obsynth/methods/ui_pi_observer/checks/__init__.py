@@ -33,7 +33,7 @@ _MATRICES = ("tracking", "Phi", "Cw", "poles", "stability")
 
 
 def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
-    """Yield every check of ``design``; see `obsynth.verification.verify`."""
+    """Yield every check of ``design``; see `obsynth.verify`."""
     good = True
     for row in _realisation_rows(design, printed_digits):
         good &= row.passed
