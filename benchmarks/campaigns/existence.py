@@ -23,7 +23,7 @@ from benchmarks.campaigns.frame import Outcome
 from flint import fmpq, fmpq_mat
 
 import obsynth as ob
-from obsynth.methods.refusals import own_shares
+from obsynth.methods.refusals import rounding_shares
 
 CASES = 12000
 LIMIT = 120.0  # s
@@ -70,7 +70,7 @@ def judged(method: str, drawn: Drawn) -> Outcome:
     if drawn.exists is False:
         return Outcome(method, "designed", f"designed, but {drawn.why}")
     error = settling_error(drawn, design.observer)
-    told = own_shares(design.plant, design.observer, 1.0 if design.plant.is_discrete else 0.0)
+    told = rounding_shares(design.plant, design.observer, 1.0 if design.plant.is_discrete else 0.0, own=True)
     if error >= _DROWNED and not (told is not None and design.notes and error <= np.max(told)):
         return Outcome(method, "designed", f"the estimates settle {error:.1e} off")
     return Outcome(method, "designed" if error < _TOLERANCE else "designed, coarse")

@@ -471,7 +471,7 @@ PRECONDITIONS = [
     ),
     impossible("elimination of index 2", eliminated(E=[[0, 1], [0, 0]], A=eye(2)), "index", "index 2"),
     impossible(
-        "elimination, not regular", eliminated(E=[[1, 0], [0, 0]], A=[[1, 0], [0, 0]]), "regularity", "not regular"
+        "elimination, not regular", eliminated(E=[[1, 0], [0, 0]], A=[[1, 1], [0, 0]]), "regularity", "not regular"
     ),
     impossible(
         "elimination of everything", eliminated(E=zeros(2, 2), A=eye(2)), "dynamic states", "Every state is algebraic"

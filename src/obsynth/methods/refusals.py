@@ -199,7 +199,9 @@ def _least(plant: DescriptorSystem, observer: LinearObserver, *, own: bool) -> F
     if not plant.nf or observer.order > MOST_STATES or plant.is_sparse or len(observer.fault_names) != plant.nf:
         return None
     with np.errstate(all="ignore"):
-        shares = [share for point in _points(plant) if (share := _shares(plant, observer, point, own=own)) is not None]
+        shares = [
+            share for point in _points(plant) if (share := rounding_shares(plant, observer, point, own=own)) is not None
+        ]
     return np.asarray(np.min(shares, axis=0)) if shares else None
 
 
@@ -223,7 +225,9 @@ def _responses(
     return np.asarray(plant.C @ states + plant.Df, dtype=np.complex128), np.asarray(resolvent)
 
 
-def _shares(plant: DescriptorSystem, observer: LinearObserver, point: complex, *, own: bool) -> FloatArray | None:
+def rounding_shares(
+    plant: DescriptorSystem, observer: LinearObserver, point: complex, *, own: bool
+) -> FloatArray | None:
     """Return the share of each fault that rounding of the outputs, or of the observer's ``own`` numbers, may be."""
     found = _responses(plant, observer, point)
     if found is None:
