@@ -6,7 +6,6 @@ states; the others keep theirs.  A Kalman filter exists where equations and outp
 mode dies out, an adaptive observer where the parameters leave traces of their own besides.  Wrong is a design for a
 plant that has none, and a refusal, other than an unclear one, of a plant that has one.  Columns: the answer; *noise* is
 a refusal that names the covariances (both of size one in the plant's own units) or the double precision of the steps.
-The 80 without a design, run again alone, are designed since.
 """
 
 from __future__ import annotations
