@@ -9,8 +9,7 @@ them to 1e-4, in rational numbers; a refusal, other than an unclear one, of a pl
 those are known to exist where an observer of the whole state does).  Columns: the answer; *coarse* is an error of 1e-6
 to 1e-4 (plants that one part in 1e11 makes unsolvable), or a larger one that the design tells in its notes, *no design*
 is exit code 4, 5 or 6, where nothing is claimed, *asks for noise* a plant whose outputs are bound to each other by its
-equations, for which a Kalman gain needs more to be stated.  Of the 155 without a design 118 are designed since, and 2
-unclear: those were run again alone.
+equations, for which a Kalman gain needs more to be stated.
 """
 
 from __future__ import annotations
