@@ -68,7 +68,6 @@ def default_rates(model: FilterModel, seconds: float, *, lag: int) -> tuple[Floa
         found = gain(exponent)
         return found is not None and step_misses(model, found, seconds) <= REACHED
 
-    low = float(-DECADES)
     high = next((float(e) for e in range(-DECADES, DECADES + 1) if in_time(float(e))), None)
     if high is None:
         # Some zero keeps every estimate from a step for long: the slowest walk that comes about as close as any.
@@ -76,12 +75,13 @@ def default_rates(model: FilterModel, seconds: float, *, lag: int) -> tuple[Floa
         if not misses:
             raise SolverError("No walk of the fault gives a stable filter: give fault_rate, or poles.")
         high = min(e for e, miss in misses.items() if miss <= min(misses.values()) + AS_CLOSE)
-        return 10.0**high * unit, _forgetting(model, 10.0**high * unit, _known(tried[high]), seconds, lag)
-    low = high - 1.0
-    for _ in range(BISECTIONS):
-        middle = 0.5 * (low + high)
-        low, high = (low, middle) if in_time(middle) else (middle, high)
-    return 10.0**high * unit, _forgetting(model, 10.0**high * unit, _known(gain(high)), seconds, lag)
+    else:
+        low = high - 1.0
+        for _ in range(BISECTIONS):
+            middle = 0.5 * (low + high)
+            low, high = (low, middle) if in_time(middle) else (middle, high)
+    walks = 10.0**high * unit
+    return walks, _forgetting(model, walks, _known(gain(high)), seconds, lag)
 
 
 def _forgetting(model: FilterModel, walks: FloatArray, found: KalmanGain, seconds: float, lag: int) -> KalmanGain:

@@ -115,12 +115,9 @@ def _rounded_once(model: FilterModel, gain: KalmanGain, coordinates: FloatArray)
     with flint.ctx.workprec(BITS):
         k, there = arb_matrix(gain.K), arb_matrix(coordinates)
         back = there.inv()
-        parts = ((model.A, -model.C, there), (model.B, model.L, None), (model.T, model.T0, None))
-        found = []
-        for own, fed_back, right in parts:
-            part = back * (arb_matrix(own) + k * arb_matrix(fed_back))
-            found.append(part if right is None else part * right)
-    return Dynamics(*(as_ball(part).midpoint for part in found))
+        parts = ((model.A, -model.C), (model.B, model.L), (model.T, model.T0))
+        a, b, t = (back * (arb_matrix(own) + k * arb_matrix(fed_back)) for own, fed_back in parts)
+        return Dynamics(*(as_ball(part).midpoint for part in (a * there, b, t)))
 
 
 def _registered(dynamics: Dynamics, row: Rows) -> tuple[Dynamics, Rows]:

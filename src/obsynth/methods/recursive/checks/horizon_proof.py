@@ -229,10 +229,10 @@ def covariance_row(stated: RecursiveObserver, shipped: RecursiveObserver, last: 
     root = Ball.exact(factor / _deviations(factor)[:, None])
     proof = prove_positive_definite(root @ root.T)
     claim = "the covariance of the states after the last step is positive definite, in units of their deviations"
-    definite = noise_is_definite(stated)
+    definite = proof.proved or noise_is_definite(stated)
     if definite and not proof.proved and noise_is_definite(shipped):
         return definite_by_its_noise("covariance", claim, last.gain, last.step.H, natural_units(stated))
-    if definite or proof.proved:
+    if definite:
         return Check("covariance", claim, proof.lower_bound, 0.0, proof.lower_bound, proof.proved,
                      "recomputed, the square root as computed", "proved", proof.text)  # fmt: skip
     return information("covariance", claim, proof.lower_bound, source="recomputed", detail="not definite, or not "
