@@ -15,7 +15,7 @@ from fault_estimation_filter import random_plant
 from threadpoolctl import threadpool_limits
 
 import obsynth
-from obsynth.methods.fault_estimation_filter.options import FilterOptions
+from obsynth.methods.fault_estimation_filter.method import FaultEstimationFilter
 
 THREADS = (1, 2)
 
@@ -25,7 +25,7 @@ def seconds(plant: obsynth.DescriptorSystem, threads: int) -> tuple[float, float
     method = import_module("obsynth.methods.fault_estimation_filter.synthesis")
     with threadpool_limits(limits=threads, user_api="blas"):
         began, clock = time.process_time(), time.perf_counter()
-        method.synthesise(plant, FilterOptions(engine="riccati"), progress=lambda _: None)
+        method.synthesise(plant, FaultEstimationFilter(engine="riccati"), progress=lambda _: None)
         return time.process_time() - began, time.perf_counter() - clock
 
 

@@ -23,7 +23,7 @@ import casadi as ca
 import numpy as np
 
 import obsynth
-from obsynth.methods.registry import method_spec
+from obsynth.methods.registry import method_class
 from obsynth.observers.dae.building import dae_observer_from_options
 from obsynth.spec import load_spec
 
@@ -92,7 +92,7 @@ def main() -> None:
     small = "--small" in sys.argv[1:]
     samples, trials = (60, 3) if small else (SAMPLES, TRIALS)
     spec = load_spec(SPEC)
-    asked = method_spec("dae-adaptive-observer").read_options(spec.options)
+    asked = method_class("dae-adaptive-observer").of(spec.options)
     observer = dae_observer_from_options(spec.plant, asked.as_given())
     print(f"Python {platform.python_version()}, numpy {np.__version__}, CasADi {ca.__version__}, {platform.machine()}")
     print(f"| {samples - 1:,} steps | {' | '.join(FORMS)} |")

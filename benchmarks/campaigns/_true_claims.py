@@ -155,9 +155,9 @@ def _noise(design: ob.ObserverDesign) -> Iterator[str]:
 
 def _errors_per_unit(design: ob.ObserverDesign) -> Iterator[str]:
     """Yield bounds on the error per unit of state or input that are below what the stored numbers do."""
-    from obsynth.methods.registry import method_spec
+    from obsynth.methods.registry import method_class
 
-    tracked = method_spec(design.method).load("tracked")(design)
+    tracked = method_class(design.method).error_model(design)
     observer, certificate = design.observer, design.certificate.matrices
     e, a, b, c, d, t = (_exact(part) for part in (tracked.E, tracked.A, tracked.B, tracked.C, tracked.D, tracked.T))
     az, bu, by, cz, du, dy = (_exact(getattr(observer, name)) for name in ("Az", "Bu", "By", "Cz", "Du", "Dy"))

@@ -13,8 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from obsynth.methods.adaptive_observer.public import adaptive_observer
-from obsynth.methods.dae_adaptive_observer.public import dae_adaptive_observer
+from obsynth.methods.functions import adaptive_observer, dae_adaptive_observer
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.batches import run_dae_batch
 from obsynth.plants.dae.model import DAEModel

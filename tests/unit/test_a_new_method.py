@@ -29,7 +29,7 @@ scenario: {horizon: 2, inputs: {u1: {kind: step, size: 1.0}}, initial_state: {x1
 
 @pytest.fixture(autouse=True)
 def registered(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(REGISTRY, "luenberger-observer", "luenberger_method")
+    monkeypatch.setitem(REGISTRY, "luenberger-observer", "luenberger_method:LuenbergerObserver")
 
 
 @pytest.fixture

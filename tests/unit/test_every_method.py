@@ -20,8 +20,8 @@ from test_export import through_c
 
 import obsynth
 from obsynth.errors import SpecError
-from obsynth.methods.method_spec import option_types
-from obsynth.methods.registry import REGISTRY, method_spec
+from obsynth.methods.method import option_types
+from obsynth.methods.registry import REGISTRY, method_class
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.estimates import Estimates
 from obsynth.observers.linear.observer import LinearObserver
@@ -61,7 +61,7 @@ CORRUPTED = {LinearObserver: "Az", RecursiveObserver: "initial_covariance", DAEO
 
 @pytest.fixture(autouse=True)
 def registered(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(REGISTRY, ADDED, "luenberger_method")
+    monkeypatch.setitem(REGISTRY, ADDED, "luenberger_method:LuenbergerObserver")
 
 
 @cache
@@ -206,7 +206,7 @@ def test_a_corrupted_design_fails(method: str) -> None:
 def test_a_claim_that_the_method_does_not_know_fails(method: str) -> None:
     design = design_of(method)
     claims = {**design.certificate.claims, "perfection": 1.0}
-    assert "perfection" not in method_spec(method).claims
+    assert "perfection" not in method_class(method).claims
     assert not obsynth.verify(design.replace(certificate=replace(design.certificate, claims=claims))).passed
 
 
@@ -302,7 +302,7 @@ NO_NUMBERS = (True, np.True_, [True], {"leak": True}, object())
 @EACH
 def test_no_option_takes_what_is_no_number_for_one(method: str) -> None:
     """True is not 1.0: every option that is no truth itself refuses it, in Python and in lists."""
-    for name, kind in option_types(method_spec(method).options_type).items():
+    for name, kind in option_types(method_class(method)).items():
         if bool in (kind, *get_args(kind)):
             continue
         for value in NO_NUMBERS:

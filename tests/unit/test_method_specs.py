@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from dataclasses import fields
 from typing import Any, get_args
 
@@ -10,22 +11,25 @@ import pytest
 import obsynth
 from obsynth.errors import SpecError
 from obsynth.methods.conic.lmi import FILTER_SOLVERS, SOLVER_SETTINGS
-from obsynth.methods.fault_estimation_filter.options import FilterOptions
-from obsynth.methods.method_spec import option_types
-from obsynth.methods.pd_observer.options import PdOptions
-from obsynth.methods.registry import REGISTRY, method_spec, methods_for
-from obsynth.methods.ui_pi_observer.options import UiPiOptions
+from obsynth.methods.fault_estimation_filter.method import FaultEstimationFilter
+from obsynth.methods.method import option_types
+from obsynth.methods.pd_observer.method import PdObserver
+from obsynth.methods.registry import REGISTRY, method_class, methods_for
+from obsynth.methods.ui_pi_observer.method import UiPiObserver
 from obsynth.numerics.arguments import Count, ForgettingFactor, Positive, problem_with
 
 
 @pytest.mark.parametrize("method", REGISTRY)
-def test_every_path_of_a_declaration_leads_somewhere(method: str) -> None:
-    spec = method_spec(method)
-    assert spec.id == method == spec.options_type.METHOD
-    for part in ("public", "options", "conditions", "synthesise", "checks"):
-        assert callable(spec.load(part))
-    assert getattr(obsynth, method.replace("-", "_")) is spec.load("public")
-    assert {field.name for field in fields(spec.options_type)} == set(spec.option_names)
+def test_a_method_is_one_frozen_class(method: str) -> None:
+    found = method_class(method)
+    assert found.id == method
+    assert found.__dataclass_params__.frozen  # type: ignore[attr-defined]
+    function = getattr(obsynth, method.replace("-", "_"))
+    given = {name: part.default for name, part in inspect.signature(function).parameters.items()}
+    options = {option.name: option.default for option in fields(found)}
+    assert {name: given[name] for name in options} == options
+    assert set(given) - set(options) <= {"plant", "name", "scenario"}
+    assert function.__doc__ == inspect.getdoc(found)
 
 
 def test_kinds_of_plants_have_their_methods() -> None:
@@ -35,8 +39,8 @@ def test_kinds_of_plants_have_their_methods() -> None:
 
 
 def test_choices_are_those_of_the_layers_below() -> None:
-    assert set(get_args(option_types(FilterOptions)["solver"])) == set(FILTER_SOLVERS)
-    for options in (PdOptions, UiPiOptions):
+    assert set(get_args(option_types(FaultEstimationFilter)["solver"])) == set(FILTER_SOLVERS)
+    for options in (PdObserver, UiPiObserver):
         assert set(get_args(option_types(options)["solver"])) == set(SOLVER_SETTINGS)
 
 
@@ -46,7 +50,7 @@ def test_choices_are_those_of_the_layers_below() -> None:
         (True, Positive | None, "number above 0"), (0.0, Positive, "above 0"), (float("nan"), Positive, "above 0"),
         ("1", Positive, "give a number"), (None, Positive, "missing"), (1.5, ForgettingFactor, "above 0 and at most 1"),
         (2.0, Count, "whole number at least 1"), (True, Count, "whole number"), (1, bool, "True or False"),
-        (True, option_types(PdOptions)["theorem"], "use one of 1, 2"),
+        (True, option_types(PdObserver)["theorem"], "use one of 1, 2"),
     ],
 )  # fmt: skip
 def test_values_out_of_type_or_range_are_named(value: Any, kind: Any, problem: str) -> None:

@@ -14,7 +14,7 @@ from obsynth.methods.pd_observer import gain_search as pd_design
 from obsynth.methods.pd_observer import reduced_inequality as pd_reduced
 from obsynth.methods.pd_observer.checks.certificate import prove_gains, prove_symmetric_positive
 from obsynth.methods.pd_observer.inequalities import PdTask, solve
-from obsynth.methods.pd_observer.options import MOST_STATES_FOR_LMI, PdOptions
+from obsynth.methods.pd_observer.method import MOST_STATES_FOR_LMI, PdObserver
 from obsynth.methods.pd_observer.realisation import with_faults_as_states
 from obsynth.spec import load_spec
 
@@ -158,7 +158,7 @@ class TestChoice:
         assert any("'riccati' failed" in note for note in design.notes)
 
     def test_what_is_asked_besides_takes_the_whole_inequality(self) -> None:
-        assert PdOptions(gain_bound=3.0).engines_for(10 * MOST_STATES_FOR_LMI) == ("lmi",)
+        assert PdObserver(gain_bound=3.0).engines_for(10 * MOST_STATES_FOR_LMI) == ("lmi",)
         assert obsynth.pd_observer(PLANT, fault_rate_gain=0.7).solver["engine"] == "lmi"
         for engine in ("reduced-lmi", "riccati"):
             with pytest.raises(obsynth.SpecError, match="stability and a decay rate alone") as caught:

@@ -537,7 +537,7 @@ class TestRefusals:
 
 
 def test_the_doors_options_are_those_of_the_method() -> None:
-    from obsynth.methods.pd_observer.options import PdOptions
+    from obsynth.methods.pd_observer.method import PdObserver
 
     door = {
         name: parameter.default
@@ -545,7 +545,7 @@ def test_the_doors_options_are_those_of_the_method() -> None:
         if name not in ("plant", "name")
     }
     inside = {
-        name: parameter.default for name, parameter in inspect.signature(PdOptions).parameters.items()
+        name: parameter.default for name, parameter in inspect.signature(PdObserver).parameters.items()
     }  # fmt: skip
     assert door == inside
 

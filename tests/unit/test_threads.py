@@ -18,7 +18,7 @@ import obsynth
 from obsynth.analysis.structure import analyse_structure
 from obsynth.methods import designing
 from obsynth.methods.pd_observer import synthesis as method
-from obsynth.methods.pd_observer.options import PdOptions
+from obsynth.methods.pd_observer.method import PdObserver
 from obsynth.numerics.libraries import STATES_WORTH_THREADS, one_thread_if_small
 
 PLANT = obsynth.DescriptorSystem(None, [[0.5, 1.0], [0.0, -1.0]], C=[[1.0, 0.0]], Bf=[[0.0], [1.0]])
@@ -186,7 +186,7 @@ def test_verification_alone_runs_on_one_thread(monkeypatch: pytest.MonkeyPatch) 
 
 def test_the_method_itself_leaves_the_threads_alone() -> None:
     """The setting is in `design`, once for every method."""
-    method.synthesise(PLANT, PdOptions(), progress=lambda _: None)
+    method.synthesise(PLANT, PdObserver(), progress=lambda _: None)
     assert blas_threads() == {2}
 
 

@@ -54,7 +54,7 @@ def _require_claim(options: argparse.Namespace, parameters: dict[str, list[Any]]
     """Refuse a claim that no method of a sweep can make before anything is designed."""
     if options.claim is None:
         return
-    from obsynth.methods.registry import REGISTRY, method_spec
+    from obsynth.methods.registry import REGISTRY, method_class
     from obsynth.spec.documents import read_yaml
 
     methods = list(parameters.get("method.id", ()))
@@ -62,7 +62,7 @@ def _require_claim(options: argparse.Namespace, parameters: dict[str, list[Any]]
         methods.append(section.get("id") if isinstance(section, dict) else None)
     # What chooses its method may come to any.
     known = REGISTRY if any(method not in REGISTRY for method in methods) else methods
-    claims = sorted({claim for method in known for claim in method_spec(method).claims})
+    claims = sorted({claim for method in known for claim in method_class(method).claims})
     if options.claim not in claims:
         raise SpecError(f"No method of this sweep claims {options.claim!r}: give --claim one of {', '.join(claims)}.",
                         path="--claim")  # fmt: skip

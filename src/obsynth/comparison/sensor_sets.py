@@ -17,7 +17,7 @@ from obsynth.analysis.diagnosis.sensor_search import GOALS, SensorSearch, Task, 
 from obsynth.analysis.transformations.recovery import Transformation, linear_plant
 from obsynth.errors import ObsynthError, PreconditionError, SpecError
 from obsynth.files.tables import html_table, text_table
-from obsynth.methods.functional_filter.public import functional_filter
+from obsynth.methods.functions import functional_filter
 from obsynth.numerics.arguments import Count, checked_value, is_finite_number, real_vector
 from obsynth.numerics.libraries import on_one_thread_if_small
 from obsynth.plants.descriptor import DescriptorSystem

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from time import perf_counter
 from typing import Any
@@ -12,18 +12,14 @@ import numpy as np
 from obsynth.errors import ObsynthError, PreconditionError, SpecError
 from obsynth.methods.fault_figures import DECOUPLED, FaultFigures, fault_figures, on_the_clock
 from obsynth.methods.functional_filter.rates import settling_time
-from obsynth.methods.method_spec import MethodSpec
-from obsynth.methods.registry import REGISTRY, method_spec
+from obsynth.methods.method import Method, Purpose, option_types
+from obsynth.methods.registry import REGISTRY, kind_of, method_class, methods_for
 from obsynth.observers.linear.derived import sample_observer
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.recursive.gain_schedule import steady_observer
-from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.results.design import ObserverDesign
 
-#: Methods whose designs are continuous whatever the plant is used for: they are sampled afterwards.
-CONTINUOUS_ONLY = ("pd-observer",)
 #: An estimate that shows 90 % of a step later than this share of the plant's settling time comes after faster ones.
 SLOW = 0.25
 
@@ -64,12 +60,12 @@ def candidate(
     continuous: bool = False,
 ) -> Candidate:
     """Return one method for a plant; on the sampled plant where it can be, or else (or if asked) sampled afterwards."""
-    spec = method_spec(method)
-    if "time-invariant" not in spec.plants:
+    known = method_class(method)
+    if "time-invariant" not in known.plants:
         return _refused(method, "for nonlinear plants")
     begun = perf_counter()
     try:
-        made = maker(plant if continuous or method in CONTINUOUS_ONLY else sampled, method, options)
+        made = maker(plant if continuous or known.time == "continuous" else sampled, method, options)
         observer = _sampled(made, sampled.dt)
     except ObsynthError as error:
         return _refused(method, one_line(str(error)), 1e3 * (perf_counter() - begun))
@@ -108,9 +104,9 @@ def _cut(text: str) -> str:
     return short if len(short) <= MOST_LETTERS else short[: MOST_LETTERS - 3].rstrip() + "..."
 
 
-def linear_methods() -> Sequence[MethodSpec]:
+def linear_methods() -> Sequence[type[Method]]:
     """Return the methods that take linear plants with constant matrices."""
-    return [found for found in map(method_spec, REGISTRY) if "time-invariant" in found.plants]
+    return [found for found in map(method_class, REGISTRY) if "time-invariant" in found.plants]
 
 
 #: Samples of the plant's settling time, and how many settling times figures look ahead.
@@ -120,18 +116,18 @@ SAMPLES, SETTLING_TIMES, MOST_STEPS = 200, 8, 2000
 Maker = Callable[[Any, str, Mapping[str, Any]], ObserverDesign]
 
 
-#: Linear methods whose estimates of faults are compared; the recursive ones estimate parameters, or no fault.
-FAULT_METHODS = ("fault-estimation-filter", "pd-observer", "ui-pi-observer", "functional-filter")
+def _methods_with(purpose: Purpose, among: Iterable[str]) -> list[str]:
+    """Return the methods of a list that serve a purpose."""
+    return [method for method in among if purpose in method_class(method).purposes]
 
 
 def automatic_design(plant: Any, options: Mapping[str, Any], maker: Maker, refusing: Maker) -> ObserverDesign:
     """Return the design of the method chosen; ``maker(plant, method, options)``; ``refusing`` says what would help."""
-    if isinstance(plant, DAEModel):
-        return maker(plant, "dae-adaptive-observer", options)
-    if isinstance(plant, TimeVaryingDescriptorSystem):
-        method = "adaptive-observer" if plant.parameter_names else "descriptor-kalman"
-        return maker(plant, method, options)
-    possible = [spec.id for spec in linear_methods() if set(options) <= set(spec.option_names)]
+    if not isinstance(plant, DescriptorSystem):
+        purpose: Purpose = "parameters" if plant.parameter_names else "state despite noise"
+        known = methods_for(kind_of(plant))
+        return maker(plant, next(iter(_methods_with(purpose, known)), known[0]), options)
+    possible = [method.id for method in linear_methods() if set(options) <= set(option_types(method))]
     if not possible:
         raise SpecError(
             f"No single method has the options {', '.join(sorted(options))}: name the method they are for.",
@@ -146,11 +142,11 @@ def _for_the_state(
     plant: DescriptorSystem, options: Mapping[str, Any], possible: list[str], maker: Maker
 ) -> ObserverDesign:
     """Return an observer of the state: there are no faults."""
-    order = ["ui-pi-observer", "descriptor-kalman"]
+    order: list[Purpose] = ["state despite unknown inputs", "state despite noise"]
     if plant.nw and not plant.nd:
         order.reverse()
     refusals = []
-    for method in [name for name in order if name in possible]:
+    for method in [name for purpose in order for name in _methods_with(purpose, possible)]:
         try:
             return _with_note(maker(plant, method, options), "there are no faults to estimate")
         except ObsynthError as error:
@@ -165,8 +161,9 @@ def _chosen(
 ) -> ObserverDesign:
     found = [entry for entry in designed(plant, options, possible, maker) if entry.design is not None]
     if not found:
-        # The functional filter needs least: what forbids it forbids the fault.
-        last = next((name for name in ("functional-filter", *FAULT_METHODS) if name in possible), possible[0])
+        # What forbids the one that needs least forbids the fault.
+        purposes: tuple[Purpose, ...] = ("faults under the weakest conditions", "faults")
+        last = next((name for purpose in purposes for name in _methods_with(purpose, possible)), possible[0])
         return refusing(plant, last, options)
     settling = settling_time(plant)
     best, *others = sorted(found, key=lambda entry: entry.rank(plant.nd > 0, settling))
@@ -185,7 +182,10 @@ def designed(plant: DescriptorSystem, options: Mapping[str, Any], methods: list[
         # Not of index one: only methods that need no elimination are left, and nothing to compare on.
         return []
     own_time = plant.dt == 0.0
-    taken = [m for m in methods if m in FAULT_METHODS and not (plant.dt > 0.0 and m in CONTINUOUS_ONLY)]
+    taken = [
+        method for method in _methods_with("faults", methods)
+        if not (plant.dt > 0.0 and method_class(method).time == "continuous")
+    ]  # fmt: skip
     return [candidate(method, plant, sampled, steps, maker, options, continuous=own_time) for method in taken]
 
 

@@ -15,9 +15,9 @@ from obsynth.analysis.transformations.recovery import StateRecovery, Transformat
 from obsynth.errors import PreconditionError, VerificationError
 from obsynth.extensions import extension
 from obsynth.methods.automatic import automatic_design
-from obsynth.methods.method_spec import Synthesis
+from obsynth.methods.method import Method, Synthesis
 from obsynth.methods.refusals import require_above_rounding, rounding_notes, with_advice
-from obsynth.methods.registry import AUTO, REGISTRY, Plant, kind_conditions, kind_of, method_spec
+from obsynth.methods.registry import AUTO, REGISTRY, Plant, kind_conditions, kind_of, method_class
 from obsynth.methods.verifying import verify
 from obsynth.numerics.libraries import failed_computations, one_thread_if_small
 from obsynth.observers.linear.observer import LinearObserver
@@ -91,12 +91,13 @@ def design(
     own, recovery = plant_and_recovery(plant, recovery)
 
     def made(plant: Plant, method: str, options: Mapping[str, Any], *, advise: bool = False) -> ObserverDesign:
-        each = partial(_designed, method=method, name=name, recovery=recovery, progress=report_stage, advise=advise)
-        if method_spec(method).read_options(options).as_given().get("model_error", "none") == "none":
-            return each(plant, options=options)
-        exact_model = {**options, "model_error": "none"}
+        asked = method_class(method).of(options)
+        each = partial(_designed, name=name, recovery=recovery, progress=report_stage, advise=advise)
+        if asked.as_given().get("model_error", "none") == "none":
+            return each(plant, asked)
+        exact_model = replace(asked, **{"model_error": "none"})
         found: ObserverDesign = extension("designs with model error")(
-            plant, scenario, partial(each, options=exact_model), report_stage
+            plant, scenario, partial(each, asked=exact_model), report_stage
         )
         return found
 
@@ -110,28 +111,25 @@ def design(
 
 
 def _designed(
-    plant: Plant, *, method: str, options: Mapping[str, Any], name: str, recovery: StateRecovery | None,
-    progress: Callable[[str], None], advise: bool,
+    plant: Plant, asked: Method, *, name: str, recovery: StateRecovery | None, progress: Callable[[str], None],
+    advise: bool,
 ) -> ObserverDesign:  # fmt: skip
     """Return the verified design of one method; with ``advise`` a refusal says what would help."""
-    report_stage = progress
-    spec = method_spec(method)
-    asked = spec.read_options(options)
-    for condition in kind_conditions(plant, spec):
+    for condition in kind_conditions(plant, type(asked)):
         condition.require()
     with failed_computations(), one_thread_if_small(plant.nx):
-        plant, recovery, notes = _with_arrays(plant, recovery, report_stage)
+        plant, recovery, notes = _with_arrays(plant, recovery, progress)
         try:
-            found = spec.load("synthesise")(plant, asked, progress=report_stage)
+            found = asked.synthesise(plant, progress=progress)
         except PreconditionError as error:
             if not isinstance(plant, DescriptorSystem) or not advise:
                 raise
-            report_stage("looking for what would make it possible")
-            raise with_advice(error, plant, spec, asked.as_given()) from None
+            progress("looking for what would make it possible")
+            raise with_advice(error, plant, asked) from None
         if notes:
             found = replace(found, notes=(*notes, *found.notes))
-        report_stage("verifying the shipped realisation")
-        return verified(plant, method, found, name=name, recovery=recovery)
+        progress("verifying the shipped realisation")
+        return verified(plant, asked.id, found, name=name, recovery=recovery)
 
 
 def _with_arrays(
@@ -190,11 +188,9 @@ def check(
 def _checked(plant: Plant, options: Mapping[str, Mapping[str, Any]]) -> dict[str, VerificationReport]:
     found = {}
     for method in REGISTRY:
-        spec = method_spec(method)
-        asked = {} if method not in options else spec.read_options(options[method]).as_given()
-        conditions = kind_conditions(plant, spec)
-        if not conditions:
-            conditions = tuple(spec.existence(asked)(plant))
+        known = method_class(method)
+        asked = known.of(options.get(method, known.placeholders))
+        conditions = kind_conditions(plant, known) or asked.existence(plant)
         found[method] = VerificationReport.of(condition_rows(conditions))
     return found
 
@@ -273,12 +269,11 @@ def _lost_tolerances(given: Plant, shipped: Plant) -> tuple[str, ...]:
 
 def with_stored_errors(draft: ObserverDesign) -> ObserverDesign:
     """Return a linear design whose certificate claims what rounding of its stored numbers adds to the errors."""
-    spec = method_spec(draft.method)
-    if not spec.tracked:
-        return draft
+    method = method_class(draft.method)
     with np.errstate(all="ignore"):
-        base = before_the_mean(draft)[0] if spec.averaged else draft
-        found = StoredErrors.of(spec.load("tracked")(base), base.linear[1])
+        base = before_the_mean(draft)[0] if method.averaged else draft
+        model = method.error_model(base)
+        found = None if model is None else StoredErrors.of(model, base.linear[1])
     if found is None:
         return draft
     old = draft.certificate

@@ -7,9 +7,8 @@ u the unit roundoff, in any units; the observer's own numbers, with z its state,
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from fractions import Fraction
-from typing import Any
 
 import numpy as np
 
@@ -17,7 +16,7 @@ from obsynth.analysis.conditions import Condition
 from obsynth.analysis.diagnosis.explanations import least_additions, listed, state_sensors
 from obsynth.analysis.existence.witnesses import EntryChange, Unclear, Witness
 from obsynth.errors import ObsynthError, PreconditionError
-from obsynth.methods.method_spec import MethodSpec
+from obsynth.methods.method import Method
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
@@ -48,11 +47,9 @@ def require_all_told(conditions: Iterable[Condition]) -> None:
         ) from None  # fmt: skip
 
 
-def with_advice(
-    error: PreconditionError, plant: DescriptorSystem, method: MethodSpec, options: Mapping[str, Any]
-) -> PreconditionError:
+def with_advice(error: PreconditionError, plant: DescriptorSystem, asked: Method) -> PreconditionError:
     """Return the refusal with what would help at its end; as it is where the existence conditions hold."""
-    holds = _asker(method, options)
+    holds = _asker(asked)
     if holds(plant):
         return error
     sets = least_additions(plant, state_sensors(plant), holds, most=(MOST_FOR_ONE, MOST_FOR_PAIRS))
@@ -69,26 +66,17 @@ def with_advice(
     )
 
 
-def _asker(method: MethodSpec, options: Mapping[str, Any]) -> Callable[[DescriptorSystem], bool]:
+def _asker(asked: Method) -> Callable[[DescriptorSystem], bool]:
     """Return what says whether all existence conditions of a method hold for a plant."""
 
     def holds(plant: DescriptorSystem) -> bool:
         # What would help is told to be tried, not proved: the tried plant is decided exactly then.
-        judge = method.existence({**_fitting(options, plant), "exactly": False})
         try:
-            return all(condition.holds for condition in judge(plant))
+            return all(condition.holds for condition in asked.for_plant(plant).existence(plant, exactly=False))
         except (ObsynthError, np.linalg.LinAlgError):
             return False
 
     return holds
-
-
-def _fitting(given: Mapping[str, Any], plant: DescriptorSystem) -> dict[str, Any]:
-    """Return options without the faults that a plant no longer has."""
-    faults = given.get("faults")
-    if faults is None or isinstance(faults, str):
-        return dict(given)
-    return {**given, "faults": [name for name in faults if name in plant.fault_names]}
 
 
 def _drops(plant: DescriptorSystem, holds: Callable[[DescriptorSystem], bool]) -> list[str]:

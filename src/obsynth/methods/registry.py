@@ -8,22 +8,22 @@ from typing import Any, TypeAlias
 
 from obsynth.analysis.conditions import Condition
 from obsynth.errors import SpecError
-from obsynth.methods.method_spec import MethodSpec, PlantKind
+from obsynth.methods.method import Method, PlantKind
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 
 #: What a spec and `obsynth.design` call the choice between all methods that exist.
 AUTO = "auto"
-#: Method id -> where its declaration is; a method is its own folder and a line here.
+#: Method id -> its class, ``module:name``; a method is its own folder and a line here.
 REGISTRY: dict[str, str] = {
-    "fault-estimation-filter": "obsynth.methods.fault_estimation_filter",
-    "pd-observer": "obsynth.methods.pd_observer",
-    "ui-pi-observer": "obsynth.methods.ui_pi_observer",
-    "functional-filter": "obsynth.methods.functional_filter",
-    "descriptor-kalman": "obsynth.methods.descriptor_kalman",
-    "adaptive-observer": "obsynth.methods.adaptive_observer",
-    "dae-adaptive-observer": "obsynth.methods.dae_adaptive_observer",
+    "fault-estimation-filter": "obsynth.methods.fault_estimation_filter.method:FaultEstimationFilter",
+    "pd-observer": "obsynth.methods.pd_observer.method:PdObserver",
+    "ui-pi-observer": "obsynth.methods.ui_pi_observer.method:UiPiObserver",
+    "functional-filter": "obsynth.methods.functional_filter.method:FunctionalFilter",
+    "descriptor-kalman": "obsynth.methods.descriptor_kalman.method:DescriptorKalman",
+    "adaptive-observer": "obsynth.methods.adaptive_observer.method:AdaptiveObserver",
+    "dae-adaptive-observer": "obsynth.methods.dae_adaptive_observer.method:DaeAdaptiveObserver",
 }
 Plant: TypeAlias = DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel
 _KINDS: Mapping[PlantKind, tuple[type, str]] = {
@@ -33,17 +33,18 @@ _KINDS: Mapping[PlantKind, tuple[type, str]] = {
 }
 
 
-def method_spec(method: str) -> MethodSpec:
-    """Return the declaration of a method; raise `SpecError` listing the known ones where there is none."""
+def method_class(method: str) -> type[Method]:
+    """Return the class of a method; raise `SpecError` listing the known ones where there is none."""
     if method not in REGISTRY:
         raise SpecError(f"There is no method {method!r}; there are: {', '.join(REGISTRY)}.", path="method")
-    found: MethodSpec = import_module(REGISTRY[method]).METHOD
+    module, name = REGISTRY[method].split(":")
+    found: type[Method] = getattr(import_module(module), name)
     return found
 
 
 def methods_for(kind: PlantKind) -> tuple[str, ...]:
     """Return the ids of the methods that take plants of a kind."""
-    return tuple(method for method in REGISTRY if kind in method_spec(method).plants)
+    return tuple(method for method in REGISTRY if kind in method_class(method).plants)
 
 
 def kind_of(plant: Any) -> PlantKind:
@@ -58,7 +59,7 @@ def kind_of(plant: Any) -> PlantKind:
     )
 
 
-def kind_conditions(plant: Plant, method: MethodSpec) -> tuple[Condition, ...]:
+def kind_conditions(plant: Plant, method: type[Method]) -> tuple[Condition, ...]:
     """Return the failing condition where a method does not take plants of this kind, else nothing."""
     kind = kind_of(plant)
     if kind in method.plants:

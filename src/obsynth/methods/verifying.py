@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.methods.registry import REGISTRY, method_spec
+from obsynth.methods.registry import REGISTRY, method_class
 from obsynth.numerics.libraries import failed_computations, one_thread_if_small
 from obsynth.results.checks import VerificationReport
 from obsynth.results.plant_source import remembering
@@ -47,18 +47,16 @@ def verify(design: ObserverDesign, *, printed_digits: int | None = None) -> Veri
         raise SpecError(f"Designs of method {design.method!r} cannot be verified by this version.", path="method")
     if printed_digits is not None and not 1 <= printed_digits <= 15:
         raise SpecError(f"printed_digits is {printed_digits}: give 1 to 15 decimals.", path="printed_digits")
-    spec = method_spec(design.method)
-    checks = spec.load("checks")
+    method = method_class(design.method)
     # A corrupted design may overflow; what is not a number fails its check, so no warning is needed.
     with np.errstate(all="ignore"), failed_computations(), one_thread_if_small(design.plant.nx):
         remembering(design.plant, design.source)
-        shipped, (design, mean_rows) = design, before_the_mean(design) if spec.averaged else (design, ())
-        rows = (*mean_rows, *checks(design, printed_digits))
-        if spec.tracked and all(row.passed for row in rows):
-            gamma = design.certificate.claims.get("gamma") if "gamma" in spec.claims else None
-            tracked = spec.load("tracked")(design)
+        shipped, (design, mean_rows) = design, before_the_mean(design) if method.averaged else (design, ())
+        rows = (*mean_rows, *method.checks(design, printed_digits))
+        if all(row.passed for row in rows) and (tracked := method.error_model(design)) is not None:
+            gamma = design.certificate.claims.get("gamma") if "gamma" in method.claims else None
             rows = (*rows, *stored_number_rows(design, tracked, gamma), *derivation_rows(design, tracked))
-        covered = {name: meaning.row for name, meaning in spec.claims.items()}
-        meanings = {name: meaning.meaning for name, meaning in spec.claims.items()}
+        covered = {name: meaning.row for name, meaning in method.claims.items()}
+        meanings = {name: meaning.meaning for name, meaning in method.claims.items()}
         rows = rows if shipped is design else (*rows, *mean_noise_rows(shipped))
-        return VerificationReport.of((*rows, *closed_claims(design, rows, covered, meanings, spec.witnesses)))
+        return VerificationReport.of((*rows, *closed_claims(design, rows, covered, meanings, method.witnesses)))

@@ -16,7 +16,7 @@ from obsynth.errors import ObsynthError, PreconditionError
 from obsynth.methods.automatic import SAMPLES
 from obsynth.methods.fault_figures import FaultFigures, fault_figures, on_the_clock
 from obsynth.methods.functional_filter.rates import DelayCurve, delay_curve, settling_time
-from obsynth.methods.registry import REGISTRY, method_spec
+from obsynth.methods.registry import REGISTRY, method_class
 from obsynth.observers.linear.derived import sample_observer
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.dae.model import DAEModel
@@ -143,7 +143,7 @@ def recovered_states(recovery: StateRecovery) -> Iterator[tuple[str, str]]:
 
 def promises(design: ObserverDesign) -> Iterator[tuple[str, str, str]]:
     """Yield name, value and meaning of what a design claims."""
-    known = method_spec(design.method).claims if design.method in REGISTRY else {}
+    known = method_class(design.method).claims if design.method in REGISTRY else {}
     for name, value in design.certificate.claims.items():
         claim = known.get(name)
         unit, meaning = (claim.unit, claim.meaning) if claim else ("", "unknown to this version")

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from obsynth.data.run import DataRun
 from obsynth.files.outputs import FileKind, write_atomically
-from obsynth.methods.registry import REGISTRY, method_spec
+from obsynth.methods.registry import REGISTRY, method_class
 from obsynth.report.designs import (
     FITS,
     delay_curves,
@@ -181,7 +181,7 @@ def _pictures(design: ObserverDesign, scenario: Scenario | None) -> Iterator[str
 
 
 def _gains(design: ObserverDesign) -> Iterator[str]:
-    source = method_spec(design.method).source if design.method in REGISTRY else ""
+    source = method_class(design.method).source if design.method in REGISTRY else ""
     if not design.gains:
         return
     if source:

@@ -15,7 +15,7 @@ from rich.text import Text
 
 from obsynth.analysis.structure import questions
 from obsynth.files.tables import html_table
-from obsynth.methods.registry import REGISTRY, method_spec
+from obsynth.methods.registry import REGISTRY, method_class
 from obsynth.observers.linear.derived import FORGOTTEN, transient
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
@@ -115,7 +115,7 @@ def print_summary(found: Summary, *, console: Console) -> None:
 
 
 def _facts(design: ObserverDesign, steps: Followed) -> Iterator[tuple[str, str]]:
-    known = method_spec(design.method) if design.method in REGISTRY else None
+    known = method_class(design.method) if design.method in REGISTRY else None
     yield "method", design.method + (f": {known.summary}" if known else "")
     yield "plant", _plant(design.plant)
     yield from _promise(design)
@@ -143,7 +143,7 @@ def _counted(counts: Sequence[tuple[int, str]]) -> str:
 
 def _promise(design: ObserverDesign) -> Iterator[tuple[str, str]]:
     """Yield the claim that says what is shipped."""
-    known = method_spec(design.method).claims if design.method in REGISTRY else {}
+    known = method_class(design.method).claims if design.method in REGISTRY else {}
     claims = design.certificate.claims
     for name in (name for name in _PROMISES if name in claims and name in known):
         unit = f" {known[name].unit}" if known[name].unit else ""

@@ -6,10 +6,9 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from obsynth.analysis.conditions import Condition, require_all
-from obsynth.methods.dae_adaptive_observer.conditions import dae_conditions
-from obsynth.methods.dae_adaptive_observer.options import DaeAdaptiveObserverOptions
-from obsynth.methods.method_spec import Synthesis
+from obsynth.analysis.conditions import require_all
+from obsynth.methods.dae_adaptive_observer.method import DaeAdaptiveObserver
+from obsynth.methods.method import Synthesis
 from obsynth.observers.dae.building import (
     LARGEST_TURN,
     NOMINAL_STEPS,
@@ -26,16 +25,11 @@ from obsynth.plants.dae.model import DAEModel
 from obsynth.results.design import Certificate
 
 
-def conditions(plant: object, *, dt: float = 1.0) -> tuple[Condition, ...]:
-    """Return the existence conditions; the list ends at the first failure."""
-    return tuple(dae_conditions(plant, dt))
-
-
-def synthesise(plant: DAEModel, asked: DaeAdaptiveObserverOptions, *, progress: Callable[[str], None]) -> Synthesis:
+def synthesise(plant: DAEModel, asked: DaeAdaptiveObserver, *, progress: Callable[[str], None]) -> Synthesis:
     """Put the observer together; see `obsynth.dae_adaptive_observer` for the options, results and errors."""
     observer = dae_observer_from_options(plant, asked.as_given())
     progress("checking index and parameters")
-    require_all(conditions(plant, dt=observer.dt))
+    require_all(asked.existence(plant))
     progress("running the observer on its own model")
     facts = dae_facts(plain_recursion(observer))
     claims = {

@@ -15,7 +15,7 @@ from obsynth.methods.fault_estimation_filter.central_filter import central_filte
 from obsynth.methods.fault_estimation_filter.gamma_lower_bound import BOUND_MARGIN, proved_lower_bound
 from obsynth.methods.fault_estimation_filter.inequality_search import SMALLEST_USEFUL_GAIN, LeastGain, search_least_gain
 from obsynth.methods.fault_estimation_filter.injection_problem import GainProblem, Injection, WeightLimit, normalise
-from obsynth.methods.fault_estimation_filter.options import FilterOptions
+from obsynth.methods.fault_estimation_filter.method import FaultEstimationFilter
 from obsynth.methods.fault_estimation_filter.small_gains import small_gain_design
 
 #: The bracket ends at this share of the width asked for: the filter in hand is at its upper end.
@@ -80,7 +80,7 @@ class FoundGains:
 
 
 def found_gains(
-    problem: GainProblem, asked: FilterOptions, engine: str, *, noisy: bool, progress: Callable[[str], None]
+    problem: GainProblem, asked: FaultEstimationFilter, engine: str, *, noisy: bool, progress: Callable[[str], None]
 ) -> FoundGains:
     """Search the least gain, and small gains for a slightly larger one."""
     size = max(problem.disturbance_size, NOMINAL_GAIN)
@@ -107,7 +107,12 @@ def found_gains(
 
 
 def found_within(
-    problem: GainProblem, limited: GainProblem, asked: FilterOptions, *, noisy: bool, progress: Callable[[str], None]
+    problem: GainProblem,
+    limited: GainProblem,
+    asked: FaultEstimationFilter,
+    *,
+    noisy: bool,
+    progress: Callable[[str], None],
 ) -> FoundGains:
     """Search gains with a limit on the weight, which Riccati equations do not cover."""
     if asked.engine == "auto" and limited.weight_limit is not None:
@@ -122,7 +127,7 @@ def found_within(
     return found_gains(limited, asked, engine, noisy=noisy, progress=progress)
 
 
-def _least_gain(problem: GainProblem, asked: FilterOptions, engine: str) -> LeastGain:
+def _least_gain(problem: GainProblem, asked: FaultEstimationFilter, engine: str) -> LeastGain:
     polish = engine == "lmi"
     if asked.gamma_search == "direct":
         return search_least_gain(problem, solver=asked.solver, polish=polish)
@@ -135,7 +140,7 @@ def _leaves_little(gamma: float, least: float, problem: GainProblem) -> bool:
     return near and problem.disturbances > 0 and problem.order <= MOST_STATES_TO_POLISH
 
 
-def _gain_to_ship(asked: FilterOptions, problem: GainProblem, least: LeastGain, *, noisy: bool) -> float:
+def _gain_to_ship(asked: FaultEstimationFilter, problem: GainProblem, least: LeastGain, *, noisy: bool) -> float:
     floor = SMALLEST_USEFUL_GAIN * least.starting_gain
     if problem.disturbances == 0:
         return NOMINAL_GAIN

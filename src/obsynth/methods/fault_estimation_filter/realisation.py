@@ -23,7 +23,7 @@ from obsynth.methods.fault_estimation_filter.detectability_indexes import (
     fault_detectability,
 )
 from obsynth.methods.fault_estimation_filter.prepared_plant import prepare, with_sensor_faults_as_states
-from obsynth.methods.method_spec import Synthesis
+from obsynth.methods.method import Synthesis
 from obsynth.numerics.arguments import is_whole
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.numerics.norms import spectral_radius

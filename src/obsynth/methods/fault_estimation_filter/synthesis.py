@@ -23,20 +23,19 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from obsynth.analysis.conditions import Condition, require_all
-from obsynth.analysis.existence.numbers import decided
+from obsynth.analysis.conditions import require_all
 from obsynth.errors import InfeasibleError
 from obsynth.methods.conic.lmi import FILTER_SOLVERS
 from obsynth.methods.fault_estimation_filter.certificate import bounded_real_certificate
-from obsynth.methods.fault_estimation_filter.conditions import examine_fault_filter, fault_filter_conditions
+from obsynth.methods.fault_estimation_filter.conditions import examine_fault_filter
 from obsynth.methods.fault_estimation_filter.filter_search import NOMINAL_GAIN, FoundGains, found_gains, found_within
 from obsynth.methods.fault_estimation_filter.gamma_lower_bound import least_gain_certificate
 from obsynth.methods.fault_estimation_filter.inequality_solutions import null_basis
 from obsynth.methods.fault_estimation_filter.injection_problem import GainProblem, Injection, WeightLimit
-from obsynth.methods.fault_estimation_filter.options import FilterOptions
+from obsynth.methods.fault_estimation_filter.method import FaultEstimationFilter
 from obsynth.methods.fault_estimation_filter.prepared_plant import PreparedPlant, prepare
 from obsynth.methods.fault_estimation_filter.realisation import notes, realise_filter
-from obsynth.methods.method_spec import Synthesis
+from obsynth.methods.method import Synthesis
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.observers.linear.derived import averaged
 from obsynth.observers.linear.observer import LinearObserver
@@ -49,13 +48,7 @@ BACKGROUND_NOISE = 1e-3
 FIRST_TRIES = 4
 
 
-def conditions(plant: DescriptorSystem, *, exactly: bool = True) -> tuple[Condition, ...]:
-    """Return the existence conditions, decided exactly or in floating point; the list ends at the first failure."""
-    with decided(exactly=exactly):
-        return fault_filter_conditions(plant)
-
-
-def synthesise(plant: DescriptorSystem, asked: FilterOptions, *, progress: Callable[[str], None]) -> Synthesis:
+def synthesise(plant: DescriptorSystem, asked: FaultEstimationFilter, *, progress: Callable[[str], None]) -> Synthesis:
     """Design the filter; see `obsynth.fault_estimation_filter` for the options, results and errors."""
     progress("checking the existence conditions")
     held, prepared = examine_fault_filter(plant)
@@ -118,7 +111,7 @@ def synthesise(plant: DescriptorSystem, asked: FilterOptions, *, progress: Calla
 
 
 def _found(
-    problem: GainProblem, limited: GainProblem | None, asked: FilterOptions, *, exactly: bool, noisy: bool,
+    problem: GainProblem, limited: GainProblem | None, asked: FaultEstimationFilter, *, exactly: bool, noisy: bool,
     progress: Callable[[str], None],
 ) -> FoundGains:  # fmt: skip
     problem = replace(problem, judged_exactly=exactly)

@@ -18,7 +18,7 @@ from obsynth.analysis.existence.named_pencils import NamedPencil, named_pencil, 
 from obsynth.analysis.existence.numbers import COMPUTED_STATES
 from obsynth.analysis.existence.verdicts import DECIDER
 from obsynth.analysis.plant_units import PlantUnits
-from obsynth.methods.functional_filter.options import FunctionalFilterOptions
+from obsynth.methods.functional_filter.wanted_faults import chosen_faults, residual_sets
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.fault_models import Exosystem, exosystem
 from obsynth.plants.origin import origin_of
@@ -35,8 +35,7 @@ def conditions(
     exactly: bool | None = None,
 ) -> tuple[Condition, ...]:
     """Return the existence conditions, one or two for each fault asked for."""
-    asked = FunctionalFilterOptions(faults=faults, residuals=residuals)
-    sets = asked.residual_sets(plant)
+    sets = residual_sets(residuals, plant)
     if plant.nf == 0:
         return (
             Condition("faults", "the plant has a fault", False, 0.0, 1.0, _SOURCE, "there is none: give Bf or Df."),
@@ -47,7 +46,7 @@ def conditions(
     model = fault_model if given else exosystem(fault_model, plant.fault_names, plant.dt)
     return tuple(
         condition
-        for fault in asked.chosen_faults(plant)
+        for fault in chosen_faults(faults, plant)
         for condition in fault_conditions(plant, model, fault, exactly)
     )
 

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.methods.functional_filter.conditions import conditions
 from obsynth.methods.functional_filter.kalman_gain import (
     FilterModel,
     KalmanGain,
@@ -22,15 +21,15 @@ from obsynth.methods.functional_filter.kalman_gain import (
     require_noise,
     whitening,
 )
-from obsynth.methods.functional_filter.options import FunctionalFilterOptions
+from obsynth.methods.functional_filter.method import FunctionalFilter
 from obsynth.methods.functional_filter.rates import default_rates, settling_time
 from obsynth.methods.functional_filter.realisation import FilterPart, assembled, filter_part
 from obsynth.methods.functional_filter.tracking import estimate_deviations, tracking_map
-from obsynth.methods.method_spec import Synthesis
-from obsynth.methods.placement.eigenstructure import place
+from obsynth.methods.functional_filter.wanted_faults import chosen_faults, residual_sets
+from obsynth.methods.method import Synthesis
+from obsynth.methods.placement.eigenstructure import checked_poles, place
 from obsynth.methods.refusals import require_all_told
 from obsynth.methods.riccati import lyapunov_factor
-from obsynth.methods.ui_pi_observer.options import checked_poles
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import rounding_rank
 from obsynth.plants.descriptor import DescriptorSystem
@@ -42,14 +41,12 @@ from obsynth.verification.certificates import slowest_decay
 SLOW = 20.0
 
 
-def synthesise(
-    plant: DescriptorSystem, asked: FunctionalFilterOptions, *, progress: Callable[[str], None]
-) -> Synthesis:
+def synthesise(plant: DescriptorSystem, asked: FunctionalFilter, *, progress: Callable[[str], None]) -> Synthesis:
     """Design the filter; see `obsynth.functional_filter` for the options, results and errors."""
     _require_samples(plant, asked)
     model = exosystem(asked.fault_model, plant.fault_names, plant.dt)
     progress("checking the existence conditions")
-    require_all_told(conditions(plant, fault_model=asked.fault_model, faults=asked.faults, residuals=asked.residuals))
+    require_all_told(asked.existence(plant))
     noisy, notes = _with_noise(plant, asked)
     progress("taking the unknown inputs out of the plant")
     models = _models(noisy, model, asked)
@@ -76,7 +73,7 @@ def synthesise(
     )  # fmt: skip
 
 
-def _require_samples(plant: DescriptorSystem, asked: FunctionalFilterOptions) -> None:
+def _require_samples(plant: DescriptorSystem, asked: FunctionalFilter) -> None:
     late = [name for name, default in (("delay", 0), ("mean", 1)) if getattr(asked, name) != default]
     if late and not plant.dt > 0.0:
         raise SpecError(
@@ -85,7 +82,7 @@ def _require_samples(plant: DescriptorSystem, asked: FunctionalFilterOptions) ->
         )
 
 
-def _with_noise(plant: DescriptorSystem, asked: FunctionalFilterOptions) -> tuple[DescriptorSystem, tuple[str, ...]]:
+def _with_noise(plant: DescriptorSystem, asked: FunctionalFilter) -> tuple[DescriptorSystem, tuple[str, ...]]:
     """Return the plant with the noise that the gains are for."""
     given = asked.sensor_noise(plant)
     if given is None and plant.nw:
@@ -103,11 +100,11 @@ def _with_noise(plant: DescriptorSystem, asked: FunctionalFilterOptions) -> tupl
     return noisy, () if given is not None else (note,)
 
 
-def _models(plant: DescriptorSystem, model: Exosystem, asked: FunctionalFilterOptions) -> list[FilterModel]:
+def _models(plant: DescriptorSystem, model: Exosystem, asked: FunctionalFilter) -> list[FilterModel]:
     """Return a filter model for each group of faults that one filter serves."""
-    groups = sets = asked.residual_sets(plant)
+    groups = sets = residual_sets(asked.residuals, plant)
     if groups is None:
-        chosen = asked.chosen_faults(plant)
+        chosen = chosen_faults(asked.faults, plant)
         groups = [chosen] if asked.joint else [[fault] for fault in chosen]
     others = ([j for j in range(plant.nf) if j not in group] for group in groups)
     return [
@@ -117,7 +114,7 @@ def _models(plant: DescriptorSystem, model: Exosystem, asked: FunctionalFilterOp
 
 
 def _parts(
-    plant: DescriptorSystem, models: Sequence[FilterModel], asked: FunctionalFilterOptions
+    plant: DescriptorSystem, models: Sequence[FilterModel], asked: FunctionalFilter
 ) -> tuple[list[FilterPart], list[FloatArray]]:
     """Return the filters, and the walks of their fault models' states."""
     if asked.poles is not None:
@@ -133,7 +130,7 @@ def _parts(
 
 
 def _gain(
-    plant: DescriptorSystem, model: FilterModel, given: FloatArray | None, asked: FunctionalFilterOptions
+    plant: DescriptorSystem, model: FilterModel, given: FloatArray | None, asked: FunctionalFilter
 ) -> tuple[FloatArray, KalmanGain]:
     if not model.drive.shape[1]:
         return np.zeros(0), kalman_gain(model, np.zeros(0), decay=asked.decay or 0.0)
@@ -152,7 +149,7 @@ def _gain(
     return default_rates(model, settling_time(plant), lag=asked.delay)
 
 
-def _placed(plant: DescriptorSystem, models: Sequence[FilterModel], asked: FunctionalFilterOptions) -> list[FilterPart]:
+def _placed(plant: DescriptorSystem, models: Sequence[FilterModel], asked: FunctionalFilter) -> list[FilterPart]:
     """Return the filters with the poles asked for: one list, or one for each of several filters."""
     given = [asked.poles] if len(models) == 1 else list(asked.poles)
     if len(given) != len(models) or not all(isinstance(entry, (list, tuple, np.ndarray)) for entry in given):
@@ -166,7 +163,7 @@ def _placed(plant: DescriptorSystem, models: Sequence[FilterModel], asked: Funct
 
 
 def _placed_filter(
-    plant: DescriptorSystem, model: FilterModel, poles: Sequence[Any], asked: FunctionalFilterOptions
+    plant: DescriptorSystem, model: FilterModel, poles: Sequence[Any], asked: FunctionalFilter
 ) -> FilterPart:
     fixed = np.zeros(0, dtype=np.complex128)
     wanted = checked_poles(poles, len(model.A), fixed, plant.dt, of="functional-filter")
@@ -178,9 +175,9 @@ def _placed_filter(
 
 def _residual_names(
     plant: DescriptorSystem, models: Sequence[FilterModel], parts: Sequence[FilterPart],
-    asked: FunctionalFilterOptions,
+    asked: FunctionalFilter,
 ) -> list[str]:  # fmt: skip
-    sets = asked.residual_sets(plant)
+    sets = residual_sets(asked.residuals, plant)
     names = []
     for number, part in enumerate(parts):
         seen = part.faults if sets is None else sets[number]
@@ -199,7 +196,7 @@ def _walks(model: Exosystem, models: Sequence[FilterModel], rates: Sequence[Floa
 
 
 def _resolved(
-    asked: FunctionalFilterOptions, plant: DescriptorSystem, model: Exosystem, rates: Sequence[FloatArray],
+    asked: FunctionalFilter, plant: DescriptorSystem, model: Exosystem, rates: Sequence[FloatArray],
     estimated: Sequence[int],
 ) -> dict[str, Any]:  # fmt: skip
     """Return the options as plain data, for the gain set."""
@@ -211,9 +208,7 @@ def _resolved(
     return found
 
 
-def _notes(
-    plant: DescriptorSystem, asked: FunctionalFilterOptions, slowest: float, rates: Sequence[FloatArray]
-) -> list[str]:
+def _notes(plant: DescriptorSystem, asked: FunctionalFilter, slowest: float, rates: Sequence[FloatArray]) -> list[str]:
     notes = []
     unit = "per sample" if plant.dt > 0.0 else "per square root of a second"
     if asked.residuals is None and asked.fault_rate is None and asked.poles is None and asked.decay is None:

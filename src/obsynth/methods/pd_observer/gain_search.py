@@ -15,7 +15,7 @@ from obsynth.errors import InfeasibleError, SolverError
 from obsynth.methods.pd_observer.gains import PdGains, certified
 from obsynth.methods.pd_observer.inequalities import PdSolution, PdTask, solve
 from obsynth.methods.pd_observer.limits import default_delta, fastest_mode, require_possible
-from obsynth.methods.pd_observer.options import PdOptions
+from obsynth.methods.pd_observer.method import PdObserver
 from obsynth.methods.pd_observer.realisation import with_faults_as_states, with_sensor_noise
 from obsynth.methods.pd_observer.reduced_inequality import closed_form, reduced_lmi
 from obsynth.numerics.arrays import FloatArray
@@ -37,7 +37,7 @@ MANY_STATES = 100
 HIDDEN_SHARE = 0.5
 
 
-def design_gains(plant: DescriptorSystem, asked: PdOptions) -> tuple[PdGains, list[Mapping[str, Any]]]:
+def design_gains(plant: DescriptorSystem, asked: PdObserver) -> tuple[PdGains, list[Mapping[str, Any]]]:
     """Return the gains to ship and the records of all solver runs."""
     plain = gains_for(plant, asked, decay=0.0 if asked.decay is None else float(asked.decay))
     records = [plain.record]
@@ -63,7 +63,7 @@ def design_gains(plant: DescriptorSystem, asked: PdOptions) -> tuple[PdGains, li
     return plain, records
 
 
-def _faster_at_little_cost(plant: DescriptorSystem, asked: PdOptions, plain: PdGains, target: float) -> PdGains:
+def _faster_at_little_cost(plant: DescriptorSystem, asked: PdObserver, plain: PdGains, target: float) -> PdGains:
     """Return gains that decay as fast as their size allows, for many states: from the least rate upwards."""
     found = plain
     for share in sorted(DECAY_RETRIES):
@@ -76,7 +76,7 @@ def _faster_at_little_cost(plant: DescriptorSystem, asked: PdOptions, plain: PdG
     return found
 
 
-def gains_for(plant: DescriptorSystem, asked: PdOptions, *, decay: float, most: float | None = None) -> PdGains:
+def gains_for(plant: DescriptorSystem, asked: PdObserver, *, decay: float, most: float | None = None) -> PdGains:
     """Return gains of the first coordinates whose answer is proved; with a bound ``most``, of the first alone."""
     delta = default_delta(plant, asked, decay)
     require_possible(plant, asked, delta=delta, decay=decay)
@@ -97,7 +97,7 @@ def gains_for(plant: DescriptorSystem, asked: PdOptions, *, decay: float, most: 
     ) from failure
 
 
-def _advice(asked: PdOptions) -> str:
+def _advice(asked: PdObserver) -> str:
     wishes = ("decay", "disk", "gain_bound", "fault_rate_gain", "noise_gain", "adaptation_gain", "adaptation_range")
     given = [name for name in wishes if getattr(asked, name) is not None]
     if not given:
@@ -106,7 +106,7 @@ def _advice(asked: PdOptions) -> str:
 
 
 def _units(
-    plant: DescriptorSystem, asked: PdOptions, *, balanced_first: bool
+    plant: DescriptorSystem, asked: PdObserver, *, balanced_first: bool
 ) -> Iterable[tuple[FloatArray, FloatArray]]:
     """Return units of augmented states and outputs: the user's, balancing ones, those with the plant near one."""
     found = [*_candidate_units(plant, asked)]
@@ -123,7 +123,7 @@ def _units(
     return [users, *others, natural]
 
 
-def _candidate_units(plant: DescriptorSystem, asked: PdOptions) -> Iterator[tuple[FloatArray, FloatArray]]:
+def _candidate_units(plant: DescriptorSystem, asked: PdObserver) -> Iterator[tuple[FloatArray, FloatArray]]:
     n, ny = plant.nx + plant.nf, plant.ny
     yield np.ones(n), np.ones(ny)
     if asked.gain_bound is not None:
@@ -140,14 +140,14 @@ def _candidate_units(plant: DescriptorSystem, asked: PdOptions) -> Iterator[tupl
     yield columns, np.exp2(np.round(np.log2(np.where(rows > 0.0, rows, 1.0))))
 
 
-def _inner_gain(plant: DescriptorSystem, asked: PdOptions) -> FloatArray | None:
+def _inner_gain(plant: DescriptorSystem, asked: PdObserver) -> FloatArray | None:
     """Return the G to design with; a bound on the gains is on those in the loop, in the fault's own coordinates."""
     return None if asked.gain_bound is not None else asked.gain_matrix(plant.nf)
 
 
 def _solved(
     plant: DescriptorSystem,
-    asked: PdOptions,
+    asked: PdObserver,
     engine: str,
     delta: float,
     decay: float,
@@ -176,7 +176,7 @@ def _solved(
 
 
 def _task(
-    plant: DescriptorSystem, asked: PdOptions, delta: float, decay: float, states: FloatArray, outputs: FloatArray,
+    plant: DescriptorSystem, asked: PdObserver, delta: float, decay: float, states: FloatArray, outputs: FloatArray,
     unit: float,
 ) -> PdTask:  # fmt: skip
     nx, nf = plant.nx, plant.nf

@@ -17,7 +17,7 @@ from obsynth.methods.pd_observer.checks.certificate import (
     prove_symmetric_positive,
 )
 from obsynth.methods.pd_observer.inequalities import PdSolution, symmetric
-from obsynth.methods.pd_observer.options import PdOptions
+from obsynth.methods.pd_observer.method import PdObserver
 from obsynth.methods.pd_observer.realisation import realise_pd_observer, with_faults_as_states, with_sensor_noise
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import spectral_abscissa
@@ -57,7 +57,7 @@ class PdGains:
 
 
 def certified(
-    plant: DescriptorSystem, asked: PdOptions, found: PdSolution, *, delta: float, decay: float
+    plant: DescriptorSystem, asked: PdObserver, found: PdSolution, *, delta: float, decay: float
 ) -> PdGains | None:
     """Return the gains with the solver's certificate or a computed one; ``None`` without a realisation."""
     augmented = with_faults_as_states(plant)
@@ -83,7 +83,7 @@ def certified(
     return gains if gains.proved and not other.proved_in_double_precision else other
 
 
-def _gain_certificates(plant: DescriptorSystem, asked: PdOptions, gains: PdGains) -> dict[str, FloatArray] | None:
+def _gain_certificates(plant: DescriptorSystem, asked: PdObserver, gains: PdGains) -> dict[str, FloatArray] | None:
     """Return the certificates of the bounds on l2 gains that are asked for; ``None`` when one is not found."""
     observer, found = gains.observer, {}
     for option, kind in GAIN_CLAIMS.items():

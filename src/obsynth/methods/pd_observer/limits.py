@@ -8,7 +8,7 @@ import numpy as np
 
 from obsynth.analysis.structure import analyse_structure
 from obsynth.errors import InfeasibleError
-from obsynth.methods.pd_observer.options import PdOptions
+from obsynth.methods.pd_observer.method import PdObserver
 from obsynth.methods.pd_observer.realisation import with_sensor_noise
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import NEGLIGIBLE_MODE, decide_rank
@@ -36,7 +36,7 @@ def fastest_mode(a: FloatArray) -> float:
     return float(np.max(sizes[(sizes <= FAR_BEYOND * pace) | ~damped]))
 
 
-def default_delta(plant: DescriptorSystem, asked: PdOptions, decay: float) -> float:
+def default_delta(plant: DescriptorSystem, asked: PdObserver, decay: float) -> float:
     """Return the delta to use, in seconds: as asked, or the inverse of the plant's fastest mode where that serves."""
     if asked.delta is not None:
         return float(asked.delta)
@@ -54,7 +54,7 @@ def theorem_2_limit(plant: DescriptorSystem, decay: float) -> float:
     return min((4.0 * abs(mode.real + decay) / mode.imag**2 for mode in pairs), default=math.inf)
 
 
-def require_possible(plant: DescriptorSystem, asked: PdOptions, *, delta: float, decay: float) -> None:
+def require_possible(plant: DescriptorSystem, asked: PdObserver, *, delta: float, decay: float) -> None:
     """Refuse what no gains, or no solution of these inequalities, can give."""
     hidden = analyse_structure(plant).unobservable_modes
     slowest = max((mode.real for mode in hidden), default=-math.inf)

@@ -10,114 +10,10 @@ from numpy.typing import ArrayLike
 
 from obsynth.analysis.transformations.recovery import Transformation, linear_plant
 from obsynth.errors import SpecError, VerificationError
-from obsynth.methods.designing import design as design_by_method
 from obsynth.methods.designing import design_of_given_gains, failed_rows
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.delta_scan import DeltaScan
 from obsynth.results.design import ObserverDesign
-
-
-def pd_observer(
-    plant: DescriptorSystem | Transformation,
-    *,
-    theorem: int = 1,
-    delta: float | None = None,
-    decay: float | None = None,
-    disk: ArrayLike | None = None,
-    gain_bound: float | None = None,
-    fault_rate_gain: float | None = None,
-    noise_gain: float | None = None,
-    adaptation_gain: ArrayLike | None = None,
-    adaptation_range: ArrayLike | None = None,
-    delta_scan: ArrayLike | None = None,
-    engine: str = "auto",
-    solver: str = "CLARABEL",
-    name: str = "design",
-) -> ObserverDesign:
-    r"""Design a PD observer that estimates the states and the faults of a continuous-time plant.
-
-    The estimates of states and slowly varying faults converge to them from any start; what is left is the effect of
-    the rate of the faults, of noise and of unknown disturbances, which are not decoupled.
-
-    Parameters
-    ----------
-    plant : DescriptorSystem or Transformation
-        Continuous time (``dt == 0``), ``A (nx, nx)``, ``C (ny, nx)``, ``Bf (nx, nf)``; ``E`` may be singular of index
-        1 (its algebraic states are eliminated); feedthrough ``D, Df, Dd`` and noise ``Bw, Dw`` allowed.
-    theorem : {1, 2}, optional
-        2 takes a symmetric P3, which makes the proportional part of the augmented plant stable as well, and costs
-        larger gains.
-    delta : float, optional, seconds
-        Parameter of the theorem.  It decides which gains are found, not whether there are any (Theorem 1).  By default
-        the inverse of the plant's fastest mode, well-damped ones far beyond all others left aside; the engine
-        ``"riccati"`` may take less.
-    decay : float, optional, 1/seconds
-        Errors die out at least like ``exp(-decay t)``.  By default nothing is imposed when the smallest gains give a
-        tenth of the plant's fastest mode, else that rate, or as much of it as moderate gains allow; 0 imposes nothing.
-    disk : array_like, optional, 1/seconds
-        ``[c, r]``: every eigenvalue s of the error system has ``|s + c| < r``.
-    gain_bound : float, optional
-        Bound on the spectral norm of ``[J L; G M, G N]``, in the user's units.
-    fault_rate_gain : float, optional, seconds
-        Bound on the l2 gain from the rate of the faults to the fault error.
-    noise_gain : float, optional
-        Bound on the l2 gain from the noise and its derivative (per second), taken as separate inputs, to the fault
-        error; unit noise on every output where the plant states none.
-    adaptation_gain : array_like, optional, dimensionless
-        G ``(nf, nf)`` of (25), nonsingular: the loop integrates ``G (M e + N e')``, and the design is for it.
-    adaptation_range : array_like, optional, dimensionless
-        ``[low, high]``: one design that is stable for every ``G = g I`` with g in this range.
-    delta_scan : array_like, optional, seconds
-        Values of delta to try as well; what they give is in ``design.solver["delta_scan"]`` and in the report.
-    engine : {"auto", "lmi", "reduced-lmi", "riccati"}, optional
-        How the gains are found.  ``"lmi"`` solves the inequality of the theorem for the smallest gains.
-        ``"reduced-lmi"`` solves it without Y and Z, for a reduced-order observer of the states that the outputs do not
-        show, and puts gains with L = 0 around it in closed form.  ``"riccati"`` takes gains with L = 0 from a Riccati
-        equation, and their certificate from a Lyapunov equation.  The last two give stability and a decay rate alone.
-        ``"auto"`` takes the first up to 20 unknown states, or where more is asked, and the last above.  The result's
-        ``solver["engine"]`` says which ran.
-    solver : {"CLARABEL", "SCS"}, optional
-        Semidefinite solver.
-    name : str, optional
-        Name of the design.
-
-    Returns
-    -------
-    ObserverDesign
-        ``gains``: ``J, L (nx, ny)``, ``M, N (nf, ny)`` and, where asked for, ``G (nf, nf)``.  ``observer`` is the same
-        in a form without derivatives; `obsynth.sample_observer` makes it run on samples.  ``certificate.claims``:
-        ``theorem``, ``delta``, ``decay`` and the bounds asked for.
-
-    Raises
-    ------
-    SpecError
-        An option is out of range.
-    PreconditionError
-        A discrete plant, a plant that is not regular or of index 2 or more, ``nf > ny``, dependent faults, a mode that
-        neither decays nor shows in the outputs, or ``rank [A Bf; C Df] < nx + nf`` (eq. (3)): a zero at s = 0.
-    InfeasibleError
-        An unobservable mode is slower than ``decay`` or outside ``disk``; ``noise_gain`` is below what reading a
-        constant fault takes; delta cannot serve Theorem 2 or the disk.
-    SolverError
-        Nothing is known.
-    VerificationError
-        The shipped realisation fails a check.
-
-    Notes
-    -----
-    Differs from the paper: the objective (its inequalities alone give gains of 1e9), existence by detectability, G
-    inside the loop, decay rate by ``J = J' + alpha L``, further requirements, feedthrough, no derivative of y.
-
-    References
-    ----------
-    .. [Filasova] A. Filasova, D. Krokavec, V. Serbak, Application of descriptor approaches in design of PD
-       observer-based actuator fault estimation, Theorem 1, eqs. (40)-(44), and Theorem 2, eqs. (61)-(65).
-    """
-    return design_by_method(
-        plant, "pd-observer", name=name, theorem=theorem, delta=delta, decay=decay, disk=disk, gain_bound=gain_bound,
-        fault_rate_gain=fault_rate_gain, noise_gain=noise_gain, adaptation_gain=adaptation_gain,
-        adaptation_range=adaptation_range, delta_scan=delta_scan, engine=engine, solver=solver,
-    )  # fmt: skip
 
 
 def pd_observer_from_gains(
@@ -259,11 +155,11 @@ def pd_delta_scan(
     """
     from obsynth.analysis.conditions import require_all
     from obsynth.methods.pd_observer.conditions import explicit_form, pd_observer_conditions
-    from obsynth.methods.pd_observer.options import PdOptions
+    from obsynth.methods.pd_observer.method import PdObserver
     from obsynth.methods.pd_observer.synthesis import scan_delta
 
     given: dict[str, Any] = {"theorem": theorem, "decay": decay, "delta_scan": delta, "solver": solver}
-    asked = PdOptions(**given)
+    asked = PdObserver(**given)
     plant = linear_plant(plant)
     require_all(pd_observer_conditions(plant))
     form = explicit_form(plant)

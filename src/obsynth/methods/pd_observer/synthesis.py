@@ -13,15 +13,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.analysis.conditions import Condition, require_all
-from obsynth.analysis.existence.numbers import decided
+from obsynth.analysis.conditions import require_all
 from obsynth.errors import InfeasibleError, SolverError, SpecError
-from obsynth.methods.method_spec import Synthesis
+from obsynth.methods.method import Synthesis
 from obsynth.methods.pd_observer.certificate import explicit_certificate
 from obsynth.methods.pd_observer.conditions import explicit_form, pd_observer_conditions
 from obsynth.methods.pd_observer.gain_search import design_gains, gains_for
 from obsynth.methods.pd_observer.gains import PdGains
-from obsynth.methods.pd_observer.options import PdOptions, checked_adaptation_gain
+from obsynth.methods.pd_observer.method import PdObserver, checked_adaptation_gain
 from obsynth.methods.pd_observer.realisation import (
     PdErrorSystem,
     realise_pd_observer,
@@ -36,7 +35,7 @@ from obsynth.results.delta_scan import DeltaScan
 from obsynth.results.design import Certificate
 
 
-def scan_delta(plant: DescriptorSystem, asked: PdOptions, deltas: NDArray[np.float64], *, decay: float) -> DeltaScan:
+def scan_delta(plant: DescriptorSystem, asked: PdObserver, deltas: NDArray[np.float64], *, decay: float) -> DeltaScan:
     """Return what each delta gives; where it gives nothing, the reason."""
     columns = [_measured(plant, asked, float(delta), decay) for delta in deltas]
     numbers = np.array([numbers for numbers, _ in columns], dtype=np.float64).reshape(len(columns), -1)
@@ -44,7 +43,7 @@ def scan_delta(plant: DescriptorSystem, asked: PdOptions, deltas: NDArray[np.flo
     return DeltaScan.from_dict({**measured, "failures": [text for _, text in columns]})
 
 
-def _measured(plant: DescriptorSystem, asked: PdOptions, delta: float, decay: float) -> tuple[list[float], str]:
+def _measured(plant: DescriptorSystem, asked: PdObserver, delta: float, decay: float) -> tuple[list[float], str]:
     try:
         gains = gains_for(plant, replace(asked, delta=delta, decay=decay), decay=decay)
     except (InfeasibleError, SolverError) as error:
@@ -68,16 +67,10 @@ def _quantities(plant: DescriptorSystem, gains: PdGains) -> list[float]:
 WARN_AMPLIFICATION = 50.0
 
 
-def conditions(plant: DescriptorSystem, *, exactly: bool = True) -> tuple[Condition, ...]:
-    """Return the existence conditions, decided exactly or in floating point; the list ends at the first failure."""
-    with decided(exactly=exactly):
-        return pd_observer_conditions(plant)
-
-
-def synthesise(plant: DescriptorSystem, asked: PdOptions, *, progress: Callable[[str], None]) -> Synthesis:
+def synthesise(plant: DescriptorSystem, asked: PdObserver, *, progress: Callable[[str], None]) -> Synthesis:
     """Design the observer; see `obsynth.pd_observer` for the options, results and errors."""
     progress("checking the existence conditions")
-    require_all(conditions(plant))
+    require_all(pd_observer_conditions(plant))
     form = explicit_form(plant)
     work = plant if form is None else form.plant
     g = asked.gain_matrix(work.nf)
@@ -101,7 +94,7 @@ def synthesise(plant: DescriptorSystem, asked: PdOptions, *, progress: Callable[
     )
 
 
-def _resolved(asked: PdOptions, gains: PdGains, g: FloatArray | None) -> dict[str, Any]:
+def _resolved(asked: PdObserver, gains: PdGains, g: FloatArray | None) -> dict[str, Any]:
     return {
         **asked.as_given(),
         "delta": gains.asked_delta,
@@ -122,7 +115,7 @@ def listed_gains(plant: DescriptorSystem, J: FloatArray, L: FloatArray, g: Float
     return gains if g is None else {**gains, "G": g}
 
 
-def _certificate(asked: PdOptions, gains: PdGains) -> Certificate:
+def _certificate(asked: PdObserver, gains: PdGains) -> Certificate:
     claims = {"theorem": float(gains.theorem), "delta": gains.delta, "decay": gains.decay}
     bounds: dict[str, float | None] = {
         "gain_bound": asked.gain_bound, "fault_rate_gain": asked.fault_rate_gain, "noise_gain": asked.noise_gain,
@@ -137,7 +130,7 @@ def _certificate(asked: PdOptions, gains: PdGains) -> Certificate:
     return Certificate(matrices, claims)
 
 
-def notes(plant: DescriptorSystem, asked: PdOptions, gains: PdGains) -> tuple[str, ...]:
+def notes(plant: DescriptorSystem, asked: PdObserver, gains: PdGains) -> tuple[str, ...]:
     """Return what a user should know: how delta and the decay rate were chosen, slow or noisy estimates."""
     found = []
     if asked.delta is None:
@@ -156,7 +149,7 @@ def notes(plant: DescriptorSystem, asked: PdOptions, gains: PdGains) -> tuple[st
 _ENGINES = {"lmi": "the whole inequality", "reduced-lmi": "the smaller inequality", "riccati": "a Riccati equation"}
 
 
-def _engine_notes(asked: PdOptions, gains: PdGains, states: int) -> list[str]:
+def _engine_notes(asked: PdObserver, gains: PdGains, states: int) -> list[str]:
     wanted = asked.engines_for(states)[0]
     if gains.engine != wanted:
         return [
@@ -184,7 +177,7 @@ def synthesis_from_gains(
     plant: DescriptorSystem, *, gains: Mapping[str, Any], adaptation_gain: Any, decay: float
 ) -> Synthesis:
     """Return the realisation and certificate of given gains; see `obsynth.pd_observer_from_gains`."""
-    require_all(conditions(plant))
+    require_all(pd_observer_conditions(plant))
     form = explicit_form(plant)
     work = plant if form is None else form.plant
     matrices = {name: as_matrix(value, name) for name, value in gains.items()}

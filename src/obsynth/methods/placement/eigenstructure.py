@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.errors import SolverError
-from obsynth.numerics.arrays import SMALLEST, FloatArray
-from obsynth.numerics.spectra import SAME_POLE, spectrum_error
+from obsynth.errors import SolverError, SpecError
+from obsynth.numerics.arrays import SMALLEST, ComplexArray, FloatArray
+from obsynth.numerics.spectra import SAME_POLE, decay_rates, spectrum_error
 
 #: Random starts of the search, and fewer for large pairs; each step costs two Sylvester equations.
 STARTS, FEW_STARTS, LARGE = 8, 2, 20
@@ -217,3 +217,52 @@ class _Sylvester:
             linked = (linked.astype(float) @ linked.astype(float)) > 0.0
         chains = np.array([np.max(lengths[row]) for row in linked])
         return np.asarray(g / np.where(chains > 0.0, chains, 1.0))
+
+
+#: Poles given as numbers count as a conjugate pair when they agree to this, relative to their size.
+PAIR_TOLERANCE = 1e-9
+_POLES = "method.options.poles"
+
+
+def checked_poles(
+    given: Any, count: int, fixed: ComplexArray, dt: float, *, of: str = "ui-pi-observer"
+) -> list[complex]:
+    """Return the wanted poles, in exact conjugate pairs; ``of``: what they are for, in messages."""
+    listed = [as_pole(pole) for pole in given]
+    problems = []
+    if len(listed) != count:
+        kept = ", ".join(f"{complex(value):.6g}" for value in fixed)
+        besides = f" (fixed, not to be listed: {kept})" if kept else ""
+        problems.append(f"{len(listed)} are given, but {count} can be placed{besides}.")
+    rates = decay_rates(listed, dt)
+    unstable = [pole for pole, rate in zip(listed, rates, strict=True) if not rate > 0.0]
+    if unstable:
+        where = "inside the unit circle" if dt > 0.0 else "in the left half plane"
+        problems.append(f"{', '.join(f'{pole:.6g}' for pole in unstable)} would not be stable: give poles {where}.")
+    upper = [pole for pole in listed if pole.imag > 0.0]
+    lower = [pole for pole in listed if pole.imag < 0.0]
+    lonely = []
+    for pole in upper:
+        partner = next((p for p in lower if abs(p - pole.conjugate()) <= PAIR_TOLERANCE * abs(pole)), None)
+        if partner is None:
+            lonely.append(pole)
+        else:
+            lower.remove(partner)
+    lonely += lower
+    if lonely:
+        problems.append(f"{', '.join(f'{pole:.6g}' for pole in lonely)} lack their conjugates.")
+    if problems:
+        raise SpecError(f"Option poles of {of}:", path=_POLES, problems=problems)
+    real = [pole for pole in listed if pole.imag == 0.0]
+    return [*real, *(p for pole in upper for p in (pole, pole.conjugate()))]
+
+
+def as_pole(pole: Any) -> complex:
+    """Return a pole that is given as a number, or as its real and imaginary part."""
+    try:
+        value = complex(*pole) if isinstance(pole, (list, tuple, np.ndarray)) and len(pole) == 2 else complex(pole)
+    except (TypeError, ValueError):
+        raise SpecError(f"{pole!r} is no pole: give a number, or [re, im].", path=_POLES) from None
+    if isinstance(pole, (bool, str)) or not np.isfinite(value):
+        raise SpecError(f"{pole!r} is no pole: give a finite number, or [re, im].", path=_POLES)
+    return value

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from obsynth.methods.method_spec import ClaimMeaning
+from obsynth.methods.method import ClaimMeaning
 
 RECURSIVE_CLAIMS = {
     "condition": ClaimMeaning("", "largest condition number of [E_k; C_k]", "claims"),

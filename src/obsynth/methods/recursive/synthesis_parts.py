@@ -10,7 +10,7 @@ import numpy as np
 from obsynth.analysis.time_varying import WARN_CONDITION, HorizonRanks, horizon_ranks
 from obsynth.analysis.zeros import leading_names
 from obsynth.errors import PreconditionError, SpecError
-from obsynth.methods.method_spec import Synthesis
+from obsynth.methods.method import Synthesis
 from obsynth.methods.recursive.steady_filter import reached_condition
 from obsynth.numerics.ranks import covariance_factor
 from obsynth.observers.recursive.gain_schedule_summary import (

@@ -8,7 +8,7 @@ import numpy as np
 
 from obsynth.methods.placement.kalman import NOISE_PRICE
 from obsynth.methods.ui_pi_observer.conditions import Existence
-from obsynth.methods.ui_pi_observer.options import UiPiOptions
+from obsynth.methods.ui_pi_observer.method import UiPiObserver
 from obsynth.methods.ui_pi_observer.pencils import numbers
 from obsynth.methods.ui_pi_observer.placement_problem import PlacementProblem
 from obsynth.numerics.spectra import decay_rates
@@ -18,7 +18,7 @@ SLOW_DEFAULT = 1000.0
 
 
 def notes(
-    found: Existence, problem: PlacementProblem, asked: UiPiOptions, claims: Mapping[str, float]
+    found: Existence, problem: PlacementProblem, asked: UiPiObserver, claims: Mapping[str, float]
 ) -> Iterator[str]:
     """Yield notes on eliminated states, fixed poles, a slow default and digits, where these matter."""
     if found.transformation is not None:

@@ -12,20 +12,18 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.analysis.conditions import Condition
-from obsynth.analysis.existence.numbers import decided
 from obsynth.analysis.zeros import is_outside
 from obsynth.errors import PreconditionError, SolverError, SpecError
-from obsynth.methods.method_spec import Synthesis, plain
-from obsynth.methods.placement.eigenstructure import place
+from obsynth.methods.method import Synthesis, plain
+from obsynth.methods.placement.eigenstructure import checked_poles, place
 from obsynth.methods.placement.kalman import KalmanProblem, compromise
 from obsynth.methods.placement.region import Region, region_gain
 from obsynth.methods.refusals import require_all_told
 from obsynth.methods.riccati import lyapunov_factor
 from obsynth.methods.ui_pi_observer.augmented_plant import ObserverGains, combinations_seen, realise
 from obsynth.methods.ui_pi_observer.conditions import existence
+from obsynth.methods.ui_pi_observer.method import UiPiObserver
 from obsynth.methods.ui_pi_observer.notes import notes
-from obsynth.methods.ui_pi_observer.options import UiPiOptions, checked_poles
 from obsynth.methods.ui_pi_observer.pencils import number
 from obsynth.methods.ui_pi_observer.placement_problem import (
     NoiseWeights,
@@ -58,13 +56,7 @@ RADIUS_SHARE = 0.5
 SAME_AS_ASKED = 5e-5
 
 
-def conditions(plant: DescriptorSystem, *, fault_model: Any = "step", exactly: bool = True) -> tuple[Condition, ...]:
-    """Return the existence conditions, decided exactly or in floating point; several may fail."""
-    with decided(exactly=exactly):
-        return existence(plant, exosystem(fault_model, plant.fault_names, plant.dt)).conditions
-
-
-def synthesise(plant: DescriptorSystem, asked: UiPiOptions, *, progress: Callable[[str], None]) -> Synthesis:
+def synthesise(plant: DescriptorSystem, asked: UiPiObserver, *, progress: Callable[[str], None]) -> Synthesis:
     """Design the observer; see `obsynth.ui_pi_observer` for the options, results and errors."""
     model = exosystem(asked.fault_model, plant.fault_names, plant.dt)
     region = asked.checked_region(plant.dt)
@@ -118,7 +110,7 @@ def _placed(problem: PlacementProblem, wanted: Sequence[complex], objective: str
 
 
 def _chosen(
-    asked: UiPiOptions, problem: PlacementProblem, region: Region | None, weights: NoiseWeights, dt: float
+    asked: UiPiObserver, problem: PlacementProblem, region: Region | None, weights: NoiseWeights, dt: float
 ) -> _Chosen:
     split, time = problem.split, problem.units.time
     if asked.poles is not None:
@@ -148,7 +140,7 @@ def _chosen(
 
 
 def _in_region(
-    kalman: KalmanProblem, region: Region, rate: float, asked: UiPiOptions
+    kalman: KalmanProblem, region: Region, rate: float, asked: UiPiObserver
 ) -> tuple[FloatArray, dict[str, Any]]:
     """Return a gain for the region; without a decay, with that of the default: least noise alone hardly moves."""
     if asked.region.get("decay") is None:

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from obsynth.methods.functional_filter.conditions import conditions
-from obsynth.methods.functional_filter.options import FunctionalFilterOptions
 from obsynth.methods.functional_filter.tracking import estimate_deviations, wanted_faults
+from obsynth.methods.functional_filter.wanted_faults import residual_sets
 from obsynth.methods.ui_pi_observer.augmented_plant import shipped_model
 from obsynth.methods.ui_pi_observer.checks.decoupling import decoupling_norm
 from obsynth.numerics.arrays import FloatArray
@@ -62,7 +62,7 @@ def _blind_to(design: ObserverDesign) -> Iterator[tuple[str, list[int], list[str
             beside = [] if options.get("joint") else [other for other in observer.fault_names if other != name]
             yield name, [row], [*others, *beside]
         return
-    sets = FunctionalFilterOptions(residuals=options["residuals"]).residual_sets(plant) or []
+    sets = residual_sets(options["residuals"], plant) or []
     for seen in ([plant.fault_names[i] for i in indices] for indices in sets):
         label = f"{' '.join(seen)}: "
         rows = [row for row, name in enumerate(observer.residual_names) if len(sets) == 1 or name.startswith(label)]

@@ -1,33 +1,24 @@
-"""Public function of the method ``descriptor-kalman``."""
+"""The descriptor Kalman filter as a method."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar
 
-from numpy.typing import ArrayLike
-
-from obsynth.analysis.transformations.recovery import Transformation
-from obsynth.methods.designing import design
+from obsynth.analysis.conditions import Condition
+from obsynth.methods.method import ClaimMeaning, Method, PlantKind, Purpose
+from obsynth.methods.recursive import RECURSIVE_CLAIMS
+from obsynth.numerics.arguments import Positive, WrittenAs
+from obsynth.observers.outliers import Outliers
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.sequences import MatrixLike
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.results.checks import Check
 from obsynth.results.design import ObserverDesign
 
 
-def descriptor_kalman(
-    plant: DescriptorSystem | TimeVaryingDescriptorSystem | Transformation,
-    *,
-    Q: MatrixLike = None,
-    R: MatrixLike = None,
-    initial_state: ArrayLike | None = None,
-    initial_covariance: ArrayLike | None = None,
-    early_constraints: bool = False,
-    outliers: str = "none",
-    outlier_limit: float | None = None,
-    sensors: Mapping[str, Mapping[str, int]] | None = None,
-    state_bounds: Mapping[str, Sequence[float]] | ArrayLike | None = None,
-    name: str = "design",
-) -> ObserverDesign:
+@dataclass(frozen=True)
+class DescriptorKalman(Method):
     r"""Design the Kalman filter of a descriptor plant, time-varying or not.
 
     The estimate at k is the maximum-likelihood estimate of x(k) from y(1) ... y(k) and u(0) ... u(k - 1), computed by
@@ -94,8 +85,36 @@ def descriptor_kalman(
     .. [Nikoukhah1992] Kalman filtering and Riccati equations for descriptor systems, IEEE TAC 37 (9), Lemmas 2.3, 2.4.
     .. [MoussaAli2013] Fault diagnosis for linear time-varying descriptor systems, IFAC ALCOSP 2013, eqs. (5)-(13).
     """
-    return design(
-        plant, "descriptor-kalman", name=name, Q=Q, R=R, initial_state=initial_state,
-        initial_covariance=initial_covariance, early_constraints=early_constraints, outliers=outliers,
-        outlier_limit=outlier_limit, sensors=sensors, state_bounds=state_bounds,
-    )  # fmt: skip
+
+    id: ClassVar[str] = "descriptor-kalman"
+    plants: ClassVar[tuple[PlantKind, ...]] = ("time-invariant", "time-varying")
+    time: ClassVar[str] = "discrete, time-varying"
+    summary: ClassVar[str] = "states with honest deviations"
+    source: ClassVar[str] = "Nikoukhah, Willsky, Levy 1992"
+    claims: ClassVar[Mapping[str, ClaimMeaning]] = RECURSIVE_CLAIMS
+    purposes: ClassVar[frozenset[Purpose]] = frozenset({"state despite noise"})
+
+    Q: Annotated[Any, WrittenAs("varying covariance")] = None
+    R: Annotated[Any, WrittenAs("varying covariance")] = None
+    initial_state: Annotated[Any, WrittenAs("vector")] = None
+    initial_covariance: Annotated[Any, WrittenAs("covariance")] = None
+    early_constraints: bool = False
+    outliers: Outliers = "none"
+    outlier_limit: Positive | None = None
+    sensors: Annotated[Any, WrittenAs("sensor times")] = None
+    state_bounds: Annotated[Any, WrittenAs("named pairs")] = None
+
+    def existence(
+        self, plant: DescriptorSystem | TimeVaryingDescriptorSystem, *, exactly: bool = True
+    ) -> tuple[Condition, ...]:
+        """Return the existence conditions; the list ends at the first failure."""
+        from obsynth.methods.descriptor_kalman.unknown_inputs import kalman_conditions
+
+        return kalman_conditions(plant, early=self.early_constraints)
+
+    @classmethod
+    def checks(cls, design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
+        """Yield a row for each claim, from the plant and the shipped realisation alone."""
+        from obsynth.methods.recursive.checks import checks
+
+        return checks(design, printed_digits)

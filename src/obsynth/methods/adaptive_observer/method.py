@@ -1,41 +1,31 @@
-"""Public function of the method ``adaptive-observer``."""
+"""The adaptive observer as a method."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar
 
-from numpy.typing import ArrayLike
-
-from obsynth.analysis.transformations.recovery import Transformation
-from obsynth.methods.designing import design
+from obsynth.analysis.conditions import Condition
+from obsynth.methods.descriptor_kalman.method import DescriptorKalman
+from obsynth.methods.method import ClaimMeaning, PlantKind, Purpose
+from obsynth.methods.recursive import RECURSIVE_CLAIMS
+from obsynth.numerics.arguments import Count, ForgettingFactor, Probability, WrittenAs
+from obsynth.observers.recursive.settings import Form, Guard
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.sequences import MatrixLike
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
-from obsynth.results.design import ObserverDesign
+
+CLAIMS = {
+    **RECURSIVE_CLAIMS,
+    "excitation": ClaimMeaning(
+        "", "least information on the parameters in a window, per parameter unit squared", "claims"
+    ),
+    "excitation_k": ClaimMeaning("samples", "sample that ends that window", "claims"),
+}
 
 
-def adaptive_observer(
-    plant: DescriptorSystem | TimeVaryingDescriptorSystem | Transformation,
-    *,
-    Q: MatrixLike = None,
-    R: MatrixLike = None,
-    forgetting: float = 0.98,
-    form: str = "innovation",
-    guard: str | None = None,
-    random_walk: ArrayLike | None = None,
-    initial_parameters: ArrayLike | None = None,
-    initial_parameter_covariance: ArrayLike | None = None,
-    initial_state: ArrayLike | None = None,
-    initial_covariance: ArrayLike | None = None,
-    early_constraints: bool = False,
-    outliers: str = "none",
-    outlier_limit: float | None = None,
-    sensors: Mapping[str, Mapping[str, int]] | None = None,
-    state_bounds: Mapping[str, Sequence[float]] | ArrayLike | None = None,
-    window: int = 50,
-    reset: float = 0.0,
-    name: str = "design",
-) -> ObserverDesign:
+@dataclass(frozen=True)
+class AdaptiveObserver(DescriptorKalman):
     r"""Design an observer of states and parameters of a descriptor plant, time-varying or not.
 
     While the parameters are constant and excited, their estimates are unbiased and forget their start at the rate of
@@ -105,10 +95,38 @@ def adaptive_observer(
     ----------
     .. [MoussaAli2013] Fault diagnosis for linear time-varying descriptor systems, IFAC ALCOSP 2013, eqs. (17)-(26).
     """
-    return design(
-        plant, "adaptive-observer", name=name, Q=Q, R=R, forgetting=forgetting, form=form, guard=guard,
-        random_walk=random_walk, initial_parameters=initial_parameters,
-        initial_parameter_covariance=initial_parameter_covariance, initial_state=initial_state,
-        initial_covariance=initial_covariance, early_constraints=early_constraints, outliers=outliers,
-        outlier_limit=outlier_limit, sensors=sensors, state_bounds=state_bounds, window=window, reset=reset,
-    )  # fmt: skip
+
+    id: ClassVar[str] = "adaptive-observer"
+    plants: ClassVar[tuple[PlantKind, ...]] = ("time-invariant", "time-varying")
+    time: ClassVar[str] = "discrete, time-varying"
+    summary: ClassVar[str] = "states and parameters with honest deviations"
+    source: ClassVar[str] = "Moussa Ali, Zhang 2013"
+    claims: ClassVar[Mapping[str, ClaimMeaning]] = CLAIMS
+    purposes: ClassVar[frozenset[Purpose]] = frozenset({"parameters"})
+
+    forgetting: ForgettingFactor = 0.98
+    form: Form = "innovation"
+    guard: Guard | None = None
+    random_walk: Annotated[Any, WrittenAs("covariance")] = None
+    initial_parameters: Annotated[Any, WrittenAs("vector")] = None
+    initial_parameter_covariance: Annotated[Any, WrittenAs("covariance")] = None
+    window: Count = 50
+    reset: Probability = 0.0
+
+    def conflicts(self) -> Iterator[str]:
+        """Yield a sentence for each rule across options that is broken."""
+        if self.form == "random-walk" and self.random_walk is None:
+            yield "form 'random-walk' needs random_walk, the variance of one step of each parameter."
+        if self.form != "random-walk" and self.random_walk is not None:
+            yield "random_walk belongs to form 'random-walk': the other forms forget instead."
+        if self.form == "random-walk" and self.reset:
+            yield "reset belongs to the forms that forget: the random walk follows by itself."
+
+    def existence(
+        self, plant: DescriptorSystem | TimeVaryingDescriptorSystem, *, exactly: bool = True
+    ) -> tuple[Condition, ...]:
+        """Return the existence conditions; the list ends at the first failure."""
+        from obsynth.methods.recursive.conditions import recursive_conditions
+
+        literal = self.form == "literal"
+        return tuple(recursive_conditions(plant, parameters=True, literal=literal, early=self.early_constraints))

@@ -1,42 +1,33 @@
-"""Public function of the method ``dae-adaptive-observer``."""
+"""The adaptive observer of nonlinear plants as a method."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar, Literal, TypeAlias
 
-from numpy.typing import ArrayLike
-
-from obsynth.methods.designing import design
+from obsynth.analysis.conditions import Condition
+from obsynth.methods.method import ClaimMeaning, Method, PlantKind, Purpose
+from obsynth.numerics.arguments import Count, ForgettingFactor, Positive, Probability, WrittenAs
+from obsynth.observers.dae.settings import Guard, Weight
+from obsynth.observers.outliers import Outliers
 from obsynth.plants.dae.model import DAEModel
+from obsynth.results.checks import Check
 from obsynth.results.design import ObserverDesign
 
+FormChoice: TypeAlias = Literal["forgetting", "random-walk", "augmented-kalman", "auto"]
+IntegrationChoice: TypeAlias = Literal["backward-euler", "radau", "auto"]
 
-def dae_adaptive_observer(
-    plant: DAEModel,
-    *,
-    dt: float | None = None,
-    Q: ArrayLike | Mapping[str, float] | None = None,
-    R: ArrayLike | Mapping[str, float] | None = None,
-    form: str = "auto",
-    forgetting: float = 0.98,
-    guard: str = "regularise",
-    weight: str = "innovation",
-    integration: str = "auto",
-    random_walk: ArrayLike | Mapping[str, float] | None = None,
-    initial_state: ArrayLike | Mapping[str, float] | None = None,
-    initial_covariance: ArrayLike | Mapping[str, float] | None = None,
-    initial_parameters: ArrayLike | Mapping[str, float] | None = None,
-    initial_parameter_covariance: ArrayLike | Mapping[str, float] | None = None,
-    bounds: ArrayLike | Mapping[str, ArrayLike] | None = None,
-    largest_move: float | None = None,
-    window: int = 50,
-    outliers: str = "none",
-    outlier_limit: float | None = None,
-    sensors: Mapping[str, Mapping[str, int]] | None = None,
-    state_bounds: Mapping[str, Sequence[float]] | ArrayLike | None = None,
-    reset: float = 0.0,
-    name: str = "design",
-) -> ObserverDesign:
+CLAIMS = {
+    "index": ClaimMeaning("", "index of the plant", "claims"),
+    "condition": ClaimMeaning("", "largest condition number of (7) along the nominal run", "claims"),
+    "contraction": ClaimMeaning("", "spectral radius of F (I - K H) at its end", "claims"),
+    "steps": ClaimMeaning("samples", "steps of the nominal run", "claims"),
+}
+
+
+@dataclass(frozen=True)
+class DaeAdaptiveObserver(Method):
     r"""Design an observer of states and parameters of a plant ``F(x', x, u, theta) = 0``, ``y = h(x, theta)``.
 
     While the parameters are constant and excited, their estimates forget their start at the rate of the forgetting
@@ -122,11 +113,57 @@ def dae_adaptive_observer(
     .. [MoussaAliDAE2013] Adaptive observer based fault diagnosis applied to differential-algebraic systems, IFAC SSSC
        2013, eqs. (5)-(23).
     """
-    return design(
-        plant, "dae-adaptive-observer", name=name, dt=dt, Q=Q, R=R, form=form, forgetting=forgetting, guard=guard,
-        weight=weight, integration=integration, random_walk=random_walk, initial_state=initial_state,
-        initial_covariance=initial_covariance, initial_parameters=initial_parameters,
-        initial_parameter_covariance=initial_parameter_covariance, bounds=bounds, largest_move=largest_move,
-        window=window, outliers=outliers, outlier_limit=outlier_limit, sensors=sensors, state_bounds=state_bounds,
-        reset=reset,
-    )  # fmt: skip
+
+    id: ClassVar[str] = "dae-adaptive-observer"
+    plants: ClassVar[tuple[PlantKind, ...]] = ("nonlinear",)
+    time: ClassVar[str] = "discrete, nonlinear"
+    summary: ClassVar[str] = "states and parameters of nonlinear plants"
+    source: ClassVar[str] = "Moussa Ali, Zhang 2013 (differential-algebraic systems)"
+    claims: ClassVar[Mapping[str, ClaimMeaning]] = CLAIMS
+    purposes: ClassVar[frozenset[Purpose]] = frozenset({"parameters"})
+    placeholders: ClassVar[Mapping[str, Any]] = {"dt": 1.0}
+
+    dt: Positive | None = None
+    Q: Annotated[Any, WrittenAs("named covariance")] = None
+    R: Annotated[Any, WrittenAs("named covariance")] = None
+    form: FormChoice = "auto"
+    forgetting: ForgettingFactor = 0.98
+    guard: Guard = "regularise"
+    weight: Weight = "innovation"
+    integration: IntegrationChoice = "auto"
+    random_walk: Annotated[Any, WrittenAs("named covariance")] = None
+    initial_state: Annotated[Any, WrittenAs("named vector")] = None
+    initial_covariance: Annotated[Any, WrittenAs("named covariance")] = None
+    initial_parameters: Annotated[Any, WrittenAs("named vector")] = None
+    initial_parameter_covariance: Annotated[Any, WrittenAs("named covariance")] = None
+    bounds: Annotated[Any, WrittenAs("named pairs")] = None
+    largest_move: Positive | None = None
+    window: Count = 50
+    outliers: Outliers = "none"
+    outlier_limit: Positive | None = None
+    sensors: Annotated[Any, WrittenAs("sensor times")] = None
+    state_bounds: Annotated[Any, WrittenAs("named pairs")] = None
+    reset: Probability = 0.0
+
+    def conflicts(self) -> Iterator[str]:
+        """Yield a sentence for each rule across options that is broken."""
+        if self.dt is None:
+            yield "dt is missing: give the seconds between samples."
+        if self.form == "forgetting" and self.random_walk is not None:
+            yield (
+                "random_walk belongs to the forms 'random-walk' and 'augmented-kalman': form 'forgetting' forgets "
+                "instead."
+            )
+
+    def existence(self, plant: DAEModel, *, exactly: bool = True) -> tuple[Condition, ...]:
+        """Return the existence conditions; the list ends at the first failure."""
+        from obsynth.methods.dae_adaptive_observer.conditions import dae_conditions
+
+        return tuple(dae_conditions(plant, 1.0 if self.dt is None else self.dt))
+
+    @classmethod
+    def checks(cls, design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
+        """Yield a row for each claim, from the plant and the shipped realisation alone."""
+        from obsynth.methods.dae_adaptive_observer.checks import checks
+
+        return checks(design, printed_digits)

@@ -1,0 +1,166 @@
+"""The fault-estimation filter as a method."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar, Literal
+
+from annotated_types import Ge
+
+from obsynth.analysis.conditions import Condition
+from obsynth.methods.fault_estimation_filter.least_gain_proof import WITNESSES
+from obsynth.methods.method import ClaimMeaning, Method, PlantKind, Purpose
+from obsynth.numerics.arguments import FewSamples, OpenUnitInterval, Positive, WrittenAs
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.results.checks import Check
+from obsynth.results.design import ObserverDesign
+from obsynth.verification.error_system import TrackedPlant
+
+#: The least relative distance to the optimum at which a proof can be expected: less leaves no room for one.
+LEAST_MARGIN = 1e-2
+
+CLAIMS = {
+    "gamma": ClaimMeaning("", "l2 gain from the disturbance to the fault error: shipped, proved", "LMI"),
+    "gamma_min": ClaimMeaning("", "least such gain found; proved where a row says so", "least gain"),
+    "gamma_bracket_low": ClaimMeaning("", "lower end of the bisection's bracket", "claimed gains"),
+    "gamma_bracket_high": ClaimMeaning("", "upper end of the bisection's bracket", "claimed gains"),
+    "state_lag": ClaimMeaning("samples", "samples by which the state estimate lags", "unbiased: state"),
+}
+
+
+@dataclass(frozen=True)
+class FaultEstimationFilter(Method):
+    r"""Design a fault-estimation filter with a guaranteed l2 gain from the disturbance to the fault error.
+
+    Each fault estimate equals its fault delayed by its detectability index, untouched by the other faults and the
+    state; what is left is the effect of the disturbance, bounded by gamma, and of the initial error, which dies out.
+
+    Parameters
+    ----------
+    plant : DescriptorSystem or Transformation
+        Discrete time (``dt > 0``), ``E (nx, nx)``, ``C (ny, nx)``, ``Bf (nx, nf)``, ``Bd (nx, nd)``; feedthrough
+        ``D, Df, Dd`` and noise ``Bw, Dw`` allowed.
+    gamma : float, optional, dimensionless
+        Required bound on the l2 gain d -> fault error.  ``None`` ships ``1 + gamma_margin`` times the least one; where
+        the plant states noise, not less than the gain of the Kalman filter that takes d as unit white noise.
+    gamma_search : {"direct", "bisection"}, optional
+        How the least gain is found: one minimisation, or the paper's Algorithm 1 made to end.
+    gamma_margin : float, optional
+        Relative distance to the least gain that buys small gains, or little noise where the plant states noise; the
+        bare optimum is badly conditioned.
+    free_residual_weight : bool, optional
+        Whether W is free within ``W Upsilon = I``.  By default yes when the plant states noise, else no.
+    residual_weight_limit : float, optional
+        Bound on the spectral norm of W (implies a free W; not with engine "riccati").
+    S : array_like, optional
+        The paper's free matrix ``(nx, nx + ny)`` in (17); by default T is nonsingular by construction.
+    engine : {"auto", "riccati", "lmi"}, optional
+        Who finds the gains: Riccati equations alone, which serve hundreds of states; or the matrix inequality as well,
+        started from them, for the last digits of gamma and, with up to 12 states, somewhat smaller gains.  By default
+        the equations; the inequality where what they find does not keep ``residual_weight_limit``, where ``gamma``
+        is below what they found or less than 1e-4 above (up to 64 states), and where up to 12 states have no filter of
+        theirs.  The result's ``solver["engine"]`` says which ran: "riccati" also where
+        "lmi" was asked for and the gain is at a lower bound already, see ``solver["runs"]``.  The inequality is what is
+        verified in each case.
+    solver : {"auto", "SCHUR", "CLARABEL", "SCS"}, optional
+        Semidefinite solver, for the inequality and for proofs that a gamma cannot be reached.  "SCHUR" is our own
+        interior-point method for few unknowns in dense blocks, several times as fast there as Clarabel; "auto" takes
+        it, and Clarabel where it fails.
+    tolerance : float, optional
+        Relative width of the bracket at which bisection ends.
+    mean : int, optional, samples
+        Over how many samples each fault estimate is averaged; adds ``(mean - 1) // 2`` to its delay.  The gain gamma is
+        proved for the estimate before the mean, which makes no l2 norm larger.
+    model_error : {"none", "columns"}, optional
+        With "columns", for a plant with tolerances: the directions that are to blame for what the tolerances do are
+        tried as noise of several weights, and as unknown inputs where they can be told from the faults; what is shipped
+        has the smallest mean adaptive threshold over ``scenario``.  A note says what was chosen.
+    scenario : Scenario, optional
+        For ``model_error``: inputs, disturbances and noise; its faults do not count.
+    name : str, optional
+        Name of the design.
+
+    Returns
+    -------
+    ObserverDesign
+        ``gains``: ``T (nx, nx)``, ``N (nx, ny)``, ``L (nx, ny)``, ``W (nf, ny)``, ``Psi (nx, nf)``,
+        ``Upsilon (ny, nf)``, ``R (nx, ny)``, where faults with feedthrough count as further states.
+        ``certificate.claims``: ``gamma`` (proved), ``gamma_min`` (least found), ``state_lag`` (samples).
+
+    Raises
+    ------
+    SpecError
+        An option is out of range or S has the wrong shape.
+    PreconditionError
+        ``rank [E; C] < nx`` (eq. (2)), dependent outputs or faults, a fault that never shows, ``rank Upsilon < nf``
+        (Theorem 2 (i)), or an invariant zero from the faults to the outputs on or outside the unit circle.
+    InfeasibleError
+        No filter of this structure reaches ``gamma``, for this T, N and W.
+    SolverError
+        Nothing is known.
+    VerificationError
+        The shipped realisation fails a check.
+
+    Notes
+    -----
+    Differs from the paper: the sign of the second term of (48), see (60); the zero condition; gamma minimised
+    directly; a second stage for small gains; exact treatment of feedthrough; a state estimate without the fault's
+    bias.  gamma depends on the coordinates of equations and outputs when W is fixed; existence does not.
+
+    References
+    ----------
+    .. [Wang2015] Z. Wang, M. Rodrigues, D. Theilliol, Y. Shen, Fault estimation filter design for discrete-time
+       descriptor systems, IET Control Theory Appl. 9 (10), 2015, Theorem 2, eqs. (45)-(48).
+    """
+
+    id: ClassVar[str] = "fault-estimation-filter"
+    plants: ClassVar[tuple[PlantKind, ...]] = ("time-invariant",)
+    time: ClassVar[str] = "discrete"
+    summary: ClassVar[str] = "fault estimates with a bounded gain from the disturbances"
+    source: ClassVar[str] = "Wang, Rodrigues, Theilliol, Shen 2015"
+    claims: ClassVar[Mapping[str, ClaimMeaning]] = CLAIMS
+    witnesses: ClassVar[frozenset[str]] = WITNESSES | {"P_factor", "tracking", "T0"}
+    averaged: ClassVar[bool] = True
+    purposes: ClassVar[frozenset[Purpose]] = frozenset({"faults"})
+
+    gamma: Positive | None = None
+    gamma_search: Literal["direct", "bisection"] = "direct"
+    gamma_margin: Annotated[float, Ge(LEAST_MARGIN)] = 0.05
+    free_residual_weight: bool | None = None
+    residual_weight_limit: Positive | None = None
+    S: Annotated[Any, WrittenAs("matrix")] = None
+    engine: Literal["auto", "riccati", "lmi"] = "auto"
+    solver: Literal["auto", "SCHUR", "CLARABEL", "SCS"] = "auto"
+    tolerance: OpenUnitInterval = 1e-6
+    mean: Annotated[FewSamples, Ge(1)] = 1
+    model_error: Literal["none", "columns"] = "none"
+
+    def conflicts(self) -> Iterator[str]:
+        """Yield a sentence for each rule across options that is broken."""
+        if self.residual_weight_limit is not None and self.free_residual_weight is False:
+            yield "residual_weight_limit needs free_residual_weight: the weight is fixed otherwise."
+        if self.residual_weight_limit is not None and self.engine == "riccati":
+            yield "residual_weight_limit is not covered by engine 'riccati': use 'auto' or 'lmi'."
+
+    def existence(self, plant: DescriptorSystem, *, exactly: bool = True) -> tuple[Condition, ...]:
+        """Return the existence conditions, decided exactly or in floating point; the list ends at the first failure."""
+        from obsynth.analysis.existence.numbers import decided
+        from obsynth.methods.fault_estimation_filter.conditions import fault_filter_conditions
+
+        with decided(exactly=exactly):
+            return fault_filter_conditions(plant)
+
+    @classmethod
+    def checks(cls, design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
+        """Yield a row for each claim, from the plant and the shipped realisation alone."""
+        from obsynth.methods.fault_estimation_filter.checks import checks
+
+        return checks(design, printed_digits)
+
+    @classmethod
+    def error_model(cls, design: ObserverDesign) -> TrackedPlant:
+        """Return the plant with its past states as the shipped observer tracks it."""
+        from obsynth.methods.fault_estimation_filter.checks import tracked_plant
+
+        return tracked_plant(design)

@@ -1,0 +1,189 @@
+"""The functional filter as a method."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, ClassVar, Self
+
+import numpy as np
+from annotated_types import Ge
+
+from obsynth.analysis.conditions import Condition
+from obsynth.errors import SpecError
+from obsynth.methods.method import ClaimMeaning, Method, PlantKind, Purpose
+from obsynth.numerics.arguments import FewSamples, NonNegative, WrittenAs, is_finite_number
+from obsynth.numerics.arrays import FloatArray
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.results.checks import Check
+from obsynth.results.design import ObserverDesign
+from obsynth.verification.error_system import TrackedPlant
+
+_PATH = "method.options"
+
+CLAIMS = {
+    "order": ClaimMeaning("", "states of the filter", "order"),
+    "decay": ClaimMeaning("1/s", "rate of the slowest pole: every error decays at least like this in the end", "decay"),
+}
+
+
+@dataclass(frozen=True)
+class FunctionalFilter(Method):
+    r"""Design a filter that estimates the faults asked for and nothing else, or residuals that show them.
+
+    The unknown inputs are taken out of the plant first, whatever its index; on what is left, whose known inputs are u
+    and y, faults are walks of their models and a Kalman gain with correlated noise is chosen.  It exists for every
+    plant on which the fault can be told from the rest, also where no observer of the whole state does.
+
+    Parameters
+    ----------
+    plant : DescriptorSystem or Transformation
+        Either time, any index; ``C (ny, nx)``, ``Bf (nx, nf)``, ``Bd (nx, nd)``, ``D, Df, Dd`` allowed.
+    faults : sequence of str, optional
+        Faults to estimate, all by default.  The others are treated like unknown inputs: no estimate sees them.
+    joint : bool, optional
+        One filter for all faults asked for: of lower order, and less noisy, but each estimate is free of the other
+        faults only where these follow their models.  By default each is free of all others whatever their course.
+    fault_model : str, mapping or FaultModel, optional
+        How faults run, as for `ui_pi_observer`.
+    fault_rate : float or mapping of str to float, optional
+        How far each fault walks per sample (per square root of a second for ``dt == 0``), a standard deviation in the
+        fault's unit: what noise is weighed against.  By default the slowest walk that shows a step in about the
+        plant's own time; see the note of the design.
+    delay : int, optional, samples
+        Fixed lag: the estimate at k is of the fault at ``k - delay``, with what came after it taken into account.
+    mean : int, optional, samples
+        How many estimates are averaged; adds ``(mean - 1) // 2`` to the delay.
+    decay : float, optional, 1/s
+        Every error decays at this rate or faster.
+    poles : sequence, optional, 1/s (dimensionless for ``dt > 0``)
+        Poles of the filter instead of a Kalman gain, as for `ui_pi_observer`; where several filters are asked for
+        (one for each fault, or set of faults), a list of poles for each.
+    noise : float or mapping of str to float, optional
+        Standard deviation of each output that the gain is for, per sample; what the plant states by default.
+    residuals : {"detect", "isolate"} or sequence, optional
+        Only residuals, blind to the unknown inputs: one set that sees every fault, one set for each fault that is
+        blind to all others, or one for each list of faults to see.
+    name : str, optional
+        Name of the design.
+
+    Returns
+    -------
+    ObserverDesign
+        An observer without state rows; ``gains`` and the certificate hold ``T (nz, nx)`` and ``T0 (rows, nx)``, which
+        prove that neither state, nor u, nor d reaches any estimate.
+
+    Raises
+    ------
+    SpecError
+        An option is malformed, or ``delay`` or ``mean`` are asked for in continuous time.
+    PreconditionError
+        A fault cannot be told from the rest: what hides it, and which sensors would help, is said.  Or an output has
+        no stated noise.
+    SolverError
+        The Riccati equation has no usable solution, or poles could not be placed.
+    VerificationError
+        The shipped realisation fails a check.
+
+    References
+    ----------
+    .. [Frisk] E. Frisk, M. Nyberg, "A minimal polynomial basis solution to residual generation for fault diagnosis in
+       linear systems", Automatica 37, 2001: the null space.  Ours: one state-space reduction for any index, fault
+       models and walks on it, delay, and the proof by T and T0 on the shipped numbers.
+    .. [AndersonMoore] B. Anderson, J. Moore, Optimal Filtering, 1979, ch. 7: the fixed lag.
+    """
+
+    id: ClassVar[str] = "functional-filter"
+    plants: ClassVar[tuple[PlantKind, ...]] = ("time-invariant",)
+    time: ClassVar[str] = "both"
+    summary: ClassVar[str] = (
+        "the faults asked for and nothing else, untouched by any unknown input; needs not the whole state"
+    )
+    source: ClassVar[str] = "ours, after Frisk, Nyberg 2001 and Anderson, Moore 1979"
+    claims: ClassVar[Mapping[str, ClaimMeaning]] = CLAIMS
+    witnesses: ClassVar[frozenset[str]] = frozenset(
+        {"T", "T0", "Phi", "Cw", "walks", "stability", "tracking", "deviations"}
+    )
+    purposes: ClassVar[frozenset[Purpose]] = frozenset({"faults", "faults under the weakest conditions"})
+
+    faults: Annotated[Any, WrittenAs("texts")] = None
+    joint: bool = False
+    fault_model: Annotated[Any, WrittenAs("fault model")] = "step"
+    fault_rate: Annotated[Any, WrittenAs("named numbers")] = None
+    delay: FewSamples = 0
+    mean: Annotated[FewSamples, Ge(1)] = 1
+    decay: NonNegative | None = None
+    poles: Annotated[Any, WrittenAs("pole sets")] = None
+    noise: Annotated[Any, WrittenAs("named numbers")] = None
+    residuals: Annotated[Any, WrittenAs("fault sets")] = None
+
+    def conflicts(self) -> Iterator[str]:
+        """Yield a sentence for each rule across options that is broken."""
+        if self.poles is not None:
+            given = [name for name in ("fault_rate", "decay", "noise") if getattr(self, name) is not None]
+            given += ["delay"] if self.delay else []
+            if given:
+                yield f"{', '.join(given)} choose gains, and so do poles: give one."
+        if self.residuals is not None:
+            given = [name for name in ("faults", "fault_rate") if getattr(self, name) is not None]
+            late = [name for name, default in (("delay", 0), ("mean", 1)) if getattr(self, name) != default]
+            if given or late or self.joint:
+                listed = [*given, *late, *(["joint"] if self.joint else [])]
+                yield f"{', '.join(listed)} are about estimates: leave them out where only residuals are asked for."
+
+    def rates(self, plant: DescriptorSystem) -> FloatArray | None:
+        """Return the walk of each fault of the plant ``(nf,)``, or ``None`` for the default; faults left out get 0."""
+        if self.fault_rate is None:
+            return None
+        return _by_name(self.fault_rate, plant.fault_names, "fault_rate", missing=0.0)
+
+    def sensor_noise(self, plant: DescriptorSystem) -> FloatArray | None:
+        """Return the deviation of each output ``(ny,)``, or ``None`` for what the plant states."""
+        if self.noise is None:
+            return None
+        return _by_name(self.noise, plant.output_names, "noise", missing=None)
+
+    def existence(self, plant: DescriptorSystem, *, exactly: bool = True) -> tuple[Condition, ...]:
+        """Return the existence conditions, one or two for each fault asked for."""
+        from obsynth.methods.functional_filter.conditions import conditions
+
+        return conditions(
+            plant, fault_model=self.fault_model, faults=self.faults, residuals=self.residuals,
+            exactly=None if exactly else False,
+        )  # fmt: skip
+
+    def for_plant(self, plant: DescriptorSystem) -> Self:
+        """Return the method without the faults that a plant no longer has."""
+        if self.faults is None or isinstance(self.faults, str):
+            return self
+        return replace(self, faults=[name for name in self.faults if name in plant.fault_names])
+
+    @classmethod
+    def checks(cls, design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
+        """Yield a row for each claim, from the plant and the shipped realisation alone."""
+        from obsynth.methods.functional_filter.checks import checks
+
+        return checks(design, printed_digits)
+
+    @classmethod
+    def error_model(cls, design: ObserverDesign) -> TrackedPlant:
+        """Return the plant as the shipped filter tracks it: without a fault every row is to be zero."""
+        from obsynth.methods.functional_filter.checks import tracked_plant
+
+        return tracked_plant(design)
+
+
+def _by_name(given: Any, names: Sequence[str], option: str, *, missing: float | None) -> FloatArray:
+    """Return a number for each name, from one number or a mapping."""
+    path = f"{_PATH}.{option}"
+    if isinstance(given, Mapping):
+        unknown = [name for name in given if name not in names]
+        lacking = [name for name in names if name not in given]
+        if unknown or (lacking and missing is None):
+            raise SpecError(f"{option} must name {', '.join(names)}: unknown {unknown}, missing {lacking}.", path=path)
+        values = [given.get(name, missing) for name in names]
+    else:
+        values = [given] * len(names)
+    if not all(is_finite_number(value) and value >= 0.0 for value in values) or not any(values):
+        raise SpecError(f"{option} is {given!r}: give positive numbers, one for all or by name.", path=path)
+    return np.array(values, dtype=np.float64)

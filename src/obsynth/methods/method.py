@@ -1,0 +1,166 @@
+"""What a method is: one frozen class whose fields are its options; and what it hands to the pipeline."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, fields
+from functools import cache
+from importlib import import_module
+from typing import Any, ClassVar, Literal, Self, TypeAlias, get_type_hints
+
+import numpy as np
+
+from obsynth.analysis.conditions import Condition
+from obsynth.analysis.transformations.recovery import Transformation
+from obsynth.errors import SpecError
+from obsynth.numerics.arguments import problem_with
+from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.dae.observer import DAEObserver
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.fault_models import FaultModel
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.results.checks import Check
+from obsynth.results.design import Certificate, ObserverDesign
+from obsynth.verification.error_system import TrackedPlant
+
+PlantKind: TypeAlias = Literal["time-invariant", "time-varying", "nonlinear"]
+#: What the choice by default (`auto`) takes a method for.
+Purpose: TypeAlias = Literal[
+    "faults", "faults under the weakest conditions", "state despite unknown inputs", "state despite noise", "parameters"
+]
+
+
+@dataclass(frozen=True)
+class ClaimMeaning:
+    """A number that a method may claim; ``row`` checks it, or is `obsynth.verification.claims.STATED`: none can."""
+
+    unit: str  # empty: dimensionless
+    meaning: str
+    row: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Synthesis:
+    """The unverified outcome of a method."""
+
+    options: Mapping[str, Any]
+    gains: Mapping[str, FloatArray]
+    observer: LinearObserver | RecursiveObserver | DAEObserver
+    certificate: Certificate
+    solver: Mapping[str, Any] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    transformation: Transformation | None = None  # before the design, which is then for its plant, with the way back
+    # As the recursive methods see it, where given another kind; or with the noise that the design is for.
+    plant: DescriptorSystem | TimeVaryingDescriptorSystem | None = None
+
+
+@dataclass(frozen=True)
+class Method(ABC):
+    """A method: a frozen dataclass whose fields are its options.
+
+    Annotations of the fields say what each option may be.  The docstring is that of the public function: what each
+    option means, what is returned and raised, and the source.  From both follow the public function
+    (`obsynth.methods.functions`), the spec's schema and the checks of the two.  What is heavy is imported where it is
+    used.
+    """
+
+    #: Id of the method, in specs, gain sets and messages.
+    id: ClassVar[str]
+    #: Kinds of plants that it takes.
+    plants: ClassVar[tuple[PlantKind, ...]]
+    #: Continuous, discrete or both, in words; ``continuous`` alone: its designs are sampled afterwards.
+    time: ClassVar[str]
+    #: What it estimates, in a few words.
+    summary: ClassVar[str]
+    #: The paper whose letters its gains have.
+    source: ClassVar[str]
+    #: Every number that it may claim.
+    claims: ClassVar[Mapping[str, ClaimMeaning]] = {}
+    #: Matrices that its certificate may hold.
+    witnesses: ClassVar[frozenset[str]] = frozenset()
+    #: What `auto` takes it for; nothing: only who names it gets it.
+    purposes: ClassVar[frozenset[Purpose]] = frozenset()
+    #: Whether an option ``mean`` puts registers behind the observer, which the checks are not about.
+    averaged: ClassVar[bool] = False
+    #: Values of required options, for questions that do not depend on them.
+    placeholders: ClassVar[Mapping[str, Any]] = {}
+
+    def __post_init__(self) -> None:
+        kinds = option_types(type(self))
+        problems = [text for name, kind in kinds.items() if (text := problem_with(getattr(self, name), name, kind))]
+        # Rules across options presume that each of them is of its type.
+        problems = problems or list(self.conflicts())
+        if problems:
+            raise SpecError(f"Options of {self.id}:", path="method.options", problems=problems)
+
+    @classmethod
+    def of(cls, given: Mapping[str, Any]) -> Self:
+        """Return the method with these options; raise `SpecError` for unknown names, wrong types and broken rules."""
+        unknown = sorted(set(given) - set(option_types(cls)))
+        if unknown:
+            listed = ", ".join(sorted(option_types(cls)))
+            raise SpecError(
+                f"{cls.id} has no option {', '.join(map(repr, unknown))}; there are: {listed}.", path="method.options"
+            )
+        return cls(**given)
+
+    def conflicts(self) -> Iterator[str]:
+        """Yield a sentence for each rule across options that is broken."""
+        yield from ()
+
+    @abstractmethod
+    def existence(self, plant: Any, *, exactly: bool = True) -> tuple[Condition, ...]:
+        """Return the existence conditions of a plant, with these options, decided exactly or in floating point."""
+
+    def for_plant(self, plant: DescriptorSystem) -> Self:
+        """Return the method without what a plant of fewer faults makes void."""
+        return self
+
+    def synthesise(self, plant: Any, *, progress: Callable[[str], None]) -> Synthesis:
+        """Return gains, observer and certificate, not yet verified.
+
+        By default what the function ``synthesise(plant, method, progress=)`` of the module ``synthesis`` in the
+        method's own package returns: heavy, and imported only here.
+        """
+        package = type(self).__module__.rpartition(".")[0]
+        found: Synthesis = import_module(f"{package}.synthesis").synthesise(plant, self, progress=progress)
+        return found
+
+    @classmethod
+    @abstractmethod
+    def checks(cls, design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
+        """Yield a row for each claim, from the plant and the shipped realisation alone."""
+
+    @classmethod
+    def error_model(cls, design: ObserverDesign) -> TrackedPlant | None:
+        """Return the plant as the shipped observer tracks it; ``None`` where it is no linear observer."""
+        return None
+
+    def as_given(self) -> dict[str, Any]:
+        """Return every option by name."""
+        return {option.name: getattr(self, option.name) for option in fields(self)}
+
+    def as_plain(self) -> dict[str, Any]:
+        """Return every option by name, as lists, mappings, numbers and texts."""
+        return {name: plain(value) for name, value in self.as_given().items()}
+
+
+def plain(value: Any) -> Any:
+    """Return an option as lists, mappings and numbers."""
+    if isinstance(value, FaultModel):
+        return {"Phi": value.Phi.tolist(), "Cw": value.Cw.tolist()}
+    if isinstance(value, Mapping):
+        return {str(key): plain(part) for key, part in value.items()}
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    return [plain(part) for part in value] if isinstance(value, (list, tuple)) else value
+
+
+@cache
+def option_types(method: type[Method]) -> dict[str, Any]:
+    """Return name -> annotated type of every option."""
+    hints = get_type_hints(method, include_extras=True)
+    return {option.name: hints[option.name] for option in fields(method)}

@@ -1,0 +1,255 @@
+"""The PD observer as a method."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar, Literal
+
+import numpy as np
+
+from obsynth.analysis.conditions import Condition
+from obsynth.errors import SpecError
+from obsynth.methods.method import ClaimMeaning, Method, PlantKind, Purpose
+from obsynth.numerics.arguments import NonNegative, Positive, WrittenAs
+from obsynth.numerics.arrays import FloatArray, as_matrix
+from obsynth.numerics.ranks import decide_rank
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.results.checks import Check
+from obsynth.results.design import ObserverDesign
+from obsynth.verification.error_system import TrackedPlant
+
+#: Engines for stability and a decay rate alone.
+ENGINES_OF_STABILITY = ("reduced-lmi", "riccati")
+#: Up to so many unknown states "auto" takes the first (a second or two); up to so many it tries the second where the
+#: third does not serve.
+MOST_STATES_FOR_LMI = 20
+MOST_STATES_FOR_REDUCED_LMI = 50
+
+CLAIMS = {
+    "theorem": ClaimMeaning("", "theorem whose inequality is proved", "LMI"),
+    "delta": ClaimMeaning("s", "the theorem's parameter in the certificate", "LMI"),
+    "decay": ClaimMeaning("1/s", "rate at which errors die out: imposed, proved (0: stability alone)", "LMI"),
+    "disk_centre": ClaimMeaning("1/s", "c of the disk |s + c| < r that holds every eigenvalue", "disk"),
+    "disk_radius": ClaimMeaning("1/s", "r of that disk", "disk"),
+    "gain_bound": ClaimMeaning("", "bound on the norm of the gains", "gain bound"),
+    "fault_rate_gain": ClaimMeaning(
+        "s", "bound on the l2 gain from the rate of the faults to the fault error: proved", "LMI, rate"
+    ),
+    "noise_gain": ClaimMeaning(
+        "", "bound on the l2 gain from noise and its derivative to the fault error: proved", "LMI, noise"
+    ),
+    "adaptation_low": ClaimMeaning("", "stable for every adaptation gain from here, proved", "adaptation range"),
+    "adaptation_high": ClaimMeaning("", "to here", "adaptation range"),
+}
+
+
+@dataclass(frozen=True)
+class PdObserver(Method):
+    r"""Design a PD observer that estimates the states and the faults of a continuous-time plant.
+
+    The estimates of states and slowly varying faults converge to them from any start; what is left is the effect of
+    the rate of the faults, of noise and of unknown disturbances, which are not decoupled.
+
+    Parameters
+    ----------
+    plant : DescriptorSystem or Transformation
+        Continuous time (``dt == 0``), ``A (nx, nx)``, ``C (ny, nx)``, ``Bf (nx, nf)``; ``E`` may be singular of index
+        1 (its algebraic states are eliminated); feedthrough ``D, Df, Dd`` and noise ``Bw, Dw`` allowed.
+    theorem : {1, 2}, optional
+        2 takes a symmetric P3, which makes the proportional part of the augmented plant stable as well, and costs
+        larger gains.
+    delta : float, optional, seconds
+        Parameter of the theorem.  It decides which gains are found, not whether there are any (Theorem 1).  By default
+        the inverse of the plant's fastest mode, well-damped ones far beyond all others left aside; the engine
+        ``"riccati"`` may take less.
+    decay : float, optional, 1/seconds
+        Errors die out at least like ``exp(-decay t)``.  By default nothing is imposed when the smallest gains give a
+        tenth of the plant's fastest mode, else that rate, or as much of it as moderate gains allow; 0 imposes nothing.
+    disk : array_like, optional, 1/seconds
+        ``[c, r]``: every eigenvalue s of the error system has ``|s + c| < r``.
+    gain_bound : float, optional
+        Bound on the spectral norm of ``[J L; G M, G N]``, in the user's units.
+    fault_rate_gain : float, optional, seconds
+        Bound on the l2 gain from the rate of the faults to the fault error.
+    noise_gain : float, optional
+        Bound on the l2 gain from the noise and its derivative (per second), taken as separate inputs, to the fault
+        error; unit noise on every output where the plant states none.
+    adaptation_gain : array_like, optional, dimensionless
+        G ``(nf, nf)`` of (25), nonsingular: the loop integrates ``G (M e + N e')``, and the design is for it.
+    adaptation_range : array_like, optional, dimensionless
+        ``[low, high]``: one design that is stable for every ``G = g I`` with g in this range.
+    delta_scan : array_like, optional, seconds
+        Values of delta to try as well; what they give is in ``design.solver["delta_scan"]`` and in the report.
+    engine : {"auto", "lmi", "reduced-lmi", "riccati"}, optional
+        How the gains are found.  ``"lmi"`` solves the inequality of the theorem for the smallest gains.
+        ``"reduced-lmi"`` solves it without Y and Z, for a reduced-order observer of the states that the outputs do not
+        show, and puts gains with L = 0 around it in closed form.  ``"riccati"`` takes gains with L = 0 from a Riccati
+        equation, and their certificate from a Lyapunov equation.  The last two give stability and a decay rate alone.
+        ``"auto"`` takes the first up to 20 unknown states, or where more is asked, and the last above.  The result's
+        ``solver["engine"]`` says which ran.
+    solver : {"CLARABEL", "SCS"}, optional
+        Semidefinite solver.
+    name : str, optional
+        Name of the design.
+
+    Returns
+    -------
+    ObserverDesign
+        ``gains``: ``J, L (nx, ny)``, ``M, N (nf, ny)`` and, where asked for, ``G (nf, nf)``.  ``observer`` is the same
+        in a form without derivatives; `obsynth.sample_observer` makes it run on samples.  ``certificate.claims``:
+        ``theorem``, ``delta``, ``decay`` and the bounds asked for.
+
+    Raises
+    ------
+    SpecError
+        An option is out of range.
+    PreconditionError
+        A discrete plant, a plant that is not regular or of index 2 or more, ``nf > ny``, dependent faults, a mode that
+        neither decays nor shows in the outputs, or ``rank [A Bf; C Df] < nx + nf`` (eq. (3)): a zero at s = 0.
+    InfeasibleError
+        An unobservable mode is slower than ``decay`` or outside ``disk``; ``noise_gain`` is below what reading a
+        constant fault takes; delta cannot serve Theorem 2 or the disk.
+    SolverError
+        Nothing is known.
+    VerificationError
+        The shipped realisation fails a check.
+
+    Notes
+    -----
+    Differs from the paper: the objective (its inequalities alone give gains of 1e9), existence by detectability, G
+    inside the loop, decay rate by ``J = J' + alpha L``, further requirements, feedthrough, no derivative of y.
+
+    References
+    ----------
+    .. [Filasova] A. Filasova, D. Krokavec, V. Serbak, Application of descriptor approaches in design of PD
+       observer-based actuator fault estimation, Theorem 1, eqs. (40)-(44), and Theorem 2, eqs. (61)-(65).
+    """
+
+    id: ClassVar[str] = "pd-observer"
+    plants: ClassVar[tuple[PlantKind, ...]] = ("time-invariant",)
+    time: ClassVar[str] = "continuous"
+    summary: ClassVar[str] = "states and faults by proportional and derivative action, no derivative taken"
+    source: ClassVar[str] = "Filasova, Krokavec, Serbak"
+    claims: ClassVar[Mapping[str, ClaimMeaning]] = CLAIMS
+    witnesses: ClassVar[frozenset[str]] = frozenset({"P1", "P3", "P_rate", "P_noise", "P1_low", "P1_high", "T0"})
+    purposes: ClassVar[frozenset[Purpose]] = frozenset({"faults"})
+
+    theorem: Literal[1, 2] = 1
+    delta: Positive | None = None
+    decay: NonNegative | None = None
+    disk: Annotated[Any, WrittenAs("pair")] = None
+    gain_bound: Positive | None = None
+    fault_rate_gain: Positive | None = None
+    noise_gain: Positive | None = None
+    adaptation_gain: Annotated[Any, WrittenAs("matrix")] = None
+    adaptation_range: Annotated[Any, WrittenAs("pair")] = None
+    delta_scan: Annotated[Any, WrittenAs("positive numbers")] = None
+    engine: Literal["auto", "lmi", "reduced-lmi", "riccati"] = "auto"
+    solver: Literal["CLARABEL", "SCS"] = "CLARABEL"
+
+    def conflicts(self) -> Iterator[str]:
+        """Yield a sentence for each rule across options, or for lists of numbers, that is broken."""
+        if self.engine in ENGINES_OF_STABILITY and self.further:
+            yield (
+                f"engine {self.engine!r} gives stability and a decay rate alone: take engine 'lmi', or leave out "
+                f"{', '.join(self.further)}."
+            )
+        yield from self._broken_lists()
+        others = ("disk", "gain_bound", "fault_rate_gain", "noise_gain", "adaptation_gain")
+        clash = [name for name in others if getattr(self, name) is not None]
+        if self.adaptation_range is not None and clash:
+            yield f"adaptation_range cannot be combined with {', '.join(clash)}."
+
+    def _broken_lists(self) -> Iterator[str]:
+        wanted = {"disk": 2, "adaptation_range": 2, "delta_scan": None}
+        found = {name: _numbers(getattr(self, name), count) for name, count in wanted.items()}
+        for name, numbers in found.items():
+            if getattr(self, name) is not None and numbers is None:
+                count = wanted[name] or "one number or more"
+                yield f"{name} is {getattr(self, name)!r}: give a list of {count}{' numbers' if wanted[name] else ''}."
+        disk, low_high, scanned = found["disk"], found["adaptation_range"], found["delta_scan"]
+        if disk is not None and not disk[1] > max(-disk[0], 0.0):
+            yield f"disk is {disk}: give [c, r] for |s + c| < r, with r > 0 and part of the disk left of the axis."
+        if low_high is not None and not 0.0 < low_high[0] < low_high[1]:
+            yield f"adaptation_range is {low_high}: give [low, high] with 0 < low < high."
+        if scanned is not None and not all(value > 0.0 for value in scanned):
+            yield f"delta_scan is {scanned}: give positive numbers of seconds."
+
+    @property
+    def further(self) -> tuple[str, ...]:
+        """What is asked besides stability and a decay rate: the whole inequality alone can give it."""
+        names = ("disk", "gain_bound", "fault_rate_gain", "noise_gain", "adaptation_range")
+        return tuple(name for name in names if getattr(self, name) is not None)
+
+    def engines_for(self, states: int) -> tuple[str, ...]:
+        """Return the engine for this many unknown states (of plant and faults), and those to take if it fails."""
+        if self.further or self.engine == "lmi" or (self.engine == "auto" and states <= MOST_STATES_FOR_LMI):
+            return ("lmi",) if self.further else ("lmi", "riccati")
+        if self.engine == "auto":
+            return ("riccati", "reduced-lmi") if states <= MOST_STATES_FOR_REDUCED_LMI else ("riccati",)
+        return (self.engine,) if self.engine == "riccati" else (self.engine, "riccati")
+
+    @property
+    def disk_numbers(self) -> tuple[float, float] | None:
+        """Centre c and radius r as plain numbers."""
+        return None if self.disk is None else (float(self.disk[0]), float(self.disk[1]))
+
+    @property
+    def range_numbers(self) -> tuple[float, float] | None:
+        """Ends of the range of adaptation gains as plain numbers."""
+        if self.adaptation_range is None:
+            return None
+        return float(self.adaptation_range[0]), float(self.adaptation_range[1])
+
+    def gain_matrix(self, nf: int) -> FloatArray | None:
+        """Return G ``(nf, nf)``, nonsingular; ``None`` when none is asked for."""
+        return None if self.adaptation_gain is None else checked_adaptation_gain(self.adaptation_gain, nf)
+
+    def existence(self, plant: DescriptorSystem, *, exactly: bool = True) -> tuple[Condition, ...]:
+        """Return the existence conditions, decided exactly or in floating point; the list ends at the first failure."""
+        from obsynth.analysis.existence.numbers import decided
+        from obsynth.methods.pd_observer.conditions import pd_observer_conditions
+
+        with decided(exactly=exactly):
+            return pd_observer_conditions(plant)
+
+    @classmethod
+    def checks(cls, design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
+        """Yield a row for each claim, from the plant and the shipped realisation alone."""
+        from obsynth.methods.pd_observer.checks import checks
+
+        return checks(design, printed_digits)
+
+    @classmethod
+    def error_model(cls, design: ObserverDesign) -> TrackedPlant:
+        """Return the plant with its faults as states as the shipped observer tracks it."""
+        from obsynth.methods.pd_observer.checks import tracked_plant
+
+        return tracked_plant(design)
+
+
+def _numbers(value: Any, count: int | None) -> tuple[float, ...] | None:
+    """Return a list of numbers as floats; ``None`` where it is none, or not of this length."""
+    if value is None:
+        return None
+    try:
+        row = as_matrix(np.atleast_2d(np.asarray(value)), "option")
+    except (SpecError, ValueError):
+        return None
+    fits = row.shape[0] == 1 and row.size > 0 and (count is None or row.size == count)
+    return tuple(map(float, row[0])) if fits else None
+
+
+def checked_adaptation_gain(value: Any, nf: int) -> FloatArray:
+    """Return G as a matrix ``(nf, nf)``; raise `SpecError` when it has another shape or is singular."""
+    matrix = as_matrix(value, "adaptation_gain")
+    if matrix.shape == (1, 1) and nf != 1:
+        matrix = float(matrix[0, 0]) * np.eye(nf)
+    if matrix.shape != (nf, nf) or not decide_rank(matrix, expected=nf).full:
+        raise SpecError(
+            f"adaptation_gain is {matrix.shape[0]} by {matrix.shape[1]}: give a nonsingular matrix {nf} by {nf}, or "
+            "one number.",
+            path="method.options.adaptation_gain",
+        )
+    return matrix

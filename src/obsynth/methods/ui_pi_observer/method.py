@@ -1,0 +1,246 @@
+"""The unknown-input PI observer as a method."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+
+import numpy as np
+
+from obsynth.analysis.conditions import Condition
+from obsynth.errors import SpecError
+from obsynth.methods.method import ClaimMeaning, Method, PlantKind, Purpose
+from obsynth.numerics.arguments import NonNegative, Positive, WrittenAs, problem_with
+from obsynth.numerics.spectra import decay_rates
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.fault_models import Exosystem, exosystem
+from obsynth.results.checks import Check
+from obsynth.results.design import ObserverDesign
+from obsynth.verification.claims import STATED
+from obsynth.verification.error_system import TrackedPlant
+
+if TYPE_CHECKING:
+    from obsynth.methods.placement.region import Region
+    from obsynth.methods.ui_pi_observer.placement_problem import NoiseWeights
+
+_PATH = "method.options"
+
+CLAIMS = {
+    "decay": ClaimMeaning("1/s", "rate of the slowest pole: every error decays at least like this in the end", "decay"),
+    "noise_amplification": ClaimMeaning(
+        "", "H2 norm from unit white noise on every output to the noisiest fault estimate", "noise amplification"
+    ),
+    "noise_price": ClaimMeaning(
+        "", "noise of the fault estimates against the quietest Kalman filter of the same plant", STATED
+    ),
+    "digits": ClaimMeaning(
+        "",
+        "significant digits in which Ahat has to be kept, where more than 9 are needed",
+        "stable with the claimed digits",
+    ),
+    "condition": ClaimMeaning("", "condition number of the (generalised) eigenvectors", STATED),
+}
+
+
+@dataclass(frozen=True)
+class UiPiObserver(Method):
+    r"""Design an unknown-input PI observer: state and faults, untouched by any unknown input.
+
+    The estimates converge to the state and to every fault that follows its model, whatever the unknown inputs do.
+    Without poles, decay or region: the fastest Kalman gain, up to the median speed of the plant's own modes, that
+    costs no fault estimate more than ten times the noise of the quietest one.  The units of the data play no role: they
+    are chosen by the plant itself, and undone in the gains.
+
+    Parameters
+    ----------
+    plant : DescriptorSystem or Transformation
+        Either time, ``E (nx, nx)``, ``C (ny, nx)``, ``Bf (nx, nf)``, ``Bd (nx, nd)``, ``Df, Dd, D`` allowed; it need
+        be neither regular nor of index 1.
+    fault_model : str, mapping or FaultModel, optional
+        How faults run: ``"step"``, ``"ramp"``, ``"parabola"``, ``{"polynomial": order}``, ``{"sinusoid": rad/s}``,
+        ``{"exponential": 1/s}``, ``{"Phi": ..., "Cw": ...}``, ``{"sum": [...]}``; one for all, or by fault name.
+    poles : sequence, optional, 1/s (dimensionless for ``dt > 0``)
+        Movable poles: numbers, complex numbers or ``[re, im]``; any multiplicity.  Fixed ones are not listed.
+    decay : float, optional, 1/s
+        A Kalman gain all of whose movable poles decay at this rate or faster; 0 is the plain Kalman gain.
+    region : mapping, optional
+        ``decay`` (1/s), ``radius`` (1/s), ``damping`` (ratio): movable poles by a matrix inequality, with little noise;
+        where there are many (20), those that a Kalman gain of this rate has inside already stay there.  Without
+        ``decay``: that of the default, where it can be had (at most half the radius).
+    noise : mapping, optional
+        Weights of the Kalman gain: ``measurement`` (standard deviation: one, a list, or by output; the plant's own
+        noise by default), ``process`` and ``fault`` (drive of states and fault models, relative to the default,
+        dimensionless).
+    objective : {"conditioning", "gain"}, optional
+        What to make of the freedom that ``poles`` leaves.
+    joint : bool, optional
+        Design K and the free part of the decoupling (the paper's G) together; the fault estimates may then see the
+        outputs directly.
+    E_sharp, C_sharp, G : array_like, optional
+        The paper's ``(nx, nx)``, ``(nx, ny)``, ``(nx, ny)`` of (10), (11), instead of our decoupling.
+    solver : {"CLARABEL", "SCS"}, optional
+        Semidefinite solver, for ``region``.
+    name : str, optional
+        Name of the design.
+
+    Returns
+    -------
+    ObserverDesign
+        ``gains``: ``U_a, D_a, K_a, Ahat, Bhat, Jhat`` of the augmented plant, ``Phi, Cw`` of the fault model and,
+        unless ``joint``, ``U (nx, nx)``, ``D (nx, ny)``, ``K (nx, ny)``, ``F (nw, ny)``, ``Hhat (nx, nf)``.  Where
+        algebraic states had to be eliminated, ``plant`` is the plant without them and ``recovery`` the way back.
+
+    Raises
+    ------
+    SpecError
+        A malformed option or fault model, or one too fast for the samples; poles of the wrong count, not stable, or
+        not closed under conjugation.
+    PreconditionError
+        (D1), (D2) or (D3) fails: the eigenvalue, and the fault and disturbance that mask each other, are named.
+    SolverError
+        Poles could not be placed, or the solver found nothing: nothing is known.
+    VerificationError
+        The shipped realisation fails a check.
+
+    Notes
+    -----
+    Differs from the paper: existence by (D1)-(D3), as Theorems 1 and 2 and Lemma 6 are false as printed; vector
+    faults; faults and disturbances in outputs; a U of full rank by construction; fixed modes kept and named; repeated
+    poles by Jordan chains; the defaults.
+
+    References
+    ----------
+    .. [SharePasand] M. M. Share Pasand, M. Aliyari Sh., H. D. Taghirad, Unknown Input-Proportional Integral Observer
+       for Singular Systems: Application to fault detection, eqs. (4), (13), (19), procedures 1 and 2.
+    """
+
+    id: ClassVar[str] = "ui-pi-observer"
+    plants: ClassVar[tuple[PlantKind, ...]] = ("time-invariant",)
+    time: ClassVar[str] = "both"
+    summary: ClassVar[str] = "state and faults untouched by any unknown input"
+    source: ClassVar[str] = "Share Pasand, Aliyari, Taghirad"
+    claims: ClassVar[Mapping[str, ClaimMeaning]] = CLAIMS
+    witnesses: ClassVar[frozenset[str]] = frozenset({"tracking", "Phi", "Cw", "poles", "stability", "T0"})
+    purposes: ClassVar[frozenset[Purpose]] = frozenset({"faults", "state despite unknown inputs"})
+
+    fault_model: Annotated[Any, WrittenAs("fault model")] = "step"
+    poles: Annotated[Any, WrittenAs("poles")] = None
+    decay: NonNegative | None = None
+    region: Annotated[Any, WrittenAs("pole region")] = None
+    noise: Annotated[Any, WrittenAs("noise weights")] = None
+    objective: Literal["conditioning", "gain"] = "conditioning"
+    joint: bool = False
+    E_sharp: Annotated[Any, WrittenAs("matrix")] = None
+    C_sharp: Annotated[Any, WrittenAs("matrix")] = None
+    G: Annotated[Any, WrittenAs("matrix")] = None
+    solver: Literal["CLARABEL", "SCS"] = "CLARABEL"
+
+    def conflicts(self) -> Iterator[str]:
+        """Yield a sentence for each rule across options that is broken."""
+        ways = [name for name in ("poles", "decay", "region") if getattr(self, name) is not None]
+        if len(ways) > 1:
+            yield f"{' and '.join(ways)} are given: use one of them."
+        if self.poles is not None and self.noise is not None:
+            yield "noise weights do not act on given poles: leave one of the two out."
+        given = [getattr(self, name) is not None for name in ("E_sharp", "C_sharp", "G")]
+        if any(given) and not all(given):
+            yield "E_sharp, C_sharp and G come together: give all three, or none."
+        if any(given) and self.joint:
+            yield "joint designs what E_sharp, C_sharp and G would fix: leave one of the two out."
+
+    def given_decoupling(self) -> dict[str, Any] | None:
+        """Return the paper's matrices, or ``None`` for our own decoupling."""
+        if self.G is None:
+            return None
+        return {"E_sharp": self.E_sharp, "C_sharp": self.C_sharp, "G": self.G}
+
+    def checked_region(self, dt: float) -> Region | None:
+        """Return the region asked for."""
+        from obsynth.methods.placement.region import Region
+
+        if self.region is None:
+            return None
+        if not isinstance(self.region, Mapping):
+            raise SpecError(f"region is {self.region!r}: give decay, radius, damping by name.", path=f"{_PATH}.region")
+        return Region.of({key: value for key, value in self.region.items() if value is not None}, dt)
+
+    def checked_noise(self, output_names: Sequence[str]) -> NoiseWeights:
+        """Return the noise weights asked for."""
+        from obsynth.methods.ui_pi_observer.placement_problem import NoiseWeights
+
+        if self.noise is None:
+            return NoiseWeights()
+        if not isinstance(self.noise, Mapping):
+            message = f"noise is {self.noise!r}: give measurement, process, fault by name."
+            raise SpecError(message, path=f"{_PATH}.noise")
+        given = {key: value for key, value in self.noise.items() if value is not None}
+        problems = [f"unknown key {key!r}." for key in given if key not in ("measurement", "process", "fault")]
+        sizes = {key: given[key] for key in ("process", "fault") if key in given}
+        problems += [text for key, size in sizes.items() if (text := problem_with(size, key, Positive))]
+        measurement = given.get("measurement")
+        if isinstance(measurement, (list, tuple, np.ndarray)):
+            if np.shape(measurement) != (len(output_names),):
+                problems.append(f"measurement has shape {np.shape(measurement)}: give one number for each output.")
+                measurement = None
+            else:
+                measurement = given["measurement"] = dict(zip(output_names, measurement, strict=True))
+        if isinstance(measurement, Mapping):
+            missing = [name for name in output_names if name not in measurement]
+            unknown = [name for name in measurement if name not in output_names]
+            if missing or unknown:
+                problems.append(f"measurement must name each output once: missing {missing}, unknown {unknown}.")
+            values = list(measurement.values())
+        else:
+            values = [] if measurement is None else [measurement]
+        if any(problem_with(value, "measurement", Positive) for value in values):
+            problems.append("measurement must be positive standard deviations: one number, a list, or by output.")
+        if problems:
+            raise SpecError("Option noise of ui-pi-observer:", path=f"{_PATH}.noise", problems=problems)
+        return NoiseWeights(**given)
+
+    def slowest_asked(self, dt: float) -> float | None:
+        """Return the least rate of decay that was asked for, in 1/s."""
+        from obsynth.methods.placement.eigenstructure import as_pole
+
+        if self.decay is not None:
+            return self.decay
+        if isinstance(self.region, Mapping):
+            return float(self.region.get("decay") or 0.0)
+        if self.poles is not None:
+            return float(np.min(decay_rates([as_pole(pole) for pole in self.poles], dt), initial=np.inf))
+        return None
+
+    def resolved(self, model: Exosystem, fault_names: Sequence[str]) -> dict[str, Any]:
+        """Return the options as plain data, for the gain set."""
+        from obsynth.methods.placement.eigenstructure import as_pole
+
+        listed = None if self.poles is None else [as_pole(pole) for pole in self.poles]
+        return {
+            "fault_model": None,
+            "fault_model_in_words": dict(zip(fault_names, model.descriptions, strict=True)),
+            **self.as_plain(),
+            "poles": None if listed is None else [[pole.real, pole.imag] for pole in listed],
+        }
+
+    def existence(self, plant: DescriptorSystem, *, exactly: bool = True) -> tuple[Condition, ...]:
+        """Return the existence conditions, decided exactly or in floating point; several may fail."""
+        from obsynth.analysis.existence.numbers import decided
+        from obsynth.methods.ui_pi_observer.conditions import existence
+
+        with decided(exactly=exactly):
+            return existence(plant, exosystem(self.fault_model, plant.fault_names, plant.dt)).conditions
+
+    @classmethod
+    def checks(cls, design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
+        """Yield a row for each claim, from the plant and the shipped realisation alone."""
+        from obsynth.methods.ui_pi_observer.checks import checks
+
+        return checks(design, printed_digits)
+
+    @classmethod
+    def error_model(cls, design: ObserverDesign) -> TrackedPlant:
+        """Return the plant with the fault model as the shipped observer tracks it, decoupled from the disturbances."""
+        from obsynth.methods.ui_pi_observer.checks import tracked_plant
+
+        return tracked_plant(design)
