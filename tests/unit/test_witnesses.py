@@ -23,6 +23,7 @@ from obsynth import (
     functional_filter,
 )
 from obsynth.analysis.conditions import Condition
+from obsynth.analysis.existence import named_pencils
 from obsynth.analysis.existence.witnesses import EntryChange, Unclear, Witness, rational_matrices
 from obsynth.methods.fault_estimation_filter.conditions import fault_filter_conditions
 from obsynth.methods.functional_filter.conditions import conditions as functional_conditions
@@ -247,3 +248,13 @@ def test_a_witness_is_named_entry_by_entry() -> None:
     # As it was written: 1.0000000000000004.
     assert abs(change.after - before) == Fraction("4e-16")
     assert f"entry ({change.row + 1}, {change.column + 1}) of C (output 'y" in condition.detail
+
+
+@pytest.mark.parametrize("inside", [complex(0.6, 0.8) * (1.0 - 1e-9), complex(0.3, 0.4), complex(-0.2, 0.1)])
+def test_a_point_inside_the_circle_is_stretched_onto_it_at_once(inside):
+    # By one exact stretch: not by steps of the last digit, which never end for a point that is not near.
+    for digits in (3, 8, 11):
+        real, imaginary = named_pencils._placed(inside, digits, 0.1)
+        assert 1 <= real * real + imaginary * imaginary <= 1 + Fraction(10, 10**digits)
+        # The direction is that of the point, whose parts are rounded to so many digits.
+        assert abs(float(imaginary) * inside.real - float(real) * inside.imag) <= 10.0 ** (1 - digits)

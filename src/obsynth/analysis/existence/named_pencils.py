@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from math import isqrt
 
 import numpy as np
 
@@ -167,8 +168,11 @@ def _placed(point: complex, digits: int, dt: float | None) -> tuple[Fraction, Fr
         return max(real, Fraction(0)), imaginary
     if not imaginary:
         return (real if abs(real) >= 1 else Fraction(1 if real >= 0 else -1)), imaginary
-    while real * real + imaginary * imaginary < 1:
-        real, imaginary = (part * (1 + Fraction(1, 10**digits)) for part in (real, imaginary))
+    square = real * real + imaginary * imaginary
+    if square < 1:
+        # The least stretch of so many digits that reaches the circle.
+        stretch = Fraction(isqrt(int(10 ** (2 * digits) / square)) + 1, 10**digits)
+        real, imaginary = stretch * real, stretch * imaginary
     return real, imaginary
 
 
