@@ -134,3 +134,37 @@ def test_a_long_run_proves_nearly_the_norm():
     assert 1.99 < pairs.bound({PAIRS: mixture}, free_weight=False) <= 2.0
     # Without the first sample, which is the one at rest, nothing says where the run came from.
     assert pairs.bound({PAIRS: np.array([[1.0], [0.0]])}, free_weight=False) == 0.0
+
+
+def noisy_plant(seed: int, nx: int) -> obsynth.DescriptorSystem:
+    """Return a plant with more unknown inputs than outputs, so that some of them are invisible for ever."""
+    rng = np.random.default_rng([9, nx, seed])
+    a = rng.normal(size=(nx, nx))
+    a *= 1.1 / np.max(np.abs(np.linalg.eigvals(a)))
+    hidden = rng.normal(size=(nx, 2))
+    e = np.eye(nx) - hidden @ np.linalg.pinv(hidden)
+    parts = (rng.normal(size=shape) for shape in ((nx // 4 + 2, nx), (nx, 2), (nx, nx // 2 + 2)))
+    return obsynth.DescriptorSystem(e, a, None, next(parts), Bf=next(parts), Bd=0.3 * next(parts), dt=0.1)
+
+
+@pytest.mark.parametrize("nx", [5, 8])
+def test_runs_of_a_few_samples_prove_the_least_gain_of_small_filters(nx):
+    """Neither the two steps nor a semidefinite solver: what is proved is below the gain of the filter in hand."""
+    for seed in range(3):
+        design = obsynth.fault_estimation_filter(noisy_plant(seed, nx))
+        row, claims = design.report["least gain"], design.certificate.claims
+        assert row.status == "proved"
+        assert (1.0 - 1e-4) * claims["gamma_min"] <= row.value <= claims["gamma_min"] * (1.0 + 1e-6)
+        pairs = design.certificate.matrices[PAIRS]
+        assert pairs.shape[1] > 1
+
+
+def test_a_proof_of_the_least_gain_at_any_price_is_made_on_request():
+    plant = noisy_plant(0, 12)
+    quick = obsynth.fault_estimation_filter(plant)
+    assert quick.report["least gain"].status == "assumed"
+    assert "prove_least" in quick.report["least gain"].detail
+    thorough = obsynth.fault_estimation_filter(plant, prove_least=True)
+    assert thorough.report["least gain"].status == "proved"
+    assert thorough.options["prove_least"] is True
+    assert thorough.certificate.claims["gamma"] == quick.certificate.claims["gamma"]

@@ -112,3 +112,14 @@ def test_a_run_of_a_linear_gain_set_loads_nothing_heavy(tmp_path):
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True)
     assert done.stdout.split(maxsplit=1) == ["0", "[]\n"]
+
+
+def test_a_design_with_default_options_needs_no_semidefinite_solver() -> None:
+    """The README's first command; its least gain is proved all the same."""
+    spec = SOURCE.parent / "designs" / "wang2015" / "spec.yaml"
+    design = (
+        f"import obsynth; spec = obsynth.load_spec({str(spec)!r}); "
+        "design = obsynth.fault_estimation_filter(spec.plant); print(design.report['least gain'].status); "
+        "assert design.report['least gain'].status == 'proved'"
+    )
+    assert loaded_modules(design, ("cvxpy", "clarabel", "matplotlib", "pandas")) == "LOADED []"

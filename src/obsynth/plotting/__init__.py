@@ -1,11 +1,18 @@
-"""Pictures of results, readable without colour; nothing is shown or saved here."""
+"""Pictures of results, readable without colour; nothing is shown or saved here.
 
-from obsynth.plotting.data import plot_data
-from obsynth.plotting.estimates import plot_faults, plot_parameters, plot_residuals, plot_states
-from obsynth.plotting.frequency import estimate_gains, plot_gains
-from obsynth.plotting.simulation import plot_decision, plot_detection, plot_simulation
-from obsynth.plotting.spectra import plot_poles
-from obsynth.plotting.trade_off import plot_delta_scan, plot_tolerances, plot_trade_off
+A picture is imported when it is asked for: reports need the figures behind one of them, and no other.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from obsynth.plotting.data import plot_data
+    from obsynth.plotting.estimates import plot_faults, plot_parameters, plot_residuals, plot_states
+    from obsynth.plotting.frequency import estimate_gains, plot_gains
+    from obsynth.plotting.simulation import plot_decision, plot_detection, plot_simulation
+    from obsynth.plotting.spectra import plot_poles
+    from obsynth.plotting.trade_off import plot_delta_scan, plot_tolerances, plot_trade_off
 
 __all__ = [
     "estimate_gains",
@@ -23,3 +30,26 @@ __all__ = [
     "plot_tolerances",
     "plot_trade_off",
 ]
+
+_HOMES = {
+    name: module
+    for module, names in {
+        "data": "plot_data",
+        "estimates": "plot_faults plot_parameters plot_residuals plot_states",
+        "frequency": "estimate_gains plot_gains",
+        "simulation": "plot_decision plot_detection plot_simulation",
+        "spectra": "plot_poles",
+        "trade_off": "plot_delta_scan plot_tolerances plot_trade_off",
+    }.items()
+    for name in names.split()
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOMES:
+        return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -11,6 +11,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import lru_cache
+from math import frexp
 from typing import Any, TypeAlias
 
 import flint
@@ -96,16 +98,22 @@ FractionRows: TypeAlias = Sequence[Sequence[Fraction]]
 
 def written_fraction(value: float) -> Fraction:
     """Return the rational number that a finite double was written as."""
-    text = repr(float(value))
-    if _digits(text) <= LOSSLESS_DIGITS:
-        return Fraction(text)
-    exact = Fraction(value)
-    return exact if _odd_part(exact).bit_length() <= SHORT_BITS else Fraction(text)
+    return Fraction(*_written(float(value)))
+
+
+# Matrices hold the same numbers many times, and conditions ask for the same plant's again.
+@lru_cache(maxsize=1 << 14)
+def _written(value: float) -> tuple[int, int]:
+    """Return numerator and denominator, which may have common factors, of what a finite double was written as."""
+    digits, power = _decimal(value)
+    if _count(digits) > LOSSLESS_DIGITS and _is_short(value):
+        return value.as_integer_ratio()
+    return (int(digits) * 10**power, 1) if power >= 0 else (int(digits), int(10**-power))
 
 
 def is_computed(value: float) -> bool:
     """Whether a double has so many digits that it was computed, and is known only to its last digit."""
-    return _digits(repr(float(value))) > LOSSLESS_DIGITS and _odd_part(Fraction(value)).bit_length() > SHORT_BITS
+    return not _is_short(value) and _count(_decimal(value)[0]) > LOSSLESS_DIGITS
 
 
 def computed_entries(matrix: FloatArray) -> int:
@@ -116,7 +124,7 @@ def computed_entries(matrix: FloatArray) -> int:
 def written_matrix(matrix: FloatArray) -> fmpq_mat:
     """Return a matrix ``(m, n)`` of doubles as the rational numbers that were written."""
     rows, columns = matrix.shape
-    return fmpq_mat(rows, columns, [_as_fmpq(written_fraction(value)) for value in np.ravel(matrix).tolist()])
+    return fmpq_mat(rows, columns, [fmpq(*_written(value)) for value in np.ravel(matrix).tolist()])
 
 
 def stored_matrix(matrix: FloatArray) -> fmpq_mat:
@@ -160,14 +168,21 @@ def _as_fmpq(value: Fraction) -> fmpq:
     return fmpq(value.numerator, value.denominator)
 
 
-def _digits(text: str) -> int:
-    mantissa = text.lower().partition("e")[0].lstrip("-").replace(".", "")
-    return len(mantissa.strip("0")) or 1
+def _decimal(value: float) -> tuple[str, int]:
+    """Return the shortest decimal of a finite double: its digits with their sign, and the power of ten of the last."""
+    mantissa, _, exponent = repr(value).partition("e")
+    whole, _, part = mantissa.partition(".")
+    return whole + part, int(exponent or 0) - len(part)
 
 
-def _odd_part(value: Fraction) -> int:
-    numerator = abs(value.numerator)
-    return numerator >> ((numerator & -numerator).bit_length() - 1) if numerator else 0
+def _count(digits: str) -> int:
+    """Return how many digits of a decimal count."""
+    return len(digits.lstrip("-").strip("0")) or 1
+
+
+def _is_short(value: float) -> bool:
+    """Whether a double is a whole number of few bits times a power of two."""
+    return (frexp(value)[0] * (1 << SHORT_BITS)).is_integer()
 
 
 #: Digits (binary) in which roots are isolated first, and how often they are doubled.

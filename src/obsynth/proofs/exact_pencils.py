@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
 
+import numpy as np
 from flint import fmpq, fmpq_mat, fmpq_poly, fmpz_mat, fmpz_poly, nmod_mat, nmod_poly
 
 from obsynth.numerics.arrays import FloatArray
@@ -30,8 +31,8 @@ from obsynth.proofs.exact_arithmetic import (
 
 #: Primes for ranks that are only bounded from below.
 _PRIMES = ((1 << 61) - 1, 2305843009213693921, 2305843009213693907)
-#: Size of the random integers of a compression, and the seed that makes every decision repeatable.
-_COMPRESSION_SIZE = 1 << 12
+#: Random integers of a compression are of 16 bits less these; and the seed that makes every decision repeatable.
+_DROPPED_BITS = 3
 _SEED = 20150709
 #: Compressions after which a factor that all of them share is a factor of all minors.
 _MOST_COMPRESSIONS = 6
@@ -76,6 +77,8 @@ class ExactPencil:
         for _ in range(_MOST_COMPRESSIONS):
             if found.degree() == 0:
                 break
+            if self._is_coprime_modulo(found, rank):
+                return fmpz_poly([1])
             other = found.gcd(self._compressed_determinant(rank))
             settled = other.degree() == found.degree() and other.degree() < self._degree
             found = primitive(fmpq_poly(other))
@@ -141,19 +144,30 @@ class ExactPencil:
         """Whether two compressions have coprime determinants modulo a prime that keeps the degree: then they are."""
         if self.shape == (rank, rank):
             return False
-        prime, found = _PRIMES[0], list[nmod_poly]()
-        shift = self._rng.randrange(prime)
-        for _ in range(2):
-            e, a = (nmod_mat(part, prime) for part in self._compressed(rank))
-            start = a - e * shift
-            if start.rank() < rank:
-                return False
-            # det(start - t e) / det(start) is the reversed characteristic polynomial of start^-1 e.
-            coefficients = start.solve(e).charpoly().coeffs()
-            found.append(nmod_poly([int(value) for value in coefficients[::-1]], prime))
+        shift = self._rng.randrange(_PRIMES[0])
+        first, second = (self._determinant_modulo(rank, shift) for _ in range(2))
         # A common factor keeps its degree where the leading coefficient that it divides is not zero.
-        full = found[0].degree() == min(self._degree, rank)
-        return full and found[0].gcd(found[1]).degree() == 0
+        full = first is not None and first.degree() == min(self._degree, rank)
+        return bool(full and first and second and first.gcd(second).degree() == 0)
+
+    def _is_coprime_modulo(self, known: fmpz_poly, rank: int) -> bool:
+        """Whether another compression has no factor of a known determinant modulo a prime that keeps its degree."""
+        prime = _PRIMES[0]
+        shift = self._rng.randrange(prime)
+        other = self._determinant_modulo(rank, shift)
+        moved = nmod_poly([int(value) % prime for value in known.coeffs()], prime)(nmod_poly([shift, 1], prime))
+        return bool(other is not None and moved.degree() == known.degree() and moved.gcd(other).degree() == 0)
+
+    def _determinant_modulo(self, rank: int, shift: int) -> nmod_poly | None:
+        """Return a multiple of ``det(A - (shift + t) E)`` of a compression modulo the first prime, or none."""
+        prime = _PRIMES[0]
+        e, a = (nmod_mat(part, prime) for part in self._compressed(rank))
+        start = a - e * shift
+        if start.rank() < rank:
+            return None
+        # det(start - t e) / det(start) is the reversed characteristic polynomial of start^-1 e.
+        coefficients = start.solve(e).charpoly().coeffs()
+        return nmod_poly([int(value) for value in coefficients[::-1]], prime)
 
     def _compressed(self, rank: int) -> tuple[fmpz_mat, fmpz_mat]:
         """Return both matrices with rows and columns compressed at random to the normal rank."""
@@ -172,8 +186,8 @@ class ExactPencil:
         return _determinant(e, a, min(self._degree, rank))
 
     def _random(self, rows: int, columns: int) -> fmpz_mat:
-        size = _COMPRESSION_SIZE
-        return fmpz_mat(rows, columns, [self._rng.randint(-size, size) for _ in range(rows * columns)])
+        drawn = np.frombuffer(self._rng.randbytes(2 * rows * columns), dtype="<i2") >> _DROPPED_BITS
+        return fmpz_mat(rows, columns, drawn.tolist())
 
 
 def system_pencil(E: fmpq_mat, A: fmpq_mat, B: fmpq_mat, C: fmpq_mat, D: fmpq_mat) -> ExactPencil:

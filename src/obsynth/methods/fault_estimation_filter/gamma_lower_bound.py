@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -45,6 +45,11 @@ NEGLIGIBLE_DISTURBANCES = (1e-3, 3e-2)
 MOST_REACHED = 24
 #: Where two steps show less than this share of the gain in double precision, they prove nothing exactly either.
 HOPEFUL_SHARE = 0.99
+#: Filters of so many states are examined in any case: exact null spaces cost next to nothing there.
+FEW_STATES = 8
+#: Runs from rest have at most so many unknowns, and are long enough when less than this share of the gain is missing.
+MOST_UNKNOWNS = 96
+LONG_ENOUGH = 1e-5
 _PARTS = ("S", "top", "bottom", "image", "shown", "Z", "Zd")
 
 
@@ -176,14 +181,15 @@ def _checked_bound(dual: _DualProblem, z1: FloatArray, corner: FloatArray, last:
 
 def least_gain_certificate(
     problem: GainProblem, work: DescriptorSystem, gains: Mapping[str, FloatArray], factor: FloatArray, *, gain: float,
-    solver: str,
+    solver: str, thorough: bool,
 ) -> tuple[dict[str, FloatArray], float]:  # fmt: skip
     """Return a proof that no such filter has a gain below ``gain``, and what it proves; else none.
 
-    ``factor (n, n)`` maps errors to coordinates in which they are of natural sizes.
+    ``factor (n, n)`` maps errors to coordinates in which they are of natural sizes.  What is not thorough is tried
+    where it costs little, and takes no semidefinite solver.
     """
     free_weight = problem.weight_is_free
-    if _is_hopeless(problem, gain):
+    if _is_hopeless(problem, gain, thorough=thorough):
         return {}, 0.0
     pairs = InvisiblePairs.of(work, gains)
     if pairs is None:
@@ -197,16 +203,22 @@ def least_gain_certificate(
         return {}, 0.0
     forth = np.linalg.pinv(back)
     moved = (forth @ top @ turn, bottom @ turn, forth @ image @ turn)
+    attempts: list[Callable[[], tuple[FloatArray, FloatArray, FloatArray]]] = [
+        lambda: _two_steps(*moved, shown @ turn, z @ back, zd, free_weight)
+    ]
+    if np.any(top):
+        attempts.append(lambda: _mixture(*moved, z @ back, zd, free_weight, lambda dual: _best_run(dual, gain)))
+        if thorough and s.shape[1] <= MOST_REACHED:
+            attempts.append(
+                lambda: _mixture(*moved, z @ back, zd, free_weight, lambda dual: _best_dual_point(dual, solver=solver))
+            )
     best: dict[str, FloatArray] = {}
     least = 0.0
-    for attempt in range(2 if np.any(top) and s.shape[1] <= MOST_REACHED else 1):
+    for attempt in attempts:
         if least >= gain * (1.0 - PROVED_SHARE):
             break
         try:
-            f, last, alone = (
-                _mixture(*moved, z @ back, zd, free_weight, solver) if attempt
-                else _two_steps(*moved, shown @ turn, z @ back, zd, free_weight)
-            )  # fmt: skip
+            f, last, alone = attempt()
         except (SolverError, np.linalg.LinAlgError):
             continue
         made = {PAIRS: turn @ f, LAST: last @ forth, ALONE: alone}
@@ -217,16 +229,49 @@ def least_gain_certificate(
     return (best, least) if least >= gain * (1.0 - PROVED_SHARE) else ({}, 0.0)
 
 
-def _is_hopeless(problem: GainProblem, gain: float) -> bool:
-    """Return whether two steps alone are tried, as many states are reached, and show too little in double precision."""
-    if not MOST_REACHED < problem.order <= MOST_STATES:
+def _is_hopeless(problem: GainProblem, gain: float, *, thorough: bool) -> bool:
+    """Return whether two steps show too little in double precision, and more would cost much or is not tried."""
+    if not (MOST_REACHED if thorough else FEW_STATES) < problem.order <= MOST_STATES:
         return False
     top, bottom, image = invisible_pairs(problem)
-    if reached_from_rest(top, image).shape[1] <= MOST_REACHED:
+    if thorough and reached_from_rest(top, image).shape[1] <= MOST_REACHED:
         return False
     _, both = _first_two(top, bottom, image, problem.Z @ top + problem.Zd @ bottom, problem.Z, problem.Zd)
     most = both[:, : both.shape[1] - problem.Zd.shape[1]] if problem.weight_is_free else both
     return not most.size or float(np.linalg.norm(most, 2)) < HOPEFUL_SHARE * gain
+
+
+def _best_run(dual: _DualProblem, enough: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return, as a dual point, the invisible run from rest, of some samples, that shows most for its energy.
+
+    Where W is fixed one more disturbance follows it.  A longer run shows no less: it may begin with rest.
+    """
+    top, nd = dual.top, dual.bottom.shape[0]
+    forth, starts = np.linalg.pinv(top), null_space(top)
+    outside = null_space(top.T).T
+    d = np.zeros((nd, 0)) if dual.free_weight else np.eye(nd)
+    run = [starts]
+    while True:
+        width = run[0].shape[1]
+        if width == 0:
+            raise np.linalg.LinAlgError("no disturbance from rest is invisible")
+        sizes = np.linalg.inv(np.linalg.qr(np.vstack([dual.bottom @ pair for pair in run]), mode="r"))
+        run = [pair @ sizes for pair in run]
+        blocks = [[dual.shown @ pair, np.zeros((len(dual.shown), d.shape[1]))] for pair in run]
+        if not dual.free_weight:
+            blocks.append([dual.outputs[:, : len(top)] @ dual.image @ run[-1], dual.outputs[:, len(top) :]])
+        _, values, vectors = np.linalg.svd(np.block(blocks), full_matrices=False)
+        shown, strongest = float(values[0]), vectors[0]
+        long_enough = shown >= enough * (1.0 - LONG_ENOUGH)
+        if long_enough or width + starts.shape[1] > MOST_UNKNOWNS or len(run) >= MOST_UNKNOWNS:
+            break
+        # Pairs that go on: what leads out of the states of all pairs is left out.
+        kept = null_space(outside @ dual.image @ run[-1]) if len(outside) else np.eye(width)
+        run = [np.hstack([pair @ kept, np.zeros((len(pair), starts.shape[1]))]) for pair in run]
+        run.append(np.hstack([forth @ dual.image @ run[-1][:, : kept.shape[1]], starts]))
+    pairs = np.array([pair @ strongest[:width] for pair in run]).T
+    reached, later = dual.image @ pairs[:, -1], strongest[width:] if d.size else np.zeros(nd)
+    return pairs @ pairs.T, np.outer(later, reached), np.outer(later, later)
 
 
 def _first_two(
@@ -263,11 +308,11 @@ def _strongest(matrix: FloatArray) -> FloatArray:
 
 def _mixture(
     top: FloatArray, bottom: FloatArray, image: FloatArray, z: FloatArray, zd: FloatArray, free_weight: bool,
-    solver: str,
+    best: Callable[[_DualProblem], tuple[FloatArray, FloatArray, FloatArray]],
 ) -> tuple[FloatArray, FloatArray, FloatArray]:  # fmt: skip
-    """Return the best mixture of pairs of all kinds, from the dual inequalities."""
+    """Return a mixture of pairs of all kinds that comes from a point of the dual inequalities."""
     dual, invisible, states = _DualProblem.on(top, bottom, image, z, zd, free_weight)
-    z1, corner, last = _best_dual_point(dual, solver=solver)
+    z1, corner, last = best(dual)
     z1 = 0.5 * (z1 + z1.T) + DUAL_MARGIN * np.eye(len(z1))
     f = invisible @ np.linalg.cholesky(z1)
     nd, s = zd.shape[1], top.shape[0]

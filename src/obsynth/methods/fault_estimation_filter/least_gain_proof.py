@@ -122,14 +122,15 @@ class InvisiblePairs:
 
 def least_gain_row(
     work: DescriptorSystem | None, gains: Mapping[str, FloatArray], matrices: Mapping[str, FloatArray], claimed: float,
-    *, free_weight: bool,
+    *, free_weight: bool, thorough: bool,
 ) -> Check:  # fmt: skip
     """Return the row on the least gain: proved from the certificate, or named as the least that was found."""
     family = "these T and N" if free_weight else "these T, N and W"
+    detail = "" if thorough else "prove_least = true asks for a proof"
     if not WITNESSES & matrices.keys():
         return information(
             "least gain", f"the least gain found of all filters with {family}; that none is below is not proved",
-            claimed, source="stated by the search", status="assumed",
+            claimed, source="stated by the search", status="assumed", detail=detail,
         )  # fmt: skip
     pairs = None if work is None else InvisiblePairs.of(work, gains)
     found = 0.0 if pairs is None else pairs.bound(matrices, free_weight=free_weight)

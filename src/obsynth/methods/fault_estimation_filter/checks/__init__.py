@@ -126,7 +126,9 @@ def _least_gain(design: ObserverDesign, work: DescriptorSystem | None) -> Iterat
         return
     free = bool(design.options.get("free_residual_weight"))
     kept = matrices if work is not None else {}
-    yield least_gain_row(work, design.gains, kept, claimed(claims, "gamma_min"), free_weight=free)
+    sought = bool(design.options.get("prove_least"))
+    least = claimed(claims, "gamma_min")
+    yield least_gain_row(work, design.gains, kept, least, free_weight=free, thorough=sought)
 
 
 def _with_sensor_faults(plant: DescriptorSystem) -> DescriptorSystem | None:
