@@ -33,7 +33,7 @@ SECTIONS = (
 ORDER = (
     "Plants", "Plants from other tools", "Specs", "What is possible", "Designs", "Comparing designs", "Results",
     "Observers", "Measured data", "Simulation and monitors", "Calibration", "Tolerances", "Handing on", "Other",
-    "Pictures", "Errors",
+    "Conditions", "Pictures", "Errors",
 )  # fmt: skip
 
 
@@ -54,12 +54,14 @@ def _section(name: str) -> str:
 
 
 def _reference() -> str:
+    import obsynth.conditions
     import obsynth.plotting
 
     found: dict[str, list[str]] = {}
     # A second name of the same thing has no page of its own.
     for name in (name for name in obsynth.__all__ if getattr(getattr(obsynth, name), "__name__", name) == name):
         found.setdefault(_section(name), []).append(f"obsynth.{name}")
+    found["Conditions"] = [f"obsynth.conditions.{name}" for name in obsynth.conditions.__all__]
     found["Pictures"] = [f"obsynth.plotting.{name}" for name in obsynth.plotting.__all__]
     lines = ["API reference", "=============", "", "Every public name, from its docstring.", ""]
     for title in (title for title in ORDER if title in found):

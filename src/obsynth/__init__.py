@@ -116,7 +116,7 @@ _HOMES = {
     for name, _, other in (entry.partition("=") for entry in names.split())
 }
 #: Packages whose names are used through them, such as ``obsynth.plotting.plot_data``.
-_PACKAGES = ("plotting",)
+_PACKAGES = ("conditions", "plotting")
 
 __all__ = sorted(_HOMES)
 

@@ -1,3 +1,4 @@
+from obsynth import conditions as conditions
 from obsynth import plotting as plotting
 from obsynth.analysis.dae_structure import Identifiability as Identifiability
 from obsynth.analysis.dae_structure import identifiability as identifiability

@@ -1,0 +1,281 @@
+r"""The inequalities of which all the papers' conditions are made, each with its lemma.
+
+``A, B, C, D`` are those of ``e+ = A e + B w``, ``z = C e + D w`` (``e+`` is e' for ``dt = 0``).  For a gain L that is
+still to be found, ``A - L Cy`` and ``B - L Dy``, give the variable ``Y = P L`` with ``Cy`` and ``Dy``: then P A stands
+for ``P A - Y Cy`` and P B for ``P B - Y Dy`` and everything stays linear.  C and D may be expressions of variables.
+
+Each function returns a list of `cvxpy` constraints.  They are meant strictly: ``margin`` times the identity is kept.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from obsynth.errors import SpecError
+from obsynth.methods.conic import lmi
+from obsynth.numerics.arguments import is_finite_number, shown
+from obsynth.numerics.regions import LMIRegion, checked_region
+
+if TYPE_CHECKING:
+    import cvxpy
+
+#: How far inside the cone the inequalities hold by default.
+MARGIN = 1e-9
+
+
+def bounded_real(
+    A: Any, B: Any, C: Any, D: Any, P: Any, gamma: Any, dt: float,
+    *, Y: Any = None, Cy: Any = None, Dy: Any = None, gamma_squared: Any = None, margin: float = MARGIN,
+) -> list[cvxpy.Constraint]:  # fmt: skip
+    r"""Return the bounded real inequality: A is stable and the H-infinity norm from w to z is below gamma.
+
+    .. math::
+        \begin{bmatrix} P & 0 & (PA)^T & C^T \\ 0 & \gamma^2 I & (PB)^T & D^T \\ PA & PB & P & 0 \\ C & D & 0 & I
+        \end{bmatrix} > 0
+        \qquad\text{or, for } dt = 0, \qquad
+        \begin{bmatrix} PA + (PA)^T & PB & C^T \\ (PB)^T & -\gamma^2 I & D^T \\ C & D & -I \end{bmatrix} < 0 .
+
+    Parameters
+    ----------
+    A, B, C, D : array_like or cvxpy.Expression
+        ``(n, n)``, ``(n, nw)``, ``(nz, n)``, ``(nz, nw)``; expressions in C and D.
+    P : cvxpy.Variable
+        ``(n, n)``, symmetric.
+    gamma : float
+        The level, in units of z over w; ``None`` where ``gamma_squared`` is given.
+    dt : float
+        0 for continuous time, else seconds.
+    Y, Cy, Dy : optional
+        ``(n, ny)``, ``(ny, n)``, ``(ny, nw)``: the gain that is still to be found, ``Y = P L``.
+    gamma_squared : cvxpy.Expression, optional
+        The square of the level, as a variable or a parameter.
+    margin : float, optional
+        What is kept to the boundary of the cone.
+
+    Returns
+    -------
+    list of cvxpy.Constraint
+        The inequality, and ``P > 0``.
+
+    Raises
+    ------
+    SpecError
+        Shapes that do not fit, or a gamma that is no positive number.
+
+    References
+    ----------
+    .. [Hsiung1999] K.-L. Hsiung, L. Lee, IEE Proc. Control Theory Appl. 146 (4), 1999: Lemma 3 of Wang et al. 2015,
+       after a Schur complement.
+    .. [Boyd1994] S. Boyd et al., Linear matrix inequalities in system and control theory, SIAM 1994, section 2.7.3.
+    """
+    n, nw, nz = _sizes(A, B, C, D, P)
+    pa, pb = _moved(A, P, Y, Cy), _moved(B, P, Y, Dy)
+    level = _square(gamma) if gamma_squared is None else gamma_squared
+    if dt > 0.0:
+        whole = lmi.symmetric_blocks([
+            [P],
+            [np.zeros((nw, n)), level * np.eye(nw)],
+            [pa, pb, P],
+            [C, D, np.zeros((nz, n)), np.eye(nz)],
+        ])  # fmt: skip
+    else:
+        whole = -lmi.symmetric_blocks([[pa + pa.T], [pb.T, -level * np.eye(nw)], [C, D, -np.eye(nz)]])
+    return [lmi.at_least(P, margin), lmi.at_least(whole, margin)]
+
+
+def h2(
+    A: Any, B: Any, C: Any, D: Any, P: Any, Z: Any, dt: float,
+    *, Y: Any = None, Cy: Any = None, Dy: Any = None, margin: float = MARGIN,
+) -> list[cvxpy.Constraint]:  # fmt: skip
+    r"""Return the H2 inequalities: A is stable and the squared H2 norm from w to z is below the trace of Z.
+
+    .. math::
+        \begin{bmatrix} P & (PA)^T & C^T \\ PA & P & 0 \\ C & 0 & I \end{bmatrix} > 0, \qquad
+        \begin{bmatrix} Z & (PB)^T & D^T \\ PB & P & 0 \\ D & 0 & I \end{bmatrix} > 0
+
+    or, for ``dt = 0`` and ``D = 0``,
+
+    .. math::
+        \begin{bmatrix} PA + (PA)^T & C^T \\ C & -I \end{bmatrix} < 0, \qquad
+        \begin{bmatrix} Z & (PB)^T \\ PB & P \end{bmatrix} > 0 .
+
+    Parameters
+    ----------
+    A, B, C, D : array_like or cvxpy.Expression
+        ``(n, n)``, ``(n, nw)``, ``(nz, n)``, ``(nz, nw)``; in continuous time D must be zero.
+    P, Z : cvxpy.Variable
+        ``(n, n)`` and ``(nw, nw)``, symmetric; minimise ``cvxpy.trace(Z)`` for the least norm.
+    dt : float
+        0 for continuous time, else seconds.
+    Y, Cy, Dy : optional
+        ``(n, ny)``, ``(ny, n)``, ``(ny, nw)``: the gain that is still to be found, ``Y = P L``.
+    margin : float, optional
+        What is kept to the boundary of the cone.
+
+    Returns
+    -------
+    list of cvxpy.Constraint
+        The two inequalities.
+
+    Raises
+    ------
+    SpecError
+        Shapes that do not fit, or a D in continuous time, where the norm is infinite.
+
+    References
+    ----------
+    .. [Scherer1997] C. Scherer, P. Gahinet, M. Chilali, IEEE TAC 42 (7), 1997, section III.
+    """
+    n, nw, nz = _sizes(A, B, C, D, P)
+    if getattr(Z, "shape", None) != (nw, nw):
+        raise SpecError(f"Z is {_shape(Z)}, but {(nw, nw)} is needed.", path="Z")
+    pa, pb = _moved(A, P, Y, Cy), _moved(B, P, Y, Dy)
+    if dt > 0.0:
+        first = lmi.symmetric_blocks([[P], [pa, P], [C, np.zeros((nz, n)), np.eye(nz)]])
+        second = lmi.symmetric_blocks([[Z], [pb, P], [D, np.zeros((nz, n)), np.eye(nz)]])
+    else:
+        if np.any(np.asarray(D) if not hasattr(D, "value") else 1.0):
+            raise SpecError("D is not zero: in continuous time the H2 norm is infinite then.", path="D")
+        first = -lmi.symmetric_blocks([[pa + pa.T], [C, -np.eye(nz)]])
+        second = lmi.symmetric_blocks([[Z], [pb, P]])
+    return [lmi.at_least(first, margin), lmi.at_least(second, margin)]
+
+
+def region(
+    A: Any, P: Any, where: LMIRegion, *, Y: Any = None, Cy: Any = None, margin: float = MARGIN
+) -> list[cvxpy.Constraint]:
+    r"""Return the inequality that puts every eigenvalue of A into a region: ``L x P + M x (PA) + M' x (PA)' < 0``.
+
+    With an eigenvector v of A for z it gives ``v* P v (L + z M + conj(z) M') < 0``.
+
+    Parameters
+    ----------
+    A : array_like
+        ``(n, n)``.
+    P : cvxpy.Variable
+        ``(n, n)``, symmetric; the inequality does not fix its scale.
+    where : LMIRegion
+        See `disk`, `half_plane` and `sector`; joined by ``&``.
+    Y, Cy : optional
+        ``(n, ny)``, ``(ny, n)``: the gain that is still to be found, ``Y = P L``.
+    margin : float, optional
+        What is kept to the boundary of the cone.
+
+    Returns
+    -------
+    list of cvxpy.Constraint
+        The inequality, and ``P > 0``.
+
+    Raises
+    ------
+    SpecError
+        Shapes that do not fit, or ``where`` is no region.
+
+    References
+    ----------
+    .. [Chilali1996] M. Chilali, P. Gahinet, IEEE TAC 41 (3), 1996, Theorem 2.2.
+    """
+    where = checked_region(where, "where")
+    _square_matrix(A, P)
+    pa = _moved(A, P, Y, Cy)
+    k = len(where.L)
+    blocks = [
+        [where.L[i, j] * P + where.M[i, j] * pa + where.M[j, i] * pa.T for j in range(i + 1)] for i in range(k)
+    ]  # fmt: skip
+    return [lmi.at_least(P, margin), lmi.at_most(lmi.symmetric_blocks(blocks), -margin)]
+
+
+def admissible(
+    E: Any, A: Any, P: Any, dt: float, *, Y: Any = None, Cy: Any = None, margin: float = MARGIN
+) -> list[cvxpy.Constraint]:
+    r"""Return the inequality that makes a pair regular, impulse-free and stable.
+
+    .. math::
+        E^T P = P^T E \ge 0, \quad P^T A + A^T P < 0 \qquad\text{or, for } dt > 0 \text{ and symmetric } P, \qquad
+        E^T P E \ge 0, \quad A^T P A - E^T P E < 0 .
+
+    Parameters
+    ----------
+    E, A : array_like
+        ``(n, n)``; E may be singular.
+    P : cvxpy.Variable
+        ``(n, n)``; any matrix in continuous time, symmetric in discrete time (and not definite for singular E).
+    dt : float
+        0 for continuous time, else seconds.
+    Y, Cy : optional
+        ``(n, ny)``, ``(ny, n)``: the gain that is still to be found, ``Y = P' L``; continuous time only.
+    margin : float, optional
+        What is kept to the boundary of the cone, in the strict inequality.
+
+    Returns
+    -------
+    list of cvxpy.Constraint
+        The equality and the inequalities.
+
+    Raises
+    ------
+    SpecError
+        Shapes that do not fit, or a Y in discrete time, where the product is not linear.
+
+    References
+    ----------
+    .. [Masubuchi1997] I. Masubuchi et al., Automatica 33 (4), 1997: Lemma 2 of Filasova et al.
+    .. [Xu1999] S. Xu, C. Yang, Stabilization of discrete-time singular systems, Automatica 35 (9), 1999.
+    """
+    _square_matrix(A, P)
+    if _shape(E) != _shape(A):
+        raise SpecError(f"E is {_shape(E)}, but {_shape(A)} is needed.", path="E")
+    e, a = np.asarray(E, dtype=np.float64), A
+    if dt > 0.0:
+        if Y is not None:
+            raise SpecError("Y is for continuous time: A' P A is not linear in P and Y.", path="Y")
+        kept = e.T @ P @ e
+        return [lmi.at_least(kept), lmi.at_most(a.T @ P @ a - kept, -margin)]
+    moving = P.T @ a if Y is None else P.T @ a - Y @ Cy
+    return [P.T @ e == e.T @ P, lmi.at_least(e.T @ P), lmi.at_most(moving + moving.T, -margin)]
+
+
+def _moved(matrix: Any, P: Any, Y: Any, measured: Any) -> Any:
+    """Return ``P matrix``, or ``P matrix - Y measured`` with a gain that is still to be found."""
+    if Y is None:
+        return P @ matrix
+    if measured is None:
+        return P @ matrix
+    if getattr(Y, "shape", None) != (_shape(P)[0], _shape(measured)[0]):
+        raise SpecError(f"Y is {_shape(Y)}, but {(_shape(P)[0], _shape(measured)[0])} is needed.", path="Y")
+    return P @ matrix - Y @ measured
+
+
+def _square(gamma: Any) -> float:
+    if not is_finite_number(gamma) or not gamma > 0.0:
+        raise SpecError(f"gamma is {shown(gamma)}: give a positive number, or gamma_squared=.", path="gamma")
+    return float(gamma) ** 2
+
+
+def _shape(matrix: Any) -> tuple[int, ...]:
+    return tuple(getattr(matrix, "shape", np.shape(matrix)))
+
+
+def _square_matrix(A: Any, P: Any) -> int:
+    shape = _shape(A)
+    if len(shape) != 2 or shape[0] != shape[1]:
+        raise SpecError(f"A is {shape}: give a square matrix.", path="A")
+    if _shape(P) != shape:
+        raise SpecError(f"P is {_shape(P)}, but {shape} is needed.", path="P")
+    return shape[0]
+
+
+def _sizes(A: Any, B: Any, C: Any, D: Any, P: Any) -> tuple[int, int, int]:
+    """Return n, nw and nz of shapes that fit."""
+    n = _square_matrix(A, P)
+    shapes = {name: _shape(part) for name, part in (("B", B), ("C", C), ("D", D))}
+    for name, shape in shapes.items():
+        if len(shape) != 2:
+            raise SpecError(f"{name} is {shape}: give a matrix.", path=name)
+    nw, nz = shapes["B"][1], shapes["C"][0]
+    for name, wanted in (("B", (n, nw)), ("C", (nz, n)), ("D", (nz, nw))):
+        if shapes[name] != wanted:
+            raise SpecError(f"{name} is {shapes[name]}, but {wanted} is needed.", path=name)
+    return n, nw, nz

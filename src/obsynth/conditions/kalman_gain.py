@@ -1,0 +1,147 @@
+r"""Nikoukhah, Willsky, Levy 1992; Moussa Ali, Zhang 2013: the steady descriptor Kalman gain as an H2 inequality.
+
+``E x(k+1) = A x(k) + B u(k) + w(k)``, ``y(k) = C x(k) + v(k)`` with covariances Q and R of w and v (4); the filter is
+``xhat(k+1) = L (A xhat(k) + B u(k)) + K y(k+1)`` with ``L E + K C = I`` (10), (12), and its error (13)
+
+.. math::
+    e(k+1) = L A\, e(k) + L w(k) - K v(k+1) .
+
+Every such ``[L K]`` is ``[L0 K0] + S [N1 N2]``, with ``[L0 K0]`` the pseudo-inverse of ``[E; C]`` and ``[N1 N2]`` a
+basis of its left null space.  S is an output injection from ``N1 A e + N1 w - N2 v``, and the trace of the steady
+covariance of e is a squared H2 norm: least at the Kalman gain (11), and linear matrix inequalities in P, ``Y = P S``.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from obsynth.analysis.time_varying import as_time_varying
+from obsynth.analysis.transformations.recovery import Transformation, linear_plant
+from obsynth.conditions import atoms
+from obsynth.conditions.problem import Conditions, Values, require_data
+from obsynth.errors import SpecError, VerificationError
+from obsynth.methods.descriptor_kalman.public import descriptor_kalman
+from obsynth.methods.descriptor_kalman.synthesis import conditions as existence
+from obsynth.methods.descriptor_kalman.synthesis import without_unknown_inputs
+from obsynth.methods.recursive.steady_filter import steady_state_filter
+from obsynth.methods.recursive.synthesis_parts import with_stated_noise
+from obsynth.numerics.arrays import FloatArray, as_matrix
+from obsynth.numerics.ranks import covariance_factor
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.results.design import ObserverDesign
+
+#: A gain of the inequality is that of the recursion when they differ by at most this share of their size: the minimum
+#: is flat, so that half the digits of a solver's optimum are those of its gain.
+SAME_GAIN = 1e-3
+
+
+def kalman(
+    plant: DescriptorSystem | Transformation, *, Q: ArrayLike | None = None, R: ArrayLike | None = None,
+    margin: float = atoms.MARGIN,
+) -> Conditions:  # fmt: skip
+    """Return the steady descriptor Kalman gain as the H2 inequalities in P, Y and Z.
+
+    Parameters
+    ----------
+    plant : DescriptorSystem or Transformation
+        Discrete time, no feedthrough of inputs: ``E (ne, nx)``, ``A``, ``C (ny, nx)``; its faults are taken as zero,
+        and of its unknown inputs nothing is assumed, as by `obsynth.descriptor_kalman`.
+    Q, R : array_like, optional
+        Covariances ``(ne, ne)`` and ``(ny, ny)``, or numbers; ``Bw Bw'`` and ``Dw Dw'`` by default, else identities.
+    margin : float, optional
+        What the inequalities keep to the boundary of the cone.
+
+    Returns
+    -------
+    Conditions
+        Variables ``P (nx, nx)`` (inverse of the covariance at the optimum), ``Y``, ``Z``; the minimum is the trace of
+        the steady covariance; constraints ``"(13) stable"`` and ``"(13) covariance"``; gains ``L (nx, ne)``,
+        ``K (nx, ny)``, ``covariance``.
+
+    Raises
+    ------
+    SpecError
+        A covariance is malformed, or depends on k.
+    PreconditionError
+        ``rank [E; C] < nx``, or a plant of another kind.
+
+    Notes
+    -----
+    ``design`` returns the recursive filter of `obsynth.descriptor_kalman`, whose gains tend to these; where they do
+    not, a `VerificationError` says so.
+
+    References
+    ----------
+    .. [MoussaAli2013] Fault diagnosis for linear time-varying descriptor systems, IFAC ALCOSP 2013, eqs. (4)-(16).
+    .. [Nikoukhah1992] Kalman filtering and Riccati equations for descriptor systems, IEEE TAC 37 (9), Lemma 2.4.
+    """
+    import cvxpy as cp
+
+    own = linear_plant(plant).dense()
+    held = existence(own)
+    require_data(held, solvers=("detectability",))
+    varying, process, sensor = _noisy_plant(own, Q, R)
+    E, A, C = varying.E.at(1), varying.A.at(0), varying.C.at(1)
+    ne, n = E.shape
+
+    H = np.vstack([E, C])
+    inverse, null = np.linalg.pinv(H), np.linalg.svd(H)[0][:, n:].T
+    L0, K0, N1, N2 = inverse[:, :ne], inverse[:, ne:], null[:, :ne], null[:, ne:]
+    W, V = covariance_factor(process, "Q"), covariance_factor(sensor, "R")
+    nw, m = W.shape[1] + V.shape[1], len(null)
+
+    P, Z = cp.Variable((n, n), symmetric=True, name="P"), cp.Variable((nw, nw), symmetric=True, name="Z")
+    Y = cp.Variable((n, m), name="Y")
+    stable, covariance = atoms.h2(
+        L0 @ A, np.hstack([L0 @ W, -K0 @ V]), np.eye(n), np.zeros((n, nw)), P, Z, own.dt,
+        Y=Y, Cy=-N1 @ A, Dy=np.hstack([-N1 @ W, N2 @ V]), margin=margin,
+    )  # fmt: skip
+    constraints = {"(13) stable": stable, "(13) covariance": covariance}
+
+    def gains(values: Values) -> dict[str, FloatArray]:
+        S = np.linalg.solve(values["P"], values["Y"])
+        return {"L": L0 + S @ N1, "K": K0 + S @ N2, "covariance": np.linalg.inv(values["P"])}
+
+    def design(found: dict[str, FloatArray], name: str) -> ObserverDesign:
+        made = descriptor_kalman(plant, Q=Q, R=R, name=name)
+        steady = steady_state_filter(varying, Q=process, R=sensor)
+        for letter, wanted in (("L", steady.L), ("K", steady.K)):
+            miss = float(np.linalg.norm(found[letter] - wanted) / max(float(np.linalg.norm(wanted)), 1.0))
+            if not miss <= SAME_GAIN:
+                raise VerificationError(
+                    f"{letter} of the inequality misses the gain that the recursion tends to by {miss:.3g} of its "
+                    "size: with other constraints or another objective this is no Kalman filter.", report=made.report,
+                )  # fmt: skip
+        return made
+
+    data = {"E": E, "A": A, "C": C, "L0": L0, "K0": K0, "N1": N1, "N2": N2, "Q": process, "R": sensor}
+    return Conditions(
+        "Moussa Ali, Zhang 2013, (10)-(13): steady Kalman gain as an H2 inequality",
+        cp.Problem(cp.Minimize(cp.trace(Z)), list(constraints.values())), {"P": P, "Y": Y, "Z": Z}, {}, data,
+        constraints, lambda: held, gains, design,
+    )  # fmt: skip
+
+
+def _noisy_plant(own: DescriptorSystem, Q: Any, R: Any) -> tuple[TimeVaryingDescriptorSystem, FloatArray, FloatArray]:
+    """Return the plant without unknown inputs, with covariances of its equations and of its outputs."""
+    given = with_stated_noise(own, {"Q": Q, "R": R})
+    q = 1.0 if given["Q"] is None else given["Q"]
+    if own.nd:
+        reduced = without_unknown_inputs(own)
+        varying, q = reduced.plant, reduced.process_covariance(q)
+    else:
+        varying = as_time_varying(own)
+    process = _covariance(q, varying.ne, "Q")
+    return varying, process, _covariance(1.0 if given["R"] is None else given["R"], varying.ny, "R")
+
+
+def _covariance(given: Any, size: int, name: str) -> FloatArray:
+    matrix = as_matrix(given, name)
+    matrix = float(matrix[0, 0]) * np.eye(size) if np.ndim(given) == 0 else matrix
+    if matrix.shape != (size, size):
+        raise SpecError(f"{name} is {matrix.shape}, but {(size, size)} is needed.", path=name)
+    return matrix

@@ -1,0 +1,204 @@
+"""What every source of conditions returns: a problem to read, to change and to solve, and the way to a design."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from obsynth.analysis.conditions import Condition
+from obsynth.errors import SolverError, SpecError, VerificationError
+from obsynth.methods.designing import failed_rows
+from obsynth.numerics.arguments import shown
+from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.results.checks import VerificationReport
+from obsynth.results.design import ObserverDesign
+from obsynth.verification.plant import condition_rows
+
+if TYPE_CHECKING:
+    import cvxpy
+
+#: Numbers by name, such as the values of variables.
+Values = Mapping[str, FloatArray]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Conditions:
+    """The conditions of a paper as a `cvxpy.Problem`, with everything in it by name.
+
+    Parameters
+    ----------
+    source : str
+        Paper, theorem, equations.
+    problem : cvxpy.Problem
+        Solve it with any solver: ``problem.solve(solver=...)``.
+    variables : mapping of str to cvxpy.Variable
+        By the paper's letters.
+    parameters : mapping of str to cvxpy.Parameter
+        Numbers that may change between two solutions, such as ``gamma_squared`` in a bisection.
+    data : mapping of str to FloatArray
+        The matrices of the inequalities, by the paper's letters.
+    constraints : mapping of str to cvxpy.Constraint
+        By name, so that one can be dropped or replaced.
+    """
+
+    source: str
+    problem: cvxpy.Problem
+    variables: Mapping[str, cvxpy.Variable]
+    parameters: Mapping[str, cvxpy.Parameter]
+    data: Mapping[str, FloatArray]
+    constraints: Mapping[str, cvxpy.Constraint]
+    _examined: Callable[[], Sequence[Condition]]
+    _gains: Callable[[Values], dict[str, FloatArray]]
+    _design: Callable[[dict[str, FloatArray], str], ObserverDesign]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "data", MappingProxyType({k: read_only(v) for k, v in self.data.items()}))
+        for name in ("variables", "parameters", "constraints"):
+            object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
+
+    @cached_property
+    def existence(self) -> VerificationReport:
+        """The checks of whether there is a solution at all, and why not; they need no solver for the inequalities."""
+        return VerificationReport.of(condition_rows(self._examined()))
+
+    def gains(self) -> dict[str, FloatArray]:
+        """Return the gain matrices of the variables' present values, by the paper's letters.
+
+        Raises
+        ------
+        SpecError
+            A variable has no value yet.
+        SolverError
+            The solver left none, or the values do not determine the gains.
+        """
+        values = {name: self._value(name, variable) for name, variable in self.variables.items()}
+        try:
+            gains = self._gains(values)
+        except np.linalg.LinAlgError as error:
+            raise SolverError(f"The values of {', '.join(self.variables)} determine no gains: {error}.") from error
+        if not all(np.isfinite(gain).all() for gain in gains.values()):
+            raise SolverError("The values of the variables determine no finite gains: nothing is known.")
+        return gains
+
+    def design(self, *, name: str = "design") -> ObserverDesign:
+        """Return the verified design of the variables' present values.
+
+        Parameters
+        ----------
+        name : str, optional
+            Name of the design.
+
+        Raises
+        ------
+        SpecError, SolverError
+            As for `gains`.
+        PreconditionError
+            No such observer exists for this plant.
+        VerificationError
+            The gains fail a check, which is named.
+        """
+        found = self._design(self.gains(), name)
+        if not found.report.passed:
+            raise VerificationError(
+                f"The gains of this solution fail: {failed_rows(found.report)}. Solve to more digits, or leave more "
+                "room in the constraints.",
+                report=found.report,
+            )
+        return found.replace(solver={**found.solver, "conditions": self.source, "status": str(self.problem.status)})
+
+    def changed(
+        self, *, constraints: Iterable[Any] | Mapping[str, Any] = (), drop: Iterable[str] = (), objective: Any = None
+    ) -> Conditions:
+        """Return the same conditions with more or fewer constraints, or another objective; the variables are shared.
+
+        Parameters
+        ----------
+        constraints : iterable or mapping of cvxpy.Constraint, optional
+            Added; one of a name that is there already replaces it.
+        drop : iterable of str, optional
+            Names of constraints to leave out.
+        objective : cvxpy.Minimize, cvxpy.Maximize or cvxpy.Expression, optional
+            Instead of the present one; an expression is minimised.
+
+        Raises
+        ------
+        SpecError
+            Something is no constraint or no objective, or there is no constraint of a name to drop.
+        """
+        import cvxpy
+
+        unknown = [key for key in drop if key not in self.constraints]
+        if unknown:
+            raise SpecError(
+                f"There is no constraint {unknown[0]!r}; there are: {', '.join(map(repr, self.constraints))}.",
+                path="drop",
+            )
+        kept = {key: value for key, value in self.constraints.items() if key not in set(drop)}
+        kept |= named_constraints(constraints, len(kept))
+        goal = self.problem.objective if objective is None else checked_objective(objective)
+        return replace(self, problem=cvxpy.Problem(goal, list(kept.values())), constraints=kept)
+
+    def _value(self, name: str, variable: Any) -> FloatArray:
+        value = variable.value
+        if value is None and self.problem.status is None:
+            raise SpecError(f"{name} has no value: solve the problem first, problem.solve().", path=name)
+        if value is None or not np.all(np.isfinite(value)):
+            raise SolverError(
+                f"{name} has no value: the solver ended with status {str(self.problem.status)!r}. Whether there is a "
+                "solution at all, see existence."
+            )
+        return np.asarray(value, dtype=np.float64)
+
+    def __repr__(self) -> str:
+        listed = ", ".join(f"{name} {variable.shape}" for name, variable in self.variables.items())
+        return (
+            f"Conditions of {self.source}\n  variables    {listed}\n  constraints  {', '.join(self.constraints)}"
+            f"\n  data         {', '.join(self.data)}\n  status       {self.problem.status or 'not solved yet'}"
+        )
+
+
+def named_constraints(given: Any, count: int = 0) -> dict[str, Any]:
+    """Return constraints by name, the others numbered; raise `SpecError` for what is none."""
+    from cvxpy.constraints.constraint import Constraint
+
+    if isinstance(given, Constraint):
+        given = [given]
+    if not isinstance(given, Mapping) and not isinstance(given, Iterable):
+        raise SpecError(f"constraints are {shown(given)}: give a list of cvxpy constraints.", path="constraints")
+    pairs = dict(given) if isinstance(given, Mapping) else {f"own {i + 1}": part for i, part in enumerate(given)}
+    for name, part in pairs.items():
+        if not isinstance(part, Constraint):
+            raise SpecError(
+                f"Constraint {name!r} is a {type(part).__name__}: give cvxpy constraints, such as P >> numpy.eye(n).",
+                path="constraints",
+            )
+    return pairs
+
+
+def checked_objective(given: Any) -> Any:
+    """Return a cvxpy objective, minimising an expression; raise `SpecError` for anything else."""
+    import cvxpy
+
+    if isinstance(given, (cvxpy.Minimize, cvxpy.Maximize)):
+        return given
+    if not isinstance(given, cvxpy.Expression) or given.size != 1:
+        raise SpecError(
+            f"The objective is a {type(given).__name__}: give cvxpy.Minimize(...), or a scalar expression.",
+            path="objective",
+        )
+    return cvxpy.Minimize(given)
+
+
+def require_data(conditions: Sequence[Condition], *, solvers: tuple[str, ...]) -> None:
+    """Raise for the first failing condition without which the inequality cannot be written.
+
+    Those whose names begin with one of ``solvers`` leave a problem that is infeasible.
+    """
+    for condition in conditions:
+        if not condition.holds and not condition.name.startswith(solvers):
+            condition.require()

@@ -1,0 +1,199 @@
+r"""Share Pasand, Aliyari, Taghirad: the unknown-input PI observer by its augmented pair, poles or an LMI region.
+
+The paper's letters: ``E x' = A x + B u + Bf f + Bd d``, ``y = C x`` (1), faults ``f = Cw w``, ``w' = Phi w`` (2), (6);
+``Ea = diag(E, I)``, ``Aa = [A Bf Cw; 0 Phi]``, ``Bda = [Bd; 0]``, ``Ca = [C Df Cw]`` (13).  With
+
+.. math::
+    U_a B_{da} = 0, \quad U_a E_a + \hat D_a C_a = I \tag{19}, \qquad \hat A_a = U_a A_a - K_a C_a, \quad
+    \hat B_a = \hat A_a \hat D_a + K_a, \quad \hat J_a = U_a B_a
+
+the errors obey ``e+ = Ahat_a e``: any K_a with all eigenvalues in the left half-plane (the unit disk) will do.  Here
+``P (U_a A_a - K_a C_a) = P U_a A_a - Y C_a`` with ``Y = P K_a`` makes a region a linear matrix inequality.
+
+Unlike the paper: existence by (D1)-(D3) of the invariant form, as its Theorems 1, 2 and Lemma 6 are false as printed;
+a U of full rank, unless E_sharp, C_sharp and G of (10), (11) are given; several faults, in outputs too.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from obsynth.analysis.transformations.recovery import Transformation, linear_plant
+from obsynth.conditions import atoms
+from obsynth.conditions.problem import Conditions, Values, require_data
+from obsynth.errors import SpecError
+from obsynth.methods.conic import lmi
+from obsynth.methods.placement.eigenstructure import place
+from obsynth.methods.riccati import lyapunov_factor
+from obsynth.methods.ui_pi_observer.augmented_plant import (
+    AugmentedPlant,
+    Decoupled,
+    ObserverGains,
+    combinations_seen,
+    decouple,
+    direct_part,
+    paper_decoupling,
+    realise,
+)
+from obsynth.methods.ui_pi_observer.conditions import existence
+from obsynth.methods.ui_pi_observer.options import checked_poles
+from obsynth.methods.ui_pi_observer.placement_problem import with_faults
+from obsynth.methods.ui_pi_observer.public import ui_pi_observer_from_gains
+from obsynth.numerics.arrays import FloatArray, as_matrix
+from obsynth.numerics.regions import LMIRegion, checked_region, disk, half_plane
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.fault_models import exosystem
+from obsynth.results.design import ObserverDesign
+
+#: Conditions whose failure leaves an inequality that no matrices satisfy.
+LEFT_TO_THE_SOLVER = ("(D2)", "(D3)", "fixed modes", "order of the fault model", "fault model in double")
+
+#: Real numbers among which the slowest of a region is looked for: a scale alone depends on it.
+_RATES, _NUMBERS = -np.logspace(-6, 9, 151), np.linspace(-1.0, 1.0, 401)
+
+
+def sharepasand(
+    plant: DescriptorSystem | Transformation, *, fault_model: Any = "step", region: LMIRegion | None = None,
+    poles: Sequence[Any] | None = None, E_sharp: ArrayLike | None = None, C_sharp: ArrayLike | None = None,
+    G: ArrayLike | None = None, margin: float = atoms.MARGIN,
+) -> Conditions:  # fmt: skip
+    """Return the unknown-input PI observer: the decoupling as data, and the gain by a region or by poles.
+
+    Parameters
+    ----------
+    plant : DescriptorSystem or Transformation
+        ``E (nx, nx)``, ``C (ny, nx)``, ``Bf (nx, nf)``, ``Bd (nx, nd)``; na = nx + nw below.
+    fault_model : optional
+        As for `obsynth.ui_pi_observer`.
+    region : LMIRegion, optional
+        Where all eigenvalues must lie (1/s, or dimensionless for ``dt > 0``), beside stability.
+    poles : sequence, optional
+        All na eigenvalues instead (1/s, or dimensionless): K_a is then placed, which needs no solver, and what is left
+        is the Lyapunov inequality of it, in P alone.
+    E_sharp, C_sharp, G : array_like, optional
+        The paper's ``(nx, nx)``, ``(nx, ny)``, ``(nx, ny)`` of (10), (11).
+    margin : float, optional
+        What the inequalities keep to the boundary of the cone.
+
+    Returns
+    -------
+    Conditions
+        Variables ``P (na, na)`` and ``Y (na, ny)``, small ones; data ``U_a, D_a, E_a, A_a, B_da, C_a, Phi, Cw`` and
+        the coordinates ``X (na, na)`` of P and Y, in which solvers do not stall: ``K_a = X P^-1 Y``; constraints
+        ``"P"``, ``"stability"`` and ``"region"``; gains ``K_a, U_a, D_a, Ahat, Bhat, Jhat, U, D, K, F``.
+
+    Raises
+    ------
+    SpecError
+        A malformed option.
+    PreconditionError
+        (D1) fails: no U decouples the unknown inputs.
+
+    References
+    ----------
+    .. [SharePasand] Unknown Input-Proportional Integral Observer for Singular Systems: Application to fault detection,
+       eqs. (10)-(13), (19), procedure 1.
+    """
+    import cvxpy as cp
+
+    if poles is not None and region is not None:
+        raise SpecError("poles and region are given: use one of them.", path="poles")
+    own = linear_plant(plant).dense()
+    model = exosystem(fault_model, own.fault_names, own.dt)
+    found = existence(own, model)
+    require_data(found.conditions, solvers=LEFT_TO_THE_SOLVER)
+    work = found.plant
+    whole = AugmentedPlant.of(work, model)  # (13)
+    parts = _decoupling(work, E_sharp, C_sharp, G)  # (10), (11)
+    U_a, D_a = with_faults(parts.U, parts.Dhat, work, model)  # (19)
+    # Outputs that show d directly are solved for it; the others are left for the gain.
+    injected = np.vstack([parts.injection, np.zeros((model.order, work.ny))])
+    UA, seen = U_a @ (whole.A - injected @ whole.C), parts.seen @ whole.C
+    na, m = whole.order, len(seen)
+    stable = disk(0.0, 1.0) if own.is_discrete else half_plane(0.0)
+    where = stable if region is None else stable & checked_region(region)
+
+    P = cp.Variable((na, na), symmetric=True, name="P")
+    constraints = {"P": lmi.at_least(P, 1.0)}  # the inequalities leave the scale free
+    if poles is None:
+        X = _coordinates(UA, seen, where, discrete=own.is_discrete)
+        UAx, Cx = np.linalg.solve(X, UA @ X), seen @ X
+        Y = cp.Variable((na, m), name="Y")
+        # As P >= I, the first is no less than the norm of K_a; the second makes the optimum one that solvers agree on.
+        variables, goal = {"P": P, "Y": Y}, cp.norm(Y, "fro") + cp.trace(P)
+        closed = partial(atoms.region, UAx, P, Y=Y, Cy=Cx, margin=margin)
+        constraints["stability"] = closed(where=stable)[1]
+        if region is not None:
+            constraints["region"] = closed(where=region)[1]
+    else:
+        none = np.zeros(0, dtype=np.complex128)
+        wanted = checked_poles(poles, na, none, own.dt)
+        K = place(UA, seen, wanted, dt=own.dt, objective="gain").K
+        variables, goal = {"P": P}, cp.trace(P)
+        X = np.asarray(np.linalg.inv(lyapunov_factor(UA - K @ seen, own.dt)))
+        constraints["stability"] = atoms.region(np.linalg.solve(X, (UA - K @ seen) @ X), P, stable, margin=margin)[1]
+
+    def gains(values: Values) -> dict[str, FloatArray]:
+        free = K if poles is not None else X @ np.linalg.solve(values["P"], values["Y"])
+        K_a = free @ parts.seen + U_a @ injected
+        letters = realise(work, model, ObserverGains(U_a, D_a, K_a), combinations_seen(work))[1]
+        nx = work.nx
+        return {**letters, "U": U_a[:nx, :nx], "D": D_a[:nx], "K": K_a[:nx], "F": K_a[nx:]}
+
+    data = {
+        "U_a": U_a, "D_a": D_a, "E_a": whole.E, "A_a": whole.A, "B_da": whole.Bd, "C_a": whole.C, "UA": UA,
+        "C_seen": seen, "X": X, "Phi": model.Phi, "Cw": model.Cw,
+    }  # fmt: skip
+    target = plant if found.transformation is None else found.transformation
+    return Conditions(
+        "Share Pasand, Aliyari, Taghirad, (13), (19), procedure 1",
+        cp.Problem(cp.Minimize(goal), list(constraints.values())), variables, {}, data, constraints,
+        lambda: found.conditions, gains, partial(_design, target, fault_model),
+    )  # fmt: skip
+
+
+def _coordinates(F: FloatArray, C: FloatArray, where: LMIRegion, *, discrete: bool) -> FloatArray:
+    """Return a state change ``(n, n)`` in which the errors of a Kalman filter of the region's speed are alike."""
+    from scipy.linalg import solve_continuous_are, solve_discrete_are
+
+    n = len(F)
+    found = [x for x in (_NUMBERS if discrete else _RATES) if where.contains(x)]
+    if not found:
+        return np.eye(n)
+    solve, moved = (
+        (solve_discrete_are, F / max(np.abs(found))) if discrete else (solve_continuous_are, F - max(found) * np.eye(n))
+    )
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # what comes of it is a scale alone
+            covariance = solve(moved.T, C.T, np.eye(n), np.eye(len(C)))
+            return np.asarray(np.linalg.cholesky(0.5 * (covariance + covariance.T)))
+    except (np.linalg.LinAlgError, ValueError):
+        return np.eye(n)
+
+
+def _decoupling(plant: DescriptorSystem, E_sharp: Any, C_sharp: Any, G: Any) -> Decoupled:
+    """Return ``U`` and ``Dhat`` with ``U Bd = 0``, ``U E + Dhat C = I``: the paper's (11), or one of full rank."""
+    given = {"E_sharp": E_sharp, "C_sharp": C_sharp, "G": G}
+    if all(matrix is None for matrix in given.values()):
+        return decouple(plant)
+    missing = [name for name, matrix in given.items() if matrix is None]
+    if missing:
+        raise SpecError(f"{', '.join(missing)} is missing: give E_sharp, C_sharp and G together.", path=missing[0])
+    e_sharp, c_sharp, g = (as_matrix(matrix, name) for name, matrix in given.items())
+    _, u, d = paper_decoupling(plant, e_sharp=e_sharp, c_sharp=c_sharp, g=g)
+    seen, injection, _ = direct_part(plant)
+    return Decoupled(u, d, np.zeros((0, plant.nx)), np.zeros((0, plant.ny)), seen, injection)
+
+
+def _design(
+    plant: DescriptorSystem | Transformation, fault_model: Any, gains: dict[str, FloatArray], name: str
+) -> ObserverDesign:
+    U, D, K, F = (gains[letter] for letter in "UDKF")
+    return ui_pi_observer_from_gains(plant, U=U, D=D, K=K, F=F, fault_model=fault_model, name=name)

@@ -1,0 +1,253 @@
+r"""Wang, Rodrigues, Theilliol, Shen 2015, Theorem 2: the fault-estimation filter (23) by the inequality (45).
+
+The paper's letters: ``E x(k+1) = A x(k) + B u(k) + F n(k) + D w(k)``, ``y(k) = C x(k)`` (1).
+
+.. math::
+    \begin{bmatrix} -P + (\Upsilon^+ C)^T (\Upsilon^+ C) & 0 & A_1^T P - C_1^T Y^T \\ * & -\gamma^2 I & (TD)^T P \\
+    * & * & -P \end{bmatrix} < 0 \tag{45}
+
+Beyond the paper: W may be any left inverse of Upsilon, or a variable; feedthrough of the disturbance (``Dd``) enters
+``T D - T A N Dd - L (I - C N) Dd`` and ``W (I - C N) Dd``; faults in outputs (``Df``) are appended to the state.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from obsynth.analysis.conditions import Condition
+from obsynth.analysis.transformations.recovery import Transformation, linear_plant
+from obsynth.conditions.atoms import MARGIN
+from obsynth.conditions.problem import Conditions, Values, require_data
+from obsynth.errors import SpecError
+from obsynth.methods.conic import lmi
+from obsynth.methods.fault_estimation_filter.conditions import examine_fault_filter
+from obsynth.methods.fault_estimation_filter.detectability_indexes import exact_indexes, fault_detectability
+from obsynth.methods.fault_estimation_filter.gamma_lower_bound import proved_lower_bound
+from obsynth.methods.fault_estimation_filter.inequality_search import search_least_gain
+from obsynth.methods.fault_estimation_filter.inequality_solutions import null_basis
+from obsynth.methods.fault_estimation_filter.injection_problem import GainProblem
+from obsynth.methods.fault_estimation_filter.prepared_plant import (
+    prepare,
+    restricted_equivalent_from,
+    with_sensor_faults_as_states,
+)
+from obsynth.methods.fault_estimation_filter.public import fault_estimation_filter_from_gains
+from obsynth.numerics.arguments import is_finite_number, shown
+from obsynth.numerics.arrays import FloatArray, as_matrix
+from obsynth.numerics.norms import hinf_norm
+from obsynth.numerics.ranks import RANK_TOLERANCE
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.results.design import ObserverDesign
+
+#: What a design claims above the true norm of its filter, tried in turn until the proof goes through.
+ROOMS = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2)
+
+
+def wang2015(
+    plant: DescriptorSystem | Transformation, *, gamma: float | None = None, S: ArrayLike | None = None,
+    T: ArrayLike | None = None, N: ArrayLike | None = None, W: ArrayLike | str | None = None, margin: float = MARGIN,
+) -> Conditions:  # fmt: skip
+    r"""Return Theorem 2 of Wang et al. 2015: the inequality (45) in P and Y.
+
+    Parameters
+    ----------
+    plant : DescriptorSystem or Transformation
+        Discrete time: ``E (nx, nx)``, ``C (ny, nx)``, ``Bf (nx, nf)`` (the paper's F), ``Bd (nx, nd)`` (its D).
+    gamma : float, optional, dimensionless
+        A given level: is (45) feasible?  It is then the parameter ``gamma_squared``, for a bisection.  By default
+        gamma squared is a variable, and minimised.
+    S : array_like, optional
+        The free matrix ``(nx, nx + ny)`` of (17); by default T is nonsingular by construction.
+    T, N : array_like, optional
+        ``(nx, nx)`` and ``(nx, ny)`` with ``T E + N C = I`` (7), instead.
+    W : array_like or "free", optional
+        Residual weight ``(nf, ny)`` with ``W Upsilon = I``; ``Upsilon^+`` of (47) by default; a variable with "free".
+    margin : float, optional
+        What (45) keeps to the boundary of the cone.
+
+    Returns
+    -------
+    Conditions
+        Variables ``P``, ``Y``, ``gamma_squared``, and ``W`` where it is free; data ``T, N, Psi, Upsilon, A1, C1, TD``
+        and ``W``; constraints ``"P"`` and ``"(45)"``; gains ``T, N, L, W, Psi, Upsilon, R``.
+
+    Raises
+    ------
+    SpecError
+        A matrix has the wrong shape, ``T E + N C`` or ``W Upsilon`` is not the identity.
+    PreconditionError
+        The data of (45) do not exist: ``rank [E; C] < nx`` (2), or ``rank Upsilon < nf`` (Theorem 2 (i)).
+
+    Notes
+    -----
+    Below the least gamma an interior-point solver may stall rather than say infeasible; one of first order (SCS) says
+    so, and so do the others with a bound, ``changed(constraints={"bound": cvxpy.trace(P) <= 1e4})``.
+
+    (48) has the sign of its second term wrong; L is that of (60).  The paper does not say that a zero from the faults
+    to the outputs on or outside the unit circle makes (45) infeasible: ``existence`` does.
+
+    References
+    ----------
+    .. [Wang2015] Fault estimation filter design for discrete-time descriptor systems, IET Control Theory Appl. 9 (10).
+    """
+    import cvxpy as cp
+
+    own = linear_plant(plant).dense()
+    held, _ = examine_fault_filter(own)
+    require_data(held, solvers=("fault zeros",))
+    work = with_sensor_faults_as_states(own)
+    A, C, F, D = work.A, work.C, work.Bf, work.Bd
+    n, m, q, nd = work.nx, work.ny, work.nf, work.nd
+
+    T, N = _restricted_equivalent(own, work, S, T, N)  # (7), (16)-(17)
+    TA, TF = T @ A, T @ F
+    Psi = _psi(own, TA, C, TF)  # (20)
+    Upsilon = C @ Psi
+    free = isinstance(W, str)
+    W0 = _left_inverse(W, Upsilon)  # (47)
+    V = null_basis(Upsilon.T)
+    L0 = TA @ Psi @ W0
+    rest = np.eye(m) - Upsilon @ W0  # I - Upsilon Upsilon^+
+    A1, C1 = TA - L0 @ C, rest @ C  # (46)
+    shown_d = (np.eye(m) - C @ N) @ work.Dd  # of d in the innovation: zero in the paper, as D1 and Zd
+    TD, D1 = T @ D - TA @ (N @ work.Dd) - L0 @ shown_d, rest @ shown_d
+
+    P, Y = cp.Variable((n, n), symmetric=True, name="P"), cp.Variable((n, m), name="Y")
+    variables: dict[str, Any] = {"P": P, "Y": Y}
+    if gamma is None:
+        gamma_squared = variables["gamma_squared"] = cp.Variable(nonneg=True, name="gamma_squared")
+        goal = cp.Minimize(gamma_squared)
+    else:
+        gamma_squared = cp.Parameter(nonneg=True, value=_level(gamma) ** 2, name="gamma_squared")
+        goal = cp.Minimize(0)
+    if free:
+        Vw = variables["Vw"] = cp.Variable((q, m - q), name="Vw") if m > q else np.zeros((q, 0))
+        if m == q:
+            del variables["Vw"]
+        Wx = W0 + Vw @ V.T  # every left inverse of Upsilon
+        Z, Zd = Wx @ C, Wx @ shown_d
+        whole = lmi.symmetric_blocks([  # (45) before its last Schur complement
+            [-P],
+            [np.zeros((nd, n)), -gamma_squared * np.eye(nd)],
+            [P @ A1 - Y @ C1, P @ TD - Y @ D1, -P],
+            [Z, Zd, np.zeros((q, n)), -np.eye(q)],
+        ])  # fmt: skip
+    else:
+        Z, Zd = W0 @ C, W0 @ shown_d
+        whole = lmi.symmetric_blocks([  # (45)
+            [-P + Z.T @ Z],
+            [Zd.T @ Z, -gamma_squared * np.eye(nd) + Zd.T @ Zd],
+            [P @ A1 - Y @ C1, P @ TD - Y @ D1, -P],
+        ])  # fmt: skip
+    constraints = {"P": lmi.at_least(P, margin), "(45)": lmi.at_most(whole, -margin)}
+
+    def gains(values: Values) -> dict[str, FloatArray]:
+        R = np.linalg.solve(values["P"], values["Y"]) @ rest  # (63)
+        weight = W0 + values["Vw"] @ V.T if "Vw" in values else W0
+        return {"T": T, "N": N, "L": L0 + R, "W": weight, "Psi": Psi, "Upsilon": Upsilon, "R": R}  # (60)
+
+    data = {"T": T, "N": N, "Psi": Psi, "Upsilon": Upsilon, "W": W0, "A1": A1, "C1": C1, "TD": TD, "L0": L0, "D1": D1}
+    convex = GainProblem(
+        A1, V.T @ C, W0 @ C, TD, V.T @ shown_d, W0 @ shown_d, np.zeros((n, m - q)), -np.eye(m - q),
+        np.zeros((q, m - q)), free,
+    )  # fmt: skip
+    return Conditions(
+        "Wang et al. 2015, Theorem 2, (45)", cp.Problem(goal, list(constraints.values())), variables,
+        {} if gamma is None else {"gamma_squared": gamma_squared}, data, constraints,
+        partial(_existence, held, convex, gamma), gains, partial(_design, plant, convex),
+    )  # fmt: skip
+
+
+def _restricted_equivalent(
+    plant: DescriptorSystem, work: DescriptorSystem, S: Any, T: Any, N: Any
+) -> tuple[FloatArray, FloatArray]:
+    """Return T and N with ``T E + N C = I``."""
+    if (T is None) != (N is None) or (S is not None and T is not None):
+        raise SpecError("Give T and N together, or S alone.", path="T" if T is not None else "N")
+    if S is not None:
+        return restricted_equivalent_from(work.E, work.C, as_matrix(S, "S"))
+    if T is None:
+        found = prepare(plant)
+        states = found.scaling.states[:, None]
+        return states * found.T * found.scaling.equations, states * found.N * found.scaling.outputs
+    t, n = as_matrix(T, "T"), as_matrix(N, "N")
+    for name, matrix, shape in (("T", t, (work.nx, work.nx)), ("N", n, (work.nx, work.ny))):
+        if matrix.shape != shape:
+            raise SpecError(f"{name} is {matrix.shape}, but {shape} is needed.", path=name)
+    _require_identity("T E + N C", t @ work.E + n @ work.C, np.abs(t) @ np.abs(work.E) + np.abs(n) @ np.abs(work.C))
+    return t, n
+
+
+def _psi(plant: DescriptorSystem, TA: FloatArray, C: FloatArray, TF: FloatArray) -> FloatArray:
+    """Return ``Psi`` (20), with the detectability indexes (19)."""
+    found = fault_detectability(TA, C, TF, exact=exact_indexes(plant))
+    if not found.finite:
+        raise SpecError("With this T some fault never reaches the outputs: choose another.", path="T")
+    return found.Psi
+
+
+def _left_inverse(W: Any, Upsilon: FloatArray) -> FloatArray:
+    """Return a left inverse of Upsilon: that of least norm, or a given one."""
+    if W is None or (isinstance(W, str) and W == "free"):
+        return np.asarray(np.linalg.pinv(Upsilon))
+    if isinstance(W, str):
+        raise SpecError(f"W is {W!r}: give a matrix, or 'free'.", path="W")
+    weight = as_matrix(W, "W")
+    if weight.shape != Upsilon.T.shape:
+        raise SpecError(f"W is {weight.shape}, but {Upsilon.T.shape} is needed.", path="W")
+    _require_identity("W Upsilon", weight @ Upsilon, np.abs(weight) @ np.abs(Upsilon))
+    return weight
+
+
+def _require_identity(name: str, found: FloatArray, size: FloatArray) -> None:
+    miss = float(np.max(np.abs(found - np.eye(len(found))) / np.maximum(size, 1.0), initial=0.0))
+    if not miss <= RANK_TOLERANCE:
+        raise SpecError(f"{name} misses the identity by {miss:.3g}: give all digits.", path=name.split()[0])
+
+
+def _level(gamma: Any) -> float:
+    if not is_finite_number(gamma) or not gamma > 0.0:
+        raise SpecError(f"gamma is {shown(gamma)}: give a positive number.", path="gamma")
+    return float(gamma)
+
+
+def _existence(held: Sequence[Condition], convex: GainProblem, gamma: float | None) -> list[Condition]:
+    """Return the existence conditions, and whether a filter of a given level can be."""
+    found = list(held)
+    if gamma is None or not convex.disturbances or not all(condition.holds for condition in held):
+        return found
+    best = search_least_gain(convex, solver="auto")
+    bound = best.gain if not convex.measured else proved_lower_bound(
+        convex, solver="auto", best=best.injection, enough=gamma
+    )  # fmt: skip
+    holds = bool(best.gain <= gamma or bound <= gamma)
+    detail = f"the best filter found has {best.gain:.9g}, and no filter is below {bound:.9g}"
+    source = "dual of (45), checked without the solver"
+    claim = "gamma is not below the least gain for this T, N and W"
+    return [*found, Condition("gamma", claim, holds, gamma, bound, source, detail)]
+
+
+def _design(
+    plant: DescriptorSystem | Transformation, convex: GainProblem, gains: dict[str, FloatArray], name: str
+) -> ObserverDesign:
+    """Return the design of gains, claiming as little above its true norm as can be proved."""
+    given: dict[str, Any] = {letter: gains[letter] for letter in "TNLW"}
+    if not convex.disturbances:
+        return fault_estimation_filter_from_gains(plant, **given, name=name)
+    work = with_sensor_faults_as_states(linear_plant(plant).dense())
+    loop, shown_d = gains["T"] @ work.A - gains["L"] @ work.C, (np.eye(work.ny) - work.C @ gains["N"]) @ work.Dd
+    entering = gains["T"] @ work.Bd - gains["T"] @ work.A @ (gains["N"] @ work.Dd) - gains["L"] @ shown_d
+    norm = hinf_norm(loop, entering, gains["W"] @ work.C, gains["W"] @ shown_d).upper
+    if not np.isfinite(norm):
+        return fault_estimation_filter_from_gains(plant, **given, gamma=1.0, name=name)
+    size = max(norm, float(np.finfo(np.float64).eps) * convex.disturbance_size, float(np.finfo(np.float64).tiny))
+    for room in ROOMS:
+        found = fault_estimation_filter_from_gains(plant, **given, gamma=(1.0 + room) * size, name=name)
+        if found.report.passed:
+            break
+    return found

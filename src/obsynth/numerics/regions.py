@@ -1,0 +1,157 @@
+"""Regions of the complex plane that a linear matrix inequality describes: ``L + z M + conj(z) M' < 0``.
+
+Source: M. Chilali, P. Gahinet, IEEE TAC 41 (3), 1996, section II.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from obsynth.errors import SpecError
+from obsynth.numerics.arguments import is_finite_number, shown
+from obsynth.numerics.arrays import FloatArray, read_only
+
+
+@dataclass(frozen=True, eq=False)
+class LMIRegion:
+    """A region of the complex plane: all z with ``L + z M + conj(z) M' < 0``; open, convex, symmetric to the real axis.
+
+    Parameters
+    ----------
+    L : FloatArray
+        ``(k, k)``, symmetric.
+    M : FloatArray
+        ``(k, k)``.
+    text : str
+        The region in words.
+    """
+
+    L: FloatArray
+    M: FloatArray
+    text: str
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "L", read_only(self.L))
+        object.__setattr__(self, "M", read_only(self.M))
+
+    def __repr__(self) -> str:
+        return self.text
+
+    def __and__(self, other: LMIRegion) -> LMIRegion:
+        """Return the intersection of two regions."""
+        if not isinstance(other, LMIRegion):
+            return NotImplemented
+        one, two = len(self.L), len(other.L)
+        zero = np.zeros((one, two))
+        return LMIRegion(
+            np.block([[self.L, zero], [zero.T, other.L]]),
+            np.block([[self.M, zero], [zero.T, other.M]]),
+            f"{self.text} & {other.text}",
+        )
+
+    def margins(self, values: Any) -> FloatArray:
+        """Return, for each of some complex numbers, how far inside the region it is: negative outside."""
+        points = np.atleast_1d(np.asarray(values, dtype=np.complex128))
+        forms = self.L + points[:, None, None] * self.M + points.conj()[:, None, None] * self.M.T
+        return np.asarray(-np.linalg.eigvalsh(forms)[:, -1] if len(points) else np.zeros(0))
+
+    def contains(self, values: Any) -> bool:
+        """Whether all of some complex numbers lie in the region."""
+        return bool(np.all(self.margins(values) > 0.0))
+
+
+def disk(center: float, radius: float) -> LMIRegion:
+    """Return the open disk ``abs(z - center) < radius``.
+
+    Parameters
+    ----------
+    center : float
+        A real number; 1/s in continuous time, dimensionless in discrete time.
+    radius : float
+        Above zero, in the same unit.
+
+    Returns
+    -------
+    LMIRegion
+        ``[[-r, z - c], [conj(z) - c, -r]] < 0``.
+
+    Raises
+    ------
+    SpecError
+        The center is no real number, or the radius is not positive.
+    """
+    c, r = _number(center, "center"), _positive(radius, "radius")
+    return LMIRegion(np.array([[-r, -c], [-c, -r]]), np.array([[0.0, 1.0], [0.0, 0.0]]), f"disk({c:g}, {r:g})")
+
+
+def half_plane(decay: float) -> LMIRegion:
+    """Return the open half-plane ``Re z < -decay``.
+
+    Parameters
+    ----------
+    decay : float
+        1/s; 0 is stability in continuous time.
+
+    Returns
+    -------
+    LMIRegion
+        ``2 decay + z + conj(z) < 0``.
+
+    Raises
+    ------
+    SpecError
+        The decay is no real number.
+    """
+    a = _number(decay, "decay")
+    return LMIRegion(np.array([[2.0 * a]]), np.array([[1.0]]), f"half_plane({a:g})")
+
+
+def sector(damping: float) -> LMIRegion:
+    """Return the open sector of the left half-plane with ``-Re z > damping abs(z)``.
+
+    Parameters
+    ----------
+    damping : float
+        Damping ratio, between 0 and 1, dimensionless: the cosine of the angle to the negative real axis.
+
+    Returns
+    -------
+    LMIRegion
+        ``[[s (z + conj(z)), c (z - conj(z))], [c (conj(z) - z), s (z + conj(z))]] < 0`` with c the damping and
+        ``s^2 + c^2 = 1``.
+
+    Raises
+    ------
+    SpecError
+        The damping is no number between 0 and 1.
+    """
+    c = _number(damping, "damping")
+    if not 0.0 < c < 1.0:
+        raise SpecError(f"damping is {shown(damping)}: give a ratio between 0 and 1.", path="damping")
+    s = float(np.sqrt(1.0 - c**2))
+    return LMIRegion(np.zeros((2, 2)), np.array([[s, c], [-c, s]]), f"sector({c:g})")
+
+
+def checked_region(region: Any, name: str = "region") -> LMIRegion:
+    """Return a region; raise `SpecError` for anything else."""
+    if not isinstance(region, LMIRegion):
+        raise SpecError(
+            f"{name} is {shown(region)}: give conditions.disk(center, radius), conditions.half_plane(decay), "
+            "conditions.sector(damping), or several of them joined by &.", path=name,
+        )  # fmt: skip
+    return region
+
+
+def _number(value: Any, name: str) -> float:
+    if not is_finite_number(value):
+        raise SpecError(f"{name} is {shown(value)}: give a number.", path=name)
+    return float(value)
+
+
+def _positive(value: Any, name: str) -> float:
+    if not is_finite_number(value) or not value > 0.0:
+        raise SpecError(f"{name} is {shown(value)}: give a positive number.", path=name)
+    return float(value)
