@@ -6,7 +6,7 @@ With bases N of ker E, L of its left null space, completed by unit vectors D and
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any
@@ -67,14 +67,15 @@ def exact_elimination(plant: DescriptorSystem) -> ExactElimination | None:
     found = _eliminated(plant, clean=computed)
     if found is None or not computed:
         return found
-    before = _eliminated(plant, clean=False)
+    before = _eliminated(plant, clean=False, sized=False)
     if before is None or all(found.matrices[name] == before.matrices[name] for name in found.matrices):
         return replace(found, computed=True)
     return replace(found, computed=True, uncleaned=before.matrices)
 
 
-def _eliminated(plant: DescriptorSystem, *, clean: bool) -> ExactElimination | None:
-    """Return the elimination; with ``clean`` what rounding of computed data may have left is zero."""
+def _eliminated(plant: DescriptorSystem, *, clean: bool, sized: bool = True) -> ExactElimination | None:
+    """Return the elimination; with ``clean`` what rounding of computed data may have left is zero.
+    Without ``sized`` the sizes of terms are left out."""
     from obsynth.proofs.exact_arithmetic import blocks, null_basis, pivot_columns, written_matrix
 
     e, a, c = (written_matrix(matrix) for matrix in (plant.E, plant.A, plant.C))
@@ -90,15 +91,19 @@ def _eliminated(plant: DescriptorSystem, *, clean: bool) -> ExactElimination | N
         return None
     direct = blocks([[c * keep, *(written_matrix(getattr(plant, name)) for name in _DIRECT)]])
     states = blocks([[keep, *(_zeros(plant.nx, int(signal.ncols())) for signal in signals)]])
-    moving = take * right
-    with np.errstate(all="ignore"):
-        sizes = _term_sizes(left, right, coupling, (take, a * null), (direct, c * null), take * e * keep)
+    moving, leading = take * right, take * e * keep
+    # The inverses are asked for their sizes alone.
+    inverses = [_sizes(part.inv()) for part in (coupling, leading)] if clean or sized else []
+    sizes = [np.zeros((int(part.nrows()), int(part.ncols()))) for part in (moving, direct)]
+    if sized:
+        with np.errstate(all="ignore"):
+            sizes = _term_sizes((left, right), coupling, (take, a * null), (direct, c * null), leading, inverses)
     if plant.nx > len(pivots):
-        algebraic = _solved(-coupling, left * right, clean=clean)
+        algebraic = _solved(-coupling, left * right, inverses[0] if clean else None)
         moving = _sum(moving, take * (a * null), algebraic, clean=clean)
         direct = _sum(direct, c * null, algebraic, clean=clean)
         states = _sum(states, null, algebraic, clean=clean)
-    moving = _solved(take * e * keep, moving, clean=clean)
+    moving = _solved(leading, moving, inverses[1] if clean else None)
     widths = [len(pivots), *(int(signal.ncols()) for signal in signals)]
     return ExactElimination(
         dict(zip(("A", *_SIGNALS), _split(moving, widths), strict=True))
@@ -112,19 +117,19 @@ def _eliminated(plant: DescriptorSystem, *, clean: bool) -> ExactElimination | N
 
 
 def _term_sizes(
-    left: fmpq_mat, right: fmpq_mat, coupling: fmpq_mat, equations: tuple[fmpq_mat, fmpq_mat],
-    outputs: tuple[fmpq_mat, fmpq_mat], moving: fmpq_mat,
-) -> tuple[FloatArray, FloatArray]:  # fmt: skip
-    """Return the sums of the sizes of all terms, of the dynamic equations and of the outputs."""
-    take, across = equations
-    direct, shown = outputs
-    inverse, dynamic = _sizes(moving.inv()), _sizes(take) @ _sizes(right)
+    constraints: tuple[fmpq_mat, fmpq_mat], coupling: fmpq_mat, equations: tuple[fmpq_mat, fmpq_mat],
+    outputs: tuple[fmpq_mat, fmpq_mat], moving: fmpq_mat, inverses: Sequence[FloatArray],
+) -> list[FloatArray]:  # fmt: skip
+    """Return the sums of the sizes of all terms, of the dynamic equations and of the outputs.
+    ``inverses``: sizes of the inverses of ``coupling`` and ``moving``."""
+    (left, right), (take, across), (direct, shown) = constraints, equations, outputs
+    solver, inverse = inverses
+    dynamic = _sizes(take) @ _sizes(right)
     if not coupling.nrows():
-        return inverse @ (_sizes(moving) @ (inverse @ dynamic)), _sizes(direct)
-    solver = _sizes(coupling.inv())
+        return [inverse @ (_sizes(moving) @ (inverse @ dynamic)), _sizes(direct)]
     algebraic = solver @ (_sizes(coupling) @ (solver @ (_sizes(left) @ _sizes(right))))
     dynamic = dynamic + _sizes(take * across) @ algebraic
-    return inverse @ (_sizes(moving) @ (inverse @ dynamic)), _sizes(direct) + _sizes(shown) @ algebraic
+    return [inverse @ (_sizes(moving) @ (inverse @ dynamic)), _sizes(direct) + _sizes(shown) @ algebraic]
 
 
 def rounded_once(
@@ -174,10 +179,10 @@ def _moved_sizes(sizes: Mapping[str, FloatArray], change: FloatArray, back: Floa
     return {name: change @ size if name in ("A", *_SIGNALS) else size for name, size in found.items()}
 
 
-def _solved(matrix: fmpq_mat, right: fmpq_mat, *, clean: bool) -> fmpq_mat:
-    """Return ``matrix^-1 right``; of computed data, what their rounding may have left is zero."""
+def _solved(matrix: fmpq_mat, right: fmpq_mat, inverse: FloatArray | None) -> fmpq_mat:
+    """Return ``matrix^-1 right``; with the sizes of ``matrix^-1``, what rounding of the data may have left is zero."""
     solution = matrix.solve(right)
-    return _cleaned(solution, _sizes(matrix.inv()) @ (_sizes(matrix) @ _sizes(solution))) if clean else solution
+    return solution if inverse is None else _cleaned(solution, inverse @ (_sizes(matrix) @ _sizes(solution)))
 
 
 def _sum(direct: fmpq_mat, factor: fmpq_mat, solution: fmpq_mat, *, clean: bool) -> fmpq_mat:
