@@ -121,6 +121,7 @@ _PACKAGES = ("conditions", "plotting")
 __all__ = sorted(_HOMES)
 
 provide({
+    "conditions of a design": "obsynth.conditions.shipped:conditions_of",
     "checks as text": "obsynth.results.layout:report_text",
     "design summary": "obsynth.report.summary:summary",
     "designs with model error": "obsynth.experiments.tolerant_designs:with_model_error",

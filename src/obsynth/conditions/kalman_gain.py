@@ -13,22 +13,24 @@ covariance of e is a squared H2 norm: least at the Kalman gain (11), and linear 
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from obsynth.analysis.conditions import Condition
 from obsynth.analysis.time_varying import as_time_varying
 from obsynth.analysis.transformations.recovery import Transformation, linear_plant
 from obsynth.conditions import atoms
 from obsynth.conditions.problem import Conditions, Values, require_data
 from obsynth.errors import SpecError, VerificationError
-from obsynth.methods.descriptor_kalman.public import descriptor_kalman
-from obsynth.methods.descriptor_kalman.synthesis import conditions as existence
-from obsynth.methods.descriptor_kalman.synthesis import without_unknown_inputs
+from obsynth.methods.descriptor_kalman.unknown_inputs import kalman_conditions, without_unknown_inputs
+from obsynth.methods.functions import descriptor_kalman
 from obsynth.methods.recursive.steady_filter import steady_state_filter
 from obsynth.methods.recursive.synthesis_parts import with_stated_noise
 from obsynth.numerics.arrays import FloatArray, as_matrix
+from obsynth.numerics.norms import output_covariance
 from obsynth.numerics.ranks import covariance_factor
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
@@ -58,9 +60,9 @@ def kalman(
     Returns
     -------
     Conditions
-        Variables ``P (nx, nx)`` (inverse of the covariance at the optimum), ``Y``, ``Z``; the minimum is the trace of
-        the steady covariance; constraints ``"(13) stable"`` and ``"(13) covariance"``; gains ``L (nx, ne)``,
-        ``K (nx, ny)``, ``covariance``.
+        Variables ``P (nx, nx)``, ``Y``, ``Z``; the minimum is the trace of the steady covariance; constraints
+        ``"(13) stable"`` and ``"(13) covariance"``; gains ``L (nx, ne)``, ``K (nx, ny)`` and the ``covariance
+        (nx, nx)`` of the error with them.
 
     Raises
     ------
@@ -79,32 +81,10 @@ def kalman(
     .. [MoussaAli2013] Fault diagnosis for linear time-varying descriptor systems, IFAC ALCOSP 2013, eqs. (4)-(16).
     .. [Nikoukhah1992] Kalman filtering and Riccati equations for descriptor systems, IEEE TAC 37 (9), Lemma 2.4.
     """
-    import cvxpy as cp
-
     own = linear_plant(plant).dense()
-    held = existence(own)
+    held = tuple(kalman_conditions(own))
     require_data(held, solvers=("detectability",))
     varying, process, sensor = _noisy_plant(own, Q, R)
-    E, A, C = varying.E.at(1), varying.A.at(0), varying.C.at(1)
-    ne, n = E.shape
-
-    H = np.vstack([E, C])
-    inverse, null = np.linalg.pinv(H), np.linalg.svd(H)[0][:, n:].T
-    L0, K0, N1, N2 = inverse[:, :ne], inverse[:, ne:], null[:, :ne], null[:, ne:]
-    W, V = covariance_factor(process, "Q"), covariance_factor(sensor, "R")
-    nw, m = W.shape[1] + V.shape[1], len(null)
-
-    P, Z = cp.Variable((n, n), symmetric=True, name="P"), cp.Variable((nw, nw), symmetric=True, name="Z")
-    Y = cp.Variable((n, m), name="Y")
-    stable, covariance = atoms.h2(
-        L0 @ A, np.hstack([L0 @ W, -K0 @ V]), np.eye(n), np.zeros((n, nw)), P, Z, own.dt,
-        Y=Y, Cy=-N1 @ A, Dy=np.hstack([-N1 @ W, N2 @ V]), margin=margin,
-    )  # fmt: skip
-    constraints = {"(13) stable": stable, "(13) covariance": covariance}
-
-    def gains(values: Values) -> dict[str, FloatArray]:
-        S = np.linalg.solve(values["P"], values["Y"])
-        return {"L": L0 + S @ N1, "K": K0 + S @ N2, "covariance": np.linalg.inv(values["P"])}
 
     def design(found: dict[str, FloatArray], name: str) -> ObserverDesign:
         made = descriptor_kalman(plant, Q=Q, R=R, name=name)
@@ -118,7 +98,41 @@ def kalman(
                 )  # fmt: skip
         return made
 
-    data = {"E": E, "A": A, "C": C, "L0": L0, "K0": K0, "N1": N1, "N2": N2, "Q": process, "R": sensor}
+    return steady_gain(varying, process, sensor, margin=margin, held=held, design=design)
+
+
+def steady_gain(
+    varying: TimeVaryingDescriptorSystem, process: FloatArray, sensor: FloatArray, *, margin: float,
+    held: Sequence[Condition], design: Callable[[dict[str, FloatArray], str], ObserverDesign],
+) -> Conditions:  # fmt: skip
+    """Return the inequalities of a plant without unknown inputs, constant matrices, with its covariances."""
+    import cvxpy as cp
+
+    E, A, C = varying.E.at(1), varying.A.at(0), varying.C.at(1)
+    ne, n = E.shape
+
+    H = np.vstack([E, C])
+    inverse, null = np.linalg.pinv(H), np.linalg.svd(H)[0][:, n:].T
+    L0, K0, N1, N2 = inverse[:, :ne], inverse[:, ne:], null[:, :ne], null[:, ne:]
+    W, V = covariance_factor(process, "Q"), covariance_factor(sensor, "R")
+    nw, m = W.shape[1] + V.shape[1], len(null)
+
+    P, Z = cp.Variable((n, n), symmetric=True, name="P"), cp.Variable((nw, nw), symmetric=True, name="Z")
+    Y = cp.Variable((n, m), name="Y")
+    stable, covariance = atoms.h2(
+        L0 @ A, np.hstack([L0 @ W, -K0 @ V]), np.eye(n), np.zeros((n, nw)), P, Z, varying.dt,
+        Y=Y, Cy=-N1 @ A, Dy=np.hstack([-N1 @ W, N2 @ V]), margin=margin,
+    )  # fmt: skip
+    constraints = {"(13) stable": stable, "(13) covariance": covariance}
+
+    def gains(values: Values) -> dict[str, FloatArray]:
+        S = np.linalg.solve(values["P"], values["Y"])
+        L, K = L0 + S @ N1, K0 + S @ N2
+        driven = np.hstack([L @ W, -K @ V])
+        return {"L": L, "K": K, "covariance": output_covariance(L @ A, driven, np.eye(n), np.zeros((n, nw)))}
+
+    data = {"E": E, "A": A, "C": C, "L0": L0, "K0": K0, "N1": N1, "N2": N2, "Q": process, "R": sensor,
+            "W": W, "V": V}  # fmt: skip
     return Conditions(
         "Moussa Ali, Zhang 2013, (10)-(13): steady Kalman gain as an H2 inequality",
         cp.Problem(cp.Minimize(cp.trace(Z)), list(constraints.values())), {"P": P, "Y": Y, "Z": Z}, {}, data,

@@ -17,19 +17,20 @@ a U of full rank, unless E_sharp, C_sharp and G of (10), (11) are given; several
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from obsynth.analysis.conditions import Condition
 from obsynth.analysis.transformations.recovery import Transformation, linear_plant
 from obsynth.conditions import atoms
 from obsynth.conditions.problem import Conditions, Values, require_data
 from obsynth.errors import SpecError
 from obsynth.methods.conic import lmi
-from obsynth.methods.placement.eigenstructure import place
+from obsynth.methods.placement.eigenstructure import checked_poles, place
 from obsynth.methods.riccati import lyapunov_factor
 from obsynth.methods.ui_pi_observer.augmented_plant import (
     AugmentedPlant,
@@ -42,13 +43,12 @@ from obsynth.methods.ui_pi_observer.augmented_plant import (
     realise,
 )
 from obsynth.methods.ui_pi_observer.conditions import existence
-from obsynth.methods.ui_pi_observer.options import checked_poles
 from obsynth.methods.ui_pi_observer.placement_problem import with_faults
 from obsynth.methods.ui_pi_observer.public import ui_pi_observer_from_gains
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.numerics.regions import LMIRegion, checked_region, disk, half_plane
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.fault_models import exosystem
+from obsynth.plants.fault_models import Exosystem, exosystem
 from obsynth.results.design import ObserverDesign
 
 #: Conditions whose failure leaves an inequality that no matrices satisfy.
@@ -100,61 +100,72 @@ def sharepasand(
     .. [SharePasand] Unknown Input-Proportional Integral Observer for Singular Systems: Application to fault detection,
        eqs. (10)-(13), (19), procedure 1.
     """
-    import cvxpy as cp
-
     if poles is not None and region is not None:
         raise SpecError("poles and region are given: use one of them.", path="poles")
     own = linear_plant(plant).dense()
     model = exosystem(fault_model, own.fault_names, own.dt)
     found = existence(own, model)
     require_data(found.conditions, solvers=LEFT_TO_THE_SOLVER)
-    work = found.plant
-    whole = AugmentedPlant.of(work, model)  # (13)
-    parts = _decoupling(work, E_sharp, C_sharp, G)  # (10), (11)
-    U_a, D_a = with_faults(parts.U, parts.Dhat, work, model)  # (19)
+    parts = _decoupling(found.plant, E_sharp, C_sharp, G)  # (10), (11)
+    target = plant if found.transformation is None else found.transformation
+    return augmented_problem(
+        found.plant, model, with_faults(parts.U, parts.Dhat, found.plant, model), region=region, poles=poles,
+        margin=margin, held=found.conditions, design=partial(_design, target, fault_model),
+    )  # fmt: skip
+
+
+def augmented_problem(
+    plant: DescriptorSystem, model: Exosystem, decoupling: tuple[FloatArray, FloatArray], *, margin: float,
+    held: Sequence[Condition], design: Callable[[dict[str, FloatArray], str], ObserverDesign],
+    region: LMIRegion | None = None, poles: Sequence[Any] | None = None, X: FloatArray | None = None,
+) -> Conditions:  # fmt: skip
+    """Return the conditions for given ``U_a (na, na)`` and ``D_a (na, ny)`` (19), in coordinates ``X (na, na)``."""
+    import cvxpy as cp
+
+    whole = AugmentedPlant.of(plant, model)  # (13)
+    U_a, D_a = decoupling
     # Outputs that show d directly are solved for it; the others are left for the gain.
-    injected = np.vstack([parts.injection, np.zeros((model.order, work.ny))])
-    UA, seen = U_a @ (whole.A - injected @ whole.C), parts.seen @ whole.C
-    na, m = whole.order, len(seen)
-    stable = disk(0.0, 1.0) if own.is_discrete else half_plane(0.0)
+    seen, injection, _ = direct_part(plant)
+    injected = np.vstack([injection, np.zeros((model.order, plant.ny))])
+    UA, shown = U_a @ (whole.A - injected @ whole.C), seen @ whole.C
+    na, m = whole.order, len(shown)
+    stable = disk(0.0, 1.0) if plant.is_discrete else half_plane(0.0)
     where = stable if region is None else stable & checked_region(region)
 
     P = cp.Variable((na, na), symmetric=True, name="P")
     constraints = {"P": lmi.at_least(P, 1.0)}  # the inequalities leave the scale free
     if poles is None:
-        X = _coordinates(UA, seen, where, discrete=own.is_discrete)
-        UAx, Cx = np.linalg.solve(X, UA @ X), seen @ X
+        X = _coordinates(UA, shown, where, discrete=plant.is_discrete) if X is None else X
+        UAx, Cx = np.linalg.solve(X, UA @ X), shown @ X
         Y = cp.Variable((na, m), name="Y")
         # As P >= I, the first is no less than the norm of K_a; the second makes the optimum one that solvers agree on.
         variables, goal = {"P": P, "Y": Y}, cp.norm(Y, "fro") + cp.trace(P)
-        closed = partial(atoms.region, UAx, P, Y=Y, Cy=Cx, margin=margin)
-        constraints["stability"] = closed(where=stable)[1]
+        constraints["stability"] = atoms.region(UAx, P, stable, Y=Y, Cy=Cx, margin=margin)[1]
         if region is not None:
-            constraints["region"] = closed(where=region)[1]
+            constraints["region"] = atoms.region(UAx, P, region, Y=Y, Cy=Cx, margin=margin)[1]
     else:
-        none = np.zeros(0, dtype=np.complex128)
-        wanted = checked_poles(poles, na, none, own.dt)
-        K = place(UA, seen, wanted, dt=own.dt, objective="gain").K
+        wanted = checked_poles(poles, na, np.zeros(0, dtype=np.complex128), plant.dt, of="ui-pi-observer")
+        K = place(UA, shown, wanted, dt=plant.dt, objective="gain").K
+        X = np.asarray(np.linalg.inv(lyapunov_factor(UA - K @ shown, plant.dt)))
         variables, goal = {"P": P}, cp.trace(P)
-        X = np.asarray(np.linalg.inv(lyapunov_factor(UA - K @ seen, own.dt)))
-        constraints["stability"] = atoms.region(np.linalg.solve(X, (UA - K @ seen) @ X), P, stable, margin=margin)[1]
+        closed = np.linalg.solve(X, (UA - K @ shown) @ X)
+        constraints["stability"] = atoms.region(closed, P, stable, margin=margin)[1]
 
     def gains(values: Values) -> dict[str, FloatArray]:
         free = K if poles is not None else X @ np.linalg.solve(values["P"], values["Y"])
-        K_a = free @ parts.seen + U_a @ injected
-        letters = realise(work, model, ObserverGains(U_a, D_a, K_a), combinations_seen(work))[1]
-        nx = work.nx
+        K_a = free @ seen + U_a @ injected
+        letters = realise(plant, model, ObserverGains(U_a, D_a, K_a), combinations_seen(plant))[1]
+        nx = plant.nx
         return {**letters, "U": U_a[:nx, :nx], "D": D_a[:nx], "K": K_a[:nx], "F": K_a[nx:]}
 
     data = {
         "U_a": U_a, "D_a": D_a, "E_a": whole.E, "A_a": whole.A, "B_da": whole.Bd, "C_a": whole.C, "UA": UA,
-        "C_seen": seen, "X": X, "Phi": model.Phi, "Cw": model.Cw,
+        "C_seen": shown, "X": X, "Phi": model.Phi, "Cw": model.Cw,
     }  # fmt: skip
-    target = plant if found.transformation is None else found.transformation
     return Conditions(
         "Share Pasand, Aliyari, Taghirad, (13), (19), procedure 1",
-        cp.Problem(cp.Minimize(goal), list(constraints.values())), variables, {}, data, constraints,
-        lambda: found.conditions, gains, partial(_design, target, fault_model),
+        cp.Problem(cp.Minimize(goal), list(constraints.values())), variables, {}, data, constraints, lambda: held,
+        gains, design,
     )  # fmt: skip
 
 

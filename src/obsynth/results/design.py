@@ -189,6 +189,50 @@ class ObserverDesign:
         """
         return save(self, path)
 
+    def conditions(self) -> Any:
+        """Return the `obsynth.conditions.Conditions` of the design's paper, with what is shipped put in.
+
+        Every variable has the value of the certificate, so that each constraint can be evaluated:
+        ``constraint.violation()`` is zero to rounding, whichever engine found the gains.
+
+        Raises
+        ------
+        SpecError
+            The method is not made of matrix inequalities, or the plant changes with k.
+        """
+        return extension("conditions of a design")(self)
+
+    def to_scipy(self) -> Any:
+        """Return the observer as a ``scipy.signal`` state space from ``[u; y]`` to ``[xhat; fhat; r]``.
+
+        A ``scipy.signal.StateSpace``, with ``dt`` in seconds where the design is discrete.  Of a recursive design for
+        a time-invariant plant it is the steady state of the recursion.
+
+        Raises
+        ------
+        SpecError
+            The plant changes with k or is nonlinear: there is no constant realisation.
+        PreconditionError, SolverError
+            A recursive design has no stable steady state.
+        """
+        import numpy as np
+        from scipy.signal import StateSpace
+
+        observer = self._constant_observer()
+        matrices = (
+            observer.Az, np.hstack([observer.Bu, observer.By]), observer.Cz, np.hstack([observer.Du, observer.Dy])
+        )  # fmt: skip
+        return StateSpace(*matrices, dt=observer.dt) if observer.dt > 0.0 else StateSpace(*matrices)
+
+    def _constant_observer(self) -> LinearObserver:
+        """Return the observer, of a recursive design its steady state."""
+        from obsynth.observers.recursive.gain_schedule import steady_observer
+        from obsynth.observers.recursive.observer import RecursiveObserver
+
+        if isinstance(self.observer, RecursiveObserver):
+            return steady_observer(self.observer).observer
+        return self.linear[1]
+
     def to_control(self) -> control.StateSpace:
         """Return the observer as a ``control.StateSpace`` from ``[u; y]`` to ``[xhat; fhat; r]``, with names.
 
@@ -204,12 +248,7 @@ class ObserverDesign:
         import control
         import numpy as np
 
-        from obsynth.observers.recursive.gain_schedule import steady_observer
-        from obsynth.observers.recursive.observer import RecursiveObserver
-
-        observer = (
-            steady_observer(self.observer).observer if isinstance(self.observer, RecursiveObserver) else self.linear[1]
-        )
+        observer = self._constant_observer()
         return control.ss(
             observer.Az, np.hstack([observer.Bu, observer.By]), observer.Cz, np.hstack([observer.Du, observer.Dy]),
             observer.dt, inputs=[*observer.input_names, *observer.output_names], outputs=list(observer.row_names),
