@@ -64,7 +64,8 @@ class NamedPencil:
         With ``dt`` the point may move, but not become stable.  ``last``: the last column is to depend on the others."""
         at = 0j if point is None else complex(point)
         matrix = nearest(self.A) - (at if at.imag else at.real) * nearest(self.E)
-        sizes = np.abs(matrix) if self.terms is None else self.terms + abs(at) * np.abs(nearest(self.E))
+        # Of the terms, not of what is left of them: at a point that rounding has moved off a mode that is nothing.
+        sizes = (np.abs(nearest(self.A)) if self.terms is None else self.terms) + abs(at) * np.abs(nearest(self.E))
         scaled = self.rows[:, None] * sizes * self.columns
         pencil = equilibrate_pencil(np.zeros_like(scaled), scaled)
         rows, columns = self.rows * pencil.rows, self.columns * pencil.columns
