@@ -123,7 +123,7 @@ STRUCTURES: dict[Callable[[np.random.Generator], dict], int] = {
 }
 
 
-DROWNED = "Unclear: gains were found and proved, but they are so large"
+DROWNED = "Unclear: gains were found, but they are so large"
 #: Where a filter of the equations exists, but rounding of its data would drown the fault, and the refusal says so.
 AT_THE_LIMIT = {hardly_visible_fault: (DROWNED,)}
 

@@ -88,7 +88,7 @@ def test_a_rate_far_above_the_plants_own_is_reached(joint: bool) -> None:
 @pytest.mark.parametrize("decay", [1e5, 1e6])
 @pytest.mark.parametrize("joint", [False, True])
 def test_gains_that_drown_a_unit_fault_in_rounding_are_no_design(decay: float, joint: bool) -> None:
-    with pytest.raises(PreconditionError, match=r"^Unclear: gains were found and proved, but they are so large"):
+    with pytest.raises(PreconditionError, match=r"^Unclear: gains were found, but they are so large"):
         ui_pi_observer(PAPER, decay=decay, joint=joint)
 
 

@@ -121,7 +121,7 @@ def require_above_rounding(plant: DescriptorSystem, observer: LinearObserver) ->
     if least[worst] >= MOST:
         name = plant.fault_names[worst]
         raise PreconditionError(
-            "Unclear: gains were found and proved, but they are so large that rounding of the outputs to double "
+            "Unclear: gains were found, but they are so large that rounding of the outputs to double "
             f"precision alone moves the estimate of {name!r} by {least[worst]:.2g} of the fault at every frequency "
             f"tried. {_doubt(plant, observer, worst).described(plant)}",
             condition="gains against rounding",

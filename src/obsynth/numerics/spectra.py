@@ -140,13 +140,16 @@ def noise_covariance(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray,
 
 
 def certain_noise_covariance(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, dt: float) -> FloatArray:
-    """Return `noise_covariance`, or NaN where the trace by observability disagrees: all digits are rounding."""
+    """Return `noise_covariance`, or NaN where the trace by observability disagrees: all digits are rounding.
+    Infinite is that of a matrix with a pole on or outside the boundary, not of sums that rounding has blown up."""
     found = noise_covariance(a, b, c, d, dt)
     # A variance below zero is rounding as well.
     variance, again = float(np.trace(found)), float(np.trace(noise_covariance(a.T, c.T, b.T, d.T, dt)))
-    if not np.isfinite(variance) or abs(variance - again) <= AGREEMENT * variance:
-        return found
-    return np.full_like(found, np.nan)
+    if np.isfinite(variance):
+        known = abs(variance - again) <= AGREEMENT * variance
+    else:
+        known = not np.isfinite(again) and not abscissa(a, dt) < (1.0 if dt > 0.0 else 0.0)
+    return found if known else np.full_like(found, np.nan)
 
 
 def boundary_points(frequencies: FloatArray, dt: float) -> ComplexArray:
