@@ -5,6 +5,7 @@ The unknowns only shift with the units of the data: up to the rounding of expone
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -170,6 +171,8 @@ RIDGE = 1e-11
 WISH_WEIGHT = 1e-8
 #: An entry this many bits below one has half a say: what is far below is coupling that hardly counts, or rounding.
 HALF_SAY = 10.0
+#: Corrections by exact residuals, each of which takes four or five digits of rounding away.
+REFINEMENTS = 3
 #: Passes in which small entries lose their say.
 PASSES = 3
 
@@ -204,12 +207,33 @@ class LogBalance:
 
     def solve(self, *, passes: int = PASSES, ridge: float = RIDGE) -> FloatArray:
         """Return the exponents ``(count,)``, not rounded."""
-        found = self._solved([term.weights for term in self._terms], ridge)
+        weights = [term.weights for term in self._terms]
+        normal, found = self._solved(weights, ridge)
         for _ in range(passes):
-            found = self._solved([term.weights * term.say(found) for term in self._terms], ridge)
-        return found
+            weights = [term.weights * term.say(found) for term in self._terms]
+            normal, found = self._solved(weights, ridge)
+        # What the entries leave open would be rounding over the ridge: of exact residuals nothing is left of it.
+        for _ in range(REFINEMENTS):
+            found = found + np.linalg.solve(normal, self._missed(weights, found, ridge))
+        return np.asarray(found, dtype=np.float64)
 
-    def _solved(self, weights: Sequence[FloatArray], ridge: float) -> FloatArray:
+    def _missed(self, weights: Sequence[FloatArray], found: FloatArray, ridge: float) -> FloatArray:
+        """Return what is left of the normal equations, each sum rounded once."""
+        parts: list[list[float]] = [[-ridge * value] for value in found.tolist()]
+        for term, weight in zip(self._terms, weights, strict=True):
+            missed = -weight * term.logarithms(found)
+            for place, row in zip(range(term.rows.start, term.rows.stop), missed, strict=True):
+                parts[place].extend((term.row_sign * row).tolist())
+            for place, column in zip(range(term.columns.start, term.columns.stop), missed.T, strict=True):
+                parts[place].extend((term.column_sign * column).tolist())
+            if term.common is not None:
+                parts[term.common].extend(missed.ravel().tolist())
+        for unknown, exponent in self._wishes:
+            parts[unknown].append(WISH_WEIGHT * (exponent - float(found[unknown])))
+        return np.array([math.fsum(part) for part in parts])
+
+    def _solved(self, weights: Sequence[FloatArray], ridge: float) -> tuple[FloatArray, FloatArray]:
+        """Return the normal matrix and the solution."""
         normal, right = ridge * np.eye(self.count), np.zeros(self.count)
         diagonal = np.einsum("ii->i", normal)
         for term, weight in zip(self._terms, weights, strict=True):
@@ -230,7 +254,7 @@ class LogBalance:
         for unknown, exponent in self._wishes:
             normal[unknown, unknown] += WISH_WEIGHT
             right[unknown] += WISH_WEIGHT * exponent
-        return np.asarray(np.linalg.solve(normal, right), dtype=np.float64)
+        return normal, np.asarray(np.linalg.solve(normal, right), dtype=np.float64)
 
 
 def _in_turn(parts: FloatArray) -> FloatArray:
@@ -250,10 +274,12 @@ class _Term:
     column_sign: int
     common: int | None
 
-    def say(self, exponents: FloatArray) -> FloatArray:
-        """Return the say of each entry: all of it above one, less the further it is below."""
+    def logarithms(self, exponents: FloatArray) -> FloatArray:
+        """Return the logarithms of the scaled entries."""
         rows, columns = self.row_sign * exponents[self.rows], self.column_sign * exponents[self.columns]
         sizes = self.sizes + rows[:, None] + columns
-        if self.common is not None:
-            sizes += exponents[self.common]
-        return np.asarray(1.0 / (1.0 + (np.minimum(sizes, 0.0) / HALF_SAY) ** 2))
+        return sizes if self.common is None else sizes + exponents[self.common]
+
+    def say(self, exponents: FloatArray) -> FloatArray:
+        """Return the say of each entry: all of it above one, less the further it is below."""
+        return np.asarray(1.0 / (1.0 + (np.minimum(self.logarithms(exponents), 0.0) / HALF_SAY) ** 2))

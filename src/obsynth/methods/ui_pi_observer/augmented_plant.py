@@ -109,14 +109,17 @@ def decouple(plant: DescriptorSystem) -> Decoupled:
     null = q[:, nx:].T
     ut, dt = inverse[:, :left_over], inverse[:, left_over:]
     nu, nd = null[:, :left_over], null[:, left_over:]
-    z = _completing(ut, nu, (kept @ plant.A).T)
+    # What A leaves open a fixed matrix decides, and not the orientation of somebody's singular vectors.
+    generic = np.random.default_rng(0).standard_normal((nx, nx))
+    z = _completing(ut, nu, plant.A.T @ kept.T, generic @ kept.T)
     return Decoupled((ut + z @ nu) @ kept, (dt + z @ nd) @ seen, nu @ kept, nd @ seen, seen, injection)
 
 
-def _completing(ut: FloatArray, nu: FloatArray, wanted: FloatArray) -> FloatArray:
+def _completing(ut: FloatArray, nu: FloatArray, wanted: FloatArray, generic: FloatArray) -> FloatArray:
     """Return Z such that ``ut + Z nu`` has full column rank; ``[ut; nu]`` has, so what ut lacks, nu sees.
 
-    Kernel directions of ut go outside its range, near where ``wanted`` sends them: no choice hangs on rounding.
+    Kernel directions of ut go outside its range, near where ``wanted`` sends them, or else ``generic``: no choice hangs
+    on rounding.
     """
     rows, columns = ut.shape
     if columns == 0 or nu.shape[0] == 0:
@@ -128,15 +131,24 @@ def _completing(ut: FloatArray, nu: FloatArray, wanted: FloatArray) -> FloatArra
     if lacking == 0:
         return np.zeros((rows, nu.shape[0]))
     kernel = right[rank:].T
-    outside = left[:, rank:] @ _nearest_isometry(left[:, rank:].T @ wanted @ kernel)
+    free = left[:, rank:]
+    scale = float(np.linalg.norm(wanted))
+    outside = free @ _nearest_isometry(free.T @ wanted @ kernel, free.T @ generic @ kernel, scale)
     shown = nu @ kernel
     return np.asarray(outside @ np.linalg.pinv(shown) * largest)
 
 
-def _nearest_isometry(matrix: FloatArray) -> FloatArray:
-    """Return the matrix ``(m, n)``, ``m >= n``, with orthonormal columns that is nearest: the polar factor."""
-    left, _, right = np.linalg.svd(matrix, full_matrices=False)
-    return np.asarray(left @ right)
+def _nearest_isometry(matrix: FloatArray, otherwise: FloatArray, scale: float) -> FloatArray:
+    """Return the matrix ``(m, n)``, ``m >= n``, with orthonormal columns that is nearest: the polar factor.
+    Directions in which the matrix is nothing beside ``scale`` go where ``otherwise (m, n)`` sends them."""
+    left, values, right = np.linalg.svd(matrix)
+    rank = int(np.sum(values > RANK_TOLERANCE * scale))
+    found = left[:, :rank] @ right[:rank]
+    if rank < matrix.shape[1]:
+        outer, inner = left[:, rank:], right[rank:]
+        turned = np.linalg.svd(outer.T @ otherwise @ inner.T, full_matrices=False)
+        found = found + outer @ turned[0] @ turned[2] @ inner
+    return np.asarray(found)
 
 
 def paper_decoupling(
