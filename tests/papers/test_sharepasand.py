@@ -9,6 +9,7 @@ import pytest
 from exact_runs import ONE, RAMP, Together, ramp_and_sine, sine
 
 import obsynth
+from obsynth.numerics.spectra import spectrum_error
 from obsynth.analysis.zeros import invariant_zeros
 from obsynth.methods.placement.eigenstructure import place
 from obsynth.methods.ui_pi_observer.augmented_plant import paper_decoupling
@@ -187,7 +188,9 @@ class TestShipped:
     def test_repeated_poles_and_a_region(self) -> None:
         for poles in ([-4] * 5, [-4, -4, -5, -5, -6]):
             found = obsynth.ui_pi_observer(PLANT, fault_model="ramp", poles=poles)
-            assert found.report["poles"].value < 1e-6
+            assert found.report["poles"].passed
+            # Rounding scatters k poles by its k-th root, but moves their mean by cond * |Ahat| * 1e-16 = 1e-10 at most.
+            assert spectrum_error(found.observer.Az, poles, 0.0) < 1e-6
         region = TRUTH["region"]
         found = obsynth.ui_pi_observer(PLANT, fault_model="ramp", region=region)
         poles = np.linalg.eigvals(found.observer.Az)

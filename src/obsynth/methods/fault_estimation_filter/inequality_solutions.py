@@ -24,7 +24,7 @@ MARGIN = 1e-9
 P_FLOOR = 1e-4
 P_CEILING = 1e4
 #: Relative room in P and in the squared level for the gains of the eliminated form.
-RECOVERY_ROOM = 1e-6
+RECOVERY_ROOM = 1e-5
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,6 +30,8 @@ TIME_CONSTANTS, LEAST_SAMPLES = 7.0, 4.0
 REACHED, ASKED_AT = 0.1, (1.0, 1.5, 2.5)
 #: Where no walk shows a step in time: walks that miss it by so much more than the best are as good.
 AS_CLOSE = 0.05
+#: A walk that misses a step by more shows nothing of it in time: how much more than that is a matter of rounding.
+NOTHING_SHOWN = 0.5
 #: Errors that need longer than so many settling times to die out would stay in any run: the gain moves such poles.
 FOR_GOOD = 1e5
 #: Decades of the search around a rate of the size of the noise, and its steps per decade at the end.
@@ -74,7 +76,8 @@ def default_rates(model: FilterModel, seconds: float, *, lag: int) -> tuple[Floa
         misses = {e: step_misses(model, found, seconds) for e, found in tried.items() if found is not None}
         if not misses:
             raise SolverError("No walk of the fault gives a stable filter: give fault_rate, or poles.")
-        high = min(e for e, miss in misses.items() if miss <= min(misses.values()) + AS_CLOSE)
+        least = min(misses.values())
+        high = min(e for e, miss in misses.items() if miss <= least + AS_CLOSE or least > NOTHING_SHOWN)
     else:
         low = high - 1.0
         for _ in range(BISECTIONS):

@@ -21,6 +21,8 @@ MANY_STATES = 40
 #: A rate that cannot be had at once is gone to in steps of this factor, from one that is at most so many below.
 RATE_FACTOR = 4.0
 MOST_STEPS = 12
+#: Steps are shortened down to this factor.
+LEAST_FACTOR = 1.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,15 +44,20 @@ class KalmanProblem:
         best, change = self.solved(decay, plain)
         if best is not None or not persistent:
             return best
-        slower = [decay]
-        while best is None and len(slower) <= MOST_STEPS:
-            slower.append(slower[-1] / RATE_FACTOR)
-            best, change = self.solved(slower[-1], plain)
-        for rate in reversed(slower[:-1]):
-            if best is None:
-                break
-            best, change = self.solved(rate, change)
-        return best
+        rate, steps = decay, 0
+        while best is None and steps <= MOST_STEPS:
+            rate, steps = rate / RATE_FACTOR, steps + 1
+            best, change = self.solved(rate, plain)
+        factor = RATE_FACTOR
+        while best is not None and rate < decay and factor > LEAST_FACTOR:
+            # By shorter steps where one fails: how long a step may be is a matter of rounding.
+            further = min(rate * factor, decay)
+            gain, moved = self.solved(further, change)
+            if gain is None:
+                factor = float(np.sqrt(factor))
+            else:
+                best, change, rate = gain, moved, further
+        return best if rate == decay else None
 
     def solved(self, decay: float, change: FloatArray) -> tuple[FloatArray | None, FloatArray]:
         """Return the gain of a rate, and coordinates (like ``change``) in which its error covariance is one."""
