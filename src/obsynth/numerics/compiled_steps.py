@@ -90,6 +90,9 @@ def _whiten(work: FloatArray, right: FloatArray, innovation: FloatArray) -> None
         innovation[i] = right[i] / work[i, i]
         for r in range(i + 1, len(right)):
             right[r] -= work[i, r] * innovation[i]
+        if work[i, i] < 0.0:
+            # That of a positive diagonal, whatever the reflections met.
+            innovation[i] = -innovation[i]
 
 
 @compiled

@@ -106,6 +106,8 @@ def projected_step(
             return None
         innovation = dtrtrs(triangle[:m, :m], innovation, trans=1)[0]
         right[:, :columns] = data[m:] - triangle[:m, m:rows].T @ innovation
+        # A reflection goes by the sign of what may be rounding of zero: that of a positive diagonal is the one taken.
+        innovation = innovation * np.sign(triangle.diagonal()[:m])[:, None]
     else:
         right[:, :columns] = data
     np.multiply(triangle[m:rows, m:rows].T, projection.lower, out=right[:, columns:])
@@ -191,7 +193,8 @@ def _whitened(
     else:
         _require_consistent(left, terms)
     rotated = q1.T @ S @ z
-    return innovation, rotated[:, :rank] @ innovation, rotated[:, rank:]
+    signs = np.sign(np.diagonal(lower))[:, None]
+    return signs * innovation, rotated[:, :rank] @ innovation, rotated[:, rank:]
 
 
 def _require_consistent(left: FloatArray, terms: FloatArray) -> None:
