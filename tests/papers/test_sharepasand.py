@@ -9,10 +9,10 @@ import pytest
 from exact_runs import ONE, RAMP, Together, ramp_and_sine, sine
 
 import obsynth
-from obsynth.numerics.spectra import spectrum_error
 from obsynth.analysis.zeros import invariant_zeros
 from obsynth.methods.placement.eigenstructure import place
 from obsynth.methods.ui_pi_observer.augmented_plant import paper_decoupling
+from obsynth.numerics.spectra import spectrum_error
 from obsynth.simulation import simulate_plant
 from obsynth.spec import load_spec
 from obsynth.spec.documents import read_yaml

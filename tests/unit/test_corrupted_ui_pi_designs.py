@@ -7,6 +7,7 @@ from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
+import mpmath
 import numpy as np
 import pytest
 from corruption_tables import (
@@ -22,6 +23,7 @@ from corruption_tables import (
 )
 
 from obsynth import Certificate, DescriptorSystem, ObserverDesign, ui_pi_observer, verify
+from obsynth.numerics.spectra import decay_rates
 from obsynth.spec.loader import load_spec
 
 PAPER = Path(__file__).parents[2] / "designs" / "sharepasand" / "spec.yaml"
@@ -163,7 +165,14 @@ def in_other_coordinates(design: ObserverDesign, size: float) -> ObserverDesign:
         observer, Az=shear @ observer.Az @ back, Bu=shear @ observer.Bu, By=shear @ observer.By, Cz=observer.Cz @ back
     )
     factor = np.triu(np.linalg.qr(matrices["stability"] @ back, mode="r"))
-    return with_certificate(design.replace(observer=changed), tracking=shear @ matrices["tracking"], stability=factor)
+    # How far rounding of the sheared numbers moves the poles is chance: the claims are those of the numbers stored.
+    with mpmath.workdps(60):
+        poles = np.array([complex(value) for value in mpmath.eig(mpmath.matrix(changed.Az.tolist()), right=False)])
+    return with_certificate(
+        design.replace(observer=changed),
+        {"decay": float(np.min(decay_rates(poles, observer.dt)))},
+        tracking=shear @ matrices["tracking"], stability=factor, poles=np.column_stack([poles.real, poles.imag]),
+    )  # fmt: skip
 
 
 def swapped_faults(design: ObserverDesign) -> ObserverDesign:
@@ -229,12 +238,11 @@ TABLE: dict[str, tuple[str, Callable[[ObserverDesign], ObserverDesign], tuple[st
     "unstable gain": ("paper", unstable, (STABILITY, POLES, DECAY, DIGITS, NOISE)),
     "unstable gain, discrete": ("direct", unstable,
         (INPUTS, IN_ERROR, STABILITY, POLES, DECAY, DIGITS, DECOUPLING, NOISE)),
-    "coordinates that cost digits": ("paper", lambda d: in_other_coordinates(d, 3e4), (POLES, DIGITS)),
-    "coordinates that cost digits, discrete": ("direct", lambda d: in_other_coordinates(d, 5e5),
-        (POLES, DECAY, DIGITS, NOISE)),
+    "coordinates that cost digits": ("paper", lambda d: in_other_coordinates(d, 3e4), (DIGITS,)),
+    "coordinates that cost digits, discrete": ("direct", lambda d: in_other_coordinates(d, 5e5), (DIGITS,)),
     "fewer digits claimed than needed": (
         "paper", lambda d: with_certificate(in_other_coordinates(d, 3e4), claims={"digits": 9.0}),
-        (POLES, "stable with the claimed digits")),
+        ("stable with the claimed digits",)),
     # The certificate.
     "tracking": ("paper", certificate("tracking", 1, 0, 0.4), (SYLVESTER, IN_ERROR, STATE, RESIDUAL)),
     "tracking of the fault model": ("fixed", certificate("tracking", 3, 3, 1.1), (SYLVESTER, FAULT)),

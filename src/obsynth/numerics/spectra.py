@@ -15,8 +15,6 @@ from obsynth.numerics.norms import balanced_realisation, output_covariance
 SAME_POLE = 1e-3
 #: Modulus below which a discrete eigenvalue counts as zero: it forgets in a few samples, and has no useful rate.
 DEAD_BEAT = 1e-6
-#: Relative difference of two ways of computing a variance up to which it counts as known.
-AGREEMENT = 1e-2
 #: Significant digits with which gains are commonly printed in full, and those with which a double is kept as it is.
 PRINTED_DIGITS, DOUBLE_DIGITS = 9, 17
 
@@ -137,19 +135,6 @@ def noise_covariance(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray,
         except RuntimeWarning:
             return np.full((c.shape[0], c.shape[0]), np.inf)
     return np.asarray(c @ states @ c.T) / size
-
-
-def certain_noise_covariance(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, dt: float) -> FloatArray:
-    """Return `noise_covariance`, or NaN where the trace by observability disagrees: all digits are rounding.
-    Infinite is that of a matrix with a pole on or outside the boundary, not of sums that rounding has blown up."""
-    found = noise_covariance(a, b, c, d, dt)
-    # A variance below zero is rounding as well.
-    variance, again = float(np.trace(found)), float(np.trace(noise_covariance(a.T, c.T, b.T, d.T, dt)))
-    if np.isfinite(variance):
-        known = abs(variance - again) <= AGREEMENT * variance
-    else:
-        known = not np.isfinite(again) and not abscissa(a, dt) < (1.0 if dt > 0.0 else 0.0)
-    return found if known else np.full_like(found, np.nan)
 
 
 def boundary_points(frequencies: FloatArray, dt: float) -> ComplexArray:

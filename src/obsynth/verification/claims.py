@@ -14,9 +14,9 @@ import numpy as np
 
 from obsynth.analysis.transformations.recovery import StateRecovery
 from obsynth.numerics.arguments import is_number
-from obsynth.numerics.spectra import certain_noise_covariance
 from obsynth.observers.linear.derived import unaveraged
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.proofs.covariances import certain_noise_covariance
 from obsynth.results.checks import Check, information, upper_bound_check
 from obsynth.results.design import Certificate, ObserverDesign
 from obsynth.verification.identities import EQUALITY_TOLERANCE

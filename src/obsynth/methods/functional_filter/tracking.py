@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.spectra import certain_noise_covariance
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.proofs.covariances import certain_noise_covariance
 from obsynth.proofs.extended_balls import arb_matrix
 from obsynth.proofs.products import BITS, as_ball
 

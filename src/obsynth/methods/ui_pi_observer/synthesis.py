@@ -37,7 +37,6 @@ from obsynth.numerics.spectra import (
     PRINTED_DIGITS,
     abscissa,
     as_printed,
-    certain_noise_covariance,
     decay_rates,
     digits_needed,
     eigenvalues,
@@ -46,6 +45,7 @@ from obsynth.numerics.spectra import (
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.fault_models import Exosystem, exosystem
+from obsynth.proofs.covariances import certain_noise_covariance
 from obsynth.proofs.extended_balls import enclosed_eigenvalues, middle_of
 from obsynth.results.design import Certificate
 from obsynth.verification.certificates import slowest_decay

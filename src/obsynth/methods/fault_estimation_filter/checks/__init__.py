@@ -20,9 +20,9 @@ from obsynth.numerics.modal_response import Modes
 from obsynth.numerics.norms import highest_gain_found, hinf_norm
 from obsynth.numerics.pencils import pencil_structure
 from obsynth.numerics.scaling import Scaling, balance_by_least_squares
-from obsynth.numerics.spectra import certain_noise_covariance
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.proofs.covariances import certain_noise_covariance
 from obsynth.results.checks import Check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.certificates import prove_bounded_real

@@ -14,7 +14,6 @@ from obsynth.numerics.spectra import (
     PRINTED_DIGITS,
     abscissa,
     as_printed,
-    certain_noise_covariance,
     digits_needed,
     eigenvalues,
     farthest_pole,
@@ -23,6 +22,7 @@ from obsynth.numerics.spectra import (
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.fault_models import Exosystem
+from obsynth.proofs.covariances import certain_noise_covariance
 from obsynth.proofs.extended_balls import enclosed_eigenvalues, middle_of
 from obsynth.results.checks import Check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
