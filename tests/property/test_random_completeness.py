@@ -72,8 +72,8 @@ def test_there_are_enough_plants():
 
 
 @pytest.mark.parametrize("family", FAMILIES)
-def test_every_plant_is_solved(family):
-    plants = plants_of(family)
+def test_every_plant_is_solved(family, share):
+    plants = share(plants_of(family), 2)
     failures = [failure for failure in map(outcome_of, plants) if failure is not None]
     solved = len(plants) - len(failures)
     assert solved == len(plants), "\n".join(f"{text}\n    {recipe}" for text, recipe in failures)
@@ -90,16 +90,16 @@ def test_every_plant_is_solved(family):
     ],
     ids=str,
 )
-def test_every_plant_is_solved_with_options(options):
-    plants = plants_of("random")[:30]
+def test_every_plant_is_solved_with_options(options, share):
+    plants = share(plants_of("random")[:30], 3)
     failures = [failure for failure in (outcome_of(known, **options) for known in plants) if failure is not None]
     assert failures == []
 
 
 @pytest.mark.parametrize(("engine", "factor", "count"), [("lmi", 2.0, 30), ("auto", 2.0, 30), ("auto", 1.2, 10)])
-def test_limit_on_the_residual_weight_is_kept(engine, factor, count):
+def test_limit_on_the_residual_weight_is_kept(engine, factor, count, share):
     failures = []
-    for known in plants_of("random")[:count]:
+    for known in share(plants_of("random")[:count]):
         least = 1.0 / np.linalg.svd(obsynth.fault_estimation_filter(known.plant).gains["Upsilon"])[1][-1]
         design = obsynth.fault_estimation_filter(known.plant, residual_weight_limit=factor * least, engine=engine)
         if not design.report.passed or np.linalg.norm(design.gains["W"], 2) > factor * least:

@@ -56,9 +56,9 @@ def test_two_solvers_agree():
 
 
 @pytest.mark.parametrize("fixed", [{}, {"feedthrough": True}, {"explicit": True, "singularity": 0}], ids=str)
-def test_no_filter_beats_the_least_gain(fixed):
+def test_no_filter_beats_the_least_gain(fixed, share):
     beaten = []
-    for plant in disturbed_plants(10, 3, largest=8, **fixed):
+    for plant in share(disturbed_plants(10, 3, largest=8, **fixed), 3):
         design = obsynth.fault_estimation_filter(plant)
         found = design.certificate.claims["gamma_min"]
         better = ErrorProblem.of(design).best(found)

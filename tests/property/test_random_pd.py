@@ -84,26 +84,28 @@ def test_there_are_enough_plants_and_they_are_what_they_should_be():
 
 @pytest.mark.parametrize(("theorem", "every"), [(1, 1), (2, 3)])
 @pytest.mark.parametrize("family", FAMILIES)
-def test_every_plant_is_solved(family, theorem, every):
+def test_every_plant_is_solved(family, theorem, every, share):
     failures = [
         f"{text}\n    {recipe}"
-        for plant, recipe in plants_of(family)[::every]
+        for plant, recipe in share(plants_of(family)[::every])
         if (text := outcome_of(plant, theorem=theorem))
     ]  # fmt: skip
     assert failures == [], "\n".join(failures)
 
 
 @pytest.mark.parametrize("delta", [1e-2, 1.0, 10.0])
-def test_theorem_1_does_not_depend_on_delta(delta):
+def test_theorem_1_does_not_depend_on_delta(delta, share):
     """In units of the plant's own time (its modes are of order one)."""
-    failures = [text for plant, _ in plants_of("random")[:30] if (text := outcome_of(plant, delta=delta, decay=0.0))]
+    failures = [
+        text for plant, _ in share(plants_of("random")[:30]) if (text := outcome_of(plant, delta=delta, decay=0.0))
+    ]
     assert failures == []
 
 
 @pytest.mark.parametrize("decay", [0.1, 1.0])
-def test_a_decay_rate_is_reached(decay):
+def test_a_decay_rate_is_reached(decay, share):
     """All of these plants are observable, so any rate is possible."""
-    failures = [text for plant, _ in plants_of("random")[:20] if (text := outcome_of(plant, decay=decay))]
+    failures = [text for plant, _ in share(plants_of("random")[:20]) if (text := outcome_of(plant, decay=decay))]
     assert failures == []
 
 
@@ -180,12 +182,12 @@ def asked_beside(plain: obsynth.ObserverDesign, option: str) -> dict[str, Any]:
     [("disk", 15), ("noise gain", 15), ("adaptation range", 15), ("adaptation gain", 15), ("gain bound", 13),
      ("fault rate gain", 11)],
 )  # fmt: skip
-def test_what_is_asked_is_given_or_nothing_is_known(option, least):
+def test_what_is_asked_is_given_or_nothing_is_known(option, least, share):
     """The last two are sufficient conditions: where they fail, nothing is shipped, and nothing is claimed either."""
-    solved = 0
-    for plant, recipe in plants_of("random")[:15]:
+    solved, plants = 0, share(plants_of("random")[:15], 3)
+    for plant, recipe in plants:
         options = asked_beside(obsynth.pd_observer(plant, decay=0.0), option)
         text = outcome_of(plant, decay=0.0, **options)
         assert text == "" or text.startswith("SolverError"), f"{text}\n    {recipe}"
         solved += text == ""
-    assert solved >= least
+    assert solved >= least - (15 - len(plants))

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ from obsynth.methods.ui_pi_observer.conditions import existence
 from obsynth.plants.fault_models import exosystem
 
 BATCHES, SIZE = 16, 24
+Share = Callable[..., Sequence[Any]]
 ALL = range(BATCHES * SIZE)
 
 
@@ -27,8 +30,8 @@ def decided(case: Case) -> bool:
 
 
 @pytest.mark.parametrize("number", range(BATCHES))
-def test_the_verdict_is_that_of_the_pencil(number: int) -> None:
-    for seed, case in batch(number):
+def test_the_verdict_is_that_of_the_pencil(number: int, share: Share) -> None:
+    for seed, case in share(batch(number), 2):
         assert decided(case) == brute_force(case)[0], (seed, case.kind, case.model)
 
 
@@ -42,8 +45,8 @@ def test_every_kind_of_plant_is_there_with_both_verdicts() -> None:
 
 
 @pytest.mark.parametrize("number", range(BATCHES))
-def test_fixed_modes_are_the_drops_of_the_pencil(number: int) -> None:
-    for seed, case in batch(number):
+def test_fixed_modes_are_the_drops_of_the_pencil(number: int, share: Share) -> None:
+    for seed, case in share(batch(number), 2):
         exists, drops = brute_force(case)
         if exists:
             model = exosystem(case.model, case.plant.fault_names, case.plant.dt)
@@ -76,10 +79,10 @@ def group_means(poles: np.ndarray, wanted: list[float]) -> float:
     return worst
 
 
-def test_repeated_poles_are_placed_or_refused() -> None:
+def test_repeated_poles_are_placed_or_refused(share: Share) -> None:
     """Some pairs are so close to unobservable ones that double precision cannot place a triple pole: few, and told."""
-    placed, refused = 0, []
-    for seed in range(0, BATCHES * SIZE, 3):
+    placed, refused, seeds = 0, [], share(range(0, BATCHES * SIZE, 3))
+    for seed in seeds:
         case = random_case(seed)
         if not brute_force(case)[0]:
             continue
@@ -95,16 +98,16 @@ def test_repeated_poles_are_placed_or_refused() -> None:
         placed += 1
         assert group_means(np.linalg.eigvals(design.observer.Az), poles) < 1e-2, seed
         assert design.report["poles"].value < 1e-4, seed
-    assert placed >= 85
-    assert len(refused) <= 5, refused
+    assert placed >= 0.66 * len(seeds)
+    assert len(refused) <= 0.04 * len(seeds), refused
 
 
 @pytest.mark.parametrize("number", range(0, BATCHES, 2))
-def test_default_designs_see_no_disturbance(number: int) -> None:
+def test_default_designs_see_no_disturbance(number: int, share: Share) -> None:
     """Trajectories ``(x, d) e^{st}`` of the plant, at points that no grid of ours holds, give exact estimates."""
     rng = np.random.default_rng(number)
     refused = []
-    for seed, case in batch(number):
+    for seed, case in share(batch(number)):
         if not brute_force(case)[0]:
             continue
         try:
