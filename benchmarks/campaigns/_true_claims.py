@@ -159,7 +159,9 @@ def _errors_per_unit(design: ob.ObserverDesign) -> Iterator[str]:
 
     tracked = method_class(design.method).error_model(design)
     observer, certificate = design.observer, design.certificate.matrices
-    e, a, b, c, d, t = (_exact(part) for part in (tracked.E, tracked.A, tracked.B, tracked.C, tracked.D, tracked.T))
+    e, a, b, c, d, t = (
+        _exact(part) for part in (tracked.E, tracked.A, tracked.B, tracked.C, design.plant.D, tracked.T)
+    )
     az, bu, by, cz, du, dy = (_exact(getattr(observer, name)) for name in ("Az", "Bu", "By", "Cz", "Du", "Dy"))
     te = t @ e
     missed = {

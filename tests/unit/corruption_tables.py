@@ -9,6 +9,9 @@ import numpy as np
 
 from obsynth import Certificate, ObserverDesign, VerificationReport, verify
 
+#: What no number of a design breaks: a wrong error model is the method's, see `test_every_method`.
+OF_THE_METHOD = {"error model"}
+
 Corruption = Callable[[ObserverDesign], ObserverDesign]
 Table = Mapping[str, tuple[str, Corruption, Sequence[str]]]
 Maker = Callable[[str], ObserverDesign]
@@ -30,7 +33,7 @@ def assert_every_row_is_broken(table: Table, names: Iterable[str], good: Maker) 
     for name, corrupt, _ in table.values():
         produced |= rows_that_decide(verify(corrupt(good(name))))
     broken = set().union(*(expected for _, _, expected in table.values()))
-    assert broken == produced
+    assert broken == produced - OF_THE_METHOD
 
 
 def assert_information_does_not_fail(table: Table, good: Maker) -> None:

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from luenberger_method import LuenbergerObserver
 
 import obsynth
 from obsynth.cli.main import main
-from obsynth.methods.registry import REGISTRY
+from obsynth.methods.method import Synthesis
+from obsynth.methods.registry import REGISTRY, error_model
 from obsynth.spec import load_spec
+from obsynth.verification.error_system import ErrorModel
 
 SPEC = """\
 schema_version: 1
@@ -82,3 +86,36 @@ def test_a_corrupted_design_fails(tmp_path: Path) -> None:
     assert obsynth.verify(obsynth.load(good.save(tmp_path / "a.json"))).passed
     wrong = good.replace(observer=replace(good.observer, Az=good.observer.Az + 0.5 * np.eye(2)))
     assert {row.name for row in obsynth.verify(wrong).failures} == {"error dynamics", "radius"}
+
+
+class TrustingObserver(LuenbergerObserver):
+    """The same with a map in its certificate, which is zero, and which no check of its own looks at."""
+
+    id = "trusting-observer"
+    witnesses = frozenset({"tracking"})
+
+    def synthesise(self, plant: obsynth.DescriptorSystem, *, progress: Callable[[str], None]) -> Synthesis:
+        found = super().synthesise(plant, progress=progress)
+        zero = obsynth.Certificate({"tracking": np.zeros((2, 2))}, found.certificate.claims)
+        return replace(found, certificate=zero)
+
+    @classmethod
+    def error_model(cls, design: obsynth.ObserverDesign) -> ErrorModel:
+        return ErrorModel(*design.linear, design.certificate.matrices["tracking"])
+
+
+def test_a_zero_error_model_is_not_verified(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(REGISTRY, TrustingObserver.id, f"{__name__}:TrustingObserver")
+    with pytest.raises(obsynth.VerificationError) as caught:
+        obsynth.design(designed().plant, TrustingObserver.id, pole=0.25)
+    assert {row.name for row in caught.value.report.failures} == {"error model"}
+
+
+def test_thresholds_follow_from_the_error_model() -> None:
+    """A method gets monitors over tolerances by its error model alone: T E x with T = E^-1."""
+    scaled = obsynth.DescriptorSystem(
+        [[2.0, 0.0], [0.0, 4.0]], [[2.2, 0.2], [0.0, 3.6]], [[0.0], [1.0]], np.eye(2), dt=0.1
+    )
+    design = obsynth.design(scaled, "luenberger-observer", pole=0.25)
+    assert design.report.passed
+    np.testing.assert_array_equal(error_model(design).own, np.diag([0.5, 0.25]))

@@ -112,6 +112,35 @@ def test_a_design_is_verified_and_survives_its_file(method: str, tmp_path: Path)
     pd.testing.assert_frame_equal(here, there, check_exact=True)
 
 
+WRONG_MODELS = ("zero", "a hundredth too large", "one entry", "other equations", "another shape", "none")
+
+
+@pytest.mark.parametrize("wrong", WRONG_MODELS)
+@EACH
+def test_a_wrong_error_model_fails(method: str, wrong: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    design, known = design_of(method), method_class(method)
+    if not isinstance(design.observer, LinearObserver):
+        assert known.error_model(design) is None
+        return
+    right = known.error_model(design)
+    assert right is not None
+    i, j = np.unravel_index(np.argmax(np.abs(right.T)), right.T.shape)
+    other = right.T.copy()
+    other[i, j] *= 1.0 + 1e-4
+    added = np.zeros_like(right.goal)
+    added[0, 0] = 1.0
+    models = {
+        "zero": replace(right, T=0.0 * right.T),
+        "a hundredth too large": replace(right, T=1.01 * right.T),
+        "one entry": replace(right, T=other),
+        "other equations": replace(right, T0=added),
+        "another shape": replace(right, T=right.T[:, 1:]),
+        "none": None,
+    }
+    monkeypatch.setattr(known, "error_model", classmethod(lambda _, __: models[wrong]))
+    assert "error model" in {row.name for row in obsynth.verify(design).failures}
+
+
 @EACH
 def test_a_run_is_its_steps(method: str) -> None:
     design = design_of(method)

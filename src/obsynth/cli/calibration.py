@@ -103,9 +103,11 @@ def run_calibrate(options: argparse.Namespace) -> int:
 
 def _asked(spec: Spec | None, options: argparse.Namespace) -> dict[str, Any]:
     """Return the arguments of `calibrate`: of the spec, those of its nonlinear method, and of the command line."""
+    from obsynth.plants.dae.model import DAEModel
+
     asked: dict[str, Any] = {"log": None}
     if spec is not None:
-        if spec.method == "dae-adaptive-observer":
+        if isinstance(spec.plant, DAEModel):
             method = spec.options
             if isinstance(method.get("Q"), dict):
                 asked["noisy"] = [name for name, variance in method["Q"].items() if variance > 0.0]

@@ -276,7 +276,7 @@ def with_stored_errors(draft: ObserverDesign) -> ObserverDesign:
     with np.errstate(all="ignore"):
         base = before_the_mean(draft)[0] if method.averaged else draft
         model = method.error_model(base)
-        found = None if model is None else StoredErrors.of(model, base.linear[1])
+        found = None if model is None or not model.fits else StoredErrors.of(model)
     if found is None:
         return draft
     old = draft.certificate

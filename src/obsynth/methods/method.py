@@ -24,7 +24,7 @@ from obsynth.plants.fault_models import FaultModel
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.results.checks import Check
 from obsynth.results.design import Certificate, ObserverDesign
-from obsynth.verification.error_system import TrackedPlant
+from obsynth.verification.error_system import ErrorModel
 
 PlantKind: TypeAlias = Literal["time-invariant", "time-varying", "nonlinear"]
 #: What the choice by default (`auto`) takes a method for.
@@ -83,6 +83,8 @@ class Method(ABC):
     witnesses: ClassVar[frozenset[str]] = frozenset()
     #: What `auto` takes it for; nothing: only who names it gets it.
     purposes: ClassVar[frozenset[Purpose]] = frozenset()
+    #: Claims that say what was imposed and proved, not what was found.
+    imposed: ClassVar[frozenset[str]] = frozenset()
     #: Whether an option ``mean`` puts registers behind the observer, which the checks are not about.
     averaged: ClassVar[bool] = False
     #: Values of required options, for questions that do not depend on them.
@@ -135,8 +137,11 @@ class Method(ABC):
         """Yield a row for each claim, from the plant and the shipped realisation alone."""
 
     @classmethod
-    def error_model(cls, design: ObserverDesign) -> TrackedPlant | None:
-        """Return the plant as the shipped observer tracks it; ``None`` where it is no linear observer."""
+    def error_model(cls, design: ObserverDesign) -> ErrorModel | None:
+        """Return what the shipped observer follows; ``None`` where it is no linear one, or its certificate lacks it.
+
+        Every linear design needs one, and `verify` checks it.
+        """
         return None
 
     def as_given(self) -> dict[str, Any]:

@@ -12,6 +12,8 @@ from obsynth.methods.method import Method, PlantKind
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.results.design import ObserverDesign
+from obsynth.verification.error_system import ErrorModel
 
 #: What a spec and `obsynth.design` call the choice between all methods that exist.
 AUTO = "auto"
@@ -39,6 +41,14 @@ def method_class(method: str) -> type[Method]:
         raise SpecError(f"There is no method {method!r}; there are: {', '.join(REGISTRY)}.", path="method")
     module, name = REGISTRY[method].split(":")
     found: type[Method] = getattr(import_module(module), name)
+    return found
+
+
+def error_model(design: ObserverDesign) -> ErrorModel:
+    """Return what a linear design follows; raise `SpecError` where its certificate does not say it."""
+    found = method_class(design.method).error_model(design)
+    if found is None or not found.fits:
+        raise SpecError(f"Design {design.name!r} has no tracking map: its residual has no model.", path="observer")
     return found
 
 

@@ -9,9 +9,11 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.methods.registry import REGISTRY, method_class
 from obsynth.numerics.libraries import failed_computations, one_thread_if_small
+from obsynth.observers.linear.observer import LinearObserver
 from obsynth.results.checks import VerificationReport
 from obsynth.results.plant_source import remembering
 from obsynth.verification.claims import before_the_mean, closed_claims, mean_noise_rows
+from obsynth.verification.error_system import error_model_row
 from obsynth.verification.plant import derivation_rows
 from obsynth.verification.stored_numbers import stored_number_rows
 
@@ -53,9 +55,12 @@ def verify(design: ObserverDesign, *, printed_digits: int | None = None) -> Veri
         remembering(design.plant, design.source)
         shipped, (design, mean_rows) = design, before_the_mean(design) if method.averaged else (design, ())
         rows = (*mean_rows, *method.checks(design, printed_digits))
-        if all(row.passed for row in rows) and (tracked := method.error_model(design)) is not None:
+        if isinstance(design.observer, LinearObserver) and all(row.passed for row in rows):
+            model = method.error_model(design)
+            rows = (*rows, error_model_row(model, printed_digits))
             gamma = design.certificate.claims.get("gamma") if "gamma" in method.claims else None
-            rows = (*rows, *stored_number_rows(design, tracked, gamma), *derivation_rows(design, tracked))
+            if model is not None and rows[-1].passed:
+                rows = (*rows, *stored_number_rows(design, model, gamma), *derivation_rows(design, model))
         covered = {name: meaning.row for name, meaning in method.claims.items()}
         meanings = {name: meaning.meaning for name, meaning in method.claims.items()}
         rows = rows if shipped is design else (*rows, *mean_noise_rows(shipped))

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from obsynth.analysis.zeros import fault_zeros
+from obsynth.methods.registry import REGISTRY, method_class
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.spectra import eigenvalues
 from obsynth.plotting.panels import WIDTH, new_panels
@@ -107,13 +108,12 @@ def _continuous_plane(axes: Axes, poles: ComplexArray, zeros: ComplexArray) -> N
 
 
 def region_asked_for(design: ObserverDesign) -> list[Excess]:
-    """Return the parts of the region that was asked for (or proved, of a PD observer); none where none was."""
+    """Return the parts of the region that was asked for (or imposed and proved); none where none was."""
     claims, options, dt = design.certificate.claims, design.options, design.linear[1].dt
     asked = options.get("region") or {}
     asked = dict(asked) if isinstance(asked, Mapping) else {}
-    # An observer of its own kind claims the decay that it has; a PD observer the one that was imposed.
     decay = asked.get("decay") or options.get("decay") or 0.0
-    if design.method == "pd-observer":
+    if design.method in REGISTRY and "decay" in method_class(design.method).imposed:
         decay = claims.get("decay", 0.0)
     parts: list[Excess] = []
     if decay and dt > 0.0:

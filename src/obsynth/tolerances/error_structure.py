@@ -19,7 +19,8 @@ from obsynth.numerics.ranks import EFFECT_RANK_SHARE
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.proofs.affine import AffineMatrix, affine_block
 from obsynth.proofs.balls import gamma, rounded_up
-from obsynth.tolerances.exact_plant import IDENTITY_SHARE, Tracking
+from obsynth.tolerances.exact_plant import Tracking
+from obsynth.verification.error_system import IDENTITY_SHARE
 
 #: Remainders below this share of their row's terms are rounding: one common channel is enough for them.
 ROUNDING_SHARE = 1e-9

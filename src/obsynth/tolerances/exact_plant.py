@@ -14,6 +14,7 @@ from obsynth.analysis.transformations.sampling import discretise
 from obsynth.analysis.transformations.uncertain_plant import AffinePlant, untouched_states
 from obsynth.analysis.zeros import zeros_of_system
 from obsynth.errors import ObsynthError, PreconditionError
+from obsynth.methods.registry import error_model
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import DIRECTION_SHARE
 from obsynth.observers.linear.observer import LinearObserver
@@ -21,9 +22,7 @@ from obsynth.plants.constants import ConstantsBox
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.uncertainty import SAMPLED, UNCERTAIN_MATRICES, Uncertainty, matrices_of
 from obsynth.results.design import ObserverDesign
-
-#: The identities of an observer of the nominal plant hold to this share of their terms.
-IDENTITY_SHARE = 1e-7
+from obsynth.verification.error_system import IDENTITY_SHARE
 
 
 class Tracking(NamedTuple):
@@ -47,29 +46,9 @@ def tracking_of(design: ObserverDesign, affine: AffinePlant) -> Tracking:
             "The design does not estimate the full state, which a bound over tolerances needs.",
             condition="full state estimate",
         )
-    given = design.certificate.matrices.get("tracking")
-    if design.method == "pd-observer":
-        t = np.eye(observer.order)[:, : plant.nx]
-    elif given is not None:
-        t = np.asarray(given[:, : plant.nx])
-    else:
-        t = _fitted(design)
-    stored = design.certificate.matrices.get("algebraic")
-    t0 = _algebraic_rows(observer, plant.E, t, affine) if stored is None else np.asarray(stored)
-    return Tracking(t, t0)
-
-
-def _fitted(design: ObserverDesign) -> FloatArray:
-    """Return T by least squares from ``Az T E + By C = T A`` and ``Bu + By D = T B``."""
-    plant, observer = design.linear
-    n, nz = plant.nx, observer.order
-    eye = np.eye(nz)
-    left = [np.kron(observer.Az, plant.E.T) - np.kron(eye, plant.A.T), np.kron(eye, plant.B.T)]
-    left.append(np.kron(observer.Cz[observer.state_rows], plant.E.T))
-    shown = np.eye(n) - observer.Dy[observer.state_rows] @ plant.C
-    right = [-(observer.By @ plant.C), observer.Bu + observer.By @ plant.D, shown]
-    found = np.linalg.lstsq(np.vstack(left), np.concatenate([item.ravel() for item in right]), rcond=None)[0]
-    return np.asarray(found.reshape(nz, n))
+    model = error_model(design)
+    t0 = _algebraic_rows(observer, plant.E, model.own, affine) if model.T0 is None else model.T0[:, : plant.nx]
+    return Tracking(model.own, t0)
 
 
 def _algebraic_rows(observer: LinearObserver, e: FloatArray, t: FloatArray, affine: AffinePlant) -> FloatArray:

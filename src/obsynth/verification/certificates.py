@@ -24,7 +24,6 @@ from obsynth.proofs.contraction import prove_contraction
 from obsynth.proofs.definiteness import DefinitenessProof, prove_positive_definite, unproved
 from obsynth.proofs.extended_balls import Enclosed, block, enclosed_eigenvalues
 from obsynth.results.checks import Check, CheckKind
-from obsynth.verification.error_system import LaggedPlant
 
 
 def prove_bounded_real(
@@ -77,9 +76,8 @@ def _formed(
     """Return the matrix of the inequality with the bounds on the errors of forming it."""
     exact = kind.exact
     core, nd = factor.shape[0], plant.nd
-    bd = LaggedPlant.of(plant, lag).input(plant.Bd)
     q, s = exact(factor), exact(inverse)
-    b = exact(tracking[:core]) @ exact(bd) - exact(observer.By[:core]) @ exact(plant.Dd)
+    b = exact(tracking[:core, : plant.nx]) @ exact(plant.Bd) - exact(observer.By[:core]) @ exact(plant.Dd)
     qs, qms = q @ s, q @ (exact(observer.Az[:core, :core]) @ s)
     cs = exact(observer.Cz[observer.fault_rows, :core]) @ s
     d = exact(observer.Dy[observer.fault_rows]) @ exact(plant.Dd)

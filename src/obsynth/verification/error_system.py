@@ -12,12 +12,14 @@ with ``T0 E = 0``, ``eps = z - T E x`` obeys
     K = A_z T E + B_y C - T A, \quad U = B_u + B_y D - T B, \quad
     J = C_z T E + D_y C + T_0 A - G, \quad L = D_u + D_y D + T_0 B
 
-with balls K, U, J, L, zero in exact arithmetic: `errors_per_unit` (`robust.md`, theorem 1, corrections 3 and 7).
+with balls K, U, J, L, zero in exact arithmetic: `errors_per_unit`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TypeAlias
 
 import numpy as np
 
@@ -28,113 +30,299 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.balls import Ball, rounded_up
 from obsynth.proofs.contraction import Contraction, prove_contraction
 from obsynth.proofs.peak_sums import absolute_gains
+from obsynth.results.checks import Check, upper_bound_check
+
+#: The identities of an error model hold to this share of their terms, whatever rounding of stored numbers does.
+IDENTITY_SHARE = 1e-7
+#: Gains that were printed to some decimals leave less than this of them; that is judged by the rows of the method.
+PRINTED_SHARE = 0.1
+#: Rows with terms below this share of the largest may be rounding of those: they are judged as if they were as large.
+LEAST_ROW = 1e-6
+Output: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
+
+
+def with_past(plant: DescriptorSystem, lag: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return E, A, B, C of a plant whose state holds the last ``lag`` states too: ``[x(k); x(k-1); ...; x(k-lag)]``."""
+    if lag == 0:
+        return plant.E, plant.A, plant.B, plant.C
+    nx, total = plant.nx, plant.nx * (lag + 1)
+    e, a = np.eye(total), np.zeros((total, total))
+    e[:nx, :nx], a[:nx, :nx] = plant.E, plant.A
+    a[nx:, :-nx] = np.eye(total - nx)
+    b = np.vstack([plant.B, np.zeros((total - nx, plant.nu))])
+    return e, a, b, np.hstack([plant.C, np.zeros((plant.ny, total - nx))])
 
 
 @dataclass(frozen=True, eq=False)
-class LaggedPlant:
-    """A plant whose state holds the last ``lag`` states as well: ``[x(k); x(k-1); ...; x(k-lag)]``."""
+class ErrorModel:
+    """What a linear observer follows, and from it its errors: monitors, tolerances and stored numbers use this one.
 
-    E: FloatArray
-    A: FloatArray
-    B: FloatArray
-    C: FloatArray
-    lag: int
-    nx: int
+    Its state z follows ``T E xa``, where xa is the plant's state, followed by its last ``lag`` states, or by the states
+    of a fault model ``w+ = Phi w`` (w' for dt = 0), ``f = Cw w``.  Without faults (that do not follow the model), noise
+    and disturbances its rows are ``goal xa``: the oldest state, ``Cw w``, and zero for residuals.
 
-    @classmethod
-    def of(cls, plant: DescriptorSystem, lag: int) -> LaggedPlant:
-        """Return ``plant`` with its last ``lag`` states appended."""
-        if lag == 0:
-            return cls(plant.E, plant.A, plant.B, plant.C, 0, plant.nx)
-        nx, total = plant.nx, plant.nx * (lag + 1)
-        e, a = np.eye(total), np.zeros((total, total))
-        e[:nx, :nx], a[:nx, :nx] = plant.E, plant.A
-        a[nx:, :-nx] = np.eye(total - nx)
-        b = np.vstack([plant.B, np.zeros((total - nx, plant.nu))])
-        c = np.hstack([plant.C, np.zeros((plant.ny, total - nx))])
-        return cls(e, a, b, c, lag, nx)
-
-    def input(self, matrix: FloatArray) -> FloatArray:
-        """Return an input matrix ``(nx, *)`` padded for the appended states."""
-        return np.vstack([matrix, np.zeros((self.nx * self.lag, matrix.shape[1]))]) if self.lag else matrix
-
-    @property
-    def oldest(self) -> FloatArray:
-        """Selector ``(nx, nx (lag + 1))`` of the oldest state."""
-        return np.hstack([np.zeros((self.nx, self.nx * self.lag)), np.eye(self.nx)])
-
-
-@dataclass(frozen=True, eq=False)
-class ErrorSystem:
-    """The observer's error ``e = V E x - z``, its inputs ``V b - By d``, and what it does to the estimates.
-
-    Outputs ``(C, Df, Dd, Dw)``: fault estimate or residual = ``-C e + Df f + Dd d + Dw w``; minus that for states.
+    Parameters
+    ----------
+    plant, observer : DescriptorSystem, LinearObserver
+        With the names of their signals.
+    T : FloatArray
+        ``(nz, na)``.
+    T0 : FloatArray, optional
+        ``(rows, na)`` with ``T0 E = 0``: the equations of the plant that the outputs add; none by default.
+    lag : int, optional
+        Samples by which the state estimates lag.
+    Phi, Cw : FloatArray, optional
+        The fault model ``(nw, nw)``, ``(nf, nw)`` that the observer holds; none by default.
+    model_names : tuple of str, optional
+        Names of the fault model's states.
+    decoupled : bool, optional
+        Whether no disturbance reaches z or the outputs.
     """
 
-    Az: FloatArray
-    fault: FloatArray
-    disturbance: FloatArray
-    noise: FloatArray
-    fault_output: tuple[FloatArray, FloatArray, FloatArray, FloatArray]
-    residual_output: tuple[FloatArray, FloatArray, FloatArray, FloatArray]
-    state_output: tuple[FloatArray, FloatArray, FloatArray, FloatArray]
+    plant: DescriptorSystem
+    observer: LinearObserver
+    T: FloatArray
+    T0: FloatArray | None = None
+    lag: int = 0
+    Phi: FloatArray | None = None
+    Cw: FloatArray | None = None
+    model_names: tuple[str, ...] = ()
+    decoupled: bool = False
 
-    @classmethod
-    def of(
-        cls,
-        plant: DescriptorSystem,
-        observer: LinearObserver,
-        tracking: FloatArray,
-        lag: int,
-        algebraic: FloatArray | None = None,
-    ) -> ErrorSystem:
-        """Return the error system for a tracking map ``(nz, nx (lag + 1))``."""
-        # Equations that the outputs add, ``algebraic (rows, nx)``: Cz V E + Dy C = K + algebraic A.
-        lagged = LaggedPlant.of(plant, lag)
+    def __post_init__(self) -> None:
+        if not self.observer.order:
+            # Without a state of its own an observer follows nothing.
+            object.__setattr__(self, "T", np.zeros((0, self.plant.nx * (self.lag + 1) + self._model_states)))
 
-        def driven(b: FloatArray, d: FloatArray) -> FloatArray:
-            return np.asarray(tracking @ lagged.input(b) - observer.By @ d)
+    @property
+    def _model_states(self) -> int:
+        return 0 if self.Phi is None else len(self.Phi)
 
-        def output(rows: slice) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-            direct = observer.Dy[rows]
-            added = np.zeros((len(direct), plant.nx)) if algebraic is None else algebraic[rows]
-            seen = ((plant.Bf, plant.Df), (plant.Bd, plant.Dd), (plant.Bw, plant.Dw))
-            fault, disturbance, noise = (direct @ d - added @ b for b, d in seen)
-            return observer.Cz[rows], fault, disturbance, noise
+    @cached_property
+    def _equations(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        e, a, b, c = with_past(self.plant, self.lag)
+        if self.Phi is None or self.Cw is None:
+            return e, a, b, c
+        nx, count = len(a), len(self.Phi)
+        whole, moved = np.eye(nx + count), np.zeros((nx + count, nx + count))
+        whole[:nx, :nx], moved[:nx, :nx] = e, a
+        moved[: self.plant.nx, nx:], moved[nx:, nx:] = self.plant.Bf @ self.Cw, self.Phi
+        c = np.hstack([c, self.plant.Df @ self.Cw])
+        return whole, moved, np.vstack([b, np.zeros((count, self.plant.nu))]), c
 
-        return cls(
-            observer.Az, driven(plant.Bf, plant.Df), driven(plant.Bd, plant.Dd), driven(plant.Bw, plant.Dw),
-            output(observer.fault_rows), output(observer.residual_rows), output(observer.state_rows),
+    @property
+    def E(self) -> FloatArray:
+        """``(na, na)``."""
+        return self._equations[0]
+
+    @property
+    def A(self) -> FloatArray:
+        """``(na, na)``."""
+        return self._equations[1]
+
+    @property
+    def B(self) -> FloatArray:
+        """``(na, nu)``."""
+        return self._equations[2]
+
+    @property
+    def C(self) -> FloatArray:
+        """``(ny, na)``."""
+        return self._equations[3]
+
+    @cached_property
+    def Bd(self) -> FloatArray:
+        """``(na, nd)`` of the disturbances that are decoupled."""
+        if not self.decoupled:
+            return np.zeros((len(self.E), 0))
+        return np.vstack([self.plant.Bd, np.zeros((len(self.E) - self.plant.nx, self.plant.nd))])
+
+    @property
+    def Dd(self) -> FloatArray:
+        """``(ny, nd)`` of the disturbances that are decoupled."""
+        return self.plant.Dd if self.decoupled else np.zeros((self.plant.ny, 0))
+
+    @cached_property
+    def goal(self) -> FloatArray:
+        """``(rows, na)``: what each row of the observer's output stands for."""
+        observer, states = self.observer, self.plant.state_names
+        found = np.zeros((len(observer.Cz), len(self.E)))
+        for row, name in enumerate(observer.state_names):
+            found[observer.state_rows.start + row, self.plant.nx * self.lag + states.index(name)] = 1.0
+        if self.Cw is not None:
+            named = [self.plant.fault_names.index(name) for name in observer.fault_names]
+            found[observer.fault_rows, self.plant.nx * (self.lag + 1) :] = self.Cw[named]
+        return found
+
+    @cached_property
+    def state_names(self) -> tuple[str, ...]:
+        """Names of xa."""
+        ages, own = range(self.lag + 1), self.plant.state_names
+        past = (f"{name}(k-{age})" if age else name for age in ages for name in own)
+        return (*past, *(self.model_names or (f"w{i + 1}" for i in range(self._model_states))))
+
+    @property
+    def fits(self) -> bool:
+        """Whether all shapes and names are those of plant and observer."""
+        plant, observer, count = self.plant, self.observer, self._model_states
+        shapes = [(self.T, (observer.order, plant.nx * (self.lag + 1) + count))]
+        shapes += [] if self.T0 is None else [(self.T0, (len(observer.Cz), shapes[0][1][1]))]
+        if self.Phi is not None and self.Cw is not None:
+            shapes += [(self.Phi, (count, count)), (self.Cw, (plant.nf, count))]
+        return bool(
+            self.lag >= 0
+            and (self.Phi is None) == (self.Cw is None)
+            and all(np.shape(given) == wanted for given, wanted in shapes)
+            and set(observer.state_names) <= set(plant.state_names)
+            and set(observer.fault_names) <= set(plant.fault_names)
+            and not any(delay != self.lag for delay in observer.state_delays)
+        )
+
+    def equals(self, other: ErrorModel) -> bool:
+        """Whether all numbers are the same."""
+        names = ("E", "A", "B", "C", "T", "T0", "goal", "Bd", "Dd")
+        pairs = [(getattr(self, name), getattr(other, name)) for name in names]
+        pairs.append((self.plant.D, other.plant.D))
+        return all(a is b or (a is not None and b is not None and np.array_equal(a, b)) for a, b in pairs)
+
+    # The error e = T E x - z, of the plant's own states, and what drives it.
+
+    @property
+    def own(self) -> FloatArray:
+        """The part of T ``(nz, nx)`` that belongs to the newest state."""
+        return self.T[:, : self.plant.nx]
+
+    @property
+    def Az(self) -> FloatArray:
+        """The observer's ``Az (nz, nz)``: e obeys ``e+ = Az e + fault f + disturbance d + noise w``."""
+        return self.observer.Az
+
+    @cached_property
+    def fault(self) -> FloatArray:
+        """``(nz, nf)``: faults, whatever their course, to e."""
+        return self._driven(self.plant.Bf, self.plant.Df)
+
+    @cached_property
+    def disturbance(self) -> FloatArray:
+        """``(nz, nd)``."""
+        return self._driven(self.plant.Bd, self.plant.Dd)
+
+    @cached_property
+    def noise(self) -> FloatArray:
+        """``(nz, nw)``."""
+        return self._driven(self.plant.Bw, self.plant.Dw)
+
+    def _driven(self, b: FloatArray, d: FloatArray) -> FloatArray:
+        return np.asarray(self.own @ b - self.observer.By @ d)
+
+    def output(self, rows: slice) -> Output:
+        """Return ``C, Df, Dd, Dw`` of some rows, which are ``-C e + Df f + Dd d + Dw w`` (states: the error)."""
+        plant, direct = self.plant, self.observer.Dy[rows]
+        added = np.zeros((len(direct), plant.nx)) if self.T0 is None else self.T0[rows, : plant.nx]
+        seen = ((plant.Bf, plant.Df), (plant.Bd, plant.Dd), (plant.Bw, plant.Dw))
+        fault, disturbance, noise = (direct @ d + added @ b for b, d in seen)
+        return self.observer.Cz[rows], fault, disturbance, noise
+
+    @cached_property
+    def fault_output(self) -> Output:
+        """See `output`."""
+        return self.output(self.observer.fault_rows)
+
+    @cached_property
+    def residual_output(self) -> Output:
+        """See `output`."""
+        return self.output(self.observer.residual_rows)
+
+    @cached_property
+    def state_output(self) -> Output:
+        """See `output`."""
+        return self.output(self.observer.state_rows)
+
+    # What stored numbers leave of its identities.
+
+    @cached_property
+    def remainder(self) -> RemainderChannel:
+        """What the identities miss, in outward rounding."""
+        exact, observer = Ball.exact, self.observer
+        az, bu, by, cz, du, dy = (exact(getattr(observer, name)) for name in ("Az", "Bu", "By", "Cz", "Du", "Dy"))
+        e, a, b, c, d, t = (exact(part) for part in (self.E, self.A, self.B, self.C, self.plant.D, self.T))
+        te, dd = t @ e, exact(self.Dd)
+        j, el, v = cz @ te + dy @ c - exact(self.goal), du + dy @ d, dy @ dd
+        if self.T0 is not None and self.T0.any():
+            t0 = exact(self.T0)
+            j, el, v = j + t0 @ a, el + t0 @ b, v + t0 @ exact(self.Bd)
+            # What T0 E leaves is driven by the next state, which keeps the bounds of x, or by its rate, which has none.
+            left = (t0 @ e).magnitude
+            if left.any():
+                j = Ball(j.midpoint, j.radius + (left if observer.dt > 0.0 else np.where(left > 0.0, np.inf, 0.0)))
+        return RemainderChannel(
+            az @ te + by @ c - t @ a, bu + by @ d - t @ b, j, el, by @ dd - t @ exact(self.Bd), v
         )  # fmt: skip
 
+    @cached_property
+    def _sizes(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Natural units of xa ``(na,)``, and in these the largest terms of each row of z and of the outputs."""
+        size, observer = np.abs, self.observer
+        units = balance_by_least_squares(self.E, self.A, outputs=[self.C]).states
+        te, c = size(self.T) @ size(self.E), size(self.C)
+        formed = size(observer.Az) @ te + size(observer.By) @ c + size(self.T) @ size(self.A)
+        shown = size(observer.Cz) @ te + size(observer.Dy) @ c + size(self.goal)
+        if self.T0 is not None:
+            shown = shown + size(self.T0) @ size(self.A)
+        followed, told = (np.max(terms * units, axis=1, initial=0.0, keepdims=True) for terms in (formed, shown))
+        return units, np.where(followed > 0.0, followed, 1.0), np.where(told > 0.0, told, 1.0)
 
-@dataclass(frozen=True, eq=False)
-class TrackedPlant:
-    """A plant as an observer sees it, and what each row of its output stands for."""
+    def rounding(self) -> float:
+        """Return how much K and J are at most of the largest terms of their rows, in natural units of the states."""
+        units, followed, told = self._sizes
+        pairs = ((self.remainder.K.midpoint, followed), (self.remainder.J.midpoint, told))
+        return max(float(np.max(np.abs(missed) * units / rows, initial=0.0)) for missed, rows in pairs)
 
-    E: FloatArray  # (ne, n)
-    A: FloatArray  # (ne, n)
-    B: FloatArray  # (ne, nu)
-    C: FloatArray  # (ny, n)
-    D: FloatArray  # (ny, nu)
-    T: FloatArray  # (nz, ne)
-    goal: FloatArray  # (rows, n)
-    state_names: tuple[str, ...]
-    T0: FloatArray | None = None  # (rows, ne)
-    Bd: FloatArray | None = None  # (ne, nd), of the disturbances that are decoupled
-    Dd: FloatArray | None = None  # (ny, nd)
+    def missed(self) -> float:
+        """Return the largest share that any identity misses of its terms: states, inputs, disturbances, ``T0 E``."""
+        size, observer, channel = np.abs, self.observer, self.remainder
+        t, t0 = size(self.T), np.zeros_like(self.goal) if self.T0 is None else size(self.T0)
+        by, dy, dd, d = size(observer.By), size(observer.Dy), size(self.Dd), size(self.plant.D)
+        units, *sizes = self._sizes
+        rows = [np.maximum(terms, LEAST_ROW * np.max(terms, initial=0.0)) for terms in sizes]
+        inputs = size(observer.Bu) + by @ d + t @ size(self.B), size(observer.Du) + dy @ d + t0 @ size(self.B)
+        disturbances = by @ dd + t @ size(self.Bd), dy @ dd + t0 @ size(self.Bd)
+        found = [
+            float(np.max(size(left.midpoint) * units / terms, initial=0.0))
+            for left, terms in zip((channel.K, channel.J), rows, strict=True)
+        ]
+        for left, terms in (((channel.U, channel.L), inputs), ((channel.W, channel.V), disturbances)):
+            # Each signal in the unit in which it moves some row by its largest terms.
+            missed, moved = (
+                np.vstack([part / row for part, row in zip(parts, rows, strict=True)])
+                for parts in ([size(part.midpoint) for part in left], terms)
+            )
+            scale = np.max(moved, axis=0, initial=0.0)
+            found.append(float(np.max(missed / np.where(scale > 0.0, scale, 1.0), initial=0.0)))
+        if self.T0 is not None:
+            largest = np.max(t0 @ size(self.E) * units, axis=1, initial=0.0, keepdims=True)
+            left_over = size(self.T0 @ self.E) * units / np.where(largest > 0.0, largest, 1.0)
+            found.append(float(np.max(left_over, initial=0.0)))
+        return max(found) if np.all(np.isfinite(found)) else np.nan
 
-    @classmethod
-    def of(
-        cls, plant: DescriptorSystem, tracking: FloatArray, goal: FloatArray, *, T0: FloatArray | None = None
-    ) -> TrackedPlant:
-        """Return a linear plant without decoupled disturbances."""
-        return cls(plant.E, plant.A, plant.B, plant.C, plant.D, tracking, goal, plant.state_names, T0)
 
-    def equals(self, other: TrackedPlant) -> bool:
-        """Whether all numbers are the same."""
-        pairs = ((getattr(self, field.name), getattr(other, field.name)) for field in fields(self))
-        return all(a is b or (a is not None and b is not None and np.array_equal(a, b)) for a, b in pairs)
+def error_model_row(model: ErrorModel | None, printed_digits: int | None) -> Check:
+    """Return the row that says whether a shipped observer follows what its error model says."""
+    name, claim = "error model", "the observer follows the plant, and its outputs are what they stand for"
+    source = "Az T E + By C = T A, Bu + By D = T B, Cz T E + Dy C + T0 A = goal, Du + Dy D + T0 B = 0, T0 E = 0"
+    if model is None or not model.fits:
+        why = "the method gives none" if model is None else "its matrices do not fit plant and observer"
+        return upper_bound_check(name, claim, np.nan, IDENTITY_SHARE, source=source, kind="equality", detail=why)
+    bound = IDENTITY_SHARE if printed_digits is None else PRINTED_SHARE
+    return upper_bound_check(
+        name,
+        claim,
+        model.missed(),
+        bound,
+        source=source,
+        kind="equality",
+        detail="largest miss, as a share of its terms",
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,41 +351,6 @@ class RemainderChannel:
             bound[rows] = np.minimum(bound[rows], rounded_up(gains @ k.magnitude, 2 * observer.order + 4))
             found.append(np.asarray(rounded_up(bound + direct.magnitude, 2)))
         return tuple(found)
-
-    def rounding(self, tracked: TrackedPlant, observer: LinearObserver) -> float:
-        """Return how much K and J are at most of the largest terms of their rows, in natural units of the states."""
-        size = np.abs
-        units = np.ones(tracked.E.shape[1])
-        if tracked.E.shape[0] == tracked.E.shape[1]:
-            units = balance_by_least_squares(tracked.E, tracked.A, outputs=[tracked.C]).states
-        te, c = size(tracked.T) @ size(tracked.E), size(tracked.C)
-        formed = size(observer.Az) @ te + size(observer.By) @ c + size(tracked.T) @ size(tracked.A)
-        shown = size(observer.Cz) @ te + size(observer.Dy) @ c + size(tracked.goal)
-        if tracked.T0 is not None:
-            shown = shown + size(tracked.T0) @ size(tracked.A)
-        pairs = ((self.K.midpoint, formed), (self.J.midpoint, shown))
-        largest = [(size(k) * units, np.max(terms * units, axis=1, initial=0.0, keepdims=True)) for k, terms in pairs]
-        return max(float(np.max(k / np.where(row > 0.0, row, 1.0), initial=0.0)) for k, row in largest)
-
-
-def remainder_channel(tracked: TrackedPlant, observer: LinearObserver) -> RemainderChannel:
-    """Return what the identities of a shipped observer miss on a plant, in outward rounding."""
-    exact = Ball.exact
-    az, bu, by, cz, du, dy = (exact(getattr(observer, name)) for name in ("Az", "Bu", "By", "Cz", "Du", "Dy"))
-    e, a, b, c, d, t = (exact(part) for part in (tracked.E, tracked.A, tracked.B, tracked.C, tracked.D, tracked.T))
-    te = t @ e
-    j, el = cz @ te + dy @ c - exact(tracked.goal), du + dy @ d
-    bd = np.zeros((len(tracked.E), 0)) if tracked.Bd is None else tracked.Bd
-    dd = np.zeros((len(tracked.C), bd.shape[1])) if tracked.Dd is None else tracked.Dd
-    v = dy @ exact(dd)
-    if tracked.T0 is not None and tracked.T0.any():
-        t0 = exact(tracked.T0)
-        j, el, v = j + t0 @ a, el + t0 @ b, v + t0 @ exact(bd)
-        # What T0 E leaves is driven by the next state, which keeps the bounds of x, or by its rate, which has none.
-        left = (t0 @ e).magnitude
-        if left.any():
-            j = Ball(j.midpoint, j.radius + (left if observer.dt > 0.0 else np.where(left > 0.0, np.inf, 0.0)))
-    return RemainderChannel(az @ te + by @ c - t @ a, bu + by @ d - t @ b, j, el, by @ exact(dd) - t @ exact(bd), v)
 
 
 def contraction_of(observer: LinearObserver) -> Contraction | None:

@@ -12,10 +12,8 @@ import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.scaling import Scaling, balance_by_least_squares
-from obsynth.observers.linear.observer import LinearObserver
-from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.checks import Check, upper_bound_check
-from obsynth.verification.error_system import LaggedPlant
+from obsynth.verification.error_system import ErrorModel
 
 #: Equalities may miss by this much, relative to the terms they are made of.
 EQUALITY_TOLERANCE = 1e-9
@@ -134,54 +132,49 @@ def equality(name: str, claim: str, found: Residual, source: str, *, bound: floa
     )
 
 
-def tracking_identities(
-    plant: DescriptorSystem, observer: LinearObserver, tracking: FloatArray, lag: int
-) -> dict[str, Identity]:
+def tracking_identities(model: ErrorModel) -> dict[str, Identity]:
     """Return the identities that make the observer unbiased without faults and disturbances."""
+    plant = model.plant
     # A state in small units must not hide behind one in large units.
-    found = _tracking_identities(
-        plant, observer, tracking, lag, balance_by_least_squares(plant.E, plant.A, outputs=[plant.C])
-    )
+    found = _tracking_identities(model, balance_by_least_squares(plant.E, plant.A, outputs=[plant.C]))
     # States that do not touch each other have sizes beside each other only by what drives both.
     driven = balance_by_least_squares(plant.E, plant.A, inputs=[plant.B, plant.Bf, plant.Bd], outputs=[plant.C])
-    others = _tracking_identities(plant, observer, tracking, lag, driven)
+    others = _tracking_identities(model, driven)
     return {
         name: identity if identity.units is None else replace(identity, also=replace(others[name], rough=ROUGHLY))
         for name, identity in found.items()
     }
 
 
-def _tracking_identities(
-    plant: DescriptorSystem, observer: LinearObserver, tracking: FloatArray, lag: int, scaling: Scaling
-) -> dict[str, Identity]:
-    lagged = LaggedPlant.of(plant, lag)
-    ve = tracking @ lagged.E
+def _tracking_identities(model: ErrorModel, scaling: Scaling) -> dict[str, Identity]:
+    plant, observer, tracking = model.plant, model.observer, model.T
+    ve = tracking @ model.E
     states, cz, dy, du = observer.state_rows, observer.Cz, observer.Dy, observer.Du
-    units = np.tile(scaling.states, lag + 1)
+    units = np.tile(scaling.states, model.lag + 1)
 
     # An observer state that tracks nothing but a sensor fault cancels what it is formed of down to rounding.
-    formed = np.abs(tracking) @ np.abs(lagged.A) + np.abs(observer.By) @ np.abs(lagged.C)
+    formed = np.abs(tracking) @ np.abs(model.A) + np.abs(observer.By) @ np.abs(model.C)
     # Outputs that see no state may be all it takes; the others are then rounding errors of those.
     taken = np.max(np.abs(observer.By) / scaling.outputs, axis=1, keepdims=True)
-    seen = np.sum(scaling.outputs[:, None] * np.abs(lagged.C), axis=0, keepdims=True)
+    seen = np.sum(scaling.outputs[:, None] * np.abs(model.C), axis=0, keepdims=True)
 
     def unseen(rows: slice) -> Identity:
-        factors = ((cz[rows], tracking, lagged.E), (dy[rows], lagged.C), (cz[rows], formed))
-        return Identity((cz[rows] @ ve, dy[rows] @ lagged.C), factors, units)
+        factors = ((cz[rows], tracking, model.E), (dy[rows], model.C), (cz[rows], formed))
+        return Identity((cz[rows] @ ve, dy[rows] @ model.C), factors, units)
 
     return {
         "dynamics": Identity(
-            (observer.Az @ ve, observer.By @ lagged.C, -tracking @ lagged.A),
-            ((observer.Az, tracking, lagged.E), (taken, seen), (tracking, lagged.A)),
+            (observer.Az @ ve, observer.By @ model.C, -tracking @ model.A),
+            ((observer.Az, tracking, model.E), (taken, seen), (tracking, model.A)),
             units,
         ),
         "inputs": Identity(
-            (observer.Bu, observer.By @ plant.D, -tracking @ lagged.B),
-            ((observer.By, plant.D), (tracking, lagged.B)),
+            (observer.Bu, observer.By @ plant.D, -tracking @ model.B),
+            ((observer.By, plant.D), (tracking, model.B)),
         ),
         "state estimate": Identity(
-            (cz[states] @ ve, dy[states] @ lagged.C, -lagged.oldest),
-            ((cz[states], tracking, lagged.E), (dy[states], lagged.C)),
+            (cz[states] @ ve, dy[states] @ model.C, -model.goal[states]),
+            ((cz[states], tracking, model.E), (dy[states], model.C)),
             units,
         ),
         "fault estimate": unseen(observer.fault_rows),

@@ -20,7 +20,7 @@ from obsynth.proofs.peak_sums import gathered, interval_pieces, peak_sums
 from obsynth.proofs.products import energy
 from obsynth.results.checks import Check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
-from obsynth.verification.error_system import TrackedPlant
+from obsynth.verification.error_system import ErrorModel
 
 #: Imaginary parts below this are not shown.
 SHOWN_AS_REAL = 1e-12
@@ -75,7 +75,7 @@ _MAPS = ("from_state", "from_input", "from_fault", "from_disturbance")
 _SOURCE = "the plant as written, eliminated and sampled again"
 
 
-def derivation_rows(design: ObserverDesign, tracked: TrackedPlant) -> Iterator[Check]:
+def derivation_rows(design: ObserverDesign, model: ErrorModel) -> Iterator[Check]:
     """Yield the rows on the way from the plant as written to the one that the design is for."""
     plant, observer = design.linear
     source = design.source
@@ -107,7 +107,7 @@ def derivation_rows(design: ObserverDesign, tracked: TrackedPlant) -> Iterator[C
             _difference(found.recovery, design.recovery, _MAPS), DERIVED_TOLERANCE, source=_SOURCE, kind="equality",
         )  # fmt: skip
     if source.sample_time is not None and observer.fault_names:
-        yield from _sampling_rows(source.plant, source.sample_time, plant, observer, tracked)
+        yield from _sampling_rows(source.plant, source.sample_time, plant, observer, model)
 
 
 def _difference(first: object, second: object, names: tuple[str, ...]) -> float:
@@ -127,7 +127,7 @@ def _difference(first: object, second: object, names: tuple[str, ...]) -> float:
 
 
 def _sampling_rows(
-    written: DescriptorSystem, dt: float, plant: DescriptorSystem, observer: LinearObserver, tracked: TrackedPlant
+    written: DescriptorSystem, dt: float, plant: DescriptorSystem, observer: LinearObserver, model: ErrorModel
 ) -> Iterator[Check]:
     """Yield what the hold has to do with gains and delays, and the gain over disturbances of any course."""
     delays = ", ".join(f"{delay}" for delay in observer.fault_delays)
@@ -141,7 +141,7 @@ def _sampling_rows(
     from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
 
     smooth = eliminate_algebraic_states(written).plant
-    t = tracked.T[:, : plant.nx]
+    t = model.own
     rows = observer.fault_rows
     direct = observer.Dy[rows] @ plant.Dd
     if not plant.Dd.any():

@@ -17,14 +17,12 @@ from obsynth.numerics.pencils import pencil_structure
 from obsynth.numerics.ranks import BOUNDARY_TOLERANCE
 from obsynth.numerics.spectra import boundary_points
 from obsynth.observers.linear.observer import LinearObserver
-from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.checks import Check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.error_system import (
+    ErrorModel,
     RemainderChannel,
-    TrackedPlant,
     contraction_of,
-    remainder_channel,
 )
 
 #: A bound that is claimed may be found again this much larger: sums are added up in another order.
@@ -59,26 +57,25 @@ class StoredErrors:
     bounds: tuple[FloatArray, ...]
 
     @classmethod
-    def of(cls, tracked: TrackedPlant, observer: LinearObserver) -> StoredErrors | None:
+    def of(cls, model: ErrorModel) -> StoredErrors | None:
         """Return the bounds; ``None`` where no contraction of the observer can be proved."""
         # A design is given them, and verified: the same realisation on the same plant is looked at once.
-        known = _bounds_of(observer)
+        known = _bounds_of(model.observer)
         for other, found in known:
-            if other.equals(tracked):
+            if other.equals(model):
                 return found
-        known.append((tracked, cls._found(tracked, observer)))
+        known.append((model, cls._found(model)))
         return known[-1][1]
 
     @classmethod
-    def _found(cls, tracked: TrackedPlant, observer: LinearObserver) -> StoredErrors | None:
-        contraction = contraction_of(observer)
+    def _found(cls, model: ErrorModel) -> StoredErrors | None:
+        contraction = contraction_of(model.observer)
         if contraction is None:
             return None
-        channel = remainder_channel(tracked, observer)
-        bounds = channel.errors_per_unit(observer, contraction)
+        bounds = model.remainder.errors_per_unit(model.observer, contraction)
         if not all(np.all(np.isfinite(bound)) for bound in bounds):
             return None
-        return cls(channel, bounds)
+        return cls(model.remainder, bounds)
 
     def witnesses(self) -> dict[str, FloatArray]:
         """Return what a certificate claims of them, by name; what has no column is left out."""
@@ -86,14 +83,14 @@ class StoredErrors:
 
 
 @remembered
-def _bounds_of(_observer: LinearObserver) -> list[tuple[TrackedPlant, StoredErrors | None]]:
+def _bounds_of(_observer: LinearObserver) -> list[tuple[ErrorModel, StoredErrors | None]]:
     return []
 
 
-def stored_number_rows(design: ObserverDesign, tracked: TrackedPlant, gamma: float | None = None) -> Iterator[Check]:
+def stored_number_rows(design: ObserverDesign, model: ErrorModel, gamma: float | None = None) -> Iterator[Check]:
     """Yield the rows on stored numbers; ``gamma`` is the gain from the disturbances that is claimed, if any."""
     plant, observer = design.linear
-    found = StoredErrors.of(tracked, observer)
+    found = StoredErrors.of(model)
     claimed = {name: design.certificate.matrices.get(name) for name in _WITNESSES}
     if found is None:
         yield information(
@@ -104,14 +101,14 @@ def stored_number_rows(design: ObserverDesign, tracked: TrackedPlant, gamma: flo
             yield upper_bound_check("stored numbers: states", "the claimed bounds are found again", np.nan, 0.0,
                                     source="stored numbers")  # fmt: skip
         return
-    columns = (tracked.state_names, plant.input_names, plant.disturbance_names)
+    columns = (model.state_names, plant.input_names, plant.disturbance_names)
     for kind, name, bound, labels in zip(_NAMES, _WITNESSES, found.bounds, columns, strict=True):
         if bound.size:
             yield _per_unit(observer, kind, bound, claimed[name], labels)
         elif claimed[name] is not None:
             yield upper_bound_check(f"stored numbers: {kind}", "there is something to claim", 1.0, 0.0,
                                     source="certificate")  # fmt: skip
-    yield from _gain_rows(design, tracked, found.channel, gamma)
+    yield from _gain_rows(design, model, gamma)
 
 
 def _per_unit(
@@ -141,14 +138,12 @@ def _per_unit(
     )  # fmt: skip
 
 
-def _gain_rows(
-    design: ObserverDesign, tracked: TrackedPlant, channel: RemainderChannel, gamma: float | None
-) -> Iterator[Check]:
+def _gain_rows(design: ObserverDesign, model: ErrorModel, gamma: float | None) -> Iterator[Check]:
     """Yield what plant and stored observer together make of disturbances."""
     plant, observer = design.linear
     if not plant.nd or not observer.fault_names:
         return
-    system = _Composite(plant, observer, tracked, channel)
+    system = _Composite(model)
     unit = 1.0 if plant.dt > 0.0 else system.fastest
     few = plant.nx + observer.order <= MANY_STATES
     points = POINTS if few else FEWER_POINTS
@@ -166,7 +161,7 @@ def _gain_rows(
         text = f"gain d -> fault error of the plant and the stored observer, from {SLOWEST:.0e} rad per sample up"
         detail = f"largest of {len(frequencies)} frequencies at {frequencies[worst]:.2g} rad per sample; {verdict}"
         drifting = np.isfinite(seconds) and np.all(nearest <= MOST_DISTANCE)
-        if beyond.size and drifting and channel.rounding(tracked, observer) <= ROUNDED:
+        if beyond.size and drifting and model.rounding() <= ROUNDED:
             # Nobody could store better numbers: no finite gain exists, and what can be said is for how long it holds.
             yield information("gain with stored numbers", f"{text}; above gamma by rounding alone", float(gains[worst]),
                               source="recomputed, plant included", detail=detail)  # fmt: skip
@@ -193,19 +188,13 @@ def _around(angles: FloatArray, unit: float, dt: float) -> FloatArray:
 class _Composite:
     """The transfer from the disturbances to the fault error of a plant and its stored observer, at any frequency."""
 
-    def __init__(
-        self, plant: DescriptorSystem, observer: LinearObserver, tracked: TrackedPlant, channel: RemainderChannel
-    ) -> None:
-        self.plant, self.observer = plant, observer
-        rows = observer.fault_rows
-        self.K, self.J = channel.K.midpoint, channel.J.midpoint[rows]
-        # Faults and lagged states are appended to the states of the plant.
-        self.copies = tracked.T.shape[1] // plant.nx if tracked.T.shape[1] % plant.nx == 0 else 1
-        width = plant.nx * (self.copies if tracked.state_names[: plant.nx] == plant.state_names else 1)
-        self.lags = width // plant.nx
-        self.K, self.J = self.K[:, :width], self.J[:, :width]
-        padded = np.vstack([plant.Bd, np.zeros((tracked.T.shape[1] - plant.nx, plant.nd))])
-        self.driven = observer.By @ plant.Dd - tracked.T @ padded
+    def __init__(self, model: ErrorModel) -> None:
+        self.plant, self.observer = plant, observer = model.plant, model.observer
+        rows, channel = observer.fault_rows, model.remainder
+        self.lags = model.lag + 1
+        width = plant.nx * self.lags
+        self.K, self.J = channel.K.midpoint[:, :width], channel.J.midpoint[rows, :width]
+        self.driven = -model.disturbance
         self.direct = observer.Dy[rows] @ plant.Dd
         self.shown = observer.Cz[rows]
         values = pencil_structure(plant.E, plant.A).finite_eigenvalues

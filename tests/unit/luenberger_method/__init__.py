@@ -14,6 +14,7 @@ from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.checks import Check
 from obsynth.results.design import Certificate, ObserverDesign
+from obsynth.verification.error_system import ErrorModel
 
 
 @dataclass(frozen=True)
@@ -77,3 +78,8 @@ class LuenbergerObserver(Method):
         from luenberger_method.checks import checks
 
         return checks(design, printed_digits)
+
+    @classmethod
+    def error_model(cls, design: ObserverDesign) -> ErrorModel:
+        plant, observer = design.linear
+        return ErrorModel(plant, observer, np.linalg.inv(plant.E))

@@ -6,7 +6,7 @@ d, process noise w gathered over an interval, sensor noise n.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import cast
 
@@ -15,7 +15,7 @@ import numpy as np
 from obsynth.analysis.transformations.sampling import discretise
 from obsynth.errors import SpecError
 from obsynth.experiments.monitors.between_samples import BetweenSamples
-from obsynth.methods.pd_observer.realisation import with_faults_as_states
+from obsynth.methods.registry import error_model
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import first_order_hold
 from obsynth.numerics.norms import output_covariance
@@ -26,41 +26,7 @@ from obsynth.results.design import ObserverDesign
 from obsynth.simulation.profiles import Additive, Random
 from obsynth.simulation.scenario import Scenario, observer_start
 from obsynth.simulation.signals import Drive, resolve
-from obsynth.verification.error_system import ErrorSystem
-
-
-@dataclass(frozen=True, eq=False)
-class TrackedErrors:
-    """The error system of a design in the plant's own time, and ``tracking V (nz, nx)``, of the newest state."""
-
-    errors: ErrorSystem
-    tracking: FloatArray
-
-
-def tracked_errors(design: ObserverDesign, plant: DescriptorSystem) -> TrackedErrors:
-    """Return the error system of a linear design on its plant with some noise."""
-    observer, matrices = design.linear[1], design.certificate.matrices
-    if not observer.residual_names:
-        raise SpecError(f"Design {design.name!r} has no residual to watch.", path="observer")
-    if design.method == "pd-observer":
-        # The observer's state is that of the plant with its faults as states.
-        tracking = np.eye(plant.nx + plant.nf)
-        return TrackedErrors(
-            ErrorSystem.of(with_faults_as_states(plant), observer, tracking, 0), tracking[:, : plant.nx]
-        )
-    if design.method == "functional-filter":
-        # Its states follow T E x, and its rows add equations of the plant.
-        system = ErrorSystem.of(plant, observer, matrices["T"], 0, matrices["T0"])
-        return TrackedErrors(system, matrices["T"])
-    if "tracking" not in matrices:
-        raise SpecError(f"Design {design.name!r} has no tracking map: its residual has no model.", path="observer")
-    # A fault model's states come after the plant's own in the map; they track no fault here.
-    tracking = matrices["tracking"][:, : plant.nx] if "Phi" in matrices else matrices["tracking"]
-    if tracking.shape[1] < plant.nx:
-        # Without a state of its own a filter follows nothing.
-        tracking = np.zeros((observer.order, plant.nx))
-    lag = tracking.shape[1] // plant.nx - 1
-    return TrackedErrors(ErrorSystem.of(plant, observer, tracking, lag), tracking[:, : plant.nx])
+from obsynth.verification.error_system import ErrorModel
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,15 +46,16 @@ class SampledErrors:
         return np.hstack([shown, np.zeros((len(shown), self.gathered))])
 
 
-def sampled_errors(plant: DescriptorSystem, observer: LinearObserver, found: TrackedErrors, dt: float) -> SampledErrors:
+def sampled_errors(errors: ErrorModel, dt: float) -> SampledErrors:
     """Return the error of a continuous observer from sample to sample."""
+    plant, observer = errors.plant, errors.observer
     process, sensors = plant.Bw.any(axis=0), plant.Dw.any(axis=0)
     if (process & sensors).any():
         raise SpecError("A noise drives the plant and a sensor at once, which is not known between samples: state two.",
                         path="noise")  # fmt: skip
     held = sample_observer(observer, dt)
-    transition, gathered_d, _ = first_order_hold(observer.Az, found.errors.disturbance, dt)
-    driven = found.errors.noise[:, process]
+    transition, gathered_d, _ = first_order_hold(observer.Az, errors.disturbance, dt)
+    driven = errors.noise[:, process]
     whole = DescriptorSystem(None, observer.Az, C=np.eye(observer.order), Bw=driven)
     gathered = discretise(whole, dt).plant.Bw
     heard = plant.Dw[:, sensors]
@@ -205,10 +172,11 @@ def residual_model(
     plant, observer = design.linear
     drive = resolve(plant, scenario)
     noisy = noisy_plant(plant, scenario, drive)
-    found = tracked_errors(design, noisy)
-    errors = found.errors
+    if not observer.residual_names:
+        raise SpecError(f"Design {design.name!r} has no residual to watch.", path="observer")
+    errors = replace(error_model(design), plant=noisy)
     start = np.array([scenario.initial_state.get(name, 0.0) for name in plant.state_names])
-    initial = found.tracking @ (plant.E @ start) - observer_start(scenario, observer.order)
+    initial = errors.own @ (plant.E @ start) - observer_start(scenario, observer.order)
     shown, _, direct_d, direct_w = errors.fault_output if estimates else errors.residual_output
     rows = observer.fault_rows if estimates else observer.residual_rows
     faults, _, faults_d, faults_w = errors.fault_output
@@ -216,15 +184,15 @@ def residual_model(
     a, driven, noise, flow, start_noise, heard = errors.Az, errors.disturbance, errors.noise, None, None, None
     continuous = None
     if not plant.is_discrete:
-        held, flow = sampled_errors(noisy, observer, found, drive.dt), (errors.Az, errors.disturbance)
+        held, flow = sampled_errors(errors, drive.dt), (errors.Az, errors.disturbance)
         a, driven, noise, start_noise = held.A, held.Bd, held.Bw, held.start
         sensors = noisy.Dw.any(axis=0)
         heard = errors.noise[:, sensors], direct_w[:, sensors]
-        continuous = ContinuousDesign(noisy, observer, found.tracking, drive.dt, endless, rows)
+        continuous = ContinuousDesign(noisy, observer, errors.own, drive.dt, endless, rows)
         direct_w, faults_w = held.direct(rows), held.direct(observer.fault_rows)
     between = None
     if plant.is_discrete and plant.nd and design.source is not None and design.source.sample_time is not None:
-        between = BetweenSamples.of_sampled(design.source.plant, plant, observer, found.tracking, rows=rows)
+        between = BetweenSamples.of_sampled(design.source.plant, plant, observer, errors.own, rows=rows)
     return ResidualModel(
         a, -shown, driven, direct_d, noise, direct_w, -faults, faults_d, faults_w,
         drive.steps, initial, bounds, means, deviations, steady, flow, start_noise, heard, continuous, between,

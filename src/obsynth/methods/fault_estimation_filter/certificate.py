@@ -13,7 +13,7 @@ from obsynth.numerics.norms import output_covariance, state_units
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.verification.certificates import prove_bounded_real
-from obsynth.verification.error_system import ErrorSystem
+from obsynth.verification.error_system import ErrorModel
 
 #: Levels, relative to the claimed one, at which coordinates are improved on the way to it.
 APPROACHES = ((1.05,), (1.5, 1.05, 1.001))
@@ -35,7 +35,7 @@ def bounded_real_certificate(
 
     The Riccati solution with the largest slack that does, else the last try; at most ``tries`` coordinates are tried.
     """
-    errors = ErrorSystem.of(plant, observer, tracking, lag)
+    errors = ErrorModel(plant, observer, tracking, lag=lag)
     a, b = observer.Az[:core, :core], errors.disturbance[:core] / gain
     c, d = -errors.fault_output[0][:, :core], errors.fault_output[2] / gain
     best, spare = np.eye(core), None

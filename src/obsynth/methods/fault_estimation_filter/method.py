@@ -15,7 +15,7 @@ from obsynth.numerics.arguments import FewSamples, OpenUnitInterval, Positive, W
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.checks import Check
 from obsynth.results.design import ObserverDesign
-from obsynth.verification.error_system import TrackedPlant
+from obsynth.verification.error_system import ErrorModel
 
 #: The least relative distance to the optimum at which a proof can be expected: less leaves no room for one.
 LEAST_MARGIN = 1e-2
@@ -124,7 +124,7 @@ class FaultEstimationFilter(Method):
     summary: ClassVar[str] = "fault estimates with a bounded gain from the disturbances"
     source: ClassVar[str] = "Wang, Rodrigues, Theilliol, Shen 2015"
     claims: ClassVar[Mapping[str, ClaimMeaning]] = CLAIMS
-    witnesses: ClassVar[frozenset[str]] = WITNESSES | {"P_factor", "tracking", "T0"}
+    witnesses: ClassVar[frozenset[str]] = WITNESSES | {"P_factor", "tracking"}
     averaged: ClassVar[bool] = True
     purposes: ClassVar[frozenset[Purpose]] = frozenset({"faults"})
 
@@ -164,8 +164,10 @@ class FaultEstimationFilter(Method):
         return checks(design, printed_digits)
 
     @classmethod
-    def error_model(cls, design: ObserverDesign) -> TrackedPlant:
-        """Return the plant with its past states as the shipped observer tracks it."""
-        from obsynth.methods.fault_estimation_filter.checks import tracked_plant
-
-        return tracked_plant(design)
+    def error_model(cls, design: ObserverDesign) -> ErrorModel | None:
+        """Return the plant with its past states, which the filter follows; ``None`` without a tracking map."""
+        (plant, observer), tracking = design.linear, design.certificate.matrices.get("tracking")
+        if tracking is None:
+            return None
+        lag = tracking.shape[1] // plant.nx - 1 if observer.order else int(design.certificate.claims["state_lag"])
+        return ErrorModel(plant, observer, tracking, lag=lag)

@@ -17,7 +17,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.checks import Check
 from obsynth.results.design import ObserverDesign
-from obsynth.verification.error_system import TrackedPlant
+from obsynth.verification.error_system import ErrorModel
 
 _PATH = "method.options"
 
@@ -166,11 +166,10 @@ class FunctionalFilter(Method):
         return checks(design, printed_digits)
 
     @classmethod
-    def error_model(cls, design: ObserverDesign) -> TrackedPlant:
-        """Return the plant as the shipped filter tracks it: without a fault every row is to be zero."""
-        from obsynth.methods.functional_filter.checks import tracked_plant
-
-        return tracked_plant(design)
+    def error_model(cls, design: ObserverDesign) -> ErrorModel:
+        """Return the plant as it is: without a fault every row is zero, as the equations T0 of the plant prove."""
+        (plant, observer), matrices = design.linear, design.certificate.matrices
+        return ErrorModel(plant, observer, matrices["T"], -matrices["T0"], decoupled=True)
 
 
 def _by_name(given: Any, names: Sequence[str], option: str, *, missing: float | None) -> FloatArray:

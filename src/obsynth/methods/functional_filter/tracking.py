@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -13,29 +12,10 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.covariances import certain_noise_covariance
 from obsynth.proofs.extended_balls import arb_matrix
 from obsynth.proofs.products import BITS, as_ball
+from obsynth.verification.error_system import ErrorModel
 
 #: Regulator equations of more unknowns are solved in double precision.
 MOST_UNKNOWNS = 100
-
-
-@dataclass(frozen=True, eq=False)
-class FunctionalErrors:
-    """``eps+ = A eps + fault f + noise w``, rows ``C eps + fault_output f + noise_output w``: no x, u or d."""
-
-    A: FloatArray
-    C: FloatArray
-    fault: FloatArray
-    fault_output: FloatArray
-    noise: FloatArray
-    noise_output: FloatArray
-
-    @classmethod
-    def of(cls, plant: DescriptorSystem, observer: LinearObserver, t: FloatArray, t0: FloatArray) -> FunctionalErrors:
-        """Return the system; T ``(nz, nx)``, T0 ``(rows, nx)``."""
-        return cls(
-            observer.Az, observer.Cz, observer.By @ plant.Df - t @ plant.Bf, observer.Dy @ plant.Df - t0 @ plant.Bf,
-            observer.By @ plant.Dw - t @ plant.Bw, observer.Dy @ plant.Dw - t0 @ plant.Bw,
-        )  # fmt: skip
 
 
 def tracking_map(
@@ -84,11 +64,11 @@ def estimate_deviations(
     plant: DescriptorSystem, observer: LinearObserver, matrices: Mapping[str, FloatArray]
 ) -> FloatArray:
     """Return deviations ``(faults, 2)`` of fhat under noise and of ``fhat - f`` with walks; dt = 0: per sqrt(s)."""
-    errors = FunctionalErrors.of(plant, observer, matrices["T"], matrices["T0"])
+    errors = ErrorModel(plant, observer, matrices["T"], -matrices["T0"])
     rows = observer.fault_rows
     discrete = float(plant.dt > 0.0)
     noise = certain_noise_covariance(
-        errors.A, errors.noise, errors.C[rows], discrete * errors.noise_output[rows], plant.dt
+        errors.Az, -errors.noise, observer.Cz[rows], discrete * errors.fault_output[3], plant.dt
     )
     walk = _walk_covariance(plant, observer, matrices, errors)
     alone = np.maximum(np.diag(noise), 0.0)
@@ -96,25 +76,25 @@ def estimate_deviations(
 
 
 def _walk_covariance(
-    plant: DescriptorSystem, observer: LinearObserver, matrices: Mapping[str, FloatArray], errors: FunctionalErrors
+    plant: DescriptorSystem, observer: LinearObserver, matrices: Mapping[str, FloatArray], errors: ErrorModel
 ) -> FloatArray:
     """Return the covariance of ``fhat(k) - f(k - delay)`` that the walks of the fault models cause."""
     phi, cw, drive, pi = (matrices[name] for name in ("Phi", "Cw", "walks", "tracking"))
     rows, count = observer.fault_rows, len(phi)
     # In coordinates around the motion that follows the models, only what drives them is left.
     lag = max((0, *observer.fault_delays))
-    order = len(errors.A)
+    order = observer.order
     a = np.zeros((order + lag * count, order + lag * count))
     b = np.zeros((len(a), drive.shape[1]))
     c = np.zeros((len(observer.fault_names), len(a)))
-    a[:order, :order], b[:order] = errors.A, -pi @ drive
+    a[:order, :order], b[:order] = observer.Az, -pi @ drive
     for j in range(lag):
         place = slice(order + j * count, order + (j + 1) * count)
         if j == 0:
             b[place] = drive
         else:
             a[place, order + (j - 1) * count : order + j * count] = np.eye(count)
-    c[:, :order] = errors.C[rows]
+    c[:, :order] = observer.Cz[rows]
     for row, (name, delay) in enumerate(zip(observer.fault_names, observer.fault_delays, strict=True)):
         # w(k) = Phi^delay w(k - delay) + the steps since; the estimate is of the oldest of them.
         for j in range(delay):

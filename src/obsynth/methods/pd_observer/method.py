@@ -17,7 +17,7 @@ from obsynth.numerics.ranks import decide_rank
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.checks import Check
 from obsynth.results.design import ObserverDesign
-from obsynth.verification.error_system import TrackedPlant
+from obsynth.verification.error_system import ErrorModel
 
 #: Engines for stability and a decay rate alone.
 ENGINES_OF_STABILITY = ("reduced-lmi", "riccati")
@@ -132,7 +132,8 @@ class PdObserver(Method):
     summary: ClassVar[str] = "states and faults by proportional and derivative action, no derivative taken"
     source: ClassVar[str] = "Filasova, Krokavec, Serbak"
     claims: ClassVar[Mapping[str, ClaimMeaning]] = CLAIMS
-    witnesses: ClassVar[frozenset[str]] = frozenset({"P1", "P3", "P_rate", "P_noise", "P1_low", "P1_high", "T0"})
+    witnesses: ClassVar[frozenset[str]] = frozenset({"P1", "P3", "P_rate", "P_noise", "P1_low", "P1_high"})
+    imposed: ClassVar[frozenset[str]] = frozenset({"decay"})
     purposes: ClassVar[frozenset[Purpose]] = frozenset({"faults"})
 
     theorem: Literal[1, 2] = 1
@@ -222,11 +223,12 @@ class PdObserver(Method):
         return checks(design, printed_digits)
 
     @classmethod
-    def error_model(cls, design: ObserverDesign) -> TrackedPlant:
-        """Return the plant with its faults as states as the shipped observer tracks it."""
-        from obsynth.methods.pd_observer.checks import tracked_plant
-
-        return tracked_plant(design)
+    def error_model(cls, design: ObserverDesign) -> ErrorModel:
+        """Return the plant with its faults as states, which the observer follows as they are."""
+        (plant, observer), nf = design.linear, design.linear[0].nf
+        return ErrorModel(
+            plant, observer, np.eye(plant.nx + nf), Phi=np.zeros((nf, nf)), Cw=np.eye(nf), model_names=plant.fault_names
+        )
 
 
 def _numbers(value: Any, count: int | None) -> tuple[float, ...] | None:

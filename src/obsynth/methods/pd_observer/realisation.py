@@ -21,7 +21,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import ContinuousHinfNorm, continuous_hinf_norm
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.verification.error_system import ErrorSystem
+from obsynth.verification.error_system import ErrorModel
 
 
 def realise_pd_observer(
@@ -92,7 +92,7 @@ class PdErrorSystem:
         n = augmented.nx
         rows = slice(0, n)
         direct = observer.Dy[rows]
-        errors = ErrorSystem.of(augmented, observer, np.eye(n), 0)
+        errors = ErrorModel(augmented, observer, np.eye(n))
         gain_l = solved(observer.Cz[rows], direct)
         return cls(
             observer.Az, observer.Cz[rows],

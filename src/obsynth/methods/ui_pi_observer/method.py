@@ -18,7 +18,7 @@ from obsynth.plants.fault_models import Exosystem, exosystem
 from obsynth.results.checks import Check
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.claims import STATED
-from obsynth.verification.error_system import TrackedPlant
+from obsynth.verification.error_system import ErrorModel
 
 if TYPE_CHECKING:
     from obsynth.methods.placement.region import Region
@@ -121,7 +121,7 @@ class UiPiObserver(Method):
     summary: ClassVar[str] = "state and faults untouched by any unknown input"
     source: ClassVar[str] = "Share Pasand, Aliyari, Taghirad"
     claims: ClassVar[Mapping[str, ClaimMeaning]] = CLAIMS
-    witnesses: ClassVar[frozenset[str]] = frozenset({"tracking", "Phi", "Cw", "poles", "stability", "T0"})
+    witnesses: ClassVar[frozenset[str]] = frozenset({"tracking", "Phi", "Cw", "poles", "stability"})
     purposes: ClassVar[frozenset[Purpose]] = frozenset({"faults", "state despite unknown inputs"})
 
     fault_model: Annotated[Any, WrittenAs("fault model")] = "step"
@@ -239,8 +239,9 @@ class UiPiObserver(Method):
         return checks(design, printed_digits)
 
     @classmethod
-    def error_model(cls, design: ObserverDesign) -> TrackedPlant:
-        """Return the plant with the fault model as the shipped observer tracks it, decoupled from the disturbances."""
-        from obsynth.methods.ui_pi_observer.checks import tracked_plant
-
-        return tracked_plant(design)
+    def error_model(cls, design: ObserverDesign) -> ErrorModel | None:
+        """Return the plant with the fault model, decoupled from the disturbances; ``None`` without a tracking map."""
+        (plant, observer), matrices = design.linear, design.certificate.matrices
+        if "tracking" not in matrices:
+            return None
+        return ErrorModel(plant, observer, matrices["tracking"], Phi=matrices["Phi"], Cw=matrices["Cw"], decoupled=True)

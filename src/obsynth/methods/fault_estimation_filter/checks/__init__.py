@@ -27,7 +27,7 @@ from obsynth.results.checks import Check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.certificates import prove_bounded_real
 from obsynth.verification.claims import UNCERTAIN, claim_rows, claimed, recovery_rows
-from obsynth.verification.error_system import ErrorSystem, LaggedPlant, TrackedPlant
+from obsynth.verification.error_system import ErrorModel
 from obsynth.verification.identities import equality, tracking_identities
 from obsynth.verification.plant import condition_rows, plant_information
 
@@ -72,10 +72,10 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
     work = _with_sensor_faults(plant)
     scaling = balance_by_least_squares(work.E, work.A, inputs=[work.Bf], outputs=[work.C]) if work is not None else None
     allowances = yield from _gain_set_rows(design, work, scaling, tracking, printed_digits)
-    for key, identity in tracking_identities(plant, observer, tracking, lag).items():
+    errors = ErrorModel(plant, observer, tracking, lag=lag)
+    for key, identity in tracking_identities(errors).items():
         name, claim, source = _IDENTITIES[key]
         yield equality(name, claim, identity.residual(allowances.get(key)), source)
-    errors = ErrorSystem.of(plant, observer, tracking, lag)
     yield from fault_rows(plant, observer, tracking, errors, scaling, allowances)
     modes = Modes.of(observer.Az)
     radius = modes.radius
@@ -144,19 +144,6 @@ def _whole(lag: float) -> int:
     return int(lag) if np.isfinite(lag) and lag == int(lag) else -1
 
 
-def tracked_plant(design: ObserverDesign) -> TrackedPlant:
-    """Return the plant with its past states as the shipped observer tracks it."""
-    (plant, observer), matrices = design.linear, design.certificate.matrices
-    lag = int(claimed(design.certificate.claims, "state_lag"))
-    lagged = LaggedPlant.of(plant, lag)
-    goal = np.zeros((len(observer.Cz), lagged.E.shape[1]))
-    goal[observer.state_rows] = lagged.oldest
-    names = tuple(f"{name}(k-{age})" if age else name for age in range(lag + 1) for name in plant.state_names)
-    return TrackedPlant(
-        lagged.E, lagged.A, lagged.B, lagged.C, plant.D, matrices["tracking"], goal, names, matrices.get("T0")
-    )
-
-
 def _fits(
     plant: DescriptorSystem, observer: LinearObserver, tracking: FloatArray | None, factor: FloatArray | None, lag: int
 ) -> bool:
@@ -179,7 +166,7 @@ def _fits(
 
 
 def _norm_rows(
-    design: ObserverDesign, errors: ErrorSystem, modes: Modes, tracking: FloatArray, factor: FloatArray, lag: int
+    design: ObserverDesign, errors: ErrorModel, modes: Modes, tracking: FloatArray, factor: FloatArray, lag: int
 ) -> Iterator[Check]:
     (plant, observer), claims = design.linear, design.certificate.claims
     gamma = claimed(claims, "gamma")
@@ -215,7 +202,7 @@ def _norm_rows(
     )
 
 
-def _noise_rows(plant: DescriptorSystem, errors: ErrorSystem) -> Iterator[Check]:
+def _noise_rows(plant: DescriptorSystem, errors: ErrorModel) -> Iterator[Check]:
     if not plant.nw:
         return
     covariance = certain_noise_covariance(

@@ -18,7 +18,7 @@ from obsynth.numerics.scaling import Scaling
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.checks import Check
-from obsynth.verification.error_system import ErrorSystem, LaggedPlant
+from obsynth.verification.error_system import ErrorModel, with_past
 from obsynth.verification.identities import Identity, equality, worst
 
 #: A trace of a fault in an observer state below this share of its largest one is held to be no trace.
@@ -26,7 +26,7 @@ UNREACHED = 1e-4
 _SOURCE = "Wang 2015, eqs. (32), (44)"
 
 
-def fault_identities(errors: ErrorSystem, delays: tuple[int, ...]) -> dict[str, tuple[Identity, ...]]:
+def fault_identities(errors: ErrorModel, delays: tuple[int, ...]) -> dict[str, tuple[Identity, ...]]:
     """Return, per row of the report, the identities of the fault responses, one for each step."""
     cf, direct_fault = errors.fault_output[:2]
     cr, direct_residual = errors.residual_output[:2]
@@ -49,7 +49,7 @@ def fault_identities(errors: ErrorSystem, delays: tuple[int, ...]) -> dict[str, 
     return {name: tuple(Identity(terms) for terms in steps) for name, steps in found.items()}
 
 
-def fault_traces(errors: ErrorSystem, delays: tuple[int, ...]) -> list[FloatArray]:
+def fault_traces(errors: ErrorModel, delays: tuple[int, ...]) -> list[FloatArray]:
     """Return the error states ``(nz, nf)`` one sample after a fault impulse, two samples after it, and so on."""
     traces = [errors.fault]
     for _ in range(max(delays, default=1)):
@@ -61,7 +61,7 @@ def fault_rows(
     plant: DescriptorSystem,
     observer: LinearObserver,
     tracking: FloatArray,
-    errors: ErrorSystem,
+    errors: ErrorModel,
     scaling: Scaling | None,
     allowances: Mapping[str, FloatArray],
 ) -> Iterator[Check]:
@@ -102,18 +102,19 @@ def _trace_sizes(
     scaling: Scaling | None,
 ) -> FloatArray:
     """Return the size of the terms from which traces were formed ``(nz, nf)``: Az is the difference of V A and By C."""
-    lagged = LaggedPlant.of(plant, tracking.shape[1] // plant.nx - 1)
-    formed = np.abs(tracking) @ np.abs(lagged.A) + np.abs(observer.By) @ np.abs(lagged.C)
-    sizes = np.abs(tracking) @ np.abs(lagged.input(plant.Bf)) + np.abs(observer.By) @ np.abs(plant.Df)
+    lag = tracking.shape[1] // plant.nx - 1
+    _, a, _, c = with_past(plant, lag)
+    formed = np.abs(tracking) @ np.abs(a) + np.abs(observer.By) @ np.abs(c)
+    sizes = np.abs(tracking[:, : plant.nx]) @ np.abs(plant.Bf) + np.abs(observer.By) @ np.abs(plant.Df)
     largest = _in_state_units(np.maximum(sizes, np.max(np.abs(traces), axis=0)), plant.nx)
     for trace in traces[:-1]:
         sizes = np.maximum(sizes, np.abs(observer.Az) @ np.abs(trace))
-    sizes = np.maximum(sizes, formed @ np.tile(largest, (lagged.lag + 1, 1)))
+    sizes = np.maximum(sizes, formed @ np.tile(largest, (lag + 1, 1)))
     # A state that no fault reaches holds only rounding errors of the gains: it is not judged against itself but
     # against a small share of the fault's largest trace, in the units in which the plant is balanced.
     if scaling is None:
         return np.asarray(sizes)  # a failed existence condition says so already
-    units = np.append(scaling.states, np.tile(scaling.states[: plant.nx], lagged.lag))
+    units = np.append(scaling.states, np.tile(scaling.states[: plant.nx], lag))
     units = np.resize(units, len(sizes))[:, None]
     return np.asarray(np.maximum(sizes, UNREACHED * units * np.max(sizes / units, axis=0)))
 

@@ -22,7 +22,7 @@ from obsynth.numerics.scaling import Scaling
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.checks import Check, upper_bound_check
-from obsynth.verification.error_system import ErrorSystem
+from obsynth.verification.error_system import ErrorModel
 from obsynth.verification.identities import Identity, equality, tracking_identities, worst
 
 #: Letters that every gain set has, and that it may have.
@@ -201,8 +201,8 @@ def _totals(
 ) -> dict[str, FloatArray]:
     tracking = equations.tracking(gains["T"])
     lag = tracking.shape[1] // plant.nx - 1
-    errors = ErrorSystem.of(plant, observer, tracking, lag)
-    found = {**tracking_identities(plant, observer, tracking, lag), **gain_identities(work, gains, equations, scaling)}
+    errors = ErrorModel(plant, observer, tracking, lag=lag)
+    found = {**tracking_identities(errors), **gain_identities(work, gains, equations, scaling)}
     for name, steps in fault_identities(errors, observer.fault_delays).items():
         found |= {step_key(name, step): identity for step, identity in enumerate(steps)}
     return {name: identity.total for name, identity in found.items()}

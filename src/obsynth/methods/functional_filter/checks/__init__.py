@@ -19,7 +19,6 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.checks import Check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.certificates import decay_row, stability_row
-from obsynth.verification.error_system import TrackedPlant
 from obsynth.verification.identities import Identity, equality, relative_tolerance
 from obsynth.verification.plant import condition_rows, plant_information
 
@@ -147,16 +146,6 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
         )
     yield from leak_rows(design)
     yield from noise_rows(design)
-
-
-def tracked_plant(design: ObserverDesign) -> TrackedPlant:
-    """Return the plant as the shipped filter tracks it: without a fault every row is to be zero."""
-    (plant, observer), matrices = design.linear, design.certificate.matrices
-    goal = np.zeros((len(observer.Cz), plant.nx))
-    return TrackedPlant(
-        plant.E, plant.A, plant.B, plant.C, plant.D, matrices["T"], goal, plant.state_names, -matrices["T0"], plant.Bd,
-        plant.Dd,
-    )  # fmt: skip
 
 
 def _fits(design: ObserverDesign) -> bool:

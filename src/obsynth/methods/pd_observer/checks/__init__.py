@@ -22,7 +22,7 @@ from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.checks import Check, information, lower_bound_check, upper_bound_check
 from obsynth.results.design import ObserverDesign
-from obsynth.verification.error_system import TrackedPlant
+from obsynth.verification.error_system import ErrorModel
 from obsynth.verification.identities import equality, relative_tolerance, residual, tracking_identities, worst
 from obsynth.verification.plant import condition_rows, plant_information
 
@@ -56,7 +56,7 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
     whole = replace(
         observer, state_names=augmented.state_names, fault_names=(), state_delays=(0,) * augmented.nx, fault_delays=()
     )
-    for key, identity in tracking_identities(augmented, whole, np.eye(augmented.nx), 0).items():
+    for key, identity in tracking_identities(ErrorModel(augmented, whole, np.eye(augmented.nx))).items():
         if key in _IDENTITIES:
             name, claim, source = _IDENTITIES[key]
             yield equality(name, claim, identity.residual(), source, bound=tolerance)
@@ -66,14 +66,6 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
     yield _pencil_row(design, augmented)
     yield from proof_rows(design)
     yield from norm_rows(design, errors)
-
-
-def tracked_plant(design: ObserverDesign) -> TrackedPlant:
-    """Return the plant with its faults as states as the shipped observer tracks it."""
-    plant, observer = design.linear
-    augmented = with_faults_as_states(plant)
-    goal = np.eye(len(observer.Cz), augmented.nx)
-    return TrackedPlant.of(augmented, np.eye(augmented.nx), goal, T0=design.certificate.matrices.get("T0"))
 
 
 def _fits(plant: DescriptorSystem, observer: LinearObserver) -> bool:

@@ -21,7 +21,6 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.fault_models import Exosystem
 from obsynth.results.checks import Check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
-from obsynth.verification.error_system import TrackedPlant
 from obsynth.verification.identities import Residual, equality, relative_tolerance, residual
 from obsynth.verification.plant import condition_rows, plant_information
 
@@ -81,19 +80,6 @@ def _realisation_rows(design: ObserverDesign, printed_digits: int | None) -> Ite
     )
     yield from noise_rows(design)
     yield from tracking_rows(plant, observer, tracking, phi, cw)
-
-
-def tracked_plant(design: ObserverDesign) -> TrackedPlant:
-    """Return the plant with the fault model as the shipped observer tracks it, decoupled from the disturbances."""
-    (plant, observer), matrices = design.linear, design.certificate.matrices
-    augmented = AugmentedPlant.of(plant, shipped_model(matrices, plant.nf))
-    goal = np.zeros((len(observer.Cz), augmented.order))
-    goal[observer.state_rows, : plant.nx] = np.eye(plant.nx)
-    goal[observer.fault_rows, plant.nx :] = matrices["Cw"]
-    return TrackedPlant(
-        augmented.E, augmented.A, augmented.B, augmented.C, plant.D, matrices["tracking"], goal, augmented.names,
-        matrices.get("T0"), augmented.Bd, plant.Dd,
-    )  # fmt: skip
 
 
 def _fits(design: ObserverDesign) -> bool:

@@ -27,7 +27,7 @@ from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.fault_models import balanced_transition
 from obsynth.results.checks import Check, information
-from obsynth.verification.error_system import ErrorSystem
+from obsynth.verification.error_system import ErrorModel
 
 if TYPE_CHECKING:
     from obsynth.results.design import ObserverDesign
@@ -69,7 +69,7 @@ def fault_response(design: ObserverDesign, frequencies: ArrayLike) -> ComplexArr
 def _system(
     plant: DescriptorSystem, observer: LinearObserver, tracking: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    errors = ErrorSystem.of(plant, observer, tracking[:, : plant.nx], 0)
+    errors = ErrorModel(plant, observer, tracking[:, : plant.nx])
     # In balanced states: units must not cost digits.
     return *balanced_realisation(errors.Az, errors.fault, -errors.fault_output[0]), errors.fault_output[1]
 
