@@ -25,8 +25,8 @@ from typing import Any
 from obsynth.extensions import provide
 from obsynth.version import __version__ as __version__
 
-#: What is public, by the module that holds it; ``name=other`` is another name.  Imported when it is first used, so that
-#: ``import obsynth`` stays fast; ``__init__.pyi`` tells the types.
+#: What is public, by the module that holds it.  Imported when it is first used, so that ``import obsynth`` stays fast;
+#: ``__init__.pyi`` tells the types.
 _NAMES = {
     "analysis.diagnosis.decoupled": "decouple DecoupledPlant",
     "analysis.diagnosis.diagnosing": "diagnose",
@@ -55,7 +55,7 @@ _NAMES = {
     "experiments.monitors.residual_monitor": "monitor",
     "experiments.monte_carlo": "evaluate Evaluation Interval",
     "experiments.tolerance_study": "tolerance_study ToleranceStudy",
-    "experiments.simulation": "simulate Simulation RecursiveSimulation=Simulation",
+    "experiments.simulation": "simulate Simulation",
     "exporting.files": "export",
     "importing.andes": "from_andes",
     "importing.fmu": "from_fmu",
@@ -78,15 +78,12 @@ _NAMES = {
     "observers.batches": "run_batch",
     "observers.dae.observer": "DAEObserver",
     "observers.decisions": "decide ParameterMonitor",
-    "observers.estimates": (
-        "Estimates BatchEstimates=Estimates DAEBatchEstimates=Estimates DAEEstimates=Estimates "
-        "RecursiveEstimates=Estimates"
-    ),
+    "observers.estimates": "Estimates",
     "observers.linear.observer": "LinearObserver",
     "observers.linear.derived": "sample_observer",
     "observers.recursive.observer": "RecursiveObserver",
     "observers.recursive.settings": "Adaptation",
-    "observers.running": "RunningObserver RunningDAEObserver=RunningObserver RunningRecursiveObserver=RunningObserver",
+    "observers.running": "RunningObserver",
     "plants.constants": "Constant ConstantsBox",
     "plants.dae.model": "DAEModel",
     "plants.descriptor": "DescriptorSystem",
@@ -103,18 +100,14 @@ _NAMES = {
     "simulation.linear": "simulate_time_varying",
     "simulation.profiles": "Drift Gaussian Intermittent LostEffectiveness Ramp Sine Step Stuck Uniform",
     "simulation.scenario": "Scenario",
-    "simulation.signals": "Trajectory DAETrajectory=Trajectory",
+    "simulation.signals": "Trajectory",
     "spec.loader": "load_spec Spec",
     "sweeps.fleet": "Fleet FleetRun run_fleet",
     "sweeps.sweep": "Sweep sweep SweepResult",
     "tolerances.result": "Robustness",
     "tolerances.robustness": "robustness",
 }
-_HOMES = {
-    name: (f"obsynth.{module}", other or name)
-    for module, names in _NAMES.items()
-    for name, _, other in (entry.partition("=") for entry in names.split())
-}
+_HOMES = {name: f"obsynth.{module}" for module, names in _NAMES.items() for name in names.split()}
 #: Packages whose names are used through them, such as ``obsynth.plotting.plot_data``.
 _PACKAGES = ("conditions", "plotting")
 
@@ -130,8 +123,7 @@ provide({
 
 def __getattr__(name: str) -> Any:
     if name in _HOMES:
-        module, there = _HOMES[name]
-        return getattr(import_module(module), there)
+        return getattr(import_module(_HOMES[name]), name)
     if name in _PACKAGES:
         return import_module(f"obsynth.{name}")
     raise AttributeError(f"module 'obsynth' has no attribute {name!r}")

@@ -136,11 +136,3 @@ from obsynth.tolerances.robustness import robustness as robustness
 from obsynth.version import __version__ as __version__
 
 __all__: list[str]
-BatchEstimates = Estimates
-DAEBatchEstimates = Estimates
-DAEEstimates = Estimates
-DAETrajectory = Trajectory
-RecursiveEstimates = Estimates
-RecursiveSimulation = Simulation
-RunningDAEObserver = RunningObserver
-RunningRecursiveObserver = RunningObserver

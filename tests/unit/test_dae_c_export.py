@@ -64,7 +64,7 @@ def run_c(design: obsynth.ObserverDesign, y: np.ndarray, u: np.ndarray, folder: 
     return dict(zip(fields, np.split(table, np.cumsum(list(fields.values()))[:-1], axis=1), strict=True))
 
 
-def assert_equal(found: dict[str, np.ndarray], expected: obsynth.DAEEstimates) -> None:
+def assert_equal(found: dict[str, np.ndarray], expected: obsynth.Estimates) -> None:
     assert not found["returned"].any()
     for name in ("states", "state_deviations", "parameters", "parameter_deviations", "innovations"):
         values = getattr(expected, name)

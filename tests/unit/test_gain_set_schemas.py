@@ -1,4 +1,4 @@
-"""Gain sets of schema 1 are read and say what they lack; those of schema 2 hold the plant as written, done again."""
+"""Gain sets hold the plant as written, which is eliminated and sampled again."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import json
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 
 import obsynth
@@ -16,7 +15,6 @@ from obsynth.analysis.transformations.recovery import StateRecovery
 from obsynth.results.plant_source import PlantSource, source_of
 from obsynth.spec import load_spec
 
-OLD = sorted((Path(__file__).parents[1] / "data" / "schema_1").glob("*.json"))
 DESIGNS = Path(__file__).parents[2] / "designs"
 
 
@@ -27,23 +25,12 @@ def smib() -> obsynth.ObserverDesign:
     return obsynth.design(spec.plant, spec.method, name="smib", recovery=recovery, **dict(spec.options))
 
 
-@pytest.mark.parametrize("path", OLD, ids=lambda path: path.stem)
-def test_a_gain_set_of_schema_1_loads_passes_and_says_what_it_lacks(path: Path, tmp_path: Path):
-    assert json.loads(path.read_text(encoding="utf-8"))["schema_version"] == 1
-    design = obsynth.load(path)
-    report = verify(design)
-    assert report.passed
-    assert design.source is None
-    names = {check.name: check for check in report.checks}
-    if design.method in ("pd-observer", "ui-pi-observer", "fault-estimation-filter"):
-        row = names["stored numbers: states"]
-        assert (row.kind, row.status) == ("information", "proved")
-        assert "no bound is claimed" in row.detail
-    if design.recovery is not None:
-        assert names["plant as written"].status == "assumed"
-    again = obsynth.load(design.save(tmp_path / "new.json"))
-    assert json.loads((tmp_path / "new.json").read_text(encoding="utf-8"))["schema_version"] == 2
-    assert again.certificate.claims == design.certificate.claims
+def test_another_schema_is_refused(smib: obsynth.ObserverDesign, tmp_path: Path):
+    path = smib.save(tmp_path / "a.json")
+    document = json.loads(path.read_text(encoding="utf-8"))
+    path.write_text(json.dumps({**document, "schema_version": 1}), encoding="utf-8")
+    with pytest.raises(obsynth.SpecError, match="schema version 1; this obsynth reads 2"):
+        obsynth.load(path)
 
 
 def test_the_plant_as_written_comes_back_bit_for_bit(smib, tmp_path):
@@ -113,32 +100,3 @@ def test_the_gain_over_all_disturbances_is_at_least_that_of_fast_sines(smib):
         effects.append(np.ravel(shown))
     found = np.sqrt(0.5) * np.linalg.norm(np.array(effects), 2) / np.sqrt(step)
     assert found <= value * (1.0 + 1e-6)
-
-
-STATES = sorted((Path(__file__).parents[1] / "data" / "states_of_schema_3").glob("*.state"))
-
-
-@pytest.mark.parametrize("path", STATES, ids=lambda path: path.stem)
-def test_a_saved_state_of_schema_3_goes_on(path: Path, tmp_path: Path):
-    """Eleven rows were run by the version that wrote state and gain set; thirteen follow, as if nothing had been."""
-    assert len(STATES) == 4
-    design = obsynth.load(path.with_suffix(".json"))
-    rng = np.random.default_rng(7)
-    nonlinear = path.stem.startswith("dae")
-    y = 1.0 + 0.01 * rng.standard_normal((24, 1)) if nonlinear else rng.standard_normal((24, 2))
-    u = np.full((24, 1), 0.5) if nonlinear else rng.standard_normal((24, 1))
-    names = ["time", *design.plant.input_names, *design.plant.output_names]
-    log = pd.DataFrame(np.hstack([0.1 * np.arange(24)[:, None], u, y]), columns=names)
-    state = tmp_path / "run.state"
-    state.write_bytes(path.read_bytes())
-    # Outliers were not judged then.
-    options = {} if path.stem.startswith("fault") else {"outliers": "none"}
-    part = obsynth.run_on_data(design, log.iloc[11:], state=state, **options).table
-    whole = obsynth.run_on_data(design, log, **options).table.iloc[11:].reset_index(drop=True)
-    numbers = [name for name in part.columns if name not in ("status", "alarm")]
-    np.testing.assert_allclose(part[numbers], whole[numbers], rtol=1e-9, atol=1e-12)
-    # It is written anew in the schema of today, and belongs to this gain set alone.
-    assert json.loads(state.read_text(encoding="utf-8"))["schema_version"] == 4
-    state.write_bytes(path.read_bytes())
-    with pytest.raises(obsynth.SpecError, match="another gain set"):
-        obsynth.run_on_data(design.replace(name="another"), log.iloc[11:], state=state, **options)

@@ -106,8 +106,6 @@ def test_types_are_told_of_every_public_name() -> None:
     stub = ast.parse((SOURCE / "__init__.pyi").read_text())
     told = {alias.asname: (str(node.module), alias.name) for node in stub.body if isinstance(node, ast.ImportFrom)
             for alias in node.names if alias.name not in ("__version__", "conditions", "plotting")}  # fmt: skip
-    told |= {ast.unparse(node.targets[0]): told[ast.unparse(node.value)] for node in stub.body
-             if isinstance(node, ast.Assign)}  # fmt: skip
     assert set(told) == set(obsynth.__all__)
     for name, (module, there) in told.items():
         assert getattr(import_module(module), there) is getattr(obsynth, name), name

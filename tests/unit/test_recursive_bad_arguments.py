@@ -25,7 +25,7 @@ def design() -> ObserverDesign:
 
 
 @cache
-def estimates() -> obsynth.RecursiveEstimates:
+def estimates() -> obsynth.Estimates:
     return design().observer.run(Y, U)
 
 

@@ -363,11 +363,7 @@ def test_a_plant_of_any_kind_is_simulated_alone(wang) -> None:
         obsynth.simulate(*wang, steps=3)
 
 
-def test_estimates_are_of_one_kind() -> None:
-    kinds = {obsynth.RecursiveEstimates, obsynth.DAEEstimates, obsynth.BatchEstimates, obsynth.DAEBatchEstimates}
-    assert kinds == {obsynth.Estimates}
-    assert obsynth.RecursiveSimulation is obsynth.Simulation
-    assert obsynth.DAETrajectory is obsynth.Trajectory
+def test_estimates_without_deviations_have_none() -> None:
     design = obsynth.fault_estimation_filter(
         obsynth.DescriptorSystem(None, [[0.5]], [[1.0]], [[1.0]], Bf=[[1.0]], dt=1.0)
     )

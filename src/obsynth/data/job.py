@@ -203,8 +203,6 @@ class Job:
 
 KIND = "obsynth run state"
 SCHEMA_VERSION = 4
-#: The schema before: states of recursive and nonlinear observers were laid out otherwise.
-EARLIER = 3
 STATE = FileKind("a saved state of obsynth", rb'\A\s*\{\s*"kind":\s*"obsynth run state"')
 #: Parts that are seconds, or nothing before the first row.
 _TIMES = frozenset({"last", "longest"})
@@ -217,13 +215,12 @@ def save_state(path: Path, job: Job, digest: str) -> None:
     write_atomically(path, json.dumps(document, indent=1, allow_nan=False) + "\n")
 
 
-def resume_state(path: Path, job: Job, digest: str, earlier: str = "") -> None:
-    """Let a run go on from a saved state; ``earlier`` is the digest of a gain set of an earlier schema."""
+def resume_state(path: Path, job: Job, digest: str) -> None:
+    """Let a run go on from a saved state."""
     # The state is written again at the end, so it is no input that has to be kept.
     document = read_json(path, is_protected=False)
     known = isinstance(document, dict) and document.get("kind") == KIND
-    version = document.get("schema_version") if known else None
-    if version not in (EARLIER, SCHEMA_VERSION):
+    if not known or document.get("schema_version") != SCHEMA_VERSION:
         raise SpecError(f"{path} is no saved state of a run.", path=str(path))
     body = document.get("run")
     try:
@@ -232,13 +229,11 @@ def resume_state(path: Path, job: Job, digest: str, earlier: str = "") -> None:
         intact = False
     if not intact:
         raise SpecError(f"{path} was changed after it was written: its digest does not match.", path=str(path))
-    if body.get("gains") not in ((digest, earlier) if earlier else (digest,)):
+    if body.get("gains") != digest:
         raise SpecError(f"{path} is the state of a run with another gain set.", path=str(path))
     own = job.as_dict()
     try:
         state = restored(body.get("state"))
-        if version == EARLIER:
-            state = _from_schema_3(state, own)
         job.resume(state)
         fits = _fits(own, state)
     except (AttributeError, LookupError, TypeError, ValueError, ArithmeticError):
@@ -246,20 +241,6 @@ def resume_state(path: Path, job: Job, digest: str, earlier: str = "") -> None:
     if not fits:
         raise damaged_state(path)
     job.resumed_from = path
-
-
-def _from_schema_3(saved: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
-    """Return a state as it is laid out now; outliers were not counted then, and the warm-up was another one."""
-    engine, like = saved["observer"], own["observer"]
-    if "observer" not in like:
-        return saved
-    then, now = engine["observer"], like["observer"]
-    found = {name: then.get(name, now[name]) for name in now}
-    if "regressors" in now:
-        reset = then["alarm"] or {"window": [], "resets": 0}
-        surprises = np.array(reset["window"], dtype=np.float64).reshape(-1, 2)
-        found |= {"regressors": then["window"], "surprises": surprises, "resets": reset["resets"]}
-    return {**saved, "observer": {**engine, "observer": found, "warm_up": like["warm_up"]}}
 
 
 def _fits(own: Any, saved: Any) -> bool:

@@ -221,7 +221,7 @@ def run_on_data(
     job = Job(engine, Signals.of(engine, columns, scales), design.recovery, thresholds or {}, watched, recovered, later)
     digest = gain_set_digest(design)
     if state is not None and Path(state).exists():
-        resume_state(Path(state), job, digest, design.file_digest)
+        resume_state(Path(state), job, digest)
     kept: list[FloatArray] | None = [] if out is None else None
     # What has left a stream cannot be taken back: there the state is saved however the run ends.
     save = None

@@ -78,8 +78,6 @@ class ObserverDesign:
         The report of this very object.
     source : PlantSource, optional
         The plant as written, where algebraic states were eliminated or the plant was sampled: `verify` does it again.
-    file_digest : str, optional
-        The sha256 that the file had from which it was read, of whatever schema: states of earlier runs name it.
     """
 
     name: str
@@ -94,7 +92,6 @@ class ObserverDesign:
     recovery: StateRecovery | None = None
     report: VerificationReport = field(default_factory=VerificationReport)
     source: PlantSource | None = None
-    file_digest: str = field(default="", repr=False)
 
     def __post_init__(self) -> None:
         frozen = {name: read_only(matrix) for name, matrix in self.gains.items()}
@@ -167,7 +164,7 @@ class ObserverDesign:
         **changes
             Any field.
         """
-        return replace(self, **{"file_digest": "", **changes})
+        return replace(self, **changes)
 
     def save(self, path: str | Path) -> Path:
         """Write the gain set as one JSON document, atomically.

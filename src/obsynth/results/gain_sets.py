@@ -47,8 +47,6 @@ __all__ = [
     "place_of", "plain", "restored", "save", "written_for",
 ]  # fmt: skip
 
-#: Schema 1 holds no plant as written and no bounds of stored numbers: what it lacks is assumed, or least found.
-READABLE = (1, 2)
 #: Larger gain sets are refused before they fill the memory.
 MAXIMUM_CHARACTERS = 2_000_000_000
 _HEAD_BYTES = 256
@@ -137,10 +135,10 @@ def _design_of(document: Any, arrays: bytes | None, source: str) -> ObserverDesi
     """Return the design in a document whose digest is right."""
     if not isinstance(document, dict) or document.get("kind") != KIND:
         raise SpecError(f"{source} is no gain set of obsynth.", path=source)
-    if document.get("schema_version") not in READABLE:
+    if document.get("schema_version") != SCHEMA_VERSION:
         version = document.get("schema_version")
         raise SpecError(
-            f"{source} has schema version {version!r}; this obsynth reads {' and '.join(map(str, READABLE))}.",
+            f"{source} has schema version {version!r}; this obsynth reads {SCHEMA_VERSION}.",
             path=source,
         )
     body = document.get("design")
@@ -152,7 +150,7 @@ def _design_of(document: Any, arrays: bytes | None, source: str) -> ObserverDesi
         raise SpecError(f"{source} was changed after it was written: its digest does not match.", path=source)
     try:
         parts = _checked_parts(restored(body, None if arrays is None else _arrays_in(arrays)))
-        return _design_from(parts, document["sha256"])
+        return _design_from(parts)
     except (SpecError, AttributeError, LookupError, TypeError, ValueError, ArithmeticError, RecursionError) as error:
         raise SpecError(f"{source} is incomplete: {str(error).rstrip('.')}.", path=source) from error
 
@@ -176,7 +174,7 @@ def _recovery_from(**data: Any) -> StateRecovery:
     return StateRecovery.from_operator(names, operator, data["noise_kept"], data["operating_point"])
 
 
-def _design_from(data: dict[str, Any], digest: str) -> ObserverDesign:
+def _design_from(data: dict[str, Any]) -> ObserverDesign:
     if not isinstance(data.get("kind"), (str, type(None))) or data.get("kind") not in KINDS:
         raise SpecError(f"A design of the kind {data['kind']!r} is unknown to this obsynth.", path="kind")
     plant, observer = types_of(data.get("kind"))
@@ -194,7 +192,6 @@ def _design_from(data: dict[str, Any], digest: str) -> ObserverDesign:
         recovery=None if recovery is None else _made("recovery", _recovery_from, **recovery),
         report=_made("report", VerificationReport.from_dict, data["report"]),
         source=None if data.get("source") is None else _made("source", PlantSource.from_dict, data["source"]),
-        file_digest=digest,
     )
 
 

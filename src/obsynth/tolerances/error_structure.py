@@ -1,4 +1,4 @@
-"""How an uncertain plant drives the error of a fixed observer: robust.md, sections 1, 2 and 8.
+"""How an uncertain plant drives the error of a fixed observer.
 
     eps+ = Az eps + (Az T E + By C - T A) x + (Bu + By D - T B) u + (By Dd - T Bd) d,   eps = z - T E(q) x
     xhat - x = Cx eps + (Cx T E + Dyx C + T0x A - I) x + ...      (fault estimates, residuals: without I)
@@ -165,7 +165,7 @@ def _missed(matrix: AffineMatrix, offsets: FloatArray) -> FloatArray:
 def _fault_columns(
     direct: AffineMatrix, observer: LinearObserver, c: FloatArray, n: int, offsets: FloatArray
 ) -> AffineMatrix:
-    """Return the columns of faults as signals that are estimated, each at its delay: robust.md, correction 8.1."""
+    """Return the columns of faults as signals that are estimated, each at its delay."""
     nz, nf = observer.order, direct.shape[1]
     target = np.zeros((nz + len(c), nf))
     target[nz + n : nz + n + nf] = np.eye(nf)

@@ -1,6 +1,6 @@
 """Statements about every matrix in a box, by cutting the box until each part is proved, or one point refutes it.
 
-Whether a plant is stable, and of index 1 (or 0), at every point of its box: robust.md, 1 and correction 8.5.
+Whether a plant is stable, and of index 1 (or 0), at every point of its box.
 """
 
 from __future__ import annotations

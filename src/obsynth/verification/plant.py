@@ -83,7 +83,7 @@ def derivation_rows(design: ObserverDesign, model: ErrorModel) -> Iterator[Check
         if design.recovery is not None:
             yield information(
                 "plant as written", "elimination, sampling and recovery are those of the plant as written: assumed, as "
-                "the gain set does not hold it", np.nan, source="gain set of schema 1, or given by hand",
+                "the design does not hold it", np.nan, source="given by hand",
                 status="assumed",
             )  # fmt: skip
         return

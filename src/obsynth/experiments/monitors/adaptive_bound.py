@@ -1,4 +1,4 @@
-r"""A bound of residuals and fault estimates over the box of the plant's constants (robust.md, theorems 1 and 2).
+r"""A bound of residuals and fault estimates over the box of the plant's constants.
 
 ``tau_k = nominal + start_k + sum_i |phi_i| + rest_k + rounding_k``: ``phi_i`` filters of the measured signals, one for
 each constant (first order), ``rest`` all higher orders, by a recursion of nonnegative numbers over a ring of L samples.
