@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import obsynth
-from obsynth.analysis.diagnosis.exact import question
+from obsynth.analysis.diagnosis.exact import Questions, question
 
 CASES = Path(__file__).parents[1] / "data" / "cases"
 
@@ -180,3 +180,64 @@ def test_exact_and_rounded_agree_on_random_integer_plants() -> None:
                 assert (len(exact.zeros), len(exact.blocking)) == (len(rounded.zeros), len(rounded.blocking))
                 assert (exact.derivatives, exact.residual_order) == (rounded.derivatives, rounded.residual_order)
             assert exact.order == rounded.order
+
+
+class TestManyFaultsAndStates:
+    """What several questions rest on is computed once, and rows that repeat others are not kept."""
+
+    @pytest.mark.parametrize("exactly", [True, False])
+    def test_rows_that_repeat_others_are_not_kept(self, exactly: bool) -> None:
+        """A state behind twelve integrators is known to be zero: the rows that say so were doubled by each of them."""
+        import tracemalloc
+
+        m = 12
+        a = np.diag([1.0] * (m - 1) + [0.0], 1)
+        a[m - 1, m - 1], a[m, 0] = -0.5, 1.0
+        last = np.eye(m + 1)[:, [m - 1]]
+        e = np.diag([1.0] * m + [0.0])
+        plant = obsynth.DescriptorSystem(e, a, last, last.T, Bf=last, dt=0.1)
+        tracemalloc.start()
+        try:
+            found = question(plant, (), 0, exactly)
+            assert found.visible
+            assert found.derivatives == 0  # the input and the output are known, and the state before it
+            peak = tracemalloc.get_traced_memory()[1]
+        finally:
+            tracemalloc.stop()
+        assert peak < 10e6  # 134 MB for the null space of 4,096 rows
+
+    @pytest.mark.parametrize("exactly", [True, False])
+    def test_questions_that_share_what_is_left_answer_as_if_asked_alone(self, exactly: bool) -> None:
+        rng = np.random.default_rng(5)
+        nx = 6
+        a, bf, c = (rng.integers(-3, 4, size=shape) / 4 for shape in ((nx, nx), (nx, 3), (4, nx)))
+        e = np.diag([1.0, 1.0, 1.0, 1.0, 1.0, 0.0])
+        plant = obsynth.DescriptorSystem(e, a - 2.0 * np.eye(nx), C=c, Bf=bf, Bd=np.eye(nx)[:, :1])
+        together = Questions(plant, exactly)
+        for removed in ((), (0,), (2, 1)):
+            for number in set(range(3)) - set(removed):
+                one, alone = together.of(removed, number), question(plant, removed, number, exactly)
+                assert one is together.of(removed[::-1], number)
+                for name in ("visible", "estimable", "shows_at_rest", "derivatives", "residual_order", "order"):
+                    assert getattr(one, name) == getattr(alone, name), (removed, number, name)
+                np.testing.assert_allclose(np.sort_complex(one.zeros), np.sort_complex(alone.zeros), rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "error", [np.linalg.LinAlgError("SVD did not converge"), MemoryError("32.8 GiB"), OverflowError()]
+)
+def test_a_method_whose_numbers_fail_is_a_row_of_check_and_not_its_end(error, monkeypatch) -> None:
+    from obsynth.methods.ui_pi_observer.method import UiPiObserver
+
+    def failing(*_: object, **__: object) -> None:
+        raise error
+
+    plant = obsynth.DescriptorSystem(None, [[0.5]], C=[[1.0]], Bf=[[1.0]], dt=1.0)
+    before = obsynth.check(plant)
+    monkeypatch.setattr(UiPiObserver, "existence", failing)
+    found = obsynth.check(plant)
+    assert not found["ui-pi-observer"].passed
+    assert "Unclear" in found["ui-pi-observer"].failures[0].detail
+    assert {method: report.passed for method, report in found.items() if method != "ui-pi-observer"} == {
+        method: report.passed for method, report in before.items() if method != "ui-pi-observer"
+    }

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from obsynth.cli.output import answer, output_file, print_json, progress, stdout_console
-from obsynth.errors import PreconditionError, SpecError, VerificationError
+from obsynth.errors import PreconditionError, SolverError, SpecError, VerificationError
 from obsynth.files.outputs import write_atomically
 
 if TYPE_CHECKING:
@@ -131,14 +131,18 @@ def run_check(options: argparse.Namespace) -> int:
     from obsynth.analysis.structure import analyse_structure
     from obsynth.methods.designing import check
     from obsynth.methods.registry import AUTO
+    from obsynth.numerics.libraries import failure_of
     from obsynth.plants.descriptor import DescriptorSystem
 
     # A pencil, its eigenvalues and its index are those of one matrix pair: a plant that changes with k has none.
-    structures, diagnosis = {}, None
+    structures, diagnosis, not_known = {}, None, ""
     if isinstance(spec.plant, DescriptorSystem):
         structures = {"as the method sees it": analyse_structure(spec.plant)}
         model = spec.options.get("fault_model", "step")
-        diagnosis = diagnose(spec.plant, fault_model=model)
+        try:
+            diagnosis = diagnose(spec.plant, fault_model=model)
+        except (SolverError, MemoryError) as error:  # the methods are asked all the same
+            not_known = f"What can be diagnosed is not known. {failure_of(error) or error}"
     if spec.transformation is not None:
         structures = {"as written": analyse_structure(spec.transformation.source), **structures}
     done = "" if spec.transformation is None else spec.transformation.description
@@ -153,6 +157,8 @@ def run_check(options: argparse.Namespace) -> int:
         if diagnosis is not None:
             diagnosis_report(diagnosis, console=console, everything=options.verbose)
             console.print()
+        if not_known:
+            console.print(f"{not_known}\n")
         if options.verbose:
             check_report(spec.plant, structures, methods, console=console, transformation=done)
             console.print()

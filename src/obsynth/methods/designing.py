@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -12,14 +12,14 @@ import numpy as np
 from obsynth.analysis.conditions import Condition
 from obsynth.analysis.transformations.elimination import MANY_VARIABLES, eliminate_algebraic_states
 from obsynth.analysis.transformations.recovery import StateRecovery, Transformation, plant_and_recovery
-from obsynth.errors import PreconditionError, VerificationError
+from obsynth.errors import PreconditionError, SolverError, VerificationError
 from obsynth.extensions import extension
 from obsynth.methods.automatic import automatic_design
 from obsynth.methods.method import Method, Synthesis
 from obsynth.methods.refusals import require_above_rounding, rounding_notes, with_advice
 from obsynth.methods.registry import AUTO, REGISTRY, Plant, kind_conditions, kind_of, method_class
 from obsynth.methods.verifying import verify
-from obsynth.numerics.libraries import failed_computations, one_thread_if_small
+from obsynth.numerics.libraries import failed_computations, failure_of, one_thread_if_small
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.checks import VerificationReport
@@ -190,9 +190,23 @@ def _checked(plant: Plant, options: Mapping[str, Mapping[str, Any]]) -> dict[str
     for method in REGISTRY:
         known = method_class(method)
         asked = known.of(options.get(method, known.placeholders))
-        conditions = kind_conditions(plant, known) or asked.existence(plant)
+        conditions = kind_conditions(plant, known) or _existence(plant, asked)
         found[method] = VerificationReport.of(condition_rows(conditions))
     return found
+
+
+def _existence(plant: Plant, asked: Method) -> Sequence[Condition]:
+    """Return a method's existence conditions; where its numbers fail, one that says so: the other methods go on."""
+    try:
+        return asked.existence(plant)
+    except PreconditionError as error:
+        name, told, signals = error.condition, str(error), error.signals
+    except (SolverError, np.linalg.LinAlgError, ArithmeticError, ValueError, MemoryError) as error:
+        failure = error if isinstance(error, SolverError) else failure_of(error)
+        if failure is None:
+            raise
+        name, told, signals = "computed", f"Unclear: {failure}", ()
+    return (Condition(name, "conditions that can be decided", False, np.nan, np.nan, asked.id, told, signals=signals),)
 
 
 def draft_of(

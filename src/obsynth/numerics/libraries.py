@@ -27,6 +27,9 @@ _NOT_FINITE = "infs or NaNs"
 
 def failure_of(error: Exception) -> SolverError | None:
     """Return what the error of a library says of the numbers; `None` if it says nothing of them."""
+    if isinstance(error, MemoryError):
+        told = str(error).rstrip(".")
+        return SolverError(f"This does not fit into the memory{f' ({told})' if told else ''}. Nothing is known.")
     is_numerical = isinstance(error, (np.linalg.LinAlgError, ArithmeticError))
     if not is_numerical and not (isinstance(error, ValueError) and _NOT_FINITE in str(error)):
         return None

@@ -7,14 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.analysis.diagnosis.exact import decided_exactly, question
+from obsynth.analysis.diagnosis.exact import Questions, decided_exactly
 from obsynth.analysis.diagnosis.explanations import hidden_motion, least_additions, listed, state_sensors
 from obsynth.analysis.diagnosis.fault_columns import Question, others, rest_point
 from obsynth.analysis.diagnosis.verdicts import Diagnosis, FaultDiagnosis, residual_bank
 from obsynth.analysis.transformations.recovery import Transformation, linear_plant
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import is_finite_number
-from obsynth.numerics.libraries import on_one_thread_if_small
+from obsynth.numerics.libraries import failed_computations, on_one_thread_if_small
 from obsynth.numerics.pencils import pencil_structure
 from obsynth.numerics.ranks import REST_TOLERANCE
 from obsynth.plants.descriptor import DescriptorSystem
@@ -24,6 +24,7 @@ from obsynth.plants.fault_models import Exosystem, exosystem, stated_eigenvalues
 MOST_ZEROS = 4
 
 
+@failed_computations()
 @on_one_thread_if_small
 def diagnose(
     plant: DescriptorSystem | Transformation,
@@ -62,6 +63,8 @@ def diagnose(
     ------
     SpecError
         ``plant`` is no linear time-invariant plant, the fault model is malformed, or a frequency is no number.
+    SolverError
+        The numbers are beyond double precision.
 
     References
     ----------
@@ -75,15 +78,16 @@ def diagnose(
     report_stage = progress or (lambda _: None)
     exactly = decided_exactly(plant)
     report_stage("asking what shows each fault")
-    shown = [question(plant, (), i, exactly) for i in range(plant.nf)]
-    free = [question(plant, others(plant, i), i, exactly) for i in range(plant.nf)]
+    asked = Questions(plant, exactly)
+    shown = [asked.of((), i) for i in range(plant.nf)]
+    free = [asked.of(others(plant, i), i) for i in range(plant.nf)]
     faults = tuple(
         _verdict(plant, own, alone, frequencies, model_points(model, i), suggest=suggest)
         for i, (own, alone) in enumerate(zip(shown, free, strict=True))
     )
     report_stage("telling faults from each other")
-    weak, strong, pairs = _isolability(plant, shown, exactly)
-    bank = residual_bank(plant, exactly)
+    weak, strong, pairs = _isolability(plant, shown, asked)
+    bank = residual_bank(asked)
     return Diagnosis(
         faults, weak, strong, bank, plant.disturbance_names, "; ".join(dict.fromkeys(model.descriptions)), exactly,
         _warnings(plant, [*shown, *free, *pairs]),
@@ -161,8 +165,11 @@ def _suggestion(plant: DescriptorSystem, name: str, shown: Question, *, step: bo
     """Return which states to measure, computed; and those that would only show the fault."""
     sensors, fault = state_sensors(plant), shown.number
 
+    answered: dict[tuple[str, ...], Question] = {}
+
     def free(changed: DescriptorSystem) -> Question:
-        return Question(changed, others(changed, fault), fault)
+        added = changed.output_names[plant.ny :]
+        return answered.setdefault(added, Question(changed, others(changed, fault), fault))
 
     full = least_additions(plant, sensors, lambda changed: free(changed).estimable)
     constant = () if step else least_additions(plant, sensors, lambda changed: free(changed).shows_at_rest)
@@ -182,10 +189,10 @@ def _suggestion(plant: DescriptorSystem, name: str, shown: Question, *, step: bo
 
 
 def _isolability(
-    plant: DescriptorSystem, shown: Sequence[Question], exactly: bool
+    plant: DescriptorSystem, shown: Sequence[Question], questions: Questions
 ) -> tuple[np.ndarray, np.ndarray, list[Question]]:
     weak, strong = np.zeros((2, plant.nf, plant.nf), dtype=bool)
-    asked = {(i, j): question(plant, (j,), i, exactly) for i in range(plant.nf) for j in others(plant, i)}
+    asked = {(i, j): questions.of((j,), i) for i in range(plant.nf) for j in others(plant, i)}
     for place, pair in {**asked, **{(i, i): own for i, own in enumerate(shown)}}.items():
         weak[place], strong[place] = pair.visible, pair.shows_at_rest
     weak.setflags(write=False)

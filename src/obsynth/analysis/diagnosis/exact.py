@@ -6,6 +6,7 @@ The reduction of `obsynth.analysis.diagnosis.reduction` over the rational number
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import cached_property
 from typing import NamedTuple
@@ -14,7 +15,7 @@ import numpy as np
 from flint import fmpq, fmpq_mat, fmpq_poly, fmpz_poly
 
 from obsynth.analysis.diagnosis.decoupled import unknowns_pencil
-from obsynth.analysis.diagnosis.fault_columns import Question
+from obsynth.analysis.diagnosis.fault_columns import Question, Removal
 from obsynth.numerics.arrays import ComplexArray
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.exact_arithmetic import (
@@ -47,10 +48,61 @@ def decided_exactly(plant: DescriptorSystem) -> bool:
 
 def question(plant: DescriptorSystem, removed: Sequence[int], number: int, exactly: bool | None = None) -> Question:
     """Return a question about a fault; exact (unless it is said) where the plant is decided exactly."""
-    if not (decided_exactly(plant) if exactly is None else exactly):
-        return Question(plant, tuple(removed), number)
-    kind = ExactQuestion if plant.nx + plant.ny > MOST_REDUCED else ReducedQuestion
-    return kind(plant, tuple(removed), number)
+    return Questions(plant, decided_exactly(plant) if exactly is None else exactly).of(removed, number)
+
+
+class _Reduction(NamedTuple):
+    """What `_reduced` leaves: dynamics, outputs, and the columns of every fault, then of u and y, beside both."""
+
+    A: fmpq_mat
+    C: fmpq_mat
+    right: fmpq_mat
+    outputs: fmpq_mat
+
+
+@dataclass(frozen=True, eq=False)
+class ExactRemoval(Removal):
+    """What is left of a plant without its unknown inputs and a set of faults, over the rational numbers as well."""
+
+    pencils: dict[tuple[int, ...], ExactPencil] = field(default_factory=dict, repr=False)
+
+    def pencil(self, *more: int) -> ExactPencil:
+        """Return the pencil of the unknowns, with more faults among them."""
+        gone = tuple(sorted((*self.removed, *more)))
+        if gone not in self.pencils:
+            self.pencils[gone] = ExactPencil.written(*unknowns_pencil(self.source, gone))
+        return self.pencils[gone]
+
+    @cached_property
+    def reduction(self) -> _Reduction:
+        """The reduced plant."""
+        plant = self.source
+        e, a = (written_matrix(part) for part in unknowns_pencil(plant, self.removed))
+        known = np.block([[plant.B, np.zeros((plant.nx, plant.ny))], [plant.D, -np.eye(plant.ny)]])
+        right = written_matrix(np.hstack([np.vstack([plant.Bf, plant.Df]), known]))
+        return _Reduction(*_reduced(e, a, right)[:4])
+
+
+@dataclass(frozen=True, eq=False)
+class Questions:
+    """Questions about the faults of one plant: what several of them rest on is computed once."""
+
+    source: DescriptorSystem
+    exactly: bool
+    _removals: dict[tuple[int, ...], ExactRemoval] = field(default_factory=dict, repr=False)
+    _pencils: dict[tuple[int, ...], ExactPencil] = field(default_factory=dict, repr=False)
+    _asked: dict[tuple[tuple[int, ...], int], Question] = field(default_factory=dict, repr=False)
+
+    def of(self, removed: Sequence[int], number: int) -> Question:
+        """Return the question about a fault, with others removed."""
+        gone = tuple(sorted(removed))
+        if (gone, number) not in self._asked:
+            if gone not in self._removals:
+                self._removals[gone] = ExactRemoval(self.source, gone, pencils=self._pencils)
+            small = self.source.nx + self.source.ny <= MOST_REDUCED
+            kind = Question if not self.exactly else ReducedQuestion if small else ExactQuestion
+            self._asked[gone, number] = kind(self.source, gone, number, self._removals[gone])
+        return self._asked[gone, number]
 
 
 class ExactQuestion(Question):
@@ -59,10 +111,14 @@ class ExactQuestion(Question):
     exactly = True
 
     @cached_property
+    def _exact_removal(self) -> ExactRemoval:
+        shared = self.shared
+        return shared if isinstance(shared, ExactRemoval) else ExactRemoval(self.source, self.removed)
+
+    @cached_property
     def polynomial(self) -> fmpz_poly:
         """The fault polynomial, with coprime integer coefficients; zero where nothing shows the fault."""
-        without = ExactPencil.written(*unknowns_pencil(self.source, self.removed))
-        whole = ExactPencil.written(*unknowns_pencil(self.source, (*self.removed, self.number)))
+        without, whole = self._exact_removal.pencil(), self._exact_removal.pencil(self.number)
         if whole.normal_rank == without.normal_rank:
             return fmpz_poly([])
         return primitive(fmpq_poly(whole.zero_polynomial) / fmpq_poly(without.zero_polynomial))
@@ -115,15 +171,13 @@ class ReducedQuestion(ExactQuestion):
 
     @cached_property
     def _parts(self) -> _Parts:
-        plant = self.source
-        e, a = (written_matrix(part) for part in unknowns_pencil(plant, self.removed))
-        known = np.block([[plant.B, np.zeros((plant.nx, plant.ny))], [plant.D, -np.eye(plant.ny)]])
-        fault = np.vstack([plant.Bf, plant.Df])[:, [self.number]]
-        a, c, right, outputs, _ = _reduced(e, a, written_matrix(np.hstack([fault, known])))
-        rest = range(1, right.ncols())
+        a, c, right, outputs = self._exact_removal.reduction
+        nf = self.source.nf
+        rest = range(nf, right.ncols())
         return _Parts(
-            a, c, _columns(right, [0]), _columns(outputs, [0]), _columns(right, rest), _columns(outputs, rest)
-        )
+            a, c, _columns(right, [self.number]), _columns(outputs, [self.number]), _columns(right, rest),
+            _columns(outputs, rest),
+        )  # fmt: skip
 
     @cached_property
     def order(self) -> int:
@@ -154,7 +208,8 @@ class ReducedQuestion(ExactQuestion):
             more = blocks([[rows], [blocks([[new * A, new * F, new * K]])]])
             if more.rank() == rows.rank():
                 break
-            rows = more
+            # Every pass adds rows that repeat others: only what they span counts.
+            rows = more if more.nrows() <= more.ncols() else _row_space(more)
         c, direct, vector, order = _columns(rows, range(n)), _columns(rows, [n]), F, 0
         while _is_zero(direct) and order <= n:
             direct, vector = c * vector, A * vector

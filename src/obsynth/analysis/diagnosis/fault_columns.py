@@ -6,7 +6,8 @@ the greatest common divisor of ``g = N [bf; df]``; decoupled: where ``[F; G]`` l
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar
 
@@ -22,6 +23,8 @@ from obsynth.plants.descriptor import DescriptorSystem
 
 #: Parity spaces of a higher order than this are not formed: their powers hold no digits.
 MOST_PARITY_ORDER = 24
+#: Nor where the powers have grown to this.
+LARGEST_POWER = 1e150
 
 
 def rest_point(dt: float) -> complex:
@@ -35,19 +38,91 @@ def others(plant: DescriptorSystem, fault: int) -> tuple[int, ...]:
 
 
 @dataclass(frozen=True, eq=False)
+class Removal:
+    """What is left of a plant without its unknown inputs and a set of faults: the same for every other fault."""
+
+    source: DescriptorSystem
+    removed: tuple[int, ...]
+
+    @cached_property
+    def plant(self) -> DecoupledPlant:
+        """The decoupled plant with all other faults."""
+        return decoupled(self.source, self.removed, self.kept)
+
+    @cached_property
+    def kept(self) -> list[int]:
+        """The other faults."""
+        gone = set(self.removed)
+        return [j for j in range(self.source.nf) if j not in gone]
+
+    @cached_property
+    def traces(self) -> tuple[FloatArray, FloatArray]:
+        """Sizes ``(len(kept),)`` of the faults' columns before the reduction, and of what is left, relative to them."""
+        sizes = np.maximum(self.plant.fault_sizes, np.finfo(np.float64).tiny)
+        return sizes, np.linalg.norm(np.vstack([self.plant.F, self.plant.G]) / sizes, axis=0)
+
+    @cached_property
+    def residual_orders(self) -> dict[int, int]:
+        """Least order, up to 24, of a scalar residual that shows a fault, of those that leave a trace."""
+        plant, (sizes, traces) = self.plant, self.traces
+        open_faults = [place for place in range(len(self.kept)) if traces[place] > TRACE_TOLERANCE]
+        if plant.order == 0:
+            return {self.kept[place]: 0 for place in open_faults}
+        inverse = np.linalg.inv(plant.E * plant.time)
+        a, found = inverse @ plant.A, dict[int, int]()
+        f, powers, markov = inverse @ plant.F / sizes, [plant.C], [plant.G / sizes]
+        for order in range(min(plant.order, MOST_PARITY_ORDER) + 1):
+            observed = np.vstack(powers)
+            # Powers grow or fade: rows of one length keep a long chain of one output apart from rounding.
+            lengths = np.linalg.norm(observed, axis=1, keepdims=True)
+            lengths = np.where(lengths > 0.0, lengths, 1.0)
+            left, values, _ = np.linalg.svd(observed / lengths)
+            parity = left[:, rank_from(values, expected=observed.shape[1]).rank :].T
+            for place in open_faults if len(parity) else ():
+                if _is_seen(parity, [column[:, [place]] for column in markov], lengths):
+                    found[self.kept[place]] = order
+            open_faults = [place for place in open_faults if self.kept[place] not in found]
+            if not open_faults or float(np.max(lengths)) > LARGEST_POWER:
+                break
+            markov.append(powers[-1] @ f)
+            powers.append(powers[-1] @ a)
+        return found
+
+
+def _is_seen(parity: FloatArray, markov: Sequence[FloatArray], lengths: FloatArray) -> bool:
+    """Whether parity vectors of rows that are divided by their lengths show a fault with these Markov parameters."""
+    zero, count = np.zeros_like(markov[0]), len(markov)
+    toeplitz = np.block([[markov[i - j] if j <= i else zero for j in range(count)] for i in range(count)]) / lengths
+    return bool(np.linalg.norm(parity @ toeplitz) > TRACE_TOLERANCE * max(1.0, float(np.linalg.norm(toeplitz))))
+
+
+@dataclass(frozen=True, eq=False)
 class Question:
     """A fault of a plant, with the faults ``removed`` and every unknown input out of sight, in floating point."""
 
     source: DescriptorSystem
     removed: tuple[int, ...]
     number: int
+    #: What is left without them, where other faults are asked about as well.
+    shared: Removal | None = None
     #: Whether it is decided over the rational numbers.
     exactly: ClassVar[bool] = False
 
     @cached_property
+    def removal(self) -> Removal:
+        """What is left of the plant without what is removed."""
+        return Removal(self.source, self.removed) if self.shared is None else self.shared
+
+    @cached_property
     def plant(self) -> DecoupledPlant:
         """The decoupled plant, in floating point."""
-        return decoupled(self.source, self.removed, [self.number])
+        if self.shared is None:
+            return decoupled(self.source, self.removed, [self.number])
+        whole, place = self.shared.plant, [self.shared.kept.index(self.number)]
+        return replace(
+            whole, F=whole.F[:, place], G=whole.G[:, place], fault_sizes=whole.fault_sizes[place],
+            faults=(whole.faults[place[0]],),
+        )  # fmt: skip
 
     @cached_property
     def _scaled(self) -> tuple[FloatArray, FloatArray]:
@@ -129,33 +204,7 @@ class Question:
     @cached_property
     def residual_order(self) -> int | None:
         """Least order of a scalar residual that shows the fault; ``None`` where nothing does, or beyond 24."""
-        orders = range(min(self.plant.order, MOST_PARITY_ORDER) + 1 if self.leaves_trace else 0)
-        return next((order for order in orders if self._seen_by_parity(order)), None)
-
-    def _seen_by_parity(self, order: int) -> bool:
-        """Whether a parity vector of an order shows the fault."""
-        plant = self.plant
-        f, g = self._scaled
-        if plant.order == 0:
-            return True
-        inverse = np.linalg.inv(plant.E * plant.time)
-        a, f = inverse @ plant.A, inverse @ f
-        powers, markov = [plant.C], [g]
-        for _ in range(order):
-            markov.append(powers[-1] @ f)
-            powers.append(powers[-1] @ a)
-        observed = np.vstack(powers)
-        # Powers grow or fade: rows of one length keep a long chain of one output apart from rounding.
-        lengths = np.linalg.norm(observed, axis=1, keepdims=True)
-        lengths = np.where(lengths > 0.0, lengths, 1.0)
-        left, values, _ = np.linalg.svd(observed / lengths)
-        parity = left[:, rank_from(values, expected=observed.shape[1]).rank :].T
-        if not len(parity):
-            return False
-        zero = np.zeros_like(g)
-        toeplitz = np.block([[markov[i - j] if j <= i else zero for j in range(order + 1)] for i in range(order + 1)])
-        toeplitz = toeplitz / lengths
-        return bool(np.linalg.norm(parity @ toeplitz) > TRACE_TOLERANCE * max(1.0, float(np.linalg.norm(toeplitz))))
+        return self.removal.residual_orders.get(self.number)
 
     @property
     def gap(self) -> float:
@@ -179,6 +228,7 @@ def _order_at_infinity(plant: DecoupledPlant, f: FloatArray, g: FloatArray) -> i
     inverse = np.linalg.inv(plant.E * plant.time)
     a, f, known = inverse @ plant.A, inverse @ f, inverse @ np.hstack([-plant.By, plant.Bu])
     rows = np.hstack([plant.C, g, plant.H, plant.Du])
+    independent = _rank(rows)
     for _ in range(n):
         full = np.linalg.norm(rows, 2)
         left, values, _ = np.linalg.svd(rows[:, n:])
@@ -186,10 +236,10 @@ def _order_at_infinity(plant: DecoupledPlant, f: FloatArray, g: FloatArray) -> i
         new = left[:, rank:].T @ rows[:, :n]
         if not new.size or np.linalg.norm(new) <= MARKOV_TOLERANCE * full:
             break
-        more = np.vstack([rows, np.hstack([new @ a, new @ f, new @ known])])
-        if _rank(more) == _rank(rows):
+        rows = _compressed(np.vstack([rows, np.hstack([new @ a, new @ f, new @ known])]))
+        before, independent = independent, _rank(rows)
+        if independent == before:
             break
-        rows = more
     c, direct, vector, order = rows[:, :n], rows[:, n : n + 1], f, 0
     size = max(float(np.linalg.norm(direct)), float(np.linalg.norm(c, 2) * np.linalg.norm(vector)))
     while np.linalg.norm(direct) <= MARKOV_TOLERANCE * size and order <= n:
@@ -198,6 +248,11 @@ def _order_at_infinity(plant: DecoupledPlant, f: FloatArray, g: FloatArray) -> i
         vector = a @ vector
         order += 1
     return order
+
+
+def _compressed(rows: FloatArray) -> FloatArray:
+    """Return no more rows than columns, with the same singular values: a triangle of them where they are many."""
+    return np.asarray(np.linalg.qr(rows, mode="r")) if rows.shape[0] > rows.shape[1] else rows
 
 
 def _rank(matrix: FloatArray) -> int:

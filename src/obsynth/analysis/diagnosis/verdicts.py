@@ -11,10 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.analysis.diagnosis.exact import question
+from obsynth.analysis.diagnosis.exact import Questions
 from obsynth.files.tables import html_table, text_table
 from obsynth.numerics.arrays import ComplexArray
-from obsynth.plants.descriptor import DescriptorSystem
 
 #: With more faults only residuals that are blind to one fault, or see one fault, are looked for.
 MOST_FAULTS = 6
@@ -42,12 +41,12 @@ class StructuredResidual:
     order: int | None
 
 
-def residual_bank(plant: DescriptorSystem, exactly: bool) -> tuple[StructuredResidual, ...]:
+def residual_bank(questions: Questions) -> tuple[StructuredResidual, ...]:
     """Return every structured residual that exists, those that see least first."""
-    found = []
+    found, plant = [], questions.source
     for removed in _sets(plant.nf):
         kept = [i for i in range(plant.nf) if i not in removed]
-        asked = [question(plant, removed, i, exactly) for i in kept]
+        asked = [questions.of(removed, i) for i in kept]
         if not all(one.visible for one in asked):
             continue
         orders = [one.residual_order for one in asked]
