@@ -194,3 +194,28 @@ def test_the_command_takes_a_linear_plant_in_a_file(tmp_path, capsys):
 
     low, high = json.loads(capsys.readouterr().out)["constants"]["a"]["range"]
     assert low < 0.9 < high
+
+
+#: Volumes of the Nile at Aswan, 1871 to 1970, 1e8 m3.
+NILE = np.array([
+    1120, 1160, 963, 1210, 1160, 1160, 813, 1230, 1370, 1140, 995, 935, 1110, 994, 1020, 960, 1180, 799, 958, 1140,
+    1100, 1210, 1150, 1250, 1260, 1220, 1030, 1100, 774, 840, 874, 694, 940, 833, 701, 916, 692, 1020, 1050, 969, 831,
+    726, 456, 824, 702, 1120, 1100, 832, 764, 821, 768, 845, 864, 862, 698, 845, 744, 796, 1040, 759, 781, 865, 845,
+    944, 984, 897, 822, 1010, 771, 676, 649, 846, 812, 742, 801, 1040, 860, 874, 848, 890, 744, 749, 838, 1050, 918,
+    986, 797, 923, 975, 815, 1020, 906, 901, 1170, 912, 746, 919, 718, 714, 740,
+], dtype=float)  # fmt: skip
+
+
+@pytest.mark.parametrize("factor", [1.0, 1e-3, 1e6])
+def test_the_nile_in_any_units(factor):
+    """Durbin and Koopman 2001, section 2.10: the likelihood is greatest at R = 15,099, Q = 1,469.1."""
+    level = obsynth.DescriptorSystem(
+        None, [[1.0]], None, [[1.0]], dt=1.0, state_names=["level"], output_names=["volume"]
+    )
+    found = obsynth.calibrate(
+        level, {"time": np.arange(float(len(NILE))), "volume": factor * NILE}, {}, initial_state=[0.0],
+        initial_covariance=[[1e7 * factor**2]],
+    )  # fmt: skip
+    assert found.R["volume"] / factor**2 == pytest.approx(15_099.0, rel=2e-3)
+    assert found.Q["level"] / factor**2 == pytest.approx(1_469.1, rel=2e-3)
+    assert found.upper_limits == ()

@@ -107,8 +107,8 @@ class LinearPlant(CalibrationPlant):
         self.nominal_state = np.zeros(self.nx)
         first = self.signals(log)
         self.nominal_signals = first[min(1, len(first) - 1)]
-        self.state_scales = np.ones(self.nx)
-        self.state_deviations = self._sizes(log, first)
+        # A linear plant says nothing of the size of its states: the outputs do, so that units change no answer.
+        self.state_scales = self.state_deviations = self._sizes(log, first)
 
     def integration(self, asked: str) -> str:
         """Return Radau unless something else is asked for; a discrete plant is stepped as it is."""
