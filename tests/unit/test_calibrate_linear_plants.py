@@ -209,10 +209,8 @@ NILE = np.array([
 @pytest.mark.parametrize("factor", [1.0, 1e-3, 1e6])
 def test_the_nile_in_any_units(factor):
     """Durbin and Koopman 2001, section 2.10: the likelihood is greatest at R = 15,099, Q = 1,469.1."""
-    level = obsynth.DescriptorSystem(
-        None, [[1.0]], None, [[1.0]], dt=1.0, state_names=["level"], output_names=["volume"]
-    )
-    found = obsynth.calibrate(
+    level = DescriptorSystem(None, [[1.0]], None, [[1.0]], dt=1.0, state_names=["level"], output_names=["volume"])
+    found = calibrate(
         level, {"time": np.arange(float(len(NILE))), "volume": factor * NILE}, {}, initial_state=[0.0],
         initial_covariance=[[1e7 * factor**2]],
     )  # fmt: skip
