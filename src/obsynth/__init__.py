@@ -114,6 +114,9 @@ _PACKAGES = ("conditions", "plotting")
 __all__ = sorted(_HOMES)
 
 provide({
+    "PD observer by its inequality": "obsynth.conditions.own_terms:pd_by_inequality",
+    "UI-PI observer by its inequality": "obsynth.conditions.own_terms:ui_pi_by_inequality",
+    "filter by its inequality": "obsynth.conditions.own_terms:filter_by_inequality",
     "conditions of a design": "obsynth.conditions.shipped:conditions_of",
     "checks as text": "obsynth.results.layout:report_text",
     "design summary": "obsynth.report.summary:summary",

@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import inspect
 from dataclasses import fields
-from typing import Any, get_args
+from typing import Any
 
 import pytest
 
 import obsynth
 from obsynth.errors import SpecError
-from obsynth.methods.conic.lmi import FILTER_SOLVERS, SOLVER_SETTINGS
-from obsynth.methods.fault_estimation_filter.method import FaultEstimationFilter
 from obsynth.methods.method import option_types
 from obsynth.methods.pd_observer.method import PdObserver
 from obsynth.methods.registry import REGISTRY, method_class, methods_for
-from obsynth.methods.ui_pi_observer.method import UiPiObserver
 from obsynth.numerics.arguments import Count, ForgettingFactor, Positive, problem_with
 
 
@@ -36,12 +33,6 @@ def test_kinds_of_plants_have_their_methods() -> None:
     assert methods_for("time-varying") == ("descriptor-kalman", "adaptive-observer")
     assert methods_for("nonlinear") == ("dae-adaptive-observer",)
     assert set(methods_for("time-invariant")) == set(REGISTRY) - {"dae-adaptive-observer"}
-
-
-def test_choices_are_those_of_the_layers_below() -> None:
-    assert set(get_args(option_types(FaultEstimationFilter)["solver"])) == set(FILTER_SOLVERS)
-    for options in (PdObserver, UiPiObserver):
-        assert set(get_args(option_types(options)["solver"])) == set(SOLVER_SETTINGS)
 
 
 @pytest.mark.parametrize(

@@ -35,6 +35,7 @@ from obsynth.methods.pd_observer.inequalities import MARGIN
 from obsynth.methods.pd_observer.public import pd_observer_from_gains
 from obsynth.numerics.arguments import chosen, is_finite_number, shown
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.regions import LMIRegion, checked_region
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
 
@@ -44,7 +45,7 @@ LEFT_TO_THE_SOLVER = ("nf <= ny", "rank F", "detectability", "rank [A F; C Df]")
 
 def filasova_theorem1(
     plant: DescriptorSystem | Transformation, *, delta: float, reading: str = "safe", decay: float = 0.0,
-    margin: float = MARGIN,
+    region: LMIRegion | None = None, margin: float = MARGIN,
 ) -> Conditions:  # fmt: skip
     """Return Theorem 1 of Filasova, Krokavec and Serbak: (40)-(43) in P1, P3, Y, Z.
 
@@ -58,6 +59,8 @@ def filasova_theorem1(
         ``"printed"`` asks for (40)-(43) alone; ``"safe"`` keeps P3 from singular and minimises the gains.
     decay : float, optional, 1/seconds
         Errors die out at least like ``exp(-decay t)``: (41) for ``A_o + decay I``, and ``J_o = J' + decay L_o``.
+    region : LMIRegion, optional
+        Where all eigenvalues of the error system must lie (1/s): the constraint ``"region"``, with a P of its own.
     margin : float, optional
         What the inequalities keep to the boundary of the cone.
 
@@ -79,12 +82,12 @@ def filasova_theorem1(
     .. [Filasova] Application of descriptor approaches in design of PD observer-based actuator fault estimation,
        Theorem 1, eqs. (40)-(44).
     """
-    return _theorem(plant, 1, delta, reading, decay, margin)
+    return _theorem(plant, 1, delta, reading, decay, margin, region)
 
 
 def filasova_theorem2(
     plant: DescriptorSystem | Transformation, *, delta: float, reading: str = "safe", decay: float = 0.0,
-    margin: float = MARGIN,
+    region: LMIRegion | None = None, margin: float = MARGIN,
 ) -> Conditions:  # fmt: skip
     """Return Theorem 2 of Filasova, Krokavec and Serbak: (61)-(64) in P1 (the paper's P), P3 (its Q), Y, Z.
 
@@ -98,6 +101,8 @@ def filasova_theorem2(
         As for `filasova_theorem1`; both take P and Q as variables, as the proof does.
     decay : float, optional, 1/seconds
         As for `filasova_theorem1`.
+    region : LMIRegion, optional
+        Where all eigenvalues of the error system must lie (1/s): the constraint ``"region"``, with a P of its own.
     margin : float, optional
         What the inequalities keep to the boundary of the cone.
 
@@ -118,12 +123,13 @@ def filasova_theorem2(
     .. [Filasova] Application of descriptor approaches in design of PD observer-based actuator fault estimation,
        Theorem 2, eqs. (61)-(65).
     """
-    return _theorem(plant, 2, delta, reading, decay, margin)
+    return _theorem(plant, 2, delta, reading, decay, margin, region)
 
 
 def _theorem(
-    plant: DescriptorSystem | Transformation, theorem: int, delta: Any, reading: Any, decay: Any, margin: float
-) -> Conditions:
+    plant: DescriptorSystem | Transformation, theorem: int, delta: Any, reading: Any, decay: Any, margin: float,
+    region: LMIRegion | None,
+) -> Conditions:  # fmt: skip
     import cvxpy as cp
 
     for name, number, least in (("delta", delta, "above 0"), ("decay", decay, "at least 0")):
@@ -145,6 +151,7 @@ def _theorem(
     V11 = Ad.T @ P3 + P3.T @ Ad - Y @ C_o - C_o.T @ Y.T
     V21 = P1 - P3 + delta * P3.T @ Ad - delta * Y @ C_o - C_o.T @ Z.T  # (42), (63)
     V22 = -delta * P3 - delta * P3.T - delta * Z @ C_o - delta * C_o.T @ Z.T  # (43), (64)
+    variables = {"P1": P1, "P3": P3, "Y": Y, "Z": Z}
     names = ("(40)", "(41)") if theorem == 1 else ("(61) P", "(62)")
     constraints = {
         names[0]: lmi.at_least(P1, margin),
@@ -152,6 +159,10 @@ def _theorem(
     }
     if theorem == 2:
         constraints["(61) Q"] = lmi.at_least(P3, margin)
+    if region is not None:
+        moving, still = P3.T @ A_o - (Y + decay * Z) @ C_o, P3.T + Z @ C_o  # P3' (A_o - J_o C_o), P3' (I + L_o C_o)
+        P = variables["P_region"] = cp.Variable((n, n), symmetric=True, name="P_region")
+        constraints["region"] = _region(_fitting(region, float(delta)), P, moving, still, float(delta), margin)
     if safe:
         constraints["scale"] = lmi.at_least(P3 + P3.T, 2.0)
     size = cp.norm(cp.hstack([Y, Z]), "fro") + cp.norm(P3, "fro")
@@ -164,9 +175,39 @@ def _theorem(
 
     return Conditions(
         f"Filasova, Krokavec, Serbak, Theorem {theorem}, {names[0]}-({43 if theorem == 1 else 64}), {reading}",
-        cp.Problem(goal, list(constraints.values())), {"P1": P1, "P3": P3, "Y": Y, "Z": Z}, {},
+        cp.Problem(goal, list(constraints.values())), variables, {},
         {"A_o": A_o, "C_o": C_o}, constraints, lambda: held, gains, partial(_design, plant, float(decay)),
     )  # fmt: skip
+
+
+def _fitting(region: Any, delta: float) -> LMIRegion:
+    """Return a region that holds ``-1 / delta``, without which its inequality has no solution."""
+    where = checked_region(region)
+    if not where.contains([-1.0 / delta]):
+        raise SpecError(
+            f"delta is {delta:g}, and -1 / delta = {-1.0 / delta:g} lies outside {where}: no P satisfies both. Choose "
+            "delta so that -1 / delta lies inside.", path="delta",
+        )  # fmt: skip
+    return where
+
+
+def _region(where: LMIRegion, P: Any, moving: Any, still: Any, delta: float, margin: float) -> Any:
+    """Return the inequality of a region for the pencil ``Ae - s D``, with ``moving = P3' Ae``, ``still = P3' D``.
+
+    ``[L x P, M x P; M' x P, 0] + He([I x Ae'; -I x D'] (I x P3) [I, delta I]) < 0`` with a P of its own: with
+    ``(Ae - s D) x = 0`` the vector ``[v x x; s v x x]`` makes ``(v* (L + s M + conj(s) M') v) x* P x < 0`` of it.
+    """
+    import cvxpy as cp
+
+    n, k = still.shape[0], len(where.L)
+    left, right = cp.kron(np.eye(k), moving), cp.kron(np.eye(k), still)
+    whole = lmi.symmetric_blocks([
+        [cp.kron(where.L, P) + left + left.T],
+        [cp.kron(where.M.T, P) + delta * left - right.T, -delta * (right + right.T)],
+    ])  # fmt: skip
+    # P > 0 follows where L < 0 does not; asked for in the same block, so that it is one constraint.
+    zero = np.zeros((n, 2 * k * n))
+    return lmi.at_most(cp.bmat([[whole, zero.T], [zero, -P]]), -margin)
 
 
 def _augmented(plant: DescriptorSystem) -> tuple[FloatArray, FloatArray]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -44,6 +45,8 @@ class Conditions:
         The matrices of the inequalities, by the paper's letters.
     constraints : mapping of str to cvxpy.Constraint
         By name, so that one can be dropped or replaced.
+    weight : cvxpy.Expression, optional
+        The residual weight, where it is a variable.
     """
 
     source: str
@@ -55,6 +58,7 @@ class Conditions:
     _examined: Callable[[], Sequence[Condition]]
     _gains: Callable[[Values], dict[str, FloatArray]]
     _design: Callable[[dict[str, FloatArray], str], ObserverDesign]
+    weight: Any = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "data", MappingProxyType({k: read_only(v) for k, v in self.data.items()}))
@@ -76,7 +80,8 @@ class Conditions:
         SolverError
             The solver left none, or the values do not determine the gains.
         """
-        values = {name: self._value(name, variable) for name, variable in self.variables.items()}
+        used = set(self.problem.variables())
+        values = {name: self._value(name, variable) for name, variable in self.variables.items() if variable in used}
         try:
             gains = self._gains(values)
         except np.linalg.LinAlgError as error:
@@ -110,6 +115,30 @@ class Conditions:
                 report=found.report,
             )
         return found.replace(solver={**found.solver, "conditions": self.source, "status": str(self.problem.status)})
+
+    def solve(self, solver: str, settings: Mapping[str, Any]) -> None:
+        """Solve the problem; whatever the solver does ends in values, in a status, or in a `SolverError`.
+
+        Parameters
+        ----------
+        solver : str
+            One of ``cvxpy.installed_solvers()``.
+        settings : mapping
+            Its settings by its own names.
+
+        Raises
+        ------
+        SolverError
+            The solver failed.
+        """
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # the status says the same
+                self.problem.solve(solver=solver, **settings)
+        except (KeyboardInterrupt, SystemExit):
+            raise
+        except BaseException as error:  # Rust panics, and memory that ran out inside the solver
+            raise SolverError(f"{solver} failed while solving {self.source} ({error}): nothing is known.") from error
 
     def changed(
         self, *, constraints: Iterable[Any] | Mapping[str, Any] = (), drop: Iterable[str] = (), objective: Any = None

@@ -12,7 +12,7 @@ Beyond the paper: W may be any left inverse of Upsilon, or a variable; feedthrou
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -159,7 +159,7 @@ def wang2015(
     return Conditions(
         "Wang et al. 2015, Theorem 2, (45)", cp.Problem(goal, list(constraints.values())), variables,
         {} if gamma is None else {"gamma_squared": gamma_squared}, data, constraints,
-        partial(_existence, held, convex, gamma), gains, partial(_design, plant, convex),
+        partial(_existence, held, convex, gamma), gains, partial(_design, plant, convex), weight=Wx if free else None,
     )  # fmt: skip
 
 
@@ -239,10 +239,7 @@ def _design(
     given: dict[str, Any] = {letter: gains[letter] for letter in "TNLW"}
     if not convex.disturbances:
         return fault_estimation_filter_from_gains(plant, **given, name=name)
-    work = with_sensor_faults_as_states(linear_plant(plant).dense())
-    loop, shown_d = gains["T"] @ work.A - gains["L"] @ work.C, (np.eye(work.ny) - work.C @ gains["N"]) @ work.Dd
-    entering = gains["T"] @ work.Bd - gains["T"] @ work.A @ (gains["N"] @ work.Dd) - gains["L"] @ shown_d
-    norm = hinf_norm(loop, entering, gains["W"] @ work.C, gains["W"] @ shown_d).upper
+    norm = error_norm(linear_plant(plant).dense(), gains)
     if not np.isfinite(norm):
         return fault_estimation_filter_from_gains(plant, **given, gamma=1.0, name=name)
     size = max(norm, float(np.finfo(np.float64).eps) * convex.disturbance_size, float(np.finfo(np.float64).tiny))
@@ -251,3 +248,12 @@ def _design(
         if found.report.passed:
             break
     return found
+
+
+def error_norm(plant: DescriptorSystem, gains: Mapping[str, FloatArray]) -> float:
+    """Return the H-infinity norm from the disturbance to the fault errors of a filter with gains T, N, L, W."""
+    work = with_sensor_faults_as_states(plant)
+    T, N, L, W = (gains[letter] for letter in "TNLW")
+    shown_d = (np.eye(work.ny) - work.C @ N) @ work.Dd
+    entering = T @ work.Bd - T @ work.A @ (N @ work.Dd) - L @ shown_d
+    return float(hinf_norm(T @ work.A - L @ work.C, entering, W @ work.C, W @ shown_d).upper)

@@ -16,6 +16,7 @@ from obsynth.analysis.transformations.recovery import Transformation
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import problem_with
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.regions import LMIRegion
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.recursive.observer import RecursiveObserver
@@ -157,6 +158,10 @@ def plain(value: Any) -> Any:
     """Return an option as lists, mappings and numbers."""
     if isinstance(value, FaultModel):
         return {"Phi": value.Phi.tolist(), "Cw": value.Cw.tolist()}
+    if isinstance(value, LMIRegion):
+        return list(value.parts) or {"L": value.L.tolist(), "M": value.M.tolist()}
+    if callable(value):
+        return f"a function, {getattr(value, '__name__', type(value).__name__)}"
     if isinstance(value, Mapping):
         return {str(key): plain(part) for key, part in value.items()}
     if isinstance(value, np.ndarray):

@@ -5,7 +5,10 @@ Source: M. Chilali, P. Gahinet, IEEE TAC 41 (3), 1996, section II.
 
 from __future__ import annotations
 
+import operator
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -27,11 +30,14 @@ class LMIRegion:
         ``(k, k)``.
     text : str
         The region in words.
+    parts : tuple of dict
+        The same as plain data: ``{"disk": [center, radius]}``, ``{"half_plane": decay}``, ``{"sector": damping}``.
     """
 
     L: FloatArray
     M: FloatArray
     text: str
+    parts: tuple[dict[str, Any], ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "L", read_only(self.L))
@@ -50,6 +56,7 @@ class LMIRegion:
             np.block([[self.L, zero], [zero.T, other.L]]),
             np.block([[self.M, zero], [zero.T, other.M]]),
             f"{self.text} & {other.text}",
+            (*self.parts, *other.parts),
         )
 
     def margins(self, values: Any) -> FloatArray:
@@ -84,7 +91,12 @@ def disk(center: float, radius: float) -> LMIRegion:
         The center is no real number, or the radius is not positive.
     """
     c, r = _number(center, "center"), _positive(radius, "radius")
-    return LMIRegion(np.array([[-r, -c], [-c, -r]]), np.array([[0.0, 1.0], [0.0, 0.0]]), f"disk({c:g}, {r:g})")
+    return LMIRegion(
+        np.array([[-r, -c], [-c, -r]]),
+        np.array([[0.0, 1.0], [0.0, 0.0]]),
+        f"disk({c:g}, {r:g})",
+        ({"disk": [c, r]},),
+    )
 
 
 def half_plane(decay: float) -> LMIRegion:
@@ -106,7 +118,7 @@ def half_plane(decay: float) -> LMIRegion:
         The decay is no real number.
     """
     a = _number(decay, "decay")
-    return LMIRegion(np.array([[2.0 * a]]), np.array([[1.0]]), f"half_plane({a:g})")
+    return LMIRegion(np.array([[2.0 * a]]), np.array([[1.0]]), f"half_plane({a:g})", ({"half_plane": a},))
 
 
 def sector(damping: float) -> LMIRegion:
@@ -132,17 +144,34 @@ def sector(damping: float) -> LMIRegion:
     if not 0.0 < c < 1.0:
         raise SpecError(f"damping is {shown(damping)}: give a ratio between 0 and 1.", path="damping")
     s = float(np.sqrt(1.0 - c**2))
-    return LMIRegion(np.zeros((2, 2)), np.array([[s, c], [-c, s]]), f"sector({c:g})")
+    return LMIRegion(np.zeros((2, 2)), np.array([[s, c], [-c, s]]), f"sector({c:g})", ({"sector": c},))
 
 
 def checked_region(region: Any, name: str = "region") -> LMIRegion:
     """Return a region; raise `SpecError` for anything else."""
+    if isinstance(region, Mapping):
+        region = [region]
+    if isinstance(region, (list, tuple)) and region and all(isinstance(part, Mapping) for part in region):
+        found = [_written(part, name) for part in region]
+        return reduce(operator.and_, found)
     if not isinstance(region, LMIRegion):
         raise SpecError(
             f"{name} is {shown(region)}: give conditions.disk(center, radius), conditions.half_plane(decay), "
             "conditions.sector(damping), or several of them joined by &.", path=name,
         )  # fmt: skip
     return region
+
+
+def _written(part: Mapping[str, Any], name: str) -> LMIRegion:
+    """Return a region that a document writes: ``{disk: [center, radius]}`` and its like."""
+    makers = {"disk": disk, "half_plane": half_plane, "sector": sector}
+    if len(part) != 1 or next(iter(part)) not in makers:
+        raise SpecError(f"{name} is {shown(dict(part))}: use one of disk, half_plane, sector in each.", path=name)
+    ((kind, value),) = part.items()
+    numbers = value if isinstance(value, (list, tuple)) else [value]
+    if len(numbers) != (2 if kind == "disk" else 1):
+        raise SpecError(f"{name}: {kind} takes {'[center, radius]' if kind == 'disk' else 'one number'}.", path=name)
+    return makers[kind](*numbers)
 
 
 def _number(value: Any, name: str) -> float:

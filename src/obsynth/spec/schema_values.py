@@ -9,7 +9,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import fields
 from functools import cache
-from typing import Annotated, Any, get_args, get_origin
+from typing import Annotated, Any, Literal, get_args, get_origin
 
 from pydantic import (
     BaseModel,
@@ -222,6 +222,12 @@ KINDS: Mapping[str, Any] = {
     "named numbers": Positive | dict[Text, Positive] | None,
     "named vector": list[float] | dict[Text, float] | None,
     "named pairs": dict[Text, Range] | None,
+    "solver": Text,
+    "function": None,
+    "objective": Literal["h2"] | None,
+    "placement objective": Literal["conditioning", "gain"],
+    "region": dict[Text, float | Range] | list[dict[Text, float | Range]] | None,
+    "solver options": dict[Text, Any] | None,
     "sensor times": dict[Text, SensorTimes] | None,
 }
 

@@ -8,14 +8,16 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from functools import cache
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from obsynth.errors import SolverError
+from obsynth.errors import SolverError, SpecError
 from obsynth.methods.conic.interior_point import solve_cone_programme
+from obsynth.methods.own_terms import ChosenSolver
 from obsynth.numerics.arrays import FloatArray
 
 if TYPE_CHECKING:
@@ -25,6 +27,7 @@ if TYPE_CHECKING:
 USABLE_STATUSES = ("optimal", "optimal_inaccurate")
 #: Our own solver, see `obsynth.methods.conic.interior_point`, and what "auto" tries in turn.
 SCHUR = "SCHUR"
+AUTO = "auto"
 AUTO_SOLVERS = (SCHUR, "CLARABEL")
 FIRST_ORDER_SOLVERS = ("SCS",)
 #: Solvers of cvxpy that take semidefinite constraints, and the settings we use.
@@ -34,8 +37,33 @@ SOLVER_SETTINGS: dict[str, dict[str, Any]] = {
 }
 #: Problems with more unknowns are made into cones faster by SciPy than by the usual way of cvxpy.
 MANY_UNKNOWNS = 500
-#: Solvers of filters: their inequalities have dense blocks of orders like those of the plant.
-FILTER_SOLVERS = ("auto", SCHUR, *SOLVER_SETTINGS)
+
+
+@cache
+def semidefinite_solvers() -> tuple[str, ...]:
+    """Return the installed solvers of cvxpy that take semidefinite constraints."""
+    import cvxpy
+    from cvxpy.reductions.solvers.defines import SOLVER_MAP_CONIC
+
+    taken = {
+        name: {cone.__name__ for cone in SOLVER_MAP_CONIC[name].SUPPORTED_CONSTRAINTS}
+        for name in cvxpy.installed_solvers() if name in SOLVER_MAP_CONIC
+    }  # fmt: skip
+    # Newer versions know a cone of scaled triangles besides that of matrices.
+    return tuple(name for name, cones in taken.items() if cones & {"PSD", "SvecPSD"})
+
+
+def chosen_solver(name: str, options: Mapping[str, Any] | None, *, ours: tuple[str, ...] = ()) -> ChosenSolver:
+    """Return a solver with its settings; raise `SpecError` with the list of those installed for another name."""
+    if name not in ours and name not in SOLVER_SETTINGS and name not in semidefinite_solvers():
+        listed = ", ".join(dict.fromkeys([*ours, *semidefinite_solvers()]))
+        raise SpecError(
+            f"method.options.solver: there is no solver {name!r} for semidefinite programmes here; installed are: {listed}.",
+            path="method.options.solver",
+        )
+    if options and name in ours:
+        raise SpecError(f"solver_options are for a solver of cvxpy, not for {name!r}.", path="method.options.solver")
+    return ChosenSolver(name, options)
 
 
 def symmetric_variable(size: int) -> Any:
@@ -122,7 +150,7 @@ def minimise(objective: Any, constraints: Sequence[Any], *, what: str, solver: s
     import cvxpy
 
     problem: cvxpy.Problem = cvxpy.Problem(cvxpy.Minimize(0 if objective is None else objective), list(constraints))
-    if solver != "auto":
+    if solver != AUTO:
         return _solved(problem, what, solver)
     first, second = AUTO_SOLVERS
     try:
@@ -136,8 +164,8 @@ def minimise(objective: Any, constraints: Sequence[Any], *, what: str, solver: s
 
 def _solved(problem: cvxpy.Problem, what: str, solver: str) -> dict[str, Any]:
     """Solve a problem by one solver and return the record."""
-    settings = SOLVER_SETTINGS.get(solver, {})
-    record: dict[str, Any] = {"what": what, "solver": solver, "version": _version(solver), "settings": dict(settings)}
+    settings = {**SOLVER_SETTINGS.get(solver, {}), **getattr(solver, "options", {})}
+    record: dict[str, Any] = {"what": what, "solver": str(solver), "version": _version(solver), "settings": settings}
     began = time.perf_counter()
     try:
         with warnings.catch_warnings():

@@ -11,7 +11,15 @@ from annotated_types import Ge
 from obsynth.analysis.conditions import Condition
 from obsynth.methods.fault_estimation_filter.least_gain_proof import WITNESSES
 from obsynth.methods.method import ClaimMeaning, Method, PlantKind, Purpose
-from obsynth.numerics.arguments import FewSamples, OpenUnitInterval, Positive, WrittenAs
+from obsynth.methods.own_terms import (
+    OwnConstraints,
+    OwnRegion,
+    SolverName,
+    SolverOptions,
+    own_term_conflicts,
+    own_terms,
+)
+from obsynth.numerics.arguments import FewSamples, OpenUnitInterval, Positive, WrittenAs, shown
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.checks import Check
 from obsynth.results.design import ObserverDesign
@@ -63,10 +71,25 @@ class FaultEstimationFilter(Method):
         theirs.  The result's ``solver["engine"]`` says which ran: "riccati" also where
         "lmi" was asked for and the gain is at a lower bound already, see ``solver["runs"]``.  The inequality is what is
         verified in each case.
-    solver : {"auto", "SCHUR", "CLARABEL", "SCS"}, optional
-        Semidefinite solver, for the inequality and for proofs that a gamma cannot be reached.  "SCHUR" is our own
-        interior-point method for few unknowns in dense blocks, several times as fast there as Clarabel; "auto" takes
-        it, and Clarabel where it fails.
+    solver : str, optional
+        Semidefinite solver, for the inequality and for proofs that a gamma cannot be reached: any of
+        ``cvxpy.installed_solvers()`` that does semidefinite programmes.  "SCHUR" is our own interior-point method for
+        few unknowns in dense blocks, several times as fast there as Clarabel; "auto" takes it, and Clarabel where it
+        fails.
+    solver_options : mapping, optional
+        Settings of that solver by its own names, such as ``{"max_iter": 200}`` for CLARABEL.
+    constraints : callable, optional
+        A function of the variables of `obsynth.conditions.wang2015` by name that returns cvxpy constraints:
+        ``lambda v: [cvxpy.norm(v["Y"], 2) <= 3]``.  (45) is then solved as it stands in the paper, not by an engine.
+    objective : "h2" or callable, optional
+        What is minimised instead of gamma and the size of the gains: the H2 norm from disturbances and noise, taken as
+        unit white noise, to the fault errors; or a function of the variables, among them ``Z`` with "h2" as trace.
+    region : LMIRegion, optional
+        Where all eigenvalues of the filter must lie (dimensionless), such as ``conditions.disk(0, 0.3)``; 0 among
+        them, where the filter always has some.  It shares P with the other inequalities, which may cost more than it
+        must.
+    decay : float, optional, 1/seconds
+        Errors die out at least like ``exp(-decay t)``: the disk of radius ``exp(-decay dt)``.
     tolerance : float, optional
         Relative width of the bracket at which bisection ends.
     prove_least : bool, optional
@@ -135,7 +158,12 @@ class FaultEstimationFilter(Method):
     residual_weight_limit: Positive | None = None
     S: Annotated[Any, WrittenAs("matrix")] = None
     engine: Literal["auto", "riccati", "lmi"] = "auto"
-    solver: Literal["auto", "SCHUR", "CLARABEL", "SCS"] = "auto"
+    solver: SolverName = "auto"
+    solver_options: SolverOptions = None
+    constraints: OwnConstraints = None
+    objective: Annotated[Any, WrittenAs("objective")] = None
+    region: OwnRegion = None
+    decay: Positive | None = None
     tolerance: OpenUnitInterval = 1e-6
     prove_least: bool = False
     mean: Annotated[FewSamples, Ge(1)] = 1
@@ -147,6 +175,18 @@ class FaultEstimationFilter(Method):
             yield "residual_weight_limit needs free_residual_weight: the weight is fixed otherwise."
         if self.residual_weight_limit is not None and self.engine == "riccati":
             yield "residual_weight_limit is not covered by engine 'riccati': use 'auto' or 'lmi'."
+        if self.objective is not None and self.objective != "h2" and not callable(self.objective):
+            yield f"objective is {shown(self.objective)}: give 'h2', or a function of the variables."
+        if self.own_inequality and self.gamma_search == "bisection":
+            yield "bisection does not know constraints, objective, region and decay: leave gamma_search out."
+        yield from own_term_conflicts(self, beside=("residual_weight_limit", "prove_least"), engines=("riccati",))
+        if self.decay is not None and self.engine == "riccati":
+            yield "engine 'riccati' imposes no decay: use 'auto' or 'lmi'."
+
+    @property
+    def own_inequality(self) -> bool:
+        """Whether (45) is asked for with something else in it."""
+        return bool(own_terms(self)) or self.region is not None or self.decay is not None
 
     def existence(self, plant: DescriptorSystem, *, exactly: bool = True) -> tuple[Condition, ...]:
         """Return the existence conditions, decided exactly or in floating point; the list ends at the first failure."""

@@ -25,7 +25,8 @@ import numpy as np
 
 from obsynth.analysis.conditions import require_all
 from obsynth.errors import InfeasibleError
-from obsynth.methods.conic.lmi import FILTER_SOLVERS
+from obsynth.extensions import extension
+from obsynth.methods.conic.lmi import AUTO, SCHUR, chosen_solver
 from obsynth.methods.fault_estimation_filter.certificate import bounded_real_certificate
 from obsynth.methods.fault_estimation_filter.conditions import examine_fault_filter
 from obsynth.methods.fault_estimation_filter.filter_search import NOMINAL_GAIN, FoundGains, found_gains, found_within
@@ -50,6 +51,11 @@ FIRST_TRIES = 4
 
 def synthesise(plant: DescriptorSystem, asked: FaultEstimationFilter, *, progress: Callable[[str], None]) -> Synthesis:
     """Design the filter; see `obsynth.fault_estimation_filter` for the options, results and errors."""
+    solver = chosen_solver(asked.solver, asked.solver_options, ours=(AUTO, SCHUR))
+    if asked.own_inequality:
+        own: Synthesis = extension("filter by its inequality")(plant, asked, progress=progress)
+        return own
+    asked = replace(asked, solver=solver)
     progress("checking the existence conditions")
     held, prepared = examine_fault_filter(plant)
     require_all(held)
@@ -90,7 +96,7 @@ def synthesise(plant: DescriptorSystem, asked: FaultEstimationFilter, *, progres
         claims["gamma_min"] = min(max(least.gain, proved), level)
         if "gamma_bracket_high" in claims:
             claims["gamma_bracket_high"] = max(claims["gamma_bracket_high"], claims["gamma_min"])
-    resolved = asked.as_given() | {"free_residual_weight": free, "S": None if s is None else s.tolist()}
+    resolved = asked.as_plain() | {"free_residual_weight": free, "S": None if s is None else s.tolist()}
     del resolved["model_error"]  # decided before this
     if asked.mean > 1:
         # Registers hold estimates, which see no state: nothing of the plant is tracked there.
@@ -197,7 +203,7 @@ def _left_inverse(upsilon: FloatArray) -> FloatArray:
 
 def _engine_of(records: list[dict[str, Any]]) -> str:
     """Return which engine ran: the inequality comes in only where it may and where there is something to find."""
-    return "lmi" if any(record.get("solver") in FILTER_SOLVERS for record in records) else "riccati"
+    return "lmi" if any("settings" in record for record in records) else "riccati"
 
 
 def _gamma_notes(asked: float | None, shipped: float) -> tuple[str, ...]:

@@ -11,7 +11,8 @@ import numpy as np
 from obsynth.analysis.conditions import Condition
 from obsynth.errors import SpecError
 from obsynth.methods.method import ClaimMeaning, Method, PlantKind, Purpose
-from obsynth.numerics.arguments import NonNegative, Positive, WrittenAs
+from obsynth.methods.own_terms import OwnConstraints, OwnRegion, SolverName, SolverOptions, own_term_conflicts
+from obsynth.numerics.arguments import NonNegative, Positive, WrittenAs, shown
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.numerics.ranks import decide_rank
 from obsynth.plants.descriptor import DescriptorSystem
@@ -88,8 +89,17 @@ class PdObserver(Method):
         equation, and their certificate from a Lyapunov equation.  The last two give stability and a decay rate alone.
         ``"auto"`` takes the first up to 20 unknown states, or where more is asked, and the last above.  The result's
         ``solver["engine"]`` says which ran.
-    solver : {"CLARABEL", "SCS"}, optional
-        Semidefinite solver.
+    solver : str, optional
+        Semidefinite solver: any of ``cvxpy.installed_solvers()`` that does semidefinite programmes.
+    solver_options : mapping, optional
+        Settings of that solver by its own names.
+    constraints : callable, optional
+        A function of the variables of `obsynth.conditions.filasova_theorem1` by name that returns cvxpy constraints:
+        ``lambda v: [v["Z"] == 0]``.  The theorem is then solved as it stands in the paper, with the safe reading.
+    objective : callable, optional
+        A function of the variables that returns what is minimised instead of the size of Y, Z and P3.
+    region : LMIRegion, optional
+        Where all eigenvalues of the error system must lie (1/s), such as ``conditions.sector(0.7)``.
     name : str, optional
         Name of the design.
 
@@ -147,7 +157,11 @@ class PdObserver(Method):
     adaptation_range: Annotated[Any, WrittenAs("pair")] = None
     delta_scan: Annotated[Any, WrittenAs("positive numbers")] = None
     engine: Literal["auto", "lmi", "reduced-lmi", "riccati"] = "auto"
-    solver: Literal["CLARABEL", "SCS"] = "CLARABEL"
+    solver: SolverName = "CLARABEL"
+    solver_options: SolverOptions = None
+    constraints: OwnConstraints = None
+    objective: Annotated[Any, WrittenAs("function")] = None
+    region: OwnRegion = None
 
     def conflicts(self) -> Iterator[str]:
         """Yield a sentence for each rule across options, or for lists of numbers, that is broken."""
@@ -157,6 +171,10 @@ class PdObserver(Method):
                 f"{', '.join(self.further)}."
             )
         yield from self._broken_lists()
+        if self.objective is not None and not callable(self.objective):
+            yield f"objective is {shown(self.objective)}: give a function of the variables."
+        beside = ("disk", "gain_bound", "fault_rate_gain", "noise_gain", "adaptation_gain", "adaptation_range")
+        yield from own_term_conflicts(self, beside=(*beside, "delta_scan"), engines=ENGINES_OF_STABILITY)
         others = ("disk", "gain_bound", "fault_rate_gain", "noise_gain", "adaptation_gain")
         clash = [name for name in others if getattr(self, name) is not None]
         if self.adaptation_range is not None and clash:

@@ -154,12 +154,14 @@ def pd_delta_scan(
        Theorems 1 and 2.
     """
     from obsynth.analysis.conditions import require_all
+    from obsynth.methods.conic.lmi import chosen_solver
     from obsynth.methods.pd_observer.conditions import explicit_form, pd_observer_conditions
     from obsynth.methods.pd_observer.method import PdObserver
     from obsynth.methods.pd_observer.synthesis import scan_delta
 
     given: dict[str, Any] = {"theorem": theorem, "decay": decay, "delta_scan": delta, "solver": solver}
     asked = PdObserver(**given)
+    chosen_solver(asked.solver, None)
     plant = linear_plant(plant)
     require_all(pd_observer_conditions(plant))
     form = explicit_form(plant)

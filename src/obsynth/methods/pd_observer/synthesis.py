@@ -15,7 +15,10 @@ from numpy.typing import NDArray
 
 from obsynth.analysis.conditions import require_all
 from obsynth.errors import InfeasibleError, SolverError, SpecError
+from obsynth.extensions import extension
+from obsynth.methods.conic.lmi import chosen_solver
 from obsynth.methods.method import Synthesis
+from obsynth.methods.own_terms import own_terms
 from obsynth.methods.pd_observer.certificate import explicit_certificate
 from obsynth.methods.pd_observer.conditions import explicit_form, pd_observer_conditions
 from obsynth.methods.pd_observer.gain_search import design_gains, gains_for
@@ -69,6 +72,11 @@ WARN_AMPLIFICATION = 50.0
 
 def synthesise(plant: DescriptorSystem, asked: PdObserver, *, progress: Callable[[str], None]) -> Synthesis:
     """Design the observer; see `obsynth.pd_observer` for the options, results and errors."""
+    solver_of = chosen_solver(asked.solver, asked.solver_options)
+    if own_terms(asked) or asked.region is not None:
+        own: Synthesis = extension("PD observer by its inequality")(plant, asked, progress=progress)
+        return own
+    asked = replace(asked, solver=solver_of)
     progress("checking the existence conditions")
     require_all(pd_observer_conditions(plant))
     form = explicit_form(plant)
@@ -96,7 +104,7 @@ def synthesise(plant: DescriptorSystem, asked: PdObserver, *, progress: Callable
 
 def _resolved(asked: PdObserver, gains: PdGains, g: FloatArray | None) -> dict[str, Any]:
     return {
-        **asked.as_given(),
+        **asked.as_plain(),
         "delta": gains.asked_delta,
         "decay": gains.decay,
         "disk": None if asked.disk_numbers is None else list(asked.disk_numbers),

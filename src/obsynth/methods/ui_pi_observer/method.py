@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import numpy as np
 
 from obsynth.analysis.conditions import Condition
 from obsynth.errors import SpecError
 from obsynth.methods.method import ClaimMeaning, Method, PlantKind, Purpose
-from obsynth.numerics.arguments import NonNegative, Positive, WrittenAs, problem_with
+from obsynth.methods.own_terms import OwnConstraints, SolverName, SolverOptions, own_term_conflicts
+from obsynth.numerics.arguments import NonNegative, Positive, WrittenAs, problem_with, shown
 from obsynth.numerics.spectra import decay_rates
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.fault_models import Exosystem, exosystem
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
     from obsynth.methods.ui_pi_observer.placement_problem import NoiseWeights
 
 _PATH = "method.options"
+#: What to make of the freedom that poles leave.
+OBJECTIVES = ("conditioning", "gain")
 
 CLAIMS = {
     "decay": ClaimMeaning("1/s", "rate of the slowest pole: every error decays at least like this in the end", "decay"),
@@ -64,7 +67,7 @@ class UiPiObserver(Method):
         Movable poles: numbers, complex numbers or ``[re, im]``; any multiplicity.  Fixed ones are not listed.
     decay : float, optional, 1/s
         A Kalman gain all of whose movable poles decay at this rate or faster; 0 is the plain Kalman gain.
-    region : mapping, optional
+    region : mapping or LMIRegion, optional
         ``decay`` (1/s), ``radius`` (1/s), ``damping`` (ratio): movable poles by a matrix inequality, with little noise;
         where there are many (20), those that a Kalman gain of this rate has inside already stay there.  Without
         ``decay``: that of the default, where it can be had (at most half the radius).
@@ -72,15 +75,21 @@ class UiPiObserver(Method):
         Weights of the Kalman gain: ``measurement`` (standard deviation: one, a list, or by output; the plant's own
         noise by default), ``process`` and ``fault`` (drive of states and fault models, relative to the default,
         dimensionless).
-    objective : {"conditioning", "gain"}, optional
-        What to make of the freedom that ``poles`` leaves.
+    objective : {"conditioning", "gain"} or callable, optional
+        What to make of the freedom that ``poles`` leaves; or a function of the variables of the inequality that
+        returns what is minimised.
     joint : bool, optional
         Design K and the free part of the decoupling (the paper's G) together; the fault estimates may then see the
         outputs directly.
     E_sharp, C_sharp, G : array_like, optional
         The paper's ``(nx, nx)``, ``(nx, ny)``, ``(nx, ny)`` of (10), (11), instead of our decoupling.
-    solver : {"CLARABEL", "SCS"}, optional
-        Semidefinite solver, for ``region``.
+    solver : str, optional
+        Semidefinite solver, for ``region``: any of ``cvxpy.installed_solvers()`` that does semidefinite programmes.
+    solver_options : mapping, optional
+        Settings of that solver by its own names.
+    constraints : callable, optional
+        A function of the variables of `obsynth.conditions.sharepasand` by name that returns cvxpy constraints.  The
+        inequality is then solved as it stands there, as it is with a region of `obsynth.conditions`.
     name : str, optional
         Name of the design.
 
@@ -129,12 +138,14 @@ class UiPiObserver(Method):
     decay: NonNegative | None = None
     region: Annotated[Any, WrittenAs("pole region")] = None
     noise: Annotated[Any, WrittenAs("noise weights")] = None
-    objective: Literal["conditioning", "gain"] = "conditioning"
+    objective: Annotated[Any, WrittenAs("placement objective")] = "conditioning"
     joint: bool = False
     E_sharp: Annotated[Any, WrittenAs("matrix")] = None
     C_sharp: Annotated[Any, WrittenAs("matrix")] = None
     G: Annotated[Any, WrittenAs("matrix")] = None
-    solver: Literal["CLARABEL", "SCS"] = "CLARABEL"
+    solver: SolverName = "CLARABEL"
+    solver_options: SolverOptions = None
+    constraints: OwnConstraints = None
 
     def conflicts(self) -> Iterator[str]:
         """Yield a sentence for each rule across options that is broken."""
@@ -148,6 +159,10 @@ class UiPiObserver(Method):
             yield "E_sharp, C_sharp and G come together: give all three, or none."
         if any(given) and self.joint:
             yield "joint designs what E_sharp, C_sharp and G would fix: leave one of the two out."
+        if not callable(self.objective) and self.objective not in OBJECTIVES:
+            listed = ", ".join(OBJECTIVES)
+            yield f"objective is {shown(self.objective)}: use one of {listed}, or a function of the variables."
+        yield from own_term_conflicts(self, beside=("poles", "noise", "joint"))
 
     def given_decoupling(self) -> dict[str, Any] | None:
         """Return the paper's matrices, or ``None`` for our own decoupling."""

@@ -14,7 +14,10 @@ import numpy as np
 
 from obsynth.analysis.zeros import is_outside
 from obsynth.errors import PreconditionError, SolverError, SpecError
+from obsynth.extensions import extension
+from obsynth.methods.conic.lmi import chosen_solver
 from obsynth.methods.method import Synthesis, plain
+from obsynth.methods.own_terms import own_terms
 from obsynth.methods.placement.eigenstructure import checked_poles, place
 from obsynth.methods.placement.kalman import KalmanProblem, compromise
 from obsynth.methods.placement.region import Region, region_gain
@@ -58,6 +61,11 @@ SAME_AS_ASKED = 5e-5
 
 def synthesise(plant: DescriptorSystem, asked: UiPiObserver, *, progress: Callable[[str], None]) -> Synthesis:
     """Design the observer; see `obsynth.ui_pi_observer` for the options, results and errors."""
+    solver = chosen_solver(asked.solver, asked.solver_options)
+    if own_terms(asked):
+        own: Synthesis = extension("UI-PI observer by its inequality")(plant, asked, progress=progress)
+        return own
+    asked = replace(asked, solver=solver)
     model = exosystem(asked.fault_model, plant.fault_names, plant.dt)
     region = asked.checked_region(plant.dt)
     weights = asked.checked_noise(plant.output_names)
