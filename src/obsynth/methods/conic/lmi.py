@@ -58,7 +58,8 @@ def chosen_solver(name: str, options: Mapping[str, Any] | None, *, ours: tuple[s
     if name not in ours and name not in SOLVER_SETTINGS and name not in semidefinite_solvers():
         listed = ", ".join(dict.fromkeys([*ours, *semidefinite_solvers()]))
         raise SpecError(
-            f"method.options.solver: there is no solver {name!r} for semidefinite programmes here; installed are: {listed}.",
+            f"method.options.solver: there is no solver {name!r} that does semidefinite programmes; "
+            f"installed are: {listed}.",
             path="method.options.solver",
         )
     if options and name in ours:
