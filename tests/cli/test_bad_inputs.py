@@ -239,7 +239,7 @@ SCHEMA = [
     Case(
         "unknown solver",
         put("method", "options", "solver", "MOSEK"),
-        "method.options.solver: there is no solver 'MOSEK' that does semidefinite programmes; installed are: auto, SCHUR",
+        "method.options.solver: there is no solver 'MOSEK' that does semidefinite programmes; installed are: auto",
     ),
     Case(
         "unknown search",
