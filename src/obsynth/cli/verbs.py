@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from textwrap import fill
 from typing import Any, NamedTuple
 
 from obsynth.cli.arguments import (
@@ -256,4 +257,19 @@ def _parser(name: str, told: str) -> argparse.ArgumentParser:
 def _fill(name: str, parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
     parser.set_defaults(verb=name)
     add_arguments(parser, VERBS[name].arguments)
+    if name in _TELL_METHODS:
+        # Asked for only when the help is printed: other packages may have registered some.
+        parser.format_help = lambda: _help_with_methods(parser)  # type: ignore[method-assign]
     return parser
+
+
+#: Verbs whose help lists the methods that are installed.
+_TELL_METHODS = ("design", "check", "compare")
+
+
+def _help_with_methods(parser: argparse.ArgumentParser) -> str:
+    """Return the help of a parser with the ids of the methods."""
+    from obsynth.methods.installed import REGISTRY
+
+    told = fill(", ".join([*REGISTRY, "auto"]), width=78, initial_indent="  ", subsequent_indent="  ")
+    return f"{argparse.ArgumentParser.format_help(parser)}\nmethods:\n{told}\n"

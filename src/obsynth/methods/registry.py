@@ -1,4 +1,4 @@
-"""The registry of methods, one line each; and which of them take a plant of a kind."""
+"""The classes of methods by id, obsynth's own and those of other packages; which take a plant of a kind."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any, TypeAlias
 
 from obsynth.analysis.conditions import Condition
 from obsynth.errors import SpecError
+from obsynth.methods.installed import OWN, REGISTRY, not_loadable
 from obsynth.methods.method import Method, PlantKind
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
@@ -15,18 +16,12 @@ from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.error_system import ErrorModel
 
+__all__ = [
+    "AUTO", "REGISTRY", "error_model", "kind_conditions", "kind_of", "method_class", "methods_for",
+]  # fmt: skip
+
 #: What a spec and `obsynth.design` call the choice between all methods that exist.
 AUTO = "auto"
-#: Method id -> its class, ``module:name``; a method is its own folder and a line here.
-REGISTRY: dict[str, str] = {
-    "fault-estimation-filter": "obsynth.methods.fault_estimation_filter.method:FaultEstimationFilter",
-    "pd-observer": "obsynth.methods.pd_observer.method:PdObserver",
-    "ui-pi-observer": "obsynth.methods.ui_pi_observer.method:UiPiObserver",
-    "functional-filter": "obsynth.methods.functional_filter.method:FunctionalFilter",
-    "descriptor-kalman": "obsynth.methods.descriptor_kalman.method:DescriptorKalman",
-    "adaptive-observer": "obsynth.methods.adaptive_observer.method:AdaptiveObserver",
-    "dae-adaptive-observer": "obsynth.methods.dae_adaptive_observer.method:DaeAdaptiveObserver",
-}
 Plant: TypeAlias = DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel
 _KINDS: Mapping[PlantKind, tuple[type, str]] = {
     "time-invariant": (DescriptorSystem, "a linear plant with constant matrices"),
@@ -39,8 +34,16 @@ def method_class(method: str) -> type[Method]:
     """Return the class of a method; raise `SpecError` listing the known ones where there is none."""
     if method not in REGISTRY:
         raise SpecError(f"There is no method {method!r}; there are: {', '.join(REGISTRY)}.", path="method")
-    module, name = REGISTRY[method].split(":")
-    found: type[Method] = getattr(import_module(module), name)
+    module, _, name = REGISTRY[method].partition(":")
+    if method in OWN:
+        own: type[Method] = getattr(import_module(module), name)
+        return own
+    try:
+        found = getattr(import_module(module), name)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise not_loadable(method, error) from error
+    if not (isinstance(found, type) and issubclass(found, Method)) or found.id != method:
+        raise not_loadable(method, f"it is no class derived from obsynth.methods.method.Method with the id {method!r}")
     return found
 
 
