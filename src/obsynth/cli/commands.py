@@ -140,7 +140,7 @@ def run_check(options: argparse.Namespace) -> int:
         structures = {"as the method sees it": analyse_structure(spec.plant)}
         model = spec.options.get("fault_model", "step")
         try:
-            diagnosis = diagnose(spec.plant, fault_model=model)
+            diagnosis = diagnose(spec.plant, fault_model=model, whole_bank=options.whole_bank)
         except (SolverError, MemoryError) as error:  # the methods are asked all the same
             not_known = f"What can be diagnosed is not known. {failure_of(error) or error}"
     if spec.transformation is not None:

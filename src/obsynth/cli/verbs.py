@@ -97,7 +97,8 @@ VERBS = {
     )),
     "check": Verb("commands:run_check", "Analyse the plant of a spec, and check for every method whether a design can "
                   "exist.", (
-        SYSTEM, verbose("the structure of the plant and every condition"), JSON,
+        SYSTEM, flag("--whole-bank", "look for every structured residual of more than 6 faults, up to 12"),
+        verbose("the structure of the plant and every condition"), JSON,
     )),
     "verify": Verb("commands:run_verify", "Verify a saved gain set again, from the plant and the shipped realisation "
                    "alone.", (

@@ -98,7 +98,7 @@ def diagnosis_report(diagnosis: Diagnosis, *, console: Console, everything: bool
         rows = diagnosis.bank_rows()
         print_section(console, "Which fault can be told from which", _table(diagnosis.isolability_rows()))
         more = len(rows) - 1 - MOST_ROWS
-        title = "Structured residuals" + (f" ({more} more are not shown)" if more > 0 else "")
+        title = "Structured residuals" + (f" ({more} more are not shown; --json has them)" if more > 0 else "")
         if len(rows) > 1:
             print_section(console, title, _table(rows[: MOST_ROWS + 1]))
     for sentence in diagnosis.sentences:

@@ -54,6 +54,8 @@ class DecoupledPlant:
         What was removed: the unknown inputs, and faults that are not to show.
     fault_sizes : FloatArray
         Sizes of the faults' columns in balanced units, before the reduction.
+    signal_sizes : FloatArray
+        The same of the columns of ``[u; y]``; one for those that are zero.
     time : float
         Unit of s in which the plant is balanced, 1/s.
     decisions : tuple of RankDecision
@@ -78,6 +80,7 @@ class DecoupledPlant:
     faults: tuple[str, ...]
     without: tuple[str, ...]
     fault_sizes: FloatArray
+    signal_sizes: FloatArray
     time: float
     decisions: tuple[RankDecision, ...]
 
@@ -177,10 +180,12 @@ def decoupled(plant: DescriptorSystem, removed: Sequence[int], kept: Sequence[in
     # Rows of the orthogonal reduction have unit length: what is below rounding is nothing.
     rows = np.where(np.abs(found.left) > ROUNDING, found.left, 0.0) * units.rows
     faults = np.vstack([plant.Bf, plant.Df])[:, list(kept)]
+    signals = np.block([[plant.B, np.zeros((nx, ny))], [plant.D, -np.eye(ny)]])
+    sizes = np.linalg.norm(units.rows[:, None] * signals, axis=0)
     k = found.order
     parts = {
-        "u": rows @ np.vstack([plant.B, plant.D]),
-        "y": rows @ np.vstack([np.zeros((nx, ny)), -np.eye(ny)]),
+        "u": rows @ signals[:, : plant.nu],
+        "y": rows @ signals[:, plant.nu :],
         "f": rows @ faults,
         "w": rows @ np.vstack([plant.Bw, plant.Dw]),
     }
@@ -193,8 +198,8 @@ def decoupled(plant: DescriptorSystem, removed: Sequence[int], kept: Sequence[in
         source=plant,
         faults=tuple(plant.fault_names[i] for i in kept),
         without=(*plant.disturbance_names, *(plant.fault_names[i] for i in removed)),
-        fault_sizes=read_only(np.linalg.norm(units.rows[:, None] * faults, axis=0)), time=units.time,
-        decisions=found.decisions,
+        fault_sizes=read_only(np.linalg.norm(units.rows[:, None] * faults, axis=0)),
+        signal_sizes=read_only(np.where(sizes > 0.0, sizes, 1.0)), time=units.time, decisions=found.decisions,
     )  # fmt: skip
 
 

@@ -10,10 +10,16 @@ import numpy as np
 from obsynth.analysis.diagnosis.exact import Questions, decided_exactly
 from obsynth.analysis.diagnosis.explanations import hidden_motion, least_additions, listed, state_sensors
 from obsynth.analysis.diagnosis.fault_columns import Question, others, rest_point
-from obsynth.analysis.diagnosis.verdicts import Diagnosis, FaultDiagnosis, residual_bank
+from obsynth.analysis.diagnosis.verdicts import (
+    MOST_FAULTS,
+    MOST_FAULTS_OF_WHOLE_BANK,
+    Diagnosis,
+    FaultDiagnosis,
+    residual_bank,
+)
 from obsynth.analysis.transformations.recovery import Transformation, linear_plant
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import is_finite_number
+from obsynth.numerics.arguments import is_finite_number, truth
 from obsynth.numerics.libraries import failed_computations, on_one_thread_if_small
 from obsynth.numerics.pencils import pencil_structure
 from obsynth.numerics.ranks import REST_TOLERANCE
@@ -22,6 +28,10 @@ from obsynth.plants.fault_models import Exosystem, exosystem, stated_eigenvalues
 
 #: Zeros that are named in a sentence; the others are counted.
 MOST_ZEROS = 4
+_PART_OF_THE_BANK = (
+    "Of {count} faults, the residuals listed see all faults, all but one, or one alone; others may exist. "
+    "diagnose(..., whole_bank=True) and obsynth check --whole-bank list all of up to 12 faults."
+)
 
 
 @failed_computations()
@@ -32,6 +42,7 @@ def diagnose(
     fault_model: Any = "step",
     frequencies: Sequence[float] = (),
     suggest: bool = True,
+    whole_bank: bool = False,
     progress: Callable[[str], None] | None = None,
 ) -> Diagnosis:
     """Say for each fault whether it can be detected, told from the others, and estimated; and what forbids it.
@@ -51,6 +62,8 @@ def diagnose(
         Where to ask whether a sinusoidal fault leaves a trace.
     suggest : bool, optional
         Look for states that would help where a fault cannot be estimated.
+    whole_bank : bool, optional
+        List every structured residual that exists of up to 12 faults; that is always done for six.
     progress : callable, optional
         Called with a text at the start of each stage.
 
@@ -62,7 +75,8 @@ def diagnose(
     Raises
     ------
     SpecError
-        ``plant`` is no linear time-invariant plant, the fault model is malformed, or a frequency is no number.
+        ``plant`` is no linear time-invariant plant, the fault model is malformed, a frequency is no number, or the
+        whole bank is asked for of more than 12 faults.
     SolverError
         The numbers are beyond double precision.
 
@@ -75,6 +89,12 @@ def diagnose(
     if not all(is_finite_number(value) and value >= 0.0 for value in frequencies):
         raise SpecError(f"frequencies is {list(frequencies)!r}: give numbers in rad/s, 0 or more.", path="frequencies")
     model = exosystem(fault_model, plant.fault_names, plant.dt)
+    whole_bank = truth(whole_bank, "whole_bank")
+    if whole_bank and plant.nf > MOST_FAULTS_OF_WHOLE_BANK:
+        raise SpecError(
+            f"The plant has {plant.nf} faults: the whole bank of residuals is listed for up to "
+            f"{MOST_FAULTS_OF_WHOLE_BANK}. Leave faults out, or whole_bank.", path="whole_bank",
+        )  # fmt: skip
     report_stage = progress or (lambda _: None)
     exactly = decided_exactly(plant)
     report_stage("asking what shows each fault")
@@ -87,10 +107,11 @@ def diagnose(
     )
     report_stage("telling faults from each other")
     weak, strong, pairs = _isolability(plant, shown, asked)
-    bank = residual_bank(asked)
+    bank = residual_bank(asked, whole_bank)
+    part = () if whole_bank or plant.nf <= MOST_FAULTS else (_PART_OF_THE_BANK.format(count=plant.nf),)
     return Diagnosis(
         faults, weak, strong, bank, plant.disturbance_names, "; ".join(dict.fromkeys(model.descriptions)), exactly,
-        _warnings(plant, [*shown, *free, *pairs]),
+        (*_warnings(plant, [*shown, *free, *pairs]), *part),
     )  # fmt: skip
 
 

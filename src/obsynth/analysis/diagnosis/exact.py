@@ -16,6 +16,7 @@ from flint import fmpq, fmpq_mat, fmpq_poly, fmpz_poly
 
 from obsynth.analysis.diagnosis.decoupled import unknowns_pencil
 from obsynth.analysis.diagnosis.fault_columns import Question, Removal
+from obsynth.analysis.diagnosis.residual_orders import exact_residual_order
 from obsynth.numerics.arrays import ComplexArray
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.exact_arithmetic import (
@@ -219,16 +220,7 @@ class ReducedQuestion(ExactQuestion):
     @cached_property
     def residual_order(self) -> int | None:
         """Least order of a scalar residual that shows the fault."""
-        A, C, F, G, *_ = self._parts
-        powers, markov, zero = [C], [G], zeros_matrix(C.nrows(), 1)
-        for order in range(self.order + 1) if self.visible else ():
-            parity = _left_null_basis(blocks([[part] for part in powers]))
-            toeplitz = blocks([[markov[i - j] if j <= i else zero for j in range(order + 1)] for i in range(order + 1)])
-            if C.nrows() and not _is_zero(parity * toeplitz):
-                return order
-            markov.append(powers[-1] * F)
-            powers.append(powers[-1] * A)
-        return None
+        return exact_residual_order(*self._parts) if self.visible else None
 
 
 def _reduced(e: fmpq_mat, a: fmpq_mat, right: fmpq_mat) -> tuple[fmpq_mat, fmpq_mat, fmpq_mat, fmpq_mat, fmpq_poly]:

@@ -6,7 +6,6 @@ the greatest common divisor of ``g = N [bf; df]``; decoupled: where ``[F; G]`` l
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar
@@ -15,16 +14,12 @@ import numpy as np
 
 from obsynth.analysis.diagnosis.decoupled import DecoupledPlant, decoupled
 from obsynth.analysis.diagnosis.reduction import finite_values, left_part
+from obsynth.analysis.diagnosis.residual_orders import residual_orders
 from obsynth.analysis.zeros import are_outside
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.pencils import FiniteZeros
 from obsynth.numerics.ranks import CLEAR_GAP, MARKOV_TOLERANCE, RANK_TOLERANCE, TRACE_TOLERANCE, rank_from
 from obsynth.plants.descriptor import DescriptorSystem
-
-#: Parity spaces of a higher order than this are not formed: their powers hold no digits.
-MOST_PARITY_ORDER = 24
-#: Nor where the powers have grown to this.
-LARGEST_POWER = 1e150
 
 
 def rest_point(dt: float) -> complex:
@@ -63,37 +58,19 @@ class Removal:
 
     @cached_property
     def residual_orders(self) -> dict[int, int]:
-        """Least order, up to 24, of a scalar residual that shows a fault, of those that leave a trace."""
+        """Least order of a scalar residual that shows a fault, of those that leave a trace."""
         plant, (sizes, traces) = self.plant, self.traces
-        open_faults = [place for place in range(len(self.kept)) if traces[place] > TRACE_TOLERANCE]
-        if plant.order == 0:
-            return {self.kept[place]: 0 for place in open_faults}
+        places = [place for place in range(len(self.kept)) if traces[place] > TRACE_TOLERANCE]
+        if plant.order == 0 or not places:
+            return {self.kept[place]: 0 for place in places}
         inverse = np.linalg.inv(plant.E * plant.time)
-        a, found = inverse @ plant.A, dict[int, int]()
-        f, powers, markov = inverse @ plant.F / sizes, [plant.C], [plant.G / sizes]
-        for order in range(min(plant.order, MOST_PARITY_ORDER) + 1):
-            observed = np.vstack(powers)
-            # Powers grow or fade: rows of one length keep a long chain of one output apart from rounding.
-            lengths = np.linalg.norm(observed, axis=1, keepdims=True)
-            lengths = np.where(lengths > 0.0, lengths, 1.0)
-            left, values, _ = np.linalg.svd(observed / lengths)
-            parity = left[:, rank_from(values, expected=observed.shape[1]).rank :].T
-            for place in open_faults if len(parity) else ():
-                if _is_seen(parity, [column[:, [place]] for column in markov], lengths):
-                    found[self.kept[place]] = order
-            open_faults = [place for place in open_faults if self.kept[place] not in found]
-            if not open_faults or float(np.max(lengths)) > LARGEST_POWER:
-                break
-            markov.append(powers[-1] @ f)
-            powers.append(powers[-1] @ a)
-        return found
-
-
-def _is_seen(parity: FloatArray, markov: Sequence[FloatArray], lengths: FloatArray) -> bool:
-    """Whether parity vectors of rows that are divided by their lengths show a fault with these Markov parameters."""
-    zero, count = np.zeros_like(markov[0]), len(markov)
-    toeplitz = np.block([[markov[i - j] if j <= i else zero for j in range(count)] for i in range(count)]) / lengths
-    return bool(np.linalg.norm(parity @ toeplitz) > TRACE_TOLERANCE * max(1.0, float(np.linalg.norm(toeplitz))))
+        units = (sizes * traces)[places]
+        known = np.block([[plant.Bu, plant.By], [plant.Du, -plant.H]]) / plant.signal_sizes
+        found = residual_orders(
+            inverse @ plant.A, plant.C, inverse @ plant.F[:, places] / units, plant.G[:, places] / units,
+            inverse @ known[: plant.order], known[plant.order :],
+        )  # fmt: skip
+        return {self.kept[place]: order for place, order in zip(places, found, strict=True) if order is not None}
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,7 +180,7 @@ class Question:
 
     @cached_property
     def residual_order(self) -> int | None:
-        """Least order of a scalar residual that shows the fault; ``None`` where nothing does, or beyond 24."""
+        """Least order of a scalar residual that shows the fault; ``None`` where nothing does."""
         return self.removal.residual_orders.get(self.number)
 
     @property

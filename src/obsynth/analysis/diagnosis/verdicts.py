@@ -15,8 +15,10 @@ from obsynth.analysis.diagnosis.exact import Questions
 from obsynth.files.tables import html_table, text_table
 from obsynth.numerics.arrays import ComplexArray
 
-#: With more faults only residuals that are blind to one fault, or see one fault, are looked for.
+#: With more faults only residuals that are blind to one fault, or see one, are looked for unless all are asked for.
 MOST_FAULTS = 6
+#: Of more faults the whole bank is refused: 4095 sets are asked about for this many.
+MOST_FAULTS_OF_WHOLE_BANK = 12
 
 
 @dataclass(frozen=True)
@@ -41,10 +43,10 @@ class StructuredResidual:
     order: int | None
 
 
-def residual_bank(questions: Questions) -> tuple[StructuredResidual, ...]:
-    """Return every structured residual that exists, those that see least first."""
+def residual_bank(questions: Questions, whole: bool = False) -> tuple[StructuredResidual, ...]:
+    """Return the structured residuals that exist, those that see least first: all, or those of `_sets`."""
     found, plant = [], questions.source
-    for removed in _sets(plant.nf):
+    for removed in _sets(plant.nf, whole):
         kept = [i for i in range(plant.nf) if i not in removed]
         asked = [questions.of(removed, i) for i in kept]
         if not all(one.visible for one in asked):
@@ -57,9 +59,9 @@ def residual_bank(questions: Questions) -> tuple[StructuredResidual, ...]:
     return tuple(sorted(found, key=lambda residual: len(residual.sees)))
 
 
-def _sets(count: int) -> Iterator[Sequence[int]]:
+def _sets(count: int, whole: bool) -> Iterator[Sequence[int]]:
     """Yield the sets of faults to be blind to."""
-    if count <= MOST_FAULTS:
+    if whole or count <= MOST_FAULTS:
         for size in range(count):
             yield from combinations(range(count), size)
         return
@@ -149,7 +151,8 @@ class Diagnosis:
     isolable_at_rest : NDArray
         ``(nf, nf)`` of bool: the same for constant faults that leave constant traces.
     bank : tuple of StructuredResidual
-        Every structured residual that exists, those that see least first.
+        The structured residuals that exist, those that see least first: all of them up to six faults, or where the
+        whole bank was asked for; else those that see all faults, all but one, or one alone, and a warning says so.
     unknown_inputs : tuple of str
         What all this is free of.
     model : str
