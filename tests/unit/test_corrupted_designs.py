@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -34,6 +35,7 @@ from obsynth import (
 )
 from obsynth.analysis.transformations.recovery import StateRecovery
 from obsynth.methods.fault_estimation_filter.least_gain_proof import WITNESSES
+from obsynth.plants.uncertainty import matrices_of
 from obsynth.spec.loader import load_spec
 from obsynth.verification.claims import WITNESS_CLAIMS
 
@@ -48,6 +50,7 @@ GAINS, RESTRICTED, WEIGHT = "gains fit", "gains: T and N", "gains: W"
 MATRIX, FREE, REALISED = "gains: Psi and Upsilon", "gains: R", "gains: realisation"
 CLAIMS, ORDER = "claims", "claimed gains"
 RECOVERY, KEPT = "recovery fits", "recovery of kept states"
+TEXTS, FAMILY = "tolerances as written", "tolerances of the plant"
 ESTIMATES = (ESTIMATE, IN_RESIDUAL)
 
 
@@ -127,6 +130,16 @@ def good(name: str) -> ObserverDesign:
 
 
 # Ways to corrupt a design.
+
+
+def tolerances(**changes: object) -> Callable[[ObserverDesign], ObserverDesign]:
+    """Change what is stored of the tolerances, for which nominal plant and observer stay as they are."""
+
+    def corrupt(design: ObserverDesign) -> ObserverDesign:
+        changed = {name: value(design.plant) for name, value in changes.items()}
+        return with_plant(design, uncertainty=dataclasses.replace(design.plant.uncertainty, **changed))
+
+    return corrupt
 
 
 def plant_entry(name: str, row: int, column: int, by: float) -> Callable[[ObserverDesign], ObserverDesign]:
@@ -480,6 +493,9 @@ TABLE: dict[str, tuple[str, Callable[[ObserverDesign], ObserverDesign], tuple[st
     "L without a row": ("chain", gain_set(lambda gains: {**gains, "L": gains["L"][1:]}), (GAINS,)),
     "Upsilon transposed": ("paper", gain_set(lambda gains: {**gains, "Upsilon": gains["Upsilon"].T}), (GAINS,)),
     # The way back to the states before a transformation.
+    "tolerances of other entries": ("paper", tolerances(entries=lambda plant: {"A": ((0, 1, "A[1,1]"),)}), (TEXTS,)),
+    "tolerances of another plant": (
+        "paper", tolerances(written=matrices_of, steps=lambda plant: (("eliminate", 0.0),)), (FAMILY,)),
     "recovery without a name": ("paper", with_recovery(names=lambda names: names[1:]), (RECOVERY,)),
     "recovery with a name twice": ("paper", with_recovery(names=lambda names: (*names[:-1], names[0])), (RECOVERY,)),
     "recovery with names in a list": ("quiet", with_recovery(names=list), (RECOVERY,)),

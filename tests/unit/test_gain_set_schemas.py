@@ -65,6 +65,59 @@ def test_elimination_sampling_and_recovery_are_done_again(smib):
     assert failures(smib.replace(recovery=changed)) == {"recovery as written"}
 
 
+def test_what_is_stored_twice_is_compared(smib):
+    """Names, units, operating point, noise and tolerances stand in the plant and in the plant as written."""
+    written, plant = smib.source.plant, smib.plant
+
+    def failures(**changes: object) -> set[str]:
+        return {check.name for check in verify(smib.replace(**changes)).failures}
+
+    for changed in (
+        plant.replace(units={**plant.units, plant.output_names[0]: "km"}),
+        plant.replace(operating_point={**plant.operating_point, plant.output_names[0]: 7.0}),
+        plant.replace(Dw=1.001 * plant.Dw),
+    ):
+        assert failures(plant=changed) == {"stored twice"}
+    renamed = written.replace(output_names=[f"other {name}" for name in written.output_names])
+    assert "stored twice" in failures(source=PlantSource(renamed, 0.02))
+    observer = dataclasses.replace(smib.observer, output_names=renamed.output_names)
+    assert failures(observer=observer)
+    # Noise that was stated after the plant was sampled is not compared with that of the plant as written.
+    louder = load_spec(DESIGNS / "smib" / "spec.yaml").plant.replace(Dw=2.0 * plant.Dw)
+    assert not source_of(louder).plant.nw
+    assert not failures(plant=louder, source=source_of(louder)) & {"stored twice"}
+
+
+@pytest.fixture(scope="module")
+def drive() -> obsynth.ObserverDesign:
+    spec = load_spec(DESIGNS / "drive" / "spec.yaml")
+    return obsynth.design(spec.plant, spec.method, name="drive", recovery=spec.transformation.recovery)
+
+
+@pytest.mark.parametrize("name", ["E", "A", "B", "Bf", "Bd", "C", "sample", "nominal", "text", "steps"])
+def test_tolerances_are_those_of_the_plant_as_written(drive, name: str):
+    assert verify(drive).passed
+    uncertain = drive.plant.uncertainty
+    change: dict[str, object] = {"written": {**uncertain.written, name: 0.9 * uncertain.written.get(name, np.eye(1))}}
+    if name == "sample":
+        change = {"steps": (uncertain.steps[0], ("sample", 0.03))}
+    elif name == "steps":
+        change = {"steps": (*uncertain.steps, ("balance", 0.0))}
+    elif name == "nominal":
+        k = uncertain.box.constants["k"]
+        box = {**uncertain.box.constants, "k": dataclasses.replace(k, nominal=20.5)}
+        change = {"box": dataclasses.replace(uncertain.box, constants=box)}
+    elif name == "text":
+        entries = {key: tuple((i, j, text.replace("-k", "-0.9 * k")) for i, j, text in found)
+                   for key, found in uncertain.entries.items()}  # fmt: skip
+        change = {"entries": entries}
+    plant = drive.plant.replace(uncertainty=dataclasses.replace(uncertain, **change))
+    assert {check.name for check in verify(drive.replace(plant=plant)).failures} == {"tolerances as written"}
+    alone = {check.name for check in verify(drive.replace(plant=plant, source=None)).failures}
+    # Without the plant as written beside it, the plant of the design tells.
+    assert alone & {"tolerances as written", "tolerances of the plant"}
+
+
 def test_a_changed_plant_forgets_what_it_was_made_from(smib):
     plant = load_spec(DESIGNS / "smib" / "spec.yaml").plant
     assert source_of(plant).sample_time == 0.02

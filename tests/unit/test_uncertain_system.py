@@ -7,6 +7,7 @@ import pytest
 from uncertain_plants import drive, wang
 
 import obsynth
+from obsynth.analysis.transformations.recovery import augment_faults
 from obsynth.analysis.transformations.uncertain_plant import affine_plant
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.expressions import parse_expression
@@ -86,7 +87,15 @@ def test_tolerances_go_through_a_gain_set_and_are_dropped_with_other_matrices(tm
     again = obsynth.load(design.save(tmp_path / "g.json")).plant.uncertainty
     assert again.box.as_dict() == design.plant.uncertainty.box.as_dict()
     assert again.steps == (("eliminate", 0.0), ("sample", 0.02))
-    assert design.plant.replace(A=2.0 * design.plant.A).uncertainty is None
+    changed = design.plant.replace(A=2.0 * design.plant.A)
+    assert changed.uncertainty.lost == "A was changed"
+    for use in (
+        affine_plant,
+        lambda plant: plant_at(plant, {}),
+        lambda plant: obsynth.robustness(design.replace(plant=plant)),
+    ):
+        with pytest.raises(PreconditionError, match="left behind: A was changed"):
+            use(changed)
 
 
 @pytest.mark.parametrize("make", [drive, wang])
@@ -148,8 +157,8 @@ def test_inverse_and_exponential_hold_those_of_members() -> None:
         affine_inverse(AffineMatrix(np.eye(2), np.ones((1, 2, 2)), np.zeros((2, 2))))
 
 
-def test_tolerances_that_a_method_leaves_behind_are_told() -> None:
-    """A method that eliminates algebraic states in its own units ships a plant without tolerances, and says so."""
+def test_a_method_that_eliminates_by_itself_keeps_the_tolerances() -> None:
+    """What the method eliminates in its own units is the plant that is eliminated first: its tolerances go along."""
     plant = obsynth.uncertain_system(
         {
             "E": [[1, 0, 0], [0, 1, 0], [0, 0, 0]], "A": [["0.5 * p", 0.1, 0.2], [0.1, 0.4, 0.3], [1.0, 0.5, 2.0]],
@@ -158,8 +167,9 @@ def test_tolerances_that_a_method_leaves_behind_are_told() -> None:
         {"p": {"nominal": 1.0, "tolerance": "5 %"}},
     )  # fmt: skip
     design = obsynth.ui_pi_observer(plant)
-    assert design.plant.uncertainty is None
-    assert any("left behind" in note for note in design.notes)
+    assert design.plant.uncertainty.steps == (("eliminate", 0.0),)
+    assert not design.plant.uncertainty.lost
+    assert not any("left behind" in note for note in design.notes)
     kept = obsynth.ui_pi_observer(obsynth.eliminate_algebraic_states(plant).plant)
     assert kept.plant.uncertainty.box.names == ("p",)
     assert obsynth.robustness(kept).finite_for_ever
@@ -175,3 +185,50 @@ def test_the_smaller_and_the_larger_of_two_numbers_whatever_their_floats_are(num
             for q in np.linspace(-1.0, 1.0, 21):
                 truth = exact(one.center + one.parts[0] * q, two.center + two.parts[0] * q)
                 assert abs(truth - found.center - found.parts[0] * q) <= found.radius + 1e-15
+
+
+def varying(**more) -> obsynth.DescriptorSystem:
+    """A sampled plant whose inertia m stands in E and A, with an algebraic output."""
+    return obsynth.uncertain_system(
+        {
+            "E": [["m", 0.0], [0.0, 0.0]], "A": [["0.9 * m", 0.1], ["m", -1.0]], "B": [[1.0], [0.5]],
+            "C": [[0.0, 1.0]], "Bf": [[1.0], [0.0]], "dt": 1.0,
+        },
+        {"m": {"nominal": 1.0, "tolerance": "10 %"}}, **more,
+    )  # fmt: skip
+
+
+def test_varying_constants_in_e_keep_their_meaning_when_algebraic_states_are_eliminated() -> None:
+    """E(p) of sample k + 1 and A(p) of sample k are different matrices: none of them is inverted for the other."""
+    plant, rng = varying(variation="varying"), np.random.default_rng(0)
+    reduced = obsynth.eliminate_algebraic_states(plant).plant
+    family, box = affine_plant(reduced), reduced.uncertainty.box
+    x, q = 3.0, rng.uniform(-1.0, 1.0, 41)
+    for k in range(40):
+        now, then = (box.values(q[[i]])["m"] for i in (k, k + 1))
+        u = rng.standard_normal()
+        inner = now * x + 0.5 * u
+        after = (0.9 * now * x + 0.1 * inner + u) / then
+        a, b, c, d, e = (getattr(family, name).at(q[[k]]) for name in ("A", "B", "C", "D", "E"))
+        ahead = family.E.at(q[[k + 1]])
+        assert (ahead * after)[0, 0] == pytest.approx((a * x + b * u)[0, 0], rel=1e-12)
+        assert (c * x + d * u)[0, 0] == pytest.approx(inner, rel=1e-12)
+        assert e[0, 0] == pytest.approx(now, rel=1e-12)
+        x = after
+    # Constants that stay the same leave the equation of x(k+1), and thresholds are smaller for it.
+    same = affine_plant(obsynth.eliminate_algebraic_states(varying()).plant)
+    assert not same.E.parts.any()
+    assert family.E.parts.any()
+
+
+def test_faults_that_become_states_take_the_tolerances_along() -> None:
+    written = {"E": None, "A": [["0.5 * p"]], "C": [[1.0]], "Bf": [[0.0]], "Df": [["p"]], "dt": 1.0}
+    plant = obsynth.uncertain_system(written, {"p": {"nominal": 1.0, "tolerance": "10 %"}})
+    more = augment_faults(plant, plant.fault_names).plant
+    assert dict(more.uncertainty.entries) == {"A": ((0, 0, "0.5 * p"),), "C": ((0, 1, "p"),)}
+    at = plant_at(more, {"p": 1.1})
+    assert at.A[0, 0] == pytest.approx(0.55)
+    assert at.C.tolist() == [[1.0, 1.1]]
+    other = obsynth.eliminate_algebraic_states(varying()).plant
+    other = other.replace(Df=[[1.0]], uncertainty=other.uncertainty)
+    assert "appended" in augment_faults(other, other.fault_names).plant.uncertainty.lost

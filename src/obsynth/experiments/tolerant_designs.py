@@ -155,7 +155,7 @@ def _unknown_inputs(affine: AffinePlant, plant: DescriptorSystem, blamed: Mappin
         if told[name].separable and columns.shape[1] == 1 and not affine.C.parts[i].any():
             more = plant.replace(
                 Bd=np.hstack([plant.Bd, columns]), Dd=np.hstack([plant.Dd, np.zeros((plant.ny, 1))]),
-                disturbance_names=(*plant.disturbance_names, f"error of {name}"),
+                disturbance_names=(*plant.disturbance_names, f"error of {name}"), uncertainty=None,
             )  # fmt: skip
             yield _Candidate(f"the error of {name} as an unknown input", more)
 

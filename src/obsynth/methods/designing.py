@@ -22,6 +22,7 @@ from obsynth.methods.verifying import verify
 from obsynth.numerics.libraries import failed_computations, failure_of, one_thread_if_small
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.uncertainty import UNCERTAIN_MATRICES
 from obsynth.results.checks import VerificationReport
 from obsynth.results.design import Certificate, ObserverDesign
 from obsynth.results.plant_source import source_of
@@ -213,7 +214,7 @@ def draft_of(
     plant: Plant, method: str, found: Synthesis, *, name: str, recovery: StateRecovery | None = None
 ) -> ObserverDesign:
     """Return the design that a synthesis stands for, without a report."""
-    source = source_of(plant)
+    given, source = plant, source_of(plant)
     if found.plant is not None:
         plant = found.plant
     if found.transformation is not None:
@@ -223,7 +224,7 @@ def draft_of(
     return ObserverDesign(
         name=name,
         method=method,
-        plant=plant,
+        plant=_with_tolerances_of(given, plant),
         options=found.options,
         gains=found.gains,
         observer=found.observer,
@@ -254,7 +255,7 @@ def verified(
         )
     if linear:
         draft = draft.replace(notes=(*draft.notes, *rounding_notes(*draft.linear)))
-    return draft.replace(report=report, notes=(*draft.notes, *_lost_tolerances(plant, draft.plant)))
+    return draft.replace(report=report, notes=(*draft.notes, *_lost_tolerances(draft.plant)))
 
 
 def failed_rows(report: VerificationReport) -> str:
@@ -271,16 +272,44 @@ def design_of_given_gains(
     return draft.replace(report=verify(draft))
 
 
-def _lost_tolerances(given: Plant, shipped: Plant) -> tuple[str, ...]:
-    """Return a note where a method has left a plant's tolerances behind."""
+#: A plant that a method eliminated in units of its own is the one that is eliminated as written to this share.
+SAME_ELIMINATION = 1e-9
+
+
+def _with_tolerances_of(given: Plant, shipped: Any) -> Any:
+    """Return the shipped plant with the tolerances of the given one, or with the note that they were left behind."""
     if not (isinstance(given, DescriptorSystem) and isinstance(shipped, DescriptorSystem)):
-        return ()
-    if given.uncertainty is None or shipped.uncertainty is not None:
+        return shipped
+    uncertain = given.uncertainty
+    if uncertain is None or (shipped.uncertainty is not None and not shipped.uncertainty.lost):
+        return shipped
+    if not uncertain.lost:
+        try:
+            same = eliminate_algebraic_states(given).plant
+        except PreconditionError:
+            same = given
+        if same.state_names == shipped.state_names and same.dt == shipped.dt and _agree(same, shipped):
+            return shipped.replace(uncertainty=same.uncertainty)
+    return shipped.replace(uncertainty=uncertain.left_behind("the method changed the plant by itself"))
+
+
+def _agree(one: DescriptorSystem, other: DescriptorSystem) -> bool:
+    pairs = [(getattr(one, name), getattr(other, name)) for name in UNCERTAIN_MATRICES]
+    return all(
+        a.shape == b.shape and bool(np.all(np.abs(a - b) <= SAME_ELIMINATION * np.abs(a).max(initial=0.0)))
+        for a, b in pairs
+    )
+
+
+def _lost_tolerances(shipped: Plant) -> tuple[str, ...]:
+    """Return a note where a plant's tolerances were left behind."""
+    uncertain = shipped.uncertainty if isinstance(shipped, DescriptorSystem) else None
+    if uncertain is None or not uncertain.lost:
         return ()
     return (
-        f"The tolerances of the constants ({', '.join(given.uncertainty.box.names)}) were left behind as this method "
-        "eliminated algebraic states: thresholds assume an exact model. Eliminate these states first (transform: "
-        "eliminate_algebraic_states, obsynth.eliminate_algebraic_states), and the tolerances go along.",
+        f"The tolerances of the constants ({', '.join(uncertain.box.names)}) were left behind: {uncertain.lost}. The "
+        "design is for the nominal plant, and thresholds and proofs over the box are refused. Eliminate algebraic "
+        "states first (transform: eliminate_algebraic_states, obsynth.eliminate_algebraic_states).",
     )
 
 

@@ -16,6 +16,7 @@ from obsynth.verification.claims import before_the_mean, closed_claims, mean_noi
 from obsynth.verification.error_system import error_model_row
 from obsynth.verification.plant import derivation_rows
 from obsynth.verification.stored_numbers import stored_number_rows
+from obsynth.verification.tolerances import stored_twice_rows, tolerance_rows
 
 if TYPE_CHECKING:
     from obsynth.results.design import ObserverDesign
@@ -61,6 +62,8 @@ def verify(design: ObserverDesign, *, printed_digits: int | None = None) -> Veri
             gamma = design.certificate.claims.get("gamma") if "gamma" in method.claims else None
             if model is not None and rows[-1].passed:
                 rows = (*rows, *stored_number_rows(design, model, gamma), *derivation_rows(design, model))
+        if all(row.passed for row in rows):
+            rows = (*rows, *stored_twice_rows(shipped), *tolerance_rows(shipped))
         covered = {name: meaning.row for name, meaning in method.claims.items()}
         meanings = {name: meaning.meaning for name, meaning in method.claims.items()}
         rows = rows if shipped is design else (*rows, *mean_noise_rows(shipped))

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, read_only
-from obsynth.numerics.sparse import dense, is_sparse
+from obsynth.numerics.sparse import dense, is_sparse, same_matrix
 from obsynth.plants.origin import carry_origin
 from obsynth.plants.reading import plant_fields
 from obsynth.plants.uncertainty import UNCERTAIN_MATRICES, Uncertainty, uncertainty_of
@@ -208,8 +208,9 @@ class DescriptorSystem:
     def replace(self, **changes: Any) -> DescriptorSystem:
         """Return a plant with some fields changed, checked again as a whole.
 
-        Tolerances are those of the matrices as they were: they are dropped with a change of one of these.  Units and
-        other labels of signals that are gone, such as those of ``disturbance_names=None``, go with them.
+        Tolerances are those of the matrices as they were: with a change of one of these they are left behind, and
+        whatever would use them refuses (``uncertainty=None`` says that the model is exact).  Units and other labels of
+        signals that are gone, such as those of ``disturbance_names=None``, go with them.
 
         Parameters
         ----------
@@ -217,13 +218,18 @@ class DescriptorSystem:
             Any argument of the constructor.
         """
         kept = self.as_dict()
-        if self.uncertainty is not None and changes.keys() & {*UNCERTAIN_MATRICES, "dt"}:
-            del kept["uncertainty"]
         gone = {name for field in SIGNAL_NAMES if field in changes for name in getattr(self, field)}
         gone -= {name for field in SIGNAL_NAMES for name in (changes[field] or () if field in changes else kept[field])}
         for label in ("operating_point", "scales", "units"):
             kept[label] = {name: value for name, value in kept[label].items() if name not in gone}
-        return carry_origin(self, DescriptorSystem(**{**kept, **changes}))
+        new = DescriptorSystem(**{**kept, **changes})
+        if self.uncertainty is not None and "uncertainty" not in changes:
+            moved = [name for name in UNCERTAIN_MATRICES if name in changes
+                     and not same_matrix(getattr(self, name), getattr(new, name))]  # fmt: skip
+            if moved or self.dt != new.dt:
+                what = f"{', '.join(moved or ['dt'])} {'were' if len(moved) > 1 else 'was'} changed"
+                object.__setattr__(new, "uncertainty", self.uncertainty.left_behind(what))
+        return carry_origin(self, new)
 
     def __repr__(self) -> str:
         time = f"dt={self.dt:g} s" if self.is_discrete else "continuous"

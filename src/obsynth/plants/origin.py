@@ -64,7 +64,12 @@ def carry_origin(old: Written, new: Plant) -> Plant:
         same_matrix(getattr(old, name), getattr(new, name)) for name in (*DECISIVE, "B", "D")
     )
     if made is not None and unchanged:
-        object.__setattr__(new, "_made_from", made)
+        written, time = made
+        if not (same_matrix(getattr(old, "Bw", None), getattr(new, "Bw", None))
+                and same_matrix(getattr(old, "Dw", None), getattr(new, "Dw", None))):  # fmt: skip
+            # The noise was stated anew since: that of the plant as written says nothing about it.
+            written = written.replace(Bw=None, Dw=None, noise_names=None)
+        object.__setattr__(new, "_made_from", (written, time))
     origin = origin_of(old)
     same = origin is not None and old.dt == new.dt
     if same and all(same_matrix(getattr(old, name), getattr(new, name)) for name in DECISIVE):

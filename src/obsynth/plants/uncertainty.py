@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from obsynth.errors import SpecError
+from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.expressions import Expression, parse_expression
 from obsynth.plants.constants import ConstantsBox, constants_box
@@ -49,6 +49,8 @@ class Uncertainty:
     shift : str, optional
         For a linear model of a nonlinear plant: the input that is one in every row and carries how the equilibrium
         moves with the constants; empty where it does not move, None for a plant that is linear.
+    lost : str, optional
+        What was done to the plant that its tolerances could not follow: bounds over the box are refused then.
     """
 
     box: ConstantsBox
@@ -56,6 +58,7 @@ class Uncertainty:
     written: Mapping[str, Any] | None = None
     steps: tuple[tuple[str, float], ...] = ()
     shift: str | None = None
+    lost: str = ""
     _parsed: dict[str, Expression] = field(default_factory=dict, repr=False, init=False)
 
     def __post_init__(self) -> None:
@@ -91,6 +94,16 @@ class Uncertainty:
     def not_covered(self) -> str:
         """What statements about the box leave out: empty for a plant that is linear."""
         return "" if self.shift is None else "what is not linear in the plant is not covered: this is its linear model"
+
+    def left_behind(self, why: str) -> Uncertainty:
+        """Return what is uncertain in a plant that was changed in a way that constants and entries do not tell.
+
+        Parameters
+        ----------
+        why : str
+            What was done.
+        """
+        return replace(self, lost=self.lost or why)
 
     def with_box(self, box: ConstantsBox) -> Uncertainty:
         """Return the same entries with other tolerances.
@@ -201,7 +214,19 @@ class Uncertainty:
             "written": written,
             "steps": list(map(list, self.steps)),
         }
-        return plain if self.shift is None else {**plain, "shift": self.shift}
+        more = {} if self.shift is None else {"shift": self.shift}
+        return {**plain, **more, **({"lost": self.lost} if self.lost else {})}
+
+
+def require_carried(uncertain: Uncertainty | None) -> None:
+    """Raise `PreconditionError` where a plant's tolerances did not follow what was done to the plant."""
+    if uncertain is not None and uncertain.lost:
+        names = ", ".join(uncertain.box.names)
+        raise PreconditionError(
+            f"The tolerances of the constants ({names}) were left behind: {uncertain.lost}. Nothing over the box is "
+            "known of this plant. Let obsynth eliminate and sample it (transform) without other changes, or leave the "
+            "tolerances out for an exact model (plant.replace(uncertainty=None)).", condition="tolerances carried",
+        )  # fmt: skip
 
 
 def uncertainty_of(data: Any) -> Uncertainty | None:
@@ -210,8 +235,9 @@ def uncertainty_of(data: Any) -> Uncertainty | None:
         return data
     box = dict(data["box"])
     return Uncertainty(
-        constants_box(box.pop("constants"), **box), data["entries"], data["written"], data["steps"], data.get("shift")
-    )
+        constants_box(box.pop("constants"), **box), data["entries"], data["written"], data["steps"], data.get("shift"),
+        str(data.get("lost", "")),
+    )  # fmt: skip
 
 
 def expressions_in(rows: Any) -> tuple[Any, list[Entry]]:

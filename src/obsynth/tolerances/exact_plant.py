@@ -20,7 +20,7 @@ from obsynth.numerics.ranks import DIRECTION_SHARE
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.constants import ConstantsBox
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.uncertainty import SAMPLED, UNCERTAIN_MATRICES, Uncertainty, matrices_of
+from obsynth.plants.uncertainty import SAMPLED, UNCERTAIN_MATRICES, Uncertainty, matrices_of, require_carried
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.error_system import IDENTITY_SHARE
 
@@ -74,13 +74,14 @@ def plant_at(plant: DescriptorSystem, values: Mapping[str, float]) -> Descriptor
     uncertain = plant.uncertainty
     if uncertain is None:
         return plant
+    require_carried(uncertain)
     if uncertain.written is None:
-        found = plant.replace(**uncertain.filled(matrices_of(plant), values))
+        found = plant.replace(**uncertain.filled(matrices_of(plant), values), uncertainty=None)
     else:
         bare = _written_at(plant, uncertain, values)
         for kind, size in uncertain.steps:
             bare = discretise(bare, size).plant if kind == SAMPLED else eliminate_algebraic_states(bare).plant
-        found = plant.replace(**{name: getattr(bare, name) for name in UNCERTAIN_MATRICES})
+        found = plant.replace(**{name: getattr(bare, name) for name in UNCERTAIN_MATRICES}, uncertainty=None)
     # It is no family any more, but knows which of its inputs is one in every row, if one is.
     shift = uncertain.shift
     return found.replace(uncertainty=Uncertainty(ConstantsBox({}), {}, shift=shift)) if shift else found

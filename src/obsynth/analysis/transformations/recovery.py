@@ -15,7 +15,7 @@ from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.numerics.ranks import NEGLIGIBLE_INPUT, decide_rank
 from obsynth.numerics.scaling import equilibrate_pencil
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.uncertainty import matrices_of
+from obsynth.plants.uncertainty import Uncertainty, matrices_of
 from obsynth.plants.validation import index_of
 
 if TYPE_CHECKING:
@@ -110,7 +110,7 @@ class Transformation:
         before = self.source.uncertainty
         if before is None:
             return self
-        after = before.then(matrices_of(self.source), kind, size)
+        after = before if before.lost else before.then(matrices_of(self.source), kind, size)
         return replace(self, plant=self.plant.replace(uncertainty=after))
 
     def then(self, later: Transformation) -> Transformation:
@@ -179,9 +179,23 @@ def augment_faults(plant: DescriptorSystem, faults: Sequence[str]) -> Transforma
     below = {name: np.zeros((count, getattr(plant, name).shape[1])) for name in ("B", "Bd", "Bw")}
     below["Bf"] = np.eye(plant.nf)[chosen]
     inputs = {name: np.vstack([getattr(plant, name), rows]) for name, rows in below.items()}
-    new = with_states(plant, (*plant.state_names, *names), E=E, A=A, C=output, Df=remaining, **inputs)
+    new = with_states(
+        plant, (*plant.state_names, *names), E=E, A=A, C=output, Df=remaining, **inputs,
+        uncertainty=None if plant.uncertainty is None else _augmented(plant.uncertainty, plant.nx, chosen),
+    )  # fmt: skip
     description = f"appended {', '.join(names)} as states" if names else ""
     return Transformation(plant, new, description, unchanged_states(plant, new, from_state=np.eye(nx, nx + count)))
+
+
+def _augmented(uncertain: Uncertainty, nx: int, chosen: Sequence[int]) -> Uncertainty:
+    """Return what is uncertain in a plant whose ``chosen`` faults have become states: entries of Df are then of C."""
+    if uncertain.written is not None:
+        return uncertain.left_behind("faults were appended as states after the plant was transformed")
+    entries = {name: list(found) for name, found in uncertain.entries.items()}
+    direct = entries.pop("Df", [])
+    moved = [(row, nx + chosen.index(column), text) for row, column, text in direct if column in chosen]
+    kept = {"C": [*entries.get("C", []), *moved], "Df": [item for item in direct if item[1] not in chosen]}
+    return replace(uncertain, entries={name: tuple(found) for name, found in {**entries, **kept}.items() if found})
 
 
 def _require_visible(stacked: FloatArray, plant: DescriptorSystem, faults: Sequence[str]) -> None:

@@ -13,7 +13,14 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import UNTOUCHED_SHARE
 from obsynth.plants.constants import ConstantsBox
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.uncertainty import SAMPLED, UNCERTAIN_MATRICES, Uncertainty, as_written, matrices_of
+from obsynth.plants.uncertainty import (
+    SAMPLED,
+    UNCERTAIN_MATRICES,
+    Uncertainty,
+    as_written,
+    matrices_of,
+    require_carried,
+)
 from obsynth.proofs.affine import AffineMatrix, affine_block, affine_inverse, affine_zero_order_hold
 
 #: Their coordinates are rounded to this many digits: any invertible change of coordinates is exact.
@@ -56,6 +63,7 @@ def affine_plant(plant: DescriptorSystem, box: ConstantsBox | None = None) -> Af
     if uncertain is None:
         exact = {name: AffineMatrix.exact(matrix, 0) for name, matrix in matrices_of(plant).items()}
         return AffinePlant(plant, ConstantsBox({}), exact, np.eye(plant.nx))
+    require_carried(uncertain)
     box = uncertain.box if box is None else box
     if not uncertain.steps:
         matrices = uncertain.affine(as_written(plant, uncertain), box)
@@ -63,7 +71,9 @@ def affine_plant(plant: DescriptorSystem, box: ConstantsBox | None = None) -> Af
         if not np.array_equal(basis, np.eye(len(basis))):
             matrices |= {name: matrices[name] @ basis for name in ("E", "A", "C")}
         return AffinePlant(plant, box, matrices, basis)
-    reduced, basis = reduced_family(plant, uncertain, box)
+    # E(p) of the next sample has other constants than A(p) of this one: inverted, both would have the same.
+    apart = box.variation == "varying" and all(kind != SAMPLED for kind, _ in uncertain.steps)
+    reduced, basis = reduced_family(plant, uncertain, box, inverted=not apart)
     for kind, size in uncertain.steps:
         if kind == SAMPLED:
             inputs = affine_block([[reduced[name] for name in _INPUTS]])
@@ -83,14 +93,20 @@ def moving_family(plant: DescriptorSystem, box: ConstantsBox, basis: FloatArray 
 
 
 def reduced_family(
-    plant: DescriptorSystem, uncertain: Uncertainty, box: ConstantsBox | None = None
+    plant: DescriptorSystem, uncertain: Uncertainty, box: ConstantsBox | None = None, *, inverted: bool = True
 ) -> tuple[dict[str, AffineMatrix], FloatArray]:
-    """Return a continuous plant over its box (or another) without algebraic states, E inverted; and its coordinates."""
+    """Return a plant over its box (or another) without algebraic states, and its coordinates.
+    ``inverted``: E is inverted at each point of the box; else only at the nominal values, and E stays a family."""
+    require_carried(uncertain)
     written = as_written(plant, uncertain)
-    matrices = uncertain.affine(written, uncertain.box if box is None else box)
-    first = _reduced(written, matrices, None)
+    box = uncertain.box if box is None else box
+    matrices, values = uncertain.affine(written, box), None
+    if not inverted:
+        values = uncertain.filled(written, {name: item.nominal for name, item in box.constants.items()})["E"]
+    first = _reduced(written, matrices, None, values)
     basis = untouched_coordinates(first)
-    return (first if np.array_equal(basis, np.eye(len(basis))) else _reduced(written, matrices, basis)), basis
+    same = np.array_equal(basis, np.eye(len(basis)))
+    return (first if same else _reduced(written, matrices, basis, values)), basis
 
 
 def moving_basis(plant: DescriptorSystem, box: ConstantsBox) -> FloatArray:
@@ -160,10 +176,12 @@ def _split(whole: AffineMatrix, like: Mapping[str, AffineMatrix], names: tuple[s
 
 
 def _reduced(
-    written: Mapping[str, FloatArray], matrices: Mapping[str, AffineMatrix], basis: FloatArray | None
-) -> dict[str, AffineMatrix]:
-    """Return the plant with its algebraic states eliminated and E inverted, in coordinates of its dynamic state.
-    ``x2 = X0 z + xi``, X0 that of the middle, z dynamic state and inputs: what constants do not touch stays so."""
+    written: Mapping[str, FloatArray], matrices: Mapping[str, AffineMatrix], basis: FloatArray | None,
+    divided_by: FloatArray | None = None,
+) -> dict[str, AffineMatrix]:  # fmt: skip
+    """Return the plant with its algebraic states eliminated, in coordinates of its dynamic state.
+    ``x2 = X0 z + xi``, X0 that of the middle, z dynamic state and inputs: what constants do not touch stays so.
+    E is inverted over the box; where ``divided_by`` is given, rows are only multiplied by the inverse of this E."""
     n, count = len(written["A"]), matrices["A"].count
     rows, dynamic, algebraic = algebraic_coordinates(DescriptorSystem(written["E"], written["A"], C=np.zeros((1, n))))
     nd = dynamic.shape[1]
@@ -183,12 +201,17 @@ def _reduced(
         top = top + a[state, inner] @ middle + a[state, inner] @ more
         seen = matrices["C"] @ algebraic
         outputs = outputs + seen @ middle + seen @ more
-    moving = affine_inverse((e @ dynamic)[state, :])
-    top = (moving @ top).after(2.0 * np.eye(nd) - v)
+    back = 2.0 * np.eye(nd) - v
+    if divided_by is None:
+        top = (affine_inverse((e @ dynamic)[state, :]) @ top).after(back)
+        ahead = AffineMatrix.exact(np.eye(nd), count)
+    else:
+        left = back @ np.linalg.inv((rows @ divided_by @ dynamic)[state])
+        top, ahead = top.after(left), (e @ (dynamic @ v))[state, :].after(left)
     like = {"A": AffineMatrix.exact(np.zeros((nd, nd)), count), **{k: matrices[k] for k in (*_INPUTS, *_DIRECT)}}
     found = _split(top, like, ("A", *_INPUTS))
     read = _split(outputs, {**like, "C": like["A"]}, ("C", *_DIRECT))
-    return {"E": AffineMatrix.exact(np.eye(nd), count), **found, **read}
+    return {"E": ahead, **found, **read}
 
 
 def _require_algebraic(rows: AffineMatrix, columns: AffineMatrix) -> None:
