@@ -238,7 +238,7 @@ print(f"L by hand =\n{L}\n\nL in one call =\n{design.gains['L']}")
 # our own gains pass it too.
 
 # %%
-by_hand = obsynth.fault_estimation_filter_from_gains(plant, T=T, N=N, L=L, W=W, gamma=claimed)
+by_hand = obsynth.design_from_gains(plant, "fault-estimation-filter", T=T, N=N, L=L, W=W, gamma=claimed)
 assert design.report.passed
 assert by_hand.report.passed
 for row in design.report.checks:

@@ -255,8 +255,8 @@ def estimate(observer, outputs):
 
 printed_gains = {"J": J, "L": L, "M": M, "N": N}
 designs = {
-    "printed gains": obsynth.pd_observer_from_gains(plant, **printed_gains),
-    "printed gains, printed G": obsynth.pd_observer_from_gains(plant, **printed_gains, adaptation_gain=G),
+    "printed gains": obsynth.design_from_gains(plant, "pd-observer", **printed_gains),
+    "printed gains, printed G": obsynth.design_from_gains(plant, "pd-observer", **printed_gains, adaptation_gain=G),
     "ours": design,
     "ours, decay 2": obsynth.pd_observer(plant, delta=0.1, decay=2.0),
 }

@@ -62,17 +62,15 @@ _NAMES = {
     "importing.model_files": "from_matlab from_modelica",
     "importing.python_objects": "from_control from_pandas from_scipy from_sympy",
     "methods.fault_figures": "FaultFigures",
-    "methods.designing": "check design",
-    "methods.fault_estimation_filter.public": "fault_estimation_filter_from_gains",
+    "methods.designing": "check design design_from_gains",
     "methods.functional_filter.detection": "detection_filter DetectionFilter",
     "methods.functions": (
         "adaptive_observer dae_adaptive_observer descriptor_kalman fault_estimation_filter functional_filter "
         "pd_observer ui_pi_observer"
     ),
-    "methods.pd_observer.public": "apply_adaptation_gain pd_delta_scan pd_observer_from_gains",
+    "methods.pd_observer.public": "apply_adaptation_gain pd_delta_scan",
     "methods.recursive.steady_filter": "steady_state_filter SteadyState",
     "methods.ui_pi_observer.checks.fault_response": "fault_response",
-    "methods.ui_pi_observer.public": "ui_pi_observer_from_gains",
     "methods.verifying": "verify",
     "observers.alarms": "Alarm Decision",
     "observers.batches": "run_batch",

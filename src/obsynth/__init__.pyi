@@ -61,9 +61,7 @@ from obsynth.importing.python_objects import from_scipy as from_scipy
 from obsynth.importing.python_objects import from_sympy as from_sympy
 from obsynth.methods.designing import check as check
 from obsynth.methods.designing import design as design
-from obsynth.methods.fault_estimation_filter.public import (
-    fault_estimation_filter_from_gains as fault_estimation_filter_from_gains,
-)
+from obsynth.methods.designing import design_from_gains as design_from_gains
 from obsynth.methods.fault_figures import FaultFigures as FaultFigures
 from obsynth.methods.functional_filter.detection import DetectionFilter as DetectionFilter
 from obsynth.methods.functional_filter.detection import detection_filter as detection_filter
@@ -76,11 +74,9 @@ from obsynth.methods.functions import pd_observer as pd_observer
 from obsynth.methods.functions import ui_pi_observer as ui_pi_observer
 from obsynth.methods.pd_observer.public import apply_adaptation_gain as apply_adaptation_gain
 from obsynth.methods.pd_observer.public import pd_delta_scan as pd_delta_scan
-from obsynth.methods.pd_observer.public import pd_observer_from_gains as pd_observer_from_gains
 from obsynth.methods.recursive.steady_filter import SteadyState as SteadyState
 from obsynth.methods.recursive.steady_filter import steady_state_filter as steady_state_filter
 from obsynth.methods.ui_pi_observer.checks.fault_response import fault_response as fault_response
-from obsynth.methods.ui_pi_observer.public import ui_pi_observer_from_gains as ui_pi_observer_from_gains
 from obsynth.methods.verifying import verify as verify
 from obsynth.observers.alarms import Alarm as Alarm
 from obsynth.observers.alarms import Decision as Decision

@@ -26,7 +26,7 @@ SPECTRUM_TOLERANCE = 2e-4
 
 
 def printed_design(**options: object) -> obsynth.ObserverDesign:
-    return obsynth.pd_observer_from_gains(PLANT, **GAINS, **options)
+    return obsynth.design_from_gains(PLANT, "pd-observer", **GAINS, **options)
 
 
 def miss(found: np.ndarray, expected: list[list[float]]) -> float:

@@ -39,8 +39,9 @@ def design() -> obsynth.ObserverDesign:
 
 @pytest.fixture(scope="module")
 def printed() -> obsynth.ObserverDesign:
-    return obsynth.ui_pi_observer_from_gains(
-        PLANT, U=array(PRINTED, "U"), D=array(PRINTED, "D"), K=array(TRUTH, "K"), F=array(TRUTH, "F"),
+    return obsynth.design_from_gains(
+        PLANT, "ui-pi-observer",
+        U=array(PRINTED, "U"), D=array(PRINTED, "D"), K=array(TRUTH, "K"), F=array(TRUTH, "F"),
         fault_model="ramp",
     )  # fmt: skip
 
@@ -89,8 +90,9 @@ class TestPrinted:
         """Two invariants of the characteristic polynomial hold for every F: sum of the poles, and its value at 1/2."""
         rng = np.random.default_rng(3)
         for size in (1.0, 1e2, 1e4):
-            found = obsynth.ui_pi_observer_from_gains(
-                PLANT, U=PRINTED["U"], D=PRINTED["D"], K=TRUTH["K"], F=size * rng.standard_normal((2, 2)),
+            found = obsynth.design_from_gains(
+                PLANT, "ui-pi-observer",
+                U=PRINTED["U"], D=PRINTED["D"], K=TRUTH["K"], F=size * rng.standard_normal((2, 2)),
                 fault_model="ramp",
             )  # fmt: skip
             a = found.observer.Az

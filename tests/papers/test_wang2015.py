@@ -71,7 +71,7 @@ TA = T @ PLANT.A
 def filter_from(plant: obsynth.DescriptorSystem, gain: np.ndarray, *, gamma: float = 1.5) -> obsynth.ObserverDesign:
     """Return the paper's filter with the gain L and the W of (47)."""
     weight = np.linalg.pinv(plant.C @ T @ plant.Bf)
-    return obsynth.fault_estimation_filter_from_gains(plant, T=T, N=N, L=gain, W=weight, gamma=gamma)
+    return obsynth.design_from_gains(plant, "fault-estimation-filter", T=T, N=N, L=gain, W=weight, gamma=gamma)
 
 
 def norm_of(plant: obsynth.DescriptorSystem, gain: np.ndarray) -> float:

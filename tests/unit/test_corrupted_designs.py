@@ -29,8 +29,8 @@ from obsynth import (
     ObserverDesign,
     SpecError,
     VerificationReport,
+    design_from_gains,
     fault_estimation_filter,
-    fault_estimation_filter_from_gains,
     verify,
 )
 from obsynth.analysis.transformations.recovery import StateRecovery
@@ -244,8 +244,8 @@ def with_unstable_gain(design: ObserverDesign) -> ObserverDesign:
     free = np.eye(design.plant.ny) - gains["Upsilon"] @ np.linalg.pinv(gains["Upsilon"])
     moved = gains["L"] - 10.0 * np.ones((len(gains["L"]), 1)) @ np.ones((1, design.plant.ny)) @ free
     gamma = design.certificate.claims.get("gamma")
-    return fault_estimation_filter_from_gains(
-        design.plant, T=gains["T"], N=gains["N"], L=moved, W=gains["W"], gamma=gamma
+    return design_from_gains(
+        design.plant, "fault-estimation-filter", T=gains["T"], N=gains["N"], L=moved, W=gains["W"], gamma=gamma
     )
 
 
@@ -760,7 +760,7 @@ class TestPrintedDigits:
 
     def rounded(self, **changes: np.ndarray) -> ObserverDesign:
         gains = {letter: np.round(good("paper").gains[letter], 4) for letter in "TNLW"} | changes
-        return fault_estimation_filter_from_gains(good("paper").plant, **gains, gamma=self.GAMMA)
+        return design_from_gains(good("paper").plant, "fault-estimation-filter", **gains, gamma=self.GAMMA)
 
     def test_rounded_gains_fail_by_default_and_pass_with_their_digits(self) -> None:
         design = self.rounded()

@@ -28,8 +28,8 @@ from obsynth import (
     DescriptorSystem,
     ObserverDesign,
     SpecError,
+    design_from_gains,
     pd_observer,
-    pd_observer_from_gains,
     verify,
 )
 from obsynth.methods.pd_observer.checks.certificate import prove_gain
@@ -162,7 +162,7 @@ def sampled(design: ObserverDesign) -> ObserverDesign:
 def with_gains(design: ObserverDesign, **changes: np.ndarray) -> ObserverDesign:
     """Gains that are consistent in themselves, with the certificate and claims of the good design."""
     letters = {name: design.gains[name] for name in "JLMN"} | changes
-    other = pd_observer_from_gains(design.plant, **letters, adaptation_gain=design.gains.get("G"))
+    other = design_from_gains(design.plant, "pd-observer", **letters, adaptation_gain=design.gains.get("G"))
     return other.replace(certificate=design.certificate)
 
 

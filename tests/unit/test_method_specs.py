@@ -63,3 +63,13 @@ def test_unknown_options_are_listed() -> None:
     plant = obsynth.DescriptorSystem(None, [[-1.0]], C=[[1.0]], Bf=[[1.0]])
     with pytest.raises(SpecError, match="pd-observer has no option 'gama'; there are: adaptation_gain"):
         obsynth.design(plant, "pd-observer", gama=1.0)
+
+
+def test_gains_of_another_method_are_named() -> None:
+    plant = obsynth.DescriptorSystem(None, [[-1.0]], C=[[1.0]], Bf=[[1.0]])
+    with pytest.raises(
+        SpecError, match=r"pd-observer is given by J, L, M, N \(and adaptation_gain, decay\), not by J, K"
+    ):
+        obsynth.design_from_gains(plant, "pd-observer", J=[[1.0]], K=[[1.0]])
+    with pytest.raises(SpecError, match="no gains: design it instead"):
+        obsynth.design_from_gains(plant, "functional-filter", T=[[1.0]])

@@ -42,8 +42,8 @@ def printed(wang) -> obsynth.ObserverDesign:
     # The printed digits leave 6e-5, where our own gain is exact: the part that may be chosen is taken from the paper.
     free = np.eye(3) - gains["Upsilon"] @ np.linalg.pinv(gains["Upsilon"])
     mended = gains["L"] + (gain - gains["L"]) @ free
-    return obsynth.fault_estimation_filter_from_gains(
-        wang[0].plant, T=gains["T"], N=gains["N"], L=mended, W=gains["W"], gamma=1.5
+    return obsynth.design_from_gains(
+        wang[0].plant, "fault-estimation-filter", T=gains["T"], N=gains["N"], L=mended, W=gains["W"], gamma=1.5
     )
 
 

@@ -209,8 +209,9 @@ class TestOptions:
 
     def test_the_p_part_may_be_unstable_under_theorem_2(self) -> None:
         """The audit's case: L = 0 and A_e stable, yet A - J C is not; the paper's remark says otherwise."""
-        design = obsynth.pd_observer_from_gains(
-            PLANT, J=[[1.188, 0], [0, 1.25], [-1.09, 0], [0, 1.256]], L=np.zeros((4, 2)),
+        design = obsynth.design_from_gains(
+            PLANT, "pd-observer",
+            J=[[1.188, 0], [0, 1.25], [-1.09, 0], [0, 1.256]], L=np.zeros((4, 2)),
             M=[[0.152, 0.777], [-0.002, 0]], N=np.zeros((2, 2)),
         )  # fmt: skip
         assert design.report.passed
@@ -520,7 +521,7 @@ class TestRefusals:
     def test_gains_of_the_wrong_shape(self, change: dict[str, object]) -> None:
         gains = {letter: obsynth.pd_observer(PLANT).gains[letter] for letter in "JLMN"} | change
         with pytest.raises(obsynth.SpecError, match="is needed"):
-            obsynth.pd_observer_from_gains(PLANT, **gains)
+            obsynth.design_from_gains(PLANT, "pd-observer", **gains)
 
     def test_gains_that_make_i_plus_lc_singular(self) -> None:
         """The audit's case: L(1, 1) = -1/4 with C(1, 1) = 4."""
@@ -528,11 +529,11 @@ class TestRefusals:
         singular = np.array(zero)
         singular[0, 0] = -0.25
         with pytest.raises(obsynth.SpecError, match="singular"):
-            obsynth.pd_observer_from_gains(PLANT, J=zero, L=singular, M=np.zeros((2, 2)), N=np.zeros((2, 2)))
+            obsynth.design_from_gains(PLANT, "pd-observer", J=zero, L=singular, M=np.zeros((2, 2)), N=np.zeros((2, 2)))
 
     def test_gains_that_are_not_stable_are_reported_not_refused(self) -> None:
         zero = np.zeros((4, 2))
-        design = obsynth.pd_observer_from_gains(PLANT, J=zero, L=zero, M=np.zeros((2, 2)), N=np.zeros((2, 2)))
+        design = obsynth.design_from_gains(PLANT, "pd-observer", J=zero, L=zero, M=np.zeros((2, 2)), N=np.zeros((2, 2)))
         assert {row.name for row in design.report.failures} == {"error system", "descriptor pair", "LMI"}
 
 

@@ -13,8 +13,8 @@ from obsynth import (
     DescriptorSystem,
     ObserverDesign,
     SpecError,
+    design_from_gains,
     fault_estimation_filter,
-    fault_estimation_filter_from_gains,
     verify,
 )
 from obsynth.results.checks import Check
@@ -44,7 +44,9 @@ def of_gains(seed: int, gains: dict[str, np.ndarray]) -> ObserverDesign:
     """The filter of these gains, with the detectability indexes of the plant."""
     design = designed(seed)
     gamma = design.certificate.claims.get("gamma")
-    return fault_estimation_filter_from_gains(design.plant, **gains, gamma=gamma, indexes=design.observer.fault_delays)
+    return design_from_gains(
+        design.plant, "fault-estimation-filter", **gains, gamma=gamma, indexes=design.observer.fault_delays
+    )
 
 
 def equalities(design: ObserverDesign, digits: int | None) -> list[Check]:
@@ -68,11 +70,11 @@ def test_every_equality_holds_to_the_printed_digits(seed: int, digits: int) -> N
 def test_without_the_indexes_a_rounded_t_hides_them_and_the_design_says_so(seed: int) -> None:
     design = designed(seed)
     gamma, own = design.certificate.claims.get("gamma"), design.observer.fault_delays
-    found = fault_estimation_filter_from_gains(design.plant, **rounded(seed, 4), gamma=gamma)
+    found = design_from_gains(design.plant, "fault-estimation-filter", **rounded(seed, 4), gamma=gamma)
     lost = found.observer.fault_delays != own
     assert any(f"give indexes={list(own)}" in note for note in found.notes) is lost
     exact = {letter: design.gains[letter] for letter in "TNLW"}
-    kept = fault_estimation_filter_from_gains(design.plant, **exact, gamma=gamma)
+    kept = design_from_gains(design.plant, "fault-estimation-filter", **exact, gamma=gamma)
     assert kept.observer.fault_delays == own
     assert not any("give indexes=" in note for note in kept.notes)
 
@@ -82,14 +84,14 @@ def test_indexes_are_one_whole_number_for_each_fault(indexes: object) -> None:
     plant = DescriptorSystem(None, [[0.5, 1.0], [0.0, 0.4]], C=[[1, 0]], Bf=[[0], [1]], dt=1.0)
     gains = {letter: fault_estimation_filter(plant).gains[letter] for letter in "TNLW"}
     with pytest.raises(SpecError, match="give one whole number from 1 to 2 for each of 'f1'"):
-        fault_estimation_filter_from_gains(plant, **gains, indexes=indexes)
+        design_from_gains(plant, "fault-estimation-filter", **gains, indexes=indexes)
 
 
 def test_an_index_at_which_nothing_shows_is_refused() -> None:
     plant = DescriptorSystem(None, [[0.5, 1.0], [0.0, 0.4]], C=[[1, 0]], Bf=[[0], [1]], dt=1.0)
     gains = {letter: fault_estimation_filter(plant).gains[letter] for letter in "TNLW"}
     with pytest.raises(SpecError, match="the fault 'f1' does not reach the outputs"):
-        fault_estimation_filter_from_gains(plant, **gains, indexes=[1])
+        design_from_gains(plant, "fault-estimation-filter", **gains, indexes=[1])
 
 
 def test_an_allowance_relative_to_the_terms_would_refuse_some_of_them() -> None:
@@ -126,7 +128,7 @@ def test_the_allowance_is_the_sum_of_the_cofactors() -> None:
     """
     plant = DescriptorSystem([[1.0]], [[0.5]], C=[[1.0]], Bf=[[1.0]], dt=1.0)
     gains = {"T": [[0.3]], "N": [[0.7]], "L": [[0.15]], "W": [[3.333]]}
-    report = verify(fault_estimation_filter_from_gains(plant, **gains), printed_digits=3)
+    report = verify(design_from_gains(plant, "fault-estimation-filter", **gains), printed_digits=3)
     weight, restricted = report["gains: W"], report["gains: T and N"]
     # Sizes of the terms: W T twice (as a term and as a product) and one; T, N twice and one.
     assert weight.value == pytest.approx(1e-4 / (2.0 * 0.9999 + 1.0), rel=1e-9)

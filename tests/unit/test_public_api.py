@@ -112,12 +112,10 @@ def test_functions_say_what_they_return_and_raise(name, item):
     "name",
     [
         "fault_estimation_filter",
-        "fault_estimation_filter_from_gains",
         "pd_observer",
-        "pd_observer_from_gains",
         "pd_delta_scan",
         "ui_pi_observer",
-        "ui_pi_observer_from_gains",
+        "design_from_gains",
         "descriptor_kalman",
         "adaptive_observer",
     ],

@@ -30,9 +30,9 @@ from obsynth.analysis.transformations.recovery import Transformation, linear_pla
 from obsynth.conditions.problem import Conditions, Values, require_data
 from obsynth.errors import SpecError
 from obsynth.methods.conic import lmi
+from obsynth.methods.designing import design_from_gains
 from obsynth.methods.pd_observer.conditions import explicit_form, pd_observer_conditions
 from obsynth.methods.pd_observer.inequalities import MARGIN
-from obsynth.methods.pd_observer.public import pd_observer_from_gains
 from obsynth.numerics.arguments import chosen, is_finite_number, shown
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.regions import LMIRegion, checked_region
@@ -221,4 +221,4 @@ def _design(
     plant: DescriptorSystem | Transformation, decay: float, gains: dict[str, FloatArray], name: str
 ) -> ObserverDesign:
     J, L, M, N = (gains[letter] for letter in "JLMN")
-    return pd_observer_from_gains(plant, J=J, L=L, M=M, N=N, decay=decay, name=name)
+    return design_from_gains(plant, "pd-observer", J=J, L=L, M=M, N=N, decay=decay, name=name)

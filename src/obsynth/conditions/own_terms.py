@@ -27,13 +27,13 @@ from obsynth.methods.fault_estimation_filter.prepared_plant import with_sensor_f
 from obsynth.methods.fault_estimation_filter.realisation import synthesis_from_gains as filter_from_gains
 from obsynth.methods.method import Synthesis
 from obsynth.methods.pd_observer.conditions import explicit_form, pd_observer_conditions
+from obsynth.methods.pd_observer.given_gains import synthesis_from_gains as pd_from_gains
 from obsynth.methods.pd_observer.limits import default_delta
 from obsynth.methods.pd_observer.method import PdObserver
-from obsynth.methods.pd_observer.synthesis import synthesis_from_gains as pd_from_gains
 from obsynth.methods.refusals import require_all_told
+from obsynth.methods.ui_pi_observer.assembly import synthesis_from_gains as ui_pi_from_gains
 from obsynth.methods.ui_pi_observer.conditions import existence
 from obsynth.methods.ui_pi_observer.method import UiPiObserver
-from obsynth.methods.ui_pi_observer.synthesis import synthesis_from_gains as ui_pi_from_gains
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.regions import LMIRegion, checked_region, disk, half_plane, sector
 from obsynth.observers.linear.derived import averaged

@@ -30,6 +30,7 @@ from obsynth.conditions import atoms
 from obsynth.conditions.problem import Conditions, Values, require_data
 from obsynth.errors import SpecError
 from obsynth.methods.conic import lmi
+from obsynth.methods.designing import design_from_gains
 from obsynth.methods.placement.eigenstructure import checked_poles, place
 from obsynth.methods.riccati import lyapunov_factor
 from obsynth.methods.ui_pi_observer.augmented_plant import (
@@ -44,7 +45,6 @@ from obsynth.methods.ui_pi_observer.augmented_plant import (
 )
 from obsynth.methods.ui_pi_observer.conditions import existence
 from obsynth.methods.ui_pi_observer.placement_problem import with_faults
-from obsynth.methods.ui_pi_observer.public import ui_pi_observer_from_gains
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.numerics.regions import LMIRegion, checked_region, disk, half_plane
 from obsynth.plants.descriptor import DescriptorSystem
@@ -207,4 +207,4 @@ def _design(
     plant: DescriptorSystem | Transformation, fault_model: Any, gains: dict[str, FloatArray], name: str
 ) -> ObserverDesign:
     U, D, K, F = (gains[letter] for letter in "UDKF")
-    return ui_pi_observer_from_gains(plant, U=U, D=D, K=K, F=F, fault_model=fault_model, name=name)
+    return design_from_gains(plant, "ui-pi-observer", U=U, D=D, K=K, F=F, fault_model=fault_model, name=name)

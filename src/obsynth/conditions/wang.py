@@ -25,6 +25,7 @@ from obsynth.conditions.atoms import MARGIN
 from obsynth.conditions.problem import Conditions, Values, require_data
 from obsynth.errors import SpecError
 from obsynth.methods.conic import lmi
+from obsynth.methods.designing import design_from_gains
 from obsynth.methods.fault_estimation_filter.conditions import examine_fault_filter
 from obsynth.methods.fault_estimation_filter.detectability_indexes import exact_indexes, fault_detectability
 from obsynth.methods.fault_estimation_filter.gamma_lower_bound import proved_lower_bound
@@ -36,7 +37,6 @@ from obsynth.methods.fault_estimation_filter.prepared_plant import (
     restricted_equivalent_from,
     with_sensor_faults_as_states,
 )
-from obsynth.methods.fault_estimation_filter.public import fault_estimation_filter_from_gains
 from obsynth.numerics.arguments import is_finite_number, shown
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.numerics.norms import hinf_norm
@@ -238,13 +238,13 @@ def _design(
     """Return the design of gains, claiming as little above its true norm as can be proved."""
     given: dict[str, Any] = {letter: gains[letter] for letter in "TNLW"}
     if not convex.disturbances:
-        return fault_estimation_filter_from_gains(plant, **given, name=name)
+        return design_from_gains(plant, "fault-estimation-filter", **given, name=name)
     norm = error_norm(linear_plant(plant).dense(), gains)
     if not np.isfinite(norm):
-        return fault_estimation_filter_from_gains(plant, **given, gamma=1.0, name=name)
+        return design_from_gains(plant, "fault-estimation-filter", **given, gamma=1.0, name=name)
     size = max(norm, float(np.finfo(np.float64).eps) * convex.disturbance_size, float(np.finfo(np.float64).tiny))
     for room in ROOMS:
-        found = fault_estimation_filter_from_gains(plant, **given, gamma=(1.0 + room) * size, name=name)
+        found = design_from_gains(plant, "fault-estimation-filter", **given, gamma=(1.0 + room) * size, name=name)
         if found.report.passed:
             break
     return found

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from inspect import signature
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ import numpy as np
 from obsynth.analysis.conditions import Condition
 from obsynth.analysis.transformations.elimination import MANY_VARIABLES, eliminate_algebraic_states
 from obsynth.analysis.transformations.recovery import StateRecovery, Transformation, plant_and_recovery
-from obsynth.errors import PreconditionError, SolverError, VerificationError
+from obsynth.errors import PreconditionError, SolverError, SpecError, VerificationError
 from obsynth.extensions import extension
 from obsynth.methods.automatic import automatic_design
 from obsynth.methods.method import Method, Synthesis
@@ -263,12 +264,68 @@ def failed_rows(report: VerificationReport) -> str:
     return "; ".join(f"{row.name} ({row.value:.3g} against {row.bound:.3g})" for row in report.failures)
 
 
-def design_of_given_gains(
-    plant: Plant | Transformation, method: str, synthesis: Callable[[Any], Synthesis], *, name: str
+def design_from_gains(
+    plant: Plant | Transformation, method: str, *, name: str = "design from gains", **gains: Any
 ) -> ObserverDesign:
-    """Return the design that ``synthesis(plant)`` makes of given gains, with its report, whatever that says."""
+    """Put gains from a paper or another program into a design, with its report; nothing is refused.
+
+    Parameters
+    ----------
+    plant : DescriptorSystem or Transformation
+        As for the method's own function.
+    method : str
+        Method id.
+    name : str, optional
+        Name of the design.
+    **gains
+        In the letters of the method's paper.
+
+        ``fault-estimation-filter``: ``T (nx, nx)``, ``N (nx, ny)``, ``L (nx, ny)``, ``W (nf, ny)`` of [Wang2015];
+        ``gamma`` (dimensionless), the claimed bound on the l2 gain, needed when the plant has disturbances;
+        ``indexes``, the detectability index of each fault (19): samples by which its estimate lags.  They are found
+        from T by default, which needs all of its digits: where an index is above one, ``C T f_i`` must vanish, and with
+        a rounded T it does not.
+
+        ``pd-observer``: ``J, L (nx, ny)`` and ``M, N (nf, ny)`` of [Filasova], nx after elimination of algebraic
+        states; ``adaptation_gain``, G ``(nf, nf)`` of (25), inside the loop; ``decay`` (1/seconds), the claimed rate.
+
+        ``ui-pi-observer``: ``U (nx, nx)``, ``D (nx, ny)``, ``K (nx, ny)`` of (11), (12) and ``F (nw, ny)`` of (23) in
+        [SharePasand]; ``fault_model`` as for `ui_pi_observer`.
+
+    Returns
+    -------
+    ObserverDesign
+        Its certificate is computed from the gains.  Its report may hold failed checks: look at ``report.passed``, or
+        call `obsynth.verify` with the number of printed digits.
+
+    Raises
+    ------
+    SpecError
+        A gain is missing, unknown or of the wrong shape, or the method reads none.
+    PreconditionError
+        No such observer exists for this plant.
+
+    References
+    ----------
+    .. [Wang2015] Fault estimation filter design for discrete-time descriptor systems, eq. (23).
+    .. [Filasova] Application of descriptor approaches in design of PD observer-based actuator fault estimation,
+       eqs. (4)-(6), (25).
+    .. [SharePasand] Unknown Input-Proportional Integral Observer for Singular Systems, eqs. (4), (19)-(23).
+    """
     own, recovery = plant_and_recovery(plant)
-    draft = draft_of(own, method, synthesis(own), name=name, recovery=recovery)
+    known = method_class(method)
+    for condition in kind_conditions(own, known):
+        condition.require()
+    try:
+        signature(known.from_gains).bind(own, **gains)
+    except TypeError:
+        wanted = [part for part in signature(known.from_gains).parameters.values() if part.kind is part.KEYWORD_ONLY]
+        needed = ", ".join(part.name for part in wanted if part.default is part.empty)
+        others = ", ".join(part.name for part in wanted if part.default is not part.empty)
+        wants = f"{needed or 'no gains: design it instead'}{f' (and {others})' if others else ''}"
+        message = f"{method} is given by {wants}, not by {', '.join(gains) or 'nothing'}."
+        raise SpecError(message, path="gains") from None
+    draft = draft_of(own, method, known.from_gains(own, **gains), name=name, recovery=recovery)
     return draft.replace(report=verify(draft))
 
 

@@ -133,6 +133,11 @@ class Method(ABC):
         return found
 
     @classmethod
+    def from_gains(cls, plant: Any) -> Synthesis:
+        """Return realisation and certificate of gains that are given by name, in the letters of the paper."""
+        raise SpecError(f"Gains of {cls.id} are not read: design it instead.", path="method")
+
+    @classmethod
     @abstractmethod
     def checks(cls, design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
         """Yield a row for each claim, from the plant and the shipped realisation alone."""

@@ -9,8 +9,9 @@ from typing import Annotated, Any, ClassVar, Literal
 from annotated_types import Ge
 
 from obsynth.analysis.conditions import Condition
+from obsynth.errors import SpecError
 from obsynth.methods.fault_estimation_filter.least_gain_proof import WITNESSES
-from obsynth.methods.method import ClaimMeaning, Method, PlantKind, Purpose
+from obsynth.methods.method import ClaimMeaning, Method, PlantKind, Purpose, Synthesis
 from obsynth.methods.own_terms import (
     OwnConstraints,
     OwnRegion,
@@ -195,6 +196,19 @@ class FaultEstimationFilter(Method):
 
         with decided(exactly=exactly):
             return fault_filter_conditions(plant)
+
+    @classmethod
+    def from_gains(  # type: ignore[override]
+        cls, plant: DescriptorSystem, *, T: Any, N: Any, L: Any, W: Any, gamma: float | None = None, indexes: Any = None
+    ) -> Synthesis:
+        """Return realisation and certificate of the gains of eq. (23); see `obsynth.design_from_gains`."""
+        from obsynth.methods.fault_estimation_filter.realisation import synthesis_from_gains
+
+        if plant.nd and gamma is None:
+            raise SpecError(
+                "gamma is needed: the plant has disturbances, and a gain set claims a bound on them.", path="gamma"
+            )
+        return synthesis_from_gains(plant, T=T, N=N, L=L, W=W, gamma=gamma, indexes=indexes)
 
     @classmethod
     def checks(cls, design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:

@@ -139,7 +139,7 @@ def notes(
 def synthesis_from_gains(
     plant: DescriptorSystem, *, T: Any, N: Any, L: Any, W: Any, gamma: float | None, indexes: Sequence[int] | None
 ) -> Synthesis:
-    """Return the realisation and certificate of given gains; see `obsynth.fault_estimation_filter_from_gains`."""
+    """Return the realisation and certificate of given gains; see `obsynth.design_from_gains`."""
     require_all(fault_filter_conditions(plant))
     work = with_sensor_faults_as_states(plant)
     gains = {name: as_matrix(value, name) for name, value in (("T", T), ("N", N), ("L", L), ("W", W))}

@@ -10,11 +10,10 @@ import numpy as np
 
 from obsynth.analysis.conditions import Condition
 from obsynth.errors import SpecError
-from obsynth.methods.method import ClaimMeaning, Method, PlantKind, Purpose
+from obsynth.methods.method import ClaimMeaning, Method, PlantKind, Purpose, Synthesis
 from obsynth.methods.own_terms import OwnConstraints, OwnRegion, SolverName, SolverOptions, own_term_conflicts
 from obsynth.numerics.arguments import NonNegative, Positive, WrittenAs, shown
 from obsynth.numerics.arrays import FloatArray, as_matrix
-from obsynth.numerics.ranks import decide_rank
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.checks import Check
 from obsynth.results.design import ObserverDesign
@@ -223,6 +222,8 @@ class PdObserver(Method):
 
     def gain_matrix(self, nf: int) -> FloatArray | None:
         """Return G ``(nf, nf)``, nonsingular; ``None`` when none is asked for."""
+        from obsynth.methods.pd_observer.given_gains import checked_adaptation_gain
+
         return None if self.adaptation_gain is None else checked_adaptation_gain(self.adaptation_gain, nf)
 
     def existence(self, plant: DescriptorSystem, *, exactly: bool = True) -> tuple[Condition, ...]:
@@ -232,6 +233,16 @@ class PdObserver(Method):
 
         with decided(exactly=exactly):
             return pd_observer_conditions(plant)
+
+    @classmethod
+    def from_gains(  # type: ignore[override]
+        cls, plant: DescriptorSystem, *, J: Any, L: Any, M: Any, N: Any, adaptation_gain: Any = None, decay: float = 0.0
+    ) -> Synthesis:
+        """Return realisation and certificate of the gains of eqs. (4), (6); see `obsynth.design_from_gains`."""
+        from obsynth.methods.pd_observer.given_gains import synthesis_from_gains
+
+        gains = {"J": J, "L": L, "M": M, "N": N}
+        return synthesis_from_gains(plant, gains=gains, adaptation_gain=adaptation_gain, decay=decay)
 
     @classmethod
     def checks(cls, design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
@@ -259,17 +270,3 @@ def _numbers(value: Any, count: int | None) -> tuple[float, ...] | None:
         return None
     fits = row.shape[0] == 1 and row.size > 0 and (count is None or row.size == count)
     return tuple(map(float, row[0])) if fits else None
-
-
-def checked_adaptation_gain(value: Any, nf: int) -> FloatArray:
-    """Return G as a matrix ``(nf, nf)``; raise `SpecError` when it has another shape or is singular."""
-    matrix = as_matrix(value, "adaptation_gain")
-    if matrix.shape == (1, 1) and nf != 1:
-        matrix = float(matrix[0, 0]) * np.eye(nf)
-    if matrix.shape != (nf, nf) or not decide_rank(matrix, expected=nf).full:
-        raise SpecError(
-            f"adaptation_gain is {matrix.shape[0]} by {matrix.shape[1]}: give a nonsingular matrix {nf} by {nf}, or "
-            "one number.",
-            path="method.options.adaptation_gain",
-        )
-    return matrix

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -10,62 +9,10 @@ from numpy.typing import ArrayLike
 
 from obsynth.analysis.transformations.recovery import Transformation, linear_plant
 from obsynth.errors import SpecError, VerificationError
-from obsynth.methods.designing import design_of_given_gains, failed_rows
+from obsynth.methods.designing import design_from_gains, failed_rows
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.delta_scan import DeltaScan
 from obsynth.results.design import ObserverDesign
-
-
-def pd_observer_from_gains(
-    plant: DescriptorSystem | Transformation,
-    *,
-    J: ArrayLike,
-    L: ArrayLike,
-    M: ArrayLike,
-    N: ArrayLike,
-    adaptation_gain: ArrayLike | None = None,
-    decay: float = 0.0,
-    name: str = "design from gains",
-) -> ObserverDesign:
-    """Put gains from a paper or another program into a design, with its report; nothing is refused.
-
-    Parameters
-    ----------
-    plant : DescriptorSystem or Transformation
-        As for `pd_observer`.
-    J, L, M, N : array_like
-        ``(nx, ny)``, ``(nx, ny)``, ``(nf, ny)``, ``(nf, ny)`` of eqs. (4), (6); nx after elimination of algebraic
-        states.
-    adaptation_gain : array_like, optional, dimensionless
-        G ``(nf, nf)`` of eq. (25), inside the loop.
-    decay : float, optional, 1/seconds
-        Claimed rate.
-    name : str, optional
-        Name of the design.
-
-    Returns
-    -------
-    ObserverDesign
-        Its certificate is computed from the gains.  Its report may hold failed checks: look at ``report.passed``.
-
-    Raises
-    ------
-    SpecError
-        A gain has the wrong shape, G is singular, or ``I + L C`` is.
-    PreconditionError
-        No such observer exists for this plant.
-
-    References
-    ----------
-    .. [Filasova] Application of descriptor approaches in design of PD observer-based actuator fault estimation,
-       eqs. (4)-(6), (25).
-    """
-    from obsynth.methods.pd_observer.synthesis import synthesis_from_gains
-
-    synthesis = partial(
-        synthesis_from_gains, gains={"J": J, "L": L, "M": M, "N": N}, adaptation_gain=adaptation_gain, decay=decay
-    )
-    return design_of_given_gains(plant, "pd-observer", synthesis, name=name)
 
 
 def apply_adaptation_gain(design: ObserverDesign, adaptation_gain: ArrayLike) -> ObserverDesign:
@@ -100,10 +47,10 @@ def apply_adaptation_gain(design: ObserverDesign, adaptation_gain: ArrayLike) ->
     if design.method != "pd-observer":
         raise SpecError(f"A design of method {design.method!r} has no adaptation gain.", path="design")
     gains = design.gains
-    changed = pd_observer_from_gains(
-        design.linear[0], J=gains["J"], L=gains["L"], M=gains["M"], N=gains["N"], adaptation_gain=adaptation_gain,
-        name=design.name,
-    )  # fmt: skip
+    letters = {name: gains[name] for name in "JLMN"}
+    changed = design_from_gains(
+        design.linear[0], design.method, name=design.name, adaptation_gain=adaptation_gain, **letters
+    )
     if not changed.report.passed:
         raise VerificationError(
             f"With this adaptation gain the observer fails: {failed_rows(changed.report)}. Give it to pd_observer as "

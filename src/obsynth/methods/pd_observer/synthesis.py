@@ -6,7 +6,7 @@ what is minimised, ``||[Y Z]||_F + ||P3||_F`` with ``P3 + P3' >= 2 I``, keeps so
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -14,25 +14,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.analysis.conditions import require_all
-from obsynth.errors import InfeasibleError, SolverError, SpecError
+from obsynth.errors import InfeasibleError, SolverError
 from obsynth.extensions import extension
 from obsynth.methods.conic.lmi import chosen_solver
 from obsynth.methods.method import Synthesis
 from obsynth.methods.own_terms import own_terms
-from obsynth.methods.pd_observer.certificate import explicit_certificate
 from obsynth.methods.pd_observer.conditions import explicit_form, pd_observer_conditions
 from obsynth.methods.pd_observer.gain_search import design_gains, gains_for
 from obsynth.methods.pd_observer.gains import PdGains
-from obsynth.methods.pd_observer.method import PdObserver, checked_adaptation_gain
+from obsynth.methods.pd_observer.method import PdObserver
 from obsynth.methods.pd_observer.realisation import (
     PdErrorSystem,
-    realise_pd_observer,
     with_faults_as_states,
     with_sensor_noise,
 )
-from obsynth.numerics.arrays import FloatArray, as_matrix
+from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import spectral_abscissa
-from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.delta_scan import DeltaScan
 from obsynth.results.design import Certificate
@@ -179,43 +176,3 @@ def _noise_notes(plant: DescriptorSystem, gains: PdGains) -> list[str]:
         for name, row in zip(plant.fault_names, direct, strict=True)
         if np.linalg.norm(row) > WARN_AMPLIFICATION
     ]
-
-
-def synthesis_from_gains(
-    plant: DescriptorSystem, *, gains: Mapping[str, Any], adaptation_gain: Any, decay: float
-) -> Synthesis:
-    """Return the realisation and certificate of given gains; see `obsynth.pd_observer_from_gains`."""
-    require_all(pd_observer_conditions(plant))
-    form = explicit_form(plant)
-    work = plant if form is None else form.plant
-    matrices = {name: as_matrix(value, name) for name, value in gains.items()}
-    for name, rows in (("J", work.nx), ("L", work.nx), ("M", work.nf), ("N", work.nf)):
-        if matrices[name].shape != (rows, work.ny):
-            raise SpecError(f"{name} is {matrices[name].shape}, but {(rows, work.ny)} is needed.", path=name)
-    if not (np.isfinite(decay) and decay >= 0.0):
-        raise SpecError(f"decay is {decay}: give 0 or a positive number in 1/seconds.", path="decay")
-    g = None if adaptation_gain is None else checked_adaptation_gain(adaptation_gain, work.nf)
-    inner = np.eye(work.nf) if g is None else g
-    pairs = (("J", "M"), ("L", "N"))
-    gain_j, gain_l = (np.vstack([matrices[top], inner @ matrices[bottom]]) for top, bottom in pairs)
-    observer = _realised(work, gain_j, gain_l)
-    found = explicit_certificate(observer.Az, observer.Cz[: observer.order], decay=decay)
-    if found is None:  # not stable, or too slow: the report will say so
-        found = np.eye(observer.order), np.eye(observer.order), 1.0
-    return Synthesis(
-        {"from_gains": True, "decay": decay},
-        matrices if g is None else {**matrices, "G": g},
-        observer,
-        Certificate({"P1": found[0], "P3": found[1]}, {"theorem": 1.0, "delta": found[2], "decay": float(decay)}),
-        {"runs": []},
-        transformation=form,
-    )
-
-
-def _realised(plant: DescriptorSystem, gain_j: FloatArray, gain_l: FloatArray) -> LinearObserver:
-    augmented = with_faults_as_states(plant)
-    if not np.linalg.cond(np.eye(augmented.nx) + gain_l @ augmented.C) < 1.0 / np.finfo(np.float64).eps:
-        raise SpecError(
-            "I + L C is singular with these gains: the observer's equations do not determine its estimates.", path="L"
-        )
-    return realise_pd_observer(plant, augmented, gain_j, gain_l)

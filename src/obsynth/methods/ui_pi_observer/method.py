@@ -10,7 +10,7 @@ import numpy as np
 
 from obsynth.analysis.conditions import Condition
 from obsynth.errors import SpecError
-from obsynth.methods.method import ClaimMeaning, Method, PlantKind, Purpose
+from obsynth.methods.method import ClaimMeaning, Method, PlantKind, Purpose, Synthesis
 from obsynth.methods.own_terms import OwnConstraints, SolverName, SolverOptions, own_term_conflicts
 from obsynth.numerics.arguments import NonNegative, Positive, WrittenAs, problem_with, shown
 from obsynth.numerics.spectra import decay_rates
@@ -245,6 +245,15 @@ class UiPiObserver(Method):
 
         with decided(exactly=exactly):
             return existence(plant, exosystem(self.fault_model, plant.fault_names, plant.dt)).conditions
+
+    @classmethod
+    def from_gains(  # type: ignore[override]
+        cls, plant: DescriptorSystem, *, U: Any, D: Any, K: Any, F: Any, fault_model: Any = "step"
+    ) -> Synthesis:
+        """Return realisation and certificate of the gains of eqs. (11), (12), (23); see `obsynth.design_from_gains`."""
+        from obsynth.methods.ui_pi_observer.assembly import synthesis_from_gains
+
+        return synthesis_from_gains(plant, U=U, D=D, K=K, F=F, fault_model=fault_model)
 
     @classmethod
     def checks(cls, design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
