@@ -164,7 +164,8 @@ def _scenario(plant: DescriptorSystem, given: Scenario | None, dt: float, distur
     """Return what happens: the scenario given, with at least the sensors' own noise, or each fault in turn."""
     if given is not None:
         clocked = given if plant.dt or given.sample_time == dt else given.replace(sample_time=dt)
-        return clocked.replace(observer_state=None, stabilise=False)
+        # All runs begin at rest; a state that is given may be one that the sampled plant does not have any more.
+        return clocked.replace(observer_state=None, initial_state={}, stabilise=False)
     settle = max(settling_time(plant), 4.0 * dt)
     length = SETTLING_TIMES * settle
     faults = {

@@ -118,7 +118,8 @@ def alarms(
     first = int(acts[0])
     above = np.abs(found[:, first:]) > level
     delays = np.where(above.any(axis=1), np.argmax(above, axis=1) * dt, np.inf)
-    length = len(fault) - first
+    # The response is computed as far as a step is followed, which may be less than the record.
+    length = min(len(fault) - first, len(response))
     shown = np.maximum(response[:length], 0.0)
     with np.errstate(divide="ignore", invalid="ignore"):
         needed = np.where(shown > 0.0, (level - quiet[:, first : first + length]) / shown, np.inf)

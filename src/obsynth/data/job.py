@@ -169,6 +169,7 @@ class Job:
             self.alarm_rows.setdefault(name, number)
         cells: list[Any] = []
         if self.monitor is not None:
+            deciding = deciding and (row.forgotten or not self.monitor.guarantees)
             seen = self.monitor.see(
                 time, deciding=deciding, skipped=row.skipped, residuals=row.values[self._residuals],
                 faults=row.values[self._faults], evidence=row.evidence,
@@ -202,7 +203,7 @@ class Job:
 
 
 KIND = "obsynth run state"
-SCHEMA_VERSION = 4
+SCHEMA_VERSION = 5
 STATE = FileKind("a saved state of obsynth", rb'\A\s*\{\s*"kind":\s*"obsynth run state"')
 #: Parts that are seconds, or nothing before the first row.
 _TIMES = frozenset({"last", "longest"})

@@ -51,7 +51,10 @@ class GapModel:
 
     def start(self, estimate: FloatArray, inputs: Sequence[FloatArray], fault: FloatArray) -> FloatArray:
         """Return the dynamic states now from an estimate ``(nx_source,)`` and the inputs of the samples since."""
-        state = self.into @ estimate
+        return self.forward(self.into @ estimate, inputs, fault)
+
+    def forward(self, state: FloatArray, inputs: Sequence[FloatArray], fault: FloatArray) -> FloatArray:
+        """Return the dynamic states after samples of the inputs."""
         for u in inputs:
             state = self.after(state, 0.0, u, u, fault)
         return np.asarray(state)
@@ -81,6 +84,30 @@ class GapModel:
         return float(np.linalg.norm(v[plant.nu :] - self.outputs(at, v[: plant.nu], f)))
 
 
+class PartialEstimates:
+    """States from an observer that estimates none, as filters of faults do: the smallest that explain its own state
+    ``z = T E x`` and the outputs.  ``solver (nx_source, nz + ny)``."""
+
+    def __init__(self, design: ObserverDesign) -> None:
+        from obsynth.methods.registry import error_model
+
+        self.plant, _ = design.linear
+        errors = error_model(design)
+        self._solver = np.linalg.pinv(np.vstack([errors.own[:, : self.plant.nx] @ self.plant.E, self.plant.C]))
+
+    def state(self, z: FloatArray, v: FloatArray, fault: FloatArray) -> FloatArray:
+        """Return the states ``(nx_source,)`` at a sample with inputs and outputs ``v``."""
+        nu = self.plant.nu
+        return np.asarray(self._solver @ np.concatenate([z, v[nu:] - self.plant.D @ v[:nu] - self.plant.Df @ fault]))
+
+
+def _partial_estimates(design: ObserverDesign) -> PartialEstimates | None:
+    try:
+        return PartialEstimates(design)
+    except SpecError:
+        return None
+
+
 def _running(part: _Part | None) -> _Part:
     """Return a part that is there while the observer runs."""
     if part is None:
@@ -103,7 +130,10 @@ class DataObserver(Engine):
         self.point, self.scales = self.plant.operating_point, self.plant.scales
         self.columns = self.observer.row_names
         lags = set(self.observer.state_delays) or {0}
-        self.gap_model = None if len(lags) > 1 else GapModel.of(self.plant)
+        states = len(self.observer.state_names) == self.plant.nx
+        self.partial = None if states else _partial_estimates(design)
+        known = states or self.partial is not None
+        self.gap_model = None if len(lags) > 1 or not known else GapModel.of(self.plant)
         self.nu = len(self.input_names)
         self.b = np.hstack([self.observer.Bu, self.observer.By])
         self.d = np.hstack([self.observer.Du, self.observer.Dy])
@@ -112,6 +142,11 @@ class DataObserver(Engine):
         self.v = np.zeros(self.b.shape[1])
         self.row = np.full(len(self.observer.Cz), np.nan)
         self.model: FloatArray | None = None
+        # What is known of the plant's states at the last measured row, from which the model starts.
+        self.seen = np.full(self.plant.nx, np.nan)
+        # Since when nothing is left of a gap: bounds that are never passed hold from there on.
+        self.forgotten_at, self.begun = -math.inf, False
+        self.transient = transient(self.observer)
         self.fault = np.zeros(len(self.fault_names))
         self.measured = self.v
         self.inputs: deque[FloatArray] = deque(maxlen=max(lags) + 1)
@@ -131,12 +166,16 @@ class DataObserver(Engine):
                 self._restart()
             if good and self.z is None:
                 self.z, self.settled_at, self.phase = np.zeros(self.observer.order), time + self.warm_up, WARM_UP
+                if self.begun:
+                    self.forgotten_at = time + max(self.warm_up, self.transient)
+                self.begun = True
                 self.inputs.clear()
                 seconds = 0.0
             if good:
                 found = self._measured(seconds, values)
                 if self.model is not None:
                     self.model, self.settled_at, self.phase = None, time + self.warm_up, RECOVERING
+                    self.forgotten_at = time + max(self.warm_up, self.transient)
                 status = OK if time >= self.settled_at else self.phase
             else:
                 found, status = self._unmeasured(seconds, u), GAP
@@ -147,13 +186,16 @@ class DataObserver(Engine):
             return Row(GAP, self._held(), missing)
         self.fault = found[self.observer.fault_rows].copy()
         sample = LinearSample(found, values[: self.nu], values[self.nu :])
-        return Row(status, found, missing, sample)
+        return Row(status, found, missing, sample, time >= self.forgotten_at)
 
     def _measured(self, seconds: float, v: FloatArray) -> FloatArray:
         if self.observer.dt == 0.0:
             self._flow(seconds, v)
-        self.row = np.asarray(self.observer.Cz @ _running(self.z) + self.d @ v)
+        z = _running(self.z)
+        self.row = np.asarray(self.observer.Cz @ z + self.d @ v)
         self.measured = v
+        faults = self.row[self.observer.fault_rows]
+        self.seen = self.row[self.observer.state_rows] if self.partial is None else self.partial.state(z, v, faults)
         self._taken(v)
         return self.row
 
@@ -200,7 +242,7 @@ class DataObserver(Engine):
             return self._held()
         if self.model is None:
             known = list(self.inputs) if self.observer.dt > 0.0 else []
-            self.model = self.gap_model.start(self.row[self.observer.state_rows], known, self.fault)
+            self.model = self.gap_model.start(self.seen, known, self.fault)
             if self.observer.dt == 0.0:
                 self._propagate(seconds, u)
         else:
@@ -236,11 +278,13 @@ class DataObserver(Engine):
         return {
             "z": self.z, "v": self.v, "row": self.row, "model": self.model, "fault": self.fault,
             "inputs": np.array(list(self.inputs)).reshape(len(self.inputs), self.nu), "measured": self.measured,
+            "seen": self.seen, "forgotten_at": self.forgotten_at, "begun": self.begun,
         }  # fmt: skip
 
     def _resume_own(self, data: dict[str, Any]) -> None:
         self.z, self.v, self.row, self.model = data["z"], data["v"], data["row"], data["model"]
         self.fault, self.measured = data["fault"], data["measured"]
+        self.seen, self.forgotten_at, self.begun = data["seen"], data["forgotten_at"], data["begun"]
         self.inputs.clear()
         self.inputs.extend(data["inputs"])
 

@@ -35,6 +35,7 @@ class Row(NamedTuple):
     values: FloatArray  # one for each column of the engine; deviations, NaN where nothing is known
     skipped: int = 0  # how many rows were missing before this one
     evidence: Evidence | LinearSample | None = None  # what was learnt from this row, for decisions
+    forgotten: bool = True  # whether nothing is left of gaps: bounds that are never passed hold
 
 
 class Entry(NamedTuple):

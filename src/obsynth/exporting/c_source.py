@@ -41,6 +41,18 @@ def comment(text: str) -> str:
     return f"/* {text} */"
 
 
+#: What stands around declarations so that C++ calls functions by their names in C.
+_OPENED = '\n\n#ifdef __cplusplus\nextern "C" {\n#endif\n'
+_CLOSED = "#ifdef __cplusplus\n}\n#endif\n\n"
+
+
+def with_c_linkage(header: str, prefix: str) -> str:
+    """Return a header, guard and all, that C++ may include too."""
+    head, body = header.split(f"#define {prefix.upper()}_H\n", 1)
+    declared, end = body.rsplit("#endif", 1)
+    return f"{head}#define {prefix.upper()}_H{_OPENED}{declared}{_CLOSED}#endif{end}"
+
+
 _NUMBERS_PER_LINE = 4
 #: Matrices with fewer entries are multiplied row by row: nothing is gained by more.
 LARGE_TABLE = 1024

@@ -14,7 +14,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.experiments.monitors.adaptive_bound import THRESHOLD_ROUNDING, AdaptiveBound
-from obsynth.exporting.c_source import c_identifier, comment, included, quoted, table_lines
+from obsynth.exporting.c_source import c_identifier, comment, included, quoted, table_lines, with_c_linkage
 from obsynth.files.outputs import write_together
 from obsynth.observers.dae.c_code import observer_code, observer_struct
 from obsynth.plants.dae.model import DAEModel
@@ -34,7 +34,7 @@ def write_dae_c(design: ObserverDesign, target: Path, sample_time: float | None)
     require_no_sample_time(design, sample_time)
     prefix, header = c_identifier(target.stem), target.with_suffix(".h")
     source, declarations, _ = dae_c_texts(design, prefix, header.name)
-    return write_together({target: source, header: declarations})
+    return write_together({target: source, header: with_c_linkage(declarations, prefix)})
 
 
 def require_no_sample_time(design: ObserverDesign, sample_time: float | None) -> None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.exporting.c_source import c_identifier, header_text, source_text
+from obsynth.exporting.c_source import c_identifier, header_text, source_text, with_c_linkage
 from obsynth.exporting.c_templates import threshold_header, threshold_source, write_dae_c
 from obsynth.exporting.realisation import Realisation
 from obsynth.files.outputs import FileKind, write_atomically, write_together
@@ -163,4 +163,4 @@ def _write_c(found: Realisation, target: Path, bound: AdaptiveBound | None = Non
         begin, end = declared.rsplit("#endif", 1)
         declared = begin + threshold_header(bound, prefix) + "#endif" + end
         source += threshold_source(bound, prefix)
-    return write_together({target: source, header: declared})
+    return write_together({target: source, header: with_c_linkage(declared, prefix)})

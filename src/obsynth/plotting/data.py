@@ -164,7 +164,8 @@ class _Drawing:
             biases = () if self.design is None else getattr(self.design.plant, "sensor_faults", ())
             centre = 0.0
             if self.design is not None and name not in biases:
-                centre = self.design.plant.operating_point.get(name, 0.0)
+                # Nonlinear plants estimate their parameters themselves, not deviations from a point.
+                centre = getattr(self.design.plant, "operating_point", {}).get(name, 0.0)
             _limits(panel, centre, level, "threshold", THRESHOLD_STYLES[0])
         if column in run.alarms:
             row = int(table["alarm"].astype(str).str.contains(column, regex=False).to_numpy().argmax())

@@ -171,6 +171,7 @@ def norm_beyond_nominal(plan: AdaptivePlan, found: AdaptiveStep) -> float:
 class AdaptiveRule(Rule):
     """The norm of the residual against the nominal bound and what the box adds; rows and fault estimates beside it."""
 
+    GUARANTEES = True
     KEPT = ("last", "waiting")
 
     def __init__(self, plan: AdaptivePlan, later: AdaptivePlan, nominal: NormRule) -> None:

@@ -52,6 +52,8 @@ class Rule(ABC):
     KEPT: ClassVar[tuple[str, ...]] = ()
     #: Where a saved state has the options of its monitor.
     SAME: ClassVar[str] = "options"
+    #: Whether its threshold is never passed without a fault, which needs an error at the start that is as stated.
+    GUARANTEES: ClassVar[bool] = False
     #: Of an adaptive threshold: what it is made of, and cells of a row for its columns.
     plan: Any = None
     cells: tuple[float, ...] = ()
@@ -114,6 +116,11 @@ class OnlineMonitor:
     def bound(self) -> Any:
         """Bound of an adaptive threshold, for exports; `None` for other monitors."""
         return None if self._rule.plan is None else self._rule.plan.bound
+
+    @property
+    def guarantees(self) -> bool:
+        """Whether the threshold is never passed without a fault: nothing is decided while a gap is being forgotten."""
+        return self._rule.GUARANTEES
 
     @property
     def columns(self) -> tuple[str, ...]:

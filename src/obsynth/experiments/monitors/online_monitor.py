@@ -114,6 +114,7 @@ def online_monitor(
     design, adaptive = tolerances_of(design, kind, constants, initial_set, initial_error)
     estimates = watches_estimates(design) and kind in ("pointwise", "window")
     model, dt = _endless_model(design, scenario, window, sample_time, estimates=estimates)
+    _require_noise(model, noise_bound)
     bounds = _expected_bounds(design, model, disturbance_bounds, scenario)
     rule: Rule
     if kind in ("pointwise", "window", "paper"):
@@ -154,6 +155,16 @@ def _expected_bounds(
         return bounds
     stated = [name in (given or {}) for name in design.linear[0].disturbance_names]
     return np.where(np.array(stated, dtype=bool), bounds, np.inf)
+
+
+def _require_noise(model: ResidualModel, noise_bound: float | None) -> None:
+    """Refuse a bound of noise in measured data where no noise is stated: zero deviations, however many, stay zero."""
+    if noise_bound and not model.noisy:
+        raise SpecError(
+            "noise_bound says how many standard deviations the noise never exceeds, but no noise is stated that "
+            "reaches what is watched, so there is nothing to multiply: state the noise of the sensors (sensor_noise of "
+            "the plant, or Bw and Dw), or leave noise_bound out where there is none.", path="noise_bound",
+        )  # fmt: skip
 
 
 def _require_above_zero(limit: float) -> None:

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from obsynth.analysis.transformations.sampling import discretise
 from obsynth.errors import SpecError
@@ -27,6 +28,17 @@ from obsynth.simulation.profiles import Additive, Random
 from obsynth.simulation.scenario import Scenario, observer_start
 from obsynth.simulation.signals import Drive, resolve
 from obsynth.verification.error_system import ErrorModel
+
+
+def schur_form(matrix: FloatArray) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Return ``T, Q`` with ``A = Q T Q'``, T triangular (complex): its powers keep the eigenvalues, however large
+    entries of A are that cancel."""
+    if not matrix.size:
+        return matrix, matrix
+    from scipy.linalg import schur
+
+    triangular, basis = schur(matrix, output="complex")
+    return triangular, basis
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,9 +110,12 @@ class ResidualModel:
 
     def powers(self) -> list[FloatArray]:
         """Return ``A^k`` for every sample."""
-        found = [np.eye(len(self.A))]
+        triangular, basis = schur_form(self.A)
+        power = np.eye(len(self.A), dtype=triangular.dtype)
+        found = []
         while len(found) < self.steps:
-            found.append(np.asarray(found[-1] @ self.A))
+            found.append(np.asarray((basis @ power @ basis.conj().T).real))
+            power = np.triu(power @ triangular)
         return found
 
     @property

@@ -34,6 +34,7 @@ class NormRule(Rule):
     Continuous designs: ``irregular`` holds where samples are not all ``dt`` apart, but none further; ``driven``: what
     known inputs add.  ``watched``: rows of the observer that take the place of the residual."""
 
+    GUARANTEES = True
     KEPT = ("norms", "begin", "last", "regular", "added", "states", "inputs", "moved", "late")
     SAME = "limit"
 

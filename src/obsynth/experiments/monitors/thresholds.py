@@ -11,7 +11,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.experiments.monitors.between_samples import BetweenSamples
-from obsynth.experiments.monitors.residual_model import ResidualModel
+from obsynth.experiments.monitors.residual_model import ResidualModel, schur_form
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import peak_gain
 from obsynth.numerics.norms import hinf_norm
@@ -157,10 +157,11 @@ class UnlimitedHorizonBound(NamedTuple):
 
 def samples_of(transition: FloatArray, window: int) -> int:
     """Return how many samples a table needs until an error at the start has shrunk to `LEFT`; ``transition (n, n)``."""
-    power, count = transition, 1
+    # Entries that cancel drown the eigenvalues in the powers of a matrix, but not in those of its Schur form.
+    power, count = schur_form(transition)[0], 1
     while len(power) and not np.linalg.norm(power, 2) <= LEFT:
-        power, count = power @ power, 2 * count
-        if count > MOST_SAMPLES or count * power.size > MOST_NUMBERS:
+        power, count = np.triu(power @ power), 2 * count
+        if count > MOST_SAMPLES or count * power.size > MOST_NUMBERS or not np.isfinite(power).all():
             raise SpecError(
                 "The observer forgets too slowly at this sampling for a bound for ever: use a statistical monitor, or "
                 "obsynth.monitor for a record of known length.", path="monitor",

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ctypes
 import os
+import re
 import shlex
 import shutil
 import subprocess
@@ -34,6 +35,8 @@ from obsynth.plants.dae.step import step_graph
 #: What ``record.c`` hands out of a batch, in this order.
 BATCH_PARTS = ("posterior", "theta", "spread", "innovation", "nis", "residual")
 _NUMBERS_PER_LINE = 4
+#: The beginning of a helper that CasADi writes, `casadi_fmax` say, which it leaves visible to the linker.
+_HELPER = re.compile(r"^((?:const )?(?:casadi_real|casadi_int|double|int|void)\*? casadi_\w+ ?\()", re.MULTILINE)
 #: A bound that is missed by less, in deviations of its state, is kept.
 SLACK = 1e-7
 
@@ -168,7 +171,7 @@ def _generated(functions: dict[str, Any]) -> str:
         *(f'#pragma GCC diagnostic ignored "-W{name}"' for name in ("unused-parameter", "unused-function",
                                                                      "unused-const-variable")),
         "#if !defined(__clang__)", '#pragma GCC diagnostic ignored "-Wmaybe-uninitialized"', "#endif", "#endif",
-        "#define CASADI_SYMBOL_EXPORT static", generator.dump().rstrip(),
+        "#define CASADI_SYMBOL_EXPORT static", _HELPER.sub(r"static \1", generator.dump().rstrip()),
         "#if defined(__GNUC__)", "#pragma GCC diagnostic pop", "#endif",
     ])  # fmt: skip
 

@@ -1,0 +1,165 @@
+"""Logs nobody cleaned: blanks, gaps and what monitors say after them."""
+
+from __future__ import annotations
+
+import functools
+import math
+import shutil
+import subprocess
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import obsynth
+from obsynth.observers.dae.c_code import compiler
+
+METHODS = ("functional-filter", "ui-pi-observer", "fault-estimation-filter")
+DT, ROWS, BLANK = 0.1, 80, 50
+
+
+@functools.cache
+def heated() -> obsynth.DescriptorSystem:
+    """Return two states that move and an algebraic one, reduced and sampled."""
+    plant = obsynth.DescriptorSystem(
+        E=[[1, 0, 0], [0, 1, 0], [0, 0, 0]], A=[[-0.5, 0.2, 0], [0.1, -0.4, 0.1], [1, 0.5, -1]], B=[[1], [0], [0]],
+        C=["a", "b"], Bf=[[1], [0], [0]], Bd=[[0], [1], [0]], state_names=["a", "b", "c"], input_names=["u"],
+        fault_names=["f"], disturbance_names=["d"], sensor_noise={"a": 0.01, "b": 0.01},
+    )  # fmt: skip
+    return obsynth.discretise(obsynth.eliminate_algebraic_states(plant), DT).plant
+
+
+@functools.cache
+def designed(method: str) -> obsynth.ObserverDesign:
+    return obsynth.design(heated(), method)
+
+
+def log(*, fault: float = 0.0, rows: int = ROWS) -> pd.DataFrame:
+    """Return a log without noise, with a constant fault."""
+    plant, x, found = heated(), np.zeros(2), []
+    for k in range(rows):
+        u = np.array([math.sin(k / 9.0)])
+        found.append([k * DT, u[0], *(plant.C @ x)])
+        x = plant.A @ x + plant.B @ u + plant.Bf @ np.array([fault])
+    return pd.DataFrame(found, columns=["time", "u", "a", "b"])
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("blank", [["b"], ["a"], ["a", "b"], ["u"]])
+def test_blank_cells_are_predicted_over_by_every_linear_method(method: str, blank: list[str]) -> None:
+    data = log(fault=0.5)
+    whole = obsynth.run_on_data(designed(method), data).table
+    data.loc[BLANK, blank] = np.nan
+    holed = obsynth.run_on_data(designed(method), data).table
+    assert whole is not None
+    assert holed is not None
+    assert holed.status[BLANK] == "gap"
+    # The model knows inputs and fault, so that nothing is lost by a blank output: the estimate goes on as it was.
+    share = 0.02 if "u" not in blank else 0.2
+    found = np.abs(holed["fhat[f]"] - whole["fhat[f]"]).to_numpy()
+    assert found.max() <= share * 0.5
+
+
+def test_a_state_of_a_filter_without_states_goes_on_as_if_it_had_not_been_saved(tmp_path: Path) -> None:
+    data, state, design = log(fault=0.3), tmp_path / "state.json", designed("functional-filter")
+    data.loc[BLANK : BLANK + 1, "a"] = np.nan
+    whole = obsynth.run_on_data(design, data).table
+    first = obsynth.run_on_data(design, data.iloc[: BLANK + 1], state=state).table
+    second = obsynth.run_on_data(design, data.iloc[BLANK + 1 :], state=state).table
+    pd.testing.assert_frame_equal(whole, pd.concat([first, second], ignore_index=True))
+
+
+@functools.cache
+def drive() -> obsynth.ObserverDesign:
+    spec = obsynth.load_spec("designs/drive/spec.yaml")
+    return obsynth.design(spec.plant, spec.method, **dict(spec.options))
+
+
+@pytest.mark.parametrize("start", [{"initial_set": 0.2}, {"initial_error": 0.5}, {}])
+@pytest.mark.parametrize("gap", [["motor speed"], "row", "rows left out"])
+def test_nothing_is_decided_while_a_gap_is_forgotten_whatever_the_warm_up(start: dict[str, float], gap: Any) -> None:
+    design, plant = drive(), drive().plant
+    told: dict[str, Any] = dict(start)
+    if "initial_set" in told:
+        told["initial_set"] = dict.fromkeys(plant.state_names, told["initial_set"])
+    monitor = obsynth.online_monitor(design, disturbance_bounds={"load torque": 0.2}, noise_bound=3**0.5, **told)
+    rng = np.random.default_rng(1)
+    count = 110
+    x, y = 0.2 * rng.uniform(-1, 1, 3), []
+    u = np.sign(np.sin(2 * np.pi * np.arange(count) / 100))[:, None]
+    for k in range(count):
+        y.append(plant.C @ x + 0.002 * rng.uniform(-1, 1, 2))
+        x = plant.A @ x + plant.B @ u[k] + plant.Bd @ (0.2 * rng.uniform(-1, 1, 1))
+    signals = dict(zip(plant.output_names, np.array(y).T, strict=True))
+    data = pd.DataFrame({"time": np.arange(count) * plant.dt, "torque": u[:, 0], **signals})
+    if gap == "rows left out":
+        data = data.drop(index=range(60, 65))
+    else:
+        data.loc[60:64, gap if gap != "row" else list(signals)] = np.nan
+    run = obsynth.run_on_data(design, data, monitor=monitor, warm_up=0.0 if "initial_set" in start else None)
+    assert run.alarms == {}
+
+
+def test_a_bound_of_the_noise_needs_noise_that_is_stated() -> None:
+    plant = obsynth.DescriptorSystem(
+        E=np.eye(2), A=[[0.9, 0.1], [0, 0.8]], B=[[0], [1]], C=np.eye(2), Bf=[[0], [1]], Bd=[[1], [0]], dt=1.0,
+        state_names=["a", "b"], input_names=["u"], fault_names=["f"], disturbance_names=["d"],
+    )  # fmt: skip
+    design = obsynth.design(plant, "fault-estimation-filter")
+    for kind in ("pointwise", "window"):
+        with pytest.raises(obsynth.SpecError, match="sensor_noise"):
+            obsynth.online_monitor(design, kind, disturbance_bounds={"d": 0.1}, noise_bound=4.0)
+
+
+def test_powers_of_matrices_whose_entries_cancel_are_those_of_their_eigenvalues() -> None:
+    from obsynth.experiments.monitors.residual_model import schur_form
+    from obsynth.experiments.monitors.thresholds import samples_of
+
+    turned = np.array([[1.0, 1e7], [0.0, 1.0]])
+    matrix = turned @ np.diag([0.5, 0.4]) @ np.linalg.inv(turned)
+    triangular, basis = schur_form(matrix)
+    np.testing.assert_allclose((basis @ triangular @ basis.conj().T).real, matrix, atol=1e-8 * 1e7)
+    count = samples_of(matrix, 1)
+    assert 16 <= count <= 129
+
+
+@pytest.mark.parametrize("name", ["wang2015", "filasova"])
+def test_shipped_designs_are_compared(name: str) -> None:
+    spec = obsynth.load_spec(f"designs/{name}/spec.yaml")
+    scenario = replace(spec.scenario, horizon=min(spec.scenario.horizon, 120.0 if name == "wang2015" else 13.0))
+    found = obsynth.compare(spec.plant, scenario=scenario, runs=1, methods=["fault-estimation-filter"])
+    assert np.isfinite(found.methods[0].rms)
+
+
+@pytest.mark.skipif(compiler() is None, reason="no C compiler")
+def test_all_that_casadi_writes_is_static(tmp_path: Path) -> None:
+    import casadi as ca
+
+    from obsynth.observers.dae.c_code import _generated
+
+    x = ca.SX.sym("x", 2)
+    code = _generated(
+        {"project": ca.Function("project", [x], [ca.fmax(ca.fabs(x), ca.sign(x)), ca.solve(ca.diag(x), x)])}
+    )
+    (tmp_path / "one.c").write_text(code)
+    command = compiler()
+    assert command is not None
+    subprocess.run([*command, "-std=c99", "-c", "one.c"], cwd=tmp_path, check=True)
+    symbols = subprocess.run(["nm", "-g", "--defined-only", "one.o"], cwd=tmp_path, check=True, capture_output=True)
+    assert symbols.stdout.decode().strip() == ""
+
+
+@pytest.mark.skipif(shutil.which("g++") is None or compiler() is None, reason="no compiler of C++")
+def test_exported_observers_are_called_from_cplusplus(tmp_path: Path) -> None:
+    for name in ("one", "two"):
+        obsynth.export(designed("fault-estimation-filter"), tmp_path / f"{name}.c")
+    main = "int main() { one_state a; two_state b; one_reset(&a); two_reset(&b); return 0; }\n"
+    (tmp_path / "main.cpp").write_text(f'#include "one.h"\n#include "two.h"\n{main}')
+    command = compiler()
+    assert command is not None
+    subprocess.run([*command, "-std=c99", "-c", "one.c", "two.c"], cwd=tmp_path, check=True)
+    subprocess.run(["g++", "-Wall", "main.cpp", "one.o", "two.o", "-o", "main"], cwd=tmp_path, check=True)
+    subprocess.run([tmp_path / "main"], check=True)
