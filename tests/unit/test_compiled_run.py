@@ -224,3 +224,28 @@ class TestTheChoice:
             observer.run(*record(observer.plant, 7), compiled=True)
         with pytest.raises(SpecError, match="u is missing"):
             observer.run(record(observer.plant, 5)[0], compiled=True)
+
+
+@pytest.mark.parametrize("units", [1.0, 1e3])
+def test_a_factorisation_that_has_settled_is_kept_and_changes_nothing(single_steps, units: float) -> None:
+    """Records many times longer than the filter's memory, with states of different sizes, and parameters that walk."""
+    rng = np.random.default_rng(3)
+    sizes = units ** rng.uniform(-1.0, 1.0, 5)
+    A = rng.standard_normal((5, 5))
+    A *= 0.95 / np.max(np.abs(np.linalg.eigvals(A)))
+    plant = TimeVaryingDescriptorSystem(
+        None, sizes[:, None] * A / sizes, np.eye(5), rng.standard_normal((2, 5)) / sizes, dt=1.0,
+        Phi=sizes[:, None] * rng.standard_normal((5, 1)),
+    )  # fmt: skip
+    y, u = rng.standard_normal((1500, 2)), sizes * rng.standard_normal((1500, 5))
+    y[900, 1] = np.nan
+    for adapt in (None, {"form": "random-walk", "walk": 0.01 * np.eye(1)}):
+        observer = observer_for(plant, adapt=adapt)
+        single_steps.clear()
+        found = observer.run(y, u, compiled=True)
+        assert single_steps == [0, 900]
+        exact = observer.run(y, u, compiled=False)
+        for name in ("states", "state_deviations", "innovations", "faults", "fault_covariances"):
+            ours, theirs = getattr(found, name), getattr(exact, name)
+            scale = np.nanmax(np.abs(theirs), axis=0, initial=np.finfo(float).tiny)
+            np.testing.assert_allclose(ours / scale, theirs / scale, rtol=0, atol=1e-9, err_msg=name)

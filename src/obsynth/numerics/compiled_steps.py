@@ -16,6 +16,11 @@ import numpy as np
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.least_squares_step import OUTGROWN
 
+#: A factorisation that changes by no more than this, relative to each column, and so many times in a row, has settled:
+#: what it would change from then on is what rounding does at every step.
+SETTLED = 4.0 * np.finfo(np.float64).eps
+SETTLED_STEPS = 3
+
 Function = TypeVar("Function", bound=Callable[..., object])
 
 #: Types of `square_root_steps`, so that it is compiled once for all sizes.
@@ -35,16 +40,20 @@ def compiled(function: Function, signature: str | None = None) -> Function:
 
 
 @compiled
-def _fill(work: FloatArray, factor: FloatArray, moved: FloatArray, known: FloatArray) -> float:
-    """Write the transposed noise of one step; return its squared length."""
-    n, width, rows = len(moved), len(known), work.shape[1]
+def _fill(triangle: FloatArray, work: FloatArray, factor: FloatArray, moved: FloatArray, known: FloatArray) -> float:
+    """Write the noise of one step, that of the step itself as its triangle; return its squared length."""
+    n, rows = moved.shape
     total = 0.0
-    for i in range(len(work)):
+    for i in range(rows):
         for r in range(rows):
-            work[i, r] = known[i - n, r] if n <= i < n + width else 0.0
-        if i < n:
-            for c in range(n):
-                weight = factor[c, i]
+            triangle[i, r] = known[i, r]
+            total += known[i, r] * known[i, r]
+    for i in range(n):
+        for r in range(rows):
+            work[i, r] = 0.0
+        for c in range(n):
+            weight = factor[c, i]
+            if weight != 0.0:
                 for r in range(rows):
                     work[i, r] += weight * moved[c, r]
         for r in range(rows):
@@ -53,33 +62,62 @@ def _fill(work: FloatArray, factor: FloatArray, moved: FloatArray, known: FloatA
 
 
 @compiled
-def _triangularise(work: FloatArray, sums: FloatArray) -> None:
-    """Take the reflections of a QR factorisation; only the triangle is valid afterwards."""
+def _triangularise(triangle: FloatArray, work: FloatArray, sums: FloatArray) -> None:
+    """Take the reflections of a QR factorisation of a triangle above more rows; these are spoilt."""
     height, rows = work.shape
     for j in range(rows):
         squares = 0.0
-        for i in range(j + 1, height):
+        for i in range(height):
             squares += work[i, j] * work[i, j]
         if squares == 0.0:
             continue
-        head = work[j, j]
+        head = triangle[j, j]
         length = -math.copysign(math.sqrt(head * head + squares), head)
         first = head - length
         scale = -1.0 / (length * first)
         for c in range(j + 1, rows):
-            sums[c] = first * work[j, c]
-        for i in range(j + 1, height):
+            sums[c] = first * triangle[j, c]
+        for i in range(height):
             entry = work[i, j]
             for c in range(j + 1, rows):
                 sums[c] += entry * work[i, c]
         for c in range(j + 1, rows):
             sums[c] *= scale
-            work[j, c] -= first * sums[c]
-        for i in range(j + 1, height):
+            triangle[j, c] -= first * sums[c]
+        for i in range(height):
             entry = work[i, j]
             for c in range(j + 1, rows):
                 work[i, c] -= entry * sums[c]
-        work[j, j] = length
+        triangle[j, j] = length
+
+
+@compiled
+def _is_settled(
+    triangle: FloatArray, before: FloatArray, factor: FloatArray, lengths: FloatArray, share: float
+) -> bool:
+    """Whether a triangle, and the length of each row of the root of the covariance, are those before to rounding.
+
+    Rows of a triangle count up to their signs, and each column has a scale of its own.  Both are replaced.
+    """
+    rows = len(triangle)
+    settled = True
+    for i in range(len(factor)):
+        total = 0.0
+        for j in range(len(factor)):
+            total += factor[i, j] * factor[i, j]
+        settled = settled and abs(total - lengths[i]) <= share * total
+        lengths[i] = total
+    for j in range(rows):
+        size = 0.0
+        for i in range(j + 1):
+            size += triangle[i, j] * triangle[i, j]
+        size = share * math.sqrt(size)
+        for i in range(j + 1):
+            value = math.copysign(1.0, triangle[i, i]) * triangle[i, j]
+            # Also false where something is not finite.
+            settled = settled and abs(value - before[i, j]) <= size
+            before[i, j] = value
+    return settled
 
 
 @compiled
@@ -93,6 +131,19 @@ def _whiten(work: FloatArray, right: FloatArray, innovation: FloatArray) -> None
         if work[i, i] < 0.0:
             # That of a positive diagonal, whatever the reflections met.
             innovation[i] = -innovation[i]
+
+
+@compiled
+def _solve_estimate(right: FloatArray, head: FloatArray, x: FloatArray, state: FloatArray) -> None:
+    """Solve with R_H for the estimate alone."""
+    n = len(head)
+    m = len(right) - n
+    for i in range(n - 1, -1, -1):
+        value = right[m + i]
+        for c in range(i + 1, n):
+            value -= head[i, c] * x[c]
+        x[i] = value / head[i, i]
+        state[i] = x[i]
 
 
 @compiled
@@ -142,31 +193,41 @@ def _steps(
     """Take steps of the square-root recursion until one needs a decision about a rank; return how many were taken.
 
     Arrays in C order, writeable; what does not change with k has one entry along its first axis.  Shapes: ``x (n,),
-    factor (n, n), moved (., n, rows), known (., any, rows), head (., n, n), data (steps, rows), states (steps, n),
-    innovations (steps, rows - n), deviations (steps, nx), covariances (steps, n - nx, n - nx)``.
+    factor (n, n), moved (., n, rows), known (., rows, rows) upper triangular, head (., n, n), data (steps, rows),
+    states (steps, n), innovations (steps, rows - n), deviations (steps, nx), covariances (steps, n - nx, n - nx)``.
+    Where the step stays the same, so does its factorisation once it has settled: then the estimate alone goes on.
     """
     n, rows = moved.shape[1], moved.shape[2]
     m = rows - n
-    work = np.zeros((max(n + known.shape[1], rows), rows))
-    sums, right = np.zeros(rows), np.zeros(rows)
+    triangle, work, before = np.zeros((rows, rows)), np.zeros((n, rows)), np.zeros((rows, rows))
+    sums, right, lengths = np.zeros(rows), np.zeros(rows), np.zeros(n)
+    stays, settled = len(moved) == 1 and len(known) == 1 and len(head) == 1, 0
     for k in range(len(data)):
         move, noise, top = moved[k % len(moved)], known[k % len(known)], head[k % len(head)]
-        squares = _fill(work, factor, move, noise)
-        if not squares < OUTGROWN * OUTGROWN:
-            return k
-        suspect = share * math.sqrt(squares)
-        _triangularise(work, sums)
-        for i in range(m):
-            if not abs(work[i, i]) > suspect:
+        if settled < SETTLED_STEPS:
+            squares = _fill(triangle, work, factor, move, noise)
+            if not squares < OUTGROWN * OUTGROWN:
                 return k
+            suspect = share * math.sqrt(squares)
+            _triangularise(triangle, work, sums)
+            for i in range(m):
+                if not abs(triangle[i, i]) > suspect:
+                    return k
         for r in range(rows):
             right[r] = data[k, r]
         for c in range(n):
             for r in range(rows):
                 right[r] += x[c] * move[c, r]
-        _whiten(work, right, innovations[k])
-        _solve(work, right, top, x, factor, states[k])
-        _note_spreads(factor, deviations[k], covariances[k])
+        _whiten(triangle, right, innovations[k])
+        if settled < SETTLED_STEPS:
+            _solve(triangle, right, top, x, factor, states[k])
+            _note_spreads(factor, deviations[k], covariances[k])
+            if stays:
+                settled = settled + 1 if _is_settled(triangle, before, factor, lengths, SETTLED) else 0
+        else:
+            _solve_estimate(right, top, x, states[k])
+            deviations[k] = deviations[k - 1]
+            covariances[k] = covariances[k - 1]
     return len(data)
 
 

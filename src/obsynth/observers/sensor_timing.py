@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -89,7 +90,7 @@ class SensorTiming:
         return cls(np.array([entry.get("every", 1) for entry in entries], dtype=int),
                    np.array([entry.get("delay", 0) for entry in entries], dtype=int), inputs)  # fmt: skip
 
-    @property
+    @cached_property
     def is_plain(self) -> bool:
         """Whether every sensor is sampled at each row, at once."""
         return bool((self.every == 1).all()) and not self.longest

@@ -28,7 +28,7 @@ class StepStack(NamedTuple):
     """Steps as `obsynth.numerics.compiled_steps.square_root_steps` takes them."""
 
     moved: FloatArray  # ``(1 or steps, n, rows)``
-    known: FloatArray  # ``(1 or steps, any, rows)``
+    known: FloatArray  # ``(1 or steps, rows, rows)``, upper triangular
     head: FloatArray  # ``(1 or steps, n, n)``
     data: FloatArray  # ``(steps, rows)``: as many steps as have an H of full rank, from the first one
 
@@ -37,7 +37,8 @@ def stacked_matrices(model: StepModel, first: int, count: int) -> StepMatrices:
     """Return the matrices of steps, each with a new first axis: one entry if it is the same for all, or ``count``."""
     if not isinstance(model, PlantSteps):
         steps = [model.at(k) for k in range(first, first + count)]
-        return StepMatrices(*(np.array(matrices) for matrices in zip(*steps, strict=True)))
+        same = all(step is steps[0] for step in steps)
+        return StepMatrices(*(np.array(matrices[:1] if same else matrices) for matrices in zip(*steps, strict=True)))
     plant = model.plant
     H = _joined(_stack(plant.E, first + 1, count), _stack(plant.C, first + 1, count))
     last = first + (1 if model.Q.is_constant and model.R.is_constant else count)
@@ -71,6 +72,12 @@ def _products(matrices: FloatArray, rows: FloatArray) -> FloatArray:
     return np.asarray(np.matmul(matrices, rows[:, :, None])[:, :, 0])
 
 
+def _triangles(noise: FloatArray) -> FloatArray:
+    """Return the triangular factors ``(., rows, rows)`` of rotated noise ``(., any, rows)``."""
+    found, rows = np.linalg.qr(noise, mode="r"), noise.shape[2]
+    return np.pad(found, ((0, 0), (0, rows - found.shape[1]), (0, 0)))
+
+
 def stacked_steps(step: StepMatrices, before: FloatArray, y: FloatArray, u: FloatArray) -> StepStack | None:
     """Return steps with H factorised and everything rotated, up to the first H whose rank has to be decided.
     Shapes: ``before (steps, nu)``, ``y (steps, measured)``, ``u (steps, nu)``."""
@@ -86,7 +93,7 @@ def stacked_steps(step: StepMatrices, before: FloatArray, y: FloatArray, u: Floa
     # The transpose of a rotation: parity first.
     turned = np.concatenate((orthogonal[:, :, n:], orthogonal[:, :, :n]), axis=2)
     moved = np.matmul(step.A.transpose(0, 2, 1), turned[:, :ne])
-    known = np.matmul(step.noise.transpose(0, 2, 1), turned)
+    known = _triangles(np.matmul(step.noise.transpose(0, 2, 1), turned))
     right = np.concatenate((_products(step.B, before), y, _products(step.Dn, u)), axis=1)
     data = _products(turned.transpose(0, 2, 1), right)
     return StepStack(*(np.ascontiguousarray(part) for part in (moved, known, triangle[:, :n], data[:count])))

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -103,41 +104,66 @@ def recursive_estimates(
     nx, nq = observer.plant.nx, len(observer.fault_names)
     most = max((len(row.innovation) for row in rows), default=0)
     innovations, padded = np.full((len(rows), most), np.nan), np.full((len(rows), most, nq), np.nan)
-    for i, row in enumerate(rows):
-        innovations[i, : len(row.innovation)] = row.innovation
-        if len(row.regressor):
-            padded[i, : len(row.regressor)] = row.regressor
+    degrees, nis = np.zeros(len(rows)), np.zeros(len(rows))
+    for chosen, part in _alike(rows, "innovation"):
+        innovations[chosen, : part.shape[1]], degrees[chosen] = part, part.shape[1]
+    for chosen, part in _alike(rows, "regressor"):
+        padded[chosen, : part.shape[1]] = part
+    for chosen, part in _alike(rows, "gap"):
+        # A matrix product for each row, as for a single one.
+        nis[chosen] = np.matmul(part[:, None, :], part[:, :, None])[:, 0, 0]
     return named_estimates(
         observer,
         states=np.array([row.x for row in rows]).reshape(len(rows), nx),
-        state_deviations=np.array([row.state_deviations for row in rows]).reshape(len(rows), nx),
-        faults=np.array([row.theta for row in rows]).reshape(len(rows), nq),
-        fault_covariances=np.array([row.parameter_covariance for row in rows]).reshape(len(rows), nq, nq),
-        state_covariances=np.array([_state_covariance(row) for row in rows]).reshape(len(rows), nx, nx),
-        cross_covariances=np.array([_cross_covariance(row) for row in rows]).reshape(len(rows), nx, nq),
+        **_spreads(rows, nx, nq),
         innovations=innovations,
         regressors=padded,
-        nis=np.array([row.nis for row in rows]),
-        nis_degrees=np.array([float(len(row.innovation)) for row in rows]),
+        nis=nis,
+        nis_degrees=degrees,
         excitation=levels,
         received=received_in(np.array([row.y for row in rows]).reshape(len(rows), observer.plant.ny)),
     )
 
 
-def _state_covariance(row: RawEstimate) -> FloatArray:
-    """Return the covariance of the states ``(nx, nx)``, infinite variances where missing samples leave one open."""
-    found = row.factor @ row.factor.T
-    unknown = np.isinf(row.state_deviations)
-    found[unknown], found[:, unknown] = np.nan, np.nan
-    found[unknown, unknown] = np.inf
-    return np.asarray(found)
+def _alike(rows: Sequence[RawEstimate], name: str) -> Iterator[tuple[NDArray[np.intp], FloatArray]]:
+    """Yield places of rows with arrays of one shape, and these as one array."""
+    return _groups([getattr(row, name) for row in rows])
 
 
-def _cross_covariance(row: RawEstimate) -> FloatArray:
-    """Return the covariance of states and parameters ``(nx, nq)``: what their square roots have in common."""
-    spread = row.parameters.spread
-    shared = row.factor[:, row.factor.shape[1] - spread.shape[1] :]
-    return np.asarray(shared @ spread.T)
+def _groups(arrays: Sequence[FloatArray]) -> Iterator[tuple[NDArray[np.intp], FloatArray]]:
+    places = defaultdict[tuple[int, ...], list[int]](list)
+    for place, array in enumerate(arrays):
+        places[array.shape].append(place)
+    for chosen in places.values():
+        yield np.array(chosen), np.array([arrays[place] for place in chosen])
+
+
+def _spreads(rows: Sequence[RawEstimate], nx: int, nq: int) -> dict[str, FloatArray]:
+    """Return parameters, and the deviations and covariances of states and parameters, infinite where one is open."""
+    count = len(rows)
+    states, parameters, cross = (np.zeros((count, *shape)) for shape in ((nx, nx), (nq, nq), (nx, nq)))
+    deviations = np.zeros((count, nx))
+    spreads = [row.parameters.spread for row in rows]
+    for chosen, factor in _alike(rows, "factor"):
+        deviations[chosen] = np.sqrt(np.einsum("kij,kij->ki", factor, factor))
+        states[chosen] = np.matmul(factor, factor.transpose(0, 2, 1))
+        for spread_of, spread in _groups([spreads[place] for place in chosen]):
+            shared = factor[spread_of][:, :, factor.shape[2] - spread.shape[2] :]
+            parameters[chosen[spread_of]] = np.matmul(spread, spread.transpose(0, 2, 1))
+            cross[chosen[spread_of]] = np.matmul(shared, spread.transpose(0, 2, 1))
+    for place, row in enumerate(rows):
+        if row.diffuse.shape[1]:
+            unknown = (np.abs(row.diffuse) > UNDETERMINED_SHARE).any(axis=1)
+            deviations[place, unknown] = np.inf
+            states[place, unknown], states[place][:, unknown] = np.nan, np.nan
+            states[place, unknown, unknown] = np.inf
+    return {
+        "state_deviations": deviations,
+        "faults": np.array([row.theta for row in rows]).reshape(count, nq),
+        "fault_covariances": parameters,
+        "state_covariances": states,
+        "cross_covariances": cross,
+    }
 
 
 def received_in(y: FloatArray) -> NDArray[np.bool_]:
@@ -154,9 +180,13 @@ def excitation_levels(regressors: Sequence[FloatArray], window: int) -> FloatArr
     levels = np.zeros(len(regressors))
     if not nq or len(regressors) < window:
         return levels
-    squares = np.array([regressor.T @ regressor for regressor in regressors])
+    squares = np.empty((len(regressors), nq, nq))
+    for chosen, part in _groups(regressors):
+        squares[chosen] = np.matmul(part.transpose(0, 2, 1), part)
     # Each window is summed anew: differences of cumulated sums would leave rounding of early, strong excitation.
-    for start in range(len(regressors) - window + 1):
-        total = squares[start : start + window].sum(axis=0)
-        levels[start + window - 1] = float(np.linalg.eigvalsh(total)[0])
+    count = len(regressors) - window + 1
+    totals = squares[:count].copy()
+    for later in range(1, window):
+        totals += squares[later : later + count]
+    levels[window - 1 :] = np.linalg.eigvalsh(totals)[:, 0]
     return np.maximum(levels, 0.0)

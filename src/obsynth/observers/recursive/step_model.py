@@ -205,9 +205,15 @@ class RandomWalkParameterSteps(StepModel):
     model: StepModel  # with parameters
     walk: FloatArray  # ``(nq, nq)``: square root of the covariance of one step of the walk
 
+    def __post_init__(self) -> None:
+        self._last: tuple[StepMatrices, StepMatrices] | None = None
+
     def at(self, k: int) -> StepMatrices:
-        """Return the matrices of the step from k to k + 1."""
-        return with_walking_parameters(self.model.at(k), self.walk)
+        """Return the matrices of the step from k to k + 1; the same object for the same step of the model."""
+        step, last = self.model.at(k), self._last
+        if last is None or last[0] is not step:
+            self._last = last = (step, with_walking_parameters(step, self.walk))
+        return last[1]
 
 
 @dataclass
