@@ -22,6 +22,8 @@ from obsynth.proofs.products import exponential
 
 #: Most steps that are summed up one by one, and the share of the sum that the rest may then have.
 MOST_STEPS, LEFT = 65_536, 1e-3
+#: Steps that are taken together.
+BLOCK = 64
 #: A piece of an interval is at most this share of one over the norm of A; most pieces.
 PIECE, MOST_PIECES = 0.05, 1_024
 #: More than the square root of what underflows in a square.
@@ -46,7 +48,7 @@ def peak_sums(
 ) -> PeakSums:  # fmt: skip
     """Return bounds on the sums over j of ``|c M^j b|`` (Euclidean; ``each``: by row) of columns ``b``, ``c (p, n)``.
 
-    From ``least`` to ``most`` terms one by one, until the rest is bounded by the share ``left``.
+    From ``least`` to ``most`` terms, in blocks of 64, until the rest is bounded by the share ``left``.
     """
     moving, n, growth = matrix.midpoint, len(matrix.midpoint), gamma(len(matrix.midpoint) + 2)
     driven, sizes = columns.midpoint, contraction.sizes(columns.midpoint, columns.radius)
@@ -55,20 +57,20 @@ def peak_sums(
     collected = np.zeros_like(powers)
     total: FloatArray | float = 0.0
     while True:
-        product = np.abs(powers @ driven)
-        terms.append(product if each else _norms(product))
-        total, collected = total + terms[-1], collected + np.abs(powers)
-        done = len(terms) >= max(most, least)
-        if done or (len(terms) >= least and (len(terms) % 64 == 0 or not powers.any())):
-            after = contraction.factor * _seen(
-                contraction, powers @ moving, _missed(matrix, np.abs(powers), growth), each
-            )
+        block, powers = _block(powers, moving)
+        # Products of many rows at once: one step after the other would take most of its time in Python.
+        products = np.abs(block @ driven)
+        terms.append(products if each else _norms(products))
+        total, collected = total + np.sum(terms[-1], axis=0), collected + np.sum(np.abs(block), axis=0)
+        done = BLOCK * len(terms) >= max(most, least)
+        if done or BLOCK * len(terms) >= least:
+            after = contraction.factor * _seen(contraction, powers, _missed(matrix, np.abs(block[-1]), growth), each)
             after = np.asarray(after * sizes)
             # A column that is nothing but its radius has no terms to compare with.
             if done or np.all((after <= left * total) | idle):
                 break
-        powers = powers @ moving
-    count = len(terms) + 8
+    every = np.concatenate(terms)
+    count = len(every) + 8
     # Every defect of the rows, and what the columns are off by, in the norm that contracts: sums of norms are at most
     # the sums of all entries.
     defects = rounded_up(_missed(matrix, collected, growth), 3 * n + count)
@@ -77,8 +79,17 @@ def peak_sums(
     known = collected @ columns.radius if columns.radius.any() else np.zeros_like(products)
     products = rounded_up(products + known, n + count)
     added = rounded_up(added + (products if each else np.sum(products, axis=0)), len(rows) + 6)
-    partial = rounded_up(np.cumsum(np.array(terms), axis=0), count + 2 * len(rows) + 10) + added
+    partial = rounded_up(np.cumsum(every, axis=0), count + 2 * len(rows) + 10) + added
     return PeakSums(rounded_up(partial, 4), rounded_up(partial[-1] + after, 6))
+
+
+def _block(rows: FloatArray, moving: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return rows ``(p, n)`` moved zero times and more, ``(BLOCK, p, n)``, and moved once more than the last."""
+    found = np.empty((BLOCK, *rows.shape))
+    found[0] = rows
+    for i in range(1, BLOCK):
+        np.matmul(found[i - 1], moving, out=found[i])
+    return found, found[-1] @ moving
 
 
 def _missed(matrix: Ball, sizes: FloatArray, growth: float) -> FloatArray:
@@ -100,7 +111,7 @@ def _seen(
 
 def _norms(sizes: FloatArray) -> FloatArray:
     """Return Euclidean norms of columns, up to roundings that the caller counts; what squares lose is added."""
-    return np.asarray(np.sqrt(np.sum(sizes * sizes, axis=0)) + len(sizes) * LOST_SQUARES)
+    return np.asarray(np.sqrt(np.sum(sizes * sizes, axis=-2)) + sizes.shape[-2] * LOST_SQUARES)
 
 
 class Pieces(NamedTuple):

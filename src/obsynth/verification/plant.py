@@ -167,6 +167,9 @@ def _sampling_rows(
     )  # fmt: skip
 
 
+_PARTS = ("midpoint", "radius")
+
+
 def _peak_gain(
     smooth: DescriptorSystem, dt: float, observer: LinearObserver, t: FloatArray, direct: FloatArray
 ) -> float:
@@ -176,6 +179,8 @@ def _peak_gain(
     rows = observer.Cz[observer.fault_rows]
     pieces = interval_pieces(smooth.A, smooth.Bd, Ball.exact(-t), dt)
     az = Ball.exact(observer.Az)
-    between = gathered(pieces, peak_sums(az, rows, pieces.columns, contraction).whole, smooth.nd)
-    sampled = peak_sums(az, rows, Ball.exact(observer.By) @ Ball.exact(smooth.Dd), contraction).whole
+    at_samples, count = Ball.exact(observer.By) @ Ball.exact(smooth.Dd), pieces.columns.shape[1]
+    both = Ball(*(np.hstack([getattr(part, name) for part in (pieces.columns, at_samples)]) for name in _PARTS))
+    sums = peak_sums(az, rows, both, contraction).whole
+    between, sampled = gathered(pieces, sums[..., :count], smooth.nd), sums[..., count:]
     return float(np.sum(between + sampled + column_norms(Ball.exact(direct))))

@@ -74,7 +74,7 @@ def _products(matrices: FloatArray, rows: FloatArray) -> FloatArray:
 
 def _triangles(noise: FloatArray) -> FloatArray:
     """Return the triangular factors ``(., rows, rows)`` of rotated noise ``(., any, rows)``."""
-    found, rows = np.linalg.qr(noise, mode="r"), noise.shape[2]
+    found, rows = np.asarray(np.linalg.qr(noise, mode="r")), noise.shape[2]
     return np.pad(found, ((0, 0), (0, rows - found.shape[1]), (0, 0)))
 
 
