@@ -140,7 +140,7 @@ class InfeasibleError(ObsynthError):
 
 
 class SolverError(ObsynthError):
-    """A solver ended without an answer that passes our own checks: nothing is known.
+    """A solver ended without an answer that passes our own checks: the result is inconclusive.
 
     Parameters
     ----------

@@ -73,7 +73,7 @@ CASES: dict[str, tuple[dict[str, Any] | None, dict[str, Any], int, tuple[str, ..
     "less noise than standstill takes": (None, {"noise_gain": 0.01}, 4, ("standstill", "noise_gain")),
     "a delta that does not suit the disk": (None, {"disk": [5.0, 4.0], "delta": 20.0}, 4, ("-1/delta",)),
     # Nothing is known: 5.
-    "gains far too small": (None, {"gain_bound": 0.001}, 5, ("gain_bound", "nothing is known")),
+    "gains far too small": (None, {"gain_bound": 0.001}, 5, ("gain_bound", "inconclusive")),
 }  # fmt: skip
 
 

@@ -152,7 +152,7 @@ class TestDesign:
             "0.02",
             "Verified: all",
             "an exact model",
-            "forgets its start",
+            "2 % settling time",
         ):
             assert text in printed
         assert len(printed.splitlines()) <= 16

@@ -13,7 +13,7 @@ from obsynth import (
     ui_pi_observer,
 )
 from obsynth.analysis.existence.numbers import numbers_of
-from obsynth.analysis.existence.verdicts import DROWNED, settled_rank
+from obsynth.analysis.existence.verdicts import ROUNDING_LEVEL, settled_rank
 from obsynth.methods.designing import check
 from obsynth.numerics.ranks import decide_rank
 from obsynth.plants.origin import origin_of
@@ -81,7 +81,7 @@ def test_a_rank_lost_only_exactly_says_so():
 
 @pytest.mark.parametrize(
     ("smallest", "exact", "means", "rank"),
-    [(1e-3, 2, "exact", 2), (1e-12, 2, "exact", 2), (DROWNED / 4, 2, "unclear", 1), (1e-3, 1, "exact", 1)],
+    [(1e-3, 2, "exact", 2), (1e-12, 2, "exact", 2), (ROUNDING_LEVEL / 4, 2, "unclear", 1), (1e-3, 1, "exact", 1)],
 )
 def test_three_answers_for_a_rank(smallest, exact, means, rank):
     decision = settled_rank(decide_rank(np.diag([1.0, smallest]), equilibrated=False), exact)

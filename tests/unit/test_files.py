@@ -18,7 +18,7 @@ from obsynth.files.outputs import (
     write_together,
 )
 from obsynth.files.signals import HeldSignals, ending_signals
-from obsynth.files.tables import TableWriter, as_meant, harmless
+from obsynth.files.tables import TableWriter, harmless, unquoted
 
 KIND = FileKind("a note", rb"\Anote:", ending=".note.txt")
 
@@ -276,4 +276,4 @@ class TestTables:
 
     def test_names_are_read_back(self):
         for name in (*self.NAMES, "plain", "'quoted", "it's", ""):
-            assert as_meant(harmless(name)) == name
+            assert unquoted(harmless(name)) == name

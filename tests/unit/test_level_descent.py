@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from obsynth.methods.fault_estimation_filter.gamma_iteration import Descent
+from obsynth.methods.fault_estimation_filter.gamma_iteration import GammaIteration
 from obsynth.methods.fault_estimation_filter.injection_problem import Injection
 
 TOLERANCE = 1e-7
@@ -55,7 +55,7 @@ def jump(level):
 @pytest.mark.parametrize(("margin", "most"), [(straight, 7), (curved, 12), (jump, 45)])
 def test_the_least_level_is_found_in_few_steps(margin, most):
     equation = Equation(margin)
-    descent = Descent(equation, 0.0, 1.0, TOLERANCE)
+    descent = GammaIteration(equation, 0.0, 1.0, TOLERANCE)
     descent.run(0.5)
     injection, gain = descent.best()
     assert 0.3 <= gain <= 0.3 * (1.0 + 3.0 * TOLERANCE)
@@ -66,7 +66,7 @@ def test_the_least_level_is_found_in_few_steps(margin, most):
 
 def test_a_first_level_next_to_the_best_that_fails_ends_the_descent():
     equation = Equation(straight)
-    descent = Descent(equation, 0.0, 0.3, TOLERANCE)
+    descent = GammaIteration(equation, 0.0, 0.3, TOLERANCE)
     descent.run(0.3 * (1.0 - 1e-6))
     assert len(equation.asked) == 1
     assert descent.best() is None
@@ -74,7 +74,9 @@ def test_a_first_level_next_to_the_best_that_fails_ends_the_descent():
 
 def test_a_promise_broken_next_to_the_least_level_is_left_for_the_lowest_that_is_kept():
     kept = 0.3 * (1.0 + 1e-5)
-    descent = Descent(Equation(straight, lambda level: level if level >= kept else math.inf), 0.0, 1.0, TOLERANCE)
+    descent = GammaIteration(
+        Equation(straight, lambda level: level if level >= kept else math.inf), 0.0, 1.0, TOLERANCE
+    )
     descent.run(0.5)
     assert descent.high < kept
     _, gain = descent.best()
@@ -84,7 +86,7 @@ def test_a_promise_broken_next_to_the_least_level_is_left_for_the_lowest_that_is
 def test_solutions_whose_margin_grows_downwards_are_not_believed():
     # Below 0.5 the equation has another solution, which is not the stabilising one.
     equation = Equation(lambda level: 1.0 - (0.45 / level) ** 2 if level >= 0.5 else 0.9, lambda level: level)
-    descent = Descent(equation, 0.0, 1.0, TOLERANCE)
+    descent = GammaIteration(equation, 0.0, 1.0, TOLERANCE)
     descent.run(0.6)
     assert 0.5 <= descent.high <= 0.5 * (1.0 + 2.0 * TOLERANCE)
     assert not descent.settled
@@ -92,7 +94,7 @@ def test_solutions_whose_margin_grows_downwards_are_not_believed():
 
 def test_where_the_first_promise_is_broken_each_is_judged():
     equation = Equation(straight, lambda level: level if level >= 0.7 else math.inf)
-    descent = Descent(equation, 0.0, 1.0, TOLERANCE)
+    descent = GammaIteration(equation, 0.0, 1.0, TOLERANCE)
     descent.run(0.5)
     assert descent.best() is None
     _, gain = descent.judged_again(1.0).best()
@@ -100,11 +102,11 @@ def test_where_the_first_promise_is_broken_each_is_judged():
 
 
 def test_a_wary_descent_judges_the_first_and_gives_up_in_a_narrow_bracket():
-    broken = Descent(Equation(straight, lambda level: math.inf), 0.0, 1.0, TOLERANCE, wary=True)
+    broken = GammaIteration(Equation(straight, lambda level: math.inf), 0.0, 1.0, TOLERANCE, wary=True)
     broken.run(1.0 - 1e-6)
     assert not broken.reached
     equation = Equation(lambda level: 1.0 if level >= 0.9995 else 0.0)
-    narrow = Descent(equation, 0.999, 1.0, TOLERANCE, wary=True)
+    narrow = GammaIteration(equation, 0.999, 1.0, TOLERANCE, wary=True)
     narrow.run(1.0 - 1e-6)
     assert len(narrow.reached) >= 1
     assert sum(level < 0.9995 for level in equation.asked) == 3

@@ -46,7 +46,7 @@ PAPER = DescriptorSystem(
 
 def test_faults_that_only_hide_together_are_named_together() -> None:
     plant = DescriptorSystem(None, TWO, C=np.eye(2), Bf=[[1, 1], [0, 0]], fault_names=["leak", "clog"])
-    with pytest.raises(PreconditionError, match="a combination of the faults 'leak', 'clog' can persist"):
+    with pytest.raises(PreconditionError, match="a combination of the faults 'leak', 'clog' is output-nulling"):
         ui_pi_observer(plant)
 
 

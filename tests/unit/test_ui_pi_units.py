@@ -105,7 +105,7 @@ def test_outputs_that_show_nothing_are_refused_by_name() -> None:
         ui_pi_observer(DescriptorSystem(None, [[-2.0]], C=[[0.0]], Bf=[[1.0]], fault_names=["leak"]))
     assert caught.value.condition == "(D3) fault model at 0"
     assert caught.value.signals == ("leak",)
-    assert "'leak' can persist without showing in any output" in str(caught.value)
+    assert "'leak' is output-nulling: no output shows it" in str(caught.value)
     with pytest.raises(PreconditionError) as caught:
         ui_pi_observer(DescriptorSystem(None, [[2.0]], C=[[0.0]]))
     assert (caught.value.condition, caught.value.mode, caught.value.signals) == ("(D2) zeros", 2.0, ("x1",))

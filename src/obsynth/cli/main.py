@@ -59,7 +59,7 @@ def unwritable_output(error: OSError) -> int:
 def told_error(error: Exception) -> ObsynthError | None:
     """Return what an error of Python or of a library is for the user; `None` if it is a mistake of obsynth."""
     if isinstance(error, MemoryError):
-        return SolverError("The computation does not fit into the memory: nothing is known.")
+        return SolverError("The computation does not fit into the memory: the result is inconclusive.")
     if isinstance(error, RecursionError):
         return SpecError("An expression or a document is nested too deeply.")
     if isinstance(error, ImportError):

@@ -151,8 +151,8 @@ VERBS = {
         Group("", (
             flag("--smooth", "recursive and nonlinear designs: estimates from the whole log, not only from what came "
                  "before"),
-            option("--lag", "N", "the same from the N samples after each row: rows are written N samples late, with "
-                   "their own time", type=int),
+            option("--lag", "N", "the same from the N samples after each row: rows come with N samples of delay, "
+                   "with their own time", type=int),
         )),
         option("--recovered", "NAME", "a state of the plant as written to recover (or all, or none; default: all of up "
                "to 300)", action="append"),

@@ -87,7 +87,7 @@ class Conditions:
         except np.linalg.LinAlgError as error:
             raise SolverError(f"The values of {', '.join(self.variables)} determine no gains: {error}.") from error
         if not all(np.isfinite(gain).all() for gain in gains.values()):
-            raise SolverError("The values of the variables determine no finite gains: nothing is known.")
+            raise SolverError("The values of the variables determine no finite gains: the result is inconclusive.")
         return gains
 
     def design(self, *, name: str = "design") -> ObserverDesign:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.analysis.transformations.recovery import StateRecovery
-from obsynth.data.log_estimator import DECIDING, Engine, Entry, Later, Row
+from obsynth.data.log_estimator import DECIDING, Engine, Entry, LagBuffer, Row
 from obsynth.data.recovered import LATE, RecoveredStates
 from obsynth.data.signals import TIME, Signals
 from obsynth.errors import SpecError
@@ -72,7 +72,7 @@ class Job:
 
     def __init__(
         self, engine: Engine, signals: Signals, recovery: StateRecovery | None, thresholds: Mapping[str, float],
-        monitor: OnlineMonitor | None, recovered: str | Sequence[str] | None = None, later: Later | None = None,
+        monitor: OnlineMonitor | None, recovered: str | Sequence[str] | None = None, later: LagBuffer | None = None,
     ) -> None:  # fmt: skip
         self.engine, self.signals, self.monitor, self.later = engine, signals, monitor, later
         self.recovered = RecoveredStates.of(recovery, engine, recovered)

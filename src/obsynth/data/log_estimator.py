@@ -46,7 +46,7 @@ class Entry(NamedTuple):
     row: Row  # of the filter, and in time smoothed
 
 
-class Later(Protocol):
+class LagBuffer(Protocol):
     """Rows that wait for those after them: what leaves is an entry, what the observer said of it, and more."""
 
     def take(self, entry: Entry) -> Iterable[tuple[Entry, Any, Any]]:

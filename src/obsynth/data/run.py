@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 from obsynth.data.job import Job, resume_state, save_state
 from obsynth.data.linear_log import engine_of
-from obsynth.data.log_estimator import Engine, Later
+from obsynth.data.log_estimator import Engine, LagBuffer
 from obsynth.data.signals import TIME, Signals, Stamps
 from obsynth.data.sinks import FrameSink, Sink, measured_frame, sink_for
 from obsynth.data.sources import CHUNK_ROWS, Data, chunks
@@ -145,7 +145,7 @@ def run_on_data(
         Continuous-time designs: longer intervals are gaps; by default those ten times the longest one before.
     warm_up : float, optional, seconds
         Marked after the start and after each gap; by default until the slowest mode has shrunk to 2 %, and none for
-        recursive and nonlinear designs, whose deviations are honest from the start.
+        recursive and nonlinear designs, whose deviations hold from the start.
     outliers : {"gate", "huber", "none"}, optional
         Recursive and nonlinear designs: what is done with a sample that its prediction excludes; by default what the
         design says, and a gate of six deviations where it says nothing.
@@ -241,7 +241,9 @@ def run_on_data(
     )  # fmt: skip
 
 
-def _later_rows(engine: Engine, data: Data, *, smooth: bool, lag: int | None, state: str | Path | None) -> Later | None:
+def _later_rows(
+    engine: Engine, data: Data, *, smooth: bool, lag: int | None, state: str | Path | None
+) -> LagBuffer | None:
     """Return where rows wait for those after them, if they do."""
     if not truth(smooth, "smooth") and lag is None:
         return None

@@ -14,7 +14,7 @@ import numpy as np
 
 from obsynth.data.signals import MISSING, Signals, Stamps
 from obsynth.errors import SpecError
-from obsynth.files.tables import as_meant
+from obsynth.files.tables import unquoted
 from obsynth.numerics.arrays import FloatArray
 
 #: What may separate columns, the first one that fits.
@@ -75,7 +75,7 @@ def stream_rows(stream: TextIO, signals: Signals, stamps: Stamps) -> Iterator[Fl
     dialect = Dialect(told.group(1)) if told else _dialect_of(head, signals)
     # A name in quotes may go on in the next line.
     table = _cells(itertools.chain([head], lines), dialect)
-    header = tuple(as_meant(name.strip()) for name in next(table, []))
+    header = tuple(unquoted(name.strip()) for name in next(table, []))
     places = signals.positions(header)
     row = 0
     for cells in table:
@@ -106,7 +106,7 @@ def _dialect_of(head: str, signals: Signals) -> Dialect:
 
 def _names(head: str, separator: str) -> Sequence[str]:
     try:
-        return [as_meant(name.strip()) for name in next(csv.reader([head], delimiter=separator), [])]
+        return [unquoted(name.strip()) for name in next(csv.reader([head], delimiter=separator), [])]
     except csv.Error:
         return []
 

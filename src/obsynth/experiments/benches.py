@@ -23,7 +23,7 @@ from obsynth.results.design import ObserverDesign
 from obsynth.simulation.dae import simulate_dae
 from obsynth.simulation.linear import Stepper, make_stepper, varying_runs
 from obsynth.simulation.scenario import Scenario, observer_start
-from obsynth.simulation.signals import Drive, resolve, resolve_parameters
+from obsynth.simulation.signals import ScenarioSignals, resolve, resolve_parameters
 
 #: Warm-up ends when the effect of an error at the start has shrunk to this share of its largest, for good.
 WARM_UP_SHARE = 0.01
@@ -65,7 +65,7 @@ class Runs:
 class Bench(ABC):
     """A design and a scenario, ready to run; it can be sent to another process, with a model that is data."""
 
-    drive: Drive
+    drive: ScenarioSignals
     observer: LinearObserver | RecursiveObserver | DAEObserver  # in discrete time
     initial_state: FloatArray
     fault_signals: slice

@@ -34,7 +34,7 @@ def harmless(text: str) -> str:
     return _MARK + text if text.lstrip().startswith(_FORMULA) or text.startswith(("\t", "\r", "\n")) else text
 
 
-def as_meant(cell: str) -> str:
+def unquoted(cell: str) -> str:
     """Return the text of a cell that `harmless` may have marked."""
     return cell[1:] if cell.startswith(_MARK) and harmless(cell[1:]) == cell else cell
 

@@ -34,7 +34,7 @@ from obsynth.verification.stored_numbers import StoredErrors
 
 
 def _silent(_: str) -> None:
-    """Progress that nobody watches."""
+    """Progress that does nothing (no-op)."""
 
 
 def design(
@@ -84,7 +84,7 @@ def design(
     InfeasibleError
         A checked certificate proves that what was asked cannot be reached.
     SolverError
-        The solver gave no usable answer: nothing is known.
+        The solver gave no usable answer: the result is inconclusive.
     VerificationError
         Gains were found, but the shipped realisation fails a check.
     """

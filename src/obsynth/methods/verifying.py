@@ -44,7 +44,7 @@ def verify(design: ObserverDesign, *, printed_digits: int | None = None) -> Veri
     SpecError
         The design's method is unknown, or ``printed_digits`` is not between 1 and 15.
     SolverError
-        LAPACK fails on the numbers of the design: nothing is known.
+        LAPACK fails on the numbers of the design: the result is inconclusive.
     """
     if design.method not in REGISTRY:
         raise SpecError(f"Designs of method {design.method!r} cannot be verified by this version.", path="method")

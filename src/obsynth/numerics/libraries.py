@@ -29,13 +29,15 @@ def failure_of(error: Exception) -> SolverError | None:
     """Return what the error of a library says of the numbers; `None` if it says nothing of them."""
     if isinstance(error, MemoryError):
         told = str(error).rstrip(".")
-        return SolverError(f"This does not fit into the memory{f' ({told})' if told else ''}. Nothing is known.")
+        return SolverError(
+            f"This does not fit into the memory{f' ({told})' if told else ''}. The result is inconclusive."
+        )
     is_numerical = isinstance(error, (np.linalg.LinAlgError, ArithmeticError))
     if not is_numerical and not (isinstance(error, ValueError) and _NOT_FINITE in str(error)):
         return None
     return SolverError(
-        f"LAPACK gave up ({str(error).rstrip('.')}): the numbers are beyond double precision. Nothing is known; look "
-        "at the units of the plant and at the options."
+        f"LAPACK gave up ({str(error).rstrip('.')}): the numbers are beyond double precision. The result is "
+        "inconclusive; look at the units of the plant and at the options."
     )
 
 

@@ -32,7 +32,7 @@ class Gaussian(NamedTuple):
     diffuse: FloatArray
 
 
-class WayBack(NamedTuple):
+class SmootherGain(NamedTuple):
     """The way back: j_0 ``offset (c, columns)``, J_1 ``from_next (c, c_next)``, J_2 and J_3 ``(c, any)``."""
 
     offset: FloatArray
@@ -47,7 +47,7 @@ class JointStep(NamedTuple):
     estimate: FloatArray
     factor: FloatArray
     diffuse: FloatArray
-    back: WayBack
+    back: SmootherGain
 
 
 def joint_step(
@@ -88,7 +88,7 @@ def _regular(H: FloatArray, S: FloatArray, width: int, right: FloatArray, least:
     carried = data[m:] + triangle[:m, m:rows].T @ white
     solved = solve_triangular(projection.head, np.hstack((carried, triangle[m:rows, m:rows].T)))
     head = orthogonal[:width]
-    back = WayBack(head[:, :m] @ white, head[:, m:rows], head[:, rows:], np.zeros((width, 0)))
+    back = SmootherGain(head[:, :m] @ white, head[:, m:rows], head[:, rows:], np.zeros((width, 0)))
     columns = right.shape[1]
     return JointStep(solved[:, :columns], solved[:, columns:], np.zeros((n, 0)), back)
 
@@ -129,7 +129,7 @@ def _by_rank(H: FloatArray, S: FloatArray, width: int, right: FloatArray, unknow
     before, lost = turned[:width, count:], free[n:] / lengths[n:, None]
     upper = np.hstack((before @ compact[:, :most], np.zeros((width, kept))))
     lower = np.hstack((solved[n:, columns:] @ compact[:, :most], lost @ into))
-    back = WayBack(
+    back = SmootherGain(
         np.vstack((turned[:width, :count] @ white, solved[n:, :columns])), np.vstack((upper, lower)),
         np.vstack((before @ compact[:, most:], solved[n:, columns:] @ compact[:, most:])),
         np.vstack((np.zeros((width, free.shape[1] - kept)), lost @ right_vectors[kept:].T)),
@@ -152,7 +152,7 @@ def _whitened(q2: FloatArray, S: FloatArray, right: FloatArray) -> tuple[FloatAr
     return white, turned, count
 
 
-def stepped_back(later: Gaussian, back: WayBack) -> Gaussian:
+def stepped_back(later: Gaussian, back: SmootherGain) -> Gaussian:
     """Return what is known of the coordinates before a step from what is known of those after it."""
     mean = back.offset + back.from_next @ later.mean
     factor = np.hstack((back.from_next @ later.factor, back.noise))

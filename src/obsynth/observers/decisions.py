@@ -47,7 +47,7 @@ def decide(
     estimates : Estimates
         Of a whole run.
     statistic : {"chi-square", "cusum", "glr", "nis"}, optional
-        ``chi-square`` on theta against its nominal value, with its honest covariance (default); ``cusum`` for small
+        ``chi-square`` on theta against its nominal value, with its covariance (default); ``cusum`` for small
         changes; ``glr`` with restarted signatures for abrupt ones (recursive observers); ``nis`` for all that the model
         does not explain.
     nominal : array_like, optional

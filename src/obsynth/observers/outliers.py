@@ -55,18 +55,18 @@ def no_refusals(outputs: int) -> FloatArray:
 def robust_advance(
     kind: str, limit: float, plain: Callable[[State, FloatArray, FloatArray], tuple[State, Row]],
     predicted: Callable[[State, FloatArray, FloatArray], tuple[FloatArray, FloatArray]], state: State, y: FloatArray,
-    u: FloatArray, *, foreseen: Callable[[State, FloatArray], tuple[FloatArray, FloatArray]] | None = None,
+    u: FloatArray, *, predicted_outputs: Callable[[State, FloatArray], tuple[FloatArray, FloatArray]] | None = None,
 ) -> tuple[State, Row]:  # fmt: skip
     """Take a step; where its innovation is too long, ask each sensor and take the step again without the outliers.
     ``predicted(state, heard, u)``: mean and deviation of each output ``(ny,)`` from the samples that are heard;
-    ``foreseen(state, u)``: of outputs that determine the state; these may be `BLIND` times further off."""
+    ``predicted_outputs(state, u)``: of outputs that determine the state; these may be `BLIND` times further off."""
     failed, mean, deviation, far = False, y, y, np.zeros(len(y), dtype=bool)
     try:
         with np.errstate(all="ignore"):
             after, row = plain(state, y, u)
             passes = float(row.nis) <= limit**2
-            if passes and foreseen is not None:
-                mean, deviation = foreseen(state, u)
+            if passes and predicted_outputs is not None:
+                mean, deviation = predicted_outputs(state, u)
                 far = np.abs(y - mean) > BLIND * limit * deviation + ROUNDING * (np.abs(y) + np.abs(mean).max())
         if passes and not far.any():
             return after._replace(refused=np.stack([np.zeros(len(y)), state.refused[1]])), row

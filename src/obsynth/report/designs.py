@@ -10,7 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from obsynth.analysis.diagnosis.exact import question
-from obsynth.analysis.diagnosis.fault_columns import rest_point
+from obsynth.analysis.diagnosis.fault_columns import dc_point
 from obsynth.analysis.transformations.recovery import StateRecovery
 from obsynth.errors import ObsynthError, PreconditionError
 from obsynth.methods.automatic import SAMPLES
@@ -175,7 +175,7 @@ def fault_estimates(design: ObserverDesign, gains: FaultGains | None) -> tuple[t
         return ("parameter", f"std {when}"), [(name, deviation(name, "-")) for name in observer.fault_names]
     linear = design.linear[1]
     none, noise = "by sampling" if plant.nw else "none stated", "deviation" if plant.is_discrete else "dev. at 1 s"
-    delays = ("samples late", "s late") if plant.is_discrete else ()
+    delays = ("delay", "delay in s") if plant.is_discrete else ()
     rows: list[tuple[str, ...]] = []
     for name, late, leaks in zip(linear.fault_names, linear.fault_delays, gains.leaks, strict=True):
         delay = (str(late), number(late * plant.dt)) if plant.is_discrete else ()
@@ -184,7 +184,7 @@ def fault_estimates(design: ObserverDesign, gains: FaultGains | None) -> tuple[t
             leak = float(leaks.max())
             row += (f"{number(leak)} of {plant.disturbance_names[int(leaks.argmax())]}" if leak else "none",)
         rows.append(row)
-    return ("fault", *delays, noise, *(("worst leak",) if plant.nd else ())), rows
+    return ("fault", *delays, noise, *(("worst gain",) if plant.nd else ())), rows
 
 
 #: Without a scenario steps are followed for so many settling times of the plant, at most so many samples.
@@ -243,7 +243,7 @@ def design_warnings(
 
 
 def _undetectable(plant: DescriptorSystem, observer: LinearObserver) -> Iterator[str]:
-    rest = rest_point(plant.dt)
+    rest = dc_point(plant.dt)
     unknown = ", ".join(plant.disturbance_names)
     for name in observer.fault_names if plant.nd else ():
         asked = question(plant, (), plant.fault_names.index(name))

@@ -60,7 +60,7 @@ def pictures_of(design: ObserverDesign, *, scenario: Scenario | None = None) -> 
     if design.observer.order:
         region = "inside the circle" if sampled else "left of the dashed line"
         yield Picture(
-            "Spectrum", f"Eigenvalues of the observer: it forgets its start where all are {region}.",
+            "Spectrum", f"Eigenvalues of the observer: its initial-condition response decays where all are {region}.",
             drawn((HALF, 5.4 if sampled else 4.2), 1, lambda axes: plot_poles(design, axes=axes[0])),
         )  # fmt: skip
     if design.observer.fault_names:

@@ -154,10 +154,10 @@ def _slowest(design: ObserverDesign) -> str:
     """Return how long the observer remembers its start."""
     if isinstance(design.plant, DescriptorSystem):
         seconds = transient(design.linear[1])
-        return (f"mode forgets its start to {FORGOTTEN:.0%} within {number(seconds)} s; observer of order "
+        return (f"{100.0 * FORGOTTEN:g} % settling time {number(seconds)} s; observer of order "
                 f"{design.observer.order}")  # fmt: skip
     factor = design.certificate.claims.get("contraction", math.nan)
-    return f"errors shrink by {number(factor)} per step on average; observer of order {design.observer.order}"
+    return f"errors shrink to {number(100.0 * factor)} % per step on average; observer of order {design.observer.order}"
 
 
 def _speed(design: ObserverDesign, steps: Followed) -> Iterator[tuple[str, str]]:

@@ -22,7 +22,7 @@ from obsynth.numerics.continuous import driven, first_order_hold
 from obsynth.numerics.ranks import decide_rank
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
-from obsynth.simulation.signals import Drive, Trajectory, signal_of
+from obsynth.simulation.signals import ScenarioSignals, Trajectory, signal_of
 
 
 def simulate_plant(
@@ -115,7 +115,9 @@ class Stepper:
         return seen(self.state_of), seen(self.output_of), fed
 
 
-def make_stepper(plant: DescriptorSystem, drive: Drive, *, initial_state: FloatArray, stabilise: bool) -> Stepper:
+def make_stepper(
+    plant: DescriptorSystem, drive: ScenarioSignals, *, initial_state: FloatArray, stabilise: bool
+) -> Stepper:
     """Return the stepper of ``plant`` for the sampling of ``drive``, from ``initial_state (nx,)``."""
     elimination = eliminate_algebraic_states(plant)
     reduced, recovery = elimination.plant, elimination.recovery
@@ -141,7 +143,7 @@ def make_stepper(plant: DescriptorSystem, drive: Drive, *, initial_state: FloatA
 
 
 def _sampled_noise(
-    reduced: DescriptorSystem, recovery: StateRecovery, a: FloatArray, drive: Drive
+    reduced: DescriptorSystem, recovery: StateRecovery, a: FloatArray, drive: ScenarioSignals
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return noise matrices over a sample: process noise gathered in it, sensor noise as it is."""
     if not drive.noise:

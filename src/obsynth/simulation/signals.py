@@ -22,7 +22,7 @@ MAXIMUM_SAMPLES = 5_000_000
 
 
 @dataclass(frozen=True, eq=False)
-class Drive:
+class ScenarioSignals:
     """A scenario for one plant, in arrays, apart from its random numbers: column and profile of each of those."""
 
     dt: float
@@ -75,13 +75,15 @@ class Drive:
         return int(np.argmax(wrong)) if wrong.any() else None
 
 
-def resolve(plant: DescriptorSystem, scenario: Scenario) -> Drive:
+def resolve(plant: DescriptorSystem, scenario: Scenario) -> ScenarioSignals:
     """Return the signals of ``scenario`` for ``plant``."""
     scenario.check_names(plant)
     return _resolved(plant, scenario, scenario.step_of(plant), plant.fault_names, plant.disturbance_names)
 
 
-def resolve_parameters(plant: TimeVaryingDescriptorSystem | DAEModel, scenario: Scenario, *, dt: float) -> Drive:
+def resolve_parameters(
+    plant: TimeVaryingDescriptorSystem | DAEModel, scenario: Scenario, *, dt: float
+) -> ScenarioSignals:
     """Return the signals of ``scenario`` for a plant with parameters: ``[u, theta]``, less their nominal values."""
     check_parameters(plant, scenario)
     if scenario.sample_time is not None and scenario.sample_time != dt:
@@ -119,7 +121,7 @@ def check_parameters(plant: TimeVaryingDescriptorSystem | DAEModel, scenario: Sc
 def _resolved(
     plant: DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel, scenario: Scenario, dt: float,
     faults: tuple[str, ...], disturbances: tuple[str, ...],
-) -> Drive:  # fmt: skip
+) -> ScenarioSignals:  # fmt: skip
     if scenario.horizon / dt > MAXIMUM_SAMPLES:
         raise SpecError(
             f"{scenario.horizon:g} s are {scenario.horizon / dt:.3g} samples of {dt:g} s, more than "
@@ -153,7 +155,7 @@ def _resolved(
         for name, profile in profiles_of(scenario, "sensors")
     ]
     deviations = np.array([scenario.sensor_noise.get(name, 0.0) for name in plant.output_names])
-    return Drive(dt, left, right, tuple(random), tuple(sensors), scenario.noise, deviations)
+    return ScenarioSignals(dt, left, right, tuple(random), tuple(sensors), scenario.noise, deviations)
 
 
 def _missing(profile: Profile, commanded: FloatArray, acts: np.ndarray, before: FloatArray) -> FloatArray:

@@ -9,7 +9,7 @@ import numpy as np
 
 from obsynth.analysis.diagnosis.exact import Questions, decided_exactly
 from obsynth.analysis.diagnosis.explanations import hidden_motion, least_additions, listed, state_sensors
-from obsynth.analysis.diagnosis.fault_columns import Question, others, rest_point
+from obsynth.analysis.diagnosis.fault_columns import Question, dc_point, others
 from obsynth.analysis.diagnosis.verdicts import (
     MOST_FAULTS,
     MOST_FAULTS_OF_WHOLE_BANK,
@@ -150,7 +150,7 @@ def _verdict(
 
 def _sentences(plant: DescriptorSystem, shown: Question, free: Question, *, suggest: bool) -> list[str]:
     """Return what hides a fault, at which point, and what would help."""
-    name, rest = plant.fault_names[shown.number], rest_point(plant.dt)
+    name, rest = plant.fault_names[shown.number], dc_point(plant.dt)
     letter = "z" if plant.dt > 0.0 else "s"
     step, texts = free.shows_at_rest, []
     if not shown.visible:

@@ -9,7 +9,7 @@ from itertools import combinations
 import numpy as np
 
 from obsynth.analysis.diagnosis.decoupled import unknowns_pencil
-from obsynth.analysis.diagnosis.fault_columns import rest_point
+from obsynth.analysis.diagnosis.fault_columns import dc_point
 from obsynth.analysis.diagnosis.reduction import PencilUnits
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.ranks import RANK_TOLERANCE
@@ -111,7 +111,7 @@ class HiddenMotion:
     @property
     def _course(self) -> str:
         point = self.point
-        if point == rest_point(self.dt):
+        if point == dc_point(self.dt):
             return "a step"
         if self.dt > 0.0:
             return f"a course {_amplitude(point)}^k"

@@ -22,7 +22,7 @@ from obsynth.numerics.ranks import CLEAR_GAP, MARKOV_TOLERANCE, RANK_TOLERANCE, 
 from obsynth.plants.descriptor import DescriptorSystem
 
 
-def rest_point(dt: float) -> complex:
+def dc_point(dt: float) -> complex:
     """Return the point at which signals are constant."""
     return 1.0 + 0.0j if dt > 0.0 else 0.0j
 
@@ -133,7 +133,7 @@ class Question:
     @property
     def shows_at_rest(self) -> bool:
         """Whether a constant fault leaves a constant trace."""
-        return self.visible and self.shows_at(rest_point(self.source.dt))
+        return self.visible and self.shows_at(dc_point(self.source.dt))
 
     @property
     def estimable(self) -> bool:

@@ -19,7 +19,7 @@ from obsynth.numerics.scaling import equilibrate_pencil
 
 #: Below this distance, relative to the data, rounding of the data is as large as what a unit fault moves: gains of its
 #: inverse would be needed, which double precision drowns.
-DROWNED = 2e-14
+ROUNDING_LEVEL = 2e-14
 #: Zeros closer than this, relative to their size, may be one that rounding has moved.
 SAME_ZERO = 1e-3
 #: Points on the stability boundary; in continuous time between these magnitudes of the own rates.
@@ -58,7 +58,7 @@ def distance_to_loss(
     return best
 
 
-def drowned_zeros(
+def zeros_at_rounding_level(
     E: FloatArray, A: FloatArray, found: Iterable[complex], exact: Sequence[complex], *, nx: int
 ) -> list[complex]:
     """Return those zeros found in floating point that the exact ones lack only by rounding of the data."""
@@ -66,7 +66,7 @@ def drowned_zeros(
         value
         for value in map(complex, found)
         if not any(abs(value - other) <= SAME_ZERO * max(1.0, abs(other)) for other in exact)
-        and relative_singular_value(E, A, value, nx=nx) <= DROWNED
+        and relative_singular_value(E, A, value, nx=nx) <= ROUNDING_LEVEL
     ]
 
 

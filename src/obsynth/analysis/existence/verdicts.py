@@ -12,11 +12,11 @@ import numpy as np
 
 from obsynth.analysis.conditions import Condition
 from obsynth.analysis.existence.distance import (
-    DROWNED,
+    ROUNDING_LEVEL,
     Distance,
     distance_to_loss,
-    drowned_zeros,
     relative_singular_value,
+    zeros_at_rounding_level,
 )
 from obsynth.analysis.existence.named_pencils import named_pencil, unclear
 from obsynth.analysis.existence.numbers import numbers_of
@@ -41,7 +41,7 @@ def settled_rank(decision: RankDecision, exact_rank: int | None, share: float = 
     values = decision.singular_values
     needed = decision.expected - 1
     enough = decision.expected == 0 or (
-        len(values) > needed and values[needed] > DROWNED * values[0] and share > DROWNED
+        len(values) > needed and values[needed] > ROUNDING_LEVEL * values[0] and share > ROUNDING_LEVEL
     )
     if enough:
         return replace(decision, rank=decision.expected, means="exact", share=share)
@@ -82,7 +82,7 @@ def zero_verdict(
     distance = distance_to_loss(E, A, nx=nx, discrete=discrete, zeros=facts.zeros, sizes=sizes)
     lost = _lost_in_computing(facts, E, A, nx=nx, discrete=discrete)
     distance = min(distance, lost or distance, key=lambda found: found.value)
-    return ZeroVerdict("unclear" if distance.value <= DROWNED or lost else "yes", facts, distance)
+    return ZeroVerdict("unclear" if distance.value <= ROUNDING_LEVEL or lost else "yes", facts, distance)
 
 
 def _lost_in_computing(facts: SystemFacts, E: FloatArray, A: FloatArray, *, nx: int, discrete: bool) -> Distance | None:
@@ -161,7 +161,7 @@ def zero_doubt(
     found = verdict.distance
     point = 0j if found is None else found.point
     where = f"{point.real:.6g}" if point.imag == 0.0 else f"{point:.6g}"
-    tolerance = DROWNED if found is None else max(DROWNED, found.value)
+    tolerance = ROUNDING_LEVEL if found is None else max(ROUNDING_LEVEL, found.value)
     return unclear(
         plant, named_pencil(plant, units, layout, kept=kept), tolerance=tolerance, point=point, dt=plant.dt,
         other=f"has a zero at {where}, and no {what}", decider=DECIDER,
@@ -203,7 +203,7 @@ def rank_doubt(
     """Return why it is unclear whether a block matrix has full column rank (row rank with ``rows``)."""
     named = named_pencil(plant, units, layout, kept=kept)
     return unclear(
-        plant, named.transposed if rows else named, tolerance=DROWNED,
+        plant, named.transposed if rows else named, tolerance=ROUNDING_LEVEL,
         other=f"has rank {decision.expected - 1}", decider=DECIDER,
     )  # fmt: skip
 
@@ -232,8 +232,8 @@ def hidden_modes(plant: DescriptorSystem) -> HiddenModes:
     exact = numbers.system(numbers.zeros(plant.nx, 0), numbers.zeros(plant.ny, 0))
     exact = believed(exact, tall_e, tall_a, nx=plant.nx)
     scaled = PlantUnits.of(plant).rounded().scaled_pencil(tall_e, tall_a)
-    drowned = drowned_zeros(*scaled, found, exact.zeros, nx=plant.nx)
+    hidden = zeros_at_rounding_level(*scaled, found, exact.zeros, nx=plant.nx)
     unstable = {value for value, out in zip(found, outside, strict=True) if out}
-    modes = tuple(sorted((*exact.zeros, *drowned), key=lambda value: (value.real, value.imag)))
-    undetectable = (*exact.outside, *(value for value in drowned if value in unstable))
+    modes = tuple(sorted((*exact.zeros, *hidden), key=lambda value: (value.real, value.imag)))
+    undetectable = (*exact.outside, *(value for value in hidden if value in unstable))
     return HiddenModes(modes, undetectable, exact.normal_rank, ())

@@ -26,7 +26,7 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.profiles import Additive, Random
 from obsynth.simulation.scenario import Scenario, observer_start
-from obsynth.simulation.signals import Drive, resolve
+from obsynth.simulation.signals import ScenarioSignals, resolve
 from obsynth.verification.error_system import ErrorModel
 
 
@@ -172,7 +172,7 @@ def watches_estimates(design: ObserverDesign) -> bool:
     return "Phi" in design.certificate.matrices and bool(design.linear[1].fault_names)
 
 
-def noisy_plant(plant: DescriptorSystem, scenario: Scenario, drive: Drive) -> DescriptorSystem:
+def noisy_plant(plant: DescriptorSystem, scenario: Scenario, drive: ScenarioSignals) -> DescriptorSystem:
     """Return a plant with the noise of a scenario: its own, as often, and that of the sensors."""
     return plant.replace(
         Bw=np.hstack([scenario.noise * plant.Bw, np.zeros((plant.nx, plant.ny))]),

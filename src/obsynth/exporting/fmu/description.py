@@ -113,7 +113,7 @@ def _checked(thresholds: Mapping[str, float] | None, outputs: Sequence[Output]) 
 
 
 def finite_warm_up(seconds: float) -> float:
-    """Return a number that a description may hold: an observer that never forgets its start raises no alarm."""
+    """Return a number that a description may hold: an observer that never settles raises no alarm."""
     return seconds if math.isfinite(seconds) else _NEVER
 
 

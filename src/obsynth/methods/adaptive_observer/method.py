@@ -99,7 +99,7 @@ class AdaptiveObserver(DescriptorKalman):
     id: ClassVar[str] = "adaptive-observer"
     plants: ClassVar[tuple[PlantKind, ...]] = ("time-invariant", "time-varying")
     time: ClassVar[str] = "discrete, time-varying"
-    summary: ClassVar[str] = "states and parameters with honest deviations"
+    summary: ClassVar[str] = "states and parameters with deviations from Q and R"
     source: ClassVar[str] = "Moussa Ali, Zhang 2013"
     claims: ClassVar[Mapping[str, ClaimMeaning]] = CLAIMS
     purposes: ClassVar[frozenset[Purpose]] = frozenset({"parameters"})

@@ -142,7 +142,7 @@ def value_of(variable: Any) -> FloatArray:
     """Return the value of a variable or constant block as an array; raise `SolverError` when there is none."""
     value = variable if isinstance(variable, np.ndarray) else variable.value
     if value is None or not np.all(np.isfinite(value)):
-        raise SolverError("The solver returned no finite numbers: nothing is known.")
+        raise SolverError("The solver returned no finite numbers: the result is inconclusive.")
     return np.asarray(value, dtype=np.float64)
 
 
@@ -185,12 +185,12 @@ def _solved(problem: cvxpy.Problem, what: str, solver: str) -> dict[str, Any]:
         reason = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
         record |= {"status": "crashed", "reason": reason, "seconds": time.perf_counter() - began}
         raise SolverError(
-            f"{solver} failed while solving for {what} ({reason}): nothing is known.", record=record
+            f"{solver} failed while solving for {what} ({reason}): the result is inconclusive.", record=record
         ) from error
     record["seconds"] = time.perf_counter() - began
     if record["status"] not in USABLE_STATUSES:
         raise SolverError(
-            f"{solver} ended with status {record['status']!r} while solving for {what}: nothing is known.",
+            f"{solver} ended with status {record['status']!r} while solving for {what}: the result is inconclusive.",
             record=record,
         )
     return record

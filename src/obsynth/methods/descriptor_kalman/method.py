@@ -89,7 +89,7 @@ class DescriptorKalman(Method):
     id: ClassVar[str] = "descriptor-kalman"
     plants: ClassVar[tuple[PlantKind, ...]] = ("time-invariant", "time-varying")
     time: ClassVar[str] = "discrete, time-varying"
-    summary: ClassVar[str] = "states with honest deviations"
+    summary: ClassVar[str] = "states with deviations from Q and R"
     source: ClassVar[str] = "Nikoukhah, Willsky, Levy 1992"
     claims: ClassVar[Mapping[str, ClaimMeaning]] = RECURSIVE_CLAIMS
     purposes: ClassVar[frozenset[Purpose]] = frozenset({"state despite noise"})

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from obsynth.methods.fault_estimation_filter.central_equation import CentralEquation, central_injection
-from obsynth.methods.fault_estimation_filter.gamma_iteration import NEXT_TO, Descent
+from obsynth.methods.fault_estimation_filter.gamma_iteration import NEXT_TO, GammaIteration
 from obsynth.methods.fault_estimation_filter.injection_problem import GainProblem, Injection
 from obsynth.numerics.arrays import SMALLEST
 from obsynth.numerics.norms import spectral_radius
@@ -94,7 +94,7 @@ def search_central_filter(
             continue
         close = start_is_good or best is not start
         equation = CentralEquation.of(problem, noise=noise)
-        descent = Descent(equation, low, gain, tolerance, wary=close)
+        descent = GammaIteration(equation, low, gain, tolerance, wary=close)
         share = START_SHARE if problem.order <= FEW_STATES else COARSE_START_SHARE
         descent.run(max(low, gain * (1.0 - PROBE * tolerance if close else share)))
         found = descent.best()

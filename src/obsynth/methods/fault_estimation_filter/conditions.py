@@ -48,7 +48,7 @@ _fault_zeros = partial(
 
 @remembered
 def _decided(_plant: DescriptorSystem) -> dict[bool, tuple[Condition, ...]]:
-    """Return a place for the conditions of a plant, decided exactly or not: synthesis and verification ask for them."""
+    """Return the cache of the conditions of a plant, decided exactly or not: synthesis and verification use it."""
     return {}
 
 
@@ -261,7 +261,7 @@ def _all_inside(count: int, largest: float, distance: str = "") -> Condition:
 
 
 def _never_shown(names: tuple[str, ...]) -> Condition:
-    detail = f"faults {', '.join(map(repr, names))} can act together without showing in any output."
+    detail = f"faults {', '.join(map(repr, names))} are together output-nulling: no output shows them."
     return _fault_zeros(holds=False, value=np.inf, detail=detail, signals=names)
 
 
@@ -285,8 +285,8 @@ def _zero_failure(plant: DescriptorSystem, zero: Zero) -> Condition:
     else:
         signals = leading_names(np.abs(zero.input_direction), plant.fault_names, most=MOST_NAMES)
         detail = (
-            f"at the zero z = {value} the fault {', '.join(map(repr, signals))} can follow z^k without showing "
-            "in any output, so no filter can estimate it. Measure another signal."
+            f"at the zero z = {value} the fault {', '.join(map(repr, signals))} is output-nulling along z^k: "
+            "no output shows it, so no filter can estimate it. Measure another signal."
         )
     return _fault_zeros(holds=False, value=abs(zero.value), detail=detail, mode=zero.value, signals=signals)
 

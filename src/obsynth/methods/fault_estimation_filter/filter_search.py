@@ -175,5 +175,5 @@ def _require_reachable(problem: GainProblem, least: LeastGain, gain: float, *, s
         )
     raise SolverError(
         f"gamma = {gain:.6g} was not reached (best found {best:.6g}), and the proved lower bound {bound:.6g} does not "
-        f"rule it out: nothing is known {choice}. Ask for a slightly larger gamma."
+        f"rule it out: the result is inconclusive {choice}. Ask for a slightly larger gamma."
     )

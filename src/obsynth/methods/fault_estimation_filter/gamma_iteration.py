@@ -25,7 +25,7 @@ CAUTION = 10.0
 #: Levels that may fail in a narrow bracket where rounding is to be expected.
 MOST_FAILURES = 3
 #: A filter whose true gain is above its level by this relative amount shows that the equation was not solved.
-BROKEN_PROMISE = 2e-3
+NORM_EXCESS = 2e-3
 #: Steps away from a broken promise, each longer than the one before, and halvings (of their logarithm) back.
 RETREAT = 10.0
 HALVINGS = 2
@@ -41,7 +41,7 @@ class Reached:
 
 
 @dataclass(eq=False)
-class Descent:
+class GammaIteration:
     """The way down from ``high`` to the least level; low and high are the bracket, tolerance its relative width.
 
     ``settled``: the margin tells that nothing is below; ``wary``: rounding is expected, the first filter is judged and
@@ -115,7 +115,7 @@ class Descent:
             return None
         last = self.reached[-1]
         gain = self.equation.problem.achieved_gain(last.injection)
-        if gain <= last.level * (1.0 + BROKEN_PROMISE):
+        if gain <= last.level * (1.0 + NORM_EXCESS):
             return last.injection, gain
         least, step, found = last.level, RETREAT * self.tolerance, None
         while found is None and step <= NEXT_TO and least * (1.0 + step) < self.reached[0].level:
@@ -129,11 +129,11 @@ class Descent:
             found, step = (found, step) if lower is None else (lower, step / ratio)
         return found
 
-    def judged_again(self, high: float) -> Descent:
+    def judged_again(self, high: float) -> GammaIteration:
         """Return a descent in which each filter is judged by itself, down to the lowest level that was in vain."""
         top, last = self.reached[0].level, self.reached[-1].level
         in_vain = self._gain_as_promised(self.reached[0].injection, top) is None
-        again = Descent(self.equation, top if in_vain else last, high, self.tolerance, judged=True)
+        again = GammaIteration(self.equation, top if in_vain else last, high, self.tolerance, judged=True)
         again.run(0.5 * (top + high) if in_vain else top)
         return again
 

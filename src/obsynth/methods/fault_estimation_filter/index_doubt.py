@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from obsynth.analysis.existence.distance import DROWNED
+from obsynth.analysis.existence.distance import ROUNDING_LEVEL
 from obsynth.analysis.existence.named_pencils import DIGITS
 from obsynth.analysis.existence.numbers import numbers_of
 from obsynth.analysis.existence.rational import WrittenNumbers
@@ -40,10 +40,10 @@ def index_doubt(plant: DescriptorSystem, detectability: FaultDetectability) -> U
         found = _changed(plant, units, detectability.indexes, np.round(direction, digits))
         if found is not None and (best is None or found.size < best.size):
             best = found
-        if best is not None and best.size <= DROWNED:
+        if best is not None and best.size <= ROUNDING_LEVEL:
             break
     size = 0.0 if best is None else best.size
-    return Unclear(max(DROWNED, size), best, f"has rank Upsilon = {detectability.rank.expected - 1}", DECIDER)
+    return Unclear(max(ROUNDING_LEVEL, size), best, f"has rank Upsilon = {detectability.rank.expected - 1}", DECIDER)
 
 
 def _is_in_doubt(plant: DescriptorSystem, detectability: FaultDetectability) -> bool:

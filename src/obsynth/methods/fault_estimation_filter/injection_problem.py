@@ -240,6 +240,6 @@ def _starting_filter(problem: GainProblem) -> Injection:
             "No stable starting filter was found, although the existence conditions hold. Without feedback the error "
             f"grows by a factor of up to {spectral_radius(problem.A):.3g} per sample, with {problem.measured} free "
             "measurement(s) against it: a fault that moves the outputs little within its delay makes it grow fast, "
-            "and many unstable modes need more outputs. Nothing is known."
+            "and many unstable modes need more outputs. The result is inconclusive."
         )
     return Injection(gain, np.zeros((problem.Z.shape[0], problem.measured)))

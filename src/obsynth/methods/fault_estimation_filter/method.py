@@ -126,7 +126,7 @@ class FaultEstimationFilter(Method):
     InfeasibleError
         No filter of this structure reaches ``gamma``, for this T, N and W.
     SolverError
-        Nothing is known.
+        The result is inconclusive.
     VerificationError
         The shipped realisation fails a check.
 

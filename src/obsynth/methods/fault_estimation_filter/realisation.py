@@ -130,7 +130,7 @@ def notes(
     radius = spectral_radius(observer.Az)
     if radius > SLOW_FILTER:
         found.append(
-            f"The filter forgets its start slowly: spectral radius {radius:.6g}, time constant "
+            f"The filter settles slowly: spectral radius {radius:.6g}, time constant "
             f"{-plant.dt / np.log(radius):.3g} s."
         )
     return tuple(found)

@@ -57,13 +57,13 @@ def small_gain_design(
     central = [item for item in noise_weighted_filters(problem, gain, reaches=goal.met) if goal.met(item)]
     if fresh.start_gain <= gain and goal.met(fresh.start):
         central.append(fresh.start)
-    lively = [] if not goal.noisy or any(map(goal.is_fast, central)) else _lively_filters(goal)
+    fast = [] if not goal.noisy or any(map(goal.is_fast, central)) else _fast_filters(goal)
     quick = None
-    if lively:
+    if fast:
         # The filter of least noise may forget slowly again: what was bought is not given back.
-        quick = _towards(goal, lively[0], target, slowest=problem.radius(lively[0]))
+        quick = _towards(goal, fast[0], target, slowest=problem.radius(fast[0]))
         candidates.append(quick)
-        central += lively
+        central += fast
     else:
         central = [item for item in central if goal.is_fast(item)] or central
         candidates += [_towards(goal, min(central, key=goal.cost), target)] if central else []
@@ -80,7 +80,7 @@ def small_gain_design(
     if (wanted[engine] or not candidates) and goal.met(least.injection):
         candidates.append(least.injection)
     if not candidates:
-        raise SolverError(f"No filter with gain {gain:.6g} was found: nothing is known.", record=records[-1])
+        raise SolverError(f"No filter with gain {gain:.6g} was found: the result is inconclusive.", record=records[-1])
     # An inaccurate solution may be far from the least noise: the true cost decides, not the solver.
     fast = [item for item in candidates if goal.met_fast(item)]
     found = min(fast or candidates, key=goal.cost)
@@ -91,7 +91,7 @@ def small_gain_design(
     return (_towards(goal, found, target) if goal.noisy and quick is None and not moved else found), records
 
 
-def _lively_filters(goal: Goal) -> list[Injection]:
+def _fast_filters(goal: Goal) -> list[Injection]:
     """Return fast filters that meet the goal, the fastest first, where those that weigh the noise alone are slow.
 
     Noise on every state makes a filter trust its measurements more; little more noise than the least may be paid.

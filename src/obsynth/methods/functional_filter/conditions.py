@@ -12,8 +12,8 @@ from obsynth.analysis.conditions import Condition
 from obsynth.analysis.diagnosis.diagnosing import model_points
 from obsynth.analysis.diagnosis.exact import question
 from obsynth.analysis.diagnosis.explanations import hidden_motion
-from obsynth.analysis.diagnosis.fault_columns import Question, rest_point
-from obsynth.analysis.existence.distance import DROWNED
+from obsynth.analysis.diagnosis.fault_columns import Question, dc_point
+from obsynth.analysis.existence.distance import ROUNDING_LEVEL
 from obsynth.analysis.existence.named_pencils import NamedPencil, named_pencil, unclear
 from obsynth.analysis.existence.numbers import COMPUTED_STATES
 from obsynth.analysis.existence.verdicts import DECIDER
@@ -57,7 +57,7 @@ def fault_conditions(
     """Return whether one fault can be estimated, free of the unknown inputs and of every other fault."""
     name = plant.fault_names[fault]
     asked = question(plant, [j for j in range(plant.nf) if j != fault], fault, exactly)
-    rest = rest_point(plant.dt)
+    rest = dc_point(plant.dt)
     seen = Condition(
         f"{name} shows", f"{name} shows free of {_rest(plant, fault)}", asked.visible, float(asked.visible), 1.0,
         _SOURCE, _gap(asked) if asked.visible else _hidden(plant, asked, rest),
@@ -79,8 +79,8 @@ def fault_conditions(
     )  # fmt: skip
     if doubtful and len(doubtful) == len(lost):
         return seen, _in_doubt(kept, plant, asked, doubtful[0])
-    drowned = not lost and bool(shares) and shares[least] <= DROWNED
-    return seen, _in_doubt(kept, plant, asked, least) if drowned else kept
+    doubtful = not lost and bool(shares) and shares[least] <= ROUNDING_LEVEL
+    return seen, _in_doubt(kept, plant, asked, least) if doubtful else kept
 
 
 def _may_show(asked: Question, point: complex | None = None) -> bool:
@@ -107,7 +107,7 @@ def _in_doubt(condition: Condition, plant: DescriptorSystem, asked: Question, po
     named, name = _named(plant, asked), plant.fault_names[asked.number]
     share = named.last_share(point)
     doubt = unclear(
-        plant, named, tolerance=max(DROWNED, share), point=point, last=True, decider=DECIDER,
+        plant, named, tolerance=max(ROUNDING_LEVEL, share), point=point, last=True, decider=DECIDER,
         other=f"hides {name} at {'z' if plant.dt > 0.0 else 's'} = {_place(point)}, and no filter estimates it",
     )  # fmt: skip
     detail = f"{share:.1g} of {name} shows at {_place(point)}: rounding of the data is as large."
@@ -122,7 +122,7 @@ def _residual_conditions(plant: DescriptorSystem, seen: Sequence[int], exactly: 
         asked = question(plant, removed, fault, exactly)
         name = plant.fault_names[fault]
         blind = [*plant.disturbance_names, *(plant.fault_names[j] for j in removed)]
-        rest = rest_point(plant.dt)
+        rest = dc_point(plant.dt)
         shown = Condition(
             f"{name} shows" + (f" without {', '.join(plant.fault_names[j] for j in removed)}" if removed else ""),
             f"{name} shows free of {', '.join(blind) or 'the initial state'}", asked.visible, float(asked.visible), 1.0,

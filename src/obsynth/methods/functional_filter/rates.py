@@ -1,4 +1,4 @@
-"""How fast a fault is held to walk where nobody says so: slowly, but so that a step is seen in the plant's own time.
+"""Random-walk intensity of a fault that is not stated: slowly, but so that a step is seen in the plant's own time.
 
 And what delay buys: one Riccati equation for each walk, as smoothing over L samples takes ``sum_j G_j C M_j`` from the
 error covariance.

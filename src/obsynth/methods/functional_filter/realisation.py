@@ -74,7 +74,7 @@ class FilterPart:
 
 
 def filter_part(model: FilterModel, gain: KalmanGain, shown: FloatArray, *, delay: int, mean: int) -> FilterPart:
-    """Return the filter of a gain, ``delay`` samples late; ``shown (rows, p)``: innovations shipped as residuals."""
+    """Return the filter of a gain, with a delay in samples; ``shown (rows, p)``: innovations shipped as residuals."""
     dynamics = Dynamics(model.A - gain.K @ model.C, model.B + gain.K @ model.L, model.T + gain.K @ model.T0)
     innovation = Rows(-model.C, model.L, model.T0)
     count, nx = len(model.estimate), model.T.shape[1]

@@ -80,7 +80,9 @@ def gains_for(plant: DescriptorSystem, asked: PdObserver, *, decay: float, most:
     """Return gains of the first coordinates whose answer is proved; with a bound ``most``, of the first alone."""
     delta = default_delta(plant, asked, decay)
     require_possible(plant, asked, delta=delta, decay=decay)
-    failure = SolverError("The gains that the solver returned could not be proved to be stable: nothing is known.")
+    failure = SolverError(
+        "The gains that the solver returned could not be proved to be stable: the result is inconclusive."
+    )
     engine, *spare = asked.engines_for(plant.nx + plant.nf)
     for name in (engine, *spare):
         for states, outputs in islice(_units(plant, asked, balanced_first=name != "lmi"), None if most is None else 1):

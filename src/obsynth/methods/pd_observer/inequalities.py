@@ -81,7 +81,7 @@ def solve(task: PdTask, *, solver: str) -> PdSolution:
     try:
         gain_j, gain_l = (np.asarray(np.linalg.solve(p3_value.T, lmi.value_of(part))) for part in (found.Y, found.Z))
     except np.linalg.LinAlgError as error:
-        raise SolverError("The solver returned a singular P3: nothing is known.", record=record) from error
+        raise SolverError("The solver returned a singular P3: the result is inconclusive.", record=record) from error
     p1 = tuple(symmetric(lmi.value_of(p)) for p in own)
     return PdSolution(
         gain_j + task.decay * gain_l, gain_l, p1, symmetric(p3_value) if task.theorem == 2 else p3_value, record

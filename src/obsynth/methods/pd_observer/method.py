@@ -120,7 +120,7 @@ class PdObserver(Method):
         An unobservable mode is slower than ``decay`` or outside ``disk``; ``noise_gain`` is below what reading a
         constant fault takes; delta cannot serve Theorem 2 or the disk.
     SolverError
-        Nothing is known.
+        The result is inconclusive.
     VerificationError
         The shipped realisation fails a check.
 

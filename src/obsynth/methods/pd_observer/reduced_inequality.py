@@ -122,7 +122,9 @@ def _closed_form(task: PdTask, *, free_delta: bool) -> tuple[PdSolution, float]:
     moving = shifted - gain @ c
     found = symmetric_certificate(moving)
     if found is None:
-        raise SolverError("A Riccati equation gave gains that are not stable: nothing is known.", record=record)
+        raise SolverError(
+            "A Riccati equation gave gains that are not stable: the result is inconclusive.", record=record
+        )
     delta = min(task.delta, SHARE * found.limit) if free_delta else task.delta
     if delta < found.limit:
         p1, p3 = found.P1(delta), found.P3
@@ -160,7 +162,7 @@ def _riccati_gain(a: FloatArray, c: FloatArray, record: Mapping[str, Any]) -> Fl
         pass
     p = None if n > MOST_STATES_FOR_QZ else continuous_solution(a, c, one, np.eye(len(c)))
     if p is None:
-        raise SolverError("The Riccati equation was not solved: nothing is known.", record=record)
+        raise SolverError("The Riccati equation was not solved: the result is inconclusive.", record=record)
     return np.asarray(p @ c.T)
 
 

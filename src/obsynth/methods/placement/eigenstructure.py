@@ -96,7 +96,7 @@ def place(
         other = replace(problem, objective="conditioning").minimised(starts[0])
         starts = starts if other is None else [other[1], *starts]
     if objective == "conditioning":
-        # All go a short way, and the best of them to the end.  Small gains are not foreseen as early.
+        # All go a short way, and the best of them to the end.  Small gains are not predicted as early.
         tried = [problem.minimised(start, steps=FIRST_STEPS, restarts=1) for start in starts]
         ahead = sorted((found for found in tried if found is not None), key=lambda found: found[0])
         starts = [start for _, start in ahead[:FINALISTS]]

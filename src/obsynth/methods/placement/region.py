@@ -103,7 +103,8 @@ def region_gain(problem: KalmanProblem, region: Region, *, solver: str) -> tuple
         if region.holds(eigenvalues(problem.F - gain @ problem.C), dt):
             return gain, record
         failures.append(SolverError(
-            f"{solver} ended with poles outside the region: nothing is known. Widen the region, or use decay= instead.",
+            f"{solver} ended with poles outside the region: the result is inconclusive. Widen the region, or "
+            "use decay= instead.",
             record=record,
         ))  # fmt: skip
     raise failures[ways.index(_by_inequality)]

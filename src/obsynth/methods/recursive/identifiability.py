@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from obsynth.analysis.conditions import Condition
-from obsynth.analysis.existence.distance import DROWNED
+from obsynth.analysis.existence.distance import ROUNDING_LEVEL
 from obsynth.analysis.existence.named_pencils import NamedPencil, named_pencil, unclear
 from obsynth.analysis.existence.numbers import numbers_of
 from obsynth.analysis.existence.rational import PlantNumbers, WrittenNumbers
@@ -102,13 +102,15 @@ class ConstantPlant:
             named = NamedPencil(
                 named.A[kept], named.E[kept], named.owners[kept], named.rows[kept], named.columns, terms
             )
-        return unclear(self.plant, named, tolerance=DROWNED, other=f"has rank {decision.expected - 1}", decider=DECIDER)
+        return unclear(
+            self.plant, named, tolerance=ROUNDING_LEVEL, other=f"has rank {decision.expected - 1}", decider=DECIDER
+        )
 
     def traces_doubt(self, decision: RankDecision) -> Unclear:
         """Return why the second rank is unclear."""
         named = named_pencil(self.plant, self.units, [["A", "Bf"], ["C", "Df"]])
         found = unclear(
-            self.plant, named, tolerance=DROWNED, point=1 + 0j, other=f"has rank {decision.expected - 1}",
+            self.plant, named, tolerance=ROUNDING_LEVEL, point=1 + 0j, other=f"has rank {decision.expected - 1}",
             decider=DECIDER,
         )  # fmt: skip
         return replace(found, parameters=True)

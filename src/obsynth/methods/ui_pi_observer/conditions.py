@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from obsynth.analysis.conditions import Condition, is_doubted, is_refused
-from obsynth.analysis.existence.distance import drowned_zeros
+from obsynth.analysis.existence.distance import zeros_at_rounding_level
 from obsynth.analysis.existence.numbers import decides_exactly, numbers_of, reconsidered
 from obsynth.analysis.existence.rational import SystemFacts
 from obsynth.analysis.existence.verdicts import (
@@ -76,7 +76,7 @@ class Existence:
 
 @remembered
 def _known(_plant: DescriptorSystem) -> dict[tuple[bool, *tuple[bytes, ...]], tuple[Condition, ...]]:
-    """Return a place for the conditions of a plant with a fault model: synthesis and verification ask for them."""
+    """Return the cache of the conditions of a plant with a fault model: synthesis and verification ask for them."""
     return {}
 
 
@@ -197,7 +197,7 @@ def _timed(facts: SystemFacts, rate: float) -> SystemFacts:
 
 
 def _hidden_trajectories(rank: int, full: int) -> Condition:
-    detail = f"normal rank {rank} of {full}: the plant hides whole trajectories from its outputs."
+    detail = f"normal rank {rank} of {full}: whole trajectories of the plant are output-nulling."
     return _zeros(False, rank, full, detail)
 
 
@@ -222,8 +222,8 @@ def _zero_failure(
     where = f"{'s' if plant.dt == 0.0 else 'z'} = {number(value)}"
     masked = f" under the unknown input {', '.join(map(repr, disturbances))}" if disturbances else ""
     detail = (
-        f"at {where} the states {', '.join(map(repr, states))} move{masked} without showing in any output, and do not "
-        "come to rest: no observer can know them. Measure something they move."
+        f"at {where} the states {', '.join(map(repr, states))} move{masked} along an undetectable mode: no output "
+        "shows it, and it does not decay. Measure something that they move."
     )
     found = _zeros(False, instability(value, plant.dt), 0.0, detail)
     return replace(found, mode=value, signals=(*states, *disturbances))
@@ -244,7 +244,7 @@ def _fixed_modes(
     facts = None if exact is None else believed(_timed(exact.facts, units.rate), *pencil, nx=augmented.order)
     if facts is not None and facts.full and not facts.outside:
         # A mode that only rounding of the data moves is fixed as well.
-        nearly = drowned_zeros(*pencil, finite_zeros(*pencil).values, facts.zeros, nx=augmented.order)
+        nearly = zeros_at_rounding_level(*pencil, finite_zeros(*pencil).values, facts.zeros, nx=augmented.order)
         zeros = np.array([*map(units.eigenvalue, (*facts.zeros, *nearly))], dtype=np.complex128)
         verdict = zero_verdict(facts, *pencil, nx=augmented.order, discrete=plant.dt > 0.0)
         if verdict.answer == "unclear" and verdict.distance is not None:

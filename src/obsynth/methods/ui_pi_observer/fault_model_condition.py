@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.analysis.conditions import Condition
-from obsynth.analysis.existence.distance import DROWNED, least_share
+from obsynth.analysis.existence.distance import ROUNDING_LEVEL, least_share
 from obsynth.analysis.existence.named_pencils import named_augmented, unclear
 from obsynth.analysis.existence.numbers import numbers_of
 from obsynth.analysis.existence.verdicts import DECIDER, settled_rank
@@ -115,7 +115,7 @@ def _model_condition(
         alone = len(faults) == 1
         who = f"the fault {faults[0]!r}" if alone else f"a combination of the faults {', '.join(map(repr, faults))}"
         detail += (
-            f": at {where} {who}{masked or ' can persist'} without showing in any output, so no observer can estimate "
+            f": at {where} {who}{masked or ' is output-nulling'}: no output shows it, so no observer can estimate "
             f"{'it' if alone else 'them'}. Measure another signal, or leave one of them out."
         )
     return Condition(
@@ -133,7 +133,7 @@ def _model_condition(
 
 def _model_doubt(
     plant: DescriptorSystem, model: Exosystem, units: PlantUnits, value: complex, *, other: str,
-    decider: str = DECIDER, of_the_model: bool = False, tolerance: float = DROWNED, moving: bool = False,
+    decider: str = DECIDER, of_the_model: bool = False, tolerance: float = ROUNDING_LEVEL, moving: bool = False,
 ) -> Unclear:  # fmt: skip
     """Return why it is unclear whether plant and fault model hide something at a point, in the plant's own time."""
     kept = kept_disturbances(plant, numbers_of(plant))

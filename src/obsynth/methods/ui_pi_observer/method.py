@@ -108,7 +108,7 @@ class UiPiObserver(Method):
     PreconditionError
         (D1), (D2) or (D3) fails: the eigenvalue, and the fault and disturbance that mask each other, are named.
     SolverError
-        Poles could not be placed, or the solver found nothing: nothing is known.
+        Poles could not be placed, or the solver found nothing: the result is inconclusive.
     VerificationError
         The shipped realisation fails a check.
 

@@ -1,4 +1,4 @@
-"""The state and the rows of a recursive observer, and the estimates in them, with honest spreads."""
+"""The state and the rows of a recursive observer, and the estimates in them, with their covariances."""
 
 from __future__ import annotations
 

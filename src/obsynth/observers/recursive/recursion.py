@@ -123,12 +123,19 @@ class Recursion:
         """Return the state after a sample and what is known at it; NaN in ``y (ny,)`` is what is missing."""
         if self.settings.outliers == "none":
             return self.plain(state, y, u)
-        foreseen = self.foreseen if state.k and self._constraints is not None else None
+        predicted_outputs = self.predicted_outputs if state.k and self._constraints is not None else None
         return robust_advance(
-            self.settings.outliers, self.limit, self.plain, self.predicted, state, y, u, foreseen=foreseen
+            self.settings.outliers,
+            self.limit,
+            self.plain,
+            self.predicted,
+            state,
+            y,
+            u,
+            predicted_outputs=predicted_outputs,
         )
 
-    def foreseen(self, state: RecursiveState, u: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def predicted_outputs(self, state: RecursiveState, u: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return mean and deviation of each output ``(ny,)`` before the sample, with its own algebraic equations. They
         come with the next step, but what they say of this sample is known now. Infinite where nothing is."""
         plant, k = self.settings.plant, state.k

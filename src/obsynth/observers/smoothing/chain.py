@@ -10,7 +10,7 @@ import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import UNDETERMINED_SHARE
-from obsynth.numerics.square_root_estimation import Gaussian, WayBack, nothing_later, stepped_back
+from obsynth.numerics.square_root_estimation import Gaussian, SmootherGain, nothing_later, stepped_back
 from obsynth.observers.outliers import projected
 
 
@@ -32,7 +32,7 @@ class Node(NamedTuple):
     origin: FloatArray  # ``(n, 1 + nq)`` of constant parameters, ``(n, 1)`` where they are among the states or none
     factor: FloatArray  # ``(n, any)``
     diffuse: FloatArray  # ``(n, r)``
-    back: WayBack | None  # to the coordinates of the sample before; `None` at the first
+    back: SmootherGain | None  # to the coordinates of the sample before; `None` at the first
     lesson: Lesson | None = None  # of constant parameters; `None` where there are none
 
 
