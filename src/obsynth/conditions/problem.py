@@ -138,7 +138,9 @@ class Conditions:
         except (KeyboardInterrupt, SystemExit):
             raise
         except BaseException as error:  # Rust panics, and memory that ran out inside the solver
-            raise SolverError(f"{solver} failed while solving {self.source} ({error}): nothing is known.") from error
+            raise SolverError(
+                f"{solver} failed while solving {self.source} ({error}): the result is inconclusive."
+            ) from error
 
     def changed(
         self, *, constraints: Iterable[Any] | Mapping[str, Any] = (), drop: Iterable[str] = (), objective: Any = None
