@@ -123,9 +123,9 @@ STRUCTURES: dict[Callable[[np.random.Generator], dict], int] = {
 }
 
 
-ROUNDING_LEVEL = "Unclear: gains were found, but they are so large"
+DROWNED = "Unclear: gains were found, but they are so large"
 #: Where a filter of the equations exists, but rounding of its data would drown the fault, and the refusal says so.
-AT_THE_LIMIT = {hardly_visible_fault: (ROUNDING_LEVEL,)}
+AT_THE_LIMIT = {hardly_visible_fault: (DROWNED,)}
 
 
 @pytest.mark.parametrize("structure", STRUCTURES, ids=lambda structure: structure.__name__)

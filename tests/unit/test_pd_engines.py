@@ -40,7 +40,7 @@ def large_plant(nx: int, seed: int = 0) -> obsynth.DescriptorSystem:
     )
 
 
-class TestSmootherGain:
+class TestWayBack:
     """What is lifted from the smaller inequality is a solution of the theorem itself, for the delta that was asked."""
 
     @pytest.mark.parametrize("theorem", [1, 2])

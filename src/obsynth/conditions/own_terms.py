@@ -212,8 +212,8 @@ def _require_inside(closed: FloatArray, where: LMIRegion | None) -> None:
     worst = float(np.min(where.margins(np.linalg.eigvals(closed)), initial=np.inf))
     if worst < -REGION_TOLERANCE:
         raise SolverError(
-            f"The solver ended with eigenvalues outside {where}, by {-worst:.3g}: the result is inconclusive. Take another "
-            "solver, or a wider region."
+            f"The solver ended with eigenvalues outside {where}, by {-worst:.3g}: the result is inconclusive. "
+            "Take another solver, or a wider region."
         )
 
 
