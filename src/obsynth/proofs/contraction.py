@@ -11,6 +11,7 @@ Nonnegative matrices: proved bounds of the spectral radius, of ``(I - M)^-1``, a
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,6 +24,8 @@ from obsynth.proofs.extended_balls import Enclosed, block
 
 #: Where between the spectral radius (0) and one (1) the rate is tried, in turn.
 RATES = (0.5, 0.2, 0.8, 0.95)
+#: Roundings of an entry, of every order n, that a Lyapunov equation by Schur vectors and its square root may take.
+OPERATIONS = 1e3
 #: The same where the rate itself is what is asked for.
 TIGHT_RATES = (0.01, 0.1)
 
@@ -41,6 +44,13 @@ class Contraction:
     def factor(self) -> float:
         """Upper bound on the sum (integral) of all powers of the rate."""
         return float(rounded_up(np.asarray(1.0 / ((1.0 - self.rate) if self.discrete else self.rate)), 4))
+
+    @property
+    def roundings(self) -> float:
+        """How much, relatively, another machine's Q may be off this one: rounding times the condition of P = Q'Q."""
+        lengths = np.linalg.norm(self.Q, axis=0)
+        condition = float(np.linalg.cond(self.Q / np.where(lengths > 0.0, lengths, 1.0))) if self.Q.size else 1.0
+        return float(OPERATIONS * max(len(self.Q), 1) * UNIT_ROUNDOFF * condition**2)
 
     def sizes(self, columns: FloatArray, radius: FloatArray | None = None) -> FloatArray:
         """Return upper bounds on ``|Q b|`` of columns ``(n, m)``, known to within ``radius``, as ``(m,)``."""
@@ -81,19 +91,27 @@ def column_norms(ball: Ball) -> FloatArray:
 def prove_contraction(matrix: FloatArray | Ball, *, discrete: bool, rate: float | None = None) -> Contraction | None:
     """Return a proved contraction of ``matrix (n, n)`` (with ``rate``, at that), or ``None`` where none is found."""
     ball = Ball.of(matrix)
+    if rate is not None and ball.midpoint.size:
+        return _tried(ball, rate, discrete=discrete) if ball.is_finite else None
+    return next(proved_contractions(ball, discrete=discrete), None)
+
+
+def proved_contractions(matrix: FloatArray | Ball, *, discrete: bool) -> Iterator[Contraction]:
+    """Yield a contraction of ``matrix (n, n)`` for each of some rates at which one is proved."""
+    ball = Ball.of(matrix)
     a = ball.midpoint
     if not a.size:
-        return Contraction(a, a, 0.0, 0.0 if discrete else 1.0, discrete)
-    if not ball.is_finite:
-        return None
-    if rate is not None:
-        return _tried(ball, rate, discrete=discrete)
+        yield Contraction(a, a, 0.0, 0.0 if discrete else 1.0, discrete)
+    if not a.size or not ball.is_finite:
+        return
     values = np.linalg.eigvals(a)
     bound = float(np.max(np.abs(values))) if discrete else float(-np.max(values.real))
     if not (bound < 1.0 if discrete else bound > 0.0):
-        return None
-    rates = (bound + share * (1.0 - bound) if discrete else (1.0 - share) * bound for share in RATES)
-    return next((found for tried in rates if (found := _tried(ball, tried, discrete=discrete)) is not None), None)
+        return
+    for share in RATES:
+        found = _tried(ball, bound + share * (1.0 - bound) if discrete else (1.0 - share) * bound, discrete=discrete)
+        if found is not None:
+            yield found
 
 
 def proved_rate(matrix: FloatArray | Ball, known: Contraction | None = None) -> float | None:

@@ -17,10 +17,12 @@ with balls K, U, J, L, zero in exact arithmetic: `errors_per_unit`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
+import flint
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
@@ -28,10 +30,18 @@ from obsynth.numerics.scaling import balance_by_least_squares
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.balls import Ball, rounded_up
-from obsynth.proofs.contraction import Contraction, prove_contraction
+from obsynth.proofs.contraction import Contraction, prove_contraction, proved_contractions
+from obsynth.proofs.extended_balls import ExtendedBall
 from obsynth.proofs.peak_sums import absolute_gains
+from obsynth.proofs.products import as_ball
 from obsynth.results.checks import Check, upper_bound_check
 
+#: With more states of plant or observer the identities are evaluated in balls of double precision.
+MOST_EXACT = 300
+#: Digits, in bits, in which products of three stored numbers and their sums are all but exact.
+EXACT_BITS = 320
+#: How much wider a ball of double precision is than where another machine's may lie: both hold the same number.
+BOTH_BALLS = 3.0
 #: The identities of an error model hold to this share of their terms, whatever rounding of stored numbers does.
 IDENTITY_SHARE = 1e-7
 #: Gains that were printed to some decimals leave less than this of them; that is judged by the rows of the method.
@@ -243,21 +253,36 @@ class ErrorModel:
     @cached_property
     def remainder(self) -> RemainderChannel:
         """What the identities miss, in outward rounding."""
-        exact, observer = Ball.exact, self.observer
+        if not self.is_evaluated_exactly:
+            return self._remainder(Ball)
+        with flint.ctx.workprec(EXACT_BITS):
+            return self._remainder(ExtendedBall)
+
+    @property
+    def is_evaluated_exactly(self) -> bool:
+        """Whether what the identities miss comes out the same on every machine, all but one rounding."""
+        return bool(max(self.observer.order, len(self.E), self.plant.ny) <= MOST_EXACT)
+
+    def _remainder(self, kind: type[Ball] | type[ExtendedBall]) -> RemainderChannel:
+        exact: Callable[[FloatArray], Any] = kind.exact
+        observer = self.observer
         az, bu, by, cz, du, dy = (exact(getattr(observer, name)) for name in ("Az", "Bu", "By", "Cz", "Du", "Dy"))
         e, a, b, c, d, t = (exact(part) for part in (self.E, self.A, self.B, self.C, self.plant.D, self.T))
-        te, dd = t @ e, exact(self.Dd)
+        te, dd, driven = t @ e, exact(self.Dd), None
         j, el, v = cz @ te + dy @ c - exact(self.goal), du + dy @ d, dy @ dd
         if self.T0 is not None and self.T0.any():
             t0 = exact(self.T0)
             j, el, v = j + t0 @ a, el + t0 @ b, v + t0 @ exact(self.Bd)
-            # What T0 E leaves is driven by the next state, which keeps the bounds of x, or by its rate, which has none.
-            left = (t0 @ e).magnitude
-            if left.any():
-                j = Ball(j.midpoint, j.radius + (left if observer.dt > 0.0 else np.where(left > 0.0, np.inf, 0.0)))
-        return RemainderChannel(
-            az @ te + by @ c - t @ a, bu + by @ d - t @ b, j, el, by @ dd - t @ exact(self.Bd), v
-        )  # fmt: skip
+            driven = t0 @ e
+        missed = (az @ te + by @ c - t @ a, bu + by @ d - t @ b, j, el, by @ dd - t @ exact(self.Bd), v)
+        found = RemainderChannel(*(_as_ball(part) for part in missed))
+        if driven is None:
+            return found
+        # What T0 E leaves is driven by the next state, which keeps the bounds of x, or by its rate, which has none.
+        ball = _as_ball(driven)
+        left = np.where(_there(ball), ball.magnitude, 0.0)
+        added = left if observer.dt > 0.0 else np.where(left > 0.0, np.inf, 0.0)
+        return replace(found, J=Ball(found.J.midpoint, found.J.radius + added)) if left.any() else found
 
     @cached_property
     def _sizes(self) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -349,8 +374,29 @@ class RemainderChannel:
             bound = contraction.gain(observer.Cz, k.midpoint, k.radius)
             # The rows that matter most get a tighter one.
             bound[rows] = np.minimum(bound[rows], rounded_up(gains @ k.magnitude, 2 * observer.order + 4))
-            found.append(np.asarray(rounded_up(bound + direct.magnitude, 2)))
+            # Of what is nothing exactly nothing comes.
+            seen = np.where(_there(direct), direct.magnitude, 0.0)
+            bound = np.where(np.any(_there(k), axis=0), bound, 0.0) + seen
+            found.append(np.where(bound > 0.0, rounded_up(bound, 2), 0.0))
         return tuple(found)
+
+
+def _there(ball: Ball) -> Any:
+    """Return where a ball holds more than an exact zero."""
+    return (ball.midpoint != 0.0) | (ball.radius > 0.0)
+
+
+def _as_ball(part: Ball | ExtendedBall) -> Ball:
+    if isinstance(part, Ball):
+        return part
+    found = as_ball(part.content)
+    nothing = np.reshape([entry.is_zero() for entry in part.content.entries()], found.shape)
+    return Ball(np.where(nothing, 0.0, found.midpoint), np.where(nothing, 0.0, found.radius))
+
+
+def contractions_of(observer: LinearObserver) -> Iterator[Contraction]:
+    """Yield every contraction of a shipped observer's state that is proved: which comes first may hang on rounding."""
+    return proved_contractions(observer.Az, discrete=observer.dt > 0.0)
 
 
 def contraction_of(observer: LinearObserver) -> Contraction | None:

@@ -7,7 +7,7 @@ disturbances exists, and what can be said is after how long it matters.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,16 +17,19 @@ from obsynth.numerics.pencils import pencil_structure
 from obsynth.numerics.ranks import BOUNDARY_TOLERANCE
 from obsynth.numerics.spectra import boundary_points
 from obsynth.observers.linear.observer import LinearObserver
+from obsynth.proofs.balls import rounded_up
 from obsynth.results.checks import Check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.error_system import (
+    BOTH_BALLS,
     ErrorModel,
     RemainderChannel,
     contraction_of,
+    contractions_of,
 )
 
-#: A bound that is claimed may be found again this much larger: sums are added up in another order.
-REPEATED = 1.01
+#: Claimed bounds have room for what rounding of the contraction can do on another machine; at most this share of them.
+MOST_ROOM = 1.0
 #: A gain is claimed for disturbances that last up to one over this, rad per sample: slower ones are reported.
 SLOWEST, POINTS = 1e-7, 120
 #: With more states, of plant and observer together, fewer are looked at.
@@ -55,6 +58,7 @@ class StoredErrors:
 
     channel: RemainderChannel
     bounds: tuple[FloatArray, ...]
+    room: float  # factor, one or more
 
     @classmethod
     def of(cls, model: ErrorModel) -> StoredErrors | None:
@@ -75,11 +79,25 @@ class StoredErrors:
         bounds = model.remainder.errors_per_unit(model.observer, contraction)
         if not all(np.all(np.isfinite(bound)) for bound in bounds):
             return None
-        return cls(model.remainder, bounds)
+        room = 1.0 + min(contraction.roundings, MOST_ROOM)
+        return cls(model.remainder, bounds, room if model.is_evaluated_exactly else BOTH_BALLS * room)
 
     def witnesses(self) -> dict[str, FloatArray]:
-        """Return what a certificate claims of them, by name; what has no column is left out."""
-        return {name: bound for name, bound in zip(_WITNESSES, self.bounds, strict=True) if bound.shape[1]}
+        """Return what a certificate claims of them, by name, such that every machine finds it again: rounded outwards.
+        What has no column is left out."""
+        return {
+            name: np.where(bound > 0.0, rounded_up(self.room * bound, 2), 0.0)
+            for name, bound in zip(_WITNESSES, self.bounds, strict=True)
+            if bound.shape[1]
+        }
+
+    def least(self, observer: LinearObserver) -> StoredErrors:
+        """Return the least bounds by all contractions that are found: any of them is a proof."""
+        bounds = self.bounds
+        for contraction in contractions_of(observer):
+            others = self.channel.errors_per_unit(observer, contraction)
+            bounds = tuple(np.fmin(one, other) for one, other in zip(bounds, others, strict=True))
+        return replace(self, bounds=bounds)
 
 
 @remembered
@@ -101,6 +119,8 @@ def stored_number_rows(design: ObserverDesign, model: ErrorModel, gamma: float |
             yield upper_bound_check("stored numbers: states", "the claimed bounds are found again", np.nan, 0.0,
                                     source="stored numbers")  # fmt: skip
         return
+    if any(_exceeds(bound, claimed[name]) for name, bound in zip(_WITNESSES, found.bounds, strict=True)):
+        found = found.least(observer)
     columns = (model.state_names, plant.input_names, plant.disturbance_names)
     for kind, name, bound, labels in zip(_NAMES, _WITNESSES, found.bounds, columns, strict=True):
         if bound.size:
@@ -109,6 +129,10 @@ def stored_number_rows(design: ObserverDesign, model: ErrorModel, gamma: float |
             yield upper_bound_check(f"stored numbers: {kind}", "there is something to claim", 1.0, 0.0,
                                     source="certificate")  # fmt: skip
     yield from _gain_rows(design, model, gamma)
+
+
+def _exceeds(bound: FloatArray, claimed: FloatArray | None) -> bool:
+    return claimed is not None and claimed.shape == bound.shape and bool(np.any(bound > claimed))
 
 
 def _per_unit(
@@ -125,7 +149,7 @@ def _per_unit(
         return Check(**{**row.__dict__, "status": "proved"})
     if claimed.shape != bound.shape or not np.all(np.isfinite(claimed)):
         return upper_bound_check(name, what, np.nan, 0.0, source=source, detail="the claimed bound has another shape")
-    allowed = REPEATED * claimed
+    allowed = claimed
     # Where nothing is claimed to be left, nothing may be.
     shares = np.where(allowed > 0.0, bound / np.where(allowed > 0.0, allowed, 1.0), np.inf)
     ratios = np.where(bound > allowed, shares, 0.0)
