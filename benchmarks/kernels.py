@@ -1,0 +1,185 @@
+"""The same answer on every machine: designs made with one processor's BLAS kernels and verified with another's, and
+campaigns whose cases must come out the same.  Kernels are chosen by OpenBLAS's own switch (x86-64).
+
+    python -m benchmarks.kernels designs                      every spec under designs/, all pairs of kernels
+    python -m benchmarks.kernels campaigns --cases 200        cases of the campaigns on verdicts, every kernel
+    python -m benchmarks.kernels designs --specs smib/spec    some specs alone
+
+Both print a table of differences and exit 1 where there is one; ``campaigns`` goes on where an ended run was.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import redirect_stdout
+from dataclasses import asdict
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+KERNELS = ("Haswell", "SkylakeX", "Nehalem", "Prescott")
+CAMPAIGNS = ("existence", "recursive_existence", "random_tolerances", "diagnosis")
+#: Runs beside those of the kernels: a second thread, with the first kernel.
+TWO_THREADS = "2 threads"
+
+
+def environment(machine: str) -> dict[str, str]:
+    """Return the environment of a process that computes as a machine does."""
+    kernel, threads = (KERNELS[0], "2") if machine == TWO_THREADS else (machine, "1")
+    return {
+        **os.environ, "OPENBLAS_CORETYPE": kernel, "OPENBLAS_NUM_THREADS": threads, "OMP_NUM_THREADS": threads,
+        "PYTHONPATH": os.pathsep.join([str(ROOT), *os.environ.get("PYTHONPATH", "").split(os.pathsep)]),
+    }  # fmt: skip
+
+
+def started(machine: str, *arguments: str) -> Iterator[dict[str, object]]:
+    """Yield the lines of JSON that a process of a machine prints."""
+    command = [sys.executable, "-m", "benchmarks.kernels", *arguments]
+    with subprocess.Popen(command, env=environment(machine), cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        yield from map(json.loads, process.stdout)
+    if process.returncode:
+        raise SystemExit(f"{machine}: {' '.join(command)} ended with {process.returncode}")
+
+
+def all_specs() -> list[str]:
+    """Return the specs under designs/, without the parts of them that other specs include."""
+    files = sorted((ROOT / "designs").glob("*/*.yaml"))
+    return [f"{file.parent.name}/{file.stem}" for file in files if "\nmethod:" in file.read_text(encoding="utf-8")]
+
+
+def design_all(folder: Path, specs: Iterable[str]) -> None:
+    """Design every spec into a folder; a line of JSON for each."""
+    from obsynth.cli.main import main
+
+    for spec in specs:
+        target = folder / f"{spec.replace('/', '-')}.json"
+        system = str(ROOT / "designs" / f"{spec}.yaml")
+        given = ["design", "--system", system, "--output", str(target), "--quiet", "--force"]
+        with redirect_stdout(sys.stderr):
+            code = main(given)
+        print(json.dumps({"spec": spec, "code": code}), flush=True)
+
+
+def verify_all(files: Iterable[Path]) -> None:
+    """Verify gain sets; a line of JSON for each: what fails, and the least room that any row has left."""
+    from obsynth import load, verify
+
+    for file in files:
+        report = verify(load(file))
+        failed = [f"{row.name}: {row.value:.6g} against {row.bound:.6g}" for row in report.failures]
+        print(json.dumps({"file": str(file), "failed": failed}), flush=True)
+
+
+def compare_designs(machines: Sequence[str], specs: Sequence[str]) -> int:
+    """Design on every machine and verify on every other; print what differs."""
+    wrong = 0
+    with tempfile.TemporaryDirectory() as name:
+        codes: dict[str, dict[str, object]] = {}
+        for machine in machines:
+            folder = Path(name) / machine
+            folder.mkdir()
+            for line in started(machine, "_design", str(folder), *specs):
+                codes.setdefault(str(line["spec"]), {})[machine] = line["code"]
+        for spec, found in codes.items():
+            if len(set(found.values())) > 1:
+                wrong += 1
+                print(f"{spec}: {found}")
+        files = sorted(Path(name).glob("*/*.json"))
+        for machine in machines:
+            others = [str(file) for file in files if file.parent.name != machine]
+            for line in started(machine, "_verify", *others):
+                if line["failed"]:
+                    wrong += 1
+                    print(f"{Path(str(line['file'])).stem}: made on {Path(str(line['file'])).parent.name}, "
+                          f"verified on {machine}: {line['failed']}")  # fmt: skip
+        made = len(files)
+    print(f"{len(codes)} specs, {made} gain sets, {made * (len(machines) - 1)} verifications: {wrong} differences")
+    return wrong
+
+
+def run_cases(campaign: str, first: int, cases: int) -> None:
+    """Run the cases of a campaign; a line of JSON for each."""
+    from benchmarks.campaigns.frame import load_campaign, outcome_of
+
+    module = load_campaign(campaign)
+    for seed in range(first, first + cases):
+        outcome = outcome_of(module, seed)
+        print(json.dumps({"seed": seed, **asdict(outcome)}), flush=True)
+
+
+def compare_campaigns(machines: Sequence[str], campaigns: Sequence[str], first: int, cases: int, journal: Path) -> str:
+    """Run the cases on every machine, and return the table of differences."""
+    known: dict[tuple[str, str], dict[int, dict[str, object]]] = {}
+    if journal.exists():
+        for text in journal.read_text(encoding="utf-8").splitlines():
+            line = json.loads(text)
+            known.setdefault((line.pop("campaign"), line.pop("machine")), {})[line["seed"]] = line
+    rows = ["| campaign | cases | " + " | ".join(machines[1:]) + " |", "| --- | --- |" + " --- |" * (len(machines) - 1)]
+    listed = []
+    for campaign in campaigns:
+        for machine in machines:
+            found = known.setdefault((campaign, machine), {})
+            begin = first
+            while begin in found:
+                begin += 1
+            if begin >= first + cases:
+                continue
+            with journal.open("a", encoding="utf-8", newline="\n") as stream:
+                for line in started(machine, "_cases", campaign, str(begin), str(first + cases - begin)):
+                    found[int(str(line["seed"]))] = line
+                    stream.write(json.dumps({"campaign": campaign, "machine": machine, **line}) + "\n")
+                    stream.flush()
+        counts = []
+        for machine in machines[1:]:
+            differing = [
+                seed for seed in range(first, first + cases)
+                if known[campaign, machines[0]][seed] != known[campaign, machine][seed]
+            ]  # fmt: skip
+            counts.append(str(len(differing)))
+            for seed in differing:
+                both = (known[campaign, which][seed] for which in (machines[0], machine))
+                told = (
+                    f"{line['group']}: {line['result']}{', ' + str(line['wrong']) if line['wrong'] else ''}"
+                    for line in both
+                )
+                listed.append(f"- {campaign}, seed {seed}: {machines[0]} {' / '.join(told)} {machine}")
+        rows.append(f"| {campaign} | {first} to {first + cases - 1} | " + " | ".join(counts) + " |")
+    return "\n".join([*rows, "", f"Differences: {len(listed)}.", *listed]) + "\n"
+
+
+def main() -> int:
+    """Run what was asked for."""
+    if sys.argv[1:2] == ["_design"]:
+        design_all(Path(sys.argv[2]), sys.argv[3:])
+        return 0
+    if sys.argv[1:2] == ["_verify"]:
+        verify_all(map(Path, sys.argv[2:]))
+        return 0
+    if sys.argv[1:2] == ["_cases"]:
+        run_cases(sys.argv[2], int(sys.argv[3]), int(sys.argv[4]))
+        return 0
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.kernels", description=__doc__,
+                                     formatter_class=argparse.RawDescriptionHelpFormatter)  # fmt: skip
+    parser.add_argument("what", choices=("designs", "campaigns"))
+    parser.add_argument("--machines", nargs="+", default=list(KERNELS), help=f"kernels, or {TWO_THREADS!r}")
+    parser.add_argument("--specs", nargs="+", help="designs: which, such as smib/spec (default: all)")
+    parser.add_argument("--campaigns", nargs="+", default=list(CAMPAIGNS), choices=CAMPAIGNS)
+    parser.add_argument("--first", type=int, default=0, help="campaigns: seed of the first case")
+    parser.add_argument("--cases", type=int, default=1000, help="campaigns: cases of each")
+    parser.add_argument("--journal", type=Path, default=ROOT / "benchmarks" / "kernels.jsonl")
+    options = parser.parse_args()
+    if options.what == "designs":
+        return int(compare_designs(options.machines, options.specs or all_specs()) > 0)
+    table = compare_campaigns(options.machines, options.campaigns, options.first, options.cases, options.journal)
+    print(table)
+    return int("Differences: 0." not in table)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
