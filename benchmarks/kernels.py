@@ -17,7 +17,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import redirect_stdout
+from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import asdict
 from pathlib import Path
 
@@ -61,7 +61,7 @@ def design_all(folder: Path, specs: Iterable[str]) -> None:
         target = folder / f"{spec.replace('/', '-')}.json"
         system = str(ROOT / "designs" / f"{spec}.yaml")
         given = ["design", "--system", system, "--output", str(target), "--quiet", "--force"]
-        with redirect_stdout(sys.stderr):
+        with open(os.devnull, "w", encoding="utf-8") as nowhere, redirect_stdout(nowhere), redirect_stderr(nowhere):
             code = main(given)
         print(json.dumps({"spec": spec, "code": code}), flush=True)
 

@@ -1,0 +1,88 @@
+"""What one machine ships another one verifies: other kernels round otherwise, and so do these tests on purpose."""
+
+from __future__ import annotations
+
+import platform
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import obsynth
+from obsynth.numerics.scaling import LogBalance
+from obsynth.proofs import contraction
+from obsynth.proofs.contraction import prove_contraction, proved_contractions
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+
+from benchmarks import kernels
+
+
+def plants() -> Iterator[tuple[str, obsynth.DescriptorSystem]]:
+    rng = np.random.default_rng(5)
+    a = rng.standard_normal((4, 4))
+    a *= 0.9 / np.max(np.abs(np.linalg.eigvals(a)))
+    fields = {"C": rng.standard_normal((3, 4)), "B": rng.standard_normal((4, 1)), "Bf": rng.standard_normal((4, 1))}
+    yield "sampled", obsynth.DescriptorSystem(None, a, dt=0.1, Bd=rng.standard_normal((4, 1)), **fields)
+    yield "continuous", obsynth.DescriptorSystem(None, a - np.eye(4), Bd=rng.standard_normal((4, 1)), **fields)
+
+
+METHODS = {"sampled": obsynth.fault_estimation_filter, "continuous": obsynth.ui_pi_observer}
+PLANTS = dict(plants())
+
+
+@pytest.mark.parametrize("time", PLANTS)
+def test_bounds_are_found_again_with_another_factor_of_the_lyapunov_equation(
+    time: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another machine's factor is off by rounding times its condition; nothing else may decide."""
+    design = METHODS[time](PLANTS[time])
+    shipped = design.certificate.matrices["state_error"]
+    plain, rng = contraction._lyapunov_factor, np.random.default_rng(1)
+
+    def otherwise(a: np.ndarray, rate: float, *, discrete: bool) -> np.ndarray | None:
+        found = plain(a, rate, discrete=discrete)
+        return None if found is None else found * (1.0 + 1e-14 * rng.standard_normal(found.shape))
+
+    monkeypatch.setattr(contraction, "_lyapunov_factor", otherwise)
+    # Equal numbers in a new object: nothing is remembered of the first time.
+    again = obsynth.verify(design.replace(observer=replace(design.observer, Az=design.observer.Az.copy())))
+    assert not [row.name for row in again.failures]
+    row = again["stored numbers: states"]
+    # The room is what rounding can do, and not a share that somebody chose.
+    assert 0.999 * row.bound <= row.value <= row.bound
+    assert np.all(np.isfinite(shipped))
+
+
+def test_every_contraction_that_is_proved_counts() -> None:
+    """Which rate is proved first may hang on rounding: a bound by any of them is one."""
+    matrix = np.array([[0.5, 1.0], [0.0, 0.6]])
+    found = list(proved_contractions(matrix, discrete=True))
+    first = prove_contraction(matrix, discrete=True)
+    assert first is not None
+    assert len(found) == len(contraction.RATES)
+    assert found[0].rate == first.rate
+    assert 0.0 < first.roundings < 1e-8
+
+
+def test_what_the_entries_leave_open_is_no_rounding() -> None:
+    """Scaled equations times inversely scaled states fit as well: without exact residuals rounding over the ridge."""
+    rng = np.random.default_rng(3)
+    matrix = 10.0 ** rng.uniform(-3.0, 3.0, (6, 6))
+    problems = [LogBalance(12), LogBalance(12)]
+    problems[0].add(matrix, range(6), range(6, 12))
+    # The same in another order: other roundings.
+    problems[1].add(matrix[::-1, ::-1], range(6), range(6, 12))
+    first, other = (problem.solve() for problem in problems)
+    turned = np.concatenate([other[:6][::-1], other[6:][::-1]])
+    # Three corrections leave 1e-15 of the exponents, which are about ten.
+    np.testing.assert_allclose(first, turned, rtol=0, atol=1e-12)
+
+
+@pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="OpenBLAS's kernels of x86-64")
+def test_a_gain_set_that_one_processor_made_another_verifies(capfd: pytest.CaptureFixture[str]) -> None:
+    assert kernels.compare_designs(("Haswell", "Nehalem"), ["sharepasand/spec"]) == 0
+    assert "1 specs, 2 gain sets, 2 verifications: 0 differences" in capfd.readouterr().out
