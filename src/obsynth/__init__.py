@@ -118,6 +118,7 @@ provide({
     "conditions of a design": "obsynth.conditions.shipped:conditions_of",
     "checks as text": "obsynth.results.layout:report_text",
     "design summary": "obsynth.report.summary:summary",
+    "rows of a log": "obsynth.data.alarm_proof:rows_of",
     "designs with model error": "obsynth.experiments.tolerant_designs:with_model_error",
 })  # fmt: skip
 

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 from test_adaptive_thresholds import exact_records, start_set
 from uncertain_plants import drive, wang
 
 import obsynth
 from obsynth.experiments.alarm_proof import proved_alarm
+from obsynth.experiments.assumptions import file_digest
+from obsynth.results.gain_sets import digest_of
 from obsynth.tolerances.exact_plant import drawn_points
 
 
@@ -59,8 +63,6 @@ def test_healthy_windows_are_never_proved_faulty(make) -> None:
 
 @pytest.mark.parametrize("change", ["y", "margin", "below", "bounds", "statement", "window", "tolerance"])
 def test_changed_certificates_fail(design, tmp_path, change: str) -> None:
-    from obsynth.results.gain_sets import digest_of
-
     u, y = record(design, 1, fault=0.2)
     found = proved_alarm(design, u[:34], y[:34], **options(design))
     content = json.loads(found.save(tmp_path / "alarm.json").read_text())
@@ -74,7 +76,7 @@ def test_changed_certificates_fail(design, tmp_path, change: str) -> None:
     elif change == "window":
         body["window"] = 5
     elif change == "margin":
-        body["margin"] *= 1.1
+        body["margin"] *= 1.002
     elif change == "statement":
         body["statement"] = body["statement"].replace("a fault", "two faults")
     else:
@@ -94,3 +96,81 @@ def test_a_certificate_with_another_digest_fails(design, tmp_path) -> None:
     file = proved_alarm(design, u[:34], y[:34], **options(design)).save(tmp_path / "alarm.json")
     file.write_text(file.read_text().replace('"row": 34', '"row": 33'))
     assert not obsynth.verify_alarm(file).passed
+
+
+def resigned(content: dict[str, Any], file: Any) -> Any:
+    """Write a certificate with a digest that fits its changed content."""
+    inner = content["certificate"]["gain_set"]
+    inner["sha256"] = digest_of(inner["design"])
+    content["sha256"] = digest_of(content["certificate"])
+    file.write_text(json.dumps(content))
+    return file
+
+
+def test_the_gain_set_inside_is_verified_too(design, tmp_path) -> None:
+    """Claims, plant and tolerances of the gain set in a certificate fail it by name, digests made to fit."""
+    u, y = record(design, 1, fault=0.2)
+    found = proved_alarm(design, u[:34], y[:34], **options(design))
+    text = found.save(tmp_path / "alarm.json").read_text()
+    for path in (("observer", "By"), ("plant", "Bf"), ("certificate", "claims")):
+        content = json.loads(text)
+        part = content["certificate"]["gain_set"]["design"]
+        for key in path:
+            part = part[key]
+        if "data" in part:
+            part["data"] = [1.01 * value for value in part["data"]]
+        else:
+            part["gamma"] *= 0.9
+        report = obsynth.verify_alarm(resigned(content, tmp_path / "bad.json"))
+        assert "gain set" in {check.name for check in report.failures}
+    refused = design.replace(observer=dataclasses.replace(design.observer, By=1.01 * design.observer.By))
+    with pytest.raises(obsynth.VerificationError, match="fails its own verification"):
+        proved_alarm(refused, u[:34], y[:34], **options(design))
+    again = proved_alarm(refused, u[:34], y[:34], **options(design), unverified=True)
+    assert not again.proved
+    assert "unverified" in again.statement
+
+
+def test_the_sentence_tells_bounds_start_constants_and_log(tmp_path) -> None:
+    """Each assumption is in the sentence, and another value of it is another sentence."""
+    design = obsynth.fault_estimation_filter(drive())
+    u, y = record(design, 5, fault=2.0)
+    names = (*design.plant.input_names, *design.plant.output_names)
+    log = tmp_path / "log.csv"
+    pd.DataFrame(np.hstack([u, y]), columns=list(names)).assign(time=0.02 * np.arange(len(u))).to_csv(log, index=False)
+    start = start_set(design)
+    asked = {"disturbance_bounds": {"load": 0.1}, "noise_bound": 1.7, "initial_set": start}
+    found = obsynth.prove_alarm(design, log, 45, **asked)
+    assert found.proved
+    text = found.statement
+    for words in (
+        "load within 0.1",
+        "noise within 1.7 standard deviations",
+        "start with",
+        "J1, J2, k, c, b within 5 % of nominal",
+        "the same at all times",
+        "rows 26 to 45 of log.csv",
+        "since row 1",
+        file_digest(log)[:12],
+    ):
+        assert words in text
+    small = obsynth.prove_alarm(design, log, 45, **{**asked, "disturbance_bounds": {"load": 0.001}})
+    assert "load within 0.001" in small.statement
+    assert small.statement.split("Assumptions")[1] != text.split("Assumptions")[1]
+    file = found.save(tmp_path / "alarm.json")
+    alone, whole = obsynth.verify_alarm(file), obsynth.verify_alarm(file, data=log)
+    assert (alone["log"].status, whole["log"].status) == ("assumed", "computed twice")
+    assert alone.passed
+    assert whole.passed
+    assert alone["statement"].claim == text
+    changed = tmp_path / "other.csv"
+    changed.write_text(log.read_text().replace("time", "time ", 1))
+    assert {check.name for check in obsynth.verify_alarm(file, data=changed).failures} == {"log"}
+    content = json.loads(file.read_text())
+    content["certificate"]["y"]["data"][3] += 1e-9
+    report = obsynth.verify_alarm(resigned(content, tmp_path / "bad.json"), data=log)
+    assert "log" in {check.name for check in report.failures}
+    content["schema_version"] = 1
+    (tmp_path / "old.json").write_text(json.dumps(content))
+    with pytest.raises(obsynth.SpecError, match="prove the alarm again"):
+        obsynth.verify_alarm(tmp_path / "old.json")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,9 @@ from obsynth.data.signals import Signals
 from obsynth.data.sources import Data, samples
 from obsynth.errors import SpecError
 from obsynth.experiments.alarm_proof import WINDOW, AlarmProof, proved_alarm
+from obsynth.experiments.assumptions import Log
 from obsynth.numerics.arguments import is_whole, require_kind, require_mapping
+from obsynth.numerics.arrays import FloatArray
 from obsynth.results.design import ObserverDesign
 
 
@@ -21,7 +24,7 @@ def prove_alarm(
     design: ObserverDesign, data: Data, row: int, *, window: int = WINDOW,
     disturbance_bounds: Mapping[str, float] | None = None, noise_bound: float | None = None,
     initial_set: Mapping[str, Any] | None = None, state_bounds: Mapping[str, Any] | None = None,
-    columns: Mapping[str, str] | None = None, scales: Mapping[str, float] | None = None,
+    columns: Mapping[str, str] | None = None, scales: Mapping[str, float] | None = None, unverified: bool = False,
 ) -> AlarmProof:  # fmt: skip
     """Return a proof that measured data up to a row are not fault-free, or that there is none.
 
@@ -49,6 +52,8 @@ def prove_alarm(
         Without ``initial_set``: bounds of the absolute value of every state in the window.
     columns, scales : mapping, optional
         As for `run_on_data`.
+    unverified : bool, optional
+        Whether a design that fails its own verification gives the answer "cannot be proved" instead of an error.
 
     Returns
     -------
@@ -59,6 +64,8 @@ def prove_alarm(
     ------
     SpecError
         The data or an option is malformed, or nothing bounds a signal.
+    VerificationError
+        The design fails its own verification.
 
     Notes
     -----
@@ -70,9 +77,22 @@ def prove_alarm(
         require_mapping(value, name)
     if not is_whole(row) or row < 2:
         raise SpecError(f"row is {row!r}: give the number of a row, 2 or more.", path="row")
+    values, nu = rows_of(design, data, row, columns, scales), design.linear[0].nu
+    log = Log.of(Path(data), columns, scales) if isinstance(data, (str, Path)) else None
+    return proved_alarm(
+        design, values[:, :nu], values[:, nu:], window=window, disturbance_bounds=disturbance_bounds,
+        noise_bound=noise_bound, initial_set=initial_set, state_bounds=state_bounds, log=log, unverified=unverified,
+    )  # fmt: skip
+
+
+def rows_of(
+    design: ObserverDesign, data: Data, row: int, columns: Mapping[str, str] | None = None,
+    scales: Mapping[str, float] | None = None,
+) -> FloatArray:  # fmt: skip
+    """Return the rows of data up to one, ``(row, nu + ny)``, as a design reads them; refuse what has gaps."""
     reader = DataObserver(design)
     signals = Signals.of(reader, columns, scales)
-    found: list[np.ndarray] = []
+    found: list[FloatArray] = []
     for time, values in itertools.islice(samples(data, signals), row):
         _, missing = reader.clock.advance(time, len(found) + 1)
         if (len(found) and missing) or not np.isfinite(values).all():
@@ -81,8 +101,4 @@ def prove_alarm(
         found.append(values)
     if len(found) < row:
         raise SpecError(f"The data have {len(found)} rows: row {row} is not among them.", path="row")
-    values, nu = np.array(found), reader.nu
-    return proved_alarm(
-        design, values[:, :nu], values[:, nu:], window=window, disturbance_bounds=disturbance_bounds,
-        noise_bound=noise_bound, initial_set=initial_set, state_bounds=state_bounds,
-    )  # fmt: skip
+    return np.array(found)

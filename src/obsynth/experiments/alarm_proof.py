@@ -6,26 +6,28 @@ Certificates of alarms on disk, and their check without a solver.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from obsynth.errors import ObsynthError, PreconditionError, SpecError
+from obsynth.errors import ObsynthError, PreconditionError, SpecError, VerificationError
 from obsynth.experiments.alarm_window import Window, window_data, window_programme
+from obsynth.experiments.assumptions import SHOWN_DIGITS, Assumptions, Log, file_digest
+from obsynth.extensions import extension
 from obsynth.files.inputs import read_json
 from obsynth.files.outputs import FileKind, write_atomically
+from obsynth.methods.verifying import verify
 from obsynth.numerics.arguments import is_whole
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.validation import index_of
-from obsynth.results.checks import Check, VerificationReport
+from obsynth.results.checks import Check, VerificationReport, information
 from obsynth.results.design import ObserverDesign
-from obsynth.results.gain_sets import digest_of, loaded, restored
-from obsynth.tolerances.result import EXACT_MODEL
+from obsynth.results.gain_sets import design_as_dict, digest_of, loaded, plain, restored
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 KIND = "obsynth alarm certificate"
 CERTIFICATE = FileKind("an alarm certificate", b'"kind": "obsynth alarm certificate"')
 #: Samples of a window.
@@ -93,10 +95,23 @@ def proved_alarm(
     design: ObserverDesign, u: FloatArray, y: FloatArray, *, window: int = WINDOW,
     disturbance_bounds: Mapping[str, float] | None = None, noise_bound: float | None = None,
     initial_set: Mapping[str, Any] | None = None, state_bounds: Mapping[str, Any] | None = None,
+    log: Log | None = None, unverified: bool = False,
 ) -> AlarmProof:  # fmt: skip
-    """Return the proof for the last sample of a record ``u (steps, nu)``, ``y (steps, ny)`` of deviations."""
+    """Return the proof for the last sample of a record ``u (steps, nu)``, ``y (steps, ny)`` of deviations.
+    A design that fails its own verification proves nothing: `VerificationError`, unless ``unverified``, and then no
+    alarm is proved."""
     question = Question.of(design, disturbance_bounds, noise_bound, initial_set, state_bounds, window)
     row, length = len(y), min(window, len(y))
+    report = verify(design)
+    if not report.passed:
+        failing = ", ".join(check.name for check in report.failures)
+        if not unverified:
+            raise VerificationError(
+                f"The gain set {design.name!r} fails its own verification ({failing}): no alarm can be proved by it.",
+                report=report,
+            )
+        return AlarmProof(False, row, length, 0.0, f"Cannot be proved: the gain set is unverified ({failing} fails).",
+                          "", {})  # fmt: skip
     try:
         programme, origin = question.programme(design, u, y)
     except PreconditionError as error:
@@ -109,32 +124,38 @@ def proved_alarm(
     margin = float(programme.proved_least(equal, below))
     if not margin > 0.0:
         text = (
-            f"Cannot be proved: some plant within its tolerances, with disturbances and noise within their bounds, may "
-            f"explain the last {length} samples without a fault (the relaxed programme has a solution)."
+            f"Cannot be proved: with {question.assumptions(design).phrase()}, some plant may explain the last {length} "
+            "samples without a fault (the relaxed programme has a solution)."
         )
         return AlarmProof(False, row, length, margin, text, origin, {})
-    text = statement(design, length, origin)
+    margin *= 1.0 - MARGIN_SHARE
+    gain_set = design_as_dict(design)
+    text = statement(design, question, row, origin, log, gain_set["sha256"])
     certificate = {
         **question.as_dict(), "u": u, "y": y, "row": row, "equal": equal, "below": below, "margin": margin,
-        "origin": origin, "statement": text,
+        "origin": origin, "statement": text, "log": None if log is None else log.as_dict(),
     }  # fmt: skip
-    from obsynth.results.gain_sets import design_as_dict, plain
-
     return AlarmProof(True, row, length, margin, text, origin,
-                      {**plain(certificate), "gain_set": design_as_dict(design)})  # fmt: skip
+                      {**plain(certificate), "gain_set": gain_set})  # fmt: skip
 
 
-def statement(design: ObserverDesign, length: int, origin: str) -> str:
+def statement(
+    design: ObserverDesign, question: Question, row: int, origin: str, log: Log | None, gain_set: str
+) -> str:  # fmt: skip
     """Return what a proof says, with everything it rests on."""
+    assumed = question.assumptions(design)
     uncertain = design.linear[0].uncertainty
-    box = None if uncertain is None or not uncertain.box.names else uncertain.box
-    outside = f"; it {EXACT_MODEL}" if box is None else f", or {box.sentence}"
-    linear = "" if box is None or uncertain is None or not uncertain.not_covered else f"; {uncertain.not_covered}"
-    since = "since the start" if "start" in origin else "in the window (states within their stated bounds)"
+    linear = (
+        "" if assumed.box is None or uncertain is None or not uncertain.not_covered else f"; {uncertain.not_covered}"
+    )
+    outside = "a model that is not exact" if assumed.box is None else assumed.box.sentence
+    since = "since row 1" if question.initial_set is not None else "in these rows"
+    source = "a record" if log is None else f"{log.name} (sha256 {log.sha256[:SHOWN_DIGITS]})"
+    first = row - min(question.window, row) + 1
     return (
-        f"Proved: the last {length} samples are not explained without a fault {since} by any plant within its "
-        f"tolerances, disturbances and noise within their bounds, and a start within its set (bounds of the state: "
-        f"{origin}): a fault{outside}{linear}."
+        f"Proved: no course of {assumed.phrase()} explains rows {first} to {row} of {source} without a fault {since}: "
+        f"a fault, or {outside}{linear}. Bounds of the state: {origin}. Assumptions {assumed.digest[:SHOWN_DIGITS]}, "
+        f"gain set {gain_set[:SHOWN_DIGITS]}."
     )
 
 
@@ -183,6 +204,13 @@ class Question:
         bounds = np.concatenate([self.bounds, np.full(affine.plant.nw, self.noise_bound)])
         return window_programme(affine, bounds, data), origin
 
+    def assumptions(self, design: ObserverDesign) -> Assumptions:
+        """Return what is assumed of all that is unknown."""
+        return Assumptions(
+            design.linear[0], self.bounds, self.noise_bound, self.initial_set,
+            self.state_bounds if self.initial_set is None else None,
+        )  # fmt: skip
+
     def as_dict(self) -> dict[str, Any]:
         """Return plain data."""
         return {
@@ -215,22 +243,24 @@ def solved(programme: Window) -> tuple[FloatArray, FloatArray] | None:
     return equal, below
 
 
-#: The stated margin may differ from the one found again by this share: matrices are made anew.
-SAME_MARGIN = 1e-3
+#: The stated margin is smaller than the one found by this share: matrices are made anew where it is checked.
+MARGIN_SHARE = 1e-3
 
 
-def verify_alarm(path: str | Path) -> VerificationReport:
-    """Check the certificate of an alarm again, without a solver.
+def verify_alarm(path: str | Path, *, data: str | Path | None = None) -> VerificationReport:
+    """Check the certificate of an alarm again, without a solver, with all that it rests on.
 
     Parameters
     ----------
     path : str or Path
         What `prove_alarm` (or ``obsynth prove-alarm``) wrote.
+    data : str or Path, optional
+        The log that it names: its digest and its rows are then compared; else they are assumed.
 
     Returns
     -------
     VerificationReport
-        It fails where the file was changed, or the multipliers prove nothing.
+        It fails where the file was changed, the gain set inside fails, or the multipliers prove nothing.
 
     Raises
     ------
@@ -242,24 +272,36 @@ def verify_alarm(path: str | Path) -> VerificationReport:
     if not isinstance(content, dict) or content.get("kind") != KIND:
         raise SpecError(f"{source} is no certificate of an alarm.", path=str(source))
     body = content.get("certificate")
-    if content.get("schema_version") != SCHEMA_VERSION or not isinstance(body, dict):
+    version = content.get("schema_version")
+    if version == OLD_VERSION:
+        raise SpecError(f"{source} is of schema {OLD_VERSION}, which does not say what it rests on: prove the alarm "
+                        "again (obsynth prove-alarm).", path=str(source))  # fmt: skip
+    if version != SCHEMA_VERSION or not isinstance(body, dict):
         raise SpecError(f"{source} has an unknown schema version.", path=str(source))
     intact = content.get("sha256") == digest_of(body)
     checks = [_row("digest", "the file is as it was written", float(intact), 1.0, intact)]
     try:
-        checks += _checked(body)
-    except (ObsynthError, KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+        for check in _checked(body, None if data is None else Path(data)):
+            checks.append(check)  # those before an error stay
+    except (ObsynthError, KeyError, TypeError, ValueError, IndexError, AttributeError, ArithmeticError) as error:
         checks.append(_row("contents", f"the certificate can be read ({error})", 0.0, 1.0, False))
     return VerificationReport.of(checks)
 
 
-def _checked(body: Mapping[str, Any]) -> list[Check]:
+#: Its sentence did not tell bounds, start, constants and log.
+OLD_VERSION = 1
+
+
+def _checked(body: Mapping[str, Any], log_file: Path | None) -> Iterator[Check]:
     data = restored({name: value for name, value in body.items() if name != "gain_set"})
     design = loaded(json.dumps(body["gain_set"]).encode(), "the certificate's gain set")
     plant, _ = design.linear
     u = np.asarray(data["u"], dtype=np.float64).reshape(-1, plant.nu)
     y = np.asarray(data["y"], dtype=np.float64).reshape(-1, plant.ny)
     bounds = np.asarray(data["bounds"], dtype=np.float64)
+    log = None if data["log"] is None else Log.from_dict(data["log"])
+    yield _gain_set_row(design, body["gain_set"]["sha256"])
+    yield _log_row(log, log_file, design, u, y)
     question = Question.of(
         design, dict(zip(plant.disturbance_names, bounds.tolist(), strict=True)), data["noise_bound"],
         data["initial_set"], data["state_bounds"], data["window"],
@@ -268,20 +310,51 @@ def _checked(body: Mapping[str, Any]) -> list[Check]:
     equal, below = np.asarray(data["equal"]), np.asarray(data["below"])
     fits = equal.shape == (len(programme.equal.right),) and below.shape == (len(programme.below.right),)
     margin = float(programme.proved_least(equal, below)) if fits else float("nan")
-    said = statement(design, min(question.window, len(y)), origin)
+    said = statement(design, question, len(y), origin, log, body["gain_set"]["sha256"])
     rows = len(y) == data["row"] and len(u) == len(y)
     stated = float(data["margin"])
-    return [
-        _row("rows", "the record ends at the stated row", float(rows), 1.0, rows),
-        _row("statement", "the sentence is that of these bounds", float(said == data["statement"]), 1.0,
-             said == data["statement"]),
-        _row("proof", "least excess over all bounds, from the multipliers, in exact arithmetic", margin, 0.0,
-             margin > 0.0, kind="proved"),
-        _row("margin", "the stated margin is not above what is proved", stated, margin * (1.0 + SAME_MARGIN),
-             bool(0.0 < stated <= margin * (1.0 + SAME_MARGIN))),
-    ]  # fmt: skip
+    told = said == data["statement"] and origin == data["origin"]
+    yield _row("rows", "the record ends at the stated row", float(rows), 1.0, rows)
+    yield _row("statement", said, float(told), 1.0, told)
+    yield _row("proof", "least excess over all bounds, from the multipliers, in exact arithmetic", margin, 0.0,
+               margin > 0.0, kind="proved")  # fmt: skip
+    yield _row("margin", "the stated margin is not above what is proved", stated, margin, 0.0 < stated <= margin)
 
 
-def _row(name: str, claim: str, value: float, bound: float, passed: bool, *, kind: Any = "computed") -> Check:
+def _gain_set_row(design: ObserverDesign, digest: str) -> Check:
+    """Return the row on the gain set inside, verified like any other."""
+    report = verify(design)
+    failing = ", ".join(check.name for check in report.failures)
+    return _row("gain set", f"the gain set inside ({design.name}, {digest[:SHOWN_DIGITS]}) verifies: "
+                 f"{len(report.checks)} checks", float(len(report.failures)), 0.0, report.passed,
+                 detail=f"fails: {failing}" if failing else "")  # fmt: skip
+
+
+def _log_row(log: Log | None, file: Path | None, design: ObserverDesign, u: FloatArray, y: FloatArray) -> Check:
+    """Return the row on the log: compared where it is given, else assumed."""
+    if file is None:
+        name = "a record that no file holds" if log is None else f"{log.name}, sha256 {log.sha256}"
+        return information("log", f"the rows are those of {name}: assumed, as the log was not given (--data)",
+                           float(len(y)), source="certificate", status="assumed")  # fmt: skip
+    if log is None:
+        return _row("log", "the certificate names the log", 0.0, 1.0, False)
+    if file_digest(file) != log.sha256:
+        return _row("log", f"{file.name} is the log that the certificate names ({log.sha256[:SHOWN_DIGITS]})", 0.0, 1.0,
+                    False)  # fmt: skip
+    values = rows_of_log(design, file, len(y), dict(log.columns), dict(log.scales))
+    equal = bool(np.array_equal(values, np.hstack([u, y])))
+    return _row("log", f"rows 1 to {len(y)} are those of {file.name}, sha256 {log.sha256[:SHOWN_DIGITS]}", float(equal),
+                1.0, equal)  # fmt: skip
+
+
+def rows_of_log(design: ObserverDesign, path: Path, count: int, columns: Any, scales: Any) -> FloatArray:
+    """Return the first rows of a log as a design reads them, known inputs first."""
+    found: FloatArray = extension("rows of a log")(design, path, count, columns, scales)
+    return found
+
+
+def _row(
+    name: str, claim: str, value: float, bound: float, passed: bool, *, kind: Any = "computed", detail: str = ""
+) -> Check:
     source = "linear programme with safe dual bounds (Neumaier and Shcherbina 2004)"
-    return Check(name, claim, value, bound, value - bound, bool(passed), source, kind)
+    return Check(name, claim, value, bound, value - bound, bool(passed), source, kind, detail)
