@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable
+import textwrap
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,14 +26,72 @@ class Group(NamedTuple):
     arguments: tuple[Argument, ...]
 
 
-def add_arguments(parser: Any, arguments: Iterable[Argument | Group]) -> None:
-    """Add arguments to a parser, or to a group of one."""
+class Settings(NamedTuple):
+    """Rare arguments, given as ``--set NAME=VALUE``: listed at the end of the help."""
+
+    arguments: tuple[Argument, ...]
+
+
+def add_arguments(parser: Any, arguments: Iterable[Argument | Group | Settings]) -> None:
+    """Add arguments to a parser, or to a group of one; settings are read by `read_settings`."""
     for item in arguments:
+        if isinstance(item, Settings):
+            continue
         if isinstance(item, Group):
             group = parser.add_argument_group(item.title) if item.title else parser.add_mutually_exclusive_group()
             add_arguments(group, item.arguments)
         else:
             parser.add_argument(*item.names, **item.settings)
+
+
+def settings_of(arguments: Iterable[Argument | Group | Settings]) -> tuple[Argument, ...]:
+    """Return the arguments that are settings."""
+    return tuple(one for item in arguments if isinstance(item, Settings) for one in item.arguments)
+
+
+def add_settings(parser: argparse.ArgumentParser, settings: Sequence[Argument]) -> None:
+    """Let a parser take ``--set`` and know the defaults of settings; its help lists them at the end."""
+    parser.add_argument("--set", dest="settings", metavar="NAME=VALUE", type=setting, action="append", default=[],
+                        help="one of the settings below; may be repeated")  # fmt: skip
+    own = _settings_parser("", settings)
+    parser.set_defaults(**vars(own.parse_args([])))
+    lines = ["settings, each by --set NAME=VALUE (or --NAME VALUE):"]
+    for action in own._actions:
+        name = action.option_strings[0].removeprefix("--")
+        value = action.metavar or ("true" if action.const else "|".join(map(str, action.choices or ("VALUE",))))
+        told = (action.help or "") % {"default": action.default}
+        lines += textwrap.wrap(f"{name}={value}: {told}", 100, initial_indent="  ", subsequent_indent="      ")
+    parser.epilog = "\n".join([*([parser.epilog] if parser.epilog else []), *lines])
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+
+
+def _settings_parser(prog: str, settings: Sequence[Argument]) -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog=prog, add_help=False)
+    add_arguments(parser, settings)
+    return parser
+
+
+def read_settings(
+    prog: str, arguments: Iterable[Argument | Group | Settings], options: argparse.Namespace, rest: Sequence[str]
+) -> list[str]:
+    """Put the settings of a command line into its options, and return what is no setting of the verb."""
+    parser = _settings_parser(prog, settings_of(arguments))
+    given = []
+    for name, value in getattr(options, "settings", ()):
+        known = parser._option_string_actions.get(f"--{name}")
+        if known is not None and known.nargs == 0:
+            given += [f"--{name}"] if value.casefold() in ("true", "yes", "1") else []
+        else:
+            given.append(f"--{name}={value}")
+    return parser.parse_known_args([*given, *rest], namespace=options)[1]
+
+
+def setting(text: str) -> tuple[str, str]:
+    """Return name and value of NAME=VALUE, whose value may hold equals signs."""
+    name, mark, value = text.partition("=")
+    if not mark or not name:
+        raise argparse.ArgumentTypeError(f"{text!r} is not of the form NAME=VALUE")
+    return name.strip().replace("_", "-"), value
 
 
 def option(name: str, metavar: str | None, told: str, **settings: Any) -> Argument:
@@ -91,6 +150,9 @@ LOG_OPTIONS = (
 #: What a monitor is made of.
 MONITOR = Group("monitor", (
     option("--monitor", "KIND", "watch the residual (or the parameters) by a threshold"),
+))  # fmt: skip
+#: What its threshold is made of, where the scenario does not say it.
+MONITOR_SETTINGS = Settings((
     option("--disturbance", "NAME=BOUND", "largest absolute value of a disturbance; may be repeated"),
     option("--noise-bound", "N", "standard deviations that no noise exceeds", type=float),
     option("--initial", "STATE=BOUND", "pointwise, discrete designs: bound of a state of the plant at the start (or "
@@ -104,14 +166,16 @@ MONITOR = Group("monitor", (
 ))  # fmt: skip
 #: How a log is read, and what is watched in it.
 DATA_OPTIONS = (
-    MAP,
-    option("--time-column", "COLUMN", "column of the time, in seconds or as dates (ISO 8601); default: time"),
-    SCALE,
-    option("--threshold", "COLUMN=LEVEL", "alarm when the absolute value of a column of the output passes a level; may "
-           "be repeated"),
-    MONITOR,
-    option("--nominal", "NAME=VALUE", "monitor of a recursive design: nominal value of a parameter; may be repeated"),
-    option("--sample-time", "SECONDS", "monitor of a continuous design: between the rows", type=float),
-    option("--gap", "SECONDS", "continuous designs: longer intervals are gaps", type=float),
-    option("--warm-up", "SECONDS", "how long to mark the start, and after gaps", type=float),
+    MAP, MONITOR, MONITOR_SETTINGS,
+    Settings((
+        option("--time-column", "COLUMN", "column of the time, in seconds or as dates (ISO 8601); default: time"),
+        SCALE,
+        option("--threshold", "COLUMN=LEVEL", "alarm when the absolute value of a column of the output passes a level; "
+               "may be repeated"),
+        option("--nominal", "NAME=VALUE", "monitor of a recursive design: nominal value of a parameter; may be "
+               "repeated"),
+        option("--sample-time", "SECONDS", "monitor of a continuous design: between the rows", type=float),
+        option("--gap", "SECONDS", "continuous designs: longer intervals are gaps", type=float),
+        option("--warm-up", "SECONDS", "how long to mark the start, and after gaps", type=float),
+    )),
 )  # fmt: skip

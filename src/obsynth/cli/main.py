@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from importlib import import_module
 
+from obsynth.cli.arguments import read_settings
 from obsynth.cli.output import print_error, print_json
 from obsynth.cli.verbs import VERBS, design_parser, obsynth_parser
 from obsynth.errors import ObsynthError, SolverError, SpecError
@@ -85,7 +86,7 @@ def _run(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> in
     with usable_streams(), protected_inputs():
         try:
             try:
-                return _outcome(parser.parse_args(arguments))
+                return _outcome(_options(parser, arguments))
             finally:
                 sys.stdout.flush()
         except KeyboardInterrupt:
@@ -94,6 +95,15 @@ def _run(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> in
         except OSError as error:
             # Files are read and written elsewhere, with errors of their own: this is standard output.
             return unwritable_output(error)
+
+
+def _options(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> argparse.Namespace:
+    """Return the arguments of a command line, settings among them."""
+    options, rest = parser.parse_known_args(arguments)
+    rest = read_settings(parser.prog, VERBS[options.verb].arguments, options, rest)
+    if rest:
+        parser.error(f"unrecognized arguments: {' '.join(rest)}")
+    return options
 
 
 def _outcome(options: argparse.Namespace) -> int:

@@ -17,17 +17,21 @@ from obsynth.cli.arguments import (
     LOG_OPTIONS,
     MAP,
     MONITOR,
+    MONITOR_SETTINGS,
     QUIET,
     SCALE,
     SPEC_GAINS,
     SYSTEM,
     Argument,
     Group,
+    Settings,
     add_arguments,
+    add_settings,
     delay,
     digits,
     flag,
     option,
+    settings_of,
     verbose,
 )
 from obsynth.version import __version__
@@ -38,7 +42,7 @@ class Verb(NamedTuple):
 
     run: str
     told: str
-    arguments: tuple[Argument | Group, ...]
+    arguments: tuple[Argument | Group | Settings, ...]
     epilog: str | None = None
 
 
@@ -116,21 +120,23 @@ VERBS = {
         SYSTEM, option("--data", "FILE", "a log (CSV) to replay through every method", type=Path),
         option("--out", "FILE", "write a page (HTML) with table and picture", type=Path),
         option("--runs", "N", "drawn runs of the scenario (default: 20)", type=int, default=20),
-        option("--tolerance", "T", "relative error of parameters that is drawn (0.05)", type=float, default=0.0),
-        option("--within", "SECONDS", "90 %% of a step must be shown within this time", type=float),
-        option("--sample-time", "SECONDS", "the clock of a continuous plant", type=float),
+        Settings((
+            option("--tolerance", "T", "relative error of parameters that is drawn (0.05)", type=float, default=0.0),
+            option("--within", "SECONDS", "90 %% of a step must be shown within this time", type=float),
+            option("--sample-time", "SECONDS", "the clock of a continuous plant", type=float),
+        )),
         FORCE, JSON, QUIET,
     )),
     "evaluate": Verb("scenarios:run_evaluate", "Design an observer from a spec, run the spec's scenario many times, "
                      "and count alarms, delays and errors.", (
         SYSTEM, SPEC_GAINS,
         option("--runs", "N", "how many, each with its seed (default: 100)", type=int, default=100),
-        option("--confidence", "P", "of the intervals (default: 0.95)", type=float, default=0.95),
+        Settings((option("--confidence", "P", "of the intervals (default: 0.95)", type=float, default=0.95),)),
         option("--plants", "N", "draw N plants from the tolerances, half of them vertices", type=int), JOBS,
         option("--tolerances", "LIST", "instead, a fixed bound beside the adaptive threshold for these tolerances, "
                "such as 0,1%%,2%%,5%%"),
         option("--out", "FILE", "with --tolerances: write the picture (.png, .svg or .pdf)", type=Path),
-        MONITOR, JSON, FORCE, QUIET,
+        MONITOR, MONITOR_SETTINGS, JSON, FORCE, QUIET,
     )),
     "sweep": Verb("sweep:run_sweep", "Design and verify for every combination of specs and values; what fails is a "
                   "row of the table.", (
@@ -146,16 +152,19 @@ VERBS = {
         option("--out", "FILE", "CSV or Parquet file for the estimates (default: - for stdout); a folder for many gain "
                "sets", default="-"),
         *DATA_OPTIONS, _EXPECTED, JOBS, CLUSTER,
-        option("--outliers", None, "recursive and nonlinear designs: leave out samples that their prediction excludes "
-               "(default), pull them to its limit, or take them as they are", choices=("gate", "huber", "none")),
+        Settings((
+            option("--outliers", None, "recursive and nonlinear designs: leave out samples that their prediction "
+                   "excludes (default), pull them to its limit, or take them as they are",
+                   choices=("gate", "huber", "none")),
+            option("--recovered", "NAME", "a state of the plant as written to recover (or all, or none; default: all "
+                   "of up to 300); may be repeated", action="append"),
+        )),
         Group("", (
             flag("--smooth", "recursive and nonlinear designs: estimates from the whole log, not only from what came "
                  "before"),
             option("--lag", "N", "the same from the N samples after each row: rows come with N samples of delay, "
                    "with their own time", type=int),
         )),
-        option("--recovered", "NAME", "a state of the plant as written to recover (or all, or none; default: all of up "
-               "to 300)", action="append"),
         option("--state", "FILE", "go on from this saved state if it exists, and save the new one", type=Path),
         option("--prove", "FILE", "with --monitor pointwise: prove the first alarm, and write the certificate that "
                "'verify' rechecks", type=Path),
@@ -167,9 +176,12 @@ VERBS = {
         GAINS, option("--to", "FILE", ".mat, .npz, .c (with a header), or .fmu", type=Path, required=True),
         option("--sample-time", "SECONDS", "sample a continuous-time observer (needed for C and FMU)", type=float),
         option("--fmi", None, "version of FMI for .fmu (default: 2.0)", choices=("2.0", "3.0"), default="2.0"),
-        option("--threshold", "OUTPUT=LEVEL", "for .fmu: alarm when the absolute value of an output, such as "
-               "fhat[pump], passes a level"),
-        option("--warm-up", "SECONDS", "for .fmu: no alarms in these seconds", type=float), FORCE, JSON,
+        Settings((
+            option("--threshold", "OUTPUT=LEVEL", "for .fmu: alarm when the absolute value of an output, such as "
+                   "fhat[pump], passes a level; may be repeated"),
+            option("--warm-up", "SECONDS", "for .fmu: no alarms in these seconds", type=float),
+        )),
+        FORCE, JSON,
     )),
     "plot": Verb("data_commands:run_plot", "Run a design on measured data and draw it: outputs, estimates, residuals, "
                  "thresholds and alarms.", (
@@ -189,13 +201,16 @@ VERBS = {
     )),
     "linearise": Verb("calibration:run_linearise", "Linearise the nonlinear plant of a spec: exact matrices at rest, "
                       "or the reason why it never rests.", (
-        SYSTEM, option("--at", None, "where (default: equilibrium)", choices=("equilibrium", "point")),
-        option("--given", "NAME=VALUE", "value of a state, input, parameter or output there; may be repeated"),
-        option("--free", "NAME[=LOW:HIGH]", "an input or parameter that is solved for, within bounds; may be repeated",
-               action="append", default=[]),
-        option("--fault", "NAME", "a parameter that is a fault (default: all)", action="append"),
-        option("--disturbance", "NAME", "an input that is not known; may be repeated", action="append", default=[]),
-        flag("--drift", "take a moving point, with an input 'drift'"),
+        SYSTEM,
+        Settings((
+            option("--at", None, "where (default: equilibrium)", choices=("equilibrium", "point")),
+            option("--given", "NAME=VALUE", "value of a state, input, parameter or output there; may be repeated"),
+            option("--free", "NAME[=LOW:HIGH]", "an input or parameter that is solved for, within bounds; may be "
+                   "repeated", action="append", default=[]),
+            option("--fault", "NAME", "a parameter that is a fault (default: all); may be repeated", action="append"),
+            option("--disturbance", "NAME", "an input that is not known; may be repeated", action="append", default=[]),
+            flag("--drift", "take a moving point, with an input 'drift'"),
+        )),
         option("--data", "FILE", "the log (CSV or Parquet)", type=Path), *LOG_OPTIONS,
         option("--out", "FILE", "write the linear plant to this file (YAML), at nominal values: for designs that know "
                "tolerances, give the equations and transform.linearise in the spec", type=Path),
@@ -206,9 +221,11 @@ VERBS = {
         SYSTEM, option("--data", "FILE", "the log (CSV or Parquet)", type=Path), *LOG_OPTIONS,
         option("--unknown", "NAME=LOW:HIGH", "a constant that is to be found, with its bounds, beside those of the "
                "spec; may be repeated"),
-        option("--input-delay", "ROWS", "rows by which inputs act later than they are written, or 'auto' (default)",
-               type=delay),
-        option("--level", "P", "probability of the box (default: 0.95)", type=float),
+        Settings((
+            option("--input-delay", "ROWS", "rows by which inputs act later than they are written, or 'auto' (default)",
+                   type=delay),
+            option("--level", "P", "probability of the box (default: 0.95)", type=float),
+        )),
         option("--out", "FILE", "write the result to this file (JSON)", type=Path), JSON, FORCE, QUIET,
     )),
     "validate": Verb("calibration:run_validate", "Ask whether a recorded log without faults agrees with a design.", (
@@ -219,12 +236,15 @@ VERBS = {
                         "fault by any plant within its tolerances.", (
         GAINS, option("--data", "FILE", "CSV or Parquet file, as for run", type=Path, required=True),
         option("--row", "K", "last row of the window, from 1", type=int, required=True),
-        option("--window", "N", "samples (default: 20)", type=int, default=20),
         option("--out", "FILE", "write the certificate (JSON) if there is a proof", type=Path), MAP, SCALE,
-        option("--disturbance", "NAME=BOUND", "largest absolute value of a disturbance; may be repeated"),
-        option("--initial", "STATE=BOUND", "bound of a state at the first row (or LOW:HIGH); may be repeated"),
-        option("--state-bound", "STATE=BOUND", "without --initial: bound of a state in the window; may be repeated"),
-        option("--noise-bound", "N", "standard deviations that no noise exceeds", type=float), JSON, FORCE,
+        Settings((
+            option("--window", "N", "samples (default: 20)", type=int, default=20),
+            option("--disturbance", "NAME=BOUND", "largest absolute value of a disturbance; may be repeated"),
+            option("--initial", "STATE=BOUND", "bound of a state at the first row (or LOW:HIGH); may be repeated"),
+            option("--state-bound", "STATE=BOUND", "without initial: bound of a state in the window; may be repeated"),
+            option("--noise-bound", "N", "standard deviations that no noise exceeds", type=float),
+        )),
+        JSON, FORCE,
     )),
 }  # fmt: skip
 
@@ -258,6 +278,8 @@ def _parser(name: str, told: str) -> argparse.ArgumentParser:
 def _fill(name: str, parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
     parser.set_defaults(verb=name)
     add_arguments(parser, VERBS[name].arguments)
+    if settings := settings_of(VERBS[name].arguments):
+        add_settings(parser, settings)
     if name in _TELL_METHODS:
         # Asked for only when the help is printed: other packages may have registered some.
         parser.format_help = lambda: _help_with_methods(parser)  # type: ignore[method-assign]
