@@ -42,7 +42,10 @@ linkcheck_ignore = [r"https?://localhost.*"]
 html_theme = "pydata_sphinx_theme"
 html_title = "obsynth"
 html_theme_options = {"show_toc_level": 2, "navigation_with_keys": False, "secondary_sidebar_items": ["page-toc"]}
-html_static_path: list[str] = []
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
+# Pages of the first level have nothing below them that a left column could list.
+html_sidebars: dict[str, list[str]] = {"*": []}
 html_show_sourcelink = False
 
 write_sources(HERE)
