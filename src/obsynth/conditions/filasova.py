@@ -15,7 +15,8 @@ The paper's letters: ``q' = A q + B u + F f``, ``y = C q`` (1), (2); with the fa
 
 Theorem 2 is the same with a symmetric ``P3 = Q > 0`` (61)-(65).  As printed, nothing keeps P3 from singular: solvers
 return gains of 1e9 (Theorem 1, delta = 1).  ``reading="safe"`` adds ``P3 + P3' >= 2 I``, which fixes the scale, and
-minimises ``||[Y Z]|| + ||P3||``; no solution is lost up to scale, as L = 0 with small gains makes ``P3 + P3' > 0``.
+minimises ``||[Y Z]|| + ||P3||``.  It has a solution wherever (40)-(43) have one (L = 0 makes ``P3 + P3' > 0`` of them),
+not with all the same gains: the printed ones satisfy the printed reading alone.
 Beyond the paper: outputs that show faults directly, ``C_o = [C Df]``; algebraic states are eliminated.
 """
 

@@ -25,19 +25,20 @@ from obsynth.conditions.atoms import MARGIN
 from obsynth.conditions.problem import Conditions, Values, require_data
 from obsynth.errors import SpecError
 from obsynth.methods.conic import lmi
+from obsynth.methods.conic.lmi import AUTO
 from obsynth.methods.designing import design_from_gains
 from obsynth.methods.fault_estimation_filter.conditions import examine_fault_filter
 from obsynth.methods.fault_estimation_filter.detectability_indexes import exact_indexes, fault_detectability
 from obsynth.methods.fault_estimation_filter.gamma_lower_bound import proved_lower_bound
 from obsynth.methods.fault_estimation_filter.inequality_search import search_least_gain
 from obsynth.methods.fault_estimation_filter.inequality_solutions import null_basis
-from obsynth.methods.fault_estimation_filter.injection_problem import GainProblem
+from obsynth.methods.fault_estimation_filter.injection_problem import GainProblem, normalise
 from obsynth.methods.fault_estimation_filter.prepared_plant import (
     prepare,
     restricted_equivalent_from,
     with_sensor_faults_as_states,
 )
-from obsynth.numerics.arguments import is_finite_number, shown
+from obsynth.numerics.arguments import chosen, is_finite_number, shown
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.numerics.norms import hinf_norm
 from obsynth.numerics.ranks import RANK_TOLERANCE
@@ -50,7 +51,8 @@ ROOMS = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2)
 
 def wang2015(
     plant: DescriptorSystem | Transformation, *, gamma: float | None = None, S: ArrayLike | None = None,
-    T: ArrayLike | None = None, N: ArrayLike | None = None, W: ArrayLike | str | None = None, margin: float = MARGIN,
+    T: ArrayLike | None = None, N: ArrayLike | None = None, W: ArrayLike | str | None = None,
+    coordinates: str = "plant", margin: float = MARGIN,
 ) -> Conditions:  # fmt: skip
     r"""Return Theorem 2 of Wang et al. 2015: the inequality (45) in P and Y.
 
@@ -67,6 +69,10 @@ def wang2015(
         ``(nx, nx)`` and ``(nx, ny)`` with ``T E + N C = I`` (7), instead.
     W : array_like or "free", optional
         Residual weight ``(nf, ny)`` with ``W Upsilon = I``; ``Upsilon^+`` of (47) by default; a variable with "free".
+    coordinates : {"plant", "balanced"}, optional
+        In which states P and Y are written: the plant's; or ``X^-1 e`` of the error e, with the change from the gain
+        ``R0`` of a Riccati filter instead of R, w in units of that filter's gamma, and as many rows of C1 as there are
+        measurements that no fault reaches.  The problem is the same, and solvers find more digits of its optimum.
     margin : float, optional
         What (45) keeps to the boundary of the cone.
 
@@ -116,8 +122,20 @@ def wang2015(
     A1, C1 = TA - L0 @ C, rest @ C  # (46)
     shown_d = (np.eye(m) - C @ N) @ work.Dd  # of d in the innovation: zero in the paper, as D1 and Zd
     TD, D1 = T @ D - TA @ (N @ work.Dd) - L0 @ shown_d, rest @ shown_d
+    convex = GainProblem(
+        A1, V.T @ C, W0 @ C, TD, V.T @ shown_d, W0 @ shown_d, np.zeros((n, m - q)), -np.eye(m - q),
+        np.zeros((q, m - q)), free,
+    )  # fmt: skip
+    X, R0, unit = as_matrix(np.eye(n), "X"), np.zeros((n, m)), 1.0
+    if chosen(coordinates, "coordinates", ("plant", "balanced")) == "balanced":
+        start = search_least_gain(convex, solver=AUTO, polish=False)
+        found = normalise(convex, start=start.injection, gain=start.gain or None)
+        X, rest, unit = found.states, found.measurements @ V.T, found.gain or 1.0
+        R0 = start.injection.R @ V.T
+        A1, TD = np.linalg.solve(X, (A1 - R0 @ C) @ X), np.linalg.solve(X, TD - R0 @ shown_d) / unit
+        C1, D1 = rest @ C @ X, rest @ shown_d / unit
 
-    P, Y = cp.Variable((n, n), symmetric=True, name="P"), cp.Variable((n, m), name="Y")
+    P, Y = cp.Variable((n, n), symmetric=True, name="P"), cp.Variable((n, len(rest)), name="Y")
     variables: dict[str, Any] = {"P": P, "Y": Y}
     if gamma is None:
         gamma_squared = variables["gamma_squared"] = cp.Variable(nonneg=True, name="gamma_squared")
@@ -130,32 +148,29 @@ def wang2015(
         if m == q:
             del variables["Vw"]
         Wx = W0 + Vw @ V.T  # every left inverse of Upsilon
-        Z, Zd = Wx @ C, Wx @ shown_d
+        Z, Zd = Wx @ (C @ X), Wx @ (shown_d / unit)
         whole = lmi.symmetric_blocks([  # (45) before its last Schur complement
             [-P],
-            [np.zeros((nd, n)), -gamma_squared * np.eye(nd)],
+            [np.zeros((nd, n)), -gamma_squared / unit**2 * np.eye(nd)],
             [P @ A1 - Y @ C1, P @ TD - Y @ D1, -P],
             [Z, Zd, np.zeros((q, n)), -np.eye(q)],
         ])  # fmt: skip
     else:
-        Z, Zd = W0 @ C, W0 @ shown_d
+        Z, Zd = W0 @ C @ X, W0 @ shown_d / unit
         whole = lmi.symmetric_blocks([  # (45)
             [-P + Z.T @ Z],
-            [Zd.T @ Z, -gamma_squared * np.eye(nd) + Zd.T @ Zd],
+            [Zd.T @ Z, -gamma_squared / unit**2 * np.eye(nd) + Zd.T @ Zd],
             [P @ A1 - Y @ C1, P @ TD - Y @ D1, -P],
         ])  # fmt: skip
     constraints = {"P": lmi.at_least(P, margin), "(45)": lmi.at_most(whole, -margin)}
 
     def gains(values: Values) -> dict[str, FloatArray]:
-        R = np.linalg.solve(values["P"], values["Y"]) @ rest  # (63)
+        R = R0 + X @ np.linalg.solve(values["P"], values["Y"]) @ rest  # (63)
         weight = W0 + values["Vw"] @ V.T if "Vw" in values else W0
         return {"T": T, "N": N, "L": L0 + R, "W": weight, "Psi": Psi, "Upsilon": Upsilon, "R": R}  # (60)
 
-    data = {"T": T, "N": N, "Psi": Psi, "Upsilon": Upsilon, "W": W0, "A1": A1, "C1": C1, "TD": TD, "L0": L0, "D1": D1}
-    convex = GainProblem(
-        A1, V.T @ C, W0 @ C, TD, V.T @ shown_d, W0 @ shown_d, np.zeros((n, m - q)), -np.eye(m - q),
-        np.zeros((q, m - q)), free,
-    )  # fmt: skip
+    data = {"T": T, "N": N, "Psi": Psi, "Upsilon": Upsilon, "W": W0, "A1": A1, "C1": C1, "TD": TD, "L0": L0, "D1": D1,
+            "X": X, "R0": R0}  # fmt: skip
     return Conditions(
         "Wang et al. 2015, Theorem 2, (45)", cp.Problem(goal, list(constraints.values())), variables,
         {} if gamma is None else {"gamma_squared": gamma_squared}, data, constraints,
