@@ -132,7 +132,8 @@ def wang2015(
         found = normalise(convex, start=start.injection, gain=start.gain or None)
         X, rest, unit = found.states, found.measurements @ V.T, found.gain or 1.0
         R0 = start.injection.R @ V.T
-        A1, TD = np.linalg.solve(X, (A1 - R0 @ C) @ X), np.linalg.solve(X, TD - R0 @ shown_d) / unit
+        A1 = np.asarray(np.linalg.solve(X, (A1 - R0 @ C) @ X))
+        TD = np.asarray(np.linalg.solve(X, TD - R0 @ shown_d) / unit)
         C1, D1 = rest @ C @ X, rest @ shown_d / unit
 
     P, Y = cp.Variable((n, n), symmetric=True, name="P"), cp.Variable((n, len(rest)), name="Y")
