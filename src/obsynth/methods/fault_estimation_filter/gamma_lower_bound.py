@@ -181,14 +181,14 @@ def _checked_bound(dual: _DualProblem, z1: FloatArray, corner: FloatArray, last:
 
 def least_gain_certificate(
     problem: GainProblem, work: DescriptorSystem, gains: Mapping[str, FloatArray], factor: FloatArray, *, gain: float,
-    solver: str, thorough: bool,
+    free_weight: bool, solver: str, thorough: bool,
 ) -> tuple[dict[str, FloatArray], float]:  # fmt: skip
     """Return a proof that no such filter has a gain below ``gain``, and what it proves; else none.
 
     ``factor (n, n)`` maps errors to coordinates in which they are of natural sizes.  What is not thorough is tried
-    where it costs little, and takes no semidefinite solver.
+    where it costs little, and takes no semidefinite solver.  ``free_weight``: of all W, though the search may have
+    ended in a problem with a fixed one.
     """
-    free_weight = problem.weight_is_free
     if _is_hopeless(problem, gain, thorough=thorough):
         return {}, 0.0
     pairs = InvisiblePairs.of(work, gains)

@@ -89,7 +89,14 @@ def synthesise(plant: DescriptorSystem, asked: FaultEstimationFilter, *, progres
     if plant.nd:
         progress("proving that no filter does better")
         proof, proved = least_gain_certificate(
-            problem, prepared.plant, gains, factor, gain=least.gain, solver=asked.solver, thorough=asked.prove_least
+            problem,
+            prepared.plant,
+            gains,
+            factor,
+            gain=least.gain,
+            free_weight=free,
+            solver=asked.solver,
+            thorough=asked.prove_least,
         )
         witnesses |= proof
         # The search may end below what is proved, by its tolerance: no filter is there.
