@@ -46,6 +46,13 @@ class OperatingPointCheck:
             self._sum[known] += deviations[known]
             self._count[known] += 1.0
 
+    def take_rows(self, times: Sequence[float], deviations: FloatArray) -> None:
+        """Take rows, as `take` one by one."""
+        for time, row in zip(times, deviations, strict=True):
+            if self._begin is not None and not time - self._begin <= FIRST:
+                break
+            self.take(time, row)
+
     def warnings(self) -> tuple[str, ...]:
         """Return a text for each signal with a stated operating point, not zero, that begins far from it."""
         texts = []
@@ -127,14 +134,17 @@ class Job:
     def _taken(self, chunk: FloatArray) -> list[list[Any]]:
         entries: list[Entry] = []
         scaled = self.signals.deviations(chunk)
+        if self.later is None:
+            times = chunk[:, 0].tolist()
+            rows = self.engine.steps(times, scaled, self.rows + 1)
+            self.rows += len(rows)
+            self.first.take_rows(times, scaled)
+            return self._shown([Entry(*parts) for parts in zip(times, scaled, rows, strict=True)])
         for time, deviations in zip(chunk[:, 0].tolist(), scaled, strict=True):
             entry = Entry(time, deviations, self.engine.step(time, deviations, self.rows + 1))
             self.rows += 1
             self.first.take(time, deviations)
-            if self.later is None:
-                entries.append(entry)
-            else:
-                entries.extend(ready for ready, *_ in self.later.take(entry))
+            entries.extend(ready for ready, *_ in self.later.take(entry))
         return self._shown(entries)
 
     def finish(self) -> list[list[Any]]:

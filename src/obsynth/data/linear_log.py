@@ -23,6 +23,8 @@ from obsynth.results.design import ObserverDesign
 
 #: How many lengths of an interval are kept discretised.
 KEPT_INTERVALS = 64
+#: Rows that are taken in one piece at most.
+PIECE = 4096
 SAMPLED_GAP = "gap is for continuous-time designs: a sampled one knows which rows are missing."
 _Part = TypeVar("_Part")
 
@@ -187,6 +189,60 @@ class DataObserver(Engine):
         self.fault = found[self.observer.fault_rows].copy()
         sample = LinearSample(found, values[: self.nu], values[self.nu :])
         return Row(status, found, missing, sample, time >= self.forgotten_at)
+
+    def steps(self, times: list[float], values: FloatArray, row: int) -> list[Row]:
+        """Take rows of data: those that follow each other without a gap in one piece."""
+        found: list[Row] = []
+        complete = np.asarray(np.isfinite(values).all(axis=1))
+        while (done := len(found)) < len(times):
+            missing = np.flatnonzero(~complete[done : done + PIECE])
+            end = done + (int(missing[0]) if missing.size else PIECE)
+            if self.z is not None and self.model is None:
+                found += self._regular_rows(times[done:end], values[done:end])
+            if len(found) < len(times) and (len(found) < end or len(found) == done):
+                place = len(found)
+                found.append(self.step(times[place], values[place], row + place))
+        return found
+
+    def _regular_rows(self, times: Sequence[float], values: FloatArray) -> list[Row]:
+        """Take the first complete rows that follow each other without a gap, and end before a number overflows."""
+        steps = self.clock.regular(times)
+        count, observer = len(steps), self.observer
+        if not count:
+            return []
+        z, before, sampled = _running(self.z), self.v, observer.dt > 0.0
+        states, rows = np.empty((count, observer.order)), np.empty((count, len(observer.Cz)))
+        # The products of `step`, in the same order: results do not depend on where a piece ends.
+        with np.errstate(over="ignore", invalid="ignore"):
+            for k, v in enumerate(values[:count]):
+                if not sampled:
+                    transition, constant, ramp = self._hold(steps[k])
+                    z = transition @ z + constant @ before + ramp @ (v - before)
+                    before = v
+                states[k] = z
+                rows[k] = observer.Cz @ z + self.d @ v
+                if sampled:
+                    z = observer.Az @ z + self.b @ v
+        after = np.vstack([states[1:], z]) if sampled else states
+        known = np.isfinite(after).all(axis=1) & np.isfinite(rows).all(axis=1)
+        if not known.all():
+            count = int(np.argmin(known))
+            if not count:
+                return []
+        last = count - 1
+        self.clock.take(times[:count], steps[:count])
+        self.z, self.v, self.row, self.measured = np.array(after[last]), values[last], rows[last], values[last]
+        self.fault = rows[last][observer.fault_rows].copy()
+        self.seen = (
+            rows[last][observer.state_rows] if self.partial is None
+            else self.partial.state(states[last], values[last], rows[last][observer.fault_rows])
+        )  # fmt: skip
+        self.inputs.extend(v[: self.nu] for v in values[max(count - (self.inputs.maxlen or count), 0) : count])
+        settled, phase, forgotten, nu = self.settled_at, self.phase, self.forgotten_at, self.nu
+        return [
+            Row(OK if time >= settled else phase, row, 0, LinearSample(row, v[:nu], v[nu:]), time >= forgotten)
+            for time, row, v in zip(times[:count], rows[:count], values[:count], strict=True)
+        ]
 
     def _measured(self, seconds: float, v: FloatArray) -> FloatArray:
         if self.observer.dt == 0.0:

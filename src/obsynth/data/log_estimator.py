@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol
 
@@ -22,6 +22,8 @@ DECIDING = (OK, PARTIAL)
 LONGEST_BRIDGE = 10_000
 #: A sampled design accepts intervals that differ from a multiple of dt by this share of dt.
 FITTING_SHARE = 0.01
+#: One that differs by this share of dt is one of dt for certain.
+SURE_SHARE = 0.009
 #: Without another word, an interval is a gap when it is longer than this many times the longest one before.
 GAP_FACTOR = 10.0
 #: A gap of more samples than this cannot be counted in double precision.
@@ -84,6 +86,29 @@ class Clock:
         if not missing:
             self.longest = max(self.longest, step)
         return step, missing
+
+    def regular(self, times: Sequence[float]) -> list[float]:
+        """Return the intervals to the first of these stamps that certainly follow each other without a gap; nothing is
+        taken."""
+        found: list[float] = []
+        if self.last is None or not self.longest > 0.0:
+            return found
+        before, longest = self.last, GAP_FACTOR * self.longest if self.gap is None else self.gap
+        lowest, highest = 0.0, longest
+        if self.dt > 0.0:
+            # Narrower than what fits, so that no rounding of an interval counts.
+            lowest, highest = (1.0 - SURE_SHARE) * self.dt, (1.0 + SURE_SHARE) * self.dt
+        for time in times:
+            step = interval(before, time) if time > before and time < math.inf else 0.0
+            if not lowest <= step <= highest or step <= 0.0:
+                break
+            found.append(step)
+            before = time
+        return found
+
+    def take(self, times: Sequence[float], steps: Sequence[float]) -> None:
+        """Take stamps that `regular` found to follow each other, with their intervals."""
+        self.last, self.longest = times[-1], max(self.longest, *steps)
 
     def _sampled(self, step: float, row: int) -> int:
         count = _counted(step / self.dt, step, row)
@@ -162,6 +187,10 @@ class Engine(ABC):
     @abstractmethod
     def step(self, time: float, values: FloatArray, row: int) -> Row:
         """Take one row of data: its time, deviations ``(nu + ny,)``, and its number."""
+
+    def steps(self, times: list[float], values: FloatArray, row: int) -> list[Row]:
+        """Take rows of data, ``values (rows, nu + ny)``, of which the first has this number: as `step` one by one."""
+        return [self.step(time, found, row + i) for i, (time, found) in enumerate(zip(times, values, strict=True))]
 
     def as_dict(self) -> dict[str, Any]:
         """Return the state that goes from row to row, as data."""

@@ -61,21 +61,38 @@ class TextSink:
 
 
 class FrameSink:
-    """Rows to a data frame, in which dates stay dates."""
+    """Rows to a data frame, in which dates stay dates; numbers are kept as arrays, not as objects."""
 
     def __init__(self, header: Sequence[str], stamps: Stamps) -> None:
-        self._header, self._rows, self._stamps = list(header), list[Sequence[Any]](), stamps
-        self._times = time_columns(header)
+        self._header, self._stamps = list(header), stamps
+        self._times = frozenset(time_columns(header))
+        self._numbers: list[list[FloatArray]] = [[] for _ in header]
+        self._others: list[list[Any]] = [[] for _ in header]
 
     def write(self, rows: Sequence[Sequence[Any]]) -> None:
         """Keep rows."""
-        self._rows.extend(dated(rows, self._times, self._stamps.moment) if self._stamps.is_dated else rows)
+        for place, cells in enumerate(zip(*rows, strict=True)):
+            if self._header[place] in TEXTS:
+                self._others[place].extend(cells)
+            elif self._stamps.is_dated and place in self._times:
+                self._others[place].extend(map(self._stamps.moment, cells))
+            else:
+                self._numbers[place].append(np.array(cells, dtype=np.float64))
 
     def frame(self) -> Any:
         """Return the data frame."""
         import pandas as pd
 
-        return pd.DataFrame(self._rows, columns=self._header)
+        found = {}
+        for place, name in enumerate(self._header):
+            parts = self._numbers[place]
+            found[place] = pd.Series(np.concatenate(parts) if parts else self._others[place], name=name)
+            self._numbers[place] = []
+        if not found or not len(found[0]):
+            return pd.DataFrame([], columns=self._header)
+        frame = pd.DataFrame(found, copy=False)
+        frame.columns = pd.Index(self._header)
+        return frame
 
 
 class ParquetSink:
@@ -131,8 +148,13 @@ def measured_frame(kept: list[FloatArray] | None, signals: Signals, stamps: Stam
         return None
     import pandas as pd
 
-    rows = np.concatenate(kept)
-    frame = pd.DataFrame(signals.measured(rows), columns=list(signals.names))
-    times = [stamps.moment(time) for time in rows[:, 0].tolist()] if stamps.is_dated else rows[:, 0]
-    frame.insert(0, TIME, times)
+    count, done = sum(map(len, kept)), 0
+    seconds, found = np.empty(count), np.empty((len(signals.names), count))
+    for chunk in kept:
+        part = slice(done, done + len(chunk))
+        seconds[part], found[:, part] = chunk[:, 0], signals.measured(chunk).T
+        done += len(chunk)
+    kept.clear()
+    frame = pd.DataFrame(found.T, columns=list(signals.names), copy=False)
+    frame.insert(0, TIME, [stamps.moment(time) for time in seconds.tolist()] if stamps.is_dated else seconds)
     return frame

@@ -51,7 +51,14 @@ def chunks(data: Data, signals: Signals, stamps: Stamps, rows: int) -> Iterator[
         import pandas as pd
 
         require_kind(data, pd.DataFrame, "data", "the name of a file, a text stream or a pandas.DataFrame")
-        yield from _converted(iter([_with_time(data, signals)]), signals, stamps)
+        frame = _with_time(data, signals)
+        numbers = all(pd.api.types.is_numeric_dtype(kind) for kind in frame.dtypes)
+        # Of numbers a part says no less than the whole: no copy of all of them is made.
+        parts = range(0, max(len(frame), 1), rows) if numbers else range(1)
+        size = rows if numbers else max(len(frame), 1)
+        for whole in _converted((frame.iloc[start : start + size] for start in parts), signals, stamps):
+            for start in range(0, len(whole), rows):
+                yield whole[start : start + rows]
 
 
 def samples(data: Data, signals: Signals) -> Iterator[tuple[float, FloatArray]]:
