@@ -1,4 +1,7 @@
-"""What all tests share: how many of the plants that are drawn at random a run looks at."""
+"""What all tests share: how many of the plants drawn at random a run looks at, and which tests other machines run.
+
+`.ci/run` takes the tests marked ``numerics`` once more with other processors' kernels and with the oldest dependencies.
+"""
 
 from __future__ import annotations
 
@@ -9,12 +12,31 @@ import pytest
 
 #: Without ``--whole`` one of so many cases that are drawn at random is looked at.
 PARTS = 4
+#: Files of tests that decide something numerically.
+NUMERIC = frozenset({
+    "test_balls.py", "test_ball_arithmetic.py", "test_certain_covariance.py", "test_compiled_run.py",
+    "test_continuous_norms.py", "test_corrupted_functional_filters.py", "test_corrupted_pd_designs.py",
+    "test_corrupted_ui_pi_designs.py", "test_dae_engines.py", "test_definiteness.py", "test_exact_existence.py",
+    "test_existence_again.py", "test_filasova.py", "test_hard_structures.py", "test_interior_point.py",
+    "test_kalman_unknown_inputs.py", "test_lmi.py", "test_norms.py", "test_other_machines.py", "test_pd_observer.py",
+    "test_pencils.py", "test_placement.py", "test_platforms.py", "test_polish.py", "test_random_inequalities.py",
+    "test_random_ui_pi_units.py", "test_recursive_conditions.py", "test_refuted_levels.py", "test_riccati.py",
+    "test_rounding_of_plants.py", "test_scaling.py", "test_sharepasand.py", "test_singular_covariances.py",
+    "test_steady_filter.py", "test_ui_pi_edges.py", "test_ui_pi_units.py", "test_wang2015.py", "test_weight_limit.py",
+    "test_witnesses.py", "test_zeros.py",
+})  # fmt: skip
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--whole", action="store_true", help="all random plants of the property tests, not every fourth (ten minutes)"
     )
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if item.path.name in NUMERIC:
+            item.add_marker(pytest.mark.numerics)
 
 
 @pytest.fixture(scope="session")

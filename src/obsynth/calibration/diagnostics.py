@@ -124,7 +124,7 @@ def wrong_samples(y: FloatArray) -> BoolArray:
         away = np.abs(column - middle)
         spread = max(float(np.quantile(away[seen], OTHERS)), LEAST_SPREAD * abs(middle))
         far = seen & (away > FAR_OFF * spread)
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], far, [False]]).astype(int)))
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], far, [False]]).astype(np.int64)))
         for begin, end in zip(edges[::2], edges[1::2], strict=True):
             if spread > 0.0 and begin > 0 and end < len(column) and end - begin <= LONGEST_SPIKE:
                 found[begin:end, i] = True

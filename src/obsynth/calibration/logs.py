@@ -206,7 +206,7 @@ def _on_grid(
                       path="log.time")  # fmt: skip
     gaps = np.diff(time)
     step = float(np.median(gaps)) if dt is None and gaps.size else float(dt or 1.0)
-    counts = np.round(gaps / step).astype(int)
+    counts = np.round(gaps / step).astype(np.int64)
     jitter = np.abs(gaps / step - counts)
     notes = []
     if jitter.max(initial=0.0) > LARGEST_JITTER or (counts < 1).any():

@@ -59,7 +59,9 @@ def integration_error(
     """Compare one step from each state ``(n, nx)``, where Radau has a solution, with the input that leads on."""
     steps = [ImplicitStep(DAEFunctions(model, method), dt) for method in ("backward-euler", "radau")]
     worst = IntegrationError(0.0, model.output_names[0], 0)
-    for k in np.unique(np.linspace(0, max(len(states) - 2, 0), min(COMPARED, max(len(states) - 1, 1))).astype(int)):
+    for k in np.unique(
+        np.linspace(0, max(len(states) - 2, 0), min(COMPARED, max(len(states) - 1, 1))).astype(np.int64)
+    ):
         after = min(k + 1, len(u) - 1)
         try:
             seen = [step.functions.outputs(step.solve(states[k], u[after], theta, before=u[k], k=int(k)).x, theta)[0]

@@ -31,18 +31,18 @@ def compiled(functions: Sequence[Any]) -> list[Any]:
     command = compiler()
     if command is None:
         return list(functions)
-    with tempfile.TemporaryDirectory(prefix="obsynth-") as folder:
+    with tempfile.TemporaryDirectory(prefix="obsynth-", ignore_cleanup_errors=True) as folder:
         generator = ca.CodeGenerator("calibration.c")
         for function in functions:
             generator.add(function)
         generator.generate(f"{folder}/")
         source, library = Path(folder) / "calibration.c", Path(folder) / "calibration.so"
         done = subprocess.run(
-            [*command, *FLAGS, str(source), "-o", str(library), "-lm"], capture_output=True, text=True, check=False
+            [*command, *FLAGS, str(source), "-o", str(library), "-lm"], capture_output=True, check=False
         )
         if done.returncode != 0:
             return list(functions)
-        # What is loaded stays when the file is gone.
+        # What is loaded stays when the file is gone; Windows keeps the file.
         return [ca.external(function.name(), str(library)) for function in functions]
 
 

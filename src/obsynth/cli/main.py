@@ -32,7 +32,7 @@ def usable_streams() -> Iterator[None]:
             stream = getattr(sys, name)
             if stream is None:
                 # The first file that is opened would get its number, and what is meant for the terminal.
-                setattr(sys, name, stack.enter_context(open(os.devnull, "w", encoding="utf-8")))
+                setattr(sys, name, stack.enter_context(open(os.devnull, "w", encoding="utf-8", newline="")))
                 stack.callback(setattr, sys, name, None)
             elif hasattr(stream, "reconfigure"):
                 stream.reconfigure(errors="backslashreplace")

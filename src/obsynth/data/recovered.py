@@ -39,7 +39,7 @@ class RecoveredStates:
         self._map = np.hstack([recovery.from_state, recovery.from_fault[:, :known]])[places]
         self._inputs = recovery.from_input[places]
         used = self._map.any(axis=0)
-        delays = np.array([*engine.state_delays, *engine.fault_delays[:known]], dtype=int)
+        delays = np.array([*engine.state_delays, *engine.fault_delays[:known]], dtype=np.int64)
         self.delay = int(np.max(delays[used], initial=0))
         self._ages = np.where(used, self.delay - delays, 0)
         self._used, self._columns = used, np.arange(states + known)

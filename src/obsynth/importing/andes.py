@@ -118,7 +118,7 @@ def _dense(matrix: Any) -> FloatArray:
     if hasattr(matrix, "V"):
         rows, columns, values = (np.array(part).ravel() for part in (matrix.I, matrix.J, matrix.V))
         dense = np.zeros(matrix.size)
-        np.add.at(dense, (rows.astype(int), columns.astype(int)), values)
+        np.add.at(dense, (rows.astype(np.int64), columns.astype(np.int64)), values)
         return dense
     return np.asarray(matrix, dtype=np.float64)
 

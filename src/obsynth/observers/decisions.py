@@ -214,7 +214,7 @@ def _cusum(
     signs = np.concatenate([change, -change])
     steps = np.hstack([along, along]) * signs - 0.5 * np.hstack([squares, squares]) * signs**2
     threshold = float(np.log(2.0 * nq * samples / false_alarms))
-    level, started, values, alarm = np.zeros(2 * nq), np.zeros(2 * nq, dtype=int), np.zeros(samples), None
+    level, started, values, alarm = np.zeros(2 * nq), np.zeros(2 * nq, dtype=np.int64), np.zeros(samples), None
     for k in range(samples):
         level = np.maximum(level + steps[k], 0.0)
         started[level == 0.0] = k + 1

@@ -79,16 +79,16 @@ class WaitingState(NamedTuple):
 class SensorTiming:
     """When each sensor is sampled, and how late its values are."""
 
-    every: NDArray[np.int_]  # every, delays: ``(ny,)``, in rows
-    delays: NDArray[np.int_]
+    every: NDArray[np.int64]  # every, delays: ``(ny,)``, in rows
+    delays: NDArray[np.int64]
     inputs: int  # how many there are. A sensor is sampled at k = 0, every, 2 every,
 
     @classmethod
     def of(cls, sensors: Mapping[str, Mapping[str, int]] | None, names: Sequence[str], inputs: int) -> SensorTiming:
         """Return the timing of outputs by name."""
         entries = [(sensors or {}).get(name, {}) for name in names]
-        return cls(np.array([entry.get("every", 1) for entry in entries], dtype=int),
-                   np.array([entry.get("delay", 0) for entry in entries], dtype=int), inputs)  # fmt: skip
+        return cls(np.array([entry.get("every", 1) for entry in entries], dtype=np.int64),
+                   np.array([entry.get("delay", 0) for entry in entries], dtype=np.int64), inputs)  # fmt: skip
 
     @cached_property
     def is_plain(self) -> bool:

@@ -240,7 +240,7 @@ def _shade(panel: Axes, table: Any, told: set[str], *, alarms: bool) -> None:
         marks.append((table["alarm"].to_numpy() != "", _ALARM, "alarm"))
     times = table["time"]
     for where, style, label in marks:
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], where, [False]]).astype(int)))
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], where, [False]]).astype(np.int64)))
         for begin, end in edges.reshape(-1, 2):
             new = None if label in told else label
             told.add(label)

@@ -64,7 +64,7 @@ def _entries(matrix: FloatArray) -> dict[str, Any]:
 
 def _matrix(entries: Mapping[str, Any]) -> FloatArray:
     found = np.zeros([int(size) for size in entries["size"]])
-    found[np.array(entries["rows"], dtype=int), np.array(entries["columns"], dtype=int)] = entries["values"]
+    found[np.array(entries["rows"], dtype=np.int64), np.array(entries["columns"], dtype=np.int64)] = entries["values"]
     return found
 
 

@@ -223,7 +223,7 @@ KINDS: Mapping[str, Any] = {
     "named vector": list[float] | dict[Text, float] | None,
     "named pairs": dict[Text, Range] | None,
     "solver": Text,
-    "function": None,
+    "function": type(None),
     "objective": Literal["h2"] | None,
     "placement objective": Literal["conditioning", "gain"],
     "region": dict[Text, float | Range] | list[dict[Text, float | Range]] | None,

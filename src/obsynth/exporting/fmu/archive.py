@@ -167,11 +167,11 @@ def _binary(sources: Mapping[str, str], compiled: list[str]) -> bytes | None:
     with tempfile.TemporaryDirectory(prefix="obsynth-") as name:
         folder = Path(name)
         for file, text in sources.items():
-            (folder / file).write_text(text, encoding="utf-8")
+            (folder / file).write_text(text, encoding="utf-8", newline="\n")
         library = folder / "library"
         done = subprocess.run(
             [*command, *FLAGS, "-fvisibility=hidden", *(str(folder / file) for file in compiled), "-o", str(library),
-             "-lm"], capture_output=True, text=True, check=False,
+             "-lm"], capture_output=True, encoding="utf-8", errors="replace", check=False,
         )  # fmt: skip
         if done.returncode != 0:
             raise SpecError(f"The C compiler {command[0]!r} fails: {done.stderr.strip()[:500]}", path="fmu")

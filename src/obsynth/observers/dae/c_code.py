@@ -212,15 +212,19 @@ class DAELibrary:
                 "There is no C compiler (cc, gcc or clang, or what CC in the environment names): install one, or leave "
                 "compiled=True out.", path="compiled",
             )  # fmt: skip
-        with tempfile.TemporaryDirectory(prefix="obsynth-") as folder:
+        with tempfile.TemporaryDirectory(prefix="obsynth-", ignore_cleanup_errors=True) as folder:
             source, library = Path(folder) / "observer.c", Path(folder) / "observer.so"
-            source.write_text(record_code(steps), encoding="utf-8")
+            source.write_text(record_code(steps), encoding="utf-8", newline="\n")
             done = subprocess.run(
-                [*command, *FLAGS, str(source), "-o", str(library), "-lm"], capture_output=True, text=True, check=False
+                [*command, *FLAGS, str(source), "-o", str(library), "-lm"],
+                capture_output=True,
+                encoding="utf-8",
+                errors="replace",
+                check=False,
             )
             if done.returncode != 0:
                 raise SpecError(f"The C compiler {command[0]!r} fails: {done.stderr.strip()[:500]}", path="compiled")
-            # It stays loaded when the file is gone.
+            # It stays loaded when the file is gone; Windows keeps the file.
             self._library = ctypes.CDLL(str(library))
         pointer = ctypes.POINTER(ctypes.c_double)
         self._library.state_bytes.restype = ctypes.c_long
