@@ -7,8 +7,7 @@ import argparse
 import pytest
 
 from obsynth.cli.arguments import read_settings, settings_of
-from obsynth.cli.main import main
-from obsynth.cli.verbs import VERBS, obsynth_parser
+from obsynth.cli.main import VERBS, main, obsynth_parser
 
 
 def read(*line: str) -> argparse.Namespace:

@@ -14,7 +14,7 @@ from obsynth.numerics.pencils import pencil_structure
 from obsynth.simulation import simulate_plant
 from obsynth.spec import load_spec
 from obsynth.spec.documents import read_yaml
-from obsynth.spec.matrices import read_matrix_market
+from obsynth.spec.loader import read_matrix_market
 
 FOLDER = Path(__file__).parents[2] / "designs" / "ieee14"
 EXPECTED = read_yaml(FOLDER / "expected.yaml")

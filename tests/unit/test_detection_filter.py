@@ -91,7 +91,7 @@ def test_every_row_can_fail(row: str) -> None:
 
 def test_sensitivity_is_refuted_between_the_points_of_a_grid() -> None:
     # A notch far narrower than any grid: the proof must not pass over it.
-    from obsynth.methods.functional_filter.detection_proofs import Transfer, sensitivity_is_proved
+    from obsynth.methods.functional_filter.detection import Transfer, sensitivity_is_proved
     from obsynth.proofs.balls import Ball
 
     a = np.array([[-1e-4, 1.2345], [-1.2345, -1e-4]])

@@ -9,8 +9,7 @@ from scipy.optimize import linprog
 
 from obsynth.errors import SolverError
 from obsynth.methods.conic import interior_point, lmi
-from obsynth.methods.conic.interior_point import NormalEquations, solve_cone_programme
-from obsynth.methods.conic.semidefinite_block import SemidefiniteBlock
+from obsynth.methods.conic.interior_point import NormalEquations, SemidefiniteBlock, solve_cone_programme
 
 
 def symmetric(rng: np.random.Generator, order: int) -> np.ndarray:
@@ -31,7 +30,7 @@ class TestBlock:
         self, monkeypatch: pytest.MonkeyPatch, part: int
     ) -> None:
         """Through two moves, the second given in the scaling of the first; columns in parts or at once."""
-        monkeypatch.setattr("obsynth.methods.conic.semidefinite_block.PART", part)
+        monkeypatch.setattr("obsynth.methods.conic.interior_point.PART", part)
         rng, block = np.random.default_rng(1), SemidefiniteBlock(4, 0)
         s, z = (m @ m.T + 0.1 * np.eye(4) for m in rng.standard_normal((2, 4, 4)))
         block.move(block.vector(s), block.vector(z))

@@ -10,7 +10,7 @@ import pytest
 import obsynth
 from obsynth.cli.main import main
 from obsynth.errors import SpecError
-from obsynth.report.page_tables import value_text
+from obsynth.report.page import value_text
 
 PLANT = {
     "E": [[1.0, 0.0], [0.0, 1.0]],

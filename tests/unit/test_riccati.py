@@ -11,12 +11,13 @@ from obsynth.methods.fault_estimation_filter.central_filter import central_filte
 from obsynth.methods.fault_estimation_filter.injection_problem import GainProblem, Injection
 from obsynth.methods.riccati import bounded_real_matrix
 from obsynth.numerics.doubling import (
+    FIRST_POWER,
+    RankWatch,
     compared_gain,
     continuous_riccati_solution,
     doubled_riccati_solution,
 )
 from obsynth.numerics.norms import hinf_norm, spectral_radius
-from obsynth.numerics.slow_part import FIRST_POWER, RankWatch
 
 
 def random_problem(rng, n=5, m=2, q=1, nd=3, free_weight=False):

@@ -1,15 +1,32 @@
-"""One self-contained HTML page about a design: the verdict first."""
+"""One self-contained HTML page about a design: the verdict first.
+
+Sections of a page about a recorded log: what a design says of it, and whether the two agree.
+
+Tables of the page: facts, checks in the order of the argument, matrices; every text is escaped.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from html import escape
 from importlib.resources import files
+from itertools import groupby
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+from rich.table import Table
+from rich.text import Text
+
+from obsynth.calibration.diagnostics import Validation, draw_validation
+from obsynth.calibration.validating import states_innovations, validate
+from obsynth.data.log_estimator import DECIDING
 from obsynth.data.run import DataRun
+from obsynth.errors import ObsynthError
 from obsynth.files.outputs import FileKind, write_atomically
 from obsynth.methods.registry import REGISTRY, method_class
+from obsynth.numerics.arrays import FloatArray
+from obsynth.plotting.data import panel_count, plot_data
 from obsynth.report.designs import (
     FITS,
     delay_curves,
@@ -21,15 +38,239 @@ from obsynth.report.designs import (
     recovered_states,
     tolerance_facts,
 )
-from obsynth.report.logs import agreement_section, data_section
-from obsynth.report.page_tables import check_rows, copied_table, fact_rows, matrix_rows, table_lines, value_text
-from obsynth.report.pictures import pictures_of
+from obsynth.report.pictures import pictures_of, stacked
 from obsynth.report.summary import summary
-from obsynth.results.checks import VerificationReport
+from obsynth.results.checks import Check, CheckKind, Status, VerificationReport
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import gain_set_digest
-from obsynth.results.layout import verdict_line
+from obsynth.results.layout import headed_table, number, verdict, verdict_line
 from obsynth.simulation.scenario import Scenario
+
+#: Prefix of a check's name -> heading of its group; the others are about the shipped observer.
+_GROUPS = {"plant": "The plant", "exists": "Does such an observer exist?"}
+_SHIPPED = "The shipped observer"
+#: Characters of an option; a solver's log may be long.
+LONGEST_VALUE = 400
+#: What each kind of check is worth.
+KINDS: dict[CheckKind, str] = {
+    "proved": "an inequality that was proved, with bounds on every rounding error",
+    "condition": "an existence condition of the method, on the plant alone",
+    "equality": "an identity: what is left of it, against a bound scaled by the size of its terms; it is not called "
+    "proved",
+    "computed": "a number that was found again by a second route",
+    "information": "a number worth knowing that no verdict depends on",
+}
+#: What each row is worth, whatever its kind.
+STATUSES: dict[Status, str] = {
+    "proved": "outward rounding, on the numbers that are stored",
+    "computed twice": "double precision, by a route that shares no intermediate result with the design",
+    "estimated": "statistics, with the interval in which chance alone puts the number",
+    "assumed": "stated by whoever made the design, and not checked",
+}
+
+
+def fact_rows(rows: Iterable[Sequence[str]]) -> Iterator[str]:
+    """Yield a table of labels with one or more values each."""
+    yield '<div class="scroll"><table class="facts"><tbody>'
+    for label, *values in rows:
+        cells = "".join(f"<td>{escape(value)}</td>" for value in values)
+        yield f'<tr><th scope="row">{escape(label)}</th>{cells}</tr>'
+    yield "</tbody></table></div>"
+
+
+def copied_table(table: Table) -> Iterator[str]:
+    """Yield a terminal's table as one of the page."""
+    rows = zip(*(map(str, column.cells) for column in table.columns), strict=True)
+    yield from table_lines([str(column.header) for column in table.columns], rows)
+
+
+def table_lines(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> Iterator[str]:
+    """Yield a table with headings; all columns but the first hold numbers."""
+    kinds = ["", *["number"] * (len(headings) - 1)]
+    yield '<div class="scroll"><table class="copied"><thead><tr>'
+    yield "".join(f'<th class="{kind}">{escape(text)}</th>' for kind, text in zip(kinds, headings, strict=True))
+    yield "</tr></thead><tbody>"
+    for row in rows:
+        cells = (f'<td class="{kind}">{escape(text)}</td>' for kind, text in zip(kinds, row, strict=True))
+        yield f"<tr>{''.join(cells)}</tr>"
+    yield "</tbody></table></div>"
+
+
+def check_rows(checks: Sequence[Check]) -> Iterator[str]:
+    """Yield the table of the checks, those that fail in a group of their own at the top, and what the kinds mean."""
+    yield '<div class="scroll"><table class="checks"><thead><tr>'
+    yield "".join(
+        f'<th class="{"number" if heading in ("value", "bound", "margin") else ""}">{heading}</th>'
+        for heading in ("verdict", "check", "value", "bound", "margin", "source")
+    )
+    yield "</tr></thead>"
+    for title, members in groupby(sorted(checks, key=_place), key=_group):
+        yield f'<tbody><tr><th colspan="6" scope="rowgroup">{escape(title)}</th></tr>'
+        yield from map(_row, members)
+        yield "</tbody>"
+    yield "</table></div>"
+    yield "<h3>What each kind of check is worth</h3>"
+    yield from fact_rows([
+        *((kind, meaning) for kind, meaning in KINDS.items() if any(check.kind == kind for check in checks)),
+        *((f"({status})", meaning) for status, meaning in STATUSES.items()
+          if any(check.status == status for check in checks)),
+    ])  # fmt: skip
+
+
+def _group(check: Check) -> str:
+    return "What fails" if not check.passed else _GROUPS.get(check.name.partition(":")[0], _SHIPPED)
+
+
+def _place(check: Check) -> int:
+    return ("What fails", *_GROUPS.values(), _SHIPPED).index(_group(check))
+
+
+def _row(check: Check) -> str:
+    word = verdict(check).plain
+    detail = f"<div>{escape(check.detail)}</div>" if check.detail else ""
+    parts = dict.fromkeys([*([] if word == "info" else [check.kind]), f"({check.status})"])
+    kind = f'<span class="kind">{escape(" ".join(parts))}</span>'
+    numbers = "".join(
+        f'<td class="number{" none" if number(value) == "-" else ""}" data-label="{label}">{number(value)}</td>'
+        for label, value in (("value", check.value), ("bound", check.bound), ("margin", check.margin))
+    )
+    return (
+        f'<tr><td class="word {word.lower()}" data-label="verdict">{word}{kind}</td>'
+        f'<td><strong>{escape(check.name)}</strong><div class="claim">{escape(check.claim)}</div>{detail}</td>'
+        f'{numbers}<td class="source">{escape(check.source)}</td></tr>'
+    )
+
+
+def matrix_rows(matrix: FloatArray) -> Iterator[str]:
+    """Yield a matrix ``(rows, cols)``; zeros are faint."""
+    if not matrix.size:
+        yield '<p class="soft">empty</p>'
+        return
+    yield '<div class="scroll tall"><table class="matrix"><tbody>'
+    for row in matrix.tolist():
+        cells = (
+            f'<td class="number{"" if value else " zero"}">{number(value, digits=6) if value else "0"}</td>'
+            for value in row
+        )
+        yield f"<tr>{''.join(cells)}</tr>"
+    yield "</tbody></table></div>"
+
+
+def value_text(value: Any) -> str:
+    """Return an option or a solver's setting as one line: matrices by rows, diagonal ones as such; long ones cut."""
+    text = _text(value)
+    return text if len(text) <= LONGEST_VALUE else f"{text[:LONGEST_VALUE]} ... (the gain set has all of it)"
+
+
+def _text(value: Any) -> str:
+    if value is None or isinstance(value, (bool, np.bool_)):
+        return {None: "none", True: "yes", False: "no"}[None if value is None else bool(value)]
+    if isinstance(value, (int, float)):
+        return number(float(value), digits=7)
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key}: {_text(item)}" for key, item in value.items()) or "none"
+    if isinstance(value, np.ndarray) and value.ndim == 2:
+        if len(value) > 1 and value.shape[0] == value.shape[1] and not np.any(value[~np.eye(len(value), dtype=bool)]):
+            return f"diag({', '.join(map(_text, np.diag(value).tolist()))})"
+        return f"[{'; '.join(', '.join(map(_text, row)) for row in value.tolist())}]"
+    if isinstance(value, (list, tuple)) and value and all(isinstance(item, Mapping) for item in value):
+        return "; ".join(map(_text, value))
+    if isinstance(value, (list, tuple, np.ndarray)):
+        return f"[{', '.join(_text(item) for item in value)}]" if len(value) else "none"
+    return str(value)
+
+
+_TEXT = ("Measured and predicted signals, innovations in a band of two deviations as the design expects them, and "
+         "estimates in bands of two deviations.")  # fmt: skip
+
+
+def agreement_section(design: ObserverDesign, run: DataRun, rows: str | None) -> Iterator[str]:
+    """Yield verdict, table by sensor and picture of a run's log; nothing for designs without expected innovations."""
+    if run.measured is None or not states_innovations(design):
+        return
+    try:
+        # What was read is in the signals' units already.
+        found = validate(design, run.measured, rows=rows, scales=dict.fromkeys(run.measured.columns, 1.0))
+    except ObsynthError as error:
+        if rows is not None:
+            raise
+        yield f"<p>Not asked of this log: {escape(str(error))}</p>"
+        return
+    state = "holds" if found.passed else "fails"
+    sentence = "The log agrees with the design." if found.passed else "The log does not agree with the design."
+    yield f'<p class="verdict {state}">{sentence}</p>'
+    yield "<ul>"
+    yield from (f"<li>{escape(text)}</li>" for text in found.verdict)
+    yield "</ul>"
+    yield from fact_rows(_facts(found, rows))
+    yield from copied_table(_sensors(design, found))
+    panels = 2 * len(found.sensors) + len(found.estimates)
+    yield stacked("", _TEXT, panels, lambda axes: draw_validation(found, axes)).html()
+
+
+def _facts(found: Validation, rows: str | None) -> Iterator[tuple[str, str]]:
+    first, last = found.log["rows"]
+    every = "" if rows is not None else ", all: taken as free of faults; --rows names those that are"
+    yield "rows", f"{first} to {last - 1}{every}"
+    nis = found.nis
+    yield "NIS", f"{nis.value:.3g} per degree of freedom; {nis.low:.2f} to {nis.high:.2f} in 95 % of logs like this one"
+    if found.change is not None:
+        yield "change", f"the mean of the innovations changes at row {found.change}"
+
+
+def _sensors(design: ObserverDesign, found: Validation) -> Table:
+    table = headed_table("sensor", "unit", "mean square", "expected", "mean (deviations)", "white (p)", "variance")
+    for name, sensor in found.sensors.items():
+        ratio = found.ratios.get(name)
+        table.add_row(
+            Text(name), design.plant.units.get(name, ""), number(sensor.nis.value),
+            f"{sensor.nis.low:.2f} to {sensor.nis.high:.2f}", f"{sensor.mean:+.2g}",
+            f"{sensor.whiteness.probability:.2g}", "as designed" if ratio is None else f"{ratio:.2g} times R",
+        )  # fmt: skip
+    return table
+
+
+def data_section(design: ObserverDesign, run: DataRun, statement: str) -> Iterator[str]:
+    """Yield a picture of a run, what was counted, and statistics of estimates and residuals in decided rows."""
+    count = panel_count(run)
+    if count:
+        text = ("Measured outputs and their estimates, fault estimates, residuals and the monitor's statistic, as far "
+                "as there are any. Nothing is decided in grey rows; rows with an alarm are red.")  # fmt: skip
+        yield stacked("", text, count, lambda axes: plot_data(run, design=design, axes=axes)).html()
+    yield from fact_rows(_counts(run, statement))
+    yield from (f'<p class="warning">Warning: {escape(text)}</p>' for text in run.warnings)
+    yield from _statistics(design, run)
+
+
+def _counts(run: DataRun, statement: str) -> Iterator[tuple[str, str]]:
+    yield "rows", f"{run.rows}: " + ", ".join(f"{count} {status}" for status, count in run.statuses.items())
+    for name, time in run.alarms.items():
+        fault = f"; {run.isolated} stands out" if run.isolated and name not in run.thresholds else ""
+        yield "alarm", f"{name}, first at {run.stamps.shown(time)}{fault}"
+    if not run.alarms:
+        yield "alarm", "none"
+    if statement:
+        yield "threshold", statement
+
+
+def _statistics(design: ObserverDesign, run: DataRun) -> Iterator[str]:
+    if run.table is None:
+        return
+    decided = run.table[run.table["status"].isin(DECIDING)]
+    names = [name for name in run.table.columns if name.startswith(("fhat[", "r["))]
+    if not len(decided) or not names:
+        return
+    table = headed_table("in decided rows", "unit", "least", "mean", "largest", "deviation")
+    for name in names:
+        values = decided[name].to_numpy(dtype=np.float64)
+        values = values[np.isfinite(values)]
+        if values.size:
+            unit = design.plant.units.get(name[name.index("[") + 1 : -1], "")
+            found = (number(float(f(values))) for f in (np.min, np.mean, np.max, np.std))
+            table.add_row(Text(name), unit, *found)
+    yield "<h3>Statistics</h3>"
+    yield from copied_table(table)
+
 
 #: A page that `html_report` has written; the second mark is that of its first pages.
 PAGE = FileKind("a report of obsynth", rb'name="generator" content="obsynth|<p class="verdict (holds|fails)">')

@@ -1,26 +1,483 @@
-"""From a spec file to a plant that a method can use, transformed as asked, and a scenario that can be simulated."""
+"""From a spec file to a plant that a method can use, transformed as asked, and a scenario that can be simulated.
+
+From the sections of a checked document to plants, with the tolerances of their constants.
+
+Matrices in files beside a spec: ``.mtx``, ``.npz``, ``.mat`` and ``.csv``.
+
+The reader of Matrix Market is ours, since that of scipy (1.17) crashes the interpreter on some damaged files.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+import struct
+import warnings
+import zipfile
+import zlib
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
 
 from obsynth.errors import SpecError
+from obsynth.files.inputs import input_file, read_json
+from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.numerics.libraries import one_thread_if_small
+from obsynth.numerics.sparse import as_sparse_matrix, is_sparse
+from obsynth.plants.constants import constant_of
 from obsynth.plants.dae.model import DAEModel
-from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.descriptor import MATRICES, SIGNAL_NAMES, DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.plants.uncertain_system import with_expressions
+from obsynth.plants.uncertainty import UNCERTAIN_MATRICES, Entry
+from obsynth.plants.validation import index_of
 from obsynth.simulation.profiles import KINDS, Profile
 from obsynth.simulation.scenario import Scenario
 from obsynth.simulation.signals import check_parameters
-from obsynth.spec.documents import DocumentProblems, checked_plant, checked_spec, read_yaml
-from obsynth.spec.plants import boxed_constants, built_plant, joined, matlab_plant, read_value
+from obsynth.spec.documents import DocumentProblems, checked_plant, checked_spec, read_names, read_yaml
 
 if TYPE_CHECKING:
     from obsynth.analysis.transformations.recovery import Transformation
     from obsynth.spec.schema import DAESection, ProfileSection, ScenarioSection, TransformSection
+
+if TYPE_CHECKING:
+    from obsynth.spec.schema import DAESection, EntrySection, PlantReference, PlantSection, TimeVaryingSection
+
+
+#: Larger matrices are refused; of sparse ones, the entries that are stored count.
+MAXIMUM_ENTRIES = 50_000_000
+# What the readers of numpy and scipy raise for a damaged file.
+_READING_ERRORS = (
+    OSError, ValueError, TypeError, KeyError, IndexError, EOFError, OverflowError, RuntimeError, MemoryError,
+    AttributeError, UserWarning, struct.error, zlib.error, zipfile.BadZipFile,
+)  # fmt: skip
+
+
+def read_matrix(path: Path, *, variable: str | None = None, where: str, keep_sparse: bool = False) -> Any:
+    """Return the matrix in a file; a CSR array where it is stored by coordinates and may stay sparse."""
+    return _checked(_read_array(path, variable=variable, where=where, keep_sparse=keep_sparse), path.name, where)
+
+
+def _checked(given: Any, name: str, where: str) -> Any:
+    try:
+        matrix = as_sparse_matrix(given, name) if is_sparse(given) else as_matrix(given, name)
+    except SpecError as error:
+        raise SpecError(str(error), path=where) from error
+    if 0 in matrix.shape:
+        raise SpecError(f"{name} holds an empty matrix.", path=where)
+    return matrix
+
+
+def read_matrices(path: Path, *, variable: str | None = None, count: int | None = None, where: str) -> FloatArray:
+    """Return the matrix in a file, or a stack of matrices ``(entries, rows, columns)``."""
+    array = _read_array(path, variable=variable, where=where)
+    if np.ndim(array) != 3:
+        matrix: FloatArray = _checked(array, path.name, where)
+        if count is None:
+            return matrix
+        rows, columns = matrix.shape
+        if rows % count:
+            raise SpecError(f"{path.name} has {rows} rows, which cannot be shared out among {count} matrices.",
+                            path=where)  # fmt: skip
+        return read_only(matrix.reshape(count, rows // count, columns))
+    stack = np.moveaxis(array, -1, 0) if path.suffix.lower() == ".mat" else array
+    if not stack.size:
+        raise SpecError(f"{path.name} holds an empty stack of matrices.", path=where)
+    if count is not None and len(stack) != count:
+        raise SpecError(f"{path.name} holds a stack of {len(stack)} matrices, not {count}.", path=where)
+    named = ((f"{path.name}, matrix {k} of the stack,", matrix) for k, matrix in enumerate(stack, 1))
+    return read_only(np.array([_checked(matrix, name, where) for name, matrix in named]))
+
+
+def _read_array(path: Path, *, variable: str | None, where: str, keep_sparse: bool = False) -> Any:
+    """Return what a file holds as an array of any kind, or as a sparse one."""
+    readers: dict[str, Callable[[Path], Any]] = {
+        ".mtx": partial(read_matrix_market, maximum_entries=MAXIMUM_ENTRIES, keep_sparse=keep_sparse),
+        ".csv": partial(np.loadtxt, delimiter=",", ndmin=2, encoding="utf-8-sig"),
+    }
+    archives: dict[str, Callable[[Path], Mapping[str, Any]]] = {".npz": _numpy_archive, ".mat": _matlab_archive}
+    suffix = path.suffix.lower()
+    if suffix not in readers and suffix not in archives:
+        known = ", ".join(sorted([*readers, *archives]))
+        raise SpecError(f"{path.name} has an unknown suffix: matrices are read from {known} files.", path=where)
+    if variable is not None and suffix in readers:
+        raise SpecError(f"{path.name} holds one matrix only: remove 'variable'.", path=where)
+    input_file(path, where=where)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", UserWarning)
+            content = readers[suffix](path) if suffix in readers else archives[suffix](path)
+            raw = content if suffix in readers else _selected(content, variable, path, where)
+            return raw if keep_sparse and is_sparse(raw) and suffix == ".mtx" else _as_dense(raw)
+    except _READING_ERRORS as error:
+        raise SpecError(f"{path} cannot be read as a matrix: {_reason(error)}", path=where) from error
+
+
+def _numpy_archive(path: Path) -> dict[str, Any]:
+    # Opened here, because numpy leaves a damaged file open.
+    with path.open("rb") as stream:
+        if not zipfile.is_zipfile(stream):
+            raise ValueError("it is no .npz archive")
+        stream.seek(0)
+        with np.load(stream, allow_pickle=False) as archive:
+            return dict(archive)
+
+
+def _matlab_archive(path: Path) -> dict[str, Any]:
+    from obsynth.importing.model_files import mat_arrays
+
+    return mat_arrays(path)
+
+
+def _selected(content: Mapping[str, Any], variable: str | None, path: Path, where: str) -> Any:
+    known = ", ".join(map(repr, content)) or "none"
+    if variable is not None:
+        if variable not in content:
+            raise SpecError(f"{path} has no array {variable!r}; it has: {known}.", path=where)
+        return content[variable]
+    if len(content) != 1:
+        raise SpecError(f"{path} must say which array is meant ('variable: name'); it has: {known}.", path=where)
+    return next(iter(content.values()))
+
+
+def _as_dense(raw: Any) -> Any:
+    """Return an array for whatever a reader gave; a damaged sparse matrix must not reach scipy's loops."""
+    entries = math.prod(int(length) for length in getattr(raw, "shape", ()))
+    if entries > MAXIMUM_ENTRIES:
+        raise ValueError(f"it is too large ({entries:.1e} entries)")
+    if not hasattr(raw, "toarray"):
+        return raw
+    if hasattr(raw, "check_format"):
+        raw.check_format(full_check=True)
+    return raw.toarray()
+
+
+def _reason(error: BaseException) -> str:
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.strerror}."
+    text = str(error).strip().splitlines()
+    return f"{text[0].rstrip('.')}." if text else f"{type(error).__name__}."
+
+
+#: Smaller matrices become arrays: nothing is gained by sparsity.
+SPARSE_FROM = 300
+#: A sparse matrix needs memory for each row and column as well: this many entries' worth, generously.
+ENTRIES_PER_LINE = 1000
+#: Whole numbers with more digits are damage.
+MOST_DIGITS = 15
+
+
+def read_matrix_market(path: Path, *, maximum_entries: int, keep_sparse: bool = False) -> Any:
+    """Return the matrix in a Matrix Market file: an array, or a CSR array of a large one that may stay sparse."""
+    with path.open(encoding="utf-8") as stream:
+        layout, field, symmetry = _checked_header(stream.readline(200))
+        lines = (line for line in stream if line.strip() and not line.startswith("%"))
+        size = next(lines, "").split()
+        tokens = [token for line in lines for token in line.split()]
+    counts = [_whole(token, "the sizes") for token in size]
+    if len(counts) != (3 if layout == "coordinate" else 2) or min(counts) < 0:
+        raise ValueError("the line with the sizes is damaged")
+    rows, columns = counts[:2]
+    sparse = keep_sparse and layout == "coordinate" and max(rows, columns) >= SPARSE_FROM
+    entries = max(rows, columns) * ENTRIES_PER_LINE if sparse else rows * columns
+    if max(entries, *counts) > maximum_entries:
+        raise ValueError(f"it is too large ({max(rows * columns, *counts):.1e} entries)")
+    if symmetry != "general" and rows != columns:
+        raise ValueError(f"it is {symmetry}, but {rows} by {columns}")
+    if layout == "array":
+        return _from_array(tokens, rows, columns, symmetry)
+    return _from_coordinates(tokens, (rows, columns, counts[2]), field, symmetry, sparse=sparse)
+
+
+def _checked_header(line: str) -> tuple[str, str, str]:
+    words = line.lower().split()
+    if len(words) != 5 or words[:2] != ["%%matrixmarket", "matrix"]:
+        raise ValueError("its first line is no Matrix Market header")
+    _, _, layout, field, symmetry = words
+    if field == "complex" or symmetry == "hermitian":
+        raise ValueError("it holds complex numbers")
+    known = (
+        layout in ("coordinate", "array")
+        and field in ("real", "double", "integer", "unsigned-integer", "pattern")
+        and symmetry in ("general", "symmetric", "skew-symmetric")
+        and (layout, field) != ("array", "pattern")
+    )
+    if not known:
+        raise ValueError(f"'{' '.join(words[2:])}' is no known kind of Matrix Market file")
+    return layout, field, symmetry
+
+
+def _from_array(tokens: list[str], rows: int, columns: int, symmetry: str) -> FloatArray:
+    values = _numbers(tokens)
+    if symmetry == "general":
+        _require_count(len(values), rows * columns)
+        return values.reshape(columns, rows).T
+    # The lower triangle, column by column.
+    column, row = np.triu_indices(rows, 1 if symmetry == "skew-symmetric" else 0)
+    _require_count(len(values), len(row))
+    matrix = np.zeros((rows, columns))
+    (row, column), values = _both_triangles([row, column], values, symmetry)
+    matrix[row, column] = values
+    return matrix
+
+
+def _from_coordinates(tokens: list[str], size: tuple[int, int, int], field: str, symmetry: str, *, sparse: bool) -> Any:
+    rows, columns, stored = size
+    width = 2 if field == "pattern" else 3
+    _require_count(len(tokens), width * stored)
+    positions = [_indices(tokens[k::width]) - 1 for k in (0, 1)]
+    for position, limit in zip(positions, (rows, columns), strict=True):
+        if np.any(position < 0) or np.any(position >= limit):
+            raise ValueError("an index is outside the matrix")
+    values = np.ones(stored) if field == "pattern" else _numbers(tokens[2::width])
+    if symmetry != "general":
+        positions, values = _both_triangles(positions, values, symmetry)
+    # Entries that are given twice are added, as the format says.
+    from scipy.sparse import coo_array
+
+    found = coo_array((values, (positions[0], positions[1])), shape=(rows, columns))
+    return found.tocsr() if sparse else found.toarray()
+
+
+def _both_triangles(positions: list[Any], values: FloatArray, symmetry: str) -> tuple[list[Any], FloatArray]:
+    """Return the coordinates of a lower triangle and of what it stands for above the diagonal."""
+    row, column = positions
+    if np.any(column[values != 0.0] > row[values != 0.0]):
+        raise ValueError(f"it is {symmetry}, but has entries above the diagonal")
+    sign, below = (-1.0 if symmetry == "skew-symmetric" else 1.0), row > column
+    mirrored = [np.concatenate([row, column[below]]), np.concatenate([column, row[below]])]
+    return mirrored, np.concatenate([values, sign * values[below]])
+
+
+def _numbers(tokens: list[str]) -> FloatArray:
+    return np.fromiter(map(float, tokens), dtype=np.float64, count=len(tokens))
+
+
+def _indices(tokens: list[str]) -> Any:
+    if not all(map(str.isdecimal, tokens)) or max(map(len, tokens), default=0) > MOST_DIGITS:
+        return np.array([_whole(token, "an index") for token in tokens], dtype=np.int64)
+    return np.fromiter(map(int, tokens), dtype=np.int64, count=len(tokens))
+
+
+def _whole(token: str, what: str) -> int:
+    if not token.isdecimal() or len(token) > MOST_DIGITS:
+        raise ValueError(f"{what} must be whole numbers, not {token[:20]!r}")
+    return int(token)
+
+
+def _require_count(found: int, expected: int) -> None:
+    if found != expected:
+        raise ValueError(f"it has {found} numbers after the sizes, but {expected} are needed")
+
+
+_Plant = TypeVar("_Plant", DescriptorSystem, TimeVaryingDescriptorSystem, DAEModel)
+# Equations picked by name also name the signal that enters there.
+_SIGNAL_OF_PICK = {"B": "input_names", "Bw": "noise_names"}
+_LABELS = ("operating_point", "scales", "units")
+
+
+def built_plant(
+    section: PlantSection | TimeVaryingSection | DAESection, source: Path, prefix: str
+) -> DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel:
+    """Return the plant of a section, as written."""
+    kind = getattr(section, "kind", None)
+    make: Any = _invariant_plant if kind is None else _nonlinear_plant if kind == "dae" else _varying_plant
+    plant: DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel = make(section, source, prefix)
+    return plant
+
+
+def _placed(make: Callable[[], _Plant], source: Path, prefix: str) -> _Plant:
+    """Return the plant that is made; an error gets its place in the document."""
+    try:
+        return make()
+    except SpecError as error:
+        raise SpecError(
+            f"{source}: {error.args[0].splitlines()[0]}",
+            path=joined(prefix, error.path or ""),
+            problems=error.problems,
+        ) from error
+
+
+def joined(prefix: str, name: str) -> str:
+    """Return the path of an entry of a document."""
+    return f"{prefix}.{name}" if prefix and name else prefix or name
+
+
+def read_value(value: Any, folder: Path, where: str, problems: DocumentProblems, *, keep_sparse: bool = False) -> Any:
+    """Return rows as an array, files read, picks as lists of names, sections as mappings, all else as it is."""
+    if isinstance(value, list):
+        entries = (entry for row in value for entry in (row if isinstance(row, list) else [row]))
+        is_matrix = all(isinstance(row, list) for row in value) and not any(isinstance(entry, str) for entry in entries)
+        return np.array(value, dtype=np.float64) if is_matrix else value
+    if hasattr(value, "file"):
+        path = folder / value.file
+        try:
+            if hasattr(value, "stack"):
+                return read_matrices(path, variable=value.variable, count=value.stack, where=where)
+            return read_matrix(path, variable=value.variable, where=where, keep_sparse=keep_sparse)
+        except SpecError as error:
+            problems.add(where, str(error))
+            return None
+    if hasattr(value, "outputs") or hasattr(value, "states"):
+        return getattr(value, "outputs", getattr(value, "states", None))
+    if isinstance(value, dict):
+        return {name: entry.model_dump() if hasattr(entry, "model_dump") else entry for name, entry in value.items()}
+    return value.model_dump(exclude_unset=True) if hasattr(value, "model_dump") else value
+
+
+def _names(value: Any, folder: Path, where: str, problems: DocumentProblems) -> list[str] | None:
+    if hasattr(value, "file"):
+        try:
+            return read_names(folder / value.file, where=where)
+        except SpecError as error:
+            problems.add(where, str(error))
+            return None
+    return None if value is None else list(value)
+
+
+def _read(
+    section: Any, source: Path, prefix: str, kept: Sequence[str], matrices: Sequence[str], names: Sequence[str],
+    *, keep_sparse: bool = False,
+) -> dict[str, Any]:  # fmt: skip
+    """Return entries of a section by name: some as they are, matrices and lists of names with their files read."""
+    problems = DocumentProblems(source, what="plant" if not prefix else "spec")
+    arguments: dict[str, Any] = {name: getattr(section, name) for name in kept}
+    for name in matrices:
+        arguments[name] = read_value(
+            getattr(section, name), source.parent, joined(prefix, name), problems, keep_sparse=keep_sparse
+        )
+    for name in names:
+        arguments[name] = _names(getattr(section, name), source.parent, joined(prefix, name), problems)
+    problems.raise_if_any()
+    return arguments
+
+
+def _varying_plant(section: TimeVaryingSection, source: Path, prefix: str) -> TimeVaryingDescriptorSystem:
+    names = ("state_names", "input_names", "output_names", "parameter_names")
+    arguments = _read(section, source, prefix, ("dt", "horizon", "constants", *_LABELS),
+                      ("E", "A", "B", "C", "Phi", "Psi"), names)  # fmt: skip
+    return _placed(lambda: TimeVaryingDescriptorSystem(**arguments), source, prefix)
+
+
+def _nonlinear_plant(section: DAESection, source: Path, prefix: str) -> DAEModel:
+    left_out = {"kind", "schema_version", "transform", "variation", "box"}
+    arguments = section.model_dump(exclude=left_out, exclude_none=True)
+
+    def made() -> DAEModel:
+        units = arguments.get("units")
+        for name, item in boxed_constants(section, source.parent)[0].items():
+            found = constant_of(name, item)
+            arguments["constants"][name] = found.nominal
+            if found.unit and units is not None:
+                units.setdefault(name, found.unit)
+        return DAEModel(**arguments)
+
+    return _placed(made, source, prefix)
+
+
+def _invariant_plant(section: PlantSection, source: Path, prefix: str) -> DescriptorSystem:
+    arguments = _read(section, source, prefix, ("dt", "sensor_noise", *_LABELS), MATRICES, SIGNAL_NAMES,
+                      keep_sparse=True)  # fmt: skip
+    for matrix, names in _SIGNAL_OF_PICK.items():
+        if isinstance(arguments[matrix], list) and arguments[names] is None:
+            arguments[names] = arguments[matrix]
+    return _placed(lambda: with_constants(DescriptorSystem(**arguments), section, source.parent), source, prefix)
+
+
+def matlab_plant(reference: PlantReference, spec: Path) -> DescriptorSystem | None:
+    """Return the plant in a ``.mat`` file that a spec refers to; `None` where it refers to another kind of file."""
+    arguments = reference.model_dump(exclude={"file", "transform"}, exclude_none=True)
+    if Path(reference.file).suffix.lower() == ".mat":
+        from obsynth.importing.model_files import from_matlab
+
+        return _placed(lambda: from_matlab(spec.parent / reference.file, **arguments), spec, "plant")
+    if arguments:
+        raise SpecError(
+            f"{spec}: plant.{next(iter(arguments))}: unknown key beside a file that is no .mat file: it belongs "
+            f"into {reference.file}.", path=f"plant.{next(iter(arguments))}",
+        )  # fmt: skip
+    return None
+
+
+#: Signals that name the columns of a matrix; rows are equations (states) or outputs.
+_COLUMNS = {"B": "input_names", "D": "input_names", "Bf": "fault_names", "Df": "fault_names",
+            "Bd": "disturbance_names", "Dd": "disturbance_names"}  # fmt: skip
+_OUTPUT_ROWS = ("C", "D", "Df", "Dd")
+
+
+def with_constants(plant: DescriptorSystem, section: PlantSection, folder: Path) -> DescriptorSystem:
+    """Return the plant of a section with its constants and tolerances, if it has any."""
+    if section.constants is None and section.tolerance is None:
+        for name in ("entries", "variation", "box"):
+            if getattr(section, name) is not None:
+                raise SpecError(f"{name} is for a plant with constants: give constants, or tolerance.", path=name)
+        return plant
+    constants, box = boxed_constants(section, folder)
+    entries = {name: [_entry(plant, name, item) for item in found] for name, found in (section.entries or {}).items()}
+    return with_expressions(
+        plant, entries, constants, tolerance=section.tolerance, variation=section.variation, **box
+    )  # fmt: skip
+
+
+def boxed_constants(section: PlantSection | DAESection, folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the constants of a section, those of a calibration put in place, and where their box comes from."""
+    constants = dict(section.constants or {})
+    if section.box is None:
+        return constants, {}
+    box = section.box.model_dump(exclude_none=True)
+    file = box.pop("file", None)
+    if file is None:
+        if "source" not in box:
+            raise SpecError("box has no source: give source (stated, set-membership or calibrated), or the file of a "
+                            "calibration.", path="box.source")  # fmt: skip
+        return constants, box
+    if box:
+        raise SpecError("box has a file, which says where it comes from: remove source, level and digest.", path="box")
+    found = read_json(folder / file, where="box.file")
+    if not isinstance(found, dict) or found.get("kind") != "obsynth calibration":
+        raise SpecError(f"{file} is no calibration: write one by obsynth calibrate --out {file}.", path="box.file")
+    try:
+        calibrated = {name: _calibrated(name, item) for name, item in found["constants"].items()}
+        options = {"source": "calibrated", "level": found["level"], "digest": found["log"]["digest"]}
+    except (KeyError, TypeError, AttributeError) as error:
+        raise SpecError(f"{file} is damaged: it has no {error}.", path="box.file") from error
+    for name in calibrated:
+        stated = constants.get(name)
+        if isinstance(stated, dict) and ("range" in stated or "tolerance" in stated):
+            raise SpecError(f"{name!r} has a tolerance here, and one in {file}: remove one of them.",
+                            path=f"constants.{name}")  # fmt: skip
+    return constants | calibrated, {**options, "calibrated": tuple(calibrated)}
+
+
+def _calibrated(name: str, item: Mapping[str, Any]) -> dict[str, Any]:
+    """Return nominal value, range and unit of a calibrated constant."""
+    if item["open"]:
+        raise SpecError(
+            f"The box of {name!r} has an open {item['open'][0]} side: the log bounds nothing there. State its range, "
+            "or take a log that moves it.", path=f"constants.{name}",
+        )  # fmt: skip
+    return {"nominal": item["nominal"], "range": list(item["range"]), "unit": item["unit"]}
+
+
+def _entry(plant: DescriptorSystem, matrix: str, item: EntrySection) -> Entry:
+    if matrix not in UNCERTAIN_MATRICES:
+        raise SpecError(
+            f"{matrix!r} holds no constants: {', '.join(UNCERTAIN_MATRICES)} may.", path=f"entries.{matrix}"
+        )
+    rows = plant.output_names if matrix in _OUTPUT_ROWS else plant.state_names
+    columns = getattr(plant, _COLUMNS.get(matrix, "state_names"))
+    places = []
+    for key, value, names in (("row", item.row, rows), ("column", item.column, columns)):
+        if isinstance(value, str):
+            places.append(index_of(value, names, what=f"entries.{matrix}"))
+        elif 1 <= value <= len(names):
+            places.append(value - 1)
+        else:
+            raise SpecError(f"{matrix} has no {key} {value}: it has {len(names)}.", path=f"entries.{matrix}")
+    return places[0], places[1], str(item.value)
 
 
 _GROUPS = ("inputs", "faults", "disturbances", "sensors")

@@ -2,6 +2,15 @@
 
 Where unknown inputs (and noise) reach every output, no residual is free of them; the best there is makes their transfer
 to the residual co-inner, and no filter of gain one shows any fault more at any frequency.
+
+The two norms of a detection filter, proved in outward rounding on its stored numbers.
+
+The gain: a bounded real inequality.  The least singular value of ``G(jw) = C (jw - A)^-1 B + D`` is above a level on a
+range of frequencies if it is at one of them, and if
+
+    [A - jw, 0, B; -C'C, -A' - jw, -C'D; D'C, B', D'D - level^2]
+
+is singular at none: excluded around a frequency by an approximate inverse, as long as what it misses is below one.
 """
 
 from __future__ import annotations
@@ -14,19 +23,168 @@ import numpy as np
 from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
 from obsynth.analysis.transformations.recovery import Transformation, linear_plant
 from obsynth.errors import PreconditionError, SolverError, SpecError
-from obsynth.methods.functional_filter.detection_proofs import Transfer, gain_is_proved, sensitivity_is_proved
 from obsynth.methods.riccati import continuous_solution
 from obsynth.numerics.arguments import is_finite_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.libraries import on_one_thread_if_small
 from obsynth.numerics.norms import response
 from obsynth.numerics.ranks import decide_rank
+from obsynth.numerics.scaling import balanced_matrix
 from obsynth.numerics.spectra import abscissa
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.proofs.balls import Ball
+from obsynth.proofs.balls import Ball, rounded_up
+from obsynth.proofs.definiteness import prove_positive_definite
+from obsynth.proofs.extended_balls import Enclosed, block
 from obsynth.results.checks import Check, VerificationReport
 from obsynth.verification.identities import Identity, equality
+
+#: Strictness of the equation that proves a gain, relative to what drives it.
+STRICTNESS = 1e-9
+#: Intervals that a range may take, the share of an interval's reach that is used, and its first guess.
+MOST_INTERVALS, REACH, FIRST_SHARE = 20_000, 0.9, 1e-3
+#: Intervals this short, relative to where they are, end at a frequency at which the pencil is singular.
+SHORTEST = 1e-8
+#: A range of frequencies that is shorter begins with intervals as if it had this length.
+LEAST_RANGE = 1e-9
+#: Weight of the equations that the frequency does not enter: a power of two.
+LIGHT = 2.0**-20
+
+
+@dataclass(frozen=True, eq=False)
+class Transfer:
+    """``C (s - A)^-1 B + D``, with enclosures of B, C and D: A ``(n, n)`` is stored, the others are products."""
+
+    A: FloatArray
+    B: Ball
+    C: Ball
+    D: Ball
+
+    def balanced(self) -> Transfer:
+        """Return it in states of like size, by powers of two: nothing is rounded."""
+        if not len(self.A):
+            return self
+        a, scale = balanced_matrix(self.A)
+        return Transfer(
+            np.asarray(a), Ball(self.B.midpoint / scale[:, None], self.B.radius / scale[:, None]),
+            Ball(self.C.midpoint * scale, self.C.radius * scale), self.D,
+        )  # fmt: skip
+
+
+def gain_is_proved(transfer: Transfer, bound: float) -> bool:
+    """Prove that the system is stable and its H-infinity norm at most a bound."""
+    a, b, c, d = transfer.A, transfer.B.midpoint, transfer.C.midpoint, transfer.D.midpoint
+    if not len(a):
+        corner = Ball.exact(bound**2 * np.eye(transfer.D.shape[0])) - transfer.D @ transfer.D.T
+        return prove_positive_definite(corner).proved
+    gap = bound**2 * np.eye(len(c)) - d @ d.T
+    slack = STRICTNESS * max(float(np.linalg.norm(b @ b.T, 2)), np.finfo(np.float64).tiny)
+    found = continuous_solution(a, c, b @ b.T + slack * np.eye(len(a)), -gap, b @ d.T)
+    if found is None:
+        return False
+    p = 0.5 * (found + found.T)
+
+    def inequality(kind: type[Enclosed]) -> Enclosed:
+        closed, into, out, through = kind.exact(a), kind.of(transfer.B), kind.of(transfer.C), kind.of(transfer.D)
+        moved = closed @ kind.exact(p)
+        corner = kind.exact(bound**2 * np.eye(len(c))) - through @ through.T
+        side = kind.exact(p) @ out.T + into @ through.T
+        return block([[-(moved + moved.T) - into @ into.T, -side], [-side.T, corner]])
+
+    return prove_positive_definite(inequality).proved and prove_positive_definite(p).proved
+
+
+def sensitivity_is_proved(transfer: Transfer, level: float, low: float, high: float) -> bool:
+    """Prove that the least singular value is above a level at every frequency (rad/s) from ``low`` to ``high``."""
+    if transfer.B.shape[1] > transfer.C.shape[0]:
+        return False
+    work = transfer.balanced()
+    return _is_above_at(work, level, low) and _is_never_singular(_pencil(work, level), len(work.A), low, high)
+
+
+def _pencil(work: Transfer, level: float) -> Ball:
+    a, n, m = Ball.exact(work.A), len(work.A), work.B.shape[1]
+    corner = work.D.T @ work.D - Ball.exact(level**2 * np.eye(m))
+    return Ball.blocks([
+        [a, Ball.exact(np.zeros((n, n))), work.B],
+        [-(work.C.T @ work.C), -a.T, -(work.C.T @ work.D)],
+        [work.D.T @ work.C, work.B.T, corner],
+    ])  # fmt: skip
+
+
+def _is_never_singular(pencil: Ball, n: int, low: float, high: float) -> bool:
+    """Whether ``M - jw diag(I, 0)`` is proved to be regular from ``low`` to ``high``, the identity of order 2 n."""
+    covered, length = low, FIRST_SHARE * max(high - low, LEAST_RANGE)
+    for _ in range(MOST_INTERVALS):
+        if covered >= high:
+            return True
+        middle = min(covered + 0.5 * length, high)
+        reach = _regular_around(pencil, n, middle)
+        if max(length, reach) < SHORTEST * max(covered, SHORTEST * high):
+            return False
+        if middle - reach > covered:
+            # Too far: the interval around a nearer point.
+            length *= 0.25
+            continue
+        covered, length = middle + reach, 4.0 * reach
+    return False
+
+
+def _regular_around(pencil: Ball, n: int, frequency: float) -> float:
+    """Return how far around a frequency the pencil is proved to be regular; negative where it is not at all."""
+    size = pencil.shape[0]
+    turning = np.zeros((size, size))
+    turning[: 2 * n, : 2 * n] = np.eye(2 * n)
+    try:
+        inverse = np.linalg.inv(pencil.midpoint - 1j * frequency * turning)
+    except np.linalg.LinAlgError:
+        return -1.0
+    if not np.all(np.isfinite(inverse)):
+        return -1.0
+    whole = np.block([[inverse.real, -inverse.imag], [inverse.imag, inverse.real]])
+    turned = Ball.exact(frequency * turning)
+    matrix = Ball.blocks([[pencil, turned], [-turned, pencil]])
+    missed = Ball.exact(whole) @ matrix - Ball.exact(np.eye(2 * size))
+    # The frequency enters the equations of the states alone: the others count for little in weighted norms.
+    states = np.r_[0 : 2 * n, size : size + 2 * n]
+    weights = np.full(2 * size, LIGHT)
+    weights[states] = 1.0
+    left = _row_sum((np.abs(missed.midpoint) + missed.radius) * weights[:, None] / weights)
+    speed = _row_sum(np.abs(whole[:, states]) * weights[:, None])
+    if not left < 1.0 or not np.isfinite(speed):
+        return -1.0
+    return REACH * (1.0 - left) / speed if speed > 0.0 else np.inf
+
+
+def _row_sum(sizes: FloatArray) -> float:
+    """Return a bound on the largest row sum."""
+    return float(np.max(rounded_up(np.sum(sizes, axis=1), sizes.shape[1] + 1), initial=0.0))
+
+
+def _is_above_at(work: Transfer, level: float, frequency: float) -> bool:
+    """Prove that the least singular value at one frequency is above a level."""
+    n, m = work.B.shape
+    size = work.C.shape[0]
+    into = Ball.blocks([[work.B, Ball.exact(np.zeros((n, m)))], [Ball.exact(np.zeros((n, m))), work.B]])
+    out = Ball.blocks([[work.C, Ball.exact(np.zeros((size, n)))], [Ball.exact(np.zeros((size, n))), work.C]])
+    zero = Ball.exact(np.zeros((size, m)))
+    shown = Ball.blocks([[work.D, zero], [zero, work.D]])
+    if n:
+        turned = Ball.exact(frequency * np.eye(n))
+        matrix = Ball.blocks([[-Ball.exact(work.A), -turned], [turned, -Ball.exact(work.A)]])
+        inverse: FloatArray = np.asarray(np.linalg.inv(matrix.midpoint), dtype=np.float64)
+        solution = inverse @ into.midpoint
+        left = Ball.exact(np.eye(2 * n)) - Ball.exact(inverse) @ matrix
+        share = _row_sum(np.abs(left.midpoint) + left.radius)
+        missed = into - matrix @ Ball.exact(solution)
+        error = _row_sum(np.abs(inverse)) * float(np.max(np.abs(missed.midpoint) + missed.radius, initial=0.0))
+        if not share < 1.0:
+            return False
+        solved = Ball(solution, np.full_like(solution, float(rounded_up(np.array(error / (1.0 - share)), 6))))
+        shown = shown + out @ solved
+    least: FloatArray = np.asarray(level**2 * np.eye(2 * m), dtype=np.float64)
+    return prove_positive_definite(shown.T @ shown - Ball.exact(least)).proved
+
 
 #: The grid of frequencies begins at this share of its end, where the band begins at zero.
 LEAST_FREQUENCY = 1e-6

@@ -6,57 +6,440 @@ In place of Share Pasand, Aliyari, Taghirad, Lemma 4, Theorems 1 and 2, Lemma 6 
 (D3) at each unstable eigenvalue of Phi, tested exactly there, with V a basis of ``ker (lambda I - Phi)``:
 ``rank [lambda E - A, -Bf Cw V, -Bd; C, Df Cw V, Dd] = nx + dim V + rank [Bd; Dd]``.
 (D2), (D3) are necessary for any observer of state and fault; (D1) for any that does not differentiate.
+
+(D1), whether the unknown inputs can be decoupled without differentiating; and the elimination that may help.
+
+Source: Share Pasand, Aliyari, Taghirad, Lemma 4 (9.1), in the form of `obsynth.methods.ui_pi_observer.conditions`.
+
+Whether a fault model can be told from states and unknown inputs: (D3), and the order of the model.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from obsynth.analysis.conditions import Condition, is_doubted, is_refused
-from obsynth.analysis.existence.distance import zeros_at_rounding_level
+from obsynth.analysis.existence.distance import ROUNDING_LEVEL, least_share, zeros_at_rounding_level
+from obsynth.analysis.existence.named_pencils import named_augmented, unclear
 from obsynth.analysis.existence.numbers import decides_exactly, numbers_of, reconsidered
 from obsynth.analysis.existence.rational import SystemFacts
 from obsynth.analysis.existence.verdicts import (
+    DECIDER,
     believed,
     in_own_time,
     needed_gain,
+    rank_doubt,
+    settled_rank,
     verdict_condition,
     zero_doubt,
     zero_verdict,
 )
 from obsynth.analysis.existence.witnesses import Unclear
 from obsynth.analysis.plant_units import PlantUnits, sized_plant
-from obsynth.analysis.transformations.recovery import Transformation
-from obsynth.analysis.zeros import Zero, leading_names, system_pencil, system_zeros, zero_at, zeros_of_system
+from obsynth.analysis.transformations.elimination import (
+    dynamic_coordinates,
+    eliminate_algebraic_states,
+    eliminated_exactly,
+)
+from obsynth.analysis.transformations.recovery import StateRecovery, Transformation
+from obsynth.analysis.zeros import (
+    Zero,
+    is_outside,
+    leading_names,
+    system_pencil,
+    system_zeros,
+    zero_at,
+    zeros_of_system,
+)
+from obsynth.errors import PreconditionError
 from obsynth.methods.ui_pi_observer.augmented_plant import AugmentedPlant
-from obsynth.methods.ui_pi_observer.decoupling_condition import (
-    SOURCE,
-    decoupling_data,
-    decoupling_rank,
-    disturbance_rank,
-)
-from obsynth.methods.ui_pi_observer.fault_model_condition import (
-    lost_in_rounding,
-    model_conditions,
-    order_conditions,
-)
 from obsynth.methods.ui_pi_observer.pencils import (
     MOST_NAMES,
+    equilibrated,
     exact_drops,
+    exact_loss,
     in_disturbances,
     independent_disturbances,
     instability,
     kept_disturbances,
+    kernel,
     number,
     numbers,
 )
 from obsynth.numerics.arrays import ComplexArray, FloatArray, remembered
 from obsynth.numerics.pencils import finite_zeros
+from obsynth.numerics.ranks import RANK_TOLERANCE, RankDecision, decide_rank
+from obsynth.numerics.scaling import equilibrate_pencil
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.fault_models import Exosystem
+from obsynth.plants.origin import origin_of
+
+
+def model_conditions(
+    given: DescriptorSystem, courses: Exosystem, plant: DescriptorSystem, model: Exosystem, units: PlantUnits
+) -> list[Condition]:
+    """Test (D3) at each unstable eigenvalue of the fault model, upper half plane only."""
+    terms = sized_plant(given)
+    sizes = None if terms is None else units.scaled_plant(terms)
+    unstable = [complex(value) for value in model.eigenvalues if value.imag >= 0.0 and is_outside(value, plant.dt)]
+    found = []
+    for value in sorted(unstable, key=lambda value: (value.real, value.imag)):
+        lost = exact_loss(given, courses, units.eigenvalue(value))
+        condition, decision = _model_condition(plant, model, value, units, lost, sizes)
+        if decision.means == "unclear":
+            point = units.eigenvalue(value)
+            other = f"hides a fault that follows its model at {number(point)}, and no observer estimates it"
+            condition = condition.in_doubt(_model_doubt(given, courses, units, point, other=other), given)
+        found.append(condition)
+        if not found[-1].holds:
+            break
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class _ModelPencil:
+    """The matrix of (D3) at one eigenvalue, scaled, with what its columns stand for."""
+
+    scaled: NDArray[Any]
+    columns: FloatArray
+    courses: NDArray[Any]
+    inputs: FloatArray
+    direct: FloatArray
+    share: float = np.inf
+
+    @classmethod
+    def of(
+        cls, plant: DescriptorSystem, model: Exosystem, value: complex, sizes: DescriptorSystem | None
+    ) -> _ModelPencil:
+        """Return the matrix; ``sizes`` of the terms that the entries of the plant are sums of."""
+        inputs, direct = independent_disturbances(plant)
+        courses = model.Cw @ kernel(model.Phi - value * np.eye(model.order))
+        matrix = np.block([
+            [value * plant.E - plant.A, -plant.Bf @ courses, -inputs],
+            [plant.C.astype(complex), plant.Df @ courses, direct],
+        ])  # fmt: skip
+        if sizes is None:
+            return cls(*equilibrated(matrix), courses, inputs, direct)
+        # Disturbances that are combinations of others are judged as those: their own terms are not known.
+        own = inputs.shape == plant.Bd.shape
+        whole = np.block([
+            [abs(value) * sizes.E + sizes.A, sizes.Bf @ np.abs(courses), sizes.Bd if own else np.abs(inputs)],
+            [sizes.C, sizes.Df @ np.abs(courses), sizes.Dd if own else np.abs(direct)],
+        ])  # fmt: skip
+        return cls(*equilibrated(matrix), courses, inputs, direct, least_share(matrix, whole))
+
+    def decision(self, lost: int | None) -> RankDecision:
+        width = self.scaled.shape[1]
+        found = decide_rank(self.scaled, expected=width, equilibrated=False)
+        return settled_rank(found, None if lost is None else width - lost, self.share)
+
+
+def _model_condition(
+    plant: DescriptorSystem, model: Exosystem, value: complex, units: PlantUnits, lost: int | None,
+    sizes: DescriptorSystem | None,
+) -> tuple[Condition, RankDecision]:  # fmt: skip
+    pencil = _ModelPencil.of(plant, model, value, sizes)
+    decision = pencil.decision(lost)
+    scaled, columns, courses = pencil.scaled, pencil.columns, pencil.courses
+    inputs, direct, width = pencil.inputs, pencil.direct, courses.shape[1]
+    own = units.eigenvalue(value)
+    where = f"{'s' if plant.dt == 0.0 else 'z'} = {number(own)}"
+    signals: tuple[str, ...] = ()
+    detail = decision.describe()
+    if not decision.full:
+        direction = columns * np.linalg.svd(scaled)[2][-1].conj()
+        faults = leading_names(np.abs(courses @ direction[plant.nx : plant.nx + width]), plant.fault_names)
+        shares = in_disturbances(plant, inputs, direct, direction[plant.nx + width :])
+        disturbances = _masking(scaled, plant, width, shares)
+        signals = (*faults, *disturbances)
+        masked = f" is masked by the unknown input {', '.join(map(repr, disturbances))}" if disturbances else ""
+        alone = len(faults) == 1
+        who = f"the fault {faults[0]!r}" if alone else f"a combination of the faults {', '.join(map(repr, faults))}"
+        detail += (
+            f": at {where} {who}{masked or ' is output-nulling'}: no output shows it, so no observer can estimate "
+            f"{'it' if alone else 'them'}. Measure another signal, or leave one of them out."
+        )
+    return Condition(
+        f"(D3) fault model at {number(own)}",
+        f"rank [lambda E - A, -Bf Cw V, -Bd; C, Df Cw V, Dd] full at {where}, an eigenvalue of Phi",
+        decision.full,
+        float(decision.rank),
+        float(decision.expected),
+        "in place of Share Pasand, Theorems 1 and 2, which are false",
+        detail,
+        mode=None if decision.full else own,
+        signals=signals,
+    ), decision
+
+
+def _model_doubt(
+    plant: DescriptorSystem, model: Exosystem, units: PlantUnits, value: complex, *, other: str,
+    decider: str = DECIDER, of_the_model: bool = False, tolerance: float = ROUNDING_LEVEL, moving: bool = False,
+) -> Unclear:  # fmt: skip
+    """Return why it is unclear whether plant and fault model hide something at a point, in the plant's own time."""
+    kept = kept_disturbances(plant, numbers_of(plant))
+    named = named_augmented(plant, model, units, kept=kept, of_the_model=of_the_model)
+    return unclear(
+        plant, named, tolerance=tolerance, point=value, dt=plant.dt if moving else None, other=other, decider=decider
+    )
+
+
+def order_conditions(
+    given: DescriptorSystem, courses: Exosystem, plant: DescriptorSystem, model: Exosystem, units: PlantUnits
+) -> list[Condition]:
+    """Test that the fault model is not lost in rounding: at a zero z0 order n shows with about abs(z0)^(n + 1) only."""
+    inputs, direct = np.hstack([plant.Bf, plant.Bd]), np.hstack([plant.Df, plant.Dd])
+    wide_e, wide_a = system_pencil(plant.E, plant.A, inputs, plant.C, direct)
+    zeros = finite_zeros(wide_e, wide_a)
+    if zeros.normal_rank < wide_e.shape[1]:
+        return []
+    points = [complex(value) for value in zeros.values if value.imag >= 0.0 and is_outside(value, plant.dt)]
+    augmented = AugmentedPlant.of(plant, model)
+    own, shown = independent_disturbances(plant)
+    below = np.vstack([own, np.zeros((model.order, own.shape[1]))])
+    worst: tuple[RankDecision, complex] | None = None
+    for point in points:
+        matrix = np.block([[point * augmented.E - augmented.A, -below], [augmented.C.astype(complex), shown]])
+        scaled, _ = equilibrated(matrix)
+        decision = decide_rank(scaled, expected=matrix.shape[1], equilibrated=False)
+        if worst is None or (decision.rank, decision.smallest_kept) < (worst[0].rank, worst[0].smallest_kept):
+            worst = (decision, point)
+    if worst is None:
+        return []
+    decision, point = worst[0], units.eigenvalue(worst[1])
+    lost = (
+        f": at the zero {number(point)} of (f, d) -> y the fault model (order {model.order}) cannot be told from "
+        "nothing in double precision. Lower its order."
+    )
+    found = Condition(
+        "order of the fault model",
+        "the augmented plant is observable in double precision where faults can hide longest",
+        decision.full,
+        float(decision.rank),
+        float(decision.expected),
+        "ours: observable on paper is not enough",
+        f"{decision.describe()} at {number(point)}" + ("" if decision.full else lost),
+        mode=None if decision.full else point,
+        signals=() if decision.full else plant.fault_names,
+    )
+    return [found if decision.full else found.in_doubt(_order_doubt(given, courses, units, point), given)]
+
+
+def _order_doubt(plant: DescriptorSystem, model: Exosystem, units: PlantUnits, point: complex) -> Unclear:
+    return _model_doubt(
+        plant, model, units, point, of_the_model=True, tolerance=RANK_TOLERANCE, moving=True,
+        other=f"hides a motion of plant and fault model at {number(point)}, and no observer sees it",
+        decider="A fault model of lower order, or an output nearer to the fault, would decide it.",
+    )  # fmt: skip
+
+
+def lost_in_rounding(
+    plant: DescriptorSystem, model: Exosystem, units: PlantUnits, mode: complex, order: int
+) -> Condition:
+    """Return the failing condition for a mode that seems fixed and unstable, against all other conditions."""
+    found = Condition(
+        "fault model in double precision",
+        "no mode of plant and fault model seems hidden by rounding alone",
+        False,
+        order - 1.0,
+        float(order),
+        "ours: observable on paper is not enough",
+        f"plant and fault model (order {model.order}) seem to hide an unstable mode at {number(mode)}, which the "
+        "conditions above exclude: in double precision the model is too long a chain. Lower its order.",
+        mode=mode,
+        signals=plant.fault_names,
+    )
+    return found.in_doubt(_order_doubt(plant, model, units, mode), plant)
+
+
+def _masking(scaled: NDArray[Any], plant: DescriptorSystem, width: int, shares: FloatArray) -> tuple[str, ...]:
+    """Return the disturbances of a null vector; none where states alone already hide the fault."""
+    without = scaled[:, : plant.nx + width]
+    alone = decide_rank(without, expected=plant.nx + width, equilibrated=False)
+    return leading_names(shares, plant.disturbance_names, most=MOST_NAMES) if alone.full else ()
+
+
+#: A direct effect on an output, relative to the effect on the states (both in scaled units), that elimination may
+#: leave by rounding.
+ELIMINATION_ROUNDING = 1e-13
+#: Why algebraic states cannot be eliminated, by the condition that fails.
+_NOT_ELIMINATED = {
+    "regularity": "the plant is not regular",
+    "index": "the plant has index 2 or more",
+    "dynamic states": "no other states are left",
+}
+SOURCE = "Share Pasand, Lemma 4 (9.1), in a form without E#"
+
+
+def decoupling_rank(plant: DescriptorSystem) -> RankDecision:
+    """Decide (D1): ``rank [E 0 Bd; C Dd 0; 0 0 Dd]``, with what it must be."""
+    scaled, numbers = _scaled(plant), numbers_of(plant)
+    if numbers is None:
+        return decide_rank(_decoupling_matrix(scaled), expected=plant.nx + _rank(scaled.Dd) + disturbance_rank(plant))
+    bd, dd = numbers.matrix("Bd"), numbers.matrix("Dd")
+    nothing, square = numbers.zeros(plant.nx, plant.nd), numbers.zeros(plant.ny, plant.nd)
+    matrix = numbers.blocks([
+        [numbers.matrix("E"), nothing, bd],
+        [numbers.matrix("C"), dd, square],
+        [numbers.zeros(plant.ny, plant.nx), square, dd],
+    ])  # fmt: skip
+    expected = plant.nx + numbers.rank(dd) + disturbance_rank(plant)
+    decision, terms = decide_rank(_decoupling_matrix(scaled), expected=expected), sized_plant(plant)
+    if terms is None:
+        return settled_rank(decision, numbers.rank(matrix))
+    sizes = PlantUnits.of(plant).rounded().scaled_plant(terms)
+    share = least_share(_decoupling_matrix(scaled), _decoupling_matrix(sizes), rank=expected)
+    return settled_rank(decision, numbers.rank(matrix), share)
+
+
+def _scaled(plant: DescriptorSystem) -> DescriptorSystem:
+    return PlantUnits.of(plant).rounded().scaled_plant(plant)
+
+
+def _decoupling_matrix(plant: DescriptorSystem) -> FloatArray:
+    nx, ny, nd = plant.nx, plant.ny, plant.nd
+    matrix = np.zeros((nx + 2 * ny, nx + 2 * nd))
+    matrix[:nx, :nx], matrix[:nx, nx + nd :] = plant.E, plant.Bd
+    matrix[nx : nx + ny, :nx], matrix[nx : nx + ny, nx : nx + nd] = plant.C, plant.Dd
+    matrix[nx + ny :, nx + nd :] = plant.Dd
+    return matrix
+
+
+def disturbance_rank(plant: DescriptorSystem) -> int:
+    """Return ``rank [Bd; Dd]``: repeated disturbances count once."""
+    numbers = numbers_of(plant)
+    if numbers is not None:
+        return numbers.rank(numbers.blocks([[numbers.matrix("Bd")], [numbers.matrix("Dd")]]))
+    scaled = _scaled(plant)
+    return _rank(np.vstack([scaled.Bd, scaled.Dd]))
+
+
+def _rank(matrix: FloatArray) -> int:
+    return decide_rank(matrix).rank
+
+
+def decoupling_data(plant: DescriptorSystem) -> tuple[DescriptorSystem, Transformation | None, Condition]:
+    """Return the plant on which (D1) holds, if the algebraic states can be eliminated where it does not."""
+    written = decoupling_rank(plant)
+    said = f"rank {written.rank} of {written.expected}"
+    if written.full:
+        return plant, None, _decoupling_condition(plant, written, written.describe())
+    try:
+        transformation = _without_rounding(_eliminated(plant))
+    except PreconditionError as error:
+        why = _NOT_ELIMINATED.get(error.condition or "", "they cannot be solved for")
+        reason = f"{written.describe()}, and the algebraic states cannot be eliminated ({why})"
+        return plant, None, _decoupling_condition(plant, written, reason)
+    if not transformation.description:
+        return plant, None, _decoupling_condition(plant, written, written.describe())
+    reduced = transformation.plant
+    again = decoupling_rank(reduced)
+    detail = f"{said} as written; {again.describe()} without the algebraic states"
+    return reduced, transformation, _decoupling_condition(reduced, again, detail)
+
+
+def _eliminated(plant: DescriptorSystem) -> Transformation:
+    """Eliminate algebraic states in the plant's own units (orthogonal combinations depend on them), then undo these."""
+    units = PlantUnits.of(plant)
+    basis = dynamic_coordinates(units.scaled_plant(plant))
+    found = eliminated_exactly(plant, None if basis is None else units.states[:, None] * basis)
+    if found is not None:
+        return found
+    found = eliminate_algebraic_states(plant)
+    if origin_of(found.plant) is not None:
+        return found
+    exact = units.rounded()
+    found = eliminate_algebraic_states(exact.scaled_plant(plant))
+    if set(found.plant.state_names) <= set(plant.state_names):
+        return _in_given_units(found, plant, exact)
+    return _in_given_units(eliminate_algebraic_states(units.scaled_plant(plant)), plant, units)
+
+
+def _in_given_units(found: Transformation, plant: DescriptorSystem, units: PlantUnits) -> Transformation:
+    kept = dict(zip(plant.state_names, units.states, strict=True))
+    states = np.array([kept.get(name, 1.0) for name in found.plant.state_names])
+    back = replace(
+        units, time=1.0 / units.time, equations=states, states=1.0 / states, outputs=1.0 / units.outputs,
+        faults=1.0 / units.faults, disturbances=1.0 / units.disturbances,
+    )  # fmt: skip
+    old = found.recovery
+    # A source state that cannot be recovered is not among these.
+    own = np.array([kept.get(name, 1.0) for name in old.names])[:, None]
+    recovery = StateRecovery(
+        old.names, own * old.from_state / states, own * old.from_input, own * old.from_fault / units.faults,
+        own * old.from_disturbance / units.disturbances,
+        own * old.from_noise * (1.0 if units.discrete else np.sqrt(units.time)), old.noise_kept,
+    )  # fmt: skip
+    return replace(
+        found, source=plant, plant=back.scaled_plant(found.plant).replace(E=None, dt=plant.dt), recovery=recovery
+    )
+
+
+def _without_rounding(transformation: Transformation) -> Transformation:
+    """Set to zero what elimination left of a direct effect that is none: a rank decision would take it for one."""
+    plant = transformation.plant
+    if origin_of(plant) is not None:
+        return transformation  # rounded once: what is zero is zero
+    # What may be rounding must have no say in the units in which it is judged.
+    units = PlantUnits.of(plant.replace(Dd=np.zeros_like(plant.Dd), Df=np.zeros_like(plant.Df)))
+    scaled = units.scaled_plant(plant)
+    changes = {}
+    for direct, entering in (("Dd", scaled.Bd), ("Df", scaled.Bf)):
+        sizes = np.max(np.abs(entering), axis=0, initial=0.0)
+        negligible = np.abs(getattr(scaled, direct)) <= ELIMINATION_ROUNDING * sizes
+        changes[direct] = np.where(negligible, 0.0, getattr(plant, direct))
+    return replace(transformation, plant=plant.replace(**changes))
+
+
+def _decoupling_condition(plant: DescriptorSystem, decision: RankDecision, detail: str) -> Condition:
+    signals: tuple[str, ...] = ()
+    if not decision.full:
+        signals = _undecoupled(plant)
+        detail += ": " + (
+            f"the unknown input {', '.join(map(repr, signals))} moves states that no output shows at once, so nothing "
+            "but a derivative of the outputs could remove it. Measure such a state, or leave the input out."
+            if set(signals) & set(plant.disturbance_names)
+            else f"the states {', '.join(map(repr, signals))} are neither dynamic nor measured."
+        )
+    found = Condition(
+        "(D1) decoupling",
+        "rank [E 0 Bd; C Dd 0; 0 0 Dd] = nx + rank Dd + rank [Bd; Dd]",
+        decision.full,
+        float(decision.rank),
+        float(decision.expected),
+        SOURCE,
+        detail,
+        signals=signals,
+    )
+    if decision.means != "unclear":
+        return found
+    # Without direct parts, as almost always, the condition is that [E Bd; C 0] has full rank.
+    kept = kept_disturbances(plant, numbers_of(plant))
+    free = [j for j in kept if not plant.Dd[:, j].any()]
+    seen = [j for j in kept if j not in free]
+    layout: list[list[str | None]] = [["E", "Bd"], ["C", None]] if not seen else [["E", "Bd", None], ["C", None, "Dd"]]
+    doubt = rank_doubt(plant, PlantUnits.of(plant).rounded(), decision, layout, kept={"Bd": free, "Dd": seen})
+    return found.in_doubt(doubt, plant)
+
+
+def _undecoupled(plant: DescriptorSystem) -> tuple[str, ...]:
+    """Return the unknown inputs that move what no output shows at once, or else the states in question."""
+    matrix = _decoupling_matrix(_scaled(plant))
+    pencil = equilibrate_pencil(np.zeros_like(matrix), matrix)
+    hidden = np.linalg.svd(pencil.A)[2][decide_rank(matrix).rank :].T
+    # Of all null vectors the one that moves the states most: some are there only because disturbances repeat.
+    rotation = np.linalg.svd(hidden[: plant.nx])[2]
+    direction = hidden @ rotation[0]
+    shares = np.abs(direction[plant.nx + plant.nd :])
+    if np.max(shares, initial=0.0) > RANK_TOLERANCE:
+        return leading_names(shares, plant.disturbance_names, most=MOST_NAMES)
+    return leading_names(np.abs(direction[: plant.nx]), plant.state_names, most=MOST_NAMES)
+
 
 #: Drops of the augmented pencil this close to each other, relative to their size or one, may be one multiple mode.
 SCATTER = 1e-2
