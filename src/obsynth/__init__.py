@@ -8,7 +8,7 @@ What is possible
     check, analyse_structure, diagnose, identifiability.
 Designs
     design, and one function for each method: fault_estimation_filter, pd_observer, ui_pi_observer, descriptor_kalman,
-    adaptive_observer, dae_adaptive_observer; verify, load.
+    adaptive_observer, dae_adaptive_observer, guaranteed_test; verify, load.
 On data
     run_on_data, smooth, online_monitor, plotting.plot_data, html_report, export.
 In simulation
@@ -64,6 +64,7 @@ _NAMES = {
     "methods.fault_figures": "FaultFigures",
     "methods.designing": "check design design_from_gains",
     "methods.functional_filter.detection": "detection_filter DetectionFilter",
+    "methods.guaranteed_test.result": "GuaranteedTest guaranteed_test",
     "methods.functions": (
         "adaptive_observer dae_adaptive_observer descriptor_kalman fault_estimation_filter functional_filter "
         "pd_observer ui_pi_observer"
@@ -119,6 +120,7 @@ provide({
     "checks as text": "obsynth.results.layout:report_text",
     "design summary": "obsynth.report.summary:summary",
     "rows of a log": "obsynth.data.alarm_proof:rows_of",
+    "picture of a guaranteed test": "obsynth.plotting.guaranteed:plot_least_thresholds",
     "designs with model error": "obsynth.experiments.tolerant_designs:with_model_error",
 })  # fmt: skip
 

@@ -72,6 +72,8 @@ from obsynth.methods.functions import fault_estimation_filter as fault_estimatio
 from obsynth.methods.functions import functional_filter as functional_filter
 from obsynth.methods.functions import pd_observer as pd_observer
 from obsynth.methods.functions import ui_pi_observer as ui_pi_observer
+from obsynth.methods.guaranteed_test.result import GuaranteedTest as GuaranteedTest
+from obsynth.methods.guaranteed_test.result import guaranteed_test as guaranteed_test
 from obsynth.methods.pd_observer.public import apply_adaptation_gain as apply_adaptation_gain
 from obsynth.methods.pd_observer.public import pd_delta_scan as pd_delta_scan
 from obsynth.methods.recursive.steady_filter import SteadyState as SteadyState

@@ -54,6 +54,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "descriptor-kalman": {"Q": 0.01, "R": 0.01},
     "adaptive-observer": {"Q": 0.01, "R": 0.01},
     "dae-adaptive-observer": {"dt": 0.1, "Q": 1e-4, "R": 1e-4},
+    "guaranteed-test": {"noise_bound": {"y1": 0.1, "y2": 0.1}, "course": "constant", "samples": 6},
 }
 #: A number of the shipped observer that nothing but the design says.
 CORRUPTED = {LinearObserver: "Az", RecursiveObserver: "initial_covariance", DAEObserver: "initial_covariance"}

@@ -56,7 +56,8 @@ def verify(design: ObserverDesign, *, printed_digits: int | None = None) -> Veri
         remembering(design.plant, design.source)
         shipped, (design, mean_rows) = design, before_the_mean(design) if method.averaged else (design, ())
         rows = (*mean_rows, *method.checks(design, printed_digits))
-        if isinstance(design.observer, LinearObserver) and all(row.passed for row in rows):
+        tracked = isinstance(design.observer, LinearObserver) and method.has_error_model(design)
+        if tracked and all(row.passed for row in rows):
             model = method.error_model(design)
             rows = (*rows, error_model_row(model, printed_digits))
             gamma = design.certificate.claims.get("gamma") if "gamma" in method.claims else None

@@ -166,11 +166,16 @@ def problem_with(value: Any, name: str, kind: Any) -> str | None:
 _LISTS: Mapping[str, tuple[str, tuple[type, ...]]] = {
     "poles": ("a list of poles", (list, tuple, np.ndarray)), "texts": ("a list of names", (str, list, tuple)),
     "fault sets": ("'detect', 'isolate' or lists of names", (str, list, tuple)),
+    "named bounds": ("a number, 0 or more, or one for each name", (int, float, np.integer, np.floating, Mapping)),
+    "free faults": ("'others', 'none' or a list of names", (str, list, tuple)), "text": ("a text", (str,)),
 }  # fmt: skip
 
 
 def _problem_with_written(value: Any, name: str, kind: str) -> str | None:
     wanted, kinds = _LISTS.get(kind, ("numbers", ()))
+    if kind == "samples":
+        fits = value == "auto" or (is_whole(value) and value >= 1)
+        return None if fits else f"{name} is {shown(value)}: give a whole number of samples, at least 1, or 'auto'."
     fits = not isinstance(value, (bool, np.bool_)) and (not kinds or value is None or isinstance(value, kinds))
     if fits and kind == "fault sets" and not isinstance(value, (str, type(None))):
         fits = all(isinstance(entry, (str, list, tuple)) for entry in value)

@@ -1,0 +1,1 @@
+"""Tests of a fault on a few samples: the least threshold without false alarms, and the proof that none is smaller."""

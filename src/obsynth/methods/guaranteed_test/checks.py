@@ -1,0 +1,176 @@
+"""The checks of a guaranteed test: threshold and witness recomputed from shipped numbers, exactly, without a solver."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from obsynth.errors import ObsynthError
+from obsynth.methods.guaranteed_test.options import Asked
+from obsynth.methods.guaranteed_test.problem import delay_in_samples, observer_of, rounding_of, window_as_designed
+from obsynth.methods.guaranteed_test.proofs import (
+    Repaired,
+    proved_least,
+    proved_threshold,
+    repaired_multipliers,
+    repaired_point,
+)
+from obsynth.methods.guaranteed_test.windows import Window
+from obsynth.numerics.arrays import FloatArray
+from obsynth.proofs.balls import UNIT_ROUNDOFF
+from obsynth.results.checks import Check, information, lower_bound_check, upper_bound_check
+from obsynth.results.design import ObserverDesign
+
+SOURCE = "duality of linear programmes; exact arithmetic on the shipped numbers"
+
+
+def checks(design: ObserverDesign, read: Callable[[Mapping[str, Any]], Asked]) -> Iterator[Check]:
+    """Yield a row for each claim; ``read`` returns options that are checked."""
+    try:
+        window = window_as_designed(design.linear[0], read(design.options))
+        reason = ""
+    except (ObsynthError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        window, reason = None, str(error)
+    yield upper_bound_check(
+        "question", "the options ask a question about this plant", float(window is None), 0.0, source="options",
+        detail=reason,
+    )  # fmt: skip
+    if window is None:
+        return
+    shipped = design.certificate.matrices
+    sizes = {
+        "multipliers": window.rows,
+        "multiplier_radius": window.rows,
+        "rounding": window.plant.nu + window.plant.ny,
+    }
+    if "witness" in shipped or "witness_radius" in shipped:
+        sizes |= {"witness": len(window.bar), "witness_radius": len(window.bar)}
+    wrong = [name for name, size in sizes.items() if not _fits(shipped.get(name), size, signed="radius" not in name)]
+    yield upper_bound_check(
+        "certificate", "multipliers and witness fit the window of the options", float(len(wrong)), 0.0,
+        source="certificate", detail=f"wrong: {', '.join(wrong)}" if wrong else "",
+    )  # fmt: skip
+    if wrong:
+        return
+    test = Repaired(_flat(shipped["multipliers"]), _flat(shipped["multiplier_radius"]))
+    yield from _of_the_test(design, window, test)
+    yield from _of_the_least(design, window)
+    delay = delay_in_samples(window, window.weights(test.values)[2]) * window.plant.dt
+    claimed = float(design.certificate.claims.get("delay", np.nan))
+    yield upper_bound_check(
+        "delay", "a fault of the size that is surely found alarms after so many seconds at the latest", delay, claimed,
+        source=SOURCE,
+    )  # fmt: skip
+
+
+def _flat(matrix: FloatArray) -> FloatArray:
+    return np.asarray(matrix, dtype=np.float64).ravel()
+
+
+def _fits(matrix: FloatArray | None, size: int, *, signed: bool) -> bool:
+    if matrix is None or matrix.size != size or not np.isfinite(matrix).all():
+        return False
+    return signed or bool(np.all(matrix >= 0.0))
+
+
+def _excess(found: Repaired | None, radius: FloatArray) -> float:
+    """Return the largest ratio of what is proved to what is shipped; NaN where nothing is proved."""
+    if found is None:
+        return np.nan
+    outside = found.radius > radius
+    return float(np.max(found.radius[outside] / np.maximum(radius[outside], np.finfo(float).tiny), initial=1.0))
+
+
+def _of_the_test(design: ObserverDesign, window: Window, test: Repaired) -> Iterator[Check]:
+    claims, observer = design.certificate.claims, design.linear[1]
+    threshold = float(claims.get("threshold", np.nan))
+    zero = threshold == 0.0
+    exact = repaired_multipliers(window, test.values, refine=False, exact_zero=zero)
+    yield upper_bound_check(
+        "multipliers", "exact multipliers that see the fault with weight one and nothing free lie within the shipped "
+        "distance of the shipped ones", _excess(exact, test.radius), 1.0,
+        source=SOURCE, kind="proved", detail="the largest distance as a multiple of the shipped one; one where below",
+    )  # fmt: skip
+    yield upper_bound_check(
+        "threshold", "without the fault the residual never passes this",
+        proved_threshold(window, test, exact_zero=zero), threshold, source=SOURCE, kind="proved",
+        detail="sum of all bounds times what the exact multipliers see of each",
+    )  # fmt: skip
+    found = float(claims.get("surely_found", np.nan))
+    yield lower_bound_check(
+        "surely found", "twice the threshold", found, 2.0 * threshold, source=SOURCE, kind="proved",
+    )  # fmt: skip
+    on_y, on_u, delay = window.weights(test.values)
+    implied = observer_of(window, on_y, on_u, delay)
+    rounding = rounding_of(window, test.values, test.radius)
+    yield upper_bound_check(
+        "weights", "what runs are the weights that the multipliers say",
+        _misfit(observer, implied, window, test.values), 1.0, source="shipped realisation", kind="equality",
+        detail="largest difference, in roundings of the sums that the weights are; a wrong shape or name is infinite",
+    )  # fmt: skip
+    shipped = _flat(design.certificate.matrices["rounding"])
+    share = float(np.max(rounding / np.maximum(shipped, np.finfo(float).tiny), initial=0.0))
+    yield upper_bound_check(
+        "rounding", "what the running test may err for known signals of size one is at most what is shipped", share,
+        1.0 + SAME, source=SOURCE, kind="computed",
+    )  # fmt: skip
+
+
+#: Sums in another order differ by less than this share.
+SAME = 1e-12
+#: Roundings that a product of multipliers and inputs may be away from another.
+ROUNDINGS = 4.0
+
+
+def _misfit(shipped: object, implied: object, window: Window, multipliers: FloatArray) -> float:
+    plant, worst = window.plant, 0.0
+    equations = np.abs(multipliers[: window.outputs_at]).reshape(window.equations, plant.nx)
+    outputs = np.abs(multipliers[window.outputs_at :][: window.question.samples * plant.ny])
+    size = float(np.max(equations @ np.abs(plant.B), initial=0.0))
+    size += float(np.max(outputs.reshape(-1, plant.ny) @ np.abs(plant.D), initial=0.0))
+    room = {"Bu": size, "Du": size}
+    for name, wanted in implied.as_dict().items():  # type: ignore[attr-defined]
+        given = getattr(shipped, name)
+        if not isinstance(wanted, np.ndarray):
+            worst = worst if given == wanted else np.inf
+        elif given.shape != wanted.shape:
+            worst = np.inf
+        elif given.size:
+            away = float(np.max(np.abs(given - wanted)))
+            allowed = ROUNDINGS * (plant.nx + plant.ny) * UNIT_ROUNDOFF * room.get(name, 0.0)
+            worst = max(worst, 0.0 if away == 0.0 else away / allowed if allowed > 0.0 else np.inf)
+    return worst
+
+
+def _of_the_least(design: ObserverDesign, window: Window) -> Iterator[Check]:
+    claims, shipped = design.certificate.claims, design.certificate.matrices
+    threshold, least = float(claims.get("threshold", np.nan)), claims.get("least")
+    if least is None:
+        return
+    if least == 0.0:
+        found = 0.0
+    elif "witness" not in shipped:
+        found = np.nan
+    else:
+        witness = Repaired(_flat(shipped["witness"]), _flat(shipped["witness_radius"]))
+        exact = repaired_point(window, witness.values, refine=False)
+        yield upper_bound_check(
+            "witness", "a course of the fault that satisfies every equation exactly lies within the shipped distance "
+            "of the shipped one", _excess(exact, witness.radius), 1.0,
+            source=SOURCE, kind="proved",
+        )  # fmt: skip
+        found = proved_least(window, witness)
+    yield lower_bound_check(
+        "least", "no function of these samples has a threshold below this: a fault of twice this size, and none, give "
+        "the same samples within all bounds", found, float(least), source=SOURCE, kind="proved",
+    )  # fmt: skip
+    yield upper_bound_check(
+        "order", "the least threshold is not above the shipped one", float(least), threshold, source=SOURCE,
+        kind="proved",
+    )  # fmt: skip
+    if threshold > 0.0:
+        yield information(
+            "gap", "threshold over least, less one", threshold / least - 1.0 if least > 0.0 else np.inf, source=SOURCE
+        )

@@ -1,0 +1,146 @@
+"""Whether a window tells a fault: proved by numbers that hide it, or by a test that finds it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from obsynth.analysis.conditions import Condition
+from obsynth.methods.guaranteed_test.options import Asked
+from obsynth.methods.guaranteed_test.problem import Problem, missing_bounds, problem_of
+from obsynth.methods.guaranteed_test.proofs import proved_ray, repaired_multipliers
+from obsynth.methods.guaranteed_test.windows import Window
+from obsynth.numerics.arrays import FloatArray
+from obsynth.plants.descriptor import DescriptorSystem
+
+SOURCE = "duality of linear programmes"
+#: Values of a hidden course below this share of its largest are not told.
+TOLD = 1e-6
+
+
+def conditions(plant: DescriptorSystem, asked: Asked) -> tuple[Condition, ...]:
+    """Return the conditions in order; the first that fails ends the list."""
+    discrete = Condition(
+        "discrete time", "dt > 0", plant.dt > 0.0, plant.dt, 0.0, SOURCE,
+        "" if plant.dt > 0.0 else "the plant is continuous: sample it (transform: sample_time, obsynth.discretise).",
+    )  # fmt: skip
+    named = asked.fault is not None or plant.nf == 1
+    listed = ", ".join(plant.fault_names)
+    fault = Condition(
+        "fault named", "one fault is looked for", named, float(plant.nf), 1.0, SOURCE,
+        "" if named else (f"name one of {listed} (fault)." if plant.nf else "the plant has no fault (Bf, Df)."),
+    )  # fmt: skip
+    lacking = list(missing_bounds(plant, asked))
+    stated = Condition(
+        "bounds stated", "disturbances and noise have bounds", not lacking, float(len(lacking)), 0.0, SOURCE,
+        " ".join(lacking),
+    )  # fmt: skip
+    first = (discrete, fault, stated)
+    if not all(condition.holds for condition in first):
+        return first
+    return (*first, told(problem_of(plant, asked), asked)[0])
+
+
+def told(problem: Problem, asked: Asked) -> tuple[Condition, int]:
+    """Return the condition that some window tells the fault, and the lag with which it does."""
+    lags = [problem.question.lag]
+    if problem.question.course == "any" and asked.lag is None:
+        lags = list(range(problem.plant.nx + 2))
+    window = None
+    for lag in lags:
+        window = problem.window(_samples(problem, asked, lag), lag=lag)
+        if _has_test(window):
+            return _condition(problem, window, True, ""), lag
+    assert window is not None
+    return _condition(problem, window, False, _why(problem, asked, window)), lags[-1]
+
+
+def _samples(problem: Problem, asked: Asked, lag: int) -> int:
+    """Return the samples on which it is decided."""
+    enough = problem.enough(lag)
+    if asked.samples != "auto":
+        return int(min(max(asked.samples, lag + 1), max(enough, lag + 1)))
+    if asked.after is not None:
+        return min(asked.before + asked.after, enough)
+    return enough
+
+
+def _has_test(window: Window) -> bool:
+    """Whether exact multipliers see the fault and no free column."""
+    multipliers = least_multipliers(window)
+    if multipliers is None:
+        return False
+    return repaired_multipliers(window, multipliers, refine=True) is not None
+
+
+def least_multipliers(window: Window) -> FloatArray | None:
+    """Return multipliers that see theta with weight one and no free column; ``None`` where least squares have none."""
+    rows, columns = window.scales
+    told = np.flatnonzero(window.free | (np.arange(len(window.bar)) == 0))
+    matrix = np.ldexp(np.ldexp(window.matrix[:, told].toarray(), columns[told]), rows[:, None]).T
+    wanted = np.zeros(len(told))
+    wanted[0] = float(np.ldexp(1.0, int(columns[0])))
+    found = np.linalg.lstsq(matrix, wanted, rcond=None)[0]
+    if np.max(np.abs(matrix @ found - wanted)) > SEEN * wanted[0]:
+        return None
+    return np.asarray(np.ldexp(found, rows))
+
+
+#: What least squares may leave of an equation, as a share of the fault's own weight.
+SEEN = 1e-6
+
+
+def _condition(problem: Problem, window: Window, holds: bool, detail: str) -> Condition:
+    fault = problem.plant.fault_names[problem.question.fault]
+    return Condition(
+        "fault told", f"{fault} changes samples as nothing free does", holds, float(holds), 1.0, SOURCE, detail,
+        signals=() if holds else (fault,),
+    )  # fmt: skip
+
+
+def _why(problem: Problem, asked: Asked, window: Window) -> str:
+    """Return in words what hides the fault."""
+    fault = problem.plant.fault_names[problem.question.fault]
+    found = proved_ray(window)
+    samples = window.question.samples
+    if found is None:
+        return (
+            f"no weights of {samples} samples see {fault} and nothing free, but a course that hides it could not be "
+            "proved: this is at the edge of double precision."
+        )
+    text = f"{hidden(window, found)} (proved for {samples} samples: every equation holds exactly)."
+    lag = window.question.lag
+    if problem.question.course == "any" and asked.lag is not None:
+        for more in range(lag + 1, problem.plant.nx + 2):
+            if _has_test(problem.window(max(samples, problem.enough(more)), lag=more)):
+                return f"{text} The least lag for which there is a test is {more}."
+    if asked.samples != "auto" and samples < problem.enough(lag):
+        for more in range(samples + 1, problem.enough(lag) + 1):
+            if _has_test(problem.window(more, lag=lag)):
+                return f"{text} The least number of samples for which there is a test is {more}."
+    return text
+
+
+def hidden(window: Window, point: FloatArray) -> str:
+    """Return which signals together look like nothing."""
+    plant, question = window.plant, window.question
+    fault = plant.fault_names[question.fault]
+    largest = float(np.max(np.abs(point)))
+    others = []
+    for label, value in zip(window.labels, point, strict=True):
+        if label[0] == "f" and label[2] != question.fault and abs(value) > TOLD * largest:
+            name = plant.fault_names[label[2]]
+            if name not in others:
+                others.append(name)
+    states = {
+        plant.state_names[label[2]]
+        for label, value in zip(window.labels, point, strict=True)
+        if label[0] == "x" and abs(value) > TOLD * largest
+    }
+    moving = f", while {', '.join(sorted(states))} move" if states and len(states) <= MOST_NAMED else ""
+    if others:
+        return f"{fault} and {' and '.join(others)} together give the same outputs as neither of them{moving}"
+    return f"{fault} gives the same outputs as no fault{moving or ', from another start of the states'}"
+
+
+#: More states than these are not listed.
+MOST_NAMED = 8

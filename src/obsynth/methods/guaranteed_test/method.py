@@ -1,0 +1,163 @@
+"""The guaranteed test as a method."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from obsynth.analysis.conditions import Condition
+from obsynth.methods.guaranteed_test.options import Asked
+from obsynth.methods.method import ClaimMeaning, Method, PlantKind
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.results.checks import Check
+from obsynth.results.design import ObserverDesign
+from obsynth.verification.error_system import ErrorModel
+
+CLAIMS = {
+    "threshold": ClaimMeaning("", "never passed without the fault, in the fault's unit", "threshold"),
+    "least": ClaimMeaning("", "no function of these samples has a smaller threshold without false alarms", "least"),
+    "surely_found": ClaimMeaning("", "a fault of this size and course surely alarms", "surely found"),
+    "delay": ClaimMeaning("s", "after which it does so at the latest", "delay"),
+}
+
+
+@dataclass(frozen=True)
+class GuaranteedTestMethod(Asked, Method):
+    r"""Design the test of a fault on the last samples that has the least threshold without false alarms.
+
+    The residual is a weighted sum of the last outputs and known inputs.  While disturbances and noise keep their bounds
+    it never passes the threshold without the fault, and no function of these samples does better: a course of the fault
+    of twice that size gives the same samples as none, and the design ships it.
+
+    Parameters
+    ----------
+    plant : DescriptorSystem or Transformation
+        Discrete time (``transform: sample_time``), any index; ``C (ny, nx)``, ``Bf (nx, nf)``, ``Bd (nx, nd)``; ``D``,
+        ``Df``, ``Dd``, ``Bw``, ``Dw`` allowed.
+    fault : str, optional
+        The fault that is looked for; may be left out where there is one only.
+    samples : int or "auto", optional
+        Samples of the window.  By default the least number whose threshold is within 5 % of that of the longest window
+        tried; the numbers are in the design's certificate as ``trade_off``.
+    course : {"step", "constant", "any", "ramp", "rate"}, optional
+        What the fault does.  ``step``: nothing for ``before`` samples, then it is constant (residuals fade once it
+        fills the window: latch alarms).  ``constant``: over the whole window.  ``any``: whatever it likes; it is told
+        for one sample, ``lag`` samples back.  ``ramp``: a straight line.  ``rate``: ``fault_rate`` a sample at most.
+    lag : int, optional, samples
+        Of which sample before the last the fault is told (``any``, ``ramp``, ``rate``); for ``any`` by default the
+        least for which there is a test, otherwise 0.
+    before, after : int, optional, samples
+        Of a step: healthy samples before it, and samples from it on, which is another way to say ``samples``.
+    disturbance_bounds : float or mapping of str to float
+        Largest absolute value of every disturbance.
+    noise_bound : float or mapping of str to float
+        Deviations that no component of the stated noise exceeds; or, by output, the bound of its noise.
+    disturbance : {"jump", "held", "rate"}, optional
+        Disturbances change at will from sample to sample, not at all over the window, or by ``disturbance_rate``.
+    disturbance_rate : float or mapping of str to float, optional
+        Largest change of each disturbance from sample to sample.
+    fault_rate : float, optional
+        Largest change of the fault from sample to sample.
+    state_bounds, initial_bounds : mapping of str to float, optional
+        Largest absolute value of states, at every sample or at the first of the window; none by default.
+    free : "others", "none" or sequence of str, optional
+        Faults that may do anything besides: the test is blind to them, so that its alarm isolates.
+    free_course : {"any", "constant"}, optional
+        What these do.
+    norm : {"box", "ellipsoid"}, optional
+        Whether each component has its bound, or disturbances and noise of a sample lie in ellipsoids with these half
+        axes.
+    name : str, optional
+        Name of the design.
+
+    Returns
+    -------
+    ObserverDesign
+        Its row is the residual (``step``) or the estimate of the fault, which lies within the threshold of it.
+
+    Raises
+    ------
+    SpecError
+        A bound is missing or out of range, a signal is unknown, or the course does not fit in the window.
+    PreconditionError
+        No window tells the fault: what hides it is shown, by numbers that satisfy every equation exactly.
+    SolverError
+        No usable answer: nothing is known.
+    VerificationError
+        The shipped realisation fails a check.
+
+    References
+    ----------
+    Ours: duality of linear programmes, proved on the stored numbers.
+    """
+
+    id: ClassVar[str] = "guaranteed-test"
+    plants: ClassVar[tuple[PlantKind, ...]] = ("time-invariant",)
+    time: ClassVar[str] = "discrete"
+    summary: ClassVar[str] = "a test of one fault whose threshold no other test on these samples can beat"
+    source: ClassVar[str] = "ours, by duality of linear programmes"
+    claims: ClassVar[Mapping[str, ClaimMeaning]] = CLAIMS
+    witnesses: ClassVar[frozenset[str]] = frozenset(
+        {"multipliers", "multiplier_radius", "witness", "witness_radius", "rounding", "trade_off"}
+    )
+
+    def conflicts(self) -> Iterator[str]:
+        """Yield a sentence for each rule across options that is broken."""
+        if self.fault_rate is None and self.course == "rate":
+            yield "course rate needs fault_rate, the largest change of the fault from sample to sample."
+        if self.fault_rate is not None and self.course != "rate":
+            yield f"fault_rate is for course rate, not {self.course}."
+        if (self.disturbance_rate is None) == (self.disturbance == "rate"):
+            yield "disturbance_rate goes with disturbance rate: give both or neither."
+        if self.after is not None and self.course != "step":
+            yield f"after is for course step, not {self.course}: give samples."
+        if self.lag and self.course in ("step", "constant"):
+            yield f"lag is for courses any, ramp and rate: a {self.course} is told of all its samples."
+        if self.samples == "auto":
+            return
+        least = self.before if self.course == "step" else (self.lag or 0)
+        if self.samples <= least:
+            yield (
+                f"course {self.course} does not fit in {self.samples} samples: "
+                f"{'before' if self.course == 'step' else 'lag'} is {least}; give more samples."
+            )
+        if self.after is not None and self.samples != self.before + self.after:
+            yield f"samples is {self.samples}, but before + after is {self.before + self.after}: leave one out."
+
+    def existence(self, plant: DescriptorSystem, *, exactly: bool = True) -> tuple[Condition, ...]:
+        """Return the existence conditions: bounds are stated, and something tells the fault."""
+        from obsynth.methods.guaranteed_test.conditions import conditions
+
+        return conditions(plant, self)
+
+    def synthesise(self, plant: DescriptorSystem, *, progress: Callable[[str], None]) -> Any:
+        """Return weights, observer and certificate, not yet verified."""
+        from obsynth.methods.guaranteed_test.synthesis import synthesise
+
+        return synthesise(plant, self, progress=progress)
+
+    @classmethod
+    def checks(cls, design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
+        """Yield a row for each claim, from the plant and the shipped numbers alone."""
+        from obsynth.methods.guaranteed_test.checks import checks
+
+        del printed_digits
+        return checks(design, cls.of)
+
+    @classmethod
+    def has_error_model(cls, design: ObserverDesign) -> bool:
+        """Whether the registers follow the state whatever it is: not where bounds of states are used."""
+        return not any(design.options.get(name) for name in ("state_bounds", "initial_bounds"))
+
+    @classmethod
+    def error_model(cls, design: ObserverDesign) -> ErrorModel | None:
+        """Return what the registers follow: the multipliers of one equation each; without a fault the row is zero."""
+        from obsynth.methods.guaranteed_test.problem import window_as_designed
+
+        if not cls.has_error_model(design):
+            return None
+        plant, observer = design.linear
+        multipliers = design.certificate.matrices["multipliers"].ravel()
+        T, T0 = window_as_designed(plant, cls.of(design.options)).followed(multipliers)
+        return ErrorModel(plant, observer, T, T0)

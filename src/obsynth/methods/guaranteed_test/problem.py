@@ -1,0 +1,220 @@
+"""What the options of a guaranteed test mean for a plant: bounds and questions; its weights as an observer."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from obsynth.errors import SpecError
+from obsynth.methods.guaranteed_test.options import Asked
+from obsynth.methods.guaranteed_test.windows import Bounds, Question, Window, window_of
+from obsynth.numerics.arguments import is_finite_number
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.ranks import decide_rank
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.proofs.balls import UNIT_ROUNDOFF
+from obsynth.proofs.exact_pencils import ExactPencil
+
+#: What each course covers, and what not.
+COURSES: Mapping[str, str] = {
+    "constant": "a fault that is constant over the window: the interval holds once it fills the window, alarms always",
+    "step": "a step after healthy samples: an alarm is right whatever the course, but fades once "
+    "the fault fills the window, so it is latched",
+    "any": "a fault of any course, at one sample: the interval holds at every row",
+    "ramp": "a straight line over the window: the interval is of its value at one sample",
+    "rate": "a fault that changes by at most fault_rate a sample: the interval is of its value at one sample",
+}
+#: Samples that are tried for ``samples="auto"``; for a step, those after its healthy past.
+LADDER = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)
+#: The ladder ends where a window has more states than this.
+MOST_STATES = 2500
+#: The least number of samples whose threshold is within this share of the last one's is taken.
+WITHIN = 0.05
+#: Room for the sums that bound what rounding does to a running test.
+SUM_ROOM = 1.01
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """A plant with its bounds and what is asked, but for the number of samples and the lag."""
+
+    plant: DescriptorSystem
+    bounds: Bounds
+    question: Question  # of one sample more than its course needs
+    before: int
+
+    def window(self, samples: int, *, lag: int | None = None) -> Window:
+        """Return the stacked equations of so many samples."""
+        lag = self.question.lag if lag is None else lag
+        return window_of(self.plant, self.bounds, replace(self.question, samples=samples, lag=lag))
+
+    @property
+    def shortest(self) -> int:
+        """The least number of samples that the course fits in."""
+        return max(self.before, self.question.lag) + 1
+
+    def enough(self, lag: int) -> int:
+        """Return samples after which more of them make no test possible that there was none before."""
+        return self.before + 2 * self.plant.nx + 2 + lag
+
+    def ladder(self) -> tuple[int, ...]:
+        """Return the numbers of samples to try; of a large plant fewer."""
+        most = max(MOST_STATES // max(self.plant.nx, 1), self.shortest)
+        asked = [self.before + rung for rung in LADDER] if self.question.course == "step" else list(LADDER)
+        return tuple(rung for rung in asked if self.shortest <= rung <= most) or (self.shortest,)
+
+
+def problem_of(plant: DescriptorSystem, asked: Asked) -> Problem:
+    """Return what is asked of a plant; raise `SpecError` for unknown signals, missing bounds and courses that do not
+    fit."""
+    fault = fault_of(plant, asked.fault)
+    free = free_faults(plant, asked.free, fault)
+    before = asked.before if asked.course == "step" else 0
+    regular = decide_rank(plant.E).full
+    index = 0 if regular else ExactPencil.written(plant.E, plant.A).index
+    closing = 0 if index is None else max(index - 1, 0)
+    rates = np.zeros(0)
+    if asked.disturbance == "rate":
+        rates = _by_name(asked.disturbance_rate, plant.disturbance_names, "disturbance_rate", every=True)
+    question = Question(
+        fault, asked.course, before + 1, asked.lag or 0, before, free, asked.free_course, asked.disturbance, rates,
+        float(asked.fault_rate or 0.0), asked.norm == "ellipsoid", closing,
+    )  # fmt: skip
+    return Problem(plant, bounds_of(plant, asked), question, before)
+
+
+def window_as_designed(plant: DescriptorSystem, asked: Asked) -> Window:
+    """Return the stacked equations of options as a design ships them: with the number of samples and the lag."""
+    problem = problem_of(plant, asked)
+    return replace(problem, question=replace(problem.question, lag=asked.lag or 0)).window(int(asked.samples))
+
+
+def fault_of(plant: DescriptorSystem, name: str | None) -> int:
+    """Return the number of the fault that is looked for."""
+    names = plant.fault_names
+    if name is None and len(names) == 1:
+        return 0
+    if name is None or name not in names:
+        given = "No fault is named" if name is None else f"There is no fault {name!r}"
+        listed = f"name one of {', '.join(names)}" if names else "the plant has none (Bf, Df)"
+        raise SpecError(f"{given}: {listed}.", path="method.options.fault")
+    return names.index(name)
+
+
+def free_faults(plant: DescriptorSystem, given: Any, fault: int) -> tuple[int, ...]:
+    """Return the numbers of the faults that may do anything besides."""
+    names = plant.fault_names
+    if isinstance(given, str) and given not in names:
+        if given not in ("others", "none"):
+            raise SpecError(
+                f"free is {given!r}: use others, none, or a list of {', '.join(names)}.", path="method.options.free"
+            )
+        return tuple(k for k in range(plant.nf) if k != fault) if given == "others" else ()
+    listed = [given] if isinstance(given, str) else list(given or ())
+    wrong = [str(name) for name in listed if name not in names or names.index(name) == fault]
+    if wrong:
+        raise SpecError(
+            f"free names {', '.join(wrong)}: no other fault of the plant is called so; there are: {', '.join(names)}.",
+            path="method.options.free",
+        )
+    return tuple(sorted({names.index(name) for name in listed}))
+
+
+def missing_bounds(plant: DescriptorSystem, asked: Asked) -> Iterator[str]:
+    """Yield a sentence for each bound that is missing."""
+    acting = np.any(plant.Bd != 0.0, axis=0) | np.any(plant.Dd != 0.0, axis=0)
+    known = asked.disturbance_bounds
+    names = plant.disturbance_names
+    if known is None or isinstance(known, Mapping):
+        lacking = [name for name, does in zip(names, acting, strict=True) if does and name not in (known or {})]
+        if lacking:
+            yield f"disturbance_bounds: the largest absolute value of {', '.join(lacking)} is missing."
+    if asked.noise_bound is None and np.any(np.hstack([plant.Bw.ravel(), plant.Dw.ravel()])):
+        yield (
+            "noise_bound: a standard deviation is no bound; say how many of them the noise never exceeds, or the bound "
+            "of each output by name."
+        )
+
+
+def bounds_of(plant: DescriptorSystem, asked: Asked) -> Bounds:
+    """Return the bounds that are given."""
+    lacking = list(missing_bounds(plant, asked))
+    if lacking:
+        first = lacking[0].partition(":")[0]
+        raise SpecError("A guaranteed test needs bounds.", path=f"method.options.{first}", problems=lacking)
+    disturbance = _by_name(asked.disturbance_bounds, plant.disturbance_names, "disturbance_bounds", every=False)
+    if isinstance(asked.noise_bound, Mapping):
+        output = np.eye(plant.ny)
+        noise = _by_name(asked.noise_bound, plant.output_names, "noise_bound", every=True)
+        state, kept = np.zeros((plant.nx, plant.ny)), np.any(plant.Bw != 0.0, axis=0)
+        if kept.any():
+            raise SpecError(
+                "noise_bound is given by output, but noise enters the equations too: give a number of deviations.",
+                path="method.options.noise_bound",
+            )
+    else:
+        state, output = plant.Bw, plant.Dw
+        noise = _by_name(asked.noise_bound, plant.noise_names, "noise_bound", every=False)
+    always = _by_name(asked.state_bounds, plant.state_names, "state_bounds", every=False, missing=np.inf)
+    at_first = _by_name(asked.initial_bounds, plant.state_names, "initial_bounds", every=False, missing=np.inf)
+    return Bounds(disturbance, state, output, noise, always, at_first)
+
+
+def _by_name(given: Any, names: tuple[str, ...], option: str, *, every: bool, missing: float = 0.0) -> FloatArray:
+    """Return a number, 0 or more, for each name, from one number for all or a mapping."""
+    path = f"method.options.{option}"
+    if given is None:
+        if every and names:
+            raise SpecError(f"{option} is missing: give a number for each of {', '.join(names)}.", path=path)
+        return np.full(len(names), missing)
+    by_name = dict(given) if isinstance(given, Mapping) else dict.fromkeys(names, given)
+    unknown = [str(name) for name in by_name if name not in names]
+    lacking = [name for name in names if name not in by_name] if every else []
+    if unknown or lacking:
+        parts = [f"unknown: {', '.join(unknown)}"] if unknown else []
+        parts += [f"missing: {', '.join(lacking)}"] if lacking else []
+        raise SpecError(f"{option} must name {', '.join(names) or 'nothing'}; {'; '.join(parts)}.", path=path)
+    for name, value in by_name.items():
+        if not (is_finite_number(value) and value >= 0.0):
+            raise SpecError(f"{option} of {name} is {value!r}: give a finite number, 0 or more.", path=path)
+    return np.array([float(by_name.get(name, missing)) for name in names])
+
+
+def delay_in_samples(window: Window, delay: int) -> int:
+    """Return after how many samples at the latest a fault of twice the threshold alarms."""
+    question = window.question
+    if question.course == "step":
+        return question.samples - 1 - question.before + delay
+    # The fault must have followed its course over the whole window; one of any course needs only its own sample.
+    return (question.lag if question.course == "any" else question.samples - 1) + delay
+
+
+def observer_of(window: Window, on_y: FloatArray, on_u: FloatArray, delay: int) -> LinearObserver:
+    """Return the weights (newest first) as a linear observer with one register for each sample but the last."""
+    plant, count = window.plant, len(on_y) - 1
+    name = (plant.fault_names[window.question.fault],)
+    estimated = window.question.course != "step"
+    late = (window.question.lag + delay,) if estimated else ()
+    first = np.zeros((1, count))
+    first[0, :1] = 1.0
+    return LinearObserver(
+        Az=np.eye(count, k=1), Bu=on_u[1:], By=on_y[1:], Cz=first, Du=on_u[:1], Dy=on_y[:1], dt=plant.dt,
+        input_names=plant.input_names, output_names=plant.output_names, state_names=(),
+        fault_names=name if estimated else (), residual_names=() if estimated else name, state_delays=(),
+        fault_delays=late,
+    )  # fmt: skip
+
+
+def rounding_of(window: Window, multipliers: FloatArray, radius: FloatArray) -> FloatArray:
+    """Return what shipped weights may err for known signals of at most one ``(nu + ny,)``; the threshold lacks it."""
+    plant, at, samples = window.plant, window.outputs_at, window.question.samples
+    share = (len(multipliers) + plant.nu + plant.ny + plant.nx + 8) * UNIT_ROUNDOFF
+    sizes = (radius + share * np.abs(multipliers)) * SUM_ROOM
+    equations = sizes[:at].reshape(window.equations, plant.nx).sum(axis=0)
+    outputs = sizes[at : at + samples * plant.ny].reshape(samples, plant.ny).sum(axis=0)
+    on_inputs = np.abs(plant.B).T @ equations + np.abs(plant.D).T @ outputs
+    return np.concatenate([on_inputs, outputs])

@@ -1,0 +1,91 @@
+"""The linear programmes of a window: the largest fault that nothing tells from none, by HiGHS; only their answers are
+proved."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from obsynth.errors import SolverError
+from obsynth.methods.guaranteed_test.windows import Window
+from obsynth.numerics.arrays import FloatArray
+
+#: Tightest tolerance that HiGHS takes.
+TOLERANCE = 1e-10
+#: Statuses of `scipy.optimize.linprog`.
+SOLVED, UNBOUNDED = 0, 3
+
+
+@dataclass(frozen=True, eq=False)
+class Optimum:
+    """A solution as the solver gives it: ``multipliers (rows,)``, ``point (columns,)``; neither where unbounded."""
+
+    size: float
+    multipliers: FloatArray | None = None
+    point: FloatArray | None = None
+
+
+def largest_hidden_fault(window: Window, right: FloatArray | None = None, *, sign: float = 1.0) -> Optimum:
+    """Return the largest theta (``sign`` -1: the least) of the equations with these right sides, zero by default."""
+    if window.question.ellipsoid and right is None:
+        return _in_ellipsoids(window)
+    from scipy.optimize import linprog
+    from scipy.sparse import diags_array
+
+    rows, columns = window.scales
+    matrix = diags_array(np.ldexp(1.0, rows)) @ window.matrix @ diags_array(np.ldexp(1.0, columns))
+    cost = np.zeros(len(window.bar))
+    cost[0] = -sign
+    ends = np.ldexp(window.bar, -columns)
+    known = np.zeros(window.rows) if right is None else np.ldexp(right, rows)
+
+    given = {"A_eq": matrix.tocsr(), "b_eq": known, "bounds": np.stack([-ends, ends], axis=1), "method": "highs"}
+    options = {"primal_feasibility_tolerance": TOLERANCE, "dual_feasibility_tolerance": TOLERANCE}
+    found = linprog(cost, options=options, **given)
+    if found.status not in (SOLVED, UNBOUNDED):
+        found = linprog(cost, options={**options, "presolve": False}, **given)
+    if found.status == UNBOUNDED:
+        return Optimum(np.inf * sign)
+    if found.status != SOLVED:
+        raise SolverError(
+            f"HiGHS has no answer for the linear programme of {window.question.samples} samples (status "
+            f"{found.status}): nothing is known. "
+            "Fewer samples, or signals in units in which they are near one, may help."
+        )
+    multipliers = np.ldexp(-sign * np.asarray(found.eqlin.marginals), rows)
+    scale = float(window.matrix[:, [0]].toarray().ravel() @ multipliers)
+    point = np.ldexp(np.asarray(found.x), columns)
+    if right is None and abs(scale) > 0.0:
+        multipliers = multipliers / scale
+    return Optimum(float(point[0]), multipliers, point)
+
+
+def _in_ellipsoids(window: Window) -> Optimum:
+    """Return the same where noise and disturbances of each sample lie in an ellipsoid, by Clarabel."""
+    import cvxpy as cp
+
+    rows, columns = window.scales
+    from scipy.sparse import csr_array, diags_array
+
+    matrix = csr_array(diags_array(np.ldexp(1.0, rows)) @ window.matrix @ diags_array(np.ldexp(1.0, columns)))
+    x = cp.Variable(len(window.bar))
+    ends = np.ldexp(window.bar, -columns)
+    limits = [
+        cp.norm(cp.multiply(1.0 / ends[window.group == group], x[np.flatnonzero(window.group == group)])) <= 1.0
+        for group in np.unique(window.group[window.group >= 0])
+    ]
+    boxed = np.flatnonzero(window.bounded & (window.group < 0))
+    if boxed.size:
+        limits.append(cp.abs(x[boxed]) <= ends[boxed])
+    equations = matrix @ x == 0.0
+    problem = cp.Problem(cp.Maximize(x[0]), [equations, *limits])
+    problem.solve(solver=cp.CLARABEL)
+    if problem.status in ("unbounded", "unbounded_inaccurate"):
+        return Optimum(np.inf)
+    if x.value is None or equations.dual_value is None:
+        raise SolverError(f"Clarabel has no answer ({problem.status}): nothing is known.")
+    multipliers = np.ldexp(np.asarray(equations.dual_value).ravel(), rows)
+    scale = float(window.matrix[:, [0]].toarray().ravel() @ multipliers)
+    point = np.ldexp(np.asarray(x.value), columns)
+    return Optimum(float(point[0]), multipliers / scale if scale else multipliers, point)

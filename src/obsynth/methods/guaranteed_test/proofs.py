@@ -1,0 +1,376 @@
+"""Proofs about a window: what shipped multipliers promise, what a witness shows, and why there is no test.
+
+Shipped doubles satisfy equations up to rounding.  What is missing is computed exactly, in whole numbers; a square part
+of the equations with a proved inverse then tells how far the exact solution lies from what is shipped, at most.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+from flint import arb, arb_mat, ctx, fmpq, fmpq_mat
+
+from obsynth.methods.guaranteed_test.windows import Window
+from obsynth.numerics.arrays import FloatArray
+from obsynth.proofs.balls import UNIT_ROUNDOFF, Ball, rounded_up
+
+#: Diagonal of the pivoted triangle, as a share of its first entry, below which rows are taken as dependent.
+DEPENDENT = 1e-13
+#: Entries of a solution count at least this share of the largest one when a square part is chosen.
+LEAST_WEIGHT = 1e-3
+#: Newton steps towards the exact solution before it is rounded for the last time.
+REFINEMENTS = 4
+#: Bits of ball arithmetic where double precision proves no inverse, and the most rows for it.
+BITS, MOST_ROWS_IN_BALLS = 256, 700
+#: A bounded number so near to its bound, as a share of it, is at its bound.
+AT_BOUND = 1e-9
+#: Least room that a bounded number counts for when a square part is chosen, as a share of its bound.
+LEAST_ROOM = 1e-4
+_MANTISSA = 53
+
+
+@dataclass(frozen=True, eq=False)
+class Whole:
+    """Doubles as whole numbers times one power of two: exact."""
+
+    values: np.ndarray  # of Python's whole numbers
+    exponent: int
+
+    @classmethod
+    def of(cls, doubles: FloatArray) -> Whole:
+        """Return doubles exactly."""
+        parts, exponents = np.frexp(doubles)
+        least = int(np.min(exponents, initial=0, where=doubles != 0.0)) - _MANTISSA
+        whole = np.ldexp(parts, _MANTISSA).astype(np.int64).tolist()
+        shifts = np.where(doubles != 0.0, exponents - _MANTISSA - least, 0).tolist()
+        found = np.empty(len(whole), dtype=object)
+        found[:] = [value << shift for value, shift in zip(whole, shifts, strict=True)]
+        return cls(found, least)
+
+
+def _entries(window: Window) -> Whole:
+    """Return the entries of the matrix exactly."""
+    found = Whole.of(window.value)
+    return Whole(found.values * np.array(window.times.tolist(), dtype=object), found.exponent)
+
+
+def _sums(entries: Whole, factors: Whole, places: np.ndarray, onto: np.ndarray, count: int) -> list[Fraction]:
+    """Return exact sums of entries times factors."""
+    totals = [0] * count
+    for there, product in zip(onto.tolist(), (entries.values * factors.values[places]).tolist(), strict=True):
+        totals[there] += product
+    exponent = entries.exponent + factors.exponent
+    one = Fraction(2) ** exponent
+    return [value * one for value in totals]
+
+
+def columns_of(window: Window, multipliers: FloatArray) -> list[Fraction]:
+    """Return the matrix transposed times multipliers, exactly ``(columns,)``."""
+    return _sums(_entries(window), Whole.of(multipliers), window.i, window.j, len(window.bar))
+
+
+def rows_of(window: Window, point: FloatArray) -> list[Fraction]:
+    """Return the matrix times a point, exactly ``(rows,)``."""
+    return _sums(_entries(window), Whole.of(point), window.j, window.i, window.rows)
+
+
+def up(value: Fraction) -> float:
+    """Return a double that is not below a rational number."""
+    found = float(value)
+    return found if Fraction(found) >= value else float(np.nextafter(found, np.inf))
+
+
+def down(value: Fraction) -> float:
+    """Return a double that is not above a rational number."""
+    return -up(-value)
+
+
+@dataclass(frozen=True, eq=False)
+class _Square:
+    """A square part of equations ``K v = r``, scaled by powers of two, with an approximate inverse."""
+
+    chosen: np.ndarray
+    rows: np.ndarray  # exponents
+    columns: np.ndarray
+    inverse: FloatArray
+    contraction: float  # bound of the infinity norm of I - inverse K
+    part: Ball
+    kept: np.ndarray  # rows of K: all of them, or those that others follow from
+
+    @classmethod
+    def of(cls, matrix: FloatArray, radius: FloatArray, weight: FloatArray) -> _Square | None:
+        """Choose columns of ``matrix (m, n)``, the heavier the better; ``None`` where rows depend on each other."""
+        from scipy.linalg import qr
+
+        columns = np.frexp(np.where(weight > 0.0, weight, 1.0))[1].astype(np.int64)
+        columns = np.where(weight > 0.0, columns, -2000)
+        scaled = np.ldexp(matrix, columns)
+        largest = np.abs(scaled).max(axis=1, initial=0.0)
+        if matrix.shape[0] > matrix.shape[1] or not np.all(largest > 0.0):
+            return None
+        rows = -np.frexp(largest)[1].astype(np.int64)
+        scaled = np.ldexp(scaled, rows[:, None])
+        triangle, order = qr(scaled, mode="r", pivoting=True)
+        count = len(matrix)
+        diagonal = np.abs(np.diag(triangle))
+        if count and not diagonal[count - 1] > DEPENDENT * diagonal[0]:
+            return None
+        chosen = np.sort(order[:count])
+        spread = np.ldexp(np.ldexp(radius[:, chosen], columns[chosen]), rows[:, None])
+        part = Ball(scaled[:, chosen], spread)
+        try:
+            inverse = np.asarray(np.linalg.inv(part.midpoint), dtype=np.float64)
+        except np.linalg.LinAlgError:
+            return None
+        missing = Ball.exact(np.eye(count)) - Ball.exact(inverse) @ part
+        contraction = float(np.max(rounded_up(missing.magnitude.sum(axis=1), count + 2), initial=0.0))
+        return cls(chosen, rows, columns[chosen], inverse, contraction, part, np.arange(count))
+
+    def step(self, right: FloatArray) -> FloatArray:
+        """Return the approximate correction ``(chosen,)`` that takes away a right side."""
+        return np.asarray(np.ldexp(self.inverse @ np.ldexp(right, self.rows), self.columns))
+
+    def proved_step(self, right: list[Fraction]) -> FloatArray | None:
+        """Return bounds of the exact correction ``(chosen,)``; ``None`` where nothing is proved."""
+        sizes = np.array([up(abs(value)) for value in right])
+        scaled = np.ldexp(sizes, self.rows)
+        if self.contraction < 1.0:
+            magnitude = Ball.exact(np.abs(self.inverse)) @ Ball.exact(scaled[:, None])
+            first = magnitude.magnitude.ravel()
+            rest = self.contraction / (1.0 - self.contraction) * float(np.max(first, initial=0.0))
+            return np.asarray(np.ldexp(rounded_up(first + rest, 8), self.columns))
+        if len(right) > MOST_ROWS_IN_BALLS or self.part.radius.any():
+            return None
+        return self._in_balls(right)
+
+    def _in_balls(self, right: list[Fraction]) -> FloatArray | None:
+        before = ctx.prec
+        ctx.prec = BITS
+        try:
+            count = len(right)
+            matrix = arb_mat(count, count, [arb(value) for value in self.part.midpoint.ravel().tolist()])
+            exact = [Fraction(value) * Fraction(2) ** int(e) for value, e in zip(right, self.rows, strict=True)]
+            sides = arb_mat(count, 1, [arb(fmpq(value.numerator, value.denominator)) for value in exact])
+            found = matrix.solve(sides)
+            sizes = [abs(found[k, 0]).upper() for k in range(count)]
+        except ZeroDivisionError:
+            return None
+        finally:
+            ctx.prec = before
+        doubles = np.array([float(value) for value in sizes])
+        return np.asarray(np.ldexp(rounded_up(doubles, 4), self.columns))
+
+
+def _dense(window: Window, columns: np.ndarray) -> tuple[FloatArray, FloatArray]:
+    """Return columns of the matrix, and what rounding of their products may be."""
+    matrix = window.matrix[:, columns].toarray()
+    several = np.abs(window.times).max(initial=1) > 1
+    radius = UNIT_ROUNDOFF * np.abs(matrix) * (2.0 if several else 0.0)
+    return matrix, radius
+
+
+@dataclass(frozen=True, eq=False)
+class Repaired:
+    """Doubles next to an exact solution, which lies within ``radius`` of them."""
+
+    values: FloatArray
+    radius: FloatArray
+
+
+def _multiplier_system(window: Window, *, exact_zero: bool) -> tuple[np.ndarray, list[int]]:
+    """Return the columns whose products with multipliers are told: 0, or 1 for that of theta."""
+    told = np.ones(len(window.bar), dtype=bool) if exact_zero else window.free.copy()
+    told[0] = True
+    return told, np.flatnonzero(told).tolist()
+
+
+def repaired_multipliers(
+    window: Window, multipliers: FloatArray, *, refine: bool, exact_zero: bool = False
+) -> Repaired | None:
+    """Return multipliers with the distance to exact ones: no free column is seen, theta with weight one.
+
+    ``exact_zero``: no bounded column is seen either.  ``refine``: move them to the nearest doubles first.
+    """
+    _, told = _multiplier_system(window, exact_zero=exact_zero)
+    wanted = [Fraction(int(column == 0)) for column in told]
+
+    def missing(values: FloatArray) -> list[Fraction]:
+        seen = columns_of(window, values)
+        return [want - seen[column] for want, column in zip(wanted, told, strict=True)]
+
+    matrix, radius = _dense(window, np.array(told))
+    rows, _ = window.scales
+    sizes = np.ldexp(np.abs(multipliers), -rows)
+    weight = np.ldexp(np.maximum(sizes, LEAST_WEIGHT * float(np.max(sizes, initial=0.0))), rows)
+    return _repaired(matrix.T, radius.T, weight, np.array(multipliers), missing, refine=refine)
+
+
+def repaired_point(window: Window, point: FloatArray, *, refine: bool) -> Repaired | None:
+    """Return a hidden fault's point ``(columns,)`` with the distance to one that satisfies every equation exactly."""
+    bar, bounded = window.bar, window.bounded
+    values = np.array(point)
+    if refine:
+        near = bounded & (bar - np.abs(values) < AT_BOUND * bar)
+        values[near] = np.copysign(bar[near], values[near])
+    _, columns = window.scales
+    sizes = np.ldexp(np.abs(values), -columns)
+    room = np.ldexp(np.maximum(1.0, sizes), columns)
+    held = np.where(bounded, bar, 0.0)
+    weight = np.where(bounded, np.maximum(held - np.abs(values), LEAST_ROOM * held), room)
+    weight[0] = 0.0
+    matrix, radius = _dense(window, np.arange(len(bar)))
+
+    def missing(values: FloatArray) -> list[Fraction]:
+        return [-value for value in rows_of(window, values)]
+
+    return _repaired(matrix, radius, weight, values, missing, refine=refine)
+
+
+def _repaired(
+    matrix: FloatArray, radius: FloatArray, weight: FloatArray, values: FloatArray, missing: Any, *, refine: bool
+) -> Repaired | None:
+    square = _Square.of(matrix, radius, weight)
+    if square is None:
+        return _in_rationals(matrix, weight, values, missing, refine=refine)
+    if refine:
+        left = np.inf
+        for _ in range(REFINEMENTS):
+            lacking = np.array([float(value) for value in missing(values)])
+            size = float(np.max(np.abs(square.step(lacking) / np.ldexp(1.0, square.columns)), initial=0.0))
+            if not size < 0.5 * left:
+                break
+            left = size
+            values[square.chosen] += square.step(lacking)
+    bound = square.proved_step(missing(values))
+    if bound is None:
+        return None
+    distance = np.zeros(len(values))
+    distance[square.chosen] = bound
+    return Repaired(values, distance)
+
+
+#: Most rows for which equations that depend on each other are solved in rationals.
+MOST_ROWS_IN_RATIONALS = 400
+
+
+def _in_rationals(
+    matrix: FloatArray, weight: FloatArray, values: FloatArray, missing: Any, *, refine: bool
+) -> Repaired | None:
+    """Return the same where rows depend on each other: a largest square part solved exactly, the others looked at."""
+    from scipy.linalg import qr
+
+    if len(matrix) > MOST_ROWS_IN_RATIONALS:
+        return None
+    scaled = matrix * weight
+    largest = np.abs(scaled).max(axis=1, initial=0.0)
+    scaled = scaled / np.where(largest > 0.0, largest, 1.0)[:, None]
+    triangle, by_row = qr(scaled.T, mode="r", pivoting=True)
+    diagonal = np.abs(np.diag(triangle))
+    rank = int(np.sum(diagonal > DEPENDENT * max(float(np.max(diagonal, initial=0.0)), np.finfo(float).tiny)))
+    rows = np.sort(by_row[:rank])
+    _, by_column = qr(scaled[rows], mode="r", pivoting=True)
+    columns = np.sort(by_column[:rank])
+    exact = missing(values)
+    part = fmpq_mat(rank, rank, [_rational(float(value)) for value in matrix[np.ix_(rows, columns)].ravel()])
+    right = fmpq_mat(rank, 1, [fmpq(exact[row].numerator, exact[row].denominator) for row in rows])
+    try:
+        step = _solved(part, right) if rank else right
+    except ZeroDivisionError:
+        return None
+    correction = [Fraction(int(step[k, 0].p), int(step[k, 0].q)) for k in range(rank)]
+    for row in set(range(len(matrix))) - set(rows.tolist()):
+        seen = sum(
+            (Fraction(float(matrix[row, c])) * d for c, d in zip(columns, correction, strict=True) if matrix[row, c]),
+            start=Fraction(0),
+        )
+        if seen != exact[row]:
+            return None
+    moved = [Fraction(float(values[c])) + d for c, d in zip(columns, correction, strict=True)]
+    if refine:
+        values[columns] = [float(value) for value in moved]
+    distance = np.zeros(len(values))
+    distance[columns] = [up(abs(v - Fraction(float(values[c])))) for v, c in zip(moved, columns, strict=True)]
+    return Repaired(values, distance)
+
+
+def _solved(part: Any, right: Any) -> Any:
+    """Return the solution of a square system, by lifting: the numbers of its solution are long."""
+    return part.solve(right, algorithm="dixon")
+
+
+def _rational(value: float) -> fmpq:
+    return fmpq(*value.as_integer_ratio())
+
+
+def proved_threshold(window: Window, repaired: Repaired, *, exact_zero: bool = False) -> float:
+    """Return what the test never passes without a fault: an upper bound of ``sum bar |M_s' mu|``."""
+    if exact_zero:
+        return 0.0
+    seen = columns_of(window, repaired.values)
+    away = _absolute(window, repaired.radius)
+    bounded = np.flatnonzero(window.bounded)
+    parts = [Fraction(float(window.bar[j])) * (abs(seen[j]) + away[j]) for j in bounded]
+    if not window.question.ellipsoid:
+        return up(sum(parts, start=Fraction(0)))
+    sizes, groups = np.array([up(part) for part in parts]), window.group[bounded]
+    norms = [float(np.sqrt(np.sum(sizes[groups == group] ** 2))) for group in np.unique(groups[groups >= 0])]
+    norms += sizes[groups < 0].tolist()
+    return float(rounded_up(np.array(sum(norms)), 2 * len(sizes) + 8))
+
+
+def _absolute(window: Window, radius: FloatArray) -> list[Fraction]:
+    """Return |matrix| transposed times non-negative numbers, exactly."""
+    entries = _entries(window)
+    return _sums(Whole(abs(entries.values), entries.exponent), Whole.of(radius), window.i, window.j, len(window.bar))
+
+
+def proved_least(window: Window, repaired: Repaired) -> float:
+    """Return the size of the hidden fault that the exact point next to these doubles shows, within all bounds."""
+    bounded = np.flatnonzero(window.bounded)
+    sizes = rounded_up((np.abs(repaired.values) + repaired.radius)[bounded], 2) / window.bar[bounded]
+    sizes = rounded_up(sizes, 2)
+    groups = window.group[bounded]
+    alone = sizes if not window.question.ellipsoid else sizes[groups < 0]
+    worst = float(np.max(alone, initial=1.0))
+    if window.question.ellipsoid:
+        for group in np.unique(groups[groups >= 0]):
+            part = sizes[groups == group]
+            worst = max(worst, float(rounded_up(np.sqrt(np.sum(part**2)), 2 * len(part) + 8)))
+    return down(Fraction(float(repaired.values[0])) / Fraction(worst))
+
+
+def proved_ray(window: Window) -> FloatArray | None:
+    """Return states and free faults ``(columns,)`` that hide a fault of size one exactly, without any disturbance.
+
+    There is then no test on these samples.  ``None`` where none is found, or none is proved.
+    """
+    told = np.flatnonzero(window.free)
+    _, columns = window.scales
+    rows, _ = window.scales
+    matrix, radius = _dense(window, told)
+    theta = window.matrix[:, [0]].toarray().ravel()
+    scaled = np.ldexp(np.ldexp(matrix, columns[told]), rows[:, None])
+    found = np.linalg.lstsq(scaled, -np.ldexp(theta, rows), rcond=None)[0]
+    if np.max(np.abs(scaled @ found + np.ldexp(theta, rows)), initial=0.0) > HIDDEN * (1.0 + np.max(np.abs(found))):
+        return None
+    point = np.zeros(len(window.bar))
+    point[0], point[told] = 1.0, np.ldexp(found, columns[told])
+
+    def missing(values: FloatArray) -> list[Fraction]:
+        whole = point.copy()
+        whole[told] = values
+        return [-value for value in rows_of(window, whole)]
+
+    weight = np.ldexp(np.maximum(np.abs(found), 1.0), columns[told])
+    repaired = _repaired(matrix, radius, weight, point[told].copy(), missing, refine=True)
+    if repaired is None:
+        return None
+    point[told] = repaired.values
+    return point
+
+
+#: Residual, in scaled equations, below which a fault is taken as hidden, to be proved then.
+HIDDEN = 1e-9

@@ -1,0 +1,167 @@
+"""The weights of the least threshold, by linear programmes whose answers are then proved."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import fields, replace
+from typing import Any
+
+import numpy as np
+
+from obsynth.analysis.conditions import require_all
+from obsynth.errors import SolverError
+from obsynth.methods.guaranteed_test.conditions import conditions, told
+from obsynth.methods.guaranteed_test.options import Asked
+from obsynth.methods.guaranteed_test.problem import (
+    COURSES,
+    MOST_STATES,
+    WITHIN,
+    Problem,
+    delay_in_samples,
+    observer_of,
+    problem_of,
+    rounding_of,
+)
+from obsynth.methods.guaranteed_test.programs import Optimum, largest_hidden_fault
+from obsynth.methods.guaranteed_test.proofs import (
+    Repaired,
+    proved_least,
+    proved_threshold,
+    repaired_multipliers,
+    repaired_point,
+)
+from obsynth.methods.guaranteed_test.windows import Window
+from obsynth.methods.method import Synthesis
+from obsynth.numerics.arrays import FloatArray
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.results.design import Certificate
+
+#: Room for what another processor finds for the distance to the exact solution.
+RADIUS_ROOM = 8.0
+#: A threshold below this share of what all bounds could do is tried as an exact zero.
+ZERO = 1e-9
+#: The table of samples against threshold in a certificate.
+TRADE_OFF = "trade_off"
+
+
+def synthesise(
+    plant: DescriptorSystem, asked: Asked, *, progress: Callable[[str], None]
+) -> Synthesis:  # fmt: skip
+    """Return weights, observer and certificate."""
+    problem = problem_of(plant, asked)
+    require_all(conditions(plant, asked))
+    _, lag = told(problem, asked)
+    problem = replace(problem, question=replace(problem.question, lag=lag))
+    progress("looking for the least number of samples")
+    samples, table = chosen_samples(problem, asked)
+    progress(f"proving the threshold on {samples} samples")
+    window = problem.window(samples)
+    shipped = proved_test(window, largest_hidden_fault(window))
+    return _synthesis(problem, asked, window, shipped, table)
+
+
+def chosen_samples(problem: Problem, asked: Asked) -> tuple[int, FloatArray]:
+    """Return the number of samples, and the table of those tried with their thresholds ``(tried, 2)``."""
+    given = asked.before + asked.after if asked.after is not None else asked.samples
+    tried = problem.ladder() if given == "auto" else (int(given),)
+    table = np.array([[rung, largest_hidden_fault(problem.window(rung)).size] for rung in tried])
+    if not np.isfinite(table[-1, 1]):
+        raise SolverError(
+            f"HiGHS finds no test on {tried[-1]} samples, but there is one: nothing is known. Other units may help."
+        )
+    good = table[:, 1] <= (1.0 + WITHIN) * table[-1, 1]
+    return int(table[np.flatnonzero(good)[0], 0]), table
+
+
+class Shipped:
+    """What is proved of a window: multipliers, a witness, and both claims."""
+
+    def __init__(self, test: Repaired, threshold: float, witness: Repaired | None, least: float) -> None:
+        self.test, self.threshold, self.witness, self.least = test, threshold, witness, least
+
+
+def proved_test(window: Window, found: Optimum) -> Shipped:
+    """Return the proved test next to a solution; raise `SolverError` where nothing can be proved."""
+    if found.multipliers is None or found.point is None:
+        raise SolverError("The linear programme is unbounded on this window: nothing is known.")
+    # What all bounds together could do to these weights.
+    able = float(np.abs(window.matrix[:, window.bounded]).T @ np.abs(found.multipliers) @ window.bar[window.bounded])
+    if found.size <= ZERO * able:
+        exact = repaired_multipliers(window, found.multipliers, refine=True, exact_zero=True)
+        if exact is not None:
+            return Shipped(with_room(exact), 0.0, None, 0.0)
+    test = repaired_multipliers(window, found.multipliers, refine=True)
+    if test is None:
+        raise SolverError(
+            f"Weights of {window.question.samples} samples were found, but double precision cannot tell how far they "
+            "are from exact ones: nothing is known. Fewer samples, or signals in units near one, help."
+        )
+    test = with_room(test)
+    witness = repaired_point(window, found.point, refine=True)
+    witness = None if witness is None else with_room(witness)
+    least = np.nan if witness is None else proved_least(window, witness)
+    return Shipped(test, proved_threshold(window, test), witness, least)
+
+
+def with_room(found: Repaired) -> Repaired:
+    """Return the same with a radius that other processors find too."""
+    return Repaired(found.values, RADIUS_ROOM * found.radius)
+
+
+def _synthesis(
+    problem: Problem, asked: Asked, window: Window, shipped: Shipped, table: FloatArray
+) -> Synthesis:  # fmt: skip
+    on_y, on_u, delay = window.weights(shipped.test.values)
+    observer = observer_of(window, on_y, on_u, delay)
+    question, plant = window.question, problem.plant
+    matrices = {
+        "multipliers": shipped.test.values, "multiplier_radius": shipped.test.radius,
+        "rounding": rounding_of(window, shipped.test.values, shipped.test.radius), TRADE_OFF: table,
+    }  # fmt: skip
+    claims = {
+        "threshold": shipped.threshold, "surely_found": 2.0 * shipped.threshold,
+        "delay": delay_in_samples(window, delay) * plant.dt,
+    }  # fmt: skip
+    if shipped.witness is not None:
+        matrices |= {"witness": shipped.witness.values, "witness_radius": shipped.witness.radius}
+    if np.isfinite(shipped.least):
+        claims["least"] = shipped.least
+    options: dict[str, Any] = {option.name: getattr(asked, option.name) for option in fields(asked)} | {
+        "samples": question.samples, "lag": question.lag if question.course in ("any", "ramp", "rate") else None,
+        "fault": plant.fault_names[question.fault],
+    }  # fmt: skip
+    return Synthesis(
+        options, {"h": on_y, "g": on_u}, observer, Certificate(matrices, claims),
+        notes=tuple(_notes(problem, asked, window, shipped, table)),
+    )  # fmt: skip
+
+
+def _notes(
+    problem: Problem, asked: Asked, window: Window, shipped: Shipped, table: FloatArray
+) -> list[str]:  # fmt: skip
+    question = window.question
+    words = []
+    if shipped.threshold == 0.0:
+        words.append("No disturbance and no noise is seen at all: compare the residual with what rounding does.")
+    elif np.isfinite(shipped.least):
+        words.append(
+            f"The threshold is {shipped.threshold:.9g}, and no function of {question.samples} samples has one below "
+            f"{shipped.least:.9g}: they differ by {shipped.threshold - shipped.least:.1e}. A fault of twice "
+            "that surely alarms."
+        )
+    else:
+        words.append("That there is no smaller threshold could not be proved on these numbers: least is not claimed.")
+    words.append(f"The course {question.course} is {COURSES[question.course]}.")
+    if question.course == "any" and asked.lag is None:
+        words.append(f"The least lag with which {problem.plant.fault_names[question.fault]} is told is {question.lag}.")
+    if problem.plant.uncertainty is not None:
+        words.append("The threshold is that of the nominal plant: tolerances of its constants are not in it.")
+    if len(table) > 1:
+        listed = ", ".join(f"{int(rung)}: {size:.4g}" for rung, size in table)
+        words.append(f"Samples and thresholds (by linear programmes; that of {question.samples} is proved): {listed}.")
+        if problem.plant.nx * table[-1, 0] * 2 > MOST_STATES:
+            words.append(
+                f"The table ends at {int(table[-1, 0])} samples, as its programmes grow with samples times states; "
+                "give samples for more."
+            )
+    return words

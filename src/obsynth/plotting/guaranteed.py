@@ -1,0 +1,107 @@
+"""Pictures of guaranteed tests: how small a fault so many samples tell, and the interval in which it lies."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from obsynth.methods.guaranteed_test.result import GuaranteedTest
+from obsynth.observers.estimates import Estimates
+from obsynth.plotting.panels import PANEL_HEIGHT, WIDTH, legend_above, new_panels, tidy
+from obsynth.results.design import ObserverDesign
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+#: From this ratio of largest to smallest threshold on, its axis is logarithmic.
+WIDE_SPREAD = 5.0
+
+
+def plot_least_thresholds(design: ObserverDesign, *, axes: Axes | None = None) -> Axes:
+    """Plot the least threshold of a guaranteed test against the time that its samples take.
+
+    Parameters
+    ----------
+    design : ObserverDesign
+        By `obsynth.guaranteed_test` with ``samples="auto"``, so that there is a table.
+    axes : Axes, optional
+        Where; new ones by default.
+
+    Returns
+    -------
+    Axes
+        Threshold in the fault's unit against seconds from the begin of the fault to the verdict; the samples chosen
+        are marked, and what lies below the curve no test finds.
+
+    Raises
+    ------
+    SpecError
+        The design is by another method.
+    """
+    found = GuaranteedTest.of(design)
+    plant = found.linear[0]
+    (panel,) = new_panels(None if axes is None else [axes], 1, size=(WIDTH, 1.6 * PANEL_HEIGHT))
+    table = found.trade_off[np.isfinite(found.trade_off[:, 1])]
+    before = int(found.options["before"]) if found.options["course"] == "step" else 0
+    seconds = (table[:, 0] - 1 - before) * plant.dt
+    unit = plant.units.get(found.fault, "")
+    panel.plot(seconds, table[:, 1], color="black", marker="o", markersize=4, label="least threshold of any test")
+    panel.fill_between(seconds, 0.0, table[:, 1], color="0.9", label="no test without false alarms goes here")
+    panel.plot(
+        (found.samples - 1 - before) * plant.dt, found.threshold, marker="s", markersize=9, color="tab:red",
+        linestyle="none", label=f"chosen: {found.samples} samples, proved",
+    )  # fmt: skip
+    sizes = table[:, 1]
+    if sizes.size and sizes.min() > 0.0 and sizes.max() > WIDE_SPREAD * sizes.min():
+        panel.set_yscale("log")
+        panel.set_ylim(bottom=0.7 * float(sizes.min()))
+    else:
+        panel.set_ylim(bottom=0.0)
+    after = "from the step to the last sample" if before else "from the first to the last sample"
+    panel.set_xlabel(f"{after} (s)")
+    panel.set_ylabel(f"{found.fault}{f' ({unit})' if unit else ''}")
+    legend_above(panel)
+    tidy(panel)
+    return panel
+
+
+def plot_intervals(design: ObserverDesign, estimates: Estimates, *, axes: Axes | None = None) -> Axes:
+    """Plot the interval in which a guaranteed test says the fault lies, and where it alarms.
+
+    Parameters
+    ----------
+    design : ObserverDesign
+        By `obsynth.guaranteed_test`.
+    estimates : Estimates
+        What its observer said over a record, from its start.
+    axes : Axes, optional
+        Where; new ones by default.
+
+    Returns
+    -------
+    Axes
+        Residual with the threshold on both sides of it, against seconds; alarms are shaded from the first on.
+
+    Raises
+    ------
+    SpecError
+        The design is by another method.
+    """
+    found = GuaranteedTest.of(design)
+    plant = found.linear[0]
+    (panel,) = new_panels(None if axes is None else [axes], 1, size=(WIDTH, 1.6 * PANEL_HEIGHT))
+    low, high = found.interval(estimates)
+    seconds = np.arange(len(low)) * plant.dt
+    panel.fill_between(seconds, low, high, color="0.85", label="interval")
+    panel.plot(seconds, found.residual(estimates), color="black", linewidth=1.0, label="residual")
+    panel.axhline(0.0, color="0.4", linewidth=0.8)
+    alarms = np.flatnonzero(found.alarms(estimates))
+    if alarms.size:
+        panel.axvline(float(seconds[alarms[0]]), color="tab:red", linestyle="--", label="alarm")
+    unit = plant.units.get(found.fault, "")
+    panel.set_xlabel("time (s)")
+    panel.set_ylabel(f"{found.fault}{f' ({unit})' if unit else ''}")
+    legend_above(panel)
+    tidy(panel)
+    return panel
