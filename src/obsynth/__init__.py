@@ -10,7 +10,7 @@ Designs
     design, and one function for each method: fault_estimation_filter, pd_observer, ui_pi_observer, descriptor_kalman,
     adaptive_observer, dae_adaptive_observer, guaranteed_test; verify, load.
 On data
-    run_on_data, smooth, online_monitor, plotting.plot_data, html_report, export.
+    run_on_data, smooth, learn_thresholds, online_monitor, plotting.plot_data, html_report, export.
 In simulation
     Scenario, simulate, monitor, evaluate, decide; plotting.
 What is wrong
@@ -45,10 +45,12 @@ _NAMES = {
     "comparison.result": "ComparedMethod Comparison FaultComparison",
     "comparison.sensor_sets": "sensor_sets SensorSet SensorSets",
     "data.alarm_proof": "prove_alarm",
+    "data.normal_rows": "learn_thresholds",
     "data.run": "DataRun run_on_data",
     "data.smoothing": "smooth",
     "errors": "InfeasibleError ObsynthError PreconditionError SolverError SpecError VerificationError",
     "experiments.alarm_proof": "AlarmProof verify_alarm",
+    "experiments.monitors.learned": "LearnedThresholds load_thresholds",
     "experiments.monitors.monitor": "Detection Monitor",
     "experiments.monitors.online": "OnlineMonitor",
     "experiments.monitors.online_monitor": "online_monitor",
@@ -121,6 +123,7 @@ provide({
     "design summary": "obsynth.report.summary:summary",
     "rows of a log": "obsynth.data.alarm_proof:rows_of",
     "picture of a guaranteed test": "obsynth.plotting.guaranteed:plot_least_thresholds",
+    "thresholds from a log": "obsynth.data.normal_rows:learn_thresholds",
     "designs with model error": "obsynth.experiments.tolerant_designs:with_model_error",
 })  # fmt: skip
 

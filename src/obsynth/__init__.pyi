@@ -27,6 +27,7 @@ from obsynth.comparison.sensor_sets import SensorSet as SensorSet
 from obsynth.comparison.sensor_sets import SensorSets as SensorSets
 from obsynth.comparison.sensor_sets import sensor_sets as sensor_sets
 from obsynth.data.alarm_proof import prove_alarm as prove_alarm
+from obsynth.data.normal_rows import learn_thresholds as learn_thresholds
 from obsynth.data.run import DataRun as DataRun
 from obsynth.data.run import run_on_data as run_on_data
 from obsynth.data.smoothing import smooth as smooth
@@ -38,6 +39,8 @@ from obsynth.errors import SpecError as SpecError
 from obsynth.errors import VerificationError as VerificationError
 from obsynth.experiments.alarm_proof import AlarmProof as AlarmProof
 from obsynth.experiments.alarm_proof import verify_alarm as verify_alarm
+from obsynth.experiments.monitors.learned import LearnedThresholds as LearnedThresholds
+from obsynth.experiments.monitors.learned import load_thresholds as load_thresholds
 from obsynth.experiments.monitors.monitor import Detection as Detection
 from obsynth.experiments.monitors.monitor import Monitor as Monitor
 from obsynth.experiments.monitors.online import OnlineMonitor as OnlineMonitor

@@ -166,7 +166,9 @@ MONITOR_SETTINGS = Settings((
 ))  # fmt: skip
 #: How a log is read, and what is watched in it.
 DATA_OPTIONS = (
-    MAP, MONITOR, MONITOR_SETTINGS,
+    MAP, MONITOR,
+    option("--normal", "FILE", "monitor 'learned': what the verb thresholds wrote (.json), or a log without faults"),
+    MONITOR_SETTINGS,
     Settings((
         option("--time-column", "COLUMN", "column of the time, in seconds or as dates (ISO 8601); default: time"),
         SCALE,

@@ -104,7 +104,7 @@ def monitor_of(
     """Return the monitor that is asked for."""
     if options.monitor is None:
         of_monitors = (*(() if has_scenario else ("system",)), "noise_bound", "initial_error", "sample_time",
-                       "disturbance", "nominal", "initial")  # fmt: skip
+                       "disturbance", "nominal", "initial", "normal")  # fmt: skip
         asked = [name for name in of_monitors if getattr(options, name)]
         if asked:
             flag = f"--{asked[0].replace('_', '-')}"
@@ -122,7 +122,7 @@ def monitor_of(
         scenario = required_scenario(spec)
     return online_monitor(
         design, options.monitor, scenario=scenario, nominal=numbers_of(options.nominal),
-        sample_time=options.sample_time, **monitor_settings(design, options),
+        sample_time=options.sample_time, normal=options.normal, **monitor_settings(design, options),
     )  # fmt: skip
 
 

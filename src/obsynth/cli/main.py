@@ -97,6 +97,7 @@ however long the data are. KIND is one of
   chi-square  linear: a window of the residual against its covariance; recursive: the parameters against theirs
   cusum       small changes of the residual, or of a parameter
   nis         recursive and nonlinear designs: innovations that the model does not explain
+  learned     every design: thresholds from rows without faults (--normal), whatever the model assumes of noise
 Where --gains is a folder, every gain set in it is run on --data, a log or a folder of logs, on --jobs processes or a
 cluster; a log with the name of a gain set is for that one alone.  --out is a folder then, with the estimates, table.csv
 and fleet.png; the same command goes on where another was stopped.
@@ -185,6 +186,20 @@ VERBS = {
                "'verify' rechecks", type=Path),
         JSON, FORCE, flag("--quiet", "print no progress and no summary"),
     ), _RUN_DETAILS),
+    "thresholds": Verb("learned:run_thresholds", "Learn the thresholds of a design from a log without faults, for a "
+                       "rate of false alarms.", (
+        GAINS, option("--data", "FILE", _LOG, required=True),
+        option("--false-alarms", "RATE", "such as '1 per week' or '2 per 1000 rows' (default: '1 per 1000 rows')"),
+        option("--out", "FILE", "write the thresholds to this file (JSON), for run --monitor learned --normal FILE",
+               type=Path),
+        *LOG_OPTIONS,
+        Settings((
+            option("--time-column", "COLUMN", "column of the time, in seconds or as dates (ISO 8601); default: time"),
+            option("--gap", "SECONDS", "continuous designs: longer intervals are gaps", type=float),
+            option("--warm-up", "SECONDS", "how long to leave out the start, and what follows gaps", type=float),
+        )),
+        JSON, FORCE, QUIET,
+    )),
     "export": Verb("data_commands:run_export", "Write a gain set for Simulink (.mat), numpy (.npz), C99 (.c and .h), "
                    "or as a functional mock-up unit for co-simulation (.fmu); of a recursive design for a "
                    "time-invariant plant, its steady state.", (

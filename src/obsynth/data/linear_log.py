@@ -187,7 +187,7 @@ class DataObserver(Engine):
             self._restart()
             return Row(GAP, self._held(), missing)
         self.fault = found[self.observer.fault_rows].copy()
-        sample = LinearSample(found, values[: self.nu], values[self.nu :])
+        sample = LinearSample(found, values[: self.nu], values[self.nu :], len(self.state_names))
         return Row(status, found, missing, sample, time >= self.forgotten_at)
 
     def steps(self, times: list[float], values: FloatArray, row: int) -> list[Row]:

@@ -41,6 +41,12 @@ class LinearSample(NamedTuple):
     rows: FloatArray
     inputs: FloatArray
     outputs: FloatArray
+    states: int = 0  # how many of the rows are state estimates
+
+    @property
+    def faults_and_residuals(self) -> FloatArray:
+        """The rows after those of the states."""
+        return self.rows[self.states :]
 
 
 UNDECIDED = Seen(math.nan, math.nan, False, "")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from obsynth.errors import SpecError
 from obsynth.experiments.monitors.adaptive_monitor import EXACT, adaptive_plan, adaptive_statement, tolerances_of
 from obsynth.experiments.monitors.adaptive_records_monitor import noisy_design
 from obsynth.experiments.monitors.adaptive_rule import AdaptiveRule
+from obsynth.experiments.monitors.learned import LearnedThresholds, learned_monitor, load_thresholds
 from obsynth.experiments.monitors.monitor import KINDS, statement_of
 from obsynth.experiments.monitors.online import OnlineMonitor, Rule
 from obsynth.experiments.monitors.residual_model import ResidualModel, residual_model, watches_estimates
@@ -18,6 +20,7 @@ from obsynth.experiments.monitors.residual_monitor import bounds_of, require_opt
 from obsynth.experiments.monitors.rules import ANY_LENGTH, NormRule, WhitenedRule, parameter_monitor
 from obsynth.experiments.monitors.thresholds import samples_of, scaled_inputs, unlimited_bound, unlimited_paper
 from obsynth.experiments.monitors.whitening import steady_mean, whitened
+from obsynth.extensions import extension
 from obsynth.numerics.arguments import is_finite_number, require_kind, require_mapping
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import first_order_hold
@@ -49,6 +52,7 @@ def online_monitor(
     sample_time: float | None = None,
     constants: Any = None,
     initial_set: Mapping[str, Any] | None = None,
+    normal: Any = None,
 ) -> OnlineMonitor:
     """Return a monitor for measured data, for `run_on_data`: its threshold holds however long the data are.
 
@@ -57,9 +61,10 @@ def online_monitor(
     design : ObserverDesign
         Of any method.  Linear ones are watched by their residual, recursive ones by their parameters and innovations,
         nonlinear ones likewise (to first order, as their covariances).
-    kind : {"pointwise", "paper", "window", "chi-square", "cusum", "nis"}, optional
+    kind : {"pointwise", "paper", "window", "chi-square", "cusum", "nis", "learned"}, optional
         The first three for linear designs, as for `obsynth.monitor`; ``nis`` for the others (all that the model does
-        not explain), where ``chi-square`` is on the parameters against their nominal values.
+        not explain), where ``chi-square`` is on the parameters against their nominal values.  ``learned``, for every
+        design: from rows without faults, whatever the model assumes of noise.
     scenario : Scenario, optional
         Linear designs: whose disturbances and noise are those to be expected; its length, start, inputs and faults do
         not count.  Without one, the noise is the plant's own, once, and disturbances need bounds.
@@ -89,6 +94,9 @@ def online_monitor(
         ``pointwise``, linear designs: bounds of the plant's states at the first row (deviations), each a
         number or ``[low, high]``; the threshold then holds from the first row on, for the plant's own tolerances where
         no others are given.
+    normal : LearnedThresholds, path or pandas.DataFrame, optional
+        ``learned``: from `obsynth.learn_thresholds`, the file in which they were saved (``.json``), or a log without
+        faults, whose rate is one false alarm per 1,000 rows.
 
     Returns
     -------
@@ -108,6 +116,10 @@ def online_monitor(
     for name, given in (("disturbance_bounds", disturbance_bounds), ("nominal", nominal)):
         require_mapping(given, name)
     require_options(noise_bound, initial_error, gamma, window, false_alarms, change, 0)
+    if kind == "learned":
+        return _learned(design, normal)
+    if normal is not None:
+        raise SpecError(f"normal is for the monitor 'learned', not for {kind!r}.", path="normal")
     if isinstance(design.observer, (RecursiveObserver, DAEObserver)):
         return parameter_monitor(design.observer, kind, nominal or {}, change, false_alarms)
     _require_linear_kind(kind, nominal)
@@ -133,6 +145,18 @@ def online_monitor(
         residuals=len(design.linear[1].residual_names), fault_names=design.linear[1].fault_names,
         fault_scales=model.fault_scales(),
     )  # fmt: skip
+
+
+def _learned(design: ObserverDesign, normal: Any) -> OnlineMonitor:
+    """Return the monitor of thresholds that were learned, or are to be."""
+    if normal is None:
+        raise SpecError("learned needs rows without faults: give a log, or what obsynth thresholds wrote (normal, "
+                        "--normal).", path="normal")  # fmt: skip
+    if isinstance(normal, (str, Path)) and Path(normal).suffix.lower() == ".json":
+        normal = load_thresholds(normal)
+    if not isinstance(normal, LearnedThresholds):
+        normal = extension("thresholds from a log")(design, normal)
+    return learned_monitor(design, normal)
 
 
 def _require_linear_kind(kind: str, nominal: Mapping[str, float] | None) -> None:

@@ -1,0 +1,396 @@
+"""Monitors whose thresholds were learned from rows without faults: what is kept of them, and how they run."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from obsynth.errors import SpecError
+from obsynth.experiments.monitors.learned_levels import (
+    AGES,
+    FORGETTING,
+    HOLD,
+    SETTLING,
+    Statistics,
+    learned_levels,
+    rows_needed,
+)
+from obsynth.experiments.monitors.online import Evidence, LinearSample, OnlineMonitor, Rule
+from obsynth.files.inputs import read_json
+from obsynth.files.outputs import FileKind, write_atomically
+from obsynth.numerics.arguments import is_finite_number
+from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.autoregression import Autoregression, fitted_autoregression
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.results.design import ObserverDesign
+from obsynth.results.gain_sets import digest_of, gain_set_digest, plain, restored
+
+KIND = "obsynth learned thresholds"
+SCHEMA_VERSION = 1
+LEARNED = FileKind("learned thresholds of obsynth", rb'\A\s*\{\s*"kind":\s*"obsynth learned thresholds"')
+#: Columns that are watched at most, and the least share of a column's variance that others leave unexplained.
+MOST_WATCHED, LEAST_NEW = 8, 1e-6
+#: Rows without faults below which nothing is learned.
+LEAST_NORMAL = 100
+#: Seconds of the units of time in which a rate is told.
+UNITS = {"second": 1.0, "minute": 60.0, "hour": 3600.0, "day": 86400.0, "week": 604800.0, "month": 2629800.0,
+         "year": 31557600.0}  # fmt: skip
+_RATE = re.compile(r"\s*([0-9.eE+-]+)\s*(?:per|/)\s*([0-9.eE+]*)\s*([a-z]+?)s?\s*")
+
+
+def rows_per_alarm(rate: str | float, dt: float) -> float:
+    """Return how many rows, ``dt`` seconds apart, there are for each false alarm of a rate such as ``1 per week``,
+    ``2 per 1000 rows``, or a number of alarms per row."""
+    found: float | None = None
+    if is_finite_number(rate):
+        found = 1.0 / float(rate) if float(rate) > 0.0 else None
+    elif isinstance(rate, str) and (match := _RATE.fullmatch(rate.lower())) is not None:
+        unit = 1.0 if match.group(3) in ("row", "sample") else UNITS.get(match.group(3), 0.0) / dt
+        try:
+            alarms, count = float(match.group(1)), float(match.group(2) or 1.0)
+        except ValueError:
+            alarms, count = 0.0, 0.0
+        found = count * unit / alarms if alarms > 0.0 and math.isfinite(alarms) and count * unit > 0.0 else None
+    if found is None or not math.isfinite(found):
+        raise SpecError(f"false_alarms is {rate!r}: give a rate, such as '1 per week' or '1 per 1000 rows'.",
+                        path="false_alarms")  # fmt: skip
+    if found < 2 * HOLD:
+        raise SpecError(f"false_alarms is {rate!r}, one per {found:.3g} rows, but an alarm lasts {HOLD} rows at least: "
+                        "ask for rarer ones.", path="false_alarms")  # fmt: skip
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class LearnedThresholds:
+    """Thresholds learned from rows without faults; made by `obsynth.learn_thresholds`.
+
+    Parameters
+    ----------
+    columns : tuple of str
+        Columns of a run that are watched.
+    statistics : Statistics
+        Autoregression of these columns, and the directions in which steps are looked for.
+    levels : FloatArray
+        ``(k,)``: level of each statistic.
+    every : float
+        Rows per false alarm that were asked for.
+    rows, needed : int
+        Rows that were learned from, and those that the rate needs.
+    dt : float, seconds
+        Between these rows.
+    centres, scales : FloatArray
+        ``(nf,)``: means and deviations of the fault estimates there.
+    gains : str
+        sha256 of the gain set.
+    extrapolated : bool
+        Whether the rate is rarer than what the bootstrap shows.
+    left_out : tuple of str
+        Columns that are not watched, as they add nothing to the others.
+    settling : int
+        Rows at the start of a run in which nothing is decided, as nothing was learned from such rows.
+    """
+
+    columns: tuple[str, ...]
+    statistics: Statistics
+    levels: FloatArray
+    every: float
+    rows: int
+    needed: int
+    dt: float
+    centres: FloatArray
+    scales: FloatArray
+    gains: str
+    extrapolated: bool = False
+    left_out: tuple[str, ...] = ()
+    settling: int = 0
+
+    @property
+    def holds(self) -> bool:
+        """Whether there were rows enough for the rate that was asked for."""
+        return self.rows >= self.needed
+
+    @property
+    def statement(self) -> str:
+        """What the thresholds mean, and whether the rows suffice for it."""
+        model, lasting = self.statistics.model, self.every * self.dt
+        text = (
+            f"learned from {self.rows} rows without faults: at most one false alarm per {self.every:.6g} rows "
+            f"({_duration(lasting)}) on average, in {len(self.columns)} column(s) whitened by an autoregression of "
+            f"order {model.order}; alarms closer than {HOLD} rows are one"
+        )
+        if self.holds:
+            return text
+        rarest = min(self.rows, self.every)
+        other = f"the rate that {self.rows} rows can hold is one per {rarest:.6g} rows ({_duration(rarest * self.dt)})"
+        if rows_needed(model, 1.0) > self.rows:
+            other = "the residuals remember so long, or are so many, that these rows hold no rate"
+        return (f"{text}. The rate is not sure: it needs {self.needed} rows without faults "
+                f"({_duration(self.needed * self.dt)}); {other}")  # fmt: skip
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return all of it as data."""
+        model = self.statistics.model
+        return {
+            "gains": self.gains, "columns": list(self.columns), "left_out": list(self.left_out),
+            "offset": model.offset, "A": model.A, "whitener": model.whitener,
+            "signatures": self.statistics.signatures, "statistics": list(self.statistics.names),
+            "levels": self.levels, "every": self.every, "rows": self.rows, "needed": self.needed, "dt": self.dt,
+            "centres": self.centres, "scales": self.scales, "extrapolated": self.extrapolated,
+            "settling": self.settling,
+        }  # fmt: skip
+
+    def save(self, path: str | Path) -> Path:
+        """Write the thresholds as one JSON document, atomically.
+
+        Parameters
+        ----------
+        path : str or Path
+            Where to write.
+
+        Raises
+        ------
+        SpecError
+            The file cannot be written.
+        """
+        body = plain(self.as_dict())
+        document = {"kind": KIND, "schema_version": SCHEMA_VERSION, "sha256": digest_of(body), "thresholds": body}
+        write_atomically(Path(path), json.dumps(document, indent=1, allow_nan=False) + "\n")
+        return Path(path)
+
+
+def _duration(seconds: float) -> str:
+    """Return seconds in the largest unit of which there is one."""
+    name, size = next(((n, s) for n, s in reversed(UNITS.items()) if seconds >= s), ("second", 1.0))
+    count = seconds / size
+    return f"{count:.3g} {name}{'' if count == 1.0 else 's'}"
+
+
+def load_thresholds(path: str | Path) -> LearnedThresholds:
+    """Read learned thresholds.
+
+    Parameters
+    ----------
+    path : str or Path
+        File that ``LearnedThresholds.save``, or ``obsynth thresholds``, wrote.
+
+    Returns
+    -------
+    LearnedThresholds
+        As they were saved.
+
+    Raises
+    ------
+    SpecError
+        The file is none of these, or was changed.
+    """
+    file = Path(path)
+    document = read_json(file)
+    if not isinstance(document, dict) or document.get("kind") != KIND:
+        raise SpecError(f"{file} holds no learned thresholds.", path=str(file))
+    if document.get("schema_version") != SCHEMA_VERSION:
+        raise SpecError(f"{file} was written by another version of obsynth: learn the thresholds again.",
+                        path=str(file))  # fmt: skip
+    try:
+        body = document["thresholds"]
+        if digest_of(body) != document["sha256"]:
+            raise SpecError(f"{file} was changed after it was written: its digest does not match.", path=str(file))
+        return _from_dict(restored(body))
+    except SpecError:
+        raise
+    except (AttributeError, LookupError, TypeError, ValueError, ArithmeticError, RecursionError) as error:
+        raise SpecError(f"{file} is damaged: {error}.", path=str(file)) from error
+
+
+def _from_dict(data: Mapping[str, Any]) -> LearnedThresholds:
+    columns, m = tuple(map(str, data["columns"])), len(data["columns"])
+    offset, a, whitener, signatures, levels = (
+        np.asarray(data[name], dtype=np.float64) for name in ("offset", "A", "whitener", "signatures", "levels")
+    )
+    names = tuple(map(str, data["statistics"]))
+    shapes = (offset.shape, a.shape[1:], whitener.shape, signatures.shape[1:], levels.shape)
+    fits = shapes == ((m,), (m, m), (m, m), (m,), (len(names),)) and len(names) == 1 + len(FORGETTING) + len(signatures)
+    if not (fits and all(np.isfinite(part).all() for part in (offset, a, whitener, signatures)) and (levels > 0).all()):
+        raise ValueError("its parts do not fit together")
+    model = Autoregression(read_only(offset), read_only(a), read_only(whitener))
+    return LearnedThresholds(
+        columns, Statistics(model, read_only(signatures), names), read_only(levels), float(data["every"]),
+        int(data["rows"]), int(data["needed"]), float(data["dt"]), read_only(np.asarray(data["centres"])),
+        read_only(np.asarray(data["scales"])), str(data["gains"]), bool(data["extrapolated"]),
+        tuple(map(str, data["left_out"])), int(data["settling"]),
+    )  # fmt: skip
+
+
+def watched_names(design: ObserverDesign) -> tuple[str, ...]:
+    """Return what may be watched of a design: fault estimates, then residuals (or innovations)."""
+    observer = design.observer
+    if isinstance(observer, LinearObserver):
+        names = observer.row_names
+        return (*names[observer.fault_rows], *names[observer.residual_rows])
+    return (*(f"fhat[{name}]" for name in observer.fault_names), *(f"r[{i + 1}]" for i in range(innovations(observer))))
+
+
+def settling_rows(design: ObserverDesign) -> int:
+    """Return how many rows at a start are not like those that follow: linear designs have a warm-up for these."""
+    return 0 if isinstance(design.observer, LinearObserver) else SETTLING
+
+
+def innovations(observer: Any) -> int:
+    """Return how many innovations a recursive or nonlinear observer says."""
+    return int(getattr(observer, "innovation_count", 0) or len(observer.output_names))
+
+
+def watched_values(residuals: FloatArray, evidence: Any) -> FloatArray | None:
+    """Return fault estimates and residuals of a row, in the order of `watched_names`; `None` where there are none."""
+    if isinstance(evidence, Evidence):
+        return np.concatenate([evidence.theta, residuals])
+    if isinstance(evidence, LinearSample):
+        return evidence.faults_and_residuals
+    return None
+
+
+def thresholds_from_rows(
+    design: ObserverDesign, rows: FloatArray, *, every: float, dt: float, seed: int = 0
+) -> LearnedThresholds:
+    """Return thresholds from ``rows (n, m)`` of all that may be watched, NaN where nothing is known.
+
+    Where the fault estimates remember more than the rows can tell, the residuals alone are watched.
+    """
+    names, known = watched_names(design), np.asarray(np.isfinite(rows).all(axis=1))
+    count = int(known.sum())
+    if count < LEAST_NORMAL:
+        raise SpecError(f"Only {count} rows of the log can be learned from, as warm-up and gaps do not count: give "
+                        f"{LEAST_NORMAL} and more.", path="normal")  # fmt: skip
+    faults = len(design.observer.fault_names)
+    choices = [part for part in (independent(rows[known], 0), independent(rows[known], faults)) if part]
+    if not choices:
+        raise SpecError("Nothing that is watched ever moves in these rows: there is no noise to learn from.",
+                        path="normal")  # fmt: skip
+    fits = [(kept, fitted_autoregression(np.where(known[:, None], rows[:, kept], np.nan))) for kept in choices]
+    enough = [fit for fit in fits if rows_needed(fit[1], 1.0) <= count]
+    kept, model = enough[0] if enough else min(fits, key=lambda fit: rows_needed(fit[1], 1.0))
+    x = np.where(known[:, None], rows[:, kept], np.nan)
+    told = tuple(names[i] for i in kept)
+    statistics = Statistics.of(model, np.diag(np.sqrt(np.nanvar(x, axis=0))), told)
+    levels = learned_levels(x, every, statistics, seed)
+    centres, scales = rows[known, :faults].mean(axis=0), rows[known, :faults].std(axis=0)
+    return LearnedThresholds(
+        told, statistics, read_only(levels.own * levels.factor), every, count, rows_needed(model, every), dt,
+        read_only(centres), read_only(np.where(scales > 0.0, scales, 1.0)), gain_set_digest(design),
+        levels.extrapolated, tuple(name for i, name in enumerate(names) if i not in kept), settling_rows(design),
+    )  # fmt: skip
+
+
+def independent(rows: FloatArray, first: int) -> list[int]:
+    """Return the columns of ``(n, m)`` from the ``first`` on that those before them do not explain; at most eight."""
+    kept: list[int] = []
+    basis = np.zeros((len(rows), 0))
+    for i, column in enumerate(rows.T[first:], first):
+        left = column - column.mean()
+        power = float(left @ left)
+        # Twice, as once leaves rounding of large parts.
+        for _ in range(2):
+            left = left - basis @ (basis.T @ left)
+        if len(kept) < MOST_WATCHED and power > 0.0 and float(left @ left) > LEAST_NEW * power:
+            kept.append(i)
+            basis = np.column_stack([basis, left / np.linalg.norm(left)])
+    return kept
+
+
+class LearnedRule(Rule):
+    """The largest of all statistics in units of its level, row by row.  A row that is missing, or in which nothing may
+    be decided, is as the autoregression predicts it: it adds no evidence, and takes none away."""
+
+    KEPT = ("past", "white", "means", "last", "taken")
+
+    def __init__(self, learned: LearnedThresholds, names: Sequence[str]) -> None:
+        self.learned = learned
+        self._places = np.array([names.index(name) for name in learned.columns])
+        templates = learned.statistics.templates()
+        self._templates = templates.reshape(len(templates) * len(AGES), -1)
+        self._model = learned.statistics.model
+        self._start()
+
+    def _start(self) -> None:
+        model = self._model
+        self.past = np.tile(model.mean, (model.order, 1))
+        self.white = np.zeros((max(AGES), model.channels))
+        self.means = np.zeros((len(FORGETTING), model.channels))
+        self.last: float | None = None
+        self.taken = 0
+
+    def take(
+        self, time: float, residuals: FloatArray, evidence: Any, *, deciding: bool
+    ) -> tuple[float, float, int | None]:
+        """Return the largest statistic in units of its level, one as threshold, and the fault whose step it is."""
+        missing = 0 if self.last is None else round((time - self.last) / self.learned.dt) - 1
+        for _ in range(min(max(missing, 0), max(AGES))):
+            self._add(None)
+        self.last = time
+        self.taken += 1
+        found = watched_values(residuals, evidence)
+        if self.taken <= self.learned.settling:
+            found = None
+        if not deciding or found is None or not np.isfinite(found[self._places]).all():
+            self._add(None)
+            return math.nan, math.nan, None
+        self._add(found[self._places])
+        # Products of numbers that overflow have passed any level.
+        with np.errstate(over="ignore", invalid="ignore"):
+            ratios = ((self._templates @ self.white.ravel()) ** 2).reshape(-1, len(AGES)).max(axis=1)
+            weights = np.array([(2.0 - share) / share for share in FORGETTING])
+            smooth = weights * np.sum(self.means**2, axis=1)
+            values = np.concatenate([[np.sum(self.white[-1] ** 2)], smooth, ratios]) / self.learned.levels
+        values = np.where(np.isnan(values), np.inf, values)
+        return float(values.max()), 1.0, self._fault(found, ratios)
+
+    def _fault(self, found: FloatArray, ratios: FloatArray) -> int | None:
+        """Return the fault whose step explains most, or whose estimate is furthest from where it was."""
+        names, count = self.learned.columns, len(self.learned.scales)
+        best = int(np.argmax(ratios))
+        if names[best].startswith("fhat["):
+            return int(self._places[best])
+        if not count:
+            return None
+        return int(np.argmax(np.abs(found[:count] - self.learned.centres) / self.learned.scales))
+
+    def _add(self, x: FloatArray | None) -> None:
+        """Take a row, or `None` for one that is as predicted."""
+        model = self._model
+        predicted = model.offset + sum((a @ row for a, row in zip(model.A, self.past, strict=True)),
+                                       np.zeros(model.channels))  # fmt: skip
+        with np.errstate(over="ignore", invalid="ignore"):
+            e = np.zeros(model.channels) if x is None else model.whitener @ (x - predicted)
+        self.white = np.vstack([self.white[1:], e])
+        shares = np.array(FORGETTING)[:, None]
+        self.means = (1.0 - shares) * self.means + shares * e
+        if model.order:
+            self.past = np.vstack([predicted if x is None else x, self.past[:-1]])
+
+    def restart(self) -> None:
+        """Keep everything: rows that are missing are predicted over."""
+
+    def options(self) -> Any:
+        """Return the digest of what was learned."""
+        return digest_of(plain(self.learned.as_dict()))
+
+
+def learned_monitor(design: ObserverDesign, learned: LearnedThresholds) -> OnlineMonitor:
+    """Return the monitor of thresholds that were learned with a design; raise `SpecError` for another design."""
+    if learned.gains != gain_set_digest(design):
+        raise SpecError("The thresholds were learned with another gain set: learn them again.", path="normal")
+    observer, names = design.observer, watched_names(design)
+    missing = [name for name in learned.columns if name not in names]
+    if missing:
+        raise SpecError(f"The thresholds watch {missing[0]!r}, which the design does not say.", path="normal")
+    residuals = len(observer.residual_names) if isinstance(observer, LinearObserver) else innovations(observer)
+    return OnlineMonitor(
+        "learned", learned.statement, LearnedRule(learned, names), residuals=residuals,
+        fault_names=observer.fault_names, fault_scales=learned.scales,
+    )  # fmt: skip

@@ -1,0 +1,251 @@
+"""Levels of alarms from rows without faults: statistics of whitened rows, and a bootstrap of all that is estimated.
+
+Residuals are whitened by their autoregression (Alwan & Roberts 1988).  Watched are Hotelling's T2, exponentially
+weighted means (MEWMA, Lowry et al. 1992) and likelihood ratios of steps and their ages (Willsky & Jones 1976).  The
+bootstrap makes streams from blocks of the whitened rows (Politis & Romano 1994) whose largest follow a generalised
+Pareto tail; from each it fits everything again, so that the uncertainty of a short log is in the levels, which hold in
+`SURE` of the streams (after Gandy & Kvaloy 2013).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.autoregression import Autoregression, fitted_autoregression
+
+#: An alarm ends when so many rows in a row were below the level.
+HOLD = 20
+#: Ages of a step, in rows, and how far the exponentially weighted means look back.
+AGES = (1, 2, 3, 5, 8, 12, 20, 32, 50, 80, 130, 200)
+FORGETTING = (0.3, 0.1)
+#: Rows at the begin of a stream in which the statistics are not those of a long one.
+SETTLING = 100
+#: Streams of the bootstrap, their share in which the rate is to hold, and the rows that each is judged on.
+STREAMS, SURE = 24, 0.8
+LEAST_ROWS, MOST_ROWS, ROWS_PER_ALARM = 4_000, 20_000, 4
+#: Rows that the simulated streams are given to forget their start.
+FORGOTTEN = 200
+#: Share of the radii that follow the Pareto tail, least number of them, and bounds of its shape: with a lighter tail
+#: than the least, logs of 500 white rows rang 2.7 times too often.
+TAIL_SHARE, LEAST_TAIL, SHAPES = 0.1, 20, (-0.05, 0.4)
+#: A plotting position of weighted moments, and a shape that is an exponential one.
+POSITION, NO_SHAPE = 0.35, 1e-6
+#: How many times rarer than all together each statistic may ring, tried in turn.
+RARER = (1.4, 2.0, 2.8, 4.0, 5.6, 8.0)
+#: Least sum of squares of a template.
+_NOTHING = 1e-300
+#: A rate counts as observed when so many alarms of it are in the streams; rarer ones are extrapolated.
+OBSERVED = 10.0
+
+
+@dataclass(frozen=True, eq=False)
+class Statistics:
+    """What is computed of whitened rows: T2, two MEWMA, and for each signature the largest likelihood ratio of a step.
+
+    ``signatures (s, m)``: directions of a step in the signals as they are.
+    """
+
+    model: Autoregression
+    signatures: FloatArray
+    names: tuple[str, ...]
+
+    @classmethod
+    def of(cls, model: Autoregression, signatures: FloatArray, told: tuple[str, ...]) -> Statistics:
+        """Return the statistics of signatures with names."""
+        means = tuple(f"MEWMA {share:g}" for share in FORGETTING)
+        return cls(model, signatures, ("T2", *means, *(f"GLR {name}" for name in told)))
+
+    def responses(self) -> FloatArray:
+        """Return what a step of each signature does to e, of its first p + 1 rows ``(s, p + 1, m)``: then it stays."""
+        gone = np.concatenate([np.zeros((1, *np.eye(self.model.channels).shape)), np.cumsum(self.model.A, axis=0)])
+        left = self.signatures[:, None, :] - np.einsum("jab,sb->sja", gone, self.signatures)
+        return np.asarray(left @ self.model.whitener.T)
+
+    def templates(self) -> FloatArray:
+        """Return weights of the last ``max(AGES)`` rows of e, oldest first, for each signature and age, of norm 1:
+        ``(s, ages, rows, m)``."""
+        shapes = self.responses()
+        long = np.concatenate([shapes, np.repeat(shapes[:, -1:], max(AGES) - 1, axis=1)], axis=1)[:, : max(AGES)]
+        found = np.zeros((len(shapes), len(AGES), max(AGES), self.model.channels))
+        for i, age in enumerate(AGES):
+            part = long[:, :age]
+            size = np.sqrt(np.maximum(np.sum(part**2, axis=(1, 2)), _NOTHING))
+            found[:, i, max(AGES) - age :] = part / size[:, None, None]
+        return found
+
+    def of_rows(self, e: FloatArray) -> FloatArray:
+        """Return the statistics ``(k, runs, n)`` of white rows ``(runs, n, m)``."""
+        from scipy.signal import lfilter
+
+        found = [np.sum(e**2, axis=-1)]
+        for share in FORGETTING:
+            smooth = lfilter([share], [1.0, share - 1.0], e, axis=1)
+            found.append((2.0 - share) / share * np.sum(smooth**2, axis=-1))
+        found.extend(_likelihood_ratios(e, shape) for shape in self.responses())
+        return np.array(found)
+
+
+def _likelihood_ratios(e: FloatArray, shape: FloatArray) -> FloatArray:
+    """Return twice the largest log likelihood ratio of a step over its ages ``(runs, n)``; ``shape (p + 1, m)``."""
+    runs, n, _ = e.shape
+    last, settled = len(shape) - 1, shape[-1]
+    sums = np.concatenate([np.zeros((runs, 1)), np.cumsum(e @ settled, axis=1)], axis=1)
+    # What the first rows of a step add to a step that had settled at once, by the row at which it begins.
+    early, begun = np.zeros((runs, n)), 0
+    extra = [e @ (shape[j] - settled) for j in range(last)]
+    largest = np.zeros((runs, n))
+    power = np.cumsum([float(shape[min(j, last)] @ shape[min(j, last)]) for j in range(max(AGES))])
+    for age in AGES:
+        if age > n:
+            break
+        for j in range(begun, min(age, last)):
+            early[:, : n - j] += extra[j][:, j:]
+        begun = max(begun, min(age, last))
+        fit = sums[:, age:] - sums[:, :-age] + early[:, : n - age + 1]
+        np.maximum(largest[:, age - 1 :], fit**2 / max(power[age - 1], _NOTHING), out=largest[:, age - 1 :])
+    return largest
+
+
+def count_alarms(values: FloatArray, level: float) -> int:
+    """Return how many alarms there are in streams ``(runs, n)``: rows above the level after `HOLD` rows below."""
+    return len(_begins(np.flatnonzero(_apart(values) > level)))
+
+
+def _apart(values: FloatArray) -> FloatArray:
+    """Return streams in one, with rows between them that part their alarms; `SETTLING` rows are left out."""
+    runs = np.atleast_2d(values)[:, SETTLING:]
+    return np.hstack([runs, np.full((len(runs), HOLD + 1), -np.inf)]).ravel()
+
+
+def _begins(places: NDArray[np.int_]) -> NDArray[np.int_]:
+    return places[np.diff(places, prepend=-np.inf) > HOLD]
+
+
+def level_of(values: FloatArray, every: float) -> float:
+    """Return the level with one alarm per ``every`` rows in streams ``(runs, n)``; the largest value where these are
+    too few."""
+    streams = _apart(values)
+    rows = np.atleast_2d(values)[:, SETTLING:].size
+    allowed = rows / every
+    order = np.argsort(-streams, kind="stable")[: max(min(int(4 * HOLD * allowed), rows), 1)]
+    if allowed < 1.0:
+        return float(streams[order[0]])
+
+    def alarms(count: int) -> int:
+        return len(_begins(np.sort(order[:count])))
+
+    # The first descent of the level at which there are too many: alarms grow nearly always with the rows above.
+    low, high = int(allowed), int(allowed)
+    while high < len(order) and alarms(high) <= allowed:
+        low, high = high, min(len(order), int(1.2 * high) + 1)
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (middle, high) if alarms(middle) <= allowed else (low, middle)
+    return float(streams[order[high - 1]])
+
+
+class Tail(NamedTuple):
+    """A generalised Pareto tail above ``begin``."""
+
+    begin: float
+    scale: float
+    shape: float
+
+    @classmethod
+    def of(cls, radii: FloatArray) -> Tail:
+        """Return the tail of radii ``(n,)``, by weighted moments."""
+        ordered = np.sort(radii)
+        count = min(max(LEAST_TAIL, int(TAIL_SHARE * len(ordered))), len(ordered) - 1)
+        begin = float(ordered[-count - 1])
+        above = ordered[-count:] - begin
+        mean = float(above.mean())
+        weighted = float((above * (1.0 - (np.arange(1, count + 1) - POSITION) / count)).mean())
+        shape = 2.0 - mean / (mean - 2.0 * weighted) if mean > 2.0 * weighted else SHAPES[1]
+        shape = float(np.clip(shape, *SHAPES))
+        return cls(begin, mean * (1.0 - shape), shape)
+
+    def drawn(self, uniform: FloatArray) -> FloatArray:
+        """Return radii above the begin from numbers between 0 and 1."""
+        if abs(self.shape) < NO_SHAPE:
+            return np.asarray(self.begin - self.scale * np.log(uniform))
+        return np.asarray(self.begin + self.scale * (uniform**-self.shape - 1.0) / self.shape)
+
+
+def drawn_rows(e: FloatArray, runs: int, rows: int, rng: np.random.Generator) -> FloatArray:
+    """Return ``(runs, rows, m)`` of blocks of white rows ``(n, m)``, the largest drawn from their tail."""
+    n = len(e)
+    new = rng.random((runs, rows)) < n ** (-1.0 / 3.0)
+    new[:, 0] = True
+    begun = np.maximum.accumulate(np.where(new, np.arange(rows), 0), axis=1)
+    first = np.take_along_axis(rng.integers(0, n, (runs, rows)), begun, axis=1)
+    places = (first + np.arange(rows) - begun) % n
+    found, radii = e[places], np.linalg.norm(e, axis=1)
+    tail = Tail.of(radii)
+    far = radii[places] > tail.begin
+    # Numbers in (0, 1]: zero would be infinitely far.
+    longer = tail.drawn(1.0 - rng.random(int(far.sum())))
+    found[far] *= (longer / radii[places][far])[:, None]
+    return np.asarray(found)
+
+
+class Levels(NamedTuple):
+    """Levels of each statistic ``(k,)``, the factor on all of them that holds, and whether it was extrapolated."""
+
+    own: FloatArray
+    factor: float
+    extrapolated: bool
+
+
+def learned_levels(x: FloatArray, every: float, statistics: Statistics, seed: int = 0) -> Levels:
+    """Return the levels for one alarm per ``every`` rows from rows ``(n, m)`` without faults."""
+    rng = np.random.default_rng(seed)
+    model, n = statistics.model, len(x)
+    rows = int(np.clip(ROWS_PER_ALARM * every, LEAST_ROWS, MOST_ROWS))
+    e = model.whitened(x)[model.order :]
+    e = e[np.isfinite(e).all(axis=1)]
+    streams = model.simulated(drawn_rows(e - e.mean(axis=0), STREAMS, FORGOTTEN + n + rows, rng))
+    known = np.asarray(np.isfinite(x).all(axis=1))
+    found = []
+    for stream in streams:
+        seen = np.where(known[:, None], stream[FORGOTTEN : FORGOTTEN + n], np.nan)
+        again = fitted_autoregression(seen, order=model.order)
+        judged = Statistics(again, statistics.signatures, statistics.names)
+        found.append(judged.of_rows(again.whitened(stream[None, -rows:]))[:, 0])
+    runs = np.array(found)
+    total = runs[:, 0, SETTLING:].size
+    seen_rate = min(every, total / OBSERVED)
+    own, union = _union(runs, seen_rate, total)
+    level = level_of(union, seen_rate)
+    # One stream alone shows less rare alarms than all of them.
+    shown = min(seen_rate, rows / ROWS_PER_ALARM)
+    each = np.array([level_of(stream, shown) for stream in union])
+    sure = max(1.0, float(np.quantile(each, SURE)) / level_of(union, shown))
+    if every > seen_rate:
+        # Beyond what the streams show, levels rise by the same amount for each factor between rates.
+        before = level_of(union, seen_rate / OBSERVED)
+        level += max(level - before, 0.0) * float(np.log(every / seen_rate) / np.log(OBSERVED))
+    return Levels(read_only(own), level * sure, every > seen_rate)
+
+
+def _union(runs: FloatArray, every: float, total: int) -> tuple[FloatArray, FloatArray]:
+    """Return levels of each statistic at one rarer rate, the least rare with which all together keep theirs, and the
+    largest statistic in units of its level ``(runs, n)``."""
+    own, union = np.ones(runs.shape[1]), runs[:, 0]
+    for rarer in RARER:
+        own = np.array([level_of(runs[:, i], every * rarer) for i in range(runs.shape[1])])
+        union = (runs / own[None, :, None]).max(axis=1)
+        if count_alarms(union, 1.0) <= total / every:
+            break
+    return own, union
+
+
+def rows_needed(model: Autoregression, every: float) -> int:
+    """Return how many rows without faults a rate of one alarm per ``every`` rows needs: as many as between alarms, a
+    hundred times what the residuals remember, and enough for every coefficient."""
+    m = model.channels
+    return int(np.ceil(max(every, 100.0 * model.longest_gain, 50.0 * m * (1 + m * model.order))))

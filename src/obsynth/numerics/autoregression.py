@@ -1,0 +1,117 @@
+"""Vector autoregressions: fitted by least squares with the order of Akaike's criterion, whitening, and simulated.
+
+``x_t = c + sum A_i x_{t-i} + W^-1 e_t`` with white e of unit covariance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from obsynth.numerics.arrays import FloatArray, read_only
+
+#: Longest memory that is tried, and rows that each coefficient of an equation needs.
+MOST_ORDER, ROWS_PER_COEFFICIENT = 12, 20
+#: A fit forgets at least so fast: one that does not is shrunk by steps of the second number.
+SLOWEST, SHRINKING = 0.999, 0.99
+#: Shares of the mean variance that are added so that nothing is singular: to regressors, and to what is left.
+REGRESSOR_SHARE, NOISE_SHARE = 1e-10, 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class Autoregression:
+    """A vector autoregression: ``offset (m,)``, ``A (p, m, m)``, ``whitener (m, m)``, the W of the module's text."""
+
+    offset: FloatArray
+    A: FloatArray
+    whitener: FloatArray
+
+    @property
+    def order(self) -> int:
+        """Rows of the past that it takes."""
+        return len(self.A)
+
+    @property
+    def channels(self) -> int:
+        """Number of signals m."""
+        return len(self.offset)
+
+    @cached_property
+    def mean(self) -> FloatArray:
+        """What it tends to ``(m,)``."""
+        return np.asarray(np.linalg.solve(np.eye(self.channels) - self.A.sum(axis=0), self.offset))
+
+    @property
+    def longest_gain(self) -> float:
+        """Largest gain from an innovation that stays to the signals."""
+        return float(np.linalg.norm(np.linalg.inv(np.eye(self.channels) - self.A.sum(axis=0)), 2))
+
+    def whitened(self, x: FloatArray) -> FloatArray:
+        """Return e of rows ``(..., n, m)``: zero in the first p of them, NaN where a row that is needed is NaN."""
+        left = x - self.offset
+        for i, a in enumerate(self.A, 1):
+            left[..., i:, :] -= x[..., :-i, :] @ a.T
+        left[..., : self.order, :] = 0.0
+        return np.asarray(left @ self.whitener.T)
+
+    def simulated(self, e: FloatArray) -> FloatArray:
+        """Return the streams ``(runs, n, m)`` that white ones drive, from their mean."""
+        driven = e @ np.linalg.inv(self.whitener).T
+        if not self.order:
+            return np.asarray(driven + self.offset)
+        if self.channels == 1:
+            from scipy.signal import lfilter
+
+            return np.asarray(lfilter([1.0], np.concatenate([[1.0], -self.A[:, 0, 0]]), driven, axis=1) + self.mean)
+        stacked = np.vstack([a.T for a in self.A])
+        past, found = np.zeros((len(e), len(stacked))), np.empty_like(driven)
+        for t in range(driven.shape[1]):
+            found[:, t] = past @ stacked + driven[:, t]
+            past[:, self.channels :] = past[:, : -self.channels].copy()
+            past[:, : self.channels] = found[:, t]
+        return np.asarray(found + self.mean)
+
+
+def fitted_autoregression(x: FloatArray, order: int | None = None) -> Autoregression:
+    """Return the autoregression of rows ``(n, m)``, of which some may be NaN, with the order of least criterion."""
+    n, m = x.shape
+    most = max(0, min(MOST_ORDER, n // (ROWS_PER_COEFFICIENT * m))) if order is None else order
+    mean = np.nanmean(x, axis=0)
+    z = x - mean
+    lags = np.hstack([np.ones((n - most, 1)), *(z[most - i : n - i] for i in range(1, most + 1))])
+    aims = z[most:]
+    known = np.isfinite(lags).all(axis=1) & np.isfinite(aims).all(axis=1)
+    lags, aims = lags[known], aims[known]
+    count = len(aims)
+    gram, cross, power = lags.T @ lags, lags.T @ aims, aims.T @ aims
+    ridge = REGRESSOR_SHARE * np.trace(gram) / len(gram)
+    best: tuple[float, FloatArray, FloatArray] | None = None
+    for p in range(most + 1) if order is None else [order]:
+        k = 1 + p * m
+        found = np.linalg.solve(gram[:k, :k] + ridge * np.eye(k), cross[:k])
+        left = power - found.T @ cross[:k]
+        covariance = left / max(count - k, 1) + NOISE_SHARE * np.trace(power) / count * np.eye(m)
+        criterion = np.linalg.slogdet(covariance * (max(count - k, 1) / count))[1] + 2.0 * p * m * m / count
+        if best is None or criterion < best[0]:
+            best = float(criterion), found, (covariance + covariance.T) / 2.0
+    if best is None:
+        raise ValueError("no order was tried")
+    coefficients = best[1]
+    a = coefficients[1:].reshape(-1, m, m).transpose(0, 2, 1)
+    a = _stable(a)
+    offset = mean + coefficients[0] - a.sum(axis=0) @ mean
+    return Autoregression(read_only(offset), read_only(a), read_only(np.linalg.inv(np.linalg.cholesky(best[2]))))
+
+
+def _stable(a: FloatArray) -> FloatArray:
+    """Return coefficients ``(p, m, m)`` shrunk until the autoregression forgets."""
+    p, m = a.shape[:2]
+    powers = SHRINKING ** np.arange(1, p + 1)[:, None, None]
+    while p:
+        companion = np.vstack([np.hstack(list(a)), np.eye((p - 1) * m, p * m)])
+        if np.abs(np.linalg.eigvals(companion)).max() < SLOWEST:
+            break
+        a = a * powers
+    return a

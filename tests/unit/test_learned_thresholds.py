@@ -1,0 +1,278 @@
+"""Thresholds from rows without faults: their rate out of sample, their statistics, files, and runs with them."""
+
+from __future__ import annotations
+
+import functools
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.signal import lfilter
+
+import obsynth
+from obsynth.cli.main import main
+from obsynth.experiments.monitors.learned import LearnedRule, independent, rows_per_alarm, watched_names
+from obsynth.experiments.monitors.learned_levels import (
+    AGES,
+    HOLD,
+    Statistics,
+    Tail,
+    count_alarms,
+    learned_levels,
+    level_of,
+    rows_needed,
+)
+from obsynth.experiments.monitors.online import LinearSample
+from obsynth.numerics.autoregression import Autoregression, fitted_autoregression
+
+DT = 0.1
+
+
+def coloured(rng: np.random.Generator, rows: int, m: int = 1, memory: float = 0.7) -> np.ndarray:
+    """Return rows of deviation 1 that remember, correlated between signals, about 2."""
+    drawn = rng.standard_normal((rows + 200, m)) @ np.linalg.cholesky(0.4 * np.eye(m) + 0.6).T
+    return lfilter([np.sqrt(1.0 - memory**2)], [1.0, -memory], drawn, axis=0)[200:] + 2.0
+
+
+def test_an_autoregression_is_found_from_its_rows() -> None:
+    rng = np.random.default_rng(0)
+    a = np.array([[[0.5, 0.2], [0.0, 0.3]], [[0.1, 0.0], [0.1, 0.2]]])
+    known = Autoregression(np.array([1.0, -1.0]), a, np.linalg.inv(np.linalg.cholesky([[2.0, 0.5], [0.5, 1.0]])))
+    x = known.simulated(rng.standard_normal((1, 20_000, 2)))[0]
+    x[500:503, 0] = np.nan
+    found = fitted_autoregression(x)
+    assert found.order >= 2
+    # Of 20,000 rows a coefficient of deviation 1 is known to about 1 / sqrt(20,000) = .007.
+    np.testing.assert_allclose(found.A[:2], a, atol=0.05)
+    np.testing.assert_allclose(found.mean, np.linalg.solve(np.eye(2) - a.sum(axis=0), known.offset), atol=0.2)
+    white = found.whitened(x)
+    assert np.isnan(white[500:505]).any(axis=1).all()
+    np.testing.assert_allclose(np.cov(white[np.isfinite(white).all(axis=1)].T), np.eye(2), atol=0.03)
+
+
+def test_statistics_are_those_of_their_definitions() -> None:
+    rng = np.random.default_rng(1)
+    a = np.array([[[0.6, 0.1], [0.0, 0.2]], [[0.1, 0.0], [0.0, 0.1]]])
+    model = Autoregression(np.zeros(2), a, np.linalg.inv(np.linalg.cholesky([[1.0, 0.3], [0.3, 1.0]])))
+    direction = np.array([1.0, -0.5])
+    statistics = Statistics.of(model, direction[None], ("a",))
+    e = rng.standard_normal((1, 400, 2))
+    found = statistics.of_rows(e)[:, 0]
+    row = 350
+    np.testing.assert_allclose(found[0, row], e[0, row] @ e[0, row])
+    weights = 0.1 * 0.9 ** np.arange(row + 1)[::-1]
+    smooth = weights @ e[0, : row + 1]
+    np.testing.assert_allclose(found[2, row], smooth @ smooth * (2.0 - 0.1) / 0.1)
+    # A step in the signals, through the whitening filter: the best of all ages.
+    best = 0.0
+    for age in AGES:
+        steps = np.zeros((row + 1, 2))
+        steps[row + 1 - age :] = direction
+        seen = model.whitened(np.vstack([np.zeros((2, 2)), steps]))[2:]
+        best = max(best, np.sum(seen * e[0, : row + 1]) ** 2 / np.sum(seen**2))
+    np.testing.assert_allclose(found[3, row], best)
+    templates = statistics.templates()[0]
+    np.testing.assert_allclose(np.max(np.einsum("arm,rm->a", templates, e[0, row - 199 : row + 1]) ** 2), best)
+
+
+def test_alarms_are_events_that_last() -> None:
+    values = np.zeros((2, 400))
+    values[0, [150, 152, 152 + HOLD + 1]] = 2.0, 3.0, 2.0
+    values[1, 150] = 4.0
+    assert [count_alarms(values, level) for level in (1.0, 2.5, 3.5, 4.5)] == [3, 2, 1, 0]
+    rng = np.random.default_rng(0)
+    drawn = rng.exponential(size=(10, 2_100))
+    assert count_alarms(drawn, level_of(drawn, 500.0)) <= 20_000 / 500
+
+
+def test_a_heavy_tail_is_recognised() -> None:
+    rng = np.random.default_rng(2)
+    drawn = rng.random(20_000) ** -0.25
+    tail = Tail.of(drawn)
+    assert 0.2 <= tail.shape <= 0.3
+    # The level that one in 1,000 passes: of these radii, 1000 ** .25.
+    np.testing.assert_allclose(tail.drawn(np.array([1e-3 / 0.1])), [1000.0**0.25], rtol=0.05)
+
+
+@pytest.mark.parametrize(("m", "memory"), [(1, 0.0), (1, 0.9), (2, 0.7)])
+def test_the_stated_rate_is_kept_out_of_sample(m: int, memory: float) -> None:
+    every, rates = 500.0, []
+    for seed in range(4):
+        rng = np.random.default_rng([seed, m])
+        x, fresh = coloured(rng, 2_000, m, memory), coloured(rng, 50_000, m, memory)
+        model = fitted_autoregression(x)
+        statistics = Statistics.of(model, np.eye(m), tuple("abc"[:m]))
+        levels = learned_levels(x, every, statistics, seed)
+        largest = (statistics.of_rows(model.whitened(fresh)[None]) / levels.own[:, None, None]).max(axis=0)
+        rates.append(every * count_alarms(largest, levels.factor) / 50_000)
+        assert rows_needed(model, every) <= 2_000
+    # Of 400 alarms: 5 % each; the reference has .56 to .84 on average for 2,000 rows.
+    assert 0.4 <= np.mean(rates) <= 1.0
+    assert max(rates) <= 1.5
+
+
+def test_rates_are_told_in_words() -> None:
+    assert rows_per_alarm("1 per week", 60.0) == 10_080.0
+    assert rows_per_alarm("2 per 1000 rows", 60.0) == 500.0
+    assert rows_per_alarm("3/day", 1.0) == 28_800.0
+    assert rows_per_alarm(0.001, 1.0) == 1000.0
+    for wrong in (
+        "never",
+        "0 per day",
+        "-1 per day",
+        "1 per blue moon",
+        "1 per row",
+        0.0,
+        2.0,
+        True,
+        None,
+        "e per day",
+    ):
+        with pytest.raises(obsynth.SpecError, match="false_alarms"):
+            rows_per_alarm(wrong, 1.0)  # type: ignore[arg-type]
+
+
+def test_columns_that_others_explain_are_left_out() -> None:
+    rng = np.random.default_rng(3)
+    x = rng.standard_normal((500, 2))
+    rows = np.column_stack([x[:, 0], 3.0 * x[:, 0] + 1.0, np.full(500, 2.0), x[:, 1], x @ [1.0, 2.0]])
+    assert independent(rows, 0) == [0, 3]
+    assert independent(rows, 1) == [1, 3]
+
+
+@functools.cache
+def heated() -> obsynth.ObserverDesign:
+    plant = obsynth.DescriptorSystem(
+        E=np.eye(2), A=[[0.95, 0.02], [0.01, 0.96]], B=[[0.1], [0.0]], C=np.eye(2), Bf=[[0.1], [0.0]], dt=DT,
+        state_names=["a", "b"], output_names=["ya", "yb"], input_names=["u"], fault_names=["f"],
+        sensor_noise={"ya": 0.01, "yb": 0.01},
+    )  # fmt: skip
+    return obsynth.design(plant, "fault-estimation-filter")
+
+
+def log(rows: int, seed: int, *, begin: int | None = None, size: float = 2.0) -> pd.DataFrame:
+    """Return a log with coloured noise, an offset, and a plant that is 3 % another; a fault from a row on."""
+    rng, plant = np.random.default_rng(seed), heated().plant
+    noise = 0.01 * coloured(rng, rows, 2, 0.8)
+    x, found = np.zeros(2), []
+    for k in range(rows):
+        u, f = np.array([np.sin(k / 4.0)]), np.array([size if begin is not None and k >= begin else 0.0])
+        found.append([k * DT, u[0], *(x + noise[k])])
+        x = 0.99 * plant.A @ x + plant.B @ u + plant.Bf @ f
+    return pd.DataFrame(found, columns=["time", "u", "ya", "yb"])
+
+
+@functools.cache
+def learned() -> obsynth.LearnedThresholds:
+    return obsynth.learn_thresholds(heated(), log(3_000, 0), false_alarms="1 per 500 rows")
+
+
+def test_normal_rows_are_quiet_and_a_fault_is_named() -> None:
+    monitor = obsynth.online_monitor(heated(), "learned", normal=learned())
+    assert learned().holds
+    quiet = obsynth.run_on_data(heated(), log(5_000, 1), monitor=monitor).table
+    assert quiet is not None
+    above = np.flatnonzero((quiet.statistic > quiet.threshold).to_numpy())
+    # Ten are stated; twice as many have a probability of .003 if the rate is kept, by Poisson's law.
+    assert np.count_nonzero(np.diff(above, prepend=-HOLD - 1) > HOLD) < 20
+    run = obsynth.run_on_data(heated(), log(600, 2, begin=400), monitor=monitor)
+    assert run.isolated == "f"
+    assert 40.0 <= run.alarms["learned"] <= 42.0
+
+
+def test_blank_cells_add_no_evidence_and_take_none_away() -> None:
+    monitor = obsynth.online_monitor(heated(), "learned", normal=learned())
+    data = log(600, 2, begin=400)
+    data.loc[[200, 405, 406], "ya"] = np.nan
+    run = obsynth.run_on_data(heated(), data.drop(index=range(300, 310)), monitor=monitor, warm_up=0.0)
+    assert run.alarms["learned"] <= 43.0
+    assert run.table is not None
+    assert run.table.statistic.notna().sum() >= 580
+
+
+def test_runs_go_on_from_a_saved_state(tmp_path: Path) -> None:
+    monitor, data, state = obsynth.online_monitor(heated(), "learned", normal=learned()), log(300, 2), tmp_path / "s"
+    whole = obsynth.run_on_data(heated(), data, monitor=monitor).table
+    parts = [obsynth.run_on_data(heated(), part, monitor=monitor, state=state).table
+             for part in (data.iloc[:120], data.iloc[120:])]  # fmt: skip
+    pd.testing.assert_frame_equal(whole, pd.concat(parts, ignore_index=True))
+
+
+def test_row_by_row_is_the_same_as_at_once() -> None:
+    found, rng = learned(), np.random.default_rng(4)
+    rule = LearnedRule(found, watched_names(heated()))
+    model, count = found.statistics.model, len(watched_names(heated()))
+    rows = rng.standard_normal((400, count)) * 0.02
+    x = rows[:, [watched_names(heated()).index(name) for name in found.columns]]
+    # The rule begins with rows at the mean; the batch with zeros in the first of them.
+    padded = np.vstack([np.tile(model.mean, (model.order, 1)), x])
+    largest = (found.statistics.of_rows(model.whitened(padded)[None])[:, 0] / found.levels[:, None]).max(axis=0)
+    nothing = np.zeros(0)
+    taken = [rule.take(k * DT, nothing, LinearSample(row, nothing, nothing), deciding=True)[0]
+             for k, row in enumerate(rows)]  # fmt: skip
+    np.testing.assert_allclose(taken[max(AGES) :], largest[model.order + max(AGES) :], rtol=1e-9)
+
+
+def test_too_few_rows_are_told() -> None:
+    short = obsynth.learn_thresholds(heated(), log(400, 0), false_alarms="1 per day")
+    assert not short.holds
+    assert "needs 864000 rows" in short.statement
+    with pytest.raises(obsynth.SpecError, match="rows"):
+        obsynth.learn_thresholds(heated(), log(90, 0))
+    with pytest.raises(obsynth.SpecError, match="moves"):
+        obsynth.learn_thresholds(heated(), log(400, 0) * [1.0, 0.0, 0.0, 0.0])
+
+
+def test_every_kind_of_design_learns() -> None:
+    spec = obsynth.load_spec("designs/threetank/spec.yaml")
+    design = obsynth.design(spec.plant, spec.method, **dict(spec.options))
+    data = pd.read_csv("designs/threetank/log.csv")
+    names = {"u1": "u1_held", "u3": "u3_held"}
+    found = obsynth.learn_thresholds(design, data, columns=names, false_alarms="1 per 50 rows")
+    monitor = obsynth.online_monitor(design, "learned", normal=found)
+    run = obsynth.run_on_data(design, data, columns=names, monitor=monitor)
+    assert run.table is not None
+    assert run.table.statistic.notna().sum() >= 100
+
+
+def test_files_and_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    gains, normal, faulty, file = (tmp_path / name for name in ("g.json", "normal.csv", "faulty.csv", "t.json"))
+    heated().save(gains)
+    log(1_500, 0).to_csv(normal, index=False)
+    log(600, 2, begin=400).to_csv(faulty, index=False)
+    asked = ["thresholds", "--gains", str(gains), "--data", str(normal), "--false-alarms", "1 per 500 rows"]
+    assert main([*asked, "--out", str(file)]) == 0
+    assert "one false alarm per 500 rows" in capsys.readouterr().out
+    out = tmp_path / "out.csv"
+    run = ["run", "--gains", str(gains), "--data", str(faulty), "--out", str(out), "--monitor", "learned"]
+    assert main([*run, "--normal", str(file)]) == 0
+    assert "alarm" in capsys.readouterr().out
+    assert main([*run]) == 2
+    assert "--normal" in capsys.readouterr().err
+    assert main([*asked[:-1], "sometimes"]) == 2
+    again = obsynth.load_thresholds(file)
+    np.testing.assert_array_equal(again.levels, obsynth.learn_thresholds(
+        heated(), normal, false_alarms="1 per 500 rows").levels)  # fmt: skip
+
+
+@pytest.mark.parametrize("damage", ["level", "digest", "shape", "kind", "version", "text", "design"])
+def test_files_that_are_wrong_are_refused(tmp_path: Path, damage: str) -> None:
+    from obsynth.results.gain_sets import digest_of
+
+    file = learned().save(tmp_path / "t.json")
+    document = json.loads(file.read_text())
+    body = document["thresholds"]
+    if damage in ("level", "digest"):
+        body["levels"]["data"][0] *= 2.0 if damage == "digest" else -1.0
+    if damage == "shape":
+        body["columns"] = body["columns"][:-1]
+    if damage == "design":
+        body["gains"] = "0" * 64
+    if damage != "digest":
+        document["sha256"] = digest_of(body)
+    document |= {"kind": {"kind": "other"}, "version": {"schema_version": 99}}.get(damage, {})
+    file.write_text("{" if damage == "text" else json.dumps(document))
+    with pytest.raises(obsynth.SpecError):
+        obsynth.online_monitor(heated(), "learned", normal=file)
