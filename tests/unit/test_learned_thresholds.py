@@ -210,7 +210,7 @@ def test_row_by_row_is_the_same_as_at_once() -> None:
     padded = np.vstack([np.tile(model.mean, (model.order, 1)), x])
     largest = (found.statistics.of_rows(model.whitened(padded)[None])[:, 0] / found.levels[:, None]).max(axis=0)
     nothing = np.zeros(0)
-    taken = [rule.take(k * DT, nothing, LinearSample(row, nothing, nothing), deciding=True)[0]
+    taken = [rule.take(k * DT, nothing, LinearSample(row, nothing, nothing, 0), deciding=True)[0]
              for k, row in enumerate(rows)]  # fmt: skip
     np.testing.assert_allclose(taken[max(AGES) :], largest[model.order + max(AGES) :], rtol=1e-9)
 

@@ -238,9 +238,10 @@ class DataObserver(Engine):
             else self.partial.state(states[last], values[last], rows[last][observer.fault_rows])
         )  # fmt: skip
         self.inputs.extend(v[: self.nu] for v in values[max(count - (self.inputs.maxlen or count), 0) : count])
-        settled, phase, forgotten, nu = self.settled_at, self.phase, self.forgotten_at, self.nu
+        settled, phase, forgotten = self.settled_at, self.phase, self.forgotten_at
+        nu, nx = self.nu, len(self.state_names)
         return [
-            Row(OK if time >= settled else phase, row, 0, LinearSample(row, v[:nu], v[nu:]), time >= forgotten)
+            Row(OK if time >= settled else phase, row, 0, LinearSample(row, v[:nu], v[nu:], nx), time >= forgotten)
             for time, row, v in zip(times[:count], rows[:count], values[:count], strict=True)
         ]
 

@@ -41,7 +41,7 @@ class LinearSample(NamedTuple):
     rows: FloatArray
     inputs: FloatArray
     outputs: FloatArray
-    states: int = 0  # how many of the rows are state estimates
+    states: int  # how many of the rows are state estimates
 
     @property
     def faults_and_residuals(self) -> FloatArray:
