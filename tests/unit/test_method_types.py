@@ -1,0 +1,67 @@
+"""Editors and type checkers see the options of each public function: ``functions.pyi`` is written from the classes.
+
+``python tests/unit/test_method_types.py`` writes it again.
+"""
+
+from __future__ import annotations
+
+import types
+from dataclasses import fields
+from pathlib import Path
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
+
+import obsynth.methods
+from obsynth.methods.method import Method, option_types
+from obsynth.methods.registry import REGISTRY, method_class
+
+STUB = Path(obsynth.methods.__file__).parent / "functions.pyi"
+HEAD = """\
+# Written by tests/unit/test_method_types.py from the classes of the methods.
+from collections.abc import Callable
+from typing import Any, Literal
+
+from obsynth.analysis.transformations.recovery import Transformation
+from obsynth.methods.method import Method
+from obsynth.methods.registry import Plant
+from obsynth.results.design import ObserverDesign
+from obsynth.simulation.scenario import Scenario
+
+def design_function(method: type[Method]) -> Callable[..., ObserverDesign]: ...
+"""
+
+
+def written(kind: Any) -> str:
+    """Return a type as it is written, without its range."""
+    if get_origin(kind) is Annotated:
+        return written(get_args(kind)[0])
+    if get_origin(kind) is Literal:
+        return f"Literal[{', '.join(map(repr, get_args(kind)))}]".replace("'", '"')
+    if get_origin(kind) in (Union, types.UnionType):
+        return " | ".join(written(part) for part in get_args(kind))
+    if kind is type(None):
+        return "None"
+    return getattr(kind, "__name__", "Any") if kind in (int, float, str, bool) else "Any"
+
+
+def function(method: type[Method]) -> str:
+    """Return the declaration of a method's public function."""
+    options = [f"    {name}: {written(kind)} = ...," for name, kind in option_types(method).items()]
+    if any(option.name == "model_error" for option in fields(method)):
+        options.append("    scenario: Scenario | None = ...,")
+    name = method.id.replace("-", "_")
+    lines = [f"def {name}(", "    plant: Plant | Transformation,", "    *,", *options, "    name: str = ...,"]
+    return "\n".join([*lines, ") -> ObserverDesign: ...", ""])
+
+
+def text() -> str:
+    """Return the whole stub."""
+    body = "".join(function(method_class(method)) for method in REGISTRY)
+    return HEAD + body
+
+
+def test_the_types_are_those_of_the_classes() -> None:
+    assert STUB.read_text(encoding="utf-8") == text()
+
+
+if __name__ == "__main__":
+    STUB.write_text(text(), encoding="utf-8")
