@@ -7,6 +7,7 @@ import sys
 import tomllib
 from pathlib import Path
 
+import pytest
 from ruamel.yaml import YAML
 
 import obsynth
@@ -55,3 +56,35 @@ def test_dir_is_the_public_names_only():
     # Every name of the grouped list in the docstring exists.
     named = [word.strip(" .,;:") for word in (obsynth.__doc__ or "").split()]
     assert {"load_spec", "check", "from_control"} <= set(named) & shown
+
+
+WARNED = {
+    "theirs.py": "import warnings\n\ndef old():\n    warnings.warn('old', {category}, stacklevel=1)\n",
+    "obsynth_part.py": "import warnings\n\ndef ours():\n    warnings.warn('old', {category}, stacklevel=1)\n",
+    "test_warned.py": "import obsynth_part\nimport theirs\n\ndef test_theirs():\n    theirs.old()\n\n"
+    "def test_ours():\n    obsynth_part.ours()\n",
+}
+
+
+@pytest.mark.parametrize(
+    ("category", "failures"), [("DeprecationWarning", 1), ("FutureWarning", 1), ("UserWarning", 2)]
+)
+def test_only_warnings_that_our_code_causes_fail_a_run(tmp_path: Path, category: str, failures: int) -> None:
+    """What dependencies deprecate in each other does not; their other warnings, about our numbers, do."""
+    for name, text in WARNED.items():
+        (tmp_path / name).write_text(text.format(category=category), encoding="utf-8")
+    places = ["-c", str(ROOT / "pyproject.toml"), "--rootdir", str(tmp_path), str(tmp_path)]
+    command = [sys.executable, "-m", "pytest", "-q", "-n0", "-p", "no:cacheprovider", *places]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
+    assert done.stdout.count("FAILED ") == failures, done.stdout
+    assert f"{2 - failures} passed" in done.stdout or failures == 2
+
+
+def test_the_floors_are_in_pyproject_alone():
+    """`.ci/run` installs the oldest versions that these admit: every dependency has one."""
+    listed = [
+        *PROJECT["dependencies"],
+        *(entry for part in PROJECT["optional-dependencies"].values() for entry in part),
+    ]
+    assert not [entry for entry in listed if ">=" not in entry]
+    assert "--resolution lowest-direct '.[test]'" in (ROOT / ".ci" / "run").read_text(encoding="utf-8")

@@ -73,7 +73,8 @@ def _file_or(other: str) -> Discriminator:
 class Section(BaseModel):
     """A part of a document: strict types, no unknown keys, finite numbers."""
 
-    model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, frozen=True)
+    # Options may be called model_...: older releases of pydantic keep that for themselves.
+    model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, frozen=True, protected_namespaces=())
 
 
 Text = Annotated[str, Field(min_length=1)]
