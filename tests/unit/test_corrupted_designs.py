@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -642,16 +643,14 @@ def test_every_single_entry_of_the_observer_counts(name: str, matrix: str) -> No
 
 @pytest.mark.parametrize("matrix", ["E", "A", "B", "C", "D", "Bf", "Df"])
 @pytest.mark.parametrize("name", PLANTS)
-def test_every_single_entry_of_the_plant_counts(name: str, matrix: str) -> None:
+def test_every_single_entry_of_the_plant_counts(name: str, matrix: str, share: Callable[..., Any]) -> None:
     design = good(name)
-    rows, columns = getattr(design.plant, matrix).shape
-    for row in range(rows):
-        for column in range(columns):
-            assert failed(plant_entry(matrix, row, column, 1e-6)(design)), (row, column)
+    for row, column in share(list(np.ndindex(getattr(design.plant, matrix).shape)), 2):
+        assert failed(plant_entry(matrix, row, column, 1e-6)(design)), (row, column)
 
 
 @pytest.mark.parametrize("name", PLANTS)
-def test_not_a_number_anywhere_is_refused_or_fails(name: str) -> None:
+def test_not_a_number_anywhere_is_refused_or_fails(name: str, share: Callable[..., Any]) -> None:
     design = good(name)
     for owner in (design.observer, design.plant):
         for field, value in owner.as_dict().items():
@@ -663,10 +662,9 @@ def test_not_a_number_anywhere_is_refused_or_fails(name: str) -> None:
                     with pytest.raises(SpecError):
                         change(design, **{field: changed})
     for key, matrix in design.certificate.matrices.items():
-        for row in range(matrix.shape[0]):
-            for column in range(matrix.shape[1]):
-                expected = {LEAST if key in WITNESSES else WITNESS_CLAIMS.get(key, FITS)}
-                assert failed(certificate_entry(key, row, column, np.nan)(design)) == expected
+        for row, column in share(list(np.ndindex(matrix.shape))):
+            expected = {LEAST if key in WITNESSES else WITNESS_CLAIMS.get(key, FITS)}
+            assert failed(certificate_entry(key, row, column, np.nan)(design)) == expected
     needed = {"state_lag": {FITS, CLAIMS}}
     needed["gamma"] = {LMI, NORM, CLAIMS, ORDER} if design.plant.nd else {CLAIMS}
     for key, expected in needed.items():
@@ -709,17 +707,15 @@ def in_units(design: ObserverDesign, powers: np.ndarray) -> ObserverDesign:
 
 
 @pytest.mark.parametrize("name", PLANTS)
-def test_units_of_the_states_do_not_hide_a_corruption(name: str) -> None:
+def test_units_of_the_states_do_not_hide_a_corruption(name: str, share: Callable[..., Any]) -> None:
     """What fails is the same when the states are measured in units from 2^-14 to 2^14."""
     design = good(name)
     powers = np.exp2(np.round(np.linspace(-14.0, 14.0, design.plant.nx)))
     assert failed(in_units(design, powers)) == set()
     for matrix in CAUGHT_BY:
-        rows, columns = getattr(design.observer, matrix).shape
-        for row in range(rows):
-            for column in range(columns):
-                corrupted = entry(matrix, row, column)(design)
-                assert failed(in_units(corrupted, powers)) == failed(corrupted), (matrix, row, column)
+        for row, column in share(list(np.ndindex(getattr(design.observer, matrix).shape))):
+            corrupted = entry(matrix, row, column)(design)
+            assert failed(in_units(corrupted, powers)) == failed(corrupted), (matrix, row, column)
 
 
 @pytest.mark.parametrize("name", PLANTS)
@@ -773,13 +769,12 @@ class TestPrintedDigits:
             assert failed(good(name), printed_digits=4) == set()
 
     @pytest.mark.parametrize("letter", ["T", "N", "L", "W"])
-    def test_any_wrong_digit_still_fails(self, letter: str) -> None:
+    def test_any_wrong_digit_still_fails(self, letter: str, share: Callable[..., Any]) -> None:
         gain = np.round(good("paper").gains[letter], 4)
-        for row in range(gain.shape[0]):
-            for column in range(gain.shape[1]):
-                for by in (0.05, -0.05):
-                    wrong = self.rounded(**{letter: nudged(gain, row, column, by)})
-                    assert failed(wrong, printed_digits=4), (row, column, by)
+        for row, column in share(list(np.ndindex(gain.shape)), 2):
+            for by in (0.05, -0.05):
+                wrong = self.rounded(**{letter: nudged(gain, row, column, by)})
+                assert failed(wrong, printed_digits=4), (row, column, by)
 
     def unnoticed(self, letter: str, units: int) -> set[tuple[int, int]]:
         """Entries that may be wrong by so many units of the last digit without any row failing."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -450,17 +451,15 @@ def test_a_report_is_about_the_design_it_is_made_of_not_about_the_one_saved() ->
 
 
 @pytest.mark.parametrize("name", GOOD)
-def test_units_of_states_and_faults_hide_no_corruption(name: str) -> None:
+def test_units_of_states_and_faults_hide_no_corruption(name: str, share: Callable[..., Any]) -> None:
     """What fails is the same when states, faults and outputs are measured in units from 2^-12 to 2^12."""
     design = good(name)
     assert failed(in_units(design)) == set()
     for matrix in CAUGHT_BY:
-        rows, columns = getattr(design.observer, matrix).shape
-        for row in range(rows):
-            for column in range(columns):
-                corrupted = entry(matrix, row, column)(design)
-                exact = {DYNAMICS, INPUTS, ESTIMATES, RESIDUAL, FEEDTHROUGH, GAINS}
-                assert failed(in_units(corrupted)) & exact == failed(corrupted) & exact, (matrix, row, column)
+        for row, column in share(list(np.ndindex(getattr(design.observer, matrix).shape))):
+            corrupted = entry(matrix, row, column)(design)
+            exact = {DYNAMICS, INPUTS, ESTIMATES, RESIDUAL, FEEDTHROUGH, GAINS}
+            assert failed(in_units(corrupted)) & exact == failed(corrupted) & exact, (matrix, row, column)
 
 
 def in_units(design: ObserverDesign) -> ObserverDesign:

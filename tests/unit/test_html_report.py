@@ -81,8 +81,8 @@ def recursive() -> obsynth.ObserverDesign:
 
 @pytest.fixture(scope="module", autouse=True)
 def _drawn_once():
-    """The pictures of a design are drawn once: most tests are about what stands around them."""
-    from obsynth.report import page, pictures
+    """Pictures and tolerances of a design are made once: most tests are about what stands around them."""
+    from obsynth.report import designs, page, pictures
 
     patch = pytest.MonkeyPatch()
     drawn = cache(lambda design: list(pictures.pictures_of(design)))
@@ -91,6 +91,7 @@ def _drawn_once():
         return drawn(design) if scenario is None else pictures.pictures_of(design, scenario=scenario)
 
     patch.setattr(page, "pictures_of", pictures_once)
+    patch.setattr(page, "tolerance_facts", cache(designs.tolerance_facts))
     yield
     patch.undo()
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -94,10 +96,10 @@ def test_an_index_at_which_nothing_shows_is_refused() -> None:
         design_from_gains(plant, "fault-estimation-filter", **gains, indexes=[1])
 
 
-def test_an_allowance_relative_to_the_terms_would_refuse_some_of_them() -> None:
+def test_an_allowance_relative_to_the_terms_would_refuse_some_of_them(share: Callable[..., Any]) -> None:
     """Roundings of gains are absolute: half a unit in each of nx + ny products may be too little, or far too much."""
     refused = 0
-    for seed in LONGEST:
+    for seed in share(list(LONGEST), 2):
         plant = designed(seed).plant
         relative = 0.5 * 10.0**-PERTURBED_DIGITS * (plant.nx + plant.ny)
         found = equalities(of_gains(seed, rounded(seed, PERTURBED_DIGITS)), PERTURBED_DIGITS)
@@ -105,9 +107,9 @@ def test_an_allowance_relative_to_the_terms_would_refuse_some_of_them() -> None:
     assert refused > 0
 
 
-def test_a_gain_wrong_by_a_hundred_units_fails_in_nearly_all_entries() -> None:
+def test_a_gain_wrong_by_a_hundred_units_fails_in_nearly_all_entries(share: Callable[..., Any]) -> None:
     noticed = total = 0
-    for seed in LONGEST:
+    for seed in share(list(LONGEST)):
         rng = np.random.default_rng(100 + seed)
         for letter in "TNLW":
             gains = rounded(seed, PERTURBED_DIGITS)
