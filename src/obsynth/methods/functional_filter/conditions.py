@@ -79,8 +79,8 @@ def fault_conditions(
     )  # fmt: skip
     if doubtful and len(doubtful) == len(lost):
         return seen, _in_doubt(kept, plant, asked, doubtful[0])
-    doubtful = not lost and bool(shares) and shares[least] <= ROUNDING_LEVEL
-    return seen, _in_doubt(kept, plant, asked, least) if doubtful else kept
+    at_rounding_level = not lost and bool(shares) and shares[least] <= ROUNDING_LEVEL
+    return seen, _in_doubt(kept, plant, asked, least) if at_rounding_level else kept
 
 
 def _may_show(asked: Question, point: complex | None = None) -> bool:
