@@ -38,8 +38,10 @@ class Condition:
             involved = f" Signals involved: {', '.join(missing)}." if missing else ""
             raise PreconditionError(
                 f"{opening}Needed: {self.claim}. Found: {self.detail}{involved}",
-                condition=self.name, mode=self.mode, signals=self.signals,
-            )  # fmt: skip
+                condition=self.name,
+                mode=self.mode,
+                signals=self.signals,
+            )
 
     def in_doubt(self, found: Unclear, plant: DescriptorSystem) -> Condition:
         """Return the condition as one that rounding of the data could change, with what tells so in its detail."""
@@ -68,6 +70,12 @@ def rank_condition(
 ) -> Condition:
     """Return the condition that a rank is full."""
     return Condition(
-        name, f"{name} = {decision.expected}", decision.full, float(decision.rank), float(decision.expected), source,
-        decision.describe() + ("" if decision.full else f": {remedy}"), signals=() if decision.full else signals,
-    )  # fmt: skip
+        name,
+        f"{name} = {decision.expected}",
+        decision.full,
+        float(decision.rank),
+        float(decision.expected),
+        source,
+        decision.describe() + ("" if decision.full else f": {remedy}"),
+        signals=() if decision.full else signals,
+    )

@@ -134,10 +134,12 @@ def identifiability(
     x = finite_vector(initial_state, model.state_names, model.nominal_state, "initial_state")
     theta = finite_vector(parameters, model.parameter_names, model.nominal_parameters, "parameters")
     sizes = np.where(theta != 0.0, np.abs(theta), 1.0)
-    scales = np.concatenate([
-        finite_vector(state_scales, model.state_names, model.state_scales, "state_scales"),
-        finite_vector(parameter_scales, model.parameter_names, sizes, "parameter_scales"),
-    ])  # fmt: skip
+    scales = np.concatenate(
+        [
+            finite_vector(state_scales, model.state_names, model.state_scales, "state_scales"),
+            finite_vector(parameter_scales, model.parameter_names, sizes, "parameter_scales"),
+        ]
+    )
     if not (scales > 0.0).all():
         raise SpecError("state_scales and parameter_scales must be positive.", path="parameter_scales")
     step = ImplicitStep(DAEFunctions(model, method), length)
@@ -153,9 +155,14 @@ def identifiability(
     hidden = np.abs(directions[rank:]).max(axis=0, initial=0.0) > NAMED_SHARE
     of_parameters = np.linalg.svd(whitened[:, r:], compute_uv=False)
     return Identifiability(
-        (*model.state_names, *model.parameter_names), read_only(values), read_only(directions), read_only(scales),
-        read_only(np.where(hidden, np.inf, spread)), float(of_parameters[-1] ** 2) if model.nq else 0.0, rank,
-    )  # fmt: skip
+        (*model.state_names, *model.parameter_names),
+        read_only(values),
+        read_only(directions),
+        read_only(scales),
+        read_only(np.where(hidden, np.inf, spread)),
+        float(of_parameters[-1] ** 2) if model.nq else 0.0,
+        rank,
+    )
 
 
 def _sensitivities(
@@ -200,9 +207,13 @@ class IndexReport:
 
 
 def index_report(
-    model: DAEModel, dt: float, *, x: FloatArray | None = None, u: FloatArray | None = None,
+    model: DAEModel,
+    dt: float,
+    *,
+    x: FloatArray | None = None,
+    u: FloatArray | None = None,
     theta: FloatArray | None = None,
-) -> IndexReport:  # fmt: skip
+) -> IndexReport:
     """Find the index of a model: the condition of (7) grows by ``10^(index - 1)`` when the step falls to a tenth."""
     x = model.nominal_state if x is None else x
     u = model.nominal_input if u is None else u

@@ -119,12 +119,19 @@ class PlantUnits:
         shown = self.outputs[:, None]
         spread = 1.0 if self.discrete else float(np.sqrt(self.time))
         return plant.replace(
-            E=self.equations[:, None] * plant.E * self.states, A=left * plant.A * self.states, B=left * plant.B,
-            Bf=left * plant.Bf * self.faults, Bd=left * plant.Bd * self.disturbances,
-            Bw=spread * self.equations[:, None] * plant.Bw, C=shown * plant.C * self.states, D=shown * plant.D,
-            Df=shown * plant.Df * self.faults, Dd=shown * plant.Dd * self.disturbances, Dw=shown * plant.Dw / spread,
+            E=self.equations[:, None] * plant.E * self.states,
+            A=left * plant.A * self.states,
+            B=left * plant.B,
+            Bf=left * plant.Bf * self.faults,
+            Bd=left * plant.Bd * self.disturbances,
+            Bw=spread * self.equations[:, None] * plant.Bw,
+            C=shown * plant.C * self.states,
+            D=shown * plant.D,
+            Df=shown * plant.Df * self.faults,
+            Dd=shown * plant.Dd * self.disturbances,
+            Dw=shown * plant.Dw / spread,
             dt=1.0 if self.discrete else 0.0,
-        )  # fmt: skip
+        )
 
     def scaled_pencil(
         self, e: FloatArray, a: FloatArray, inputs: FloatArray | None = None

@@ -41,9 +41,12 @@ def step_blocks(plant: TimeVaryingDescriptorSystem, k: int, late: IntArray) -> S
         return StepBlocks(E, A, Phi, C, Psi)
     others = np.setdiff1d(np.arange(plant.ne), late)
     return StepBlocks(
-        E[others], A[others], Phi[others], np.vstack([C, plant.A.at(k + 1)[late]]),
+        E[others],
+        A[others],
+        Phi[others],
+        np.vstack([C, plant.A.at(k + 1)[late]]),
         np.vstack([Psi, plant.Phi.at(k + 1)[late]]),
-    )  # fmt: skip
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,8 +99,10 @@ def as_time_varying(
     if isinstance(plant, TimeVaryingDescriptorSystem):
         return plant
     if not isinstance(plant, DescriptorSystem):
-        raise SpecError(f"The plant is a {type(plant).__name__}: give an obsynth.DescriptorSystem or "
-                        "TimeVaryingDescriptorSystem.", path="plant")  # fmt: skip
+        raise SpecError(
+            f"The plant is a {type(plant).__name__}: give an obsynth.DescriptorSystem or TimeVaryingDescriptorSystem.",
+            path="plant",
+        )
     return TimeVaryingDescriptorSystem.from_descriptor(plant)
 
 

@@ -150,16 +150,32 @@ def calibrate(
     note = progress or (lambda text: None)
     model = require_plant(model)
     factors = dict(getattr(model, "scales", {})) | dict(scales or {})
-    whole = read_log(log, model.input_names, model.output_names, rows=rows, columns=columns, scales=factors,
-                     dt=_sample_time(model, dt, substeps))  # fmt: skip
+    whole = read_log(
+        log,
+        model.input_names,
+        model.output_names,
+        rows=rows,
+        columns=columns,
+        scales=factors,
+        dt=_sample_time(model, dt, substeps),
+    )
     digest = whole.digest
     whole = whole.without(wrong_samples(whole.y))
     whole = whole.shifted(input_delay) if isinstance(input_delay, int) else whole
     plant = NonlinearPlant(model) if isinstance(model, DAEModel) else LinearPlant(model, whole)
     problem = calibration_problem(
-        plant, whole, unknown=unknown, priors=priors, noisy=noisy, Q=Q, R=R, initial_state=initial_state,
-        initial_covariance=initial_covariance, substeps=substeps, integration=plant.integration(integration),
-    )  # fmt: skip
+        plant,
+        whole,
+        unknown=unknown,
+        priors=priors,
+        noisy=noisy,
+        Q=Q,
+        R=R,
+        initial_state=initial_state,
+        initial_covariance=initial_covariance,
+        substeps=substeps,
+        integration=plant.integration(integration),
+    )
     require_variation(problem)
     fits = simulation_fits(problem, starts, seed, note)
     if initial_covariance is None and (seen := with_seen_start(problem, fits[0])) is not problem:
@@ -192,9 +208,7 @@ def _step_error(problem: Problem, plant: NonlinearPlant, fit: Fit) -> Integratio
         SimulationError(problem).states(fit),
         np.array(plant.theta(problem.unknown, fit.t), dtype=np.float64),
     )
-    return integration_error(
-        plant.promoted(problem.unknown), states, problem.u, theta, fit.deviations, problem.log.dt
-    )  # fmt: skip
+    return integration_error(plant.promoted(problem.unknown), states, problem.u, theta, fit.deviations, problem.log.dt)
 
 
 def _innovations(
@@ -216,8 +230,10 @@ def require_plant(given: Any) -> DAEModel | DescriptorSystem | TimeVaryingDescri
     """Return a plant as written; of a transformation its source."""
     plant = plant_as_written(given)
     if not isinstance(plant, (DAEModel, DescriptorSystem, TimeVaryingDescriptorSystem)):
-        raise SpecError(f"model is {type(given).__name__}: give a DAEModel, a DescriptorSystem or a "
-                        "TimeVaryingDescriptorSystem.", path="model")  # fmt: skip
+        raise SpecError(
+            f"model is {type(given).__name__}: give a DAEModel, a DescriptorSystem or a TimeVaryingDescriptorSystem.",
+            path="model",
+        )
     return plant
 
 
@@ -229,6 +245,7 @@ def _sample_time(model: Any, dt: float | None, substeps: int) -> float | None:
     if dt is not None and abs(dt - own) > SAME_TIME * own:
         raise SpecError(f"dt is {dt:g} s, but a step of this plant takes {own:g} s: leave dt out.", path="dt")
     if substeps != 1:
-        raise SpecError("substeps divides the steps of continuous plants, and this one is discrete: leave it out.",
-                        path="substeps")  # fmt: skip
+        raise SpecError(
+            "substeps divides the steps of continuous plants, and this one is discrete: leave it out.", path="substeps"
+        )
     return own

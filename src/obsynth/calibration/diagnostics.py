@@ -192,18 +192,30 @@ class Validation:
         width = max(len(name) for name in self.sensors)
         lines.append(f"  {'':<{width}}  mean square  mean (deviations)  white (p)")
         for name, found in self.sensors.items():
-            lines.append(f"  {name:<{width}}  {found.nis.value:<11.3g}  {found.mean:<+17.2g}  "
-                         f"{found.whiteness.probability:.2g}")  # fmt: skip
+            lines.append(
+                f"  {name:<{width}}  {found.nis.value:<11.3g}  {found.mean:<+17.2g}  {found.whiteness.probability:.2g}"
+            )
         return "\n".join([*lines, *(f"  - {sentence}" for sentence in self.verdict)])
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything but the records as plain data."""
         return {
-            "passed": self.passed, "name": self.name, "nis": vars(self.nis) | {"holds": self.nis.holds},
-            "sensors": {name: {"nis": vars(found.nis) | {"holds": found.nis.holds}, "mean": found.mean,
-                               "whiteness": vars(found.whiteness)} for name, found in self.sensors.items()},
-            "ratios": dict(self.ratios), "change": self.change, "verdict": list(self.verdict), "log": dict(self.log),
-        }  # fmt: skip
+            "passed": self.passed,
+            "name": self.name,
+            "nis": vars(self.nis) | {"holds": self.nis.holds},
+            "sensors": {
+                name: {
+                    "nis": vars(found.nis) | {"holds": found.nis.holds},
+                    "mean": found.mean,
+                    "whiteness": vars(found.whiteness),
+                }
+                for name, found in self.sensors.items()
+            },
+            "ratios": dict(self.ratios),
+            "change": self.change,
+            "verdict": list(self.verdict),
+            "log": dict(self.log),
+        }
 
     def plot(self) -> Figure:
         """Return a picture: measured and predicted signals, innovations in their band, estimates."""

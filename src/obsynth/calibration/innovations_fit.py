@@ -129,9 +129,19 @@ def innovations_fit(
     whitened, e, spread = objective.likelihood.innovations(objective.full(maximum.z))
     bounds = at_bounds(maximum.z, objective.low, objective.high)[: objective.nt]
     return InnovationsFit(
-        objective.constants(maximum.z), objective.plain(maximum.z), found, sides, Q, R, limited[: len(Q)],
-        limited[len(Q) :], bounds, whitened, e, spread,
-    ), moved  # fmt: skip
+        objective.constants(maximum.z),
+        objective.plain(maximum.z),
+        found,
+        sides,
+        Q,
+        R,
+        limited[: len(Q)],
+        limited[len(Q) :],
+        bounds,
+        whitened,
+        e,
+        spread,
+    ), moved
 
 
 def _limits(objective: Objective, maximum: Maximum) -> tuple[BoolArray, FloatArray]:

@@ -76,8 +76,9 @@ def covariance_of(found: FloatArray, widths: FloatArray, names: tuple[str, ...])
     for i in np.argsort(-deviations):
         if deviations[i] > UNDETERMINED:
             shares = vectors[:, i] / vectors[int(np.argmax(np.abs(vectors[:, i]))), i]
-            directions.append({name: float(share) for name, share in zip(names, shares, strict=True)
-                               if abs(share) > LISTED_SHARE})  # fmt: skip
+            directions.append(
+                {name: float(share) for name, share in zip(names, shares, strict=True) if abs(share) > LISTED_SHARE}
+            )
     covariance = (vectors * deviations**2) @ vectors.T * np.outer(widths, widths)
     return Information(covariance, tuple(directions))
 
@@ -103,9 +104,7 @@ class Side:
     is_open: bool
 
 
-def profile_box(
-    objective: Objective, maximum: Maximum, root: float, said: Information
-) -> list[tuple[Side, Side]]:  # fmt: skip
+def profile_box(objective: Objective, maximum: Maximum, root: float, said: Information) -> list[tuple[Side, Side]]:
     """Return both ends of each constant's box, in its own units."""
     found, names = [], objective.problem.unknown
     for i, width in enumerate(objective.problem.widths):

@@ -27,9 +27,15 @@ class Likelihood:
     NaN for what is missing, ``noisy`` numbers of equations, ``x0 (nx,)``, ``P0 (nx, nx)``."""
 
     def __init__(
-        self, graphs: SampleGraphs, u: FloatArray, y: FloatArray, *, noisy: Sequence[int], x0: FloatArray,
+        self,
+        graphs: SampleGraphs,
+        u: FloatArray,
+        y: FloatArray,
+        *,
+        noisy: Sequence[int],
+        x0: FloatArray,
         P0: FloatArray,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.graphs, self.samples, self.size = graphs, len(y), graphs.nt + len(noisy) + graphs.ny
         self._both = Compiled(_whole(graphs, u, y, noisy, x0, P0))
 
@@ -69,8 +75,13 @@ def _whole(
         before = ca.horzcat(state, states[:, :-1])
         rows, total = ca.horzcat(row, said), row[0] + ca.sum2(said[0, :])
         flip = list(range(n - 2, -1, -1))
-        costates = backward.mapaccum(n - 1)(ca.MX.zeros(size + v.shape[0]), before[:, flip], numbers[:, flip],
-                            ca.DM(data[:, 1:])[:, flip], ca.repmat(v, 1, n - 1))  # fmt: skip
+        costates = backward.mapaccum(n - 1)(
+            ca.MX.zeros(size + v.shape[0]),
+            before[:, flip],
+            numbers[:, flip],
+            ca.DM(data[:, 1:])[:, flip],
+            ca.repmat(v, 1, n - 1),
+        )
         end = costates[:, -1]
         costate, gradient = end[:size], end[size:]
     else:

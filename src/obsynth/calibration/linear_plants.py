@@ -55,12 +55,17 @@ def _of_sequence(matrix: MatrixSequence) -> _Matrix:
 
     if matrix.entries is not None:
         rows = matrix.entries
-        return _Matrix(matrix.shape, lambda known, _: _dense([[symbolic_value(entry, known) for entry in row]
-                                                              for row in rows], matrix.shape))  # fmt: skip
+        return _Matrix(
+            matrix.shape,
+            lambda known, _: _dense([[symbolic_value(entry, known) for entry in row] for row in rows], matrix.shape),
+        )
     if matrix.is_constant:
         return _Matrix(matrix.shape, lambda known, _: ca.SX(ca.DM(matrix.at(0))))
-    return _Matrix(matrix.shape, lambda known, flat: ca.reshape(flat, *matrix.shape),
-                   lambda k: np.asarray(matrix.at(k)).ravel(order="F"))  # fmt: skip
+    return _Matrix(
+        matrix.shape,
+        lambda known, flat: ca.reshape(flat, *matrix.shape),
+        lambda k: np.asarray(matrix.at(k)).ravel(order="F"),
+    )
 
 
 def _dense(rows: Sequence[Sequence[Any]], shape: tuple[int, int]) -> Any:
@@ -83,8 +88,10 @@ class LinearPlant(CalibrationPlant):
             self.continuous = False
         else:
             entries = {} if uncertainty is None else uncertainty.entries
-            self.matrices = {key: _with_entries(getattr(plant, name), entries.get(name, ()), uncertainty)
-                             for name, key in INVARIANT.items()}  # fmt: skip
+            self.matrices = {
+                key: _with_entries(getattr(plant, name), entries.get(name, ()), uncertainty)
+                for name, key in INVARIANT.items()
+            }
             values, effects = {name: item.nominal for name, item in constants.items()}, plant.fault_names
             self.continuous = not plant.is_discrete
         self.state_names = self.equation_names = plant.state_names
@@ -94,12 +101,17 @@ class LinearPlant(CalibrationPlant):
         self.values = {**values, **dict.fromkeys(self.effects, 0.0)}
         self.units = {**{name: item.unit or "1" for name, item in constants.items()}, **plant.units}
         if unknown := getattr(plant, "disturbance_names", ()):
-            self.notes = (f"Of the unknown inputs ({', '.join(unknown)}) nothing is known: the noise of the equations "
-                          "stands for them.",)  # fmt: skip
+            self.notes = (
+                f"Of the unknown inputs ({', '.join(unknown)}) nothing is known: the noise of the equations "
+                "stands for them.",
+            )
         self.integrations = tuple(BUTCHER) if self.continuous else (EXACT,)
         if self.matrices["E"].shape != (self.nx, self.nx):
-            raise SpecError("The plant has another number of equations than of states: they do not determine a step, "
-                            "which a calibration needs.", path="E")  # fmt: skip
+            raise SpecError(
+                "The plant has another number of equations than of states: they do not determine a step, "
+                "which a calibration needs.",
+                path="E",
+            )
         self.late = self._algebraic(log)
         point = plant.operating_point
         self.input_point = np.array([point.get(name, 0.0) for name in plant.input_names])
@@ -124,8 +136,9 @@ class LinearPlant(CalibrationPlant):
             return []
         matrix = self.matrices["E"]
         if matrix.recorded is not None:
-            stack = np.array([matrix.recorded(log.rows[0] + i).reshape(self.nx, self.nx, order="F")
-                              for i in range(1, log.samples)])  # fmt: skip
+            stack = np.array(
+                [matrix.recorded(log.rows[0] + i).reshape(self.nx, self.nx, order="F") for i in range(1, log.samples)]
+            )
             return np.flatnonzero(~stack.any(axis=(0, 2))).tolist()
         known = {name: ca.SX.sym(name) for name in (*self.values, INDEX_NAME)}
         E = ca.SX(matrix.symbolic(known, None))
@@ -168,8 +181,10 @@ class LinearPlant(CalibrationPlant):
             width = self.matrices[name].width
             flats[name, later] = s[place : place + width]
             place += width
-        known = {**{name: ca.SX(value) for name, value in self.values.items()},
-                 **{name: t[i] for i, name in enumerate(unknown)}}  # fmt: skip
+        known = {
+            **{name: ca.SX(value) for name, value in self.values.items()},
+            **{name: t[i] for i, name in enumerate(unknown)},
+        }
         k = s[2 * self.nu]
 
         def matrix(name: str, later: bool) -> Any:
@@ -200,8 +215,13 @@ class LinearPlant(CalibrationPlant):
             E, A = at("E", True), at("A", False)
             rows = []
             for i in range(stages):
-                rate = sum((float(weights[i, j]) * (parts[:, j] - x) for j in range(1, stages)),
-                           float(weights[i, 0]) * (parts[:, 0] - x)) / dt  # fmt: skip
+                rate = (
+                    sum(
+                        (float(weights[i, j]) * (parts[:, j] - x) for j in range(1, stages)),
+                        float(weights[i, 0]) * (parts[:, 0] - x),
+                    )
+                    / dt
+                )
                 rows.append(E @ rate - A @ parts[:, i] - driven)
             found = ca.vertcat(*rows)
         else:
@@ -250,9 +270,13 @@ class LinearPlant(CalibrationPlant):
             if i:
                 J, before = (np.array(part) for part in both(row))
                 if not np.isfinite(J).all() or rounding_rank(J / np.maximum(np.abs(J).max(), SMALLEST)) < self.nx:
-                    raise refused("undetermined-step", "The equations of a step do not determine the state: a discrete "
-                                  "plant needs its algebraic equations as rows without x(k+1), and index one. "
-                                  "Eliminate algebraic states first.", signals=list(self.state_names))  # fmt: skip
+                    raise refused(
+                        "undetermined-step",
+                        "The equations of a step do not determine the state: a discrete "
+                        "plant needs its algebraic equations as rows without x(k+1), and index one. "
+                        "Eliminate algebraic states first.",
+                        signals=list(self.state_names),
+                    )
                 reach = -np.linalg.solve(J, before) @ reach
             H = np.array(outputs(np.zeros(self.nx), row, np.zeros(0))[1])
             effects = np.maximum(effects, (np.abs(H @ reach) / large).max(axis=0, initial=0.0))
@@ -282,6 +306,8 @@ def plant_as_written(given: Any) -> Any:
         return plant
     made = getattr(plant, "_made_from", None)
     if made is None:
-        raise SpecError("Elimination or sampling has mixed the constants of this plant: give the plant as it was "
-                        "written.", path="model")  # fmt: skip
+        raise SpecError(
+            "Elimination or sampling has mixed the constants of this plant: give the plant as it was written.",
+            path="model",
+        )
     return made[0]

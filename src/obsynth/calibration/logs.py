@@ -78,14 +78,20 @@ class Log:
     @property
     def described(self) -> dict[str, Any]:
         """What a report says of the log."""
-        return {"source": self.source, "rows": list(self.rows), "digest": self.digest, "samples": self.samples,
-                "dt": self.dt}  # fmt: skip
+        return {
+            "source": self.source,
+            "rows": list(self.rows),
+            "digest": self.digest,
+            "samples": self.samples,
+            "dt": self.dt,
+        }
 
     def shifted(self, rows: int) -> Log:
         """Return the log with its inputs later by whole rows: what row k says acts from row k on for ``rows = 1``."""
         if abs(rows) >= len(self.u):
-            raise SpecError(f"input_delay is {rows} rows, but the log has {len(self.u)} here: give fewer.",
-                            path="input_delay")  # fmt: skip
+            raise SpecError(
+                f"input_delay is {rows} rows, but the log has {len(self.u)} here: give fewer.", path="input_delay"
+            )
         u = np.roll(self.u, rows, axis=0)
         if rows > 0:
             u[:rows] = self.u[0]
@@ -100,8 +106,10 @@ class Log:
             rows = np.flatnonzero(wrong[:, i])
             told = ", ".join(f"row {self.rows[0] + row}: {self.y[row, i]:.4g}" for row in rows[:TOLD_ROWS])
             if len(rows):
-                notes.append(f"{len(rows)} value(s) of {name} are far from all others and count as not measured "
-                             f"({told}{', ...' if len(rows) > TOLD_ROWS else ''}).")  # fmt: skip
+                notes.append(
+                    f"{len(rows)} value(s) of {name} are far from all others and count as not measured "
+                    f"({told}{', ...' if len(rows) > TOLD_ROWS else ''})."
+                )
         return replace(self, y=read_only(np.where(wrong, np.nan, self.y)), notes=tuple(notes))
 
 
@@ -128,10 +136,15 @@ def parsed_rows(rows: str | slice | Sequence[int] | None, count: int) -> tuple[i
 
 
 def read_log(
-    log: LogData, input_names: Sequence[str], output_names: Sequence[str], *,
-    rows: str | slice | Sequence[int] | None = None, columns: Mapping[str, str] | None = None,
-    scales: Mapping[str, float] | None = None, dt: float | None = None,
-) -> Log:  # fmt: skip
+    log: LogData,
+    input_names: Sequence[str],
+    output_names: Sequence[str],
+    *,
+    rows: str | slice | Sequence[int] | None = None,
+    columns: Mapping[str, str] | None = None,
+    scales: Mapping[str, float] | None = None,
+    dt: float | None = None,
+) -> Log:
     """Return the rows of a log as inputs and outputs on a grid. A log is a CSV or Parquet file, a data frame, or a
     mapping from names to columns; ``columns`` says which column a signal (or ``time``) is in where the names differ,
     ``scales`` what its values are multiplied by."""
@@ -139,23 +152,31 @@ def read_log(
         if (log.input_names, log.output_names) != (tuple(input_names), tuple(output_names)):
             raise SpecError("The log is of another plant: its signals differ.", path="log")
         first, last = parsed_rows(rows, log.samples)
-        return replace(log, time=log.time[first:last], u=log.u[first:last], y=log.y[first:last],
-                       rows=(log.rows[0] + first, log.rows[0] + last))  # fmt: skip
+        return replace(
+            log,
+            time=log.time[first:last],
+            u=log.u[first:last],
+            y=log.y[first:last],
+            rows=(log.rows[0] + first, log.rows[0] + last),
+        )
     table, source = _table(log)
     signals = ("time", *input_names, *output_names)
     for what, given in (("columns", columns or {}), ("scales", scales or {})):
         wrong = [name for name in given if name not in signals]
         if wrong:
-            raise SpecError(f"{what} names {wrong[0]!r}, which is no signal: there are {', '.join(signals)}.",
-                            path=f"{what}.{wrong[0]}")  # fmt: skip
+            raise SpecError(
+                f"{what} names {wrong[0]!r}, which is no signal: there are {', '.join(signals)}.",
+                path=f"{what}.{wrong[0]}",
+            )
     length = max((len(values) for values in table.values()), default=0)
     first, last = parsed_rows(rows, length)
 
     def column(name: str) -> FloatArray:
         wanted = (columns or {}).get(name, name)
         if wanted not in table:
-            raise SpecError(f"The log has no column {wanted!r} for {name!r}: there are {', '.join(table)}.",
-                            path=f"columns.{name}")  # fmt: skip
+            raise SpecError(
+                f"The log has no column {wanted!r} for {name!r}: there are {', '.join(table)}.", path=f"columns.{name}"
+            )
         numbers = _numbers(table[wanted], wanted, length)[first:last]
         return np.asarray(numbers * float((scales or {}).get(name, 1.0)), dtype=np.float64)
 
@@ -181,8 +202,9 @@ def _table(log: Any) -> tuple[dict[str, Any], str]:
     if isinstance(log, Mapping) or hasattr(log, "columns"):
         names = log.keys() if isinstance(log, Mapping) else log.columns
         return {str(name): np.asarray(log[name]) for name in names}, ""
-    raise SpecError("log must be the name of a file, a pandas.DataFrame, or a mapping from names to columns.",
-                    path="log")  # fmt: skip
+    raise SpecError(
+        "log must be the name of a file, a pandas.DataFrame, or a mapping from names to columns.", path="log"
+    )
 
 
 def _numbers(values: Any, name: str, length: int) -> FloatArray:
@@ -195,15 +217,24 @@ def _numbers(values: Any, name: str, length: int) -> FloatArray:
 
 
 def _on_grid(
-    time: FloatArray, u: FloatArray, y: FloatArray, dt: float | None, inputs: tuple[str, ...],
-    outputs: tuple[str, ...], rows: tuple[int, int], source: str,
-) -> Log:  # fmt: skip
+    time: FloatArray,
+    u: FloatArray,
+    y: FloatArray,
+    dt: float | None,
+    inputs: tuple[str, ...],
+    outputs: tuple[str, ...],
+    rows: tuple[int, int],
+    source: str,
+) -> Log:
     """Return the log on its grid; missing rows become rows without outputs whose inputs are those that follow."""
     if not np.isfinite(time).all() or (np.diff(time) <= 0).any():
         wrong = ~np.isfinite(time) if not np.isfinite(time).all() else np.diff(time, prepend=-np.inf) <= 0
         bad = int(np.argmax(wrong))
-        raise bad_log("time", f"Stamps must rise and be finite, but that of row {rows[0] + bad} is {time[bad]:g} s.",
-                      path="log.time")  # fmt: skip
+        raise bad_log(
+            "time",
+            f"Stamps must rise and be finite, but that of row {rows[0] + bad} is {time[bad]:g} s.",
+            path="log.time",
+        )
     gaps = np.diff(time)
     step = float(np.median(gaps)) if dt is None and gaps.size else float(dt or 1.0)
     counts = np.round(gaps / step).astype(np.int64)
@@ -211,15 +242,23 @@ def _on_grid(
     notes = []
     if jitter.max(initial=0.0) > LARGEST_JITTER or (counts < 1).any():
         worst = int(np.argmax(jitter))
-        raise bad_log("irregular", f"The stamps are irregular: row {rows[0] + worst + 1} is {jitter[worst]:.0%} "
-                      f"of a step off the grid of {step:g} s. Resample the log.", path="log.time")  # fmt: skip
+        raise bad_log(
+            "irregular",
+            f"The stamps are irregular: row {rows[0] + worst + 1} is {jitter[worst]:.0%} "
+            f"of a step off the grid of {step:g} s. Resample the log.",
+            path="log.time",
+        )
     if jitter.max(initial=0.0) > NOTED_JITTER:
         notes.append(f"The stamps jitter by {jitter.max():.1%} of a step.")
     for name, column in zip(inputs, u.T, strict=True):
         if not np.isfinite(column).all():
             row = rows[0] + int(np.argmax(~np.isfinite(column)))
-            raise bad_log("nan", f"The input {name!r} is not finite in row {row}: inputs must be known. Fill the gap, "
-                          "or take other rows.", path=f"log.{name}")  # fmt: skip
+            raise bad_log(
+                "nan",
+                f"The input {name!r} is not finite in row {row}: inputs must be known. Fill the gap, "
+                "or take other rows.",
+                path=f"log.{name}",
+            )
     for name, column in zip(outputs, y.T, strict=True):
         if np.isinf(column).any() or not np.isfinite(column).any():
             what = "infinite" if np.isinf(column).any() else "nowhere finite"

@@ -143,9 +143,15 @@ def _process_noise(problem: Problem, fit: Fit) -> FloatArray:
 
 
 def descent(
-    both: Callable[[FloatArray], tuple[float, FloatArray]], start: FloatArray, low: FloatArray, high: FloatArray,
-    scale: FloatArray, *, tolerance: float = SEARCH_TOLERANCE, most: int = MOST_SEARCH_STEPS,
-) -> tuple[float, FloatArray]:  # fmt: skip
+    both: Callable[[FloatArray], tuple[float, FloatArray]],
+    start: FloatArray,
+    low: FloatArray,
+    high: FloatArray,
+    scale: FloatArray,
+    *,
+    tolerance: float = SEARCH_TOLERANCE,
+    most: int = MOST_SEARCH_STEPS,
+) -> tuple[float, FloatArray]:
     """Return a bounded minimum near a start, in variables scaled by what they may differ by."""
     from scipy.optimize import minimize
 
@@ -158,9 +164,13 @@ def descent(
 
     with np.errstate(all="ignore"):
         found = minimize(
-            scaled, np.zeros(len(start)), jac=True, method="SLSQP", options={"maxiter": most, "ftol": tolerance},
+            scaled,
+            np.zeros(len(start)),
+            jac=True,
+            method="SLSQP",
+            options={"maxiter": most, "ftol": tolerance},
             bounds=np.column_stack([(low - start) / scale, (high - start) / scale]),
-        )  # fmt: skip
+        )
     return float(found.fun), at(found.x)
 
 
@@ -178,16 +188,24 @@ def greatest_likelihood(objective: Objective, fits: Sequence[Fit], note: Callabl
             if reached < value:
                 best, value = z, reached
     if best is None or value >= IMPOSSIBLE:
-        raise refused("cannot-simulate", "The filter has no finite likelihood from any start: check units, bounds and "
-                      "the initial covariance.", signals=list(objective.problem.unknown))  # fmt: skip
+        raise refused(
+            "cannot-simulate",
+            "The filter has no finite likelihood from any start: check units, bounds and the initial covariance.",
+            signals=list(objective.problem.unknown),
+        )
     value, best, curvature = polished(objective, best)
     return Maximum(best, value, curvature, best)
 
 
 def polished(
-    objective: Objective, z: FloatArray, *, fixed: int | None = None, most: int = MOST_NEWTON_STEPS,
-    tolerance: float = NEWTON_TOLERANCE, near: FloatArray | None = None,
-) -> tuple[float, FloatArray, FloatArray]:  # fmt: skip
+    objective: Objective,
+    z: FloatArray,
+    *,
+    fixed: int | None = None,
+    most: int = MOST_NEWTON_STEPS,
+    tolerance: float = NEWTON_TOLERANCE,
+    near: FloatArray | None = None,
+) -> tuple[float, FloatArray, FloatArray]:
     """Return value, place and Hessian after Newton steps: a quiet log makes valleys that other searches end beside. One
     variable may be fixed; the Hessian is then that of a place nearby. ``near`` is a Hessian to begin with."""
     value, gradient = objective(z)
@@ -227,9 +245,15 @@ def _hessian_of_minimum(objective: Objective, z: FloatArray, near: FloatArray) -
 
 
 def _newton_step(
-    objective: Objective, z: FloatArray, gradient: FloatArray, curvature: FloatArray, damping: float,
-    fixed: int | None, *, least: float = 0.0,
-) -> FloatArray:  # fmt: skip
+    objective: Objective,
+    z: FloatArray,
+    gradient: FloatArray,
+    curvature: FloatArray,
+    damping: float,
+    fixed: int | None,
+    *,
+    least: float = 0.0,
+) -> FloatArray:
     """Return where a damped step leads within the bounds, along directions of more than the least curvature."""
     room = AT_BOUND * (1.0 + np.abs(z))
     held = ((z - objective.low <= room) & (gradient > 0.0)) | ((objective.high - z <= room) & (gradient < 0.0))
@@ -288,8 +312,12 @@ def hessian(
     if near is not None:
         steeper = np.sqrt(np.maximum(np.diag(near), 1.0))
         steps = np.clip(DIFFERENCE_SHARE / steeper, LEAST_DIFFERENCE, DIFFERENCE)
-    found = np.array([(both(z + step)[1] - both(z - step)[1]) / (2.0 * size)
-                      for size, step in zip(steps, np.diag(steps), strict=True)])  # fmt: skip
+    found = np.array(
+        [
+            (both(z + step)[1] - both(z - step)[1]) / (2.0 * size)
+            for size, step in zip(steps, np.diag(steps), strict=True)
+        ]
+    )
     return np.asarray(0.5 * (found + found.T))
 
 

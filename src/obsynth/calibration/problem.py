@@ -87,11 +87,19 @@ class Problem:
 
 
 def calibration_problem(
-    plant: CalibrationPlant, log: Log, *, unknown: Mapping[str, Sequence[float]],
+    plant: CalibrationPlant,
+    log: Log,
+    *,
+    unknown: Mapping[str, Sequence[float]],
     priors: Mapping[str, Sequence[float]] | None,
-    noisy: Sequence[str] | None, Q: Mapping[str, float | None] | None, R: Mapping[str, float | None] | None,
-    initial_state: Any, initial_covariance: Any, integration: str, substeps: int,
-) -> Problem:  # fmt: skip
+    noisy: Sequence[str] | None,
+    Q: Mapping[str, float | None] | None,
+    R: Mapping[str, float | None] | None,
+    initial_state: Any,
+    initial_covariance: Any,
+    integration: str,
+    substeps: int,
+) -> Problem:
     """Return the problem, or say what is wrong with what is asked."""
     substeps = whole_number(substeps, "substeps")
     if not log.samples > 1:
@@ -117,20 +125,42 @@ def calibration_problem(
     )
     variances = int(np.isnan(known_Q).sum() + np.isnan(known_R).sum())
     if not names and not variances:
-        raise SpecError("unknown is empty, and Q and R are known: nothing is to be found. Name constants with their "
-                        "bounds, or leave variances out.", path="unknown")  # fmt: skip
+        raise SpecError(
+            "unknown is empty, and Q and R are known: nothing is to be found. Name constants with their "
+            "bounds, or leave variances out.",
+            path="unknown",
+        )
     needed, seen = VALUES_PER_UNKNOWN * (len(names) + variances), int(np.isfinite(log.y).sum())
     if seen < needed:
-        raise bad_log("too-short", f"The log is too short: {seen} measured values for {len(names)} constants and "
-                      f"{variances} variances; at least {needed} are needed. Take more rows, fewer unknowns, or state "
-                      "Q and R.")  # fmt: skip
+        raise bad_log(
+            "too-short",
+            f"The log is too short: {seen} measured values for {len(names)} constants and "
+            f"{variances} variances; at least {needed} are needed. Take more rows, fewer unknowns, or state "
+            "Q and R.",
+        )
     x0 = named_vector(initial_state, plant.state_names, plant.nominal_state, "initial_state")
     graphs = sample_graphs(plant, names, log.dt, integration=integration, substeps=substeps, samples=log.samples)
     return Problem(
-        plant, log, plant.signals(log), names, np.array([values[name] for name in names]), low, high, means, weights,
-        equations, known_Q,
-        known_R, x0, _covariance(plant, initial_covariance), quanta, floors, graphs, integration, substeps,
-    )  # fmt: skip
+        plant,
+        log,
+        plant.signals(log),
+        names,
+        np.array([values[name] for name in names]),
+        low,
+        high,
+        means,
+        weights,
+        equations,
+        known_Q,
+        known_R,
+        x0,
+        _covariance(plant, initial_covariance),
+        quanta,
+        floors,
+        graphs,
+        integration,
+        substeps,
+    )
 
 
 def _started(unknown: Mapping[str, Sequence[float]], plant: CalibrationPlant) -> dict[str, float]:
@@ -152,11 +182,15 @@ def _bounds(unknown: Mapping[str, Sequence[float]], values: Mapping[str, float])
     rows = []
     for name, pair in unknown.items():
         if not _is_pair(pair) or not pair[0] < pair[1]:
-            raise SpecError(f"unknown.{name} is {pair!r}: give [low, high], finite, the lower one first.",
-                            path=f"unknown.{name}")  # fmt: skip
+            raise SpecError(
+                f"unknown.{name} is {pair!r}: give [low, high], finite, the lower one first.", path=f"unknown.{name}"
+            )
         if not pair[0] <= values[name] <= pair[1]:
-            raise SpecError(f"The nominal value of {name!r}, {values[name]:g}, is outside its bounds [{pair[0]:g}, "
-                            f"{pair[1]:g}]: move one of them.", path=f"unknown.{name}")  # fmt: skip
+            raise SpecError(
+                f"The nominal value of {name!r}, {values[name]:g}, is outside its bounds [{pair[0]:g}, "
+                f"{pair[1]:g}]: move one of them.",
+                path=f"unknown.{name}",
+            )
         rows.append([float(pair[0]), float(pair[1])])
     low, high = np.array(rows).reshape(len(rows), 2).T
     return low, high
@@ -184,8 +218,10 @@ def _variances(given: Mapping[str, float | None] | None, names: Sequence[str], w
         if value is None:
             continue
         if not is_number(value) or not value > 0.0:
-            raise SpecError(f"{what}.{name} is {value!r}: give a positive variance, or leave it out to have it found.",
-                            path=f"{what}.{name}")  # fmt: skip
+            raise SpecError(
+                f"{what}.{name} is {value!r}: give a positive variance, or leave it out to have it found.",
+                path=f"{what}.{name}",
+            )
         found[i] = float(value)
     return found
 
@@ -202,5 +238,8 @@ def _covariance(plant: CalibrationPlant, value: Any) -> FloatArray:
 def require_variation(problem: Problem) -> None:
     """Refuse a log in which nothing moves and nothing is put in: it determines no constant."""
     if not np.nanstd(problem.y, axis=0).any() and not np.std(problem.u, axis=0).any():
-        raise refused("not-exciting", "Nothing moves in these rows: every signal is constant, and no dynamics show.",
-                      signals=list(problem.unknown))  # fmt: skip
+        raise refused(
+            "not-exciting",
+            "Nothing moves in these rows: every signal is constant, and no dynamics show.",
+            signals=list(problem.unknown),
+        )

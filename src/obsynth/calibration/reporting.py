@@ -64,8 +64,10 @@ def integration_error(
     ):
         after = min(k + 1, len(u) - 1)
         try:
-            seen = [step.functions.outputs(step.solve(states[k], u[after], theta, before=u[k], k=int(k)).x, theta)[0]
-                    for step in steps]  # fmt: skip
+            seen = [
+                step.functions.outputs(step.solve(states[k], u[after], theta, before=u[k], k=int(k)).x, theta)[0]
+                for step in steps
+            ]
         except SolverError:
             return None
         errors = np.abs(seen[0] - seen[1]) / deviations
@@ -86,9 +88,15 @@ END_SHARE = 1e-6
 
 
 def reported(
-    problem: Problem, start: Fit, fit: InnovationsFit | None, *, level: float, timing: Timing,
-    error: IntegrationError | None, digest: str,
-) -> Calibration:  # fmt: skip
+    problem: Problem,
+    start: Fit,
+    fit: InnovationsFit | None,
+    *,
+    level: float,
+    timing: Timing,
+    error: IntegrationError | None,
+    digest: str,
+) -> Calibration:
     """Return the calibration of a fit of innovations, or of a simulation where there is none."""
     found = fit if fit is not None else _of_simulation(problem, start, level)
     names, seen = problem.unknown, np.isfinite(problem.y)
@@ -100,31 +108,69 @@ def reported(
     change = change_of_mean(whitened)
     nis = consistency(float((found.whitened[seen] ** 2).sum()), int(seen.sum()))
     sides = dict(zip(names, found.sides, strict=True))
-    open_sides = tuple((name, side) for name, pair in sides.items()
-                       for side, end in zip(("low", "high"), pair, strict=True) if end.is_open)  # fmt: skip
+    open_sides = tuple(
+        (name, side)
+        for name, pair in sides.items()
+        for side, end in zip(("low", "high"), pair, strict=True)
+        if end.is_open
+    )
     nominal = {name: float(value) for name, value in zip(names, found.t, strict=True)}
     box = CalibratedBox(
-        nominal, {name: min(pair[0].value, nominal[name]) for name, pair in sides.items()},
-        {name: max(pair[1].value, nominal[name]) for name, pair in sides.items()}, open_sides, level, digest,
-    )  # fmt: skip
+        nominal,
+        {name: min(pair[0].value, nominal[name]) for name, pair in sides.items()},
+        {name: max(pair[1].value, nominal[name]) for name, pair in sides.items()},
+        open_sides,
+        level,
+        digest,
+    )
     Q = {name: float(value) for name, value in zip(problem.noisy, found.Q, strict=True)} if fit is not None else {}
     R = {name: float(value) for name, value in zip(problem.output_names, found.R, strict=True)}
-    limited = [name for name, weak in zip((*problem.noisy, *problem.output_names),
-                                          (*found.limited_Q, *found.limited_R), strict=True) if weak]  # fmt: skip
+    limited = [
+        name
+        for name, weak in zip(
+            (*problem.noisy, *problem.output_names), (*found.limited_Q, *found.limited_R), strict=True
+        )
+        if weak
+    ]
     row = None if change is None else problem.log.rows[0] + change
     at_end = tuple(name for name, there in zip(names, found.at_bounds, strict=True) if there)
-    verdict = [*problem.log.notes, *problem.plant.notes, *problem.notes,
-               *_fitted(problem, box, found, at_end, correlation, limited, Q, R), *_misfits(problem, start, whitened),
-               *_checked(nis, colours, row, fit is None), *_told(problem, R, timing, error)]  # fmt: skip
+    verdict = [
+        *problem.log.notes,
+        *problem.plant.notes,
+        *problem.notes,
+        *_fitted(problem, box, found, at_end, correlation, limited, Q, R),
+        *_misfits(problem, start, whitened),
+        *_checked(nis, colours, row, fit is None),
+        *_told(problem, R, timing, error),
+    ]
     return Calibration(
-        nominal, read_only(covariance), read_only(correlation), box, found.information.undetermined, Q, R,
-        tuple(limited), nis, colours, row, timing.delay, dict(timing.losses),
-        dict(zip(problem.output_names, problem.quanta.tolist(), strict=True)), at_end, problem.integration,
-        problem.substeps, "innovations" if fit is not None else "simulation", -found.value, tuple(verdict),
-        read_only(whitened), read_only(problem.y - found.innovations), read_only(np.sqrt(found.variances)),
+        nominal,
+        read_only(covariance),
+        read_only(correlation),
+        box,
+        found.information.undetermined,
+        Q,
+        R,
+        tuple(limited),
+        nis,
+        colours,
+        row,
+        timing.delay,
+        dict(timing.losses),
+        dict(zip(problem.output_names, problem.quanta.tolist(), strict=True)),
+        at_end,
+        problem.integration,
+        problem.substeps,
+        "innovations" if fit is not None else "simulation",
+        -found.value,
+        tuple(verdict),
+        read_only(whitened),
+        read_only(problem.y - found.innovations),
+        read_only(np.sqrt(found.variances)),
         problem.log.described | {"digest": digest},
-        {name: problem.plant.units.get(name, "1") for name in names}, problem.output_names,
-    )  # fmt: skip
+        {name: problem.plant.units.get(name, "1") for name in names},
+        problem.output_names,
+    )
 
 
 def _of_simulation(problem: Problem, start: Fit, level: float) -> InnovationsFit:
@@ -145,63 +191,102 @@ def _of_simulation(problem: Problem, start: Fit, level: float) -> InnovationsFit
     variances = np.tile(start.deviations**2, (len(y), 1))
     nothing = np.zeros(len(problem.noisy))
     return InnovationsFit(
-        start.t, start.cost, information, sides, nothing, start.deviations**2, nothing.astype(bool),
-        np.zeros(len(problem.output_names), dtype=bool), ends, e / start.deviations, e, variances,
-    )  # fmt: skip
+        start.t,
+        start.cost,
+        information,
+        sides,
+        nothing,
+        start.deviations**2,
+        nothing.astype(bool),
+        np.zeros(len(problem.output_names), dtype=bool),
+        ends,
+        e / start.deviations,
+        e,
+        variances,
+    )
 
 
 def _fitted(
-    problem: Problem, box: CalibratedBox, fit: InnovationsFit, at_end: tuple[str, ...], correlation: FloatArray,
-    limited: list[str], Q: dict[str, float], R: dict[str, float],
-) -> list[str]:  # fmt: skip
+    problem: Problem,
+    box: CalibratedBox,
+    fit: InnovationsFit,
+    at_end: tuple[str, ...],
+    correlation: FloatArray,
+    limited: list[str],
+    Q: dict[str, float],
+    R: dict[str, float],
+) -> list[str]:
     found = []
     for direction in fit.information.undetermined:
         told = ", ".join(f"{name} {share:+.2g}" for name, share in direction.items())
-        found.append(f"This log does not determine the direction ({told}), in widths of the bounds: move "
-                     "what excites it, state a prior, or fix one of them.")  # fmt: skip
-    found += [f"The box of {name} is open on its {side} side: the bound stands there, not the log."
-              for name, side in box.open_sides]  # fmt: skip
+        found.append(
+            f"This log does not determine the direction ({told}), in widths of the bounds: move "
+            "what excites it, state a prior, or fix one of them."
+        )
+    found += [
+        f"The box of {name} is open on its {side} side: the bound stands there, not the log."
+        for name, side in box.open_sides
+    ]
     found += [f"{name} is at a bound: widen it if the constant may lie beyond." for name in at_end]
-    free = [i for i, name in enumerate(problem.unknown)
-            if not any(name in direction for direction in fit.information.undetermined)]  # fmt: skip
-    found += [f"{problem.unknown[i]} and {problem.unknown[j]} are correlated by {correlation[i, j]:+.2f}: their "
-              "combination is known better than either."
-              for i, j in itertools.combinations(free, 2) if abs(correlation[i, j]) > CORRELATED]  # fmt: skip
+    free = [
+        i
+        for i, name in enumerate(problem.unknown)
+        if not any(name in direction for direction in fit.information.undetermined)
+    ]
+    found += [
+        f"{problem.unknown[i]} and {problem.unknown[j]} are correlated by {correlation[i, j]:+.2f}: their "
+        "combination is known better than either."
+        for i, j in itertools.combinations(free, 2)
+        if abs(correlation[i, j]) > CORRELATED
+    ]
     values = {**Q, **R}
-    return found + [f"The variance of {name} cannot be told from zero: its upper limit {values[name]:.3g} is used."
-                    for name in limited]  # fmt: skip
+    return found + [
+        f"The variance of {name} cannot be told from zero: its upper limit {values[name]:.3g} is used."
+        for name in limited
+    ]
 
 
 def _misfits(problem: Problem, start: Fit, whitened: FloatArray) -> list[str]:
     """Return sentences about sensors that the model does not follow, their mean, and single samples that stand out."""
     found = []
     for name in unexplained(problem, start.deviations):
-        found.append(f"The best simulation leaves nearly all of what {name} does: its sign, its unit or its equation "
-                     "is another, and its R stands for the signal itself.")  # fmt: skip
+        found.append(
+            f"The best simulation leaves nearly all of what {name} does: its sign, its unit or its equation "
+            "is another, and its R stands for the signal itself."
+        )
     for name, column in zip(problem.output_names, whitened.T, strict=True):
         mean = mean_off(column)
         if mean:
-            found.append(f"The innovations of {name} have the mean {mean:+.2f} deviations: a bias of the sensor, or an "
-                         "offset that the model lacks.")  # fmt: skip
+            found.append(
+                f"The innovations of {name} have the mean {mean:+.2f} deviations: a bias of the sensor, or an "
+                "offset that the model lacks."
+            )
         rows = problem.log.rows[0] + np.flatnonzero(np.abs(np.nan_to_num(column)) > STANDS_OUT)
         if len(rows):
             told = ", ".join(map(str, rows[:TOLD_ROWS])) + (", ..." if len(rows) > TOLD_ROWS else "")
-            found.append(f"Samples of {name} stand out by more than {STANDS_OUT:g} deviations (row {told}): if they "
-                         "are outliers, mark them as missing.")  # fmt: skip
+            found.append(
+                f"Samples of {name} stand out by more than {STANDS_OUT:g} deviations (row {told}): if they "
+                "are outliers, mark them as missing."
+            )
     return found
 
 
 def _checked(nis: Consistency, colours: dict[str, Whiteness], row: int | None, simulated: bool) -> list[str]:
-    found = [f"The innovations of {name} are not white (p = {test.probability:.2g}, first autocorrelation "
-             f"{test.first:+.2f}): something that moves {name} is not in the model."
-             for name, test in colours.items() if test.probability < SIGNIFICANT]  # fmt: skip
+    found = [
+        f"The innovations of {name} are not white (p = {test.probability:.2g}, first autocorrelation "
+        f"{test.first:+.2f}): something that moves {name} is not in the model."
+        for name, test in colours.items()
+        if test.probability < SIGNIFICANT
+    ]
     if simulated and found:
         found.append("The residuals of a simulation that are not white make boxes too small: use method='innovations'.")
     if not simulated and not nis.holds:
         found.append(f"NIS per degree of freedom is {nis.value:.2f}, outside {nis.low:.2f} to {nis.high:.2f}.")
     if row is not None:
-        found.append(f"These rows are not of one piece: the mean of the innovations changes at row {row}. If a fault "
-                     "begins there, end the rows before it.")  # fmt: skip
+        found.append(
+            f"These rows are not of one piece: the mean of the innovations changes at row {row}. If a fault "
+            "begins there, end the rows before it."
+        )
     return found
 
 
@@ -209,17 +294,22 @@ def _told(problem: Problem, R: dict[str, float], timing: Timing, error: Integrat
     found = []
     for name, step in zip(problem.output_names, problem.quanta, strict=True):
         if step > 0.0 and R[name] < AT_QUANTISATION * step**2 / EVEN:
-            found.append(f"The noise of {name} is at its quantisation ({step:.3g} / sqrt 12): its R is no lower in "
-                         "truth than what a ramp makes of it.")  # fmt: skip
+            found.append(
+                f"The noise of {name} is at its quantisation ({step:.3g} / sqrt 12): its R is no lower in "
+                "truth than what a ramp makes of it."
+            )
     if timing.delay and timing.losses:
-        found.append(f"The inputs are taken {timing.delay} row later than the log writes them: better by "
-                     f"{timing.losses[0]:.1f} nats.")  # fmt: skip
+        found.append(
+            f"The inputs are taken {timing.delay} row later than the log writes them: better by "
+            f"{timing.losses[0]:.1f} nats."
+        )
     elif timing.losses.get(0, 0.0) > NOTED_NATS:
         rows = min(timing.losses, key=lambda delay: timing.losses[delay])
         found.append(f"The inputs taken {rows:+d} row would be better by {timing.losses[0]:.1f} nats: see input_delay.")
     if error is not None:
         what = "Radau is taken" if problem.integration == "radau" else "it is taken"
         told = f" and moves a constant by {error.moved:.2g} of its own" if error.moved else ""
-        found.append(f"A step of backward Euler errs by at most {error.largest:.2g} deviations of {error.sensor}"
-                     f"{told}: {what}.")  # fmt: skip
+        found.append(
+            f"A step of backward Euler errs by at most {error.largest:.2g} deviations of {error.sensor}{told}: {what}."
+        )
     return found

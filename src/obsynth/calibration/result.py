@@ -74,18 +74,24 @@ class CalibratedBox:
             name, side = self.open_sides[0]
             raise SpecError(
                 f"The box of {name!r} has an open {side} side: the log bounds nothing there. State its range, or take "
-                "a log that moves it.", path=f"constants.{name}",
-            )  # fmt: skip
-        return {name: {"nominal": value, "range": [self.low[name], self.high[name]]}
-                for name, value in self.nominal.items()}  # fmt: skip
+                "a log that moves it.",
+                path=f"constants.{name}",
+            )
+        return {
+            name: {"nominal": value, "range": [self.low[name], self.high[name]]} for name, value in self.nominal.items()
+        }
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data."""
         return {
-            "nominal": dict(self.nominal), "low": dict(self.low), "high": dict(self.high),
-            "open_sides": [list(side) for side in self.open_sides], "level": self.level, "digest": self.digest,
+            "nominal": dict(self.nominal),
+            "low": dict(self.low),
+            "high": dict(self.high),
+            "open_sides": [list(side) for side in self.open_sides],
+            "level": self.level,
+            "digest": self.digest,
             "source": self.source,
-        }  # fmt: skip
+        }
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,19 +190,25 @@ class Calibration:
 
     def __str__(self) -> str:
         rows = f"rows {self.log['rows'][0]}:{self.log['rows'][1]}"
-        lines = [f"Calibration of {len(self.nominal)} constants from {self.log['source'] or 'a log'}, {rows} ("
-                 f"{100 * self.box.level:g} % box, all at once)"]  # fmt: skip
+        lines = [
+            f"Calibration of {len(self.nominal)} constants from {self.log['source'] or 'a log'}, {rows} ("
+            f"{100 * self.box.level:g} % box, all at once)"
+        ]
         if not self.nominal:
             lines = [f"Calibration of the noise from {self.log['source'] or 'a log'}, {rows}"]
         width = max((len(name) for name in self.nominal), default=0)
         marks = set(self.box.open_sides)
         for name, value in self.nominal.items():
-            ends = [f"{'open ' if (name, side) in marks else ''}{getattr(self.box, side)[name]:.5g}"
-                    for side in ("low", "high")]  # fmt: skip
+            ends = [
+                f"{'open ' if (name, side) in marks else ''}{getattr(self.box, side)[name]:.5g}"
+                for side in ("low", "high")
+            ]
             unit = "" if self.units.get(name, "1") == "1" else f" {self.units[name]}"
             lines.append(f"  {name:<{width}}  {value:.5g}  [{ends[0]}, {ends[1]}]{unit}")
-        told = {name: f"{name} {'<= ' if name in self.upper_limits else ''}{value:.3g}"
-                for name, value in (*self.Q.items(), *self.R.items())}  # fmt: skip
+        told = {
+            name: f"{name} {'<= ' if name in self.upper_limits else ''}{value:.3g}"
+            for name, value in (*self.Q.items(), *self.R.items())
+        }
         if self.Q:
             lines.append("  Q per step: " + ", ".join(told[name] for name in self.Q))
         lines.append("  R: " + ", ".join(told[name] for name in self.R))
@@ -208,18 +220,36 @@ class Calibration:
     def to_dict(self) -> dict[str, Any]:
         """Return everything but the records as plain data."""
         return {
-            "constants": {name: {"nominal": value, "range": [self.box.low[name], self.box.high[name]],
-                                 "open": [side for other, side in self.box.open_sides if other == name],
-                                 "unit": self.units.get(name, "1")} for name, value in self.nominal.items()},
-            "level": self.box.level, "covariance": self.covariance.tolist(), "correlation": self.correlation.tolist(),
-            "undetermined": [dict(direction) for direction in self.undetermined], "Q": dict(self.Q), "R": dict(self.R),
-            "upper_limits": list(self.upper_limits), "nis": vars(self.nis) | {"holds": self.nis.holds},
-            "whiteness": {name: vars(found) for name, found in self.whiteness.items()}, "change": self.change,
-            "input_delay": self.input_delay, "timing": {str(rows): loss for rows, loss in self.timing.items()},
-            "quanta": dict(self.quanta), "at_bounds": list(self.at_bounds), "integration": self.integration,
-            "substeps": self.substeps, "method": self.method, "log_likelihood": self.log_likelihood,
-            "log": dict(self.log), "verdict": list(self.verdict),
-        }  # fmt: skip
+            "constants": {
+                name: {
+                    "nominal": value,
+                    "range": [self.box.low[name], self.box.high[name]],
+                    "open": [side for other, side in self.box.open_sides if other == name],
+                    "unit": self.units.get(name, "1"),
+                }
+                for name, value in self.nominal.items()
+            },
+            "level": self.box.level,
+            "covariance": self.covariance.tolist(),
+            "correlation": self.correlation.tolist(),
+            "undetermined": [dict(direction) for direction in self.undetermined],
+            "Q": dict(self.Q),
+            "R": dict(self.R),
+            "upper_limits": list(self.upper_limits),
+            "nis": vars(self.nis) | {"holds": self.nis.holds},
+            "whiteness": {name: vars(found) for name, found in self.whiteness.items()},
+            "change": self.change,
+            "input_delay": self.input_delay,
+            "timing": {str(rows): loss for rows, loss in self.timing.items()},
+            "quanta": dict(self.quanta),
+            "at_bounds": list(self.at_bounds),
+            "integration": self.integration,
+            "substeps": self.substeps,
+            "method": self.method,
+            "log_likelihood": self.log_likelihood,
+            "log": dict(self.log),
+            "verdict": list(self.verdict),
+        }
 
     def plot(self) -> Figure:
         """Return a picture: each constant in its box, and the innovations of each sensor in deviations."""
@@ -238,9 +268,13 @@ def _figure(found: Calibration) -> Figure:
     sensors = len(found.output_names)
     heights = [0.6 + 0.35 * len(found.names), *[1.7] * sensors]
     figure, panels = plt.subplots(
-        sensors + 1, 1, layout="constrained", squeeze=False, figsize=(7.5, 0.5 + sum(heights)),
+        sensors + 1,
+        1,
+        layout="constrained",
+        squeeze=False,
+        figsize=(7.5, 0.5 + sum(heights)),
         gridspec_kw={"height_ratios": heights},
-    )  # fmt: skip
+    )
     _boxes(panels[0, 0], found)
     time = found.log["rows"][0] + np.arange(len(found.innovations))
     for panel, name, column in zip(panels[1:, 0], found.output_names, found.innovations.T, strict=True):

@@ -113,9 +113,15 @@ class SimulationError:
         weights = FIRST_NOISE * np.nanstd(p.y, axis=0) + np.sqrt(p.floors)
         for i in range(ROUNDS):
             found = least_squares(
-                self.residuals, v, jac=self.jacobian, bounds=(low, high), args=(weights,), x_scale="jac",
-                loss="soft_l1" if i == 0 else "linear", max_nfev=MOST_EVALUATIONS,
-            )  # fmt: skip
+                self.residuals,
+                v,
+                jac=self.jacobian,
+                bounds=(low, high),
+                args=(weights,),
+                x_scale="jac",
+                loss="soft_l1" if i == 0 else "linear",
+                max_nfev=MOST_EVALUATIONS,
+            )
             v = np.asarray(found.x)
             left = self.simulated(v)[0] - p.y
             if not np.isfinite(left[np.isfinite(p.y)]).all():
@@ -140,9 +146,11 @@ def simulation_fits(
             fits.append(found)
     if not fits:
         raise refused(
-            "cannot-simulate", "No start gives a trajectory: the model has no solution along the log's inputs. Check "
-            "units, the sample time and the initial state, and narrow the bounds.", signals=list(problem.unknown),
-        )  # fmt: skip
+            "cannot-simulate",
+            "No start gives a trajectory: the model has no solution along the log's inputs. Check "
+            "units, the sample time and the initial state, and narrow the bounds.",
+            signals=list(problem.unknown),
+        )
     fits.sort(key=lambda fit: fit.cost)
     _require_explained(problem, fits[0].deviations)
     _require_levels(problem, fits[0], error)
@@ -163,8 +171,9 @@ def with_seen_start(problem: Problem, fit: Fit, *, first: FloatArray | None = No
     far = away > limit * deviations
     if not far.any():
         return problem
-    told = ", ".join(f"{name} {fit.x0[i]:.4g} for {problem.x0[i]:.4g}"
-                     for i, name in enumerate(problem.plant.state_names) if far[i])  # fmt: skip
+    told = ", ".join(
+        f"{name} {fit.x0[i]:.4g} for {problem.x0[i]:.4g}" for i, name in enumerate(problem.plant.state_names) if far[i]
+    )
     note = f"The log does not begin at the nominal state ({told}): what is known of the start is widened."
     return problem.with_start(np.diag(np.where(far, away, deviations) ** 2), note)
 
@@ -193,10 +202,12 @@ def _require_explained(problem: Problem, left: FloatArray) -> None:
         names = [name for name, wrong in zip(problem.output_names, bad, strict=True) if wrong]
         told = ", ".join(f"{name}: {100 * part:.3g} %" for name, part in zip(problem.output_names, share, strict=True))
         raise refused(
-            "explains-nothing", f"The model cannot follow the log: what the best fit leaves is as large as the signals "
+            "explains-nothing",
+            f"The model cannot follow the log: what the best fit leaves is as large as the signals "
             f"({told} of their deviations). Check units and scales (a factor of 1000?), the sample time, and the "
-            "bounds.", signals=names,
-        )  # fmt: skip
+            "bounds.",
+            signals=names,
+        )
 
 
 def _require_levels(problem: Problem, fit: Fit, error: SimulationError) -> None:
@@ -211,12 +222,14 @@ def _require_levels(problem: Problem, fit: Fit, error: SimulationError) -> None:
     far &= problem.plant.has_levels | _shares(problem, fit.deviations)[1]
     if far.any():
         names = [name for name, wrong in zip(problem.output_names, far, strict=True) if wrong]
-        told = ", ".join(f"{problem.output_names[i]}: {1.0 / levels[i]:.3g} times what the model says"
-                         for i in np.flatnonzero(far))  # fmt: skip
+        told = ", ".join(
+            f"{problem.output_names[i]}: {1.0 / levels[i]:.3g} times what the model says" for i in np.flatnonzero(far)
+        )
         raise refused(
-            "explains-nothing", f"The model cannot follow the log: {told}. Check units and scales (a factor of "
-            "1000?).", signals=names,
-        )  # fmt: skip
+            "explains-nothing",
+            f"The model cannot follow the log: {told}. Check units and scales (a factor of 1000?).",
+            signals=names,
+        )
 
 
 def _moved_by_noise(problem: Problem, deviations: FloatArray) -> bool:

@@ -177,8 +177,9 @@ class _Substep:
 
         Xs, xs, us, ts = (ca.SX.sym(name, part.numel()) for name, part in zip("Xxut", (X, x, u, t), strict=True))
         equations, nx, nt = self.function(Xs, xs, us, ts, self.dt), self.nx, ts.numel()
-        right = ca.horzcat(-ca.jacobian(equations, xs), -ca.jacobian(equations, ts),
-                           ca.repmat(ca.SX.eye(nx), self.stages, 1))  # fmt: skip
+        right = ca.horzcat(
+            -ca.jacobian(equations, xs), -ca.jacobian(equations, ts), ca.repmat(ca.SX.eye(nx), self.stages, 1)
+        )
         found = eliminated(ca.jacobian(equations, Xs), right, self.order)
         found = ca.Function("found", [Xs, xs, us, ts], [found])(X, x, u, t)
         return found[:, :nx], found[:, nx : nx + nt], found[self.size - nx :, nx + nt :]

@@ -67,8 +67,14 @@ def recorded_innovations(design: ObserverDesign, log: Log) -> RecordedInnovation
 def _nonlinear(observer: DAEObserver, log: Log) -> RecordedInnovations:
     found, error = observer.run(log.y, log.u, progress=False), None
     if observer.integration == "backward-euler":
-        error = integration_error(observer.model, np.array(found.states), log.u, np.array(found.parameters[-1]),
-                                  np.sqrt(np.diag(observer.R)), observer.dt)  # fmt: skip
+        error = integration_error(
+            observer.model,
+            np.array(found.states),
+            log.u,
+            np.array(found.parameters[-1]),
+            np.sqrt(np.diag(observer.R)),
+            observer.dt,
+        )
     deviations = np.sqrt(np.einsum("kii->ki", found.innovation_covariances))
     return _recorded(found, found.innovations, deviations, error)
 
@@ -94,8 +100,9 @@ def _recorded(
 ) -> RecordedInnovations:
     columns = np.stack([found.parameters, found.parameter_deviations], axis=2)
     estimates = {name: read_only(columns[:, i]) for i, name in enumerate(found.parameter_names)}
-    return RecordedInnovations(innovations, deviations, float(found.nis.sum()), int(found.nis_degrees.sum()), estimates,
-                               error)  # fmt: skip
+    return RecordedInnovations(
+        innovations, deviations, float(found.nis.sum()), int(found.nis_degrees.sum()), estimates, error
+    )
 
 
 #: Nats that a variance of the design must cost, the others being free, before its ratio is told.
@@ -117,10 +124,26 @@ def noise_ratios(observer: DAEObserver, log: Log) -> Mapping[str, float]:
     graphs = sample_graphs(plant, (), log.dt, integration=observer.integration, substeps=1, samples=log.samples)
     quanta = np.array([quantum(column) for column in log.y.T])
     problem = Problem(
-        plant, log, log.u, (), nothing, nothing, nothing, nothing, nothing, noisy, free_Q, np.full(model.ny, np.nan),
-        np.array(observer.initial_state), np.array(observer.initial_covariance), quanta, LEAST_RATIO * designed_R,
-        graphs, observer.integration, 1,
-    )  # fmt: skip
+        plant,
+        log,
+        log.u,
+        (),
+        nothing,
+        nothing,
+        nothing,
+        nothing,
+        nothing,
+        noisy,
+        free_Q,
+        np.full(model.ny, np.nan),
+        np.array(observer.initial_state),
+        np.array(observer.initial_covariance),
+        quanta,
+        LEAST_RATIO * designed_R,
+        graphs,
+        observer.integration,
+        1,
+    )
     fit = Fit(nothing, np.array(observer.initial_state), np.sqrt(designed_R), 0.0, np.zeros((0, 0)))
     objective = Objective(problem, fit)
     try:
@@ -186,15 +209,18 @@ def validate(
     if not states_innovations(design):
         raise SpecError(
             f"The method {design.method} states no covariance of its residual, which a log could contradict: validate "
-            "a recursive or nonlinear design, or run the log with a monitor.", path="design",
-        )  # fmt: skip
+            "a recursive or nonlinear design, or run the log with a monitor.",
+            path="design",
+        )
     plant = design.plant
     factors = dict(getattr(plant, "scales", {})) | dict(scales or {})
-    found = read_log(log, plant.input_names, plant.output_names, rows=rows, columns=columns, scales=factors,
-                     dt=design.observer.dt)  # fmt: skip
+    found = read_log(
+        log, plant.input_names, plant.output_names, rows=rows, columns=columns, scales=factors, dt=design.observer.dt
+    )
     if found.samples < LEAST_ROWS:
-        raise SpecError(f"The log has {found.samples} rows here: at least {LEAST_ROWS} are needed.", path="rows",
-                        code="too-short")  # fmt: skip
+        raise SpecError(
+            f"The log has {found.samples} rows here: at least {LEAST_ROWS} are needed.", path="rows", code="too-short"
+        )
     found = found.without(wrong_samples(found.y))
     record = recorded_innovations(design, found)
     sensors = _sensors(record, plant.output_names)
@@ -206,19 +232,32 @@ def validate(
     passed = not verdict[len(found.notes) :] and whole.holds
     if not passed and not whole.holds and not ratios:
         far = "small" if whole.value > whole.high else "large"
-        verdict.append(f"Q and R are too {far} together: the innovations are {np.sqrt(whole.value):.2g} times what is "
-                       "expected.")  # fmt: skip
+        verdict.append(
+            f"Q and R are too {far} together: the innovations are {np.sqrt(whole.value):.2g} times what is expected."
+        )
     if record.error is not None and record.error.matters:
-        verdict.append(f"A step of backward Euler errs by up to {record.error.largest:.2g} deviations of "
-                       f"{record.error.sensor} (row {found.rows[0] + record.error.row}): integration: radau does not, "
-                       "which parameters may need.")  # fmt: skip
+        verdict.append(
+            f"A step of backward Euler errs by up to {record.error.largest:.2g} deviations of "
+            f"{record.error.sensor} (row {found.rows[0] + record.error.row}): integration: radau does not, "
+            "which parameters may need."
+        )
     if passed:
         verdict.append("The innovations are as the design expects them: white, without offset, of the stated size.")
     return Validation(
-        passed, design.name, whole, sensors, ratios, change, tuple(verdict), read_only(record.innovations),
-        read_only(record.deviations), read_only(np.array(found.y)), read_only(found.y - record.innovations),
-        record.estimates, found.described,
-    )  # fmt: skip
+        passed,
+        design.name,
+        whole,
+        sensors,
+        ratios,
+        change,
+        tuple(verdict),
+        read_only(record.innovations),
+        read_only(record.deviations),
+        read_only(np.array(found.y)),
+        read_only(found.y - record.innovations),
+        record.estimates,
+        found.described,
+    )
 
 
 def states_innovations(design: ObserverDesign) -> bool:
@@ -237,9 +276,12 @@ def _sensors(record: RecordedInnovations, names: Sequence[str]) -> dict[str, Sen
 
 
 def _sentences(
-    sensors: Mapping[str, SensorValidation], ratios: Mapping[str, float], change: int | None,
-    record: RecordedInnovations, design: ObserverDesign,
-) -> list[str]:  # fmt: skip
+    sensors: Mapping[str, SensorValidation],
+    ratios: Mapping[str, float],
+    change: int | None,
+    record: RecordedInnovations,
+    design: ObserverDesign,
+) -> list[str]:
     found = []
     for name, ratio in ratios.items():
         letter, what = "R" if name in sensors else "Q", "small" if ratio > 1.0 else "large"
@@ -247,17 +289,23 @@ def _sentences(
         found.append(f"{letter} of {name} is {_times(factor)} too {what}.")
     for name, sensor in sensors.items():
         if abs(sensor.mean) > OFFSET:
-            found.append(f"The innovations of {name} have an offset of {sensor.mean:+.1f} deviations of their mean: a "
-                         "constant or an offset of the sensor is wrong.")  # fmt: skip
+            found.append(
+                f"The innovations of {name} have an offset of {sensor.mean:+.1f} deviations of their mean: a "
+                "constant or an offset of the sensor is wrong."
+            )
         if sensor.whiteness.probability < SIGNIFICANT:
-            found.append(f"The innovations of {name} are not white (p = {sensor.whiteness.probability:.2g}, first "
-                         f"autocorrelation {sensor.whiteness.first:+.2f}): Q against R is wrong, or something that "
-                         f"moves {name} is not in the model.")  # fmt: skip
+            found.append(
+                f"The innovations of {name} are not white (p = {sensor.whiteness.probability:.2g}, first "
+                f"autocorrelation {sensor.whiteness.first:+.2f}): Q against R is wrong, or something that "
+                f"moves {name} is not in the model."
+            )
     if change is not None:
         found.append(f"The mean of the innovations changes at row {change}: these rows are not free of faults.")
     for name, deviation in _far(record.estimates, design).items():
-        found.append(f"The estimate of {name} ends {deviation:.1f} deviations from its nominal value: a constant is "
-                     "wrong, or the rows are not free of faults.")  # fmt: skip
+        found.append(
+            f"The estimate of {name} ends {deviation:.1f} deviations from its nominal value: a constant is "
+            "wrong, or the rows are not free of faults."
+        )
     return found
 
 

@@ -60,8 +60,13 @@ class Validity:
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything but the records as plain data."""
-        return {"largest": self.largest, "by_sensor": dict(self.by_sensor), "rms": dict(self.rms),
-                "excursion": dict(self.excursion), "deviations": dict(self.deviations)}  # fmt: skip
+        return {
+            "largest": self.largest,
+            "by_sensor": dict(self.by_sensor),
+            "rms": dict(self.rms),
+            "excursion": dict(self.excursion),
+            "deviations": dict(self.deviations),
+        }
 
     def plot(self) -> Figure:
         """Return a picture: both outputs, and their difference in deviations, by sensor."""
@@ -119,8 +124,9 @@ def validity(
     require_kind(linear, DescriptorSystem, "linear", "what obsynth.linearise returns")
     names = {*linear.input_names, *linear.disturbance_names} - {DRIFT}
     if names != set(model.input_names) or linear.output_names != model.output_names or linear.is_discrete:
-        raise SpecError("The linear model is of another plant, or sampled: give what obsynth.linearise returns.",
-                        path="linear")  # fmt: skip
+        raise SpecError(
+            "The linear model is of another plant, or sampled: give what obsynth.linearise returns.", path="linear"
+        )
     found = read_log(log, model.input_names, model.output_names, rows=rows, columns=columns, scales=scales, dt=dt)
     point = linear.operating_point
     center = np.array([point[name] for name in linear.state_names])
@@ -137,11 +143,15 @@ def validity(
     y0 = np.array([point[name] for name in linear.output_names])
     by_name = dict(zip(model.output_names, differences.max(axis=0).tolist(), strict=True))
     return Validity(
-        max(by_name.values()), by_name,
+        max(by_name.values()),
+        by_name,
         dict(zip(model.output_names, np.sqrt((differences**2).mean(axis=0)).tolist(), strict=True)),
-        dict(zip(model.output_names, np.abs(true - y0).max(axis=0).tolist(), strict=True)), read_only(true),
-        read_only(seen), spread, found.time,
-    )  # fmt: skip
+        dict(zip(model.output_names, np.abs(true - y0).max(axis=0).tolist(), strict=True)),
+        read_only(true),
+        read_only(seen),
+        spread,
+        found.time,
+    )
 
 
 def _deviation(column: FloatArray, name: str, given: Mapping[str, float] | None) -> float:
@@ -153,8 +163,9 @@ def _deviation(column: FloatArray, name: str, given: Mapping[str, float] | None)
     rough = float(np.nanstd(np.diff(column, n=2)) / np.sqrt(6.0))
     found = max(rough, quantum(column) / math.sqrt(EVEN))
     if not found > 0.0:
-        raise SpecError(f"The record of {name!r} shows no noise: state its deviation by deviations.",
-                        path=f"deviations.{name}")  # fmt: skip
+        raise SpecError(
+            f"The record of {name!r} shows no noise: state its deviation by deviations.", path=f"deviations.{name}"
+        )
     return found
 
 

@@ -30,21 +30,39 @@ def run_thresholds(options: argparse.Namespace) -> int:
     if target is not None and target.suffix.lower() != ".json":
         raise SpecError(f"{target}: thresholds are written as JSON (.json).", path="--out")
     found = learn_thresholds(
-        load(options.gains), sys.stdin if is_stream else Path(options.data),
-        false_alarms=options.false_alarms or FALSE_ALARMS, rows=options.rows, columns=dict(options.map),
-        time_column=options.time_column, scales=numbers_of(options.scale), gap=options.gap, warm_up=options.warm_up,
-    )  # fmt: skip
+        load(options.gains),
+        sys.stdin if is_stream else Path(options.data),
+        false_alarms=options.false_alarms or FALSE_ALARMS,
+        rows=options.rows,
+        columns=dict(options.map),
+        time_column=options.time_column,
+        scales=numbers_of(options.scale),
+        gap=options.gap,
+        warm_up=options.warm_up,
+    )
     file = None if target is None else found.save(target)
     levels = dict(zip(found.statistics.names, found.levels.tolist(), strict=True))
     if not found.holds:
-        print(f"Warning: the rate needs {found.needed} rows without faults, and {found.rows} are given.",
-              file=sys.stderr)  # fmt: skip
+        print(
+            f"Warning: the rate needs {found.needed} rows without faults, and {found.rows} are given.", file=sys.stderr
+        )
     lines = [f"{found.statement[0].upper()}{found.statement[1:]}.", f"Watched: {', '.join(found.columns)}."]
     if found.left_out:
         lines.append(f"Not watched, as the others explain it, or it remembers too long: {', '.join(found.left_out)}.")
-    answer(options, {
-        "gains": options.gains, "file": file, "holds": found.holds, "statement": found.statement, "rows": found.rows,
-        "needed": found.needed, "rows_per_alarm": found.every, "watched": list(found.columns),
-        "left_out": list(found.left_out), "levels": levels,
-    }, "\n".join(lines))  # fmt: skip
+    answer(
+        options,
+        {
+            "gains": options.gains,
+            "file": file,
+            "holds": found.holds,
+            "statement": found.statement,
+            "rows": found.rows,
+            "needed": found.needed,
+            "rows_per_alarm": found.every,
+            "watched": list(found.columns),
+            "left_out": list(found.left_out),
+            "levels": levels,
+        },
+        "\n".join(lines),
+    )
     return 0

@@ -108,187 +108,409 @@ _LOG = "text (.csv, .tsv), Parquet, TDMS or MDF file; - for text on standard inp
 _EXPECTED = option("--system", "FILE", "spec (YAML) whose scenario tells what is to be expected", type=Path)
 
 VERBS = {
-    "design": Verb("commands:run_design", "Design an observer from a spec, prove it, print a report and write the "
-                   "gain set.", (
-        SYSTEM,
-        option("--output", "FILE", "where to write the gain set (default: <name of the spec>.gains.json in the current "
-               "folder)", type=Path),
-        verbose("every claim and every check"), JSON, FORCE, QUIET,
-    )),
-    "check": Verb("commands:run_check", "Analyse the plant of a spec, and check for every method whether a design can "
-                  "exist.", (
-        SYSTEM, flag("--whole-bank", "look for every structured residual of more than 6 faults, up to 12"),
-        verbose("the structure of the plant and every condition"), JSON,
-    )),
-    "verify": Verb("commands:run_verify", "Verify a saved gain set again, from the plant and the shipped realisation "
-                   "alone.", (
-        option("gains", "FILE", "a gain set that design wrote, or an alarm's certificate", type=Path),
-        option("--printed-digits", "N", "judge the gains as numbers that were printed with N decimals", type=digits),
-        verbose("every claim and every check"), JSON,
-    )),
-    "simulate": Verb("scenarios:run_simulate", "Design an observer from a spec, and simulate it on the spec's "
-                     "scenario.", (
-        SYSTEM, SPEC_GAINS, option("--out", "FILE", "write every signal to this file (CSV)", type=Path),
-        JSON, FORCE, QUIET,
-    )),
-    "compare": Verb("scenarios:run_compare", "Design by every method that exists for a spec's plant, and show them "
-                    "side by side on its scenario.", (
-        SYSTEM, option("--data", "FILE", "a log (CSV) to replay through every method", type=Path),
-        option("--out", "FILE", "write a page (HTML) with table and picture", type=Path),
-        option("--runs", "N", "drawn runs of the scenario (default: 20)", type=int, default=20),
-        Settings((
-            option("--tolerance", "T", "relative error of parameters that is drawn (0.05)", type=float, default=0.0),
-            option("--within", "SECONDS", "90 %% of a step must be shown within this time", type=float),
-            option("--sample-time", "SECONDS", "the clock of a continuous plant", type=float),
-        )),
-        FORCE, JSON, QUIET,
-    )),
-    "evaluate": Verb("scenarios:run_evaluate", "Design an observer from a spec, run the spec's scenario many times, "
-                     "and count alarms, delays and errors.", (
-        SYSTEM, SPEC_GAINS,
-        option("--runs", "N", "how many, each with its seed (default: 100)", type=int, default=100),
-        Settings((option("--confidence", "P", "of the intervals (default: 0.95)", type=float, default=0.95),)),
-        option("--plants", "N", "draw N plants from the tolerances, half of them vertices", type=int), JOBS,
-        option("--tolerances", "LIST", "instead, a fixed bound beside the adaptive threshold for these tolerances, "
-               "such as 0,1%%,2%%,5%%"),
-        option("--out", "FILE", "with --tolerances: write the picture (.png, .svg or .pdf)", type=Path),
-        MONITOR, MONITOR_SETTINGS, JSON, FORCE, QUIET,
-    )),
-    "sweep": Verb("sweep:run_sweep", "Design and verify for every combination of specs and values; what fails is a "
-                  "row of the table.", (
-        option("--system", "FILE", "a spec (YAML), or several", type=Path, required=True, nargs="+"),
-        option("--set", "PATH=LIST", "an entry of the specs and its values", action="append", default=[]),
-        option("--out", "FOLDER", "for gain sets, results, table.csv", type=Path, required=True),
-        option("--claim", "NAME", "what the picture shows (default: the most frequent claim)"),
-        JOBS, CLUSTER, JSON, FORCE, QUIET,
-    ), _SWEEP_DETAILS),
-    "run": Verb("data_commands:run_run", "Run a design on measured data: a log, or a stream on standard input, a row "
-                "in, a row out.", (
-        GAINS, option("--data", "FILE", _LOG, required=True),
-        option("--out", "FILE", "CSV or Parquet file for the estimates (default: - for stdout); a folder for many gain "
-               "sets", default="-"),
-        *DATA_OPTIONS, _EXPECTED, JOBS, CLUSTER,
-        Settings((
-            option("--outliers", None, "recursive and nonlinear designs: leave out samples that their prediction "
-                   "excludes (default), pull them to its limit, or take them as they are",
-                   choices=("gate", "huber", "none")),
-            option("--recovered", "NAME", "a state of the plant as written to recover (or all, or none; default: all "
-                   "of up to 300); may be repeated", action="append"),
-        )),
-        Group("", (
-            flag("--smooth", "recursive and nonlinear designs: estimates from the whole log, not only from what came "
-                 "before"),
-            option("--lag", "N", "the same from the N samples after each row: rows come with N samples of delay, "
-                   "with their own time", type=int),
-        )),
-        option("--state", "FILE", "go on from this saved state if it exists, and save the new one", type=Path),
-        option("--prove", "FILE", "with --monitor pointwise: prove the first alarm, and write the certificate that "
-               "'verify' rechecks", type=Path),
-        JSON, FORCE, flag("--quiet", "print no progress and no summary"),
-    ), _RUN_DETAILS),
-    "thresholds": Verb("learned:run_thresholds", "Learn the thresholds of a design from a log without faults, for a "
-                       "rate of false alarms.", (
-        GAINS, option("--data", "FILE", _LOG, required=True),
-        option("--false-alarms", "RATE", "such as '1 per week' or '2 per 1000 rows' (default: '1 per 1000 rows')"),
-        option("--out", "FILE", "write the thresholds to this file (JSON), for run --monitor learned --normal FILE",
-               type=Path),
-        *LOG_OPTIONS,
-        Settings((
-            option("--time-column", "COLUMN", "column of the time, in seconds or as dates (ISO 8601); default: time"),
-            option("--gap", "SECONDS", "continuous designs: longer intervals are gaps", type=float),
-            option("--warm-up", "SECONDS", "how long to leave out the start, and what follows gaps", type=float),
-        )),
-        JSON, FORCE, QUIET,
-    )),
-    "export": Verb("data_commands:run_export", "Write a gain set for Simulink (.mat), numpy (.npz), C99 (.c and .h), "
-                   "or as a functional mock-up unit for co-simulation (.fmu); of a recursive design for a "
-                   "time-invariant plant, its steady state.", (
-        GAINS, option("--to", "FILE", ".mat, .npz, .c (with a header), or .fmu", type=Path, required=True),
-        option("--sample-time", "SECONDS", "sample a continuous-time observer (needed for C and FMU)", type=float),
-        option("--fmi", None, "version of FMI for .fmu (default: 2.0)", choices=("2.0", "3.0"), default="2.0"),
-        Settings((
-            option("--threshold", "OUTPUT=LEVEL", "for .fmu: alarm when the absolute value of an output, such as "
-                   "fhat[pump], passes a level; may be repeated"),
-            option("--warm-up", "SECONDS", "for .fmu: no alarms in these seconds", type=float),
-        )),
-        FORCE, JSON,
-    )),
-    "plot": Verb("data_commands:run_plot", "Run a design on measured data and draw it: outputs, estimates, residuals, "
-                 "thresholds and alarms.", (
-        GAINS, option("--data", "FILE", _LOG, required=True),
-        option("--out", "FILE", "picture (.png, .svg or .pdf); without it, a window", type=Path),
-        option("--show", "PARTS", "what is drawn, of outputs,faults,residuals,statistic,shares (default: all there "
-               "is)", default="outputs,faults,residuals,statistic,shares"),
-        *DATA_OPTIONS, _EXPECTED, FORCE, JSON, QUIET,
-    )),
-    "report": Verb("data_commands:run_report", "Verify a gain set again and write one self-contained HTML page about "
-                   "it.", (
-        GAINS, option("--out", "FILE", "the page (HTML)", type=Path, required=True),
-        option("--system", "SPEC", "show the design on the scenario of this spec", type=Path),
-        option("--data", "FILE", "show the design on this log as well: text, Parquet, TDMS or MDF file"),
-        option("--rows", "A:B", "rows without faults, which are to agree (default: all)"),
-        *DATA_OPTIONS, FORCE, JSON,
-    )),
-    "linearise": Verb("calibration:run_linearise", "Linearise the nonlinear plant of a spec: exact matrices at rest, "
-                      "or the reason why it never rests.", (
-        SYSTEM,
-        Settings((
-            option("--at", None, "where (default: equilibrium)", choices=("equilibrium", "point")),
-            option("--given", "NAME=VALUE", "value of a state, input, parameter or output there; may be repeated"),
-            option("--free", "NAME[=LOW:HIGH]", "an input or parameter that is solved for, within bounds; may be "
-                   "repeated", action="append", default=[]),
-            option("--fault", "NAME", "a parameter that is a fault (default: all); may be repeated", action="append"),
-            option("--disturbance", "NAME", "an input that is not known; may be repeated", action="append", default=[]),
-            flag("--drift", "take a moving point, with an input 'drift'"),
-        )),
-        option("--data", "FILE", "the log (CSV or Parquet)", type=Path), *LOG_OPTIONS,
-        option("--out", "FILE", "write the linear plant to this file (YAML), at nominal values: for designs that know "
-               "tolerances, give the equations and transform.linearise in the spec", type=Path),
-        JSON, FORCE, QUIET,
-    )),
-    "calibrate": Verb("calibration:run_calibrate", "Fit constants and noise of a plant to a log of rows without "
-                      "faults, with boxes and a verdict.", (
-        SYSTEM, option("--data", "FILE", "the log (CSV or Parquet)", type=Path), *LOG_OPTIONS,
-        option("--unknown", "NAME=LOW:HIGH", "a constant that is to be found, with its bounds, beside those of the "
-               "spec; may be repeated"),
-        Settings((
-            option("--input-delay", "ROWS", "rows by which inputs act later than they are written, or 'auto' (default)",
-                   type=delay),
-            option("--level", "P", "probability of the box (default: 0.95)", type=float),
-        )),
-        option("--out", "FILE", "write the result to this file (JSON)", type=Path), JSON, FORCE, QUIET,
-    )),
-    "validate": Verb("calibration:run_validate", "Ask whether a recorded log without faults agrees with a design.", (
-        GAINS, option("--data", "FILE", "the log (CSV or Parquet)", type=Path, required=True), *LOG_OPTIONS,
-        JSON, QUIET,
-    )),
-    "prove-alarm": Verb("data_commands:run_prove_alarm", "Prove that data up to a row are not explained without a "
-                        "fault by any plant within its tolerances.", (
-        GAINS, option("--data", "FILE", "CSV or Parquet file, as for run", type=Path, required=True),
-        option("--row", "K", "last row of the window, from 1", type=int, required=True),
-        option("--out", "FILE", "write the certificate (JSON) if there is a proof", type=Path), MAP, SCALE,
-        Settings((
-            option("--window", "N", "samples (default: 20)", type=int, default=20),
-            option("--disturbance", "NAME=BOUND", "largest absolute value of a disturbance; may be repeated"),
-            option("--initial", "STATE=BOUND", "bound of a state at the first row (or LOW:HIGH); may be repeated"),
-            option("--state-bound", "STATE=BOUND", "without initial: bound of a state in the window; may be repeated"),
-            option("--noise-bound", "N", "standard deviations that no noise exceeds", type=float),
-        )),
-        JSON, FORCE,
-    )),
-}  # fmt: skip
+    "design": Verb(
+        "commands:run_design",
+        "Design an observer from a spec, prove it, print a report and write the gain set.",
+        (
+            SYSTEM,
+            option(
+                "--output",
+                "FILE",
+                "where to write the gain set (default: <name of the spec>.gains.json in the current folder)",
+                type=Path,
+            ),
+            verbose("every claim and every check"),
+            JSON,
+            FORCE,
+            QUIET,
+        ),
+    ),
+    "check": Verb(
+        "commands:run_check",
+        "Analyse the plant of a spec, and check for every method whether a design can exist.",
+        (
+            SYSTEM,
+            flag("--whole-bank", "look for every structured residual of more than 6 faults, up to 12"),
+            verbose("the structure of the plant and every condition"),
+            JSON,
+        ),
+    ),
+    "verify": Verb(
+        "commands:run_verify",
+        "Verify a saved gain set again, from the plant and the shipped realisation alone.",
+        (
+            option("gains", "FILE", "a gain set that design wrote, or an alarm's certificate", type=Path),
+            option(
+                "--printed-digits", "N", "judge the gains as numbers that were printed with N decimals", type=digits
+            ),
+            verbose("every claim and every check"),
+            JSON,
+        ),
+    ),
+    "simulate": Verb(
+        "scenarios:run_simulate",
+        "Design an observer from a spec, and simulate it on the spec's scenario.",
+        (
+            SYSTEM,
+            SPEC_GAINS,
+            option("--out", "FILE", "write every signal to this file (CSV)", type=Path),
+            JSON,
+            FORCE,
+            QUIET,
+        ),
+    ),
+    "compare": Verb(
+        "scenarios:run_compare",
+        "Design by every method that exists for a spec's plant, and show them side by side on its scenario.",
+        (
+            SYSTEM,
+            option("--data", "FILE", "a log (CSV) to replay through every method", type=Path),
+            option("--out", "FILE", "write a page (HTML) with table and picture", type=Path),
+            option("--runs", "N", "drawn runs of the scenario (default: 20)", type=int, default=20),
+            Settings(
+                (
+                    option(
+                        "--tolerance", "T", "relative error of parameters that is drawn (0.05)", type=float, default=0.0
+                    ),
+                    option("--within", "SECONDS", "90 %% of a step must be shown within this time", type=float),
+                    option("--sample-time", "SECONDS", "the clock of a continuous plant", type=float),
+                )
+            ),
+            FORCE,
+            JSON,
+            QUIET,
+        ),
+    ),
+    "evaluate": Verb(
+        "scenarios:run_evaluate",
+        "Design an observer from a spec, run the spec's scenario many times, and count alarms, delays and errors.",
+        (
+            SYSTEM,
+            SPEC_GAINS,
+            option("--runs", "N", "how many, each with its seed (default: 100)", type=int, default=100),
+            Settings((option("--confidence", "P", "of the intervals (default: 0.95)", type=float, default=0.95),)),
+            option("--plants", "N", "draw N plants from the tolerances, half of them vertices", type=int),
+            JOBS,
+            option(
+                "--tolerances",
+                "LIST",
+                "instead, a fixed bound beside the adaptive threshold for these tolerances, such as 0,1%%,2%%,5%%",
+            ),
+            option("--out", "FILE", "with --tolerances: write the picture (.png, .svg or .pdf)", type=Path),
+            MONITOR,
+            MONITOR_SETTINGS,
+            JSON,
+            FORCE,
+            QUIET,
+        ),
+    ),
+    "sweep": Verb(
+        "sweep:run_sweep",
+        "Design and verify for every combination of specs and values; what fails is a row of the table.",
+        (
+            option("--system", "FILE", "a spec (YAML), or several", type=Path, required=True, nargs="+"),
+            option("--set", "PATH=LIST", "an entry of the specs and its values", action="append", default=[]),
+            option("--out", "FOLDER", "for gain sets, results, table.csv", type=Path, required=True),
+            option("--claim", "NAME", "what the picture shows (default: the most frequent claim)"),
+            JOBS,
+            CLUSTER,
+            JSON,
+            FORCE,
+            QUIET,
+        ),
+        _SWEEP_DETAILS,
+    ),
+    "run": Verb(
+        "data_commands:run_run",
+        "Run a design on measured data: a log, or a stream on standard input, a row in, a row out.",
+        (
+            GAINS,
+            option("--data", "FILE", _LOG, required=True),
+            option(
+                "--out",
+                "FILE",
+                "CSV or Parquet file for the estimates (default: - for stdout); a folder for many gain sets",
+                default="-",
+            ),
+            *DATA_OPTIONS,
+            _EXPECTED,
+            JOBS,
+            CLUSTER,
+            Settings(
+                (
+                    option(
+                        "--outliers",
+                        None,
+                        "recursive and nonlinear designs: leave out samples that their prediction "
+                        "excludes (default), pull them to its limit, or take them as they are",
+                        choices=("gate", "huber", "none"),
+                    ),
+                    option(
+                        "--recovered",
+                        "NAME",
+                        "a state of the plant as written to recover (or all, or none; default: all "
+                        "of up to 300); may be repeated",
+                        action="append",
+                    ),
+                )
+            ),
+            Group(
+                "",
+                (
+                    flag(
+                        "--smooth",
+                        "recursive and nonlinear designs: estimates from the whole log, not only from what came before",
+                    ),
+                    option(
+                        "--lag",
+                        "N",
+                        "the same from the N samples after each row: rows come with N samples of delay, "
+                        "with their own time",
+                        type=int,
+                    ),
+                ),
+            ),
+            option("--state", "FILE", "go on from this saved state if it exists, and save the new one", type=Path),
+            option(
+                "--prove",
+                "FILE",
+                "with --monitor pointwise: prove the first alarm, and write the certificate that 'verify' rechecks",
+                type=Path,
+            ),
+            JSON,
+            FORCE,
+            flag("--quiet", "print no progress and no summary"),
+        ),
+        _RUN_DETAILS,
+    ),
+    "thresholds": Verb(
+        "learned:run_thresholds",
+        "Learn the thresholds of a design from a log without faults, for a rate of false alarms.",
+        (
+            GAINS,
+            option("--data", "FILE", _LOG, required=True),
+            option("--false-alarms", "RATE", "such as '1 per week' or '2 per 1000 rows' (default: '1 per 1000 rows')"),
+            option(
+                "--out",
+                "FILE",
+                "write the thresholds to this file (JSON), for run --monitor learned --normal FILE",
+                type=Path,
+            ),
+            *LOG_OPTIONS,
+            Settings(
+                (
+                    option(
+                        "--time-column",
+                        "COLUMN",
+                        "column of the time, in seconds or as dates (ISO 8601); default: time",
+                    ),
+                    option("--gap", "SECONDS", "continuous designs: longer intervals are gaps", type=float),
+                    option(
+                        "--warm-up", "SECONDS", "how long to leave out the start, and what follows gaps", type=float
+                    ),
+                )
+            ),
+            JSON,
+            FORCE,
+            QUIET,
+        ),
+    ),
+    "export": Verb(
+        "data_commands:run_export",
+        "Write a gain set for Simulink (.mat), numpy (.npz), C99 (.c and .h), "
+        "or as a functional mock-up unit for co-simulation (.fmu); of a recursive design for a "
+        "time-invariant plant, its steady state.",
+        (
+            GAINS,
+            option("--to", "FILE", ".mat, .npz, .c (with a header), or .fmu", type=Path, required=True),
+            option("--sample-time", "SECONDS", "sample a continuous-time observer (needed for C and FMU)", type=float),
+            option("--fmi", None, "version of FMI for .fmu (default: 2.0)", choices=("2.0", "3.0"), default="2.0"),
+            Settings(
+                (
+                    option(
+                        "--threshold",
+                        "OUTPUT=LEVEL",
+                        "for .fmu: alarm when the absolute value of an output, such as "
+                        "fhat[pump], passes a level; may be repeated",
+                    ),
+                    option("--warm-up", "SECONDS", "for .fmu: no alarms in these seconds", type=float),
+                )
+            ),
+            FORCE,
+            JSON,
+        ),
+    ),
+    "plot": Verb(
+        "data_commands:run_plot",
+        "Run a design on measured data and draw it: outputs, estimates, residuals, thresholds and alarms.",
+        (
+            GAINS,
+            option("--data", "FILE", _LOG, required=True),
+            option("--out", "FILE", "picture (.png, .svg or .pdf); without it, a window", type=Path),
+            option(
+                "--show",
+                "PARTS",
+                "what is drawn, of outputs,faults,residuals,statistic,shares (default: all there is)",
+                default="outputs,faults,residuals,statistic,shares",
+            ),
+            *DATA_OPTIONS,
+            _EXPECTED,
+            FORCE,
+            JSON,
+            QUIET,
+        ),
+    ),
+    "report": Verb(
+        "data_commands:run_report",
+        "Verify a gain set again and write one self-contained HTML page about it.",
+        (
+            GAINS,
+            option("--out", "FILE", "the page (HTML)", type=Path, required=True),
+            option("--system", "SPEC", "show the design on the scenario of this spec", type=Path),
+            option("--data", "FILE", "show the design on this log as well: text, Parquet, TDMS or MDF file"),
+            option("--rows", "A:B", "rows without faults, which are to agree (default: all)"),
+            *DATA_OPTIONS,
+            FORCE,
+            JSON,
+        ),
+    ),
+    "linearise": Verb(
+        "calibration:run_linearise",
+        "Linearise the nonlinear plant of a spec: exact matrices at rest, or the reason why it never rests.",
+        (
+            SYSTEM,
+            Settings(
+                (
+                    option("--at", None, "where (default: equilibrium)", choices=("equilibrium", "point")),
+                    option(
+                        "--given", "NAME=VALUE", "value of a state, input, parameter or output there; may be repeated"
+                    ),
+                    option(
+                        "--free",
+                        "NAME[=LOW:HIGH]",
+                        "an input or parameter that is solved for, within bounds; may be repeated",
+                        action="append",
+                        default=[],
+                    ),
+                    option(
+                        "--fault",
+                        "NAME",
+                        "a parameter that is a fault (default: all); may be repeated",
+                        action="append",
+                    ),
+                    option(
+                        "--disturbance",
+                        "NAME",
+                        "an input that is not known; may be repeated",
+                        action="append",
+                        default=[],
+                    ),
+                    flag("--drift", "take a moving point, with an input 'drift'"),
+                )
+            ),
+            option("--data", "FILE", "the log (CSV or Parquet)", type=Path),
+            *LOG_OPTIONS,
+            option(
+                "--out",
+                "FILE",
+                "write the linear plant to this file (YAML), at nominal values: for designs that know "
+                "tolerances, give the equations and transform.linearise in the spec",
+                type=Path,
+            ),
+            JSON,
+            FORCE,
+            QUIET,
+        ),
+    ),
+    "calibrate": Verb(
+        "calibration:run_calibrate",
+        "Fit constants and noise of a plant to a log of rows without faults, with boxes and a verdict.",
+        (
+            SYSTEM,
+            option("--data", "FILE", "the log (CSV or Parquet)", type=Path),
+            *LOG_OPTIONS,
+            option(
+                "--unknown",
+                "NAME=LOW:HIGH",
+                "a constant that is to be found, with its bounds, beside those of the spec; may be repeated",
+            ),
+            Settings(
+                (
+                    option(
+                        "--input-delay",
+                        "ROWS",
+                        "rows by which inputs act later than they are written, or 'auto' (default)",
+                        type=delay,
+                    ),
+                    option("--level", "P", "probability of the box (default: 0.95)", type=float),
+                )
+            ),
+            option("--out", "FILE", "write the result to this file (JSON)", type=Path),
+            JSON,
+            FORCE,
+            QUIET,
+        ),
+    ),
+    "validate": Verb(
+        "calibration:run_validate",
+        "Ask whether a recorded log without faults agrees with a design.",
+        (
+            GAINS,
+            option("--data", "FILE", "the log (CSV or Parquet)", type=Path, required=True),
+            *LOG_OPTIONS,
+            JSON,
+            QUIET,
+        ),
+    ),
+    "prove-alarm": Verb(
+        "data_commands:run_prove_alarm",
+        "Prove that data up to a row are not explained without a fault by any plant within its tolerances.",
+        (
+            GAINS,
+            option("--data", "FILE", "CSV or Parquet file, as for run", type=Path, required=True),
+            option("--row", "K", "last row of the window, from 1", type=int, required=True),
+            option("--out", "FILE", "write the certificate (JSON) if there is a proof", type=Path),
+            MAP,
+            SCALE,
+            Settings(
+                (
+                    option("--window", "N", "samples (default: 20)", type=int, default=20),
+                    option("--disturbance", "NAME=BOUND", "largest absolute value of a disturbance; may be repeated"),
+                    option(
+                        "--initial", "STATE=BOUND", "bound of a state at the first row (or LOW:HIGH); may be repeated"
+                    ),
+                    option(
+                        "--state-bound",
+                        "STATE=BOUND",
+                        "without initial: bound of a state in the window; may be repeated",
+                    ),
+                    option("--noise-bound", "N", "standard deviations that no noise exceeds", type=float),
+                )
+            ),
+            JSON,
+            FORCE,
+        ),
+    ),
+}
 
 
 def obsynth_parser() -> argparse.ArgumentParser:
     """Return the parser of ``obsynth``, with all its verbs."""
-    parser = _parser("obsynth", "Observers and fault-estimation filters for descriptor systems: designed, proved "
-                     "again, and run.")  # fmt: skip
+    parser = _parser(
+        "obsynth", "Observers and fault-estimation filters for descriptor systems: designed, proved again, and run."
+    )
     verbs: Any = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for name, verb in VERBS.items():
-        _fill(name, verbs.add_parser(
-            name, help=verb.told, description=verb.told, epilog=verb.epilog,
-            formatter_class=argparse.RawDescriptionHelpFormatter if verb.epilog else argparse.HelpFormatter,
-        ))  # fmt: skip
+        _fill(
+            name,
+            verbs.add_parser(
+                name,
+                help=verb.told,
+                description=verb.told,
+                epilog=verb.epilog,
+                formatter_class=argparse.RawDescriptionHelpFormatter if verb.epilog else argparse.HelpFormatter,
+            ),
+        )
     return parser
 
 

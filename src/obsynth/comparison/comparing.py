@@ -270,9 +270,15 @@ def compare(
     truth = drawn.faults if log is None else log.truth
     best = next((entry for entry in compared if not entry.refused), None)
     return Comparison(
-        tuple(compared), "" if best is None else best.method, _reason(best, compared, sampled), dt, read_only(times),
-        read_only(truth), plant.fault_names, setting,
-    )  # fmt: skip
+        tuple(compared),
+        "" if best is None else best.method,
+        _reason(best, compared, sampled),
+        dt,
+        read_only(times),
+        read_only(truth),
+        plant.fault_names,
+        setting,
+    )
 
 
 def _checked_methods(methods: Sequence[str] | None) -> list[str]:
@@ -299,10 +305,14 @@ def _scenario(plant: DescriptorSystem, given: Scenario | None, dt: float, distur
     }
     frequency = PERIOD_SHARE / settle
     return Scenario(
-        horizon=min(plant.nf * length, MOST_STEPS * dt), sample_time=None if plant.dt else dt, faults=faults, noise=1.0,
+        horizon=min(plant.nf * length, MOST_STEPS * dt),
+        sample_time=None if plant.dt else dt,
+        faults=faults,
+        noise=1.0,
         disturbances={name: Sine(amplitude=disturbance, frequency=frequency) for name in plant.disturbance_names}
-        if disturbance else {},
-    )  # fmt: skip
+        if disturbance
+        else {},
+    )
 
 
 class _Log(NamedTuple):
@@ -359,14 +369,20 @@ def _numbers(frame: Any, names: list[str]) -> FloatArray:
     try:
         return np.asarray(frame[names].to_numpy(dtype=np.float64))
     except (ValueError, TypeError, OverflowError) as error:
-        raise SpecError(f"{', '.join(map(repr, names))}: the log holds what is no number: {error}.",
-                        path="data") from error  # fmt: skip
+        raise SpecError(
+            f"{', '.join(map(repr, names))}: the log holds what is no number: {error}.", path="data"
+        ) from error
 
 
 def _compared(
-    entry: Candidate, plant: DescriptorSystem, drawn: DrawnRuns, log: _Log | None, kept: Held, limit: float,
+    entry: Candidate,
+    plant: DescriptorSystem,
+    drawn: DrawnRuns,
+    log: _Log | None,
+    kept: Held,
+    limit: float,
     false_alarms: float,
-) -> ComparedMethod:  # fmt: skip
+) -> ComparedMethod:
     nothing = np.zeros((0, 0))
     if entry.observer is None:
         return ComparedMethod(entry.method, entry.refused, None, 0, entry.milliseconds, (), False, nothing, nothing)
@@ -390,9 +406,16 @@ def _compared(
     fast = all(fault.figures.reaches and fault.figures.most <= limit for fault in rows)
     own = np.column_stack([responses[:, i, plant.fault_names.index(f.fault)] for i, f in enumerate(entry.figures)])
     return ComparedMethod(
-        entry.method, "", entry.design, observer.order, entry.milliseconds, tuple(rows), fast, read_only(own),
+        entry.method,
+        "",
+        entry.design,
+        observer.order,
+        entry.milliseconds,
+        tuple(rows),
+        fast,
+        read_only(own),
         read_only(shown),
-    )  # fmt: skip
+    )
 
 
 def _reason(best: ComparedMethod | None, compared: Sequence[ComparedMethod], plant: DescriptorSystem) -> str:

@@ -93,9 +93,21 @@ SHOWN = 0.98
 #: What the page of a comparison begins with.
 COMPARISON_PAGE = FileKind("a comparison of obsynth", rb'name="generator" content="obsynth compare"')
 _HEADER = (
-    "method", "fault", "order", "50 % s", "90 % s", "at horizon", "peak", "deviation", "leak", "bias", "alarm s",
-    "smallest", "rms", "ms",
-)  # fmt: skip
+    "method",
+    "fault",
+    "order",
+    "50 % s",
+    "90 % s",
+    "at horizon",
+    "peak",
+    "deviation",
+    "leak",
+    "bias",
+    "alarm s",
+    "smallest",
+    "rms",
+    "ms",
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,13 +156,26 @@ class Comparison:
             for k, fault in enumerate(entry.faults):
                 figures = fault.figures
                 numbers = (
-                    figures.half, figures.most, figures.at_horizon, figures.peak, figures.deviation, figures.leak,
-                    fault.bias, fault.detection_delay, fault.smallest_found, fault.rms,
-                )  # fmt: skip
-                rows.append((
-                    entry.method if k == 0 else "", figures.fault, str(entry.order) if k == 0 else "",
-                    *(_number(value) for value in numbers), f"{entry.milliseconds:.0f}" if k == 0 else "",
-                ))  # fmt: skip
+                    figures.half,
+                    figures.most,
+                    figures.at_horizon,
+                    figures.peak,
+                    figures.deviation,
+                    figures.leak,
+                    fault.bias,
+                    fault.detection_delay,
+                    fault.smallest_found,
+                    fault.rms,
+                )
+                rows.append(
+                    (
+                        entry.method if k == 0 else "",
+                        figures.fault,
+                        str(entry.order) if k == 0 else "",
+                        *(_number(value) for value in numbers),
+                        f"{entry.milliseconds:.0f}" if k == 0 else "",
+                    )
+                )
         return (_HEADER, *rows)
 
     @property
@@ -162,12 +187,18 @@ class Comparison:
         """Return the comparison as plain data."""
         header, *rows = self.rows()
         return {
-            "recommended": self.recommended, "reason": self.reason, "sample_time": self.sample_time,
-            "setting": self.setting, "refusals": list(self.refusals),
+            "recommended": self.recommended,
+            "reason": self.reason,
+            "sample_time": self.sample_time,
+            "setting": self.setting,
+            "refusals": list(self.refusals),
             "rows": [dict(zip(header, row, strict=True)) for row in rows],
             "methods": [
                 {
-                    "method": entry.method, "order": entry.order, "fast_enough": entry.fast_enough, "rms": entry.rms,
+                    "method": entry.method,
+                    "order": entry.order,
+                    "fast_enough": entry.fast_enough,
+                    "rms": entry.rms,
                     "faults": [
                         {**vars(fault.figures), **{k: v for k, v in vars(fault).items() if k != "figures"}}
                         for fault in entry.faults
@@ -176,7 +207,7 @@ class Comparison:
                 for entry in self.methods
                 if not entry.refused
             ],
-        }  # fmt: skip
+        }
 
     def plot(self) -> Figure:
         """Return a figure: for each fault, what each method makes of a unit step, and its estimate on the scenario."""

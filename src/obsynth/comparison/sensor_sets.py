@@ -93,11 +93,14 @@ class SensorSets:
     def to_dict(self) -> dict[str, Any]:
         """Return the result as plain data."""
         return {
-            "goal": self.goal, "exact": self.exact, "out_of_reach": list(self.out_of_reach),
+            "goal": self.goal,
+            "exact": self.exact,
+            "out_of_reach": list(self.out_of_reach),
             "may_be_lost": list(self.may_be_lost),
-            "lost_without": {name: list(lost) for name, lost in self.lost_without.items()}, "notes": list(self.notes),
+            "lost_without": {name: list(lost) for name, lost in self.lost_without.items()},
+            "notes": list(self.notes),
             "sets": [{**vars(found), "sensors": list(found.sensors)} for found in self.sets],
-        }  # fmt: skip
+        }
 
     def __str__(self) -> str:
         lines = [line.rstrip() for line in text_table(self.rows())]
@@ -198,8 +201,9 @@ def sensor_sets(
         raise PreconditionError(
             f"Not even all {len(sensors)} candidates together let any fault be had: to {goal} is out of reach. Give "
             "other candidates, or a weaker goal.",
-            condition="sensors", signals=tuple(plant.fault_names[i] for i in chosen),
-        )  # fmt: skip
+            condition="sensors",
+            signals=tuple(plant.fault_names[i] for i in chosen),
+        )
     report_stage("searching for least sets")
     bound = largest if largest is not None else min(plant.nd + len(chosen) + 1 + may_fail, len(sensors) * copies)
     found, exact = search.minimal_sets(wanted, bound, most)
@@ -293,9 +297,14 @@ def _lost_without(plant: DescriptorSystem, had: Sequence[Task], output: int) -> 
     """Return the faults of what the plant reaches that are lost without one of its outputs."""
     rest = [i for i in range(plant.ny) if i != output]
     fewer = plant.replace(
-        C=plant.C[rest], D=plant.D[rest], Dd=plant.Dd[rest], Df=plant.Df[rest], Dw=plant.Dw[rest],
+        C=plant.C[rest],
+        D=plant.D[rest],
+        Dd=plant.Dd[rest],
+        Df=plant.Df[rest],
+        Dw=plant.Dw[rest],
         output_names=[plant.output_names[i] for i in rest],
         scales={name: value for name, value in plant.scales.items() if name != plant.output_names[output]},
-        units={}, operating_point={},
-    )  # fmt: skip
+        units={},
+        operating_point={},
+    )
     return tuple(dict.fromkeys(plant.fault_names[task.fault] for task in had if not reached(fewer, task)))

@@ -26,9 +26,20 @@ MARGIN = 1e-9
 
 
 def bounded_real(
-    A: Any, B: Any, C: Any, D: Any, P: Any, gamma: Any, dt: float,
-    *, Y: Any = None, Cy: Any = None, Dy: Any = None, gamma_squared: Any = None, margin: float = MARGIN,
-) -> list[cvxpy.Constraint]:  # fmt: skip
+    A: Any,
+    B: Any,
+    C: Any,
+    D: Any,
+    P: Any,
+    gamma: Any,
+    dt: float,
+    *,
+    Y: Any = None,
+    Cy: Any = None,
+    Dy: Any = None,
+    gamma_squared: Any = None,
+    margin: float = MARGIN,
+) -> list[cvxpy.Constraint]:
     r"""Return the bounded real inequality: A is stable and the H-infinity norm from w to z is below gamma.
 
     .. math::
@@ -74,21 +85,33 @@ def bounded_real(
     pa, pb = _moved(A, P, Y, Cy), _moved(B, P, Y, Dy)
     level = _square(gamma) if gamma_squared is None else gamma_squared
     if dt > 0.0:
-        whole = lmi.symmetric_blocks([
-            [P],
-            [np.zeros((nw, n)), level * np.eye(nw)],
-            [pa, pb, P],
-            [C, D, np.zeros((nz, n)), np.eye(nz)],
-        ])  # fmt: skip
+        whole = lmi.symmetric_blocks(
+            [
+                [P],
+                [np.zeros((nw, n)), level * np.eye(nw)],
+                [pa, pb, P],
+                [C, D, np.zeros((nz, n)), np.eye(nz)],
+            ]
+        )
     else:
         whole = -lmi.symmetric_blocks([[pa + pa.T], [pb.T, -level * np.eye(nw)], [C, D, -np.eye(nz)]])
     return [lmi.at_least(P, margin), lmi.at_least(whole, margin)]
 
 
 def h2(
-    A: Any, B: Any, C: Any, D: Any, P: Any, Z: Any, dt: float,
-    *, Y: Any = None, Cy: Any = None, Dy: Any = None, margin: float = MARGIN,
-) -> list[cvxpy.Constraint]:  # fmt: skip
+    A: Any,
+    B: Any,
+    C: Any,
+    D: Any,
+    P: Any,
+    Z: Any,
+    dt: float,
+    *,
+    Y: Any = None,
+    Cy: Any = None,
+    Dy: Any = None,
+    margin: float = MARGIN,
+) -> list[cvxpy.Constraint]:
     r"""Return the H2 inequalities: A is stable and the squared H2 norm from w to z is below the trace of Z.
 
     .. math::
@@ -181,9 +204,7 @@ def region(
     _square_matrix(A, P)
     pa = _moved(A, P, Y, Cy)
     k = len(where.L)
-    blocks = [
-        [where.L[i, j] * P + where.M[i, j] * pa + where.M[j, i] * pa.T for j in range(i + 1)] for i in range(k)
-    ]  # fmt: skip
+    blocks = [[where.L[i, j] * P + where.M[i, j] * pa + where.M[j, i] * pa.T for j in range(i + 1)] for i in range(k)]
     return [lmi.at_least(P, margin), lmi.at_most(lmi.symmetric_blocks(blocks), -margin)]
 
 

@@ -45,9 +45,14 @@ LEFT_TO_THE_SOLVER = ("nf <= ny", "rank F", "detectability", "rank [A F; C Df]")
 
 
 def filasova_theorem1(
-    plant: DescriptorSystem | Transformation, *, delta: float, reading: str = "safe", decay: float = 0.0,
-    region: LMIRegion | None = None, margin: float = MARGIN,
-) -> Conditions:  # fmt: skip
+    plant: DescriptorSystem | Transformation,
+    *,
+    delta: float,
+    reading: str = "safe",
+    decay: float = 0.0,
+    region: LMIRegion | None = None,
+    margin: float = MARGIN,
+) -> Conditions:
     """Return Theorem 1 of Filasova, Krokavec and Serbak: (40)-(43) in P1, P3, Y, Z.
 
     Parameters
@@ -87,9 +92,14 @@ def filasova_theorem1(
 
 
 def filasova_theorem2(
-    plant: DescriptorSystem | Transformation, *, delta: float, reading: str = "safe", decay: float = 0.0,
-    region: LMIRegion | None = None, margin: float = MARGIN,
-) -> Conditions:  # fmt: skip
+    plant: DescriptorSystem | Transformation,
+    *,
+    delta: float,
+    reading: str = "safe",
+    decay: float = 0.0,
+    region: LMIRegion | None = None,
+    margin: float = MARGIN,
+) -> Conditions:
     """Return Theorem 2 of Filasova, Krokavec and Serbak: (61)-(64) in P1 (the paper's P), P3 (its Q), Y, Z.
 
     Parameters
@@ -128,9 +138,14 @@ def filasova_theorem2(
 
 
 def _theorem(
-    plant: DescriptorSystem | Transformation, theorem: int, delta: Any, reading: Any, decay: Any, margin: float,
+    plant: DescriptorSystem | Transformation,
+    theorem: int,
+    delta: Any,
+    reading: Any,
+    decay: Any,
+    margin: float,
     region: LMIRegion | None,
-) -> Conditions:  # fmt: skip
+) -> Conditions:
     import cvxpy as cp
 
     for name, number, least in (("delta", delta, "above 0"), ("decay", decay, "at least 0")):
@@ -176,9 +191,15 @@ def _theorem(
 
     return Conditions(
         f"Filasova, Krokavec, Serbak, Theorem {theorem}, {names[0]}-({43 if theorem == 1 else 64}), {reading}",
-        cp.Problem(goal, list(constraints.values())), variables, {},
-        {"A_o": A_o, "C_o": C_o}, constraints, lambda: held, gains, partial(_design, plant, float(decay)),
-    )  # fmt: skip
+        cp.Problem(goal, list(constraints.values())),
+        variables,
+        {},
+        {"A_o": A_o, "C_o": C_o},
+        constraints,
+        lambda: held,
+        gains,
+        partial(_design, plant, float(decay)),
+    )
 
 
 def _fitting(region: Any, delta: float) -> LMIRegion:
@@ -187,8 +208,9 @@ def _fitting(region: Any, delta: float) -> LMIRegion:
     if not where.contains([-1.0 / delta]):
         raise SpecError(
             f"delta is {delta:g}, and -1 / delta = {-1.0 / delta:g} lies outside {where}: no P satisfies both. Choose "
-            "delta so that -1 / delta lies inside.", path="delta",
-        )  # fmt: skip
+            "delta so that -1 / delta lies inside.",
+            path="delta",
+        )
     return where
 
 
@@ -202,10 +224,12 @@ def _region(where: LMIRegion, P: Any, moving: Any, still: Any, delta: float, mar
 
     n, k = still.shape[0], len(where.L)
     left, right = cp.kron(np.eye(k), moving), cp.kron(np.eye(k), still)
-    whole = lmi.symmetric_blocks([
-        [cp.kron(where.L, P) + left + left.T],
-        [cp.kron(where.M.T, P) + delta * left - right.T, -delta * (right + right.T)],
-    ])  # fmt: skip
+    whole = lmi.symmetric_blocks(
+        [
+            [cp.kron(where.L, P) + left + left.T],
+            [cp.kron(where.M.T, P) + delta * left - right.T, -delta * (right + right.T)],
+        ]
+    )
     # P > 0 follows where L < 0 does not; asked for in the same block, so that it is one constraint.
     zero = np.zeros((n, 2 * k * n))
     return lmi.at_most(cp.bmat([[whole, zero.T], [zero, -P]]), -margin)

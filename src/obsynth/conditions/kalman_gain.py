@@ -42,9 +42,12 @@ SAME_GAIN = 1e-3
 
 
 def kalman(
-    plant: DescriptorSystem | Transformation, *, Q: ArrayLike | None = None, R: ArrayLike | None = None,
+    plant: DescriptorSystem | Transformation,
+    *,
+    Q: ArrayLike | None = None,
+    R: ArrayLike | None = None,
     margin: float = atoms.MARGIN,
-) -> Conditions:  # fmt: skip
+) -> Conditions:
     """Return the steady descriptor Kalman gain as the H2 inequalities in P, Y and Z.
 
     Parameters
@@ -94,17 +97,23 @@ def kalman(
             if not miss <= SAME_GAIN:
                 raise VerificationError(
                     f"{letter} of the inequality misses the gain that the recursion tends to by {miss:.3g} of its "
-                    "size: with other constraints or another objective this is no Kalman filter.", report=made.report,
-                )  # fmt: skip
+                    "size: with other constraints or another objective this is no Kalman filter.",
+                    report=made.report,
+                )
         return made
 
     return steady_gain(varying, process, sensor, margin=margin, held=held, design=design)
 
 
 def steady_gain(
-    varying: TimeVaryingDescriptorSystem, process: FloatArray, sensor: FloatArray, *, margin: float,
-    held: Sequence[Condition], design: Callable[[dict[str, FloatArray], str], ObserverDesign],
-) -> Conditions:  # fmt: skip
+    varying: TimeVaryingDescriptorSystem,
+    process: FloatArray,
+    sensor: FloatArray,
+    *,
+    margin: float,
+    held: Sequence[Condition],
+    design: Callable[[dict[str, FloatArray], str], ObserverDesign],
+) -> Conditions:
     """Return the inequalities of a plant without unknown inputs, constant matrices, with its covariances."""
     import cvxpy as cp
 
@@ -120,9 +129,18 @@ def steady_gain(
     P, Z = cp.Variable((n, n), symmetric=True, name="P"), cp.Variable((nw, nw), symmetric=True, name="Z")
     Y = cp.Variable((n, m), name="Y")
     stable, covariance = atoms.h2(
-        L0 @ A, np.hstack([L0 @ W, -K0 @ V]), np.eye(n), np.zeros((n, nw)), P, Z, varying.dt,
-        Y=Y, Cy=-N1 @ A, Dy=np.hstack([-N1 @ W, N2 @ V]), margin=margin,
-    )  # fmt: skip
+        L0 @ A,
+        np.hstack([L0 @ W, -K0 @ V]),
+        np.eye(n),
+        np.zeros((n, nw)),
+        P,
+        Z,
+        varying.dt,
+        Y=Y,
+        Cy=-N1 @ A,
+        Dy=np.hstack([-N1 @ W, N2 @ V]),
+        margin=margin,
+    )
     constraints = {"(13) stable": stable, "(13) covariance": covariance}
 
     def gains(values: Values) -> dict[str, FloatArray]:
@@ -131,13 +149,18 @@ def steady_gain(
         driven = np.hstack([L @ W, -K @ V])
         return {"L": L, "K": K, "covariance": output_covariance(L @ A, driven, np.eye(n), np.zeros((n, nw)))}
 
-    data = {"E": E, "A": A, "C": C, "L0": L0, "K0": K0, "N1": N1, "N2": N2, "Q": process, "R": sensor,
-            "W": W, "V": V}  # fmt: skip
+    data = {"E": E, "A": A, "C": C, "L0": L0, "K0": K0, "N1": N1, "N2": N2, "Q": process, "R": sensor, "W": W, "V": V}
     return Conditions(
         "Moussa Ali, Zhang 2013, (10)-(13): steady Kalman gain as an H2 inequality",
-        cp.Problem(cp.Minimize(cp.trace(Z)), list(constraints.values())), {"P": P, "Y": Y, "Z": Z}, {}, data,
-        constraints, lambda: held, gains, design,
-    )  # fmt: skip
+        cp.Problem(cp.Minimize(cp.trace(Z)), list(constraints.values())),
+        {"P": P, "Y": Y, "Z": Z},
+        {},
+        data,
+        constraints,
+        lambda: held,
+        gains,
+        design,
+    )
 
 
 def _noisy_plant(own: DescriptorSystem, Q: Any, R: Any) -> tuple[TimeVaryingDescriptorSystem, FloatArray, FloatArray]:

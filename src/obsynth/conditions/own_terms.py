@@ -84,9 +84,7 @@ def filter_by_inequality(
         # The bare optimum is badly conditioned: a little more gain buys small matrices.
         least = float(np.sqrt(max(squared.value, 0.0)))
         level = (1.0 + asked.gamma_margin) * least if asked.gamma is None else asked.gamma
-        found = found.changed(
-            constraints={"gamma": squared <= level**2}, objective=cp.trace(P) + cp.norm(Y, "fro")
-        )  # fmt: skip
+        found = found.changed(constraints={"gamma": squared <= level**2}, objective=cp.trace(P) + cp.norm(Y, "fro"))
         runs.append(_solved(found, asked))
     gains = found.gains()
     work = with_sensor_faults_as_states(plant)
@@ -130,9 +128,7 @@ def pd_by_inequality(plant: DescriptorSystem, asked: PdObserver, *, progress: Ca
     return _told(made, asked, found, runs, where, delta=delta, decay=decay)
 
 
-def ui_pi_by_inequality(
-    plant: DescriptorSystem, asked: UiPiObserver, *, progress: Callable[[str], None]
-) -> Synthesis:  # fmt: skip
+def ui_pi_by_inequality(plant: DescriptorSystem, asked: UiPiObserver, *, progress: Callable[[str], None]) -> Synthesis:
     """Return a UI-PI observer by its inequality with what was asked for in it; see `obsynth.ui_pi_observer`."""
     progress("checking the existence conditions")
     model = exosystem(asked.fault_model, plant.fault_names, plant.dt)
@@ -141,7 +137,7 @@ def ui_pi_by_inequality(
     where = _region_of_poles(asked, plant.dt)
     found = sharepasand(
         plant, fault_model=asked.fault_model, region=where, E_sharp=asked.E_sharp, C_sharp=asked.C_sharp, G=asked.G
-    )  # fmt: skip
+    )
     goal = asked.objective(found.variables) if callable(asked.objective) else None
     found = found.changed(constraints=_with_own(asked, found, {}), objective=goal)
     progress("solving the matrix inequality")
@@ -201,8 +197,10 @@ def _require_origin(where: LMIRegion) -> None:
     if not where.contains([0.0]):
         raise PreconditionError(
             f"No filter has all its eigenvalues in {where}: (32) puts those of the fault directions at 0. Give a "
-            "region with 0 in it.", condition="region", mode=0j,
-        )  # fmt: skip
+            "region with 0 in it.",
+            condition="region",
+            mode=0j,
+        )
 
 
 def _require_inside(closed: FloatArray, where: LMIRegion | None) -> None:
@@ -229,9 +227,17 @@ def _h2_terms(plant: DescriptorSystem, found: Conditions, added: dict[str, Any])
     Z = cp.Variable((b.shape[1], b.shape[1]), symmetric=True, name="Z")
     weight = found.weight if found.weight is not None else data["W"]
     stable, variance = atoms.h2(
-        data["A1"], entering, weight @ work.C, weight @ rest @ d, found.variables["P"], Z, plant.dt,
-        Y=found.variables["Y"], Cy=data["C1"], Dy=measured,
-    )  # fmt: skip
+        data["A1"],
+        entering,
+        weight @ work.C,
+        weight @ rest @ d,
+        found.variables["P"],
+        Z,
+        plant.dt,
+        Y=found.variables["Y"],
+        Cy=data["C1"],
+        Dy=measured,
+    )
     added["H2 stable"], added["H2"] = stable, variance
     return cp.trace(Z)
 
@@ -263,8 +269,9 @@ def _solved(found: Conditions, asked: Any) -> dict[str, Any]:
         raise SolverError(
             f"{name} ended with status {record['status']!r} for {found.source} with "
             f"{', '.join(map(repr, found.constraints))}: with these constraints nothing was found. Relax them, or take "
-            "another solver.", record=record,
-        )  # fmt: skip
+            "another solver.",
+            record=record,
+        )
     return record
 
 
@@ -276,6 +283,4 @@ def _told(
     options.pop("model_error", None)
     imposed = f", and every eigenvalue in {where}" if where is not None else ""
     note = f"The inequality was solved as it stands in the paper, with {', '.join(found.constraints)}{imposed}."
-    return replace(
-        made, options=options, solver={"engine": "lmi", "runs": runs}, notes=(note, *made.notes)
-    )  # fmt: skip
+    return replace(made, options=options, solver={"engine": "lmi", "runs": runs}, notes=(note, *made.notes))

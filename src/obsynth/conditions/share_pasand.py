@@ -59,10 +59,16 @@ _RATES, _NUMBERS = -np.logspace(-6, 9, 151), np.linspace(-1.0, 1.0, 401)
 
 
 def sharepasand(
-    plant: DescriptorSystem | Transformation, *, fault_model: Any = "step", region: LMIRegion | None = None,
-    poles: Sequence[Any] | None = None, E_sharp: ArrayLike | None = None, C_sharp: ArrayLike | None = None,
-    G: ArrayLike | None = None, margin: float = atoms.MARGIN,
-) -> Conditions:  # fmt: skip
+    plant: DescriptorSystem | Transformation,
+    *,
+    fault_model: Any = "step",
+    region: LMIRegion | None = None,
+    poles: Sequence[Any] | None = None,
+    E_sharp: ArrayLike | None = None,
+    C_sharp: ArrayLike | None = None,
+    G: ArrayLike | None = None,
+    margin: float = atoms.MARGIN,
+) -> Conditions:
     """Return the unknown-input PI observer: the decoupling as data, and the gain by a region or by poles.
 
     Parameters
@@ -109,16 +115,29 @@ def sharepasand(
     parts = _decoupling(found.plant, E_sharp, C_sharp, G)  # (10), (11)
     target = plant if found.transformation is None else found.transformation
     return augmented_problem(
-        found.plant, model, with_faults(parts.U, parts.Dhat, found.plant, model), region=region, poles=poles,
-        margin=margin, held=found.conditions, design=partial(_design, target, fault_model),
-    )  # fmt: skip
+        found.plant,
+        model,
+        with_faults(parts.U, parts.Dhat, found.plant, model),
+        region=region,
+        poles=poles,
+        margin=margin,
+        held=found.conditions,
+        design=partial(_design, target, fault_model),
+    )
 
 
 def augmented_problem(
-    plant: DescriptorSystem, model: Exosystem, decoupling: tuple[FloatArray, FloatArray], *, margin: float,
-    held: Sequence[Condition], design: Callable[[dict[str, FloatArray], str], ObserverDesign],
-    region: LMIRegion | None = None, poles: Sequence[Any] | None = None, X: FloatArray | None = None,
-) -> Conditions:  # fmt: skip
+    plant: DescriptorSystem,
+    model: Exosystem,
+    decoupling: tuple[FloatArray, FloatArray],
+    *,
+    margin: float,
+    held: Sequence[Condition],
+    design: Callable[[dict[str, FloatArray], str], ObserverDesign],
+    region: LMIRegion | None = None,
+    poles: Sequence[Any] | None = None,
+    X: FloatArray | None = None,
+) -> Conditions:
     """Return the conditions for given ``U_a (na, na)`` and ``D_a (na, ny)`` (19), in coordinates ``X (na, na)``."""
     import cvxpy as cp
 
@@ -159,14 +178,29 @@ def augmented_problem(
         return {**letters, "U": U_a[:nx, :nx], "D": D_a[:nx], "K": K_a[:nx], "F": K_a[nx:]}
 
     data = {
-        "U_a": U_a, "D_a": D_a, "E_a": whole.E, "A_a": whole.A, "B_da": whole.Bd, "C_a": whole.C, "UA": UA,
-        "C_seen": shown, "X": X, "Phi": model.Phi, "Cw": model.Cw,
-    }  # fmt: skip
+        "U_a": U_a,
+        "D_a": D_a,
+        "E_a": whole.E,
+        "A_a": whole.A,
+        "B_da": whole.Bd,
+        "C_a": whole.C,
+        "UA": UA,
+        "C_seen": shown,
+        "X": X,
+        "Phi": model.Phi,
+        "Cw": model.Cw,
+    }
     return Conditions(
         "Share Pasand, Aliyari, Taghirad, (13), (19), procedure 1",
-        cp.Problem(cp.Minimize(goal), list(constraints.values())), variables, {}, data, constraints, lambda: held,
-        gains, design,
-    )  # fmt: skip
+        cp.Problem(cp.Minimize(goal), list(constraints.values())),
+        variables,
+        {},
+        data,
+        constraints,
+        lambda: held,
+        gains,
+        design,
+    )
 
 
 def _coordinates(F: FloatArray, C: FloatArray, where: LMIRegion, *, discrete: bool) -> FloatArray:

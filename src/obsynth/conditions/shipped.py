@@ -23,9 +23,11 @@ from obsynth.results.design import ObserverDesign
 def conditions_of(design: ObserverDesign) -> Conditions:
     """Return the conditions of a design's paper, every variable with the value that the certificate gives it."""
     makers = {
-        "fault-estimation-filter": _wang, "pd-observer": _filasova, "ui-pi-observer": _share_pasand,
+        "fault-estimation-filter": _wang,
+        "pd-observer": _filasova,
+        "ui-pi-observer": _share_pasand,
         "descriptor-kalman": _kalman,
-    }  # fmt: skip
+    }
     if design.method not in makers:
         raise SpecError(
             f"Method {design.method!r} is not made of matrix inequalities; those that are: {', '.join(makers)}.",

@@ -50,10 +50,16 @@ ROOMS = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2)
 
 
 def wang2015(
-    plant: DescriptorSystem | Transformation, *, gamma: float | None = None, S: ArrayLike | None = None,
-    T: ArrayLike | None = None, N: ArrayLike | None = None, W: ArrayLike | str | None = None,
-    coordinates: str = "plant", margin: float = MARGIN,
-) -> Conditions:  # fmt: skip
+    plant: DescriptorSystem | Transformation,
+    *,
+    gamma: float | None = None,
+    S: ArrayLike | None = None,
+    T: ArrayLike | None = None,
+    N: ArrayLike | None = None,
+    W: ArrayLike | str | None = None,
+    coordinates: str = "plant",
+    margin: float = MARGIN,
+) -> Conditions:
     r"""Return Theorem 2 of Wang et al. 2015: the inequality (45) in P and Y.
 
     Parameters
@@ -123,9 +129,17 @@ def wang2015(
     shown_d = (np.eye(m) - C @ N) @ work.Dd  # of d in the innovation: zero in the paper, as D1 and Zd
     TD, D1 = T @ D - TA @ (N @ work.Dd) - L0 @ shown_d, rest @ shown_d
     convex = GainProblem(
-        A1, V.T @ C, W0 @ C, TD, V.T @ shown_d, W0 @ shown_d, np.zeros((n, m - q)), -np.eye(m - q),
-        np.zeros((q, m - q)), free,
-    )  # fmt: skip
+        A1,
+        V.T @ C,
+        W0 @ C,
+        TD,
+        V.T @ shown_d,
+        W0 @ shown_d,
+        np.zeros((n, m - q)),
+        -np.eye(m - q),
+        np.zeros((q, m - q)),
+        free,
+    )
     X, R0, unit = as_matrix(np.eye(n), "X"), np.zeros((n, m)), 1.0
     if chosen(coordinates, "coordinates", ("plant", "balanced")) == "balanced":
         start = search_least_gain(convex, solver=AUTO, polish=False)
@@ -150,19 +164,23 @@ def wang2015(
             del variables["Vw"]
         Wx = W0 + Vw @ V.T  # every left inverse of Upsilon
         Z, Zd = Wx @ (C @ X), Wx @ (shown_d / unit)
-        whole = lmi.symmetric_blocks([  # (45) before its last Schur complement
-            [-P],
-            [np.zeros((nd, n)), -gamma_squared / unit**2 * np.eye(nd)],
-            [P @ A1 - Y @ C1, P @ TD - Y @ D1, -P],
-            [Z, Zd, np.zeros((q, n)), -np.eye(q)],
-        ])  # fmt: skip
+        whole = lmi.symmetric_blocks(
+            [  # (45) before its last Schur complement
+                [-P],
+                [np.zeros((nd, n)), -gamma_squared / unit**2 * np.eye(nd)],
+                [P @ A1 - Y @ C1, P @ TD - Y @ D1, -P],
+                [Z, Zd, np.zeros((q, n)), -np.eye(q)],
+            ]
+        )
     else:
         Z, Zd = W0 @ C @ X, W0 @ shown_d / unit
-        whole = lmi.symmetric_blocks([  # (45)
-            [-P + Z.T @ Z],
-            [Zd.T @ Z, -gamma_squared / unit**2 * np.eye(nd) + Zd.T @ Zd],
-            [P @ A1 - Y @ C1, P @ TD - Y @ D1, -P],
-        ])  # fmt: skip
+        whole = lmi.symmetric_blocks(
+            [  # (45)
+                [-P + Z.T @ Z],
+                [Zd.T @ Z, -gamma_squared / unit**2 * np.eye(nd) + Zd.T @ Zd],
+                [P @ A1 - Y @ C1, P @ TD - Y @ D1, -P],
+            ]
+        )
     constraints = {"P": lmi.at_least(P, margin), "(45)": lmi.at_most(whole, -margin)}
 
     def gains(values: Values) -> dict[str, FloatArray]:
@@ -170,13 +188,32 @@ def wang2015(
         weight = W0 + values["Vw"] @ V.T if "Vw" in values else W0
         return {"T": T, "N": N, "L": L0 + R, "W": weight, "Psi": Psi, "Upsilon": Upsilon, "R": R}  # (60)
 
-    data = {"T": T, "N": N, "Psi": Psi, "Upsilon": Upsilon, "W": W0, "A1": A1, "C1": C1, "TD": TD, "L0": L0, "D1": D1,
-            "X": X, "R0": R0}  # fmt: skip
+    data = {
+        "T": T,
+        "N": N,
+        "Psi": Psi,
+        "Upsilon": Upsilon,
+        "W": W0,
+        "A1": A1,
+        "C1": C1,
+        "TD": TD,
+        "L0": L0,
+        "D1": D1,
+        "X": X,
+        "R0": R0,
+    }
     return Conditions(
-        "Wang et al. 2015, Theorem 2, (45)", cp.Problem(goal, list(constraints.values())), variables,
-        {} if gamma is None else {"gamma_squared": gamma_squared}, data, constraints,
-        partial(_existence, held, convex, gamma), gains, partial(_design, plant, convex), weight=Wx if free else None,
-    )  # fmt: skip
+        "Wang et al. 2015, Theorem 2, (45)",
+        cp.Problem(goal, list(constraints.values())),
+        variables,
+        {} if gamma is None else {"gamma_squared": gamma_squared},
+        data,
+        constraints,
+        partial(_existence, held, convex, gamma),
+        gains,
+        partial(_design, plant, convex),
+        weight=Wx if free else None,
+    )
 
 
 def _restricted_equivalent(
@@ -238,9 +275,11 @@ def _existence(held: Sequence[Condition], convex: GainProblem, gamma: float | No
     if gamma is None or not convex.disturbances or not all(condition.holds for condition in held):
         return found
     best = search_least_gain(convex, solver="auto")
-    bound = best.gain if not convex.measured else proved_lower_bound(
-        convex, solver="auto", best=best.injection, enough=gamma
-    )  # fmt: skip
+    bound = (
+        best.gain
+        if not convex.measured
+        else proved_lower_bound(convex, solver="auto", best=best.injection, enough=gamma)
+    )
     holds = bool(best.gain <= gamma or bound <= gamma)
     detail = f"the best filter found has {best.gain:.9g}, and no filter is below {bound:.9g}"
     source = "dual of (45), checked without the solver"

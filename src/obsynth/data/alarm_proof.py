@@ -21,11 +21,19 @@ from obsynth.results.design import ObserverDesign
 
 
 def prove_alarm(
-    design: ObserverDesign, data: Data, row: int, *, window: int = WINDOW,
-    disturbance_bounds: Mapping[str, float] | None = None, noise_bound: float | None = None,
-    initial_set: Mapping[str, Any] | None = None, state_bounds: Mapping[str, Any] | None = None,
-    columns: Mapping[str, str] | None = None, scales: Mapping[str, float] | None = None, unverified: bool = False,
-) -> AlarmProof:  # fmt: skip
+    design: ObserverDesign,
+    data: Data,
+    row: int,
+    *,
+    window: int = WINDOW,
+    disturbance_bounds: Mapping[str, float] | None = None,
+    noise_bound: float | None = None,
+    initial_set: Mapping[str, Any] | None = None,
+    state_bounds: Mapping[str, Any] | None = None,
+    columns: Mapping[str, str] | None = None,
+    scales: Mapping[str, float] | None = None,
+    unverified: bool = False,
+) -> AlarmProof:
     """Return a proof that measured data up to a row are not fault-free, or that there is none.
 
     The window's samples are written as a linear programme over states, disturbances, noise and constants (products by
@@ -80,15 +88,26 @@ def prove_alarm(
     values, nu = rows_of(design, data, row, columns, scales), design.linear[0].nu
     log = Log.of(Path(data), columns, scales) if isinstance(data, (str, Path)) else None
     return proved_alarm(
-        design, values[:, :nu], values[:, nu:], window=window, disturbance_bounds=disturbance_bounds,
-        noise_bound=noise_bound, initial_set=initial_set, state_bounds=state_bounds, log=log, unverified=unverified,
-    )  # fmt: skip
+        design,
+        values[:, :nu],
+        values[:, nu:],
+        window=window,
+        disturbance_bounds=disturbance_bounds,
+        noise_bound=noise_bound,
+        initial_set=initial_set,
+        state_bounds=state_bounds,
+        log=log,
+        unverified=unverified,
+    )
 
 
 def rows_of(
-    design: ObserverDesign, data: Data, row: int, columns: Mapping[str, str] | None = None,
+    design: ObserverDesign,
+    data: Data,
+    row: int,
+    columns: Mapping[str, str] | None = None,
     scales: Mapping[str, float] | None = None,
-) -> FloatArray:  # fmt: skip
+) -> FloatArray:
     """Return the rows of data up to one, ``(row, nu + ny)``, as a design reads them; refuse what has gaps."""
     reader = DataObserver(design)
     signals = Signals.of(reader, columns, scales)
@@ -96,8 +115,9 @@ def rows_of(
     for time, values in itertools.islice(samples(data, signals), row):
         _, missing = reader.clock.advance(time, len(found) + 1)
         if (len(found) and missing) or not np.isfinite(values).all():
-            raise SpecError(f"Row {len(found) + 1} has a gap before it or misses a sample: give complete rows.",
-                            path="data")  # fmt: skip
+            raise SpecError(
+                f"Row {len(found) + 1} has a gap before it or misses a sample: give complete rows.", path="data"
+            )
         found.append(values)
     if len(found) < row:
         raise SpecError(f"The data have {len(found)} rows: row {row} is not among them.", path="row")

@@ -78,17 +78,24 @@ class Job:
     """Rows of data to rows of output: ``thresholds`` are levels by column, ``later`` where rows wait for others."""
 
     def __init__(
-        self, engine: Engine, signals: Signals, recovery: StateRecovery | None, thresholds: Mapping[str, float],
-        monitor: OnlineMonitor | None, recovered: str | Sequence[str] | None = None, later: LagBuffer | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        engine: Engine,
+        signals: Signals,
+        recovery: StateRecovery | None,
+        thresholds: Mapping[str, float],
+        monitor: OnlineMonitor | None,
+        recovered: str | Sequence[str] | None = None,
+        later: LagBuffer | None = None,
+    ) -> None:
         self.engine, self.signals, self.monitor, self.later = engine, signals, monitor, later
         self.recovered = RecoveredStates.of(recovery, engine, recovered)
         extra = () if self.recovered is None else self.recovered.columns
         names = (*engine.columns, *extra)
         for name, level in thresholds.items():
             if name not in names:
-                raise SpecError(f"There is no column {name!r} to watch: there are {', '.join(names)}.",
-                                path="thresholds")  # fmt: skip
+                raise SpecError(
+                    f"There is no column {name!r} to watch: there are {', '.join(names)}.", path="thresholds"
+                )
             if not (is_finite_number(level) and level > 0.0):
                 raise SpecError(f"The threshold of {name!r} is {level!r}: give a positive number.", path="thresholds")
         self._levels = tuple((name, names.index(name), level) for name, level in thresholds.items())
@@ -106,10 +113,13 @@ class Job:
         if monitor is not None:
             monitor.require_fit(len(residuals), engine.fault_names)
         self.header = (
-            TIME, "status", *(f"time of {name}" for name, _ in lags), *names,
+            TIME,
+            "status",
+            *(f"time of {name}" for name, _ in lags),
+            *names,
             *((*monitor.columns, "statistic", "threshold") if monitor is not None else ()),
             *(("alarm",) if thresholds or monitor is not None else ()),
-        )  # fmt: skip
+        )
         # Intervals of faults are in their own units, like the estimates.
         point = dict(zip(engine.fault_names, self._point[self._faults].tolist(), strict=True))
         ends = {f"{end} {name}": value for name, value in point.items() for end in ("lowest", "highest")}
@@ -156,8 +166,10 @@ class Job:
             return []
         nu, estimates = len(self.engine.input_names), [entry.row.values for entry in entries]
         if self.recovered is not None:
-            estimates = [np.concatenate([entry.row.values, self.recovered.take(entry.row, entry.deviations[:nu])])
-                         for entry in entries]  # fmt: skip
+            estimates = [
+                np.concatenate([entry.row.values, self.recovered.take(entry.row, entry.deviations[:nu])])
+                for entry in entries
+            ]
         self.statuses.update(entry.row.status for entry in entries)
         shown: list[list[float]] = (np.array(estimates) + self._point).tolist()
         rows: list[list[Any]] = [
@@ -181,9 +193,13 @@ class Job:
         if self.monitor is not None:
             deciding = deciding and (row.forgotten or not self.monitor.guarantees)
             seen = self.monitor.see(
-                time, deciding=deciding, skipped=row.skipped, residuals=row.values[self._residuals],
-                faults=row.values[self._faults], evidence=row.evidence,
-            )  # fmt: skip
+                time,
+                deciding=deciding,
+                skipped=row.skipped,
+                residuals=row.values[self._residuals],
+                faults=row.values[self._faults],
+                evidence=row.evidence,
+            )
             more = seen.more or (math.nan,) * len(self.monitor.columns)
             cells = [*(np.array(more) + self._shifts).tolist(), seen.statistic, seen.threshold]
             if seen.alarm:

@@ -115,13 +115,15 @@ class Clock:
         if count < 1 or abs(step - count * self.dt) > FITTING_SHARE * self.dt:
             raise SpecError(
                 f"Row {row} comes {step:.10g} s after the row before, but the design has dt = {self.dt:.10g} s: "
-                "irregular time stamps need a continuous-time design.", path=f"row {row}",
-            )  # fmt: skip
+                "irregular time stamps need a continuous-time design.",
+                path=f"row {row}",
+            )
         if count > 1 and self.longest == 0.0:
             raise SpecError(
                 f"Row {row}: the data begin with an interval of {step:.10g} s, but the design has dt = "
-                f"{self.dt:.10g} s: the sampling time does not fit.", path=f"row {row}",
-            )  # fmt: skip
+                f"{self.dt:.10g} s: the sampling time does not fit.",
+                path=f"row {row}",
+            )
         return count - 1
 
     def _continuous(self, step: float, row: int) -> int:
@@ -194,8 +196,14 @@ class Engine(ABC):
 
     def as_dict(self) -> dict[str, Any]:
         """Return the state that goes from row to row, as data."""
-        return {"last": self.clock.last, "longest": self.clock.longest, "settled_at": self.settled_at,
-                "phase": self.phase, **self.options, **self._own_data()}  # fmt: skip
+        return {
+            "last": self.clock.last,
+            "longest": self.clock.longest,
+            "settled_at": self.settled_at,
+            "phase": self.phase,
+            **self.options,
+            **self._own_data(),
+        }
 
     def resume(self, data: dict[str, Any]) -> None:
         """Go on from what `as_dict` returned."""

@@ -94,9 +94,13 @@ def learn_thresholds(
 
 
 def _said(
-    design: ObserverDesign, data: Data, columns: Mapping[str, str] | None, scales: Mapping[str, float] | None,
-    gap: float | None, warm_up: float | None,
-) -> tuple[NDArray[np.int_], FloatArray, FloatArray]:  # fmt: skip
+    design: ObserverDesign,
+    data: Data,
+    columns: Mapping[str, str] | None,
+    scales: Mapping[str, float] | None,
+    gap: float | None,
+    warm_up: float | None,
+) -> tuple[NDArray[np.int_], FloatArray, FloatArray]:
     """Return numbers from 0 and times ``(n,)`` of rows, and what is watched ``(n, m)``: NaN where nothing is decided,
     or rows are missing."""
     engine = engine_of(design, gap=gap, warm_up=warm_up)

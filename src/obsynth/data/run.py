@@ -80,13 +80,17 @@ class DataRun:
     def as_dict(self) -> dict[str, Any]:
         """Return the summary as plain data, without the table."""
         return {
-            "rows": self.rows, "statuses": dict(self.statuses), "alarms": dict(self.alarms),
+            "rows": self.rows,
+            "statuses": dict(self.statuses),
+            "alarms": dict(self.alarms),
             "alarm_rows": dict(self.alarm_rows),
             "alarm_stamps": {name: self.stamps.shown(time) for name, time in self.alarms.items()},
-            "isolated": self.isolated, "recovered": dict(self.recovered),
-            "outliers": dict(self.outliers), "warnings": list(self.warnings),
+            "isolated": self.isolated,
+            "recovered": dict(self.recovered),
+            "outliers": dict(self.outliers),
+            "warnings": list(self.warnings),
             "gains_sha256": self.digest,
-        }  # fmt: skip
+        }
 
 
 def run_on_data(
@@ -204,10 +208,13 @@ def run_on_data(
         require_kind(out, (str, Path), "out", "the name of a file, or a text stream")
     if not is_whole(chunk_rows) or chunk_rows < 1:
         raise SpecError(f"chunk_rows is {chunk_rows!r}: give a whole number, 1 or more.", path="chunk_rows")
-    require_distinct({
-        "state": state, "data": data if isinstance(data, str | Path) else None,
-        "out": out if isinstance(out, str | Path) else None,
-    })  # fmt: skip
+    require_distinct(
+        {
+            "state": state,
+            "data": data if isinstance(data, str | Path) else None,
+            "out": out if isinstance(out, str | Path) else None,
+        }
+    )
     if state is not None:
         check_output(state)
     if time_column is not None:
@@ -234,11 +241,20 @@ def run_on_data(
     table = sink.frame() if isinstance(sink, FrameSink) else None
     shown = {} if job.recovered is None else dict(job.recovered.flags)
     return DataRun(
-        job.rows, dict(job.statuses), dict(job.alarms), job.isolated, shown,
+        job.rows,
+        dict(job.statuses),
+        dict(job.alarms),
+        job.isolated,
+        shown,
         dict(getattr(engine, "outliers", {})),
-        (*engine.notes, *job.first.warnings()), digest, table, measured_frame(kept, job.signals, stamps), stamps,
-        dict(thresholds or {}), dict(job.alarm_rows),
-    )  # fmt: skip
+        (*engine.notes, *job.first.warnings()),
+        digest,
+        table,
+        measured_frame(kept, job.signals, stamps),
+        stamps,
+        dict(thresholds or {}),
+        dict(job.alarm_rows),
+    )
 
 
 def _later_rows(
@@ -252,17 +268,24 @@ def _later_rows(
     if smooth and hasattr(data, "readline"):
         raise SpecError("A stream has no end to smooth from: give a lag, or the log as a file.", path="smooth")
     if smooth and state is not None:
-        raise SpecError("smooth takes the whole record, and a saved state goes on with a part of it: give a lag, or "
-                        "leave the state out.", path="smooth")  # fmt: skip
+        raise SpecError(
+            "smooth takes the whole record, and a saved state goes on with a part of it: give a lag, or "
+            "leave the state out.",
+            path="smooth",
+        )
     from obsynth.data.smoothing import LaterRows
 
     return LaterRows(engine, lag)
 
 
 def _run_rows(
-    job: Job, rows: Iterator[FloatArray], sink: Sink, kept: list[FloatArray] | None, save: Callable[[], None] | None,
+    job: Job,
+    rows: Iterator[FloatArray],
+    sink: Sink,
+    kept: list[FloatArray] | None,
+    save: Callable[[], None] | None,
     progress: Callable[[int], object],
-) -> None:  # fmt: skip
+) -> None:
     """Run over all rows: in chunks, or one by one where the state is to be saved after a stream."""
     held, is_whole = HeldSignals(), True
     if save is None:

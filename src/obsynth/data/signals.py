@@ -92,8 +92,10 @@ class Stamps:
         if self.is_dated is None:
             self.is_dated, self.zone = True, found.tzinfo
         if (found.tzinfo is None) != (self.zone is None):
-            raise SpecError(f"Row {row}, column {column!r}: stamps with a time zone and without one stand in one log.",
-                            path=f"row {row}")  # fmt: skip
+            raise SpecError(
+                f"Row {row}, column {column!r}: stamps with a time zone and without one stand in one log.",
+                path=f"row {row}",
+            )
         past = (found if found.tzinfo is not None else found.replace(tzinfo=UTC)) - _ZERO
         return past.days * _DAY + past.seconds + past.microseconds * _MICRO
 

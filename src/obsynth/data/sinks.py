@@ -111,8 +111,10 @@ class ParquetSink:
 
         if not rows:
             return
-        columns = [pa.array(list(cells), field.type) for cells, field in zip(zip(*rows, strict=True), self._schema,
-                                                                             strict=True)]  # fmt: skip
+        columns = [
+            pa.array(list(cells), field.type)
+            for cells, field in zip(zip(*rows, strict=True), self._schema, strict=True)
+        ]
         self._writer.write_table(pa.Table.from_arrays(columns, schema=self._schema))
 
     def close(self) -> None:

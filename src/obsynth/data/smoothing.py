@@ -82,8 +82,12 @@ class LaterRows:
     def _shown(self, ready: _Waiting, found: Smoothed) -> tuple[Entry, Any, Smoothed]:
         nx, row = len(self.engine.state_names), ready.entry.row
         theta, spread = parameters_of(found, nx)
-        own = (found.x[:nx], theta, deviations_in(found.factor, found.diffuse)[:nx],
-               np.sqrt(np.einsum("ij,ij->i", spread, spread)))  # fmt: skip
+        own = (
+            found.x[:nx],
+            theta,
+            deviations_in(found.factor, found.diffuse)[:nx],
+            np.sqrt(np.einsum("ij,ij->i", spread, spread)),
+        )
         estimated = np.concatenate(own)
         values = np.concatenate((estimated, row.values[len(estimated) :]))
         return ready.entry._replace(row=row._replace(values=values)), ready.chain.row(ready.k), found
@@ -179,8 +183,9 @@ def smooth(
         engine = engine_of(design, outliers=outliers)
         return _smoothed_log(engine, data, waited, Signals.of(engine, columns, scales))
     if columns or scales or time_column:
-        raise SpecError("columns, time_column and scales are for logs: arrays have their signals in order.",
-                        path="columns")  # fmt: skip
+        raise SpecError(
+            "columns, time_column and scales are for logs: arrays have their signals in order.", path="columns"
+        )
     observer: Any = design.observer
     if outliers is not None:
         observer = changed(observer, outliers=outliers)
@@ -198,5 +203,6 @@ def _smoothed_log(engine: Any, data: Any, lag: int | None, signals: Signals) -> 
     known = smoothed_estimates(observer, [row for _, row, _ in found], [sample for _, _, sample in found])
     point = signals.estimates_point(engine)
     nx, nq = len(engine.state_names), len(engine.fault_names)
-    return replace(known, states=read_only(known.states + point[:nx]),
-                   faults=read_only(known.faults + point[nx : nx + nq]))  # fmt: skip
+    return replace(
+        known, states=read_only(known.states + point[:nx]), faults=read_only(known.faults + point[nx : nx + nq])
+    )

@@ -24,9 +24,12 @@ if TYPE_CHECKING:
 #: Files that are read as text, and those that need a package: its name and the extra that installs it.
 TEXTS = (".csv", ".tsv")
 PACKAGES = {
-    ".parquet": ("pyarrow", "parquet"), ".tdms": ("nptdms", "tdms"), ".mf4": ("asammdf", "mdf"),
-    ".mdf": ("asammdf", "mdf"), ".dat": ("asammdf", "mdf"),
-}  # fmt: skip
+    ".parquet": ("pyarrow", "parquet"),
+    ".tdms": ("nptdms", "tdms"),
+    ".mf4": ("asammdf", "mdf"),
+    ".mdf": ("asammdf", "mdf"),
+    ".dat": ("asammdf", "mdf"),
+}
 #: Rows that are held in memory at a time.
 CHUNK_ROWS = 10_000
 #: Files that estimates are written to.
@@ -82,8 +85,9 @@ def check_suffix(path: Path, suffixes: tuple[str, ...] = SUFFIXES) -> None:
         try:
             import_module(package)
         except ImportError:
-            raise SpecError(f"{suffix} files need {package}: pip install 'obsynth[{extra}]', or use CSV.",
-                            path=str(path)) from None  # fmt: skip
+            raise SpecError(
+                f"{suffix} files need {package}: pip install 'obsynth[{extra}]', or use CSV.", path=str(path)
+            ) from None
 
 
 @contextmanager
@@ -178,8 +182,12 @@ def _require_beginning(path: Path) -> None:
 
 
 _READERS: dict[str, Callable[[Path, Signals, int], Iterator[Any]]] = {
-    ".parquet": _parquet, ".tdms": _tdms, ".mf4": _mdf, ".mdf": _mdf, ".dat": _mdf,
-}  # fmt: skip
+    ".parquet": _parquet,
+    ".tdms": _tdms,
+    ".mf4": _mdf,
+    ".mdf": _mdf,
+    ".dat": _mdf,
+}
 
 
 def _with_time(frame: pd.DataFrame, signals: Signals) -> pd.DataFrame:

@@ -44,13 +44,18 @@ class SteppingEngine(Engine):
             residuals = tuple(f"innovation {i + 1}" for i in range(self.observer.innovation_count))
             constant = model.is_time_invariant and Q.is_constant and R.is_constant
             self.may_restart = constant and model.horizon is None
-        self.columns = (*self.estimated, *(f"sd {name}" for name in self.estimated),
-                        *(f"r[{name}]" for name in residuals))  # fmt: skip
+        self.columns = (
+            *self.estimated,
+            *(f"sd {name}" for name in self.estimated),
+            *(f"r[{name}]" for name in residuals),
+        )
         self.directions = len(residuals)
         late = ", ".join(name for name, entry in (self.observer.sensors or {}).items() if entry["delay"])
         if late:
-            self.notes = (f"Values of {late} arrive late: their innovations stand in no row, so that monitors see them "
-                          "in the estimates only.",)  # fmt: skip
+            self.notes = (
+                f"Values of {late} arrive late: their innovations stand in no row, so that monitors see them "
+                "in the estimates only.",
+            )
         self.state: Any = self.observer.init()
         self.u: FloatArray | None = None
 
@@ -67,8 +72,9 @@ class SteppingEngine(Engine):
         if not np.isfinite(values).all():
             raise SpecError(
                 f"Row {row}: an input is missing before it was ever known, and a nonlinear model has no zero to begin "
-                "with: begin with a row in which all inputs are known.", path=f"row {row}",
-            )  # fmt: skip
+                "with: begin with a row in which all inputs are known.",
+                path=f"row {row}",
+            )
         return values
 
     def _taken(self, y: FloatArray, u: FloatArray, row: int) -> StepRow | None:
@@ -132,8 +138,9 @@ class SteppingEngine(Engine):
         if fresh and self.is_recursive:
             heard = np.ones_like(heard)
         status = self._status(time, known[:nu], heard, spoiled=spoiled)
-        evidence = Evidence(found.theta, found.parameter_covariance, found.whitened, found.regressor, found.score,
-                            found.information)  # fmt: skip
+        evidence = Evidence(
+            found.theta, found.parameter_covariance, found.whitened, found.regressor, found.score, found.information
+        )
         return Row(status, self._values(found), missing, evidence)
 
     def _refused(self) -> np.ndarray:
@@ -188,8 +195,9 @@ class SteppingEngine(Engine):
         if found is None:
             raise SpecError(
                 f"Row {row}: the estimates are no finite numbers any more: the model is unstable, or the inputs are "
-                "too large.", path=f"row {row}",
-            )  # fmt: skip
+                "too large.",
+                path=f"row {row}",
+            )
         return found
 
     def _own_data(self) -> dict[str, Any]:

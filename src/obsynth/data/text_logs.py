@@ -46,10 +46,14 @@ class Dialect:
         except ValueError:
             advice = ""
             if "," in cell:
-                advice = (" Separate the columns by semicolons where numbers have a decimal comma."
-                          if not self.comma else " Leave out what groups thousands.")  # fmt: skip
-            raise SpecError(f"Row {row}, column {column!r}: {text!r} is no number.{advice}",
-                            path=f"row {row}") from None  # fmt: skip
+                advice = (
+                    " Separate the columns by semicolons where numbers have a decimal comma."
+                    if not self.comma
+                    else " Leave out what groups thousands."
+                )
+            raise SpecError(
+                f"Row {row}, column {column!r}: {text!r} is no number.{advice}", path=f"row {row}"
+            ) from None
 
 
 def text_chunks(path: Path, signals: Signals, stamps: Stamps, rows: int) -> Iterator[FloatArray]:
@@ -83,8 +87,9 @@ def stream_rows(stream: TextIO, signals: Signals, stamps: Stamps) -> Iterator[Fl
             continue
         row += 1
         if len(cells) > len(header):
-            raise SpecError(f"Row {row} has {len(cells)} cells, but the header has {len(header)}.",
-                            path=f"cells of row {row}")  # fmt: skip
+            raise SpecError(
+                f"Row {row} has {len(cells)} cells, but the header has {len(header)}.", path=f"cells of row {row}"
+            )
         cells += [""] * (len(header) - len(cells))
         time = stamps.read(cells[places[0]], row, header[places[0]], comma=dialect.comma)
         yield np.array([[time, *(dialect.number(cells[place], row, header[place]) for place in places[1:])]])

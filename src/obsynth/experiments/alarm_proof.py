@@ -83,8 +83,12 @@ class AlarmProof:
         """
         if not self.proved:
             raise SpecError("There is no proof to write: the alarm cannot be proved.", path="certificate")
-        body = {"kind": KIND, "schema_version": SCHEMA_VERSION, "sha256": digest_of(self.certificate),
-                "certificate": self.certificate}  # fmt: skip
+        body = {
+            "kind": KIND,
+            "schema_version": SCHEMA_VERSION,
+            "sha256": digest_of(self.certificate),
+            "certificate": self.certificate,
+        }
         return write_atomically(path, json.dumps(body, indent=1, allow_nan=False) + "\n")
 
     def __str__(self) -> str:
@@ -92,11 +96,18 @@ class AlarmProof:
 
 
 def proved_alarm(
-    design: ObserverDesign, u: FloatArray, y: FloatArray, *, window: int = WINDOW,
-    disturbance_bounds: Mapping[str, float] | None = None, noise_bound: float | None = None,
-    initial_set: Mapping[str, Any] | None = None, state_bounds: Mapping[str, Any] | None = None,
-    log: Log | None = None, unverified: bool = False,
-) -> AlarmProof:  # fmt: skip
+    design: ObserverDesign,
+    u: FloatArray,
+    y: FloatArray,
+    *,
+    window: int = WINDOW,
+    disturbance_bounds: Mapping[str, float] | None = None,
+    noise_bound: float | None = None,
+    initial_set: Mapping[str, Any] | None = None,
+    state_bounds: Mapping[str, Any] | None = None,
+    log: Log | None = None,
+    unverified: bool = False,
+) -> AlarmProof:
     """Return the proof for the last sample of a record ``u (steps, nu)``, ``y (steps, ny)`` of deviations.
     A design that fails its own verification proves nothing: `VerificationError`, unless ``unverified``, and then no
     alarm is proved."""
@@ -110,8 +121,9 @@ def proved_alarm(
                 f"The gain set {design.name!r} fails its own verification ({failing}): no alarm can be proved by it.",
                 report=report,
             )
-        return AlarmProof(False, row, length, 0.0, f"Cannot be proved: the gain set is unverified ({failing} fails).",
-                          "", {})  # fmt: skip
+        return AlarmProof(
+            False, row, length, 0.0, f"Cannot be proved: the gain set is unverified ({failing} fails).", "", {}
+        )
     try:
         programme, origin = question.programme(design, u, y)
     except PreconditionError as error:
@@ -132,16 +144,21 @@ def proved_alarm(
     gain_set = design_as_dict(design)
     text = statement(design, question, row, origin, log, gain_set["sha256"])
     certificate = {
-        **question.as_dict(), "u": u, "y": y, "row": row, "equal": equal, "below": below, "margin": margin,
-        "origin": origin, "statement": text, "log": None if log is None else log.as_dict(),
-    }  # fmt: skip
-    return AlarmProof(True, row, length, margin, text, origin,
-                      {**plain(certificate), "gain_set": gain_set})  # fmt: skip
+        **question.as_dict(),
+        "u": u,
+        "y": y,
+        "row": row,
+        "equal": equal,
+        "below": below,
+        "margin": margin,
+        "origin": origin,
+        "statement": text,
+        "log": None if log is None else log.as_dict(),
+    }
+    return AlarmProof(True, row, length, margin, text, origin, {**plain(certificate), "gain_set": gain_set})
 
 
-def statement(
-    design: ObserverDesign, question: Question, row: int, origin: str, log: Log | None, gain_set: str
-) -> str:  # fmt: skip
+def statement(design: ObserverDesign, question: Question, row: int, origin: str, log: Log | None, gain_set: str) -> str:
     """Return what a proof says, with everything it rests on."""
     assumed = question.assumptions(design)
     uncertain = design.linear[0].uncertainty
@@ -171,9 +188,14 @@ class Question:
 
     @classmethod
     def of(
-        cls, design: ObserverDesign, disturbance_bounds: Mapping[str, float] | None, noise_bound: float | None,
-        initial_set: Mapping[str, Any] | None, state_bounds: Mapping[str, Any] | None, window: int,
-    ) -> Question:  # fmt: skip
+        cls,
+        design: ObserverDesign,
+        disturbance_bounds: Mapping[str, float] | None,
+        noise_bound: float | None,
+        initial_set: Mapping[str, Any] | None,
+        state_bounds: Mapping[str, Any] | None,
+        window: int,
+    ) -> Question:
         """Return what is asked of a discrete linear design, checked."""
         plant, _ = design.linear
         if not plant.is_discrete:
@@ -185,39 +207,55 @@ class Question:
             bounds[index_of(name, plant.disturbance_names, what="disturbance_bounds")] = value
         if not np.all(bounds >= 0.0) or not np.isfinite(bounds).all():
             missing = [name for name, bound in zip(plant.disturbance_names, bounds, strict=True) if not bound >= 0.0]
-            raise SpecError(f"The disturbance {(missing or ['?'])[0]!r} has no bound: give disturbance_bounds "
-                            "(--disturbance), finite and 0 or more.", path="disturbance_bounds")  # fmt: skip
+            raise SpecError(
+                f"The disturbance {(missing or ['?'])[0]!r} has no bound: give disturbance_bounds "
+                "(--disturbance), finite and 0 or more.",
+                path="disturbance_bounds",
+            )
         if plant.nw and noise_bound is None:
-            raise SpecError("Noise has no bound: give noise_bound (--noise-bound), in standard deviations.",
-                            path="noise_bound")  # fmt: skip
+            raise SpecError(
+                "Noise has no bound: give noise_bound (--noise-bound), in standard deviations.", path="noise_bound"
+            )
         if initial_set is None and state_bounds is None:
-            raise SpecError("Nothing bounds the state: give initial_set (--initial), or state_bounds.",
-                            path="initial_set")  # fmt: skip
+            raise SpecError(
+                "Nothing bounds the state: give initial_set (--initial), or state_bounds.", path="initial_set"
+            )
         return cls(bounds, float(noise_bound or 0.0) if plant.nw else 0.0, initial_set, state_bounds, window)
 
     def programme(self, design: ObserverDesign, u: FloatArray, y: FloatArray) -> tuple[Window, str]:
         """Return the programme of the last samples of a record, and where its bounds of the state come from."""
         affine, data, origin = window_data(
-            design, u, y, self.window, bounds=self.bounds, noise_bound=self.noise_bound, initial_set=self.initial_set,
+            design,
+            u,
+            y,
+            self.window,
+            bounds=self.bounds,
+            noise_bound=self.noise_bound,
+            initial_set=self.initial_set,
             state_bounds=self.state_bounds,
-        )  # fmt: skip
+        )
         bounds = np.concatenate([self.bounds, np.full(affine.plant.nw, self.noise_bound)])
         return window_programme(affine, bounds, data), origin
 
     def assumptions(self, design: ObserverDesign) -> Assumptions:
         """Return what is assumed of all that is unknown."""
         return Assumptions(
-            design.linear[0], self.bounds, self.noise_bound, self.initial_set,
+            design.linear[0],
+            self.bounds,
+            self.noise_bound,
+            self.initial_set,
             self.state_bounds if self.initial_set is None else None,
-        )  # fmt: skip
+        )
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain data."""
         return {
-            "bounds": self.bounds, "noise_bound": self.noise_bound, "window": self.window,
+            "bounds": self.bounds,
+            "noise_bound": self.noise_bound,
+            "window": self.window,
             "initial_set": None if self.initial_set is None else _listed(self.initial_set),
             "state_bounds": None if self.state_bounds is None else _listed(self.state_bounds),
-        }  # fmt: skip
+        }
 
 
 def _listed(given: Mapping[str, Any]) -> dict[str, Any]:
@@ -233,9 +271,14 @@ def solved(programme: Window) -> tuple[FloatArray, FloatArray] | None:
     cost[-1] = 1.0
     given = {"A_eq": equal, "b_eq": programme.equal.right} if programme.equal.right else {}
     found = linprog(
-        cost, A_ub=below, b_ub=programme.below.right, bounds=np.stack([programme.lower, programme.upper], axis=1),
-        method="highs", options={"time_limit": SOLVER_SECONDS}, **given,
-    )  # fmt: skip
+        cost,
+        A_ub=below,
+        b_ub=programme.below.right,
+        bounds=np.stack([programme.lower, programme.upper], axis=1),
+        method="highs",
+        options={"time_limit": SOLVER_SECONDS},
+        **given,
+    )
     if found.status != 0:
         return None
     multipliers = (found.eqlin.marginals if programme.equal.right else (), np.minimum(found.ineqlin.marginals, 0.0))
@@ -274,8 +317,11 @@ def verify_alarm(path: str | Path, *, data: str | Path | None = None) -> Verific
     body = content.get("certificate")
     version = content.get("schema_version")
     if version == OLD_VERSION:
-        raise SpecError(f"{source} is of schema {OLD_VERSION}, which does not say what it rests on: prove the alarm "
-                        "again (obsynth prove-alarm).", path=str(source))  # fmt: skip
+        raise SpecError(
+            f"{source} is of schema {OLD_VERSION}, which does not say what it rests on: prove the alarm "
+            "again (obsynth prove-alarm).",
+            path=str(source),
+        )
     if version != SCHEMA_VERSION or not isinstance(body, dict):
         raise SpecError(f"{source} has an unknown schema version.", path=str(source))
     intact = content.get("sha256") == digest_of(body)
@@ -303,9 +349,13 @@ def _checked(body: Mapping[str, Any], log_file: Path | None) -> Iterator[Check]:
     yield _gain_set_row(design, body["gain_set"]["sha256"])
     yield _log_row(log, log_file, design, u, y)
     question = Question.of(
-        design, dict(zip(plant.disturbance_names, bounds.tolist(), strict=True)), data["noise_bound"],
-        data["initial_set"], data["state_bounds"], data["window"],
-    )  # fmt: skip
+        design,
+        dict(zip(plant.disturbance_names, bounds.tolist(), strict=True)),
+        data["noise_bound"],
+        data["initial_set"],
+        data["state_bounds"],
+        data["window"],
+    )
     programme, origin = question.programme(design, u, y)
     equal, below = np.asarray(data["equal"]), np.asarray(data["below"])
     fits = equal.shape == (len(programme.equal.right),) and below.shape == (len(programme.below.right),)
@@ -316,8 +366,14 @@ def _checked(body: Mapping[str, Any], log_file: Path | None) -> Iterator[Check]:
     told = said == data["statement"] and origin == data["origin"]
     yield _row("rows", "the record ends at the stated row", float(rows), 1.0, rows)
     yield _row("statement", said, float(told), 1.0, told)
-    yield _row("proof", "least excess over all bounds, from the multipliers, in exact arithmetic", margin, 0.0,
-               margin > 0.0, kind="proved")  # fmt: skip
+    yield _row(
+        "proof",
+        "least excess over all bounds, from the multipliers, in exact arithmetic",
+        margin,
+        0.0,
+        margin > 0.0,
+        kind="proved",
+    )
     yield _row("margin", "the stated margin is not above what is proved", stated, margin, 0.0 < stated <= margin)
 
 
@@ -325,26 +381,42 @@ def _gain_set_row(design: ObserverDesign, digest: str) -> Check:
     """Return the row on the gain set inside, verified like any other."""
     report = verify(design)
     failing = ", ".join(check.name for check in report.failures)
-    return _row("gain set", f"the gain set inside ({design.name}, {digest[:SHOWN_DIGITS]}) verifies: "
-                 f"{len(report.checks)} checks", float(len(report.failures)), 0.0, report.passed,
-                 detail=f"fails: {failing}" if failing else "")  # fmt: skip
+    return _row(
+        "gain set",
+        f"the gain set inside ({design.name}, {digest[:SHOWN_DIGITS]}) verifies: {len(report.checks)} checks",
+        float(len(report.failures)),
+        0.0,
+        report.passed,
+        detail=f"fails: {failing}" if failing else "",
+    )
 
 
 def _log_row(log: Log | None, file: Path | None, design: ObserverDesign, u: FloatArray, y: FloatArray) -> Check:
     """Return the row on the log: compared where it is given, else assumed."""
     if file is None:
         name = "a record that no file holds" if log is None else f"{log.name}, sha256 {log.sha256}"
-        return information("log", f"the rows are those of {name}: assumed, as the log was not given (--data)",
-                           float(len(y)), source="certificate", status="assumed")  # fmt: skip
+        return information(
+            "log",
+            f"the rows are those of {name}: assumed, as the log was not given (--data)",
+            float(len(y)),
+            source="certificate",
+            status="assumed",
+        )
     if log is None:
         return _row("log", "the certificate names the log", 0.0, 1.0, False)
     if file_digest(file) != log.sha256:
-        return _row("log", f"{file.name} is the log that the certificate names ({log.sha256[:SHOWN_DIGITS]})", 0.0, 1.0,
-                    False)  # fmt: skip
+        return _row(
+            "log", f"{file.name} is the log that the certificate names ({log.sha256[:SHOWN_DIGITS]})", 0.0, 1.0, False
+        )
     values = rows_of_log(design, file, len(y), dict(log.columns), dict(log.scales))
     equal = bool(np.array_equal(values, np.hstack([u, y])))
-    return _row("log", f"rows 1 to {len(y)} are those of {file.name}, sha256 {log.sha256[:SHOWN_DIGITS]}", float(equal),
-                1.0, equal)  # fmt: skip
+    return _row(
+        "log",
+        f"rows 1 to {len(y)} are those of {file.name}, sha256 {log.sha256[:SHOWN_DIGITS]}",
+        float(equal),
+        1.0,
+        equal,
+    )
 
 
 def rows_of_log(design: ObserverDesign, path: Path, count: int, columns: Any, scales: Any) -> FloatArray:

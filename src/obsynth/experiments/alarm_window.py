@@ -131,9 +131,11 @@ def window_programme(plant: AffinePlant, bounds: FloatArray, data: WindowData) -
     """Return the programme of a window; ``bounds (nd + nw,)`` of disturbances and noise."""
     steps, n, p = len(data.y), plant.A.shape[0], plant.count
     pairs = [
-        (i, j) for i in range(p) for j in range(n)
+        (i, j)
+        for i in range(p)
+        for j in range(n)
         if plant.A.parts[i][:, j].any() or plant.E.parts[i][:, j].any() or plant.C.parts[i][:, j].any()
-    ]  # fmt: skip
+    ]
     at = _Variables(steps, n, len(bounds), p, len(pairs), varying=plant.box.variation == "varying")
     size = np.maximum(np.abs(data.low), np.abs(data.high))
     scales = _scales(at, size, bounds, [j for _, j in pairs])
@@ -172,9 +174,16 @@ class _Builder:
     """Rows of one sample."""
 
     def __init__(
-        self, plant: AffinePlant, at: _Variables, pairs: list[tuple[int, int]], data: WindowData, size: FloatArray,
-        bounds: FloatArray, equal: Rows, below: Rows,
-    ) -> None:  # fmt: skip
+        self,
+        plant: AffinePlant,
+        at: _Variables,
+        pairs: list[tuple[int, int]],
+        data: WindowData,
+        size: FloatArray,
+        bounds: FloatArray,
+        equal: Rows,
+        below: Rows,
+    ) -> None:
         self.plant, self.at, self.pairs, self.data, self.size = plant, at, pairs, data, size
         self.equal, self.below = equal, below
         self.bd = np.hstack([plant.Bd.center, plant.plant.Bw])
@@ -248,9 +257,16 @@ REPLAY, STATED = "replay from the start", "stated"
 
 
 def window_data(
-    design: ObserverDesign, u: FloatArray, y: FloatArray, length: int, *, bounds: FloatArray, noise_bound: float,
-    initial_set: Mapping[str, Any] | None, state_bounds: Mapping[str, Any] | None,
-) -> tuple[AffinePlant, WindowData, str]:  # fmt: skip
+    design: ObserverDesign,
+    u: FloatArray,
+    y: FloatArray,
+    length: int,
+    *,
+    bounds: FloatArray,
+    noise_bound: float,
+    initial_set: Mapping[str, Any] | None,
+    state_bounds: Mapping[str, Any] | None,
+) -> tuple[AffinePlant, WindowData, str]:
     """Return the plant over its box, the last ``length`` samples with bounds of the state, and where these come from.
     Without stated ones they come from the observer run again from the start, and its error."""
     affine = affine_plant(design.linear[0])
@@ -279,8 +295,9 @@ def _stated(affine: AffinePlant, given: Mapping[str, Any], steps: int) -> tuple[
     names = affine.plant.state_names
     missing = [name for name in names if name not in given]
     if missing:
-        raise SpecError(f"Nothing bounds the state {missing[0]!r}: give initial_set (--initial), or its bound.",
-                        path="initial_set")  # fmt: skip
+        raise SpecError(
+            f"Nothing bounds the state {missing[0]!r}: give initial_set (--initial), or its bound.", path="initial_set"
+        )
     for name in names:
         if not (is_finite_number(given[name]) and given[name] >= 0.0):
             raise SpecError(f"The bound of {name!r} is {given[name]!r}: give a number, 0 or more.", path="state_bounds")

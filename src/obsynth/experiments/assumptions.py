@@ -59,8 +59,10 @@ class Assumptions:
         """Return one phrase for each kind of assumption."""
         found, plant = [], self.plant
         if plant.nd:
-            each = [f"{name} within {shown(bound, plant.units.get(name, ''))}"
-                    for name, bound in zip(plant.disturbance_names, self.bounds, strict=True)]  # fmt: skip
+            each = [
+                f"{name} within {shown(bound, plant.units.get(name, ''))}"
+                for name, bound in zip(plant.disturbance_names, self.bounds, strict=True)
+            ]
             found.append(_enough(each, "disturbances within their bounds"))
         if plant.nw:
             found.append(self._noise())
@@ -75,8 +77,11 @@ class Assumptions:
         """Return the phrase on the noise: the largest value at each sensor, where each has its own."""
         plant, times = self.plant, f"{shown(self.noise_bound)} standard deviations"
         sizes = self.noise_bound * np.abs(plant.Dw).sum(axis=1)
-        each = [f"{shown(float(f'{size:.6g}'), plant.units.get(name, ''))} at {name}"
-                for name, size in zip(plant.output_names, sizes, strict=True) if size > 0.0]  # fmt: skip
+        each = [
+            f"{shown(float(f'{size:.6g}'), plant.units.get(name, ''))} at {name}"
+            for name, size in zip(plant.output_names, sizes, strict=True)
+            if size > 0.0
+        ]
         process = bool(plant.Bw.any())
         if not each or len(each) > MOST_LISTED or process:
             return f"noise within {times}"
@@ -104,8 +109,10 @@ def _range(value: Any, unit: str) -> str:
 
 def _listed(given: Mapping[str, Any]) -> dict[str, Any]:
     """Return bounds of states as plain data."""
-    pairs = {name: [float(end) for end in value] if isinstance(value, (list, tuple, np.ndarray)) else float(value)
-             for name, value in given.items()}  # fmt: skip
+    pairs = {
+        name: [float(end) for end in value] if isinstance(value, (list, tuple, np.ndarray)) else float(value)
+        for name, value in given.items()
+    }
     return dict(sorted(pairs.items()))
 
 
@@ -118,8 +125,9 @@ def constants_phrase(box: ConstantsBox | None) -> str:
     if box is None or not box.names:
         return "an exact model"
     shares = [item.half / abs(item.nominal) if item.nominal else np.nan for item in box.uncertain]
-    centred = [abs(item.middle - item.nominal) <= SAME_SHARE * max(item.half, abs(item.nominal))
-               for item in box.uncertain]  # fmt: skip
+    centred = [
+        abs(item.middle - item.nominal) <= SAME_SHARE * max(item.half, abs(item.nominal)) for item in box.uncertain
+    ]
     one = max(shares) - min(shares) <= SAME_SHARE and all(centred)
     names = ", ".join(box.names) if len(box.names) <= MOST_LISTED else f"{len(box.names)} constants"
     if one:
@@ -145,8 +153,12 @@ class Log:
     @classmethod
     def of(cls, path: Path, columns: Mapping[str, str] | None, scales: Mapping[str, float] | None) -> Log:
         """Return the log in a file."""
-        return cls(path.name, file_digest(path), tuple(sorted((columns or {}).items())),
-                   tuple(sorted((name, float(value)) for name, value in (scales or {}).items())))  # fmt: skip
+        return cls(
+            path.name,
+            file_digest(path),
+            tuple(sorted((columns or {}).items())),
+            tuple(sorted((name, float(value)) for name, value in (scales or {}).items())),
+        )
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain data, as `from_dict` reads it."""
@@ -155,8 +167,12 @@ class Log:
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Log:
         """Return the log that `as_dict` described."""
-        return cls(str(data["name"]), str(data["sha256"]), tuple(sorted(data["columns"].items())),
-                   tuple(sorted((name, float(value)) for name, value in data["scales"].items())))  # fmt: skip
+        return cls(
+            str(data["name"]),
+            str(data["sha256"]),
+            tuple(sorted(data["columns"].items())),
+            tuple(sorted((name, float(value)) for name, value in data["scales"].items())),
+        )
 
 
 def file_digest(path: Path) -> str:

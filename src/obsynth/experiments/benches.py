@@ -143,11 +143,17 @@ def make_bench(design: ObserverDesign, scenario: Scenario) -> LinearBench:
         observer = sample_observer(observer, drive.dt)
     said = ((not plant.is_discrete, BETWEEN_SAMPLES), (stepper.feedback is not None, STABILISED))
     return LinearBench(
-        drive, observer, start, slice(plant.nu, plant.nu + plant.nf),
+        drive,
+        observer,
+        start,
+        slice(plant.nu, plant.nu + plant.nf),
         tuple(index_of(name, plant.fault_names, what="The plant") for name in observer.fault_names),
         tuple(text for holds, text in said if holds),
-        stepper, begin, ramp, (plant.nu, plant.nf, plant.nd),
-    )  # fmt: skip
+        stepper,
+        begin,
+        ramp,
+        (plant.nu, plant.nf, plant.nd),
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,9 +182,13 @@ class ParameterBench(Bench):
             if self.drive.deviations.any():
                 nu[:, run] += self.drive.deviations * rng.standard_normal(nu[:, run].shape)
         states, clean = varying_runs(
-            observer.plant, parameters=self.parameters, inputs=self.inputs, initial_state=self.initial_state,
-            equation_noise=mu, output_noise=nu,
-        )  # fmt: skip
+            observer.plant,
+            parameters=self.parameters,
+            inputs=self.inputs,
+            initial_state=self.initial_state,
+            equation_noise=mu,
+            output_noise=nu,
+        )
         outputs = np.moveaxis(observer.timing.arriving(np.moveaxis(self.drive.measured(clean), 1, 0)), 0, 1)
         return self._runs(states, outputs, self._watched(observer, outputs))
 
@@ -203,10 +213,15 @@ class ParameterBench(Bench):
         states, outputs, estimates = [], [], []
         for seed in seeds:
             truth = simulate_dae(
-                observer.model, self.inputs, dt=observer.dt, parameters=self.parameters,
-                initial_state=self.initial_state, Q=share * observer.Q if share else None,
-                R=share * observer.R + np.diag(self.drive.deviations**2), seed=seed,
-            )  # fmt: skip
+                observer.model,
+                self.inputs,
+                dt=observer.dt,
+                parameters=self.parameters,
+                initial_state=self.initial_state,
+                Q=share * observer.Q if share else None,
+                R=share * observer.R + np.diag(self.drive.deviations**2),
+                seed=seed,
+            )
             measured = observer.timing.arriving(self.drive.measured(truth.outputs[:, None])[:, 0])
             states.append(truth.states)
             outputs.append(measured)

@@ -49,9 +49,11 @@ def _of_linear(plant: DescriptorSystem, observer: LinearObserver) -> Scenario:
     }
     growth = _growth(plant, count * segment)
     return Scenario(
-        horizon=count * segment, sample_time=None if plant.is_discrete else step, faults=faults,
+        horizon=count * segment,
+        sample_time=None if plant.is_discrete else step,
+        faults=faults,
         stabilise=growth > np.log(GROWTH),
-    )  # fmt: skip
+    )
 
 
 def _growth(plant: DescriptorSystem, horizon: float) -> float:

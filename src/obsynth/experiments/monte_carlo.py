@@ -133,9 +133,14 @@ def _run(task: _Task) -> dict[str, FloatArray]:
     found, nx = dict[str, FloatArray](), len(observer.state_names)
     for name, rows, truth, delays, warm_up in (
         ("states", slice(0, nx), runs.states, observer.state_delays, task.warm_ups[0]),
-        ("faults", slice(nx, nx + len(observer.fault_names)), runs.faults[:, :, list(task.bench.estimated)],
-         observer.fault_delays, task.warm_ups[1]),
-    ):  # fmt: skip
+        (
+            "faults",
+            slice(nx, nx + len(observer.fault_names)),
+            runs.faults[:, :, list(task.bench.estimated)],
+            observer.fault_delays,
+            task.warm_ups[1],
+        ),
+    ):
         errors = aligned_errors(runs.rows[:, :, rows], truth, delays)[max(warm_up, *delays, 0) :]
         # A record no longer than the delays has no error to speak of.
         found[name] = np.sqrt(np.mean(errors**2, axis=0)) if len(errors) else np.full(errors.shape[1:], np.nan)
@@ -229,16 +234,18 @@ def _require_fit(bench: Bench, monitor: Monitor | ParameterMonitor | None, plant
     if plants is not None:
         raise SpecError("plants are drawn for linear designs of a plant with tolerances.", path="plants")
     if isinstance(monitor, Monitor):
-        raise SpecError("This design is recursive or nonlinear: give monitor=obsynth.ParameterMonitor(...).",
-                        path="monitor")  # fmt: skip
+        raise SpecError(
+            "This design is recursive or nonlinear: give monitor=obsynth.ParameterMonitor(...).", path="monitor"
+        )
 
 
 def _drawn_benches(design: ObserverDesign, scenario: Scenario, plants: int) -> list[Bench]:
     """Return a bench for each of some plants in the box, drawn with the scenario's seed."""
     plant, _ = design.linear
     if plant.uncertainty is None or not plant.uncertainty.box.names:
-        raise SpecError("plants are drawn from the tolerances of the plant's constants, and it has none.",
-                        path="plants")  # fmt: skip
+        raise SpecError(
+            "plants are drawn from the tolerances of the plant's constants, and it has none.", path="plants"
+        )
     box = plant.uncertainty.box
     points = drawn_points(len(box.names), plants, scenario.seed)
     return [make_bench(design.replace(plant=plant_at(plant, box.values(q))), scenario) for q in points]
@@ -290,10 +297,12 @@ def _summed(
         return MappingProxyType({signal: mean(parts[name][:, i], level) for i, signal in enumerate(signals)})
 
     return Evaluation(
-        runs, level,
+        runs,
+        level,
         false_alarm_rate=share(int(np.nansum(parts["false"])), counted, level),
         missed_detection_rate=share(faulty - int(np.sum(detected)) if faulty else 0, faulty, level),
         detection_delay=mean(delays, level),
         isolation_error_rate=share(int(np.nansum(parts["wrong"])), int(np.sum(judged)), level),
-        fault_rmse=errors("faults", observer.fault_names), state_rmse=errors("states", observer.state_names),
-    )  # fmt: skip
+        fault_rmse=errors("faults", observer.fault_names),
+        state_rmse=errors("states", observer.state_names),
+    )

@@ -136,12 +136,16 @@ class Simulation:
         x, f = shown.state_names, shown.fault_names
         found = {"time": self.time}
         for form, names, values in (
-            ("u[{}]", self.input_names, self.inputs), ("y[{}]", self.output_names, self.outputs),
-            ("x[{}]", x, self.states), ("f[{}]", f, self.faults[:, list(self.fault_columns)]),
-            ("d[{}]", self.disturbance_names, self.disturbances), ("xhat[{}]", x, shown.states),
-            *([("std xhat[{}]", x, shown.state_deviations)] if spread else []), ("fhat[{}]", f, shown.faults),
+            ("u[{}]", self.input_names, self.inputs),
+            ("y[{}]", self.output_names, self.outputs),
+            ("x[{}]", x, self.states),
+            ("f[{}]", f, self.faults[:, list(self.fault_columns)]),
+            ("d[{}]", self.disturbance_names, self.disturbances),
+            ("xhat[{}]", x, shown.states),
+            *([("std xhat[{}]", x, shown.state_deviations)] if spread else []),
+            ("fhat[{}]", f, shown.faults),
             ("std fhat[{}]", f, shown.fault_deviations) if spread else ("r[{}]", shown.residual_names, shown.residuals),
-        ):  # fmt: skip
+        ):
             for i, name in enumerate(names):
                 # Inputs and outputs go by their own names, unless those are taken.
                 plain = form[0] in "uy" and name not in found
@@ -230,8 +234,10 @@ def simulate(
 
 #: What simulates a plant alone.
 _PLANTS: dict[type, Callable[..., Trajectory]] = {
-    DescriptorSystem: simulate_plant, TimeVaryingDescriptorSystem: simulate_time_varying, DAEModel: simulate_dae,
-}  # fmt: skip
+    DescriptorSystem: simulate_plant,
+    TimeVaryingDescriptorSystem: simulate_time_varying,
+    DAEModel: simulate_dae,
+}
 
 
 def _simulated(design: ObserverDesign, scenario: Scenario) -> Simulation:
@@ -244,15 +250,27 @@ def _simulated(design: ObserverDesign, scenario: Scenario) -> Simulation:
         # Nothing was asked for: the plant starts at rest, as its inputs let it.
         change = 0.0
     if change > CONSISTENCY_TOLERANCE * max(1.0, float(np.linalg.norm(bench.initial_state))):
-        notes.append("The initial state did not satisfy the algebraic equations: it was projected, a change of "
-                     f"{change:.3g} (norm).")  # fmt: skip
+        notes.append(
+            "The initial state did not satisfy the algebraic equations: it was projected, a change of "
+            f"{change:.3g} (norm)."
+        )
     return Simulation(
-        time=dt * np.arange(bench.drive.steps, dtype=np.float64), states=runs.states[:, 0], outputs=runs.outputs[:, 0],
-        inputs=runs.inputs[:, 0], faults=runs.faults[:, 0], disturbances=runs.disturbances[:, 0],
-        estimates=runs.estimates[0], output_names=plant.output_names, input_names=plant.input_names,
-        disturbance_names=getattr(plant, "disturbance_names", ()), fault_columns=bench.estimated,
-        inconsistency=change, state_warm_up=state_warm_up, fault_warm_up=fault_warm_up, notes=tuple(notes),
-    )  # fmt: skip
+        time=dt * np.arange(bench.drive.steps, dtype=np.float64),
+        states=runs.states[:, 0],
+        outputs=runs.outputs[:, 0],
+        inputs=runs.inputs[:, 0],
+        faults=runs.faults[:, 0],
+        disturbances=runs.disturbances[:, 0],
+        estimates=runs.estimates[0],
+        output_names=plant.output_names,
+        input_names=plant.input_names,
+        disturbance_names=getattr(plant, "disturbance_names", ()),
+        fault_columns=bench.estimated,
+        inconsistency=change,
+        state_warm_up=state_warm_up,
+        fault_warm_up=fault_warm_up,
+        notes=tuple(notes),
+    )
 
 
 def aligned_errors(estimates: FloatArray, truth: FloatArray, delays: tuple[int, ...]) -> FloatArray:

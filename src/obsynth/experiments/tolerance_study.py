@@ -66,32 +66,52 @@ class ToleranceStudy:
     def rows(self) -> list[tuple[str, ...]]:
         """Return a heading and a row for each tolerance, as text."""
         unit = f" ({self.unit})" if self.unit else ""
-        heading = ("tolerance", *(f"{what}, {name}" for what in ("false alarms", f"least {self.fault}{unit}")
-                                  for name in (FIXED, ADAPTIVE)))  # fmt: skip
+        heading = (
+            "tolerance",
+            *(
+                f"{what}, {name}"
+                for what in ("false alarms", f"least {self.fault}{unit}")
+                for name in (FIXED, ADAPTIVE)
+            ),
+        )
         body = [
-            (f"{100.0 * tolerance:.3g} %", *(f"{100.0 * value:.0f} %" for value in alarms),
-             *(f"{value:.3g}" if np.isfinite(value) else "none" for value in least))
+            (
+                f"{100.0 * tolerance:.3g} %",
+                *(f"{100.0 * value:.0f} %" for value in alarms),
+                *(f"{value:.3g}" if np.isfinite(value) else "none" for value in least),
+            )
             for tolerance, alarms, least in zip(self.tolerances, self.false_alarms, self.least_faults, strict=True)
-        ]  # fmt: skip
+        ]
         return [heading, *body]
 
     def as_dict(self) -> dict[str, Any]:
         """Return everything as plain data; `None` for a fault that is never told."""
         least = [[float(value) if np.isfinite(value) else None for value in row] for row in self.least_faults]
         return {
-            "tolerances": self.tolerances.tolist(), "false_alarms": self.false_alarms.tolist(), "least_faults": least,
-            "fault": self.fault, "unit": self.unit, "runs": self.runs, "monitors": [FIXED, ADAPTIVE],
-        }  # fmt: skip
+            "tolerances": self.tolerances.tolist(),
+            "false_alarms": self.false_alarms.tolist(),
+            "least_faults": least,
+            "fault": self.fault,
+            "unit": self.unit,
+            "runs": self.runs,
+            "monitors": [FIXED, ADAPTIVE],
+        }
 
     def __str__(self) -> str:
         return "\n".join(text_table(self.rows(), left=0))
 
 
 def tolerance_study(
-    design: ObserverDesign, scenario: Scenario, *, tolerances: Sequence[float | str] = TOLERANCES,
-    fault: str | None = None, runs: int = 20, disturbance_bounds: Mapping[str, float] | None = None,
-    noise_bound: float | None = None, progress: Callable[[str], None] | None = None,
-) -> ToleranceStudy:  # fmt: skip
+    design: ObserverDesign,
+    scenario: Scenario,
+    *,
+    tolerances: Sequence[float | str] = TOLERANCES,
+    fault: str | None = None,
+    runs: int = 20,
+    disturbance_bounds: Mapping[str, float] | None = None,
+    noise_bound: float | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> ToleranceStudy:
     """Compare the fixed bound of the pointwise monitor with the adaptive one, for larger and larger tolerances.
 
     Parameters
@@ -144,8 +164,9 @@ def tolerance_study(
         scaled = _scaled(design, share / known)
         without, with_one = _both(scaled, quiet, chosen, runs)
         for j, constants in enumerate((None, scaled.linear[0])):
-            watched = monitor(scaled, quiet, constants=constants, disturbance_bounds=disturbance_bounds,
-                              noise_bound=noise_bound)  # fmt: skip
+            watched = monitor(
+                scaled, quiet, constants=constants, disturbance_bounds=disturbance_bounds, noise_bound=noise_bound
+            )
             alarms[i, j], least[i, j] = _counted(watched, without, with_one)
     return ToleranceStudy(np.array(shares), alarms, least, chosen, plant.units.get(chosen, ""), runs)
 

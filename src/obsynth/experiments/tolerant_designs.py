@@ -49,16 +49,21 @@ class _Candidate:
 
 
 def with_model_error(
-    plant: DescriptorSystem, scenario: Scenario | None, made: Callable[[DescriptorSystem], ObserverDesign],
+    plant: DescriptorSystem,
+    scenario: Scenario | None,
+    made: Callable[[DescriptorSystem], ObserverDesign],
     progress: Callable[[str], None],
-) -> ObserverDesign:  # fmt: skip
+) -> ObserverDesign:
     """Return the design with the smallest mean threshold over a scenario; ``made`` designs for a plant."""
     if plant.uncertainty is None or not plant.uncertainty.box.names:
-        raise SpecError("model_error: columns is for plants whose constants have tolerances: state constants, or leave "
-                        "it out.", path="method.options.model_error")  # fmt: skip
+        raise SpecError(
+            "model_error: columns is for plants whose constants have tolerances: state constants, or leave it out.",
+            path="method.options.model_error",
+        )
     if scenario is None:
-        raise SpecError("model_error: columns compares thresholds over a scenario: give one (scenario).",
-                        path="scenario")  # fmt: skip
+        raise SpecError(
+            "model_error: columns compares thresholds over a scenario: give one (scenario).", path="scenario"
+        )
     quiet = scenario.replace(faults={}, horizon=min(scenario.horizon, MOST_SAMPLES * plant.dt))
     progress("designing without regard to tolerances")
     first = made(plant)
@@ -83,9 +88,11 @@ def with_model_error(
             refined = True
             base = chosen.what.partition(", weight")[0]
             todo = [_with_noise(plant, base, chosen.direction, step * chosen.weight) for step in FINER]
-    text = "no direction of the model's error makes thresholds smaller" if chosen is None else (
-        f"{chosen.what}: mean thresholds {_listed(begin)} become {_listed(mean_thresholds(design, quiet))}"
-    )  # fmt: skip
+    text = (
+        "no direction of the model's error makes thresholds smaller"
+        if chosen is None
+        else (f"{chosen.what}: mean thresholds {_listed(begin)} become {_listed(mean_thresholds(design, quiet))}")
+    )
     note = f"model_error: columns: {tried} designs tried over the scenario without its faults; {text}."
     return design.replace(options={**design.options, "model_error": "columns"}, notes=(*design.notes, note))
 
@@ -102,9 +109,12 @@ def mean_thresholds(design: ObserverDesign, scenario: Scenario) -> FloatArray:
 
 
 def _scored(
-    item: _Candidate, plant: DescriptorSystem, made: Callable[[DescriptorSystem], ObserverDesign], scenario: Scenario,
+    item: _Candidate,
+    plant: DescriptorSystem,
+    made: Callable[[DescriptorSystem], ObserverDesign],
+    scenario: Scenario,
     begin: FloatArray,
-) -> tuple[ObserverDesign, float] | None:  # fmt: skip
+) -> tuple[ObserverDesign, float] | None:
     """Return the design of the plant itself and its mean threshold against the first; `None` where there is none."""
     try:
         draft = made(item.plant).replace(plant=plant)
@@ -142,9 +152,10 @@ def _most_blamed(affine: AffinePlant, blamed: Mapping[str, float]) -> Iterator[t
 
 def _with_noise(plant: DescriptorSystem, what: str, columns: FloatArray, weight: float) -> _Candidate:
     extra = plant.replace(
-        Bw=np.hstack([plant.Bw, weight * columns]), Dw=np.hstack([plant.Dw, np.zeros((plant.ny, columns.shape[1]))]),
+        Bw=np.hstack([plant.Bw, weight * columns]),
+        Dw=np.hstack([plant.Dw, np.zeros((plant.ny, columns.shape[1]))]),
         noise_names=None,
-    )  # fmt: skip
+    )
     return _Candidate(f"{what}, weight {weight:.3g}", extra, columns, weight)
 
 
@@ -154,9 +165,11 @@ def _unknown_inputs(affine: AffinePlant, plant: DescriptorSystem, blamed: Mappin
     for name, i, columns in _most_blamed(affine, blamed):
         if told[name].separable and columns.shape[1] == 1 and not affine.C.parts[i].any():
             more = plant.replace(
-                Bd=np.hstack([plant.Bd, columns]), Dd=np.hstack([plant.Dd, np.zeros((plant.ny, 1))]),
-                disturbance_names=(*plant.disturbance_names, f"error of {name}"), uncertainty=None,
-            )  # fmt: skip
+                Bd=np.hstack([plant.Bd, columns]),
+                Dd=np.hstack([plant.Dd, np.zeros((plant.ny, 1))]),
+                disturbance_names=(*plant.disturbance_names, f"error of {name}"),
+                uncertainty=None,
+            )
             yield _Candidate(f"the error of {name} as an unknown input", more)
 
 

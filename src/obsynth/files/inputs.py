@@ -21,8 +21,11 @@ MAXIMUM_CHARACTERS = 32_000_000
 _HALF_CHARACTER = re.compile(r"\\u[dD][89a-fA-F]|[\ud800-\udfff]")
 #: What a path can be that is neither a file nor a folder.
 _SPECIAL = {
-    stat.S_IFIFO: "a named pipe", stat.S_IFCHR: "a device", stat.S_IFBLK: "a device", stat.S_IFSOCK: "a socket",
-}  # fmt: skip
+    stat.S_IFIFO: "a named pipe",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+    stat.S_IFSOCK: "a socket",
+}
 
 #: Device and number of each file that the running command has read; `None` outside commands.
 _read: ContextVar[dict[tuple[int, int], Path] | None] = ContextVar("files read", default=None)
@@ -108,8 +111,11 @@ def read_text(
     except (OSError, MemoryError) as error:
         raise SpecError(f"{path} cannot be read: {reason(error)}.", path=place) from error
     if len(text) > most:
-        raise SpecError(f"{path} is too large for a document (more than {most:,} characters): large matrices belong in "
-                        ".mtx or .npz files.", path=place)  # fmt: skip
+        raise SpecError(
+            f"{path} is too large for a document (more than {most:,} characters): large matrices belong in "
+            ".mtx or .npz files.",
+            path=place,
+        )
     return text
 
 

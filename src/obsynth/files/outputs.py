@@ -64,8 +64,9 @@ def check_output(path: str | Path, *, option: str = "") -> Path:
     read = protected_as(target)
     if read is not None:
         also = "" if str(read) == where else f", as {read}"
-        raise SpecError(f"{target} is read by this command{also}: it cannot be written as well, give another file.",
-                        path=where)  # fmt: skip
+        raise SpecError(
+            f"{target} is read by this command{also}: it cannot be written as well, give another file.", path=where
+        )
     return target
 
 

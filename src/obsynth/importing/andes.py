@@ -57,13 +57,18 @@ def from_andes(
         e, a, names = _written_pencil(Path(case))
     else:
         e, a, names, point = _solved_case(case)
-    given = {kind: _names(picked, names, kind) for kind, picked in
-             (("outputs", outputs), ("faults", faults), ("disturbances", disturbances))}  # fmt: skip
+    given = {
+        kind: _names(picked, names, kind)
+        for kind, picked in (("outputs", outputs), ("faults", faults), ("disturbances", disturbances))
+    }
     stated = {**point, **(plant.pop("operating_point", None) or {})}
     arguments: dict[str, Any] = {
-        "dt": 0.0, "state_names": checked_names(names, len(names), prefix="x", what="state_names"),
-        "Bf": given["faults"] or None, "Bd": given["disturbances"] or None, "C": given["outputs"],
-    }  # fmt: skip
+        "dt": 0.0,
+        "state_names": checked_names(names, len(names), prefix="x", what="state_names"),
+        "Bf": given["faults"] or None,
+        "Bd": given["disturbances"] or None,
+        "C": given["outputs"],
+    }
     # A fault and a disturbance are changes: the value of the variable they are named after is not theirs.
     for kind, role, word in (("faults", "fault_names", "change of"), ("disturbances", "disturbance_names", "load on")):
         if given[kind]:

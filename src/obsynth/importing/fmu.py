@@ -48,17 +48,20 @@ class Instance:
         self.input_names = [v.name for v in variables if v.causality == "input"]
         self.output_names = [v.name for v in variables if v.causality == "output"]
         self.settable = [
-            v.name for v in variables
+            v.name
+            for v in variables
             if v.causality in ("input", "parameter") or v.name in self.state_names or v.initial in ("exact", "approx")
-        ]  # fmt: skip
+        ]
         self.model = self._instantiate(folder)
 
     def _instantiate(self, folder: str) -> Any:
         kind = getattr(import_module(f"fmpy.fmi{self.version[0]}"), _SPELLED[self.version][0])
         model = kind(
-            guid=self.description.guid, unzipDirectory=folder, instanceName="linearised",
+            guid=self.description.guid,
+            unzipDirectory=folder,
+            instanceName="linearised",
             modelIdentifier=self.description.modelExchange.modelIdentifier,
-        )  # fmt: skip
+        )
         model.instantiate()
         return model
 
@@ -189,8 +192,12 @@ def from_fmu(
                 close = suggestion(name, instance.settable)
                 raise SpecError(f"at: the FMU has no real variable {name!r} that can be set.{close}", path="at")
         instance.begin(at or {})
-        states = np.array([dict(at or {}).get(name, value) for name, value in
-                           zip(instance.state_names, instance.states(), strict=True)])  # fmt: skip
+        states = np.array(
+            [
+                dict(at or {}).get(name, value)
+                for name, value in zip(instance.state_names, instance.states(), strict=True)
+            ]
+        )
         instance.set_states(states)
         if equilibrium:
             states = _equilibrium(instance, states)
@@ -248,17 +255,23 @@ def _require_readable(fmpy: Any, path: Path) -> None:
         raise SpecError(f"{path} is of FMI {version or '?'}: give an FMU of FMI 2 or 3.", path=str(path))
     exchange = root.find("ModelExchange")
     if exchange is None:
-        raise SpecError(f"{path} is for co-simulation only: its states and derivatives cannot be asked for. Export it "
-                        "for model exchange.", path=str(path))  # fmt: skip
+        raise SpecError(
+            f"{path} is for co-simulation only: its states and derivatives cannot be asked for. Export it "
+            "for model exchange.",
+            path=str(path),
+        )
     # fmpy does not read the attribute of FMI 3, which is spelled differently.
     named = "providesDirectionalDerivative" + ("" if version.startswith("2") else "s")
     if exchange.get(named) not in ("true", "1"):
-        raise SpecError(f"{path} provides no directional derivatives: switch them on in the tool that exports it.",
-                        path=str(path))  # fmt: skip
+        raise SpecError(
+            f"{path} provides no directional derivatives: switch them on in the tool that exports it.", path=str(path)
+        )
     platforms = fmpy.supported_platforms(str(path))
     if fmpy.platform not in platforms and fmpy.platform_tuple not in platforms:
-        raise SpecError(f"{path} has no binary for this machine ({fmpy.platform_tuple}); it has "
-                        f"{', '.join(platforms) or 'none'}.", path=str(path))  # fmt: skip
+        raise SpecError(
+            f"{path} has no binary for this machine ({fmpy.platform_tuple}); it has {', '.join(platforms) or 'none'}.",
+            path=str(path),
+        )
 
 
 def _used(known: Sequence[str], picked: Sequence[str] | None, what: str) -> list[str]:
@@ -308,6 +321,7 @@ def _require_rest(instance: Instance, states: FloatArray, a: FloatArray, b: Floa
     raise PreconditionError(
         f"The operating point is no equilibrium: {instance.state_names[worst]!r} changes by {rates[worst]:.6g} per "
         "second there, so deviations from it obey no linear model without a constant term. Give the point by at={...}, "
-        "or let it be searched by equilibrium=True.", condition="equilibrium",
+        "or let it be searched by equilibrium=True.",
+        condition="equilibrium",
         signals=(instance.state_names[worst],),
-    )  # fmt: skip
+    )

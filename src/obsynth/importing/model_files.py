@@ -21,9 +21,11 @@ _MATRICES = ("E", "A", "B", "C", "D")
 _MORE = ("Bf", "Df", "Bd", "Dd", "Bw", "Dw")
 # What MATLAB's state-space objects call them, and what obsynth does.
 _NAMES = {
-    "StateName": "state_names", "InputName": "input_names", "OutputName": "output_names",
+    "StateName": "state_names",
+    "InputName": "input_names",
+    "OutputName": "output_names",
     **{f"{kind}_names": f"{kind}_names" for kind in ("state", "input", "output", "fault", "disturbance", "noise")},
-}  # fmt: skip
+}
 _TIMES = ("Ts", "dt")
 
 
@@ -66,12 +68,14 @@ def from_matlab(
     content = _content(source)
     fields = _fields(content, variable, source)
     if "A" not in fields:
-        raise SpecError(f"{source} has no matrix A{_in(variable)}; it has: {', '.join(fields) or 'nothing'}.",
-                        path=str(source))  # fmt: skip
+        raise SpecError(
+            f"{source} has no matrix A{_in(variable)}; it has: {', '.join(fields) or 'nothing'}.", path=str(source)
+        )
     times = [float(np.squeeze(fields[name])) for name in _TIMES if name in fields and np.size(fields[name]) == 1]
     if dt is None and not times:
-        raise SpecError(f"{source} does not say the sampling time (Ts): give dt in seconds, or 0 for continuous time.",
-                        path="dt")  # fmt: skip
+        raise SpecError(
+            f"{source} does not say the sampling time (Ts): give dt in seconds, or 0 for continuous time.", path="dt"
+        )
     if dt is not None and times and dt != times[0]:
         raise SpecError(f"dt is {dt}, but {source} has {times[0]:g}: leave dt out.", path="dt")
     names = {ours: _texts(fields[theirs]) for theirs, ours in _NAMES.items() if theirs in fields}
@@ -79,9 +83,10 @@ def from_matlab(
     given = {name: _dense(fields[name]) for name in (*_MATRICES, *_MORE) if name in fields}
     return plant_of(
         {name: given[name] for name in _MATRICES if name in given and np.size(given[name])},
-        {**{name: given[name] for name in _MORE if name in given}, **names, **plant}, labels=labels,
+        {**{name: given[name] for name in _MORE if name in given}, **names, **plant},
+        labels=labels,
         dt=times[0] if dt is None else dt,
-    )  # fmt: skip
+    )
 
 
 def mat_arrays(source: Path) -> dict[str, Any]:
@@ -108,8 +113,11 @@ def _content(source: Path) -> dict[str, Any]:
 
 
 def _fields(content: Mapping[str, Any], variable: str | None, source: Path) -> dict[str, Any]:
-    structs = [name for name, value in content.items() if getattr(value, "dtype", None) is not None
-               and value.dtype.names and value.size == 1]  # fmt: skip
+    structs = [
+        name
+        for name, value in content.items()
+        if getattr(value, "dtype", None) is not None and value.dtype.names and value.size == 1
+    ]
     if variable is None and "A" in content:
         return dict(content)
     if variable is None and len(structs) != 1:
@@ -117,8 +125,9 @@ def _fields(content: Mapping[str, Any], variable: str | None, source: Path) -> d
         raise SpecError(f"{source}: say which struct is the plant (variable=...); it has: {found}.", path=str(source))
     name = structs[0] if variable is None else variable
     if name not in structs:
-        raise SpecError(f"{source} has no struct {name!r}; it has: {', '.join(map(repr, structs)) or 'none'}.",
-                        path=str(source))  # fmt: skip
+        raise SpecError(
+            f"{source} has no struct {name!r}; it has: {', '.join(map(repr, structs)) or 'none'}.", path=str(source)
+        )
     record = content[name].reshape(-1)[0]
     return {field: record[field] for field in content[name].dtype.names}
 
@@ -181,8 +190,9 @@ def from_modelica(path: str | Path, **plant: Any) -> DescriptorSystem:
     found = {name: body for name, body in _MATRIX.findall(text)}
     missing = [name for name in ("n", "m", "p") if name not in sizes] + [name for name in "ABCD" if name not in found]
     if missing:
-        raise SpecError(f"{source} is no linear model as OpenModelica writes it: it has no {missing[0]}.",
-                        path=str(source))  # fmt: skip
+        raise SpecError(
+            f"{source} is no linear model as OpenModelica writes it: it has no {missing[0]}.", path=str(source)
+        )
     shapes = {"A": ("n", "n"), "B": ("n", "m"), "C": ("p", "n"), "D": ("p", "m")}
     matrices = {
         name: _matrix(found[name], sizes[rows], sizes[columns], name, source)
@@ -194,9 +204,12 @@ def from_modelica(path: str | Path, **plant: Any) -> DescriptorSystem:
             names[kind][int(number) - 1] = name.removeprefix(_OUTPUT_ALIAS)
     points = dict(_POINT.findall(text))
     point = {
-        name: value for kind in "xu" for name, value in
-        zip(names[kind], _numbers(points.get(kind, ""), len(names[kind]), f"{kind}0", source), strict=True)
-    }  # fmt: skip
+        name: value
+        for kind in "xu"
+        for name, value in zip(
+            names[kind], _numbers(points.get(kind, ""), len(names[kind]), f"{kind}0", source), strict=True
+        )
+    }
     measured = sizes["p"] > 0
     if not measured:
         matrices |= {"C": np.eye(sizes["n"]), "D": np.zeros((sizes["n"], sizes["m"]))}

@@ -55,12 +55,20 @@ def from_control(
     if isinstance(system, control.TransferFunction):
         system = control.ss(system)
     if not isinstance(system, control.StateSpace):
-        raise SpecError(f"system is a {type(system).__name__}: give a control.StateSpace, such as control.ss(...).",
-                        path="system")  # fmt: skip
-    labels = {"state_names": system.state_labels, "input_names": system.input_labels,
-              "output_names": system.output_labels}  # fmt: skip
-    return plant_of({"E": E, "A": system.A, "B": system.B, "C": system.C, "D": system.D}, plant, labels=labels,
-                    dt=_sampling_time(system.dt, dt))  # fmt: skip
+        raise SpecError(
+            f"system is a {type(system).__name__}: give a control.StateSpace, such as control.ss(...).", path="system"
+        )
+    labels = {
+        "state_names": system.state_labels,
+        "input_names": system.input_labels,
+        "output_names": system.output_labels,
+    }
+    return plant_of(
+        {"E": E, "A": system.A, "B": system.B, "C": system.C, "D": system.D},
+        plant,
+        labels=labels,
+        dt=_sampling_time(system.dt, dt),
+    )
 
 
 def from_scipy(
@@ -102,10 +110,11 @@ def from_scipy(
         raise SpecError(f"system is a {type(system).__name__}: give a scipy.signal.StateSpace.", path="system")
     state_space = system.to_ss()
     return plant_of(
-        {"E": E, **{name: np.asarray(getattr(state_space, name)) for name in "ABCD"}}, plant,
+        {"E": E, **{name: np.asarray(getattr(state_space, name)) for name in "ABCD"}},
+        plant,
         labels={"input_names": input_names, "output_names": output_names},
         dt=_sampling_time(state_space.dt, plant.pop("dt", None)),
-    )  # fmt: skip
+    )
 
 
 def _sampling_time(own: Any, given: float | None) -> float:
@@ -119,8 +128,9 @@ def _sampling_time(own: Any, given: float | None) -> float:
     return float(own)
 
 
-def from_sympy(A: Any, B: Any = None, C: Any = None, *, parameters: Mapping[Any, float] | None = None,
-               **plant: Any) -> DescriptorSystem:  # fmt: skip
+def from_sympy(
+    A: Any, B: Any = None, C: Any = None, *, parameters: Mapping[Any, float] | None = None, **plant: Any
+) -> DescriptorSystem:
     """Return the plant of matrices of sympy, whose symbols are parameters with values.
 
     Parameters
@@ -198,12 +208,15 @@ def _is_symbolic(value: Any, sympy: Any) -> bool:
 def _require_values(free: set[str], values: Mapping[str, float]) -> None:
     missing = sorted(free - set(values))
     if missing:
-        raise SpecError(f"The matrices hold symbols without a value: {', '.join(missing)}. Give parameters={{...}}.",
-                        path="parameters")  # fmt: skip
+        raise SpecError(
+            f"The matrices hold symbols without a value: {', '.join(missing)}. Give parameters={{...}}.",
+            path="parameters",
+        )
     unused = sorted(set(values) - free)
     if unused:
-        raise SpecError(f"No matrix holds the symbol {unused[0]!r}.{suggestion(unused[0], sorted(free))}",
-                        path="parameters")  # fmt: skip
+        raise SpecError(
+            f"No matrix holds the symbol {unused[0]!r}.{suggestion(unused[0], sorted(free))}", path="parameters"
+        )
     wrong = [name for name, value in values.items() if not is_finite_number(value)]
     if wrong:
         raise SpecError(f"The parameter {wrong[0]!r} is {values[wrong[0]]!r}: give a finite number.", path="parameters")
@@ -220,7 +233,10 @@ def _evaluated(matrix: Any, numbers: Mapping[Any, Any], name: str) -> FloatArray
         for j in range(columns):
             entry = matrix[i, j].subs(numbers)
             if not (entry.is_number and entry.is_real and entry.is_finite):
-                raise SpecError(f"{name}, row {i + 1}, column {j + 1}: {matrix[i, j]} is {entry} at these parameters; "
-                                "give a finite real number.", path=name)  # fmt: skip
+                raise SpecError(
+                    f"{name}, row {i + 1}, column {j + 1}: {matrix[i, j]} is {entry} at these parameters; "
+                    "give a finite real number.",
+                    path=name,
+                )
             dense[i, j] = int(entry.p) / int(entry.q) if entry.is_Rational else float(entry)
     return dense

@@ -17,10 +17,14 @@ _ROLES = ("faults", "disturbances", "actuator_faults", "sensor_faults")
 
 
 def plant_of(
-    matrices: Mapping[str, ArrayLike | None], plant: Mapping[str, Any], *, dt: float,
-    labels: Mapping[str, Sequence[str] | None], point: Mapping[str, float] | None = None,
+    matrices: Mapping[str, ArrayLike | None],
+    plant: Mapping[str, Any],
+    *,
+    dt: float,
+    labels: Mapping[str, Sequence[str] | None],
+    point: Mapping[str, float] | None = None,
     units: Mapping[str, str] | None = None,
-) -> DescriptorSystem:  # fmt: skip
+) -> DescriptorSystem:
     """Return the plant of matrices ``E, A, B, C, D`` whose inputs are shared out among known, faults and unknown.
     ``labels``: ``state_names``, ``input_names``, ``output_names``; ``plant``: roles and arguments of the plant, which
     go before ``dt``, and entry by entry before operating point and units."""
@@ -50,19 +54,27 @@ def plant_of(
     biased = _places(sensor_faults, outputs, "sensor_faults")
     known = [i for i in range(nu) if i not in (*fault, *unknown)]
     arguments: dict[str, Any] = {
-        "E": given.get("E"), "A": a, "B": b[:, known], "C": c, "D": d[:, known],
-        "state_names": labels.get("state_names"), "output_names": outputs,
+        "E": given.get("E"),
+        "A": a,
+        "B": b[:, known],
+        "C": c,
+        "D": d[:, known],
+        "state_names": labels.get("state_names"),
+        "output_names": outputs,
         "input_names": [inputs[i] for i in known],
-    }  # fmt: skip
+    }
     if fault or doubled or biased:
         _refuse_both(more, "faults", ("Bf", "Df", "fault_names"))
         bias = np.eye(c.shape[0])[:, biased]
         arguments |= {
             "Bf": np.hstack([b[:, [*fault, *doubled]], np.zeros((a.shape[0], len(biased)))]),
             "Df": np.hstack([d[:, [*fault, *doubled]], bias]),
-            "fault_names": [*faults, *(f"fault of {name}" for name in actuator_faults),
-                            *(f"bias of {name}" for name in sensor_faults)],
-        }  # fmt: skip
+            "fault_names": [
+                *faults,
+                *(f"fault of {name}" for name in actuator_faults),
+                *(f"bias of {name}" for name in sensor_faults),
+            ],
+        }
     if unknown:
         _refuse_both(more, "disturbances", ("Bd", "Dd", "disturbance_names"))
         arguments |= {"Bd": b[:, unknown], "Dd": d[:, unknown], "disturbance_names": list(disturbances)}
@@ -74,8 +86,9 @@ def _full(matrix: FloatArray | None, rows: int, columns: int, name: str) -> Floa
         return np.zeros((rows, columns))
     if matrix.shape != (rows, columns):
         hint = " Is it transposed?" if matrix.shape == (columns, rows) else ""
-        raise SpecError(f"{name} is {matrix.shape[0]} by {matrix.shape[1]}, but {rows} by {columns} is needed.{hint}",
-                        path=name)  # fmt: skip
+        raise SpecError(
+            f"{name} is {matrix.shape[0]} by {matrix.shape[1]}, but {rows} by {columns} is needed.{hint}", path=name
+        )
     return matrix
 
 

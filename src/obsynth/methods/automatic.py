@@ -183,9 +183,10 @@ def designed(plant: DescriptorSystem, options: Mapping[str, Any], methods: list[
         return []
     own_time = plant.dt == 0.0
     taken = [
-        method for method in _methods_with("faults", methods)
+        method
+        for method in _methods_with("faults", methods)
         if not (plant.dt > 0.0 and method_class(method).time == "continuous")
-    ]  # fmt: skip
+    ]
     return [candidate(method, plant, sampled, steps, maker, options, continuous=own_time) for method in taken]
 
 

@@ -113,9 +113,14 @@ def design(
 
 
 def _designed(
-    plant: Plant, asked: Method, *, name: str, recovery: StateRecovery | None, progress: Callable[[str], None],
+    plant: Plant,
+    asked: Method,
+    *,
+    name: str,
+    recovery: StateRecovery | None,
+    progress: Callable[[str], None],
     advise: bool,
-) -> ObserverDesign:  # fmt: skip
+) -> ObserverDesign:
     """Return the verified design of one method; with ``advise`` a refusal says what would help."""
     for condition in kind_conditions(plant, type(asked)):
         condition.require()
@@ -181,9 +186,15 @@ def check(
     except PreconditionError as error:
         # The sparse plant as written has no reduced form for any method.
         row = Condition(
-            error.condition, "algebraic states that can be eliminated", False, np.nan, np.nan, "plant", str(error),
+            error.condition,
+            "algebraic states that can be eliminated",
+            False,
+            np.nan,
+            np.nan,
+            "plant",
+            str(error),
             signals=error.signals,
-        )  # fmt: skip
+        )
         return {method: VerificationReport.of(condition_rows((row,))) for method in REGISTRY}
 
 

@@ -138,9 +138,14 @@ def _figures(
         own = step[:, row, plant.fault_names.index(name)]
         gains = np.abs(np.fft.rfft(unknown[:, row], axis=0))
         yield FaultFigures(
-            name, _first(own >= HALF, plant.dt), _first(own >= MOST, plant.dt), float(own[-1]),
-            float(np.max(np.abs(own))), float(np.sqrt(np.sum(noise[:, row] ** 2))), float(np.max(gains, initial=0.0)),
-        )  # fmt: skip
+            name,
+            _first(own >= HALF, plant.dt),
+            _first(own >= MOST, plant.dt),
+            float(own[-1]),
+            float(np.max(np.abs(own))),
+            float(np.sqrt(np.sum(noise[:, row] ** 2))),
+            float(np.max(gains, initial=0.0)),
+        )
 
 
 def _first(reached: NDArray[np.bool_], dt: float) -> float:

@@ -41,10 +41,11 @@ def require_all_told(conditions: Iterable[Condition]) -> None:
             raise
         also = "; ".join(f"{other.name}: {other.detail}" for other in others)
         raise PreconditionError(
-            f"{error} Also fails: {also}", condition=first.name,
+            f"{error} Also fails: {also}",
+            condition=first.name,
             mode=next((condition.mode for condition in failed if condition.mode is not None), None),
             signals=tuple(dict.fromkeys(name for condition in failed for name in condition.signals)),
-        ) from None  # fmt: skip
+        ) from None
 
 
 def with_advice(error: PreconditionError, plant: DescriptorSystem, asked: Method) -> PreconditionError:
@@ -131,18 +132,21 @@ def require_above_rounding(plant: DescriptorSystem, observer: LinearObserver) ->
 
 def _doubt(plant: DescriptorSystem, observer: LinearObserver, fault: int) -> Unclear:
     """Return the last digit of a number of the plant, or else of the observer, that moves an estimate most."""
-    found = max((witness for point in _points(plant) for witness in last_digits(plant, observer, fault, point)),
-                key=lambda witness: (witness.changes[0].matrix in ("C", "Df") and witness.size >= MOST, witness.size),
-                default=None)  # fmt: skip
+    found = max(
+        (witness for point in _points(plant) for witness in last_digits(plant, observer, fault, point)),
+        key=lambda witness: (witness.changes[0].matrix in ("C", "Df") and witness.size >= MOST, witness.size),
+        default=None,
+    )
     size, place = (0.0, 0j) if found is None else (found.size, found.point or 0j)
     where = f"{place.real:.4g}" if place.imag == 0.0 else f"{place:.4g}"
     return Unclear(
-        UNIT_ROUNDOFF, found,
+        UNIT_ROUNDOFF,
+        found,
         f"has an estimate of {plant.fault_names[fault]!r} that differs by {size:.2g} of the fault at "
         f"{'z' if plant.is_discrete else 's'} = {where}",
         "Less asked of the gains (a slower decay, a larger gamma), or an output in which the fault shows more, would "
         "decide it.",
-    )  # fmt: skip
+    )
 
 
 def last_digits(plant: DescriptorSystem, observer: LinearObserver, fault: int, point: complex) -> Iterator[Witness]:
@@ -156,9 +160,11 @@ def last_digits(plant: DescriptorSystem, observer: LinearObserver, fault: int, p
     left, shown = observer.Cz[row] @ resolvent, outputs[:, fault]
     gain = left @ observer.By + observer.Dy[row]
     effects = {
-        "C": np.outer(np.abs(gain), np.abs(states)), "Df": np.outer(np.abs(gain), np.eye(plant.nf)[fault]),
-        "By": np.outer(np.abs(left), np.abs(shown)), "Dy": np.outer(np.arange(len(observer.Dy)) == row, np.abs(shown)),
-    }  # fmt: skip
+        "C": np.outer(np.abs(gain), np.abs(states)),
+        "Df": np.outer(np.abs(gain), np.eye(plant.nf)[fault]),
+        "By": np.outer(np.abs(left), np.abs(shown)),
+        "Dy": np.outer(np.arange(len(observer.Dy)) == row, np.abs(shown)),
+    }
     for name, effect in effects.items():
         matrix = getattr(plant if name in ("C", "Df") else observer, name)
         moved = effect * np.where(matrix != 0.0, np.spacing(np.abs(matrix)), 0.0)
@@ -174,12 +180,17 @@ def last_digits(plant: DescriptorSystem, observer: LinearObserver, fault: int, p
 def rounding_notes(plant: DescriptorSystem, observer: LinearObserver) -> tuple[str, ...]:
     """Return what rounding of the observer's own numbers may do to an estimate, where that matters."""
     found = _least(plant, observer, own=True)
-    return () if found is None else tuple(
-        f"The numbers of the observer cancel each other: their last digits alone may move the estimate of {name!r} by"
-        f" {share:.2g} of the fault, and by more at some frequencies. State the noise of the sensors, or ask for a"
-        " larger gamma."
-        for name, share in zip(plant.fault_names, found, strict=True) if share >= TOLD
-    )  # fmt: skip
+    return (
+        ()
+        if found is None
+        else tuple(
+            f"The numbers of the observer cancel each other: their last digits alone may move the estimate of {name!r}"
+            f" by {share:.2g} of the fault, and by more at some frequencies. State the noise of the sensors, or ask "
+            "for a larger gamma."
+            for name, share in zip(plant.fault_names, found, strict=True)
+            if share >= TOLD
+        )
+    )
 
 
 def _least(plant: DescriptorSystem, observer: LinearObserver, *, own: bool) -> FloatArray | None:

@@ -17,8 +17,14 @@ from obsynth.results.design import ObserverDesign
 from obsynth.verification.error_system import ErrorModel
 
 __all__ = [
-    "AUTO", "REGISTRY", "error_model", "kind_conditions", "kind_of", "method_class", "methods_for",
-]  # fmt: skip
+    "AUTO",
+    "REGISTRY",
+    "error_model",
+    "kind_conditions",
+    "kind_of",
+    "method_class",
+    "methods_for",
+]
 
 #: What a spec and `obsynth.design` call the choice between all methods that exist.
 AUTO = "auto"
@@ -80,7 +86,12 @@ def kind_conditions(plant: Plant, method: type[Method]) -> tuple[Condition, ...]
     wanted = " or ".join(_KINDS[taken][1] for taken in method.plants)
     return (
         Condition(
-            "kind of plant", f"{method.id} needs {wanted}", False, 0.0, 1.0, method.id,
+            "kind of plant",
+            f"{method.id} needs {wanted}",
+            False,
+            0.0,
+            1.0,
+            method.id,
             f"{_KINDS[kind][1]}; methods for such plants are: {', '.join(methods_for(kind))}.",
         ),
-    )  # fmt: skip
+    )

@@ -125,9 +125,11 @@ Count = Annotated[int, Ge(1), Le(1_000_000)]
 FewSamples = Annotated[int, Ge(0), Le(1000)]
 #: Mark -> its attribute, the comparison it stands for, and how a message says it.
 _BOUNDS: Mapping[type, tuple[str, Callable[[Any, Any], bool], str]] = {
-    Gt: ("gt", operator.gt, "above"), Ge: ("ge", operator.ge, "at least"), Lt: ("lt", operator.lt, "below"),
+    Gt: ("gt", operator.gt, "above"),
+    Ge: ("ge", operator.ge, "at least"),
+    Lt: ("lt", operator.lt, "below"),
     Le: ("le", operator.le, "at most"),
-}  # fmt: skip
+}
 
 
 class WrittenAs:
@@ -164,11 +166,13 @@ def problem_with(value: Any, name: str, kind: Any) -> str | None:
 
 #: What an option is that is written as some kind, and the Python types of it.
 _LISTS: Mapping[str, tuple[str, tuple[type, ...]]] = {
-    "poles": ("a list of poles", (list, tuple, np.ndarray)), "texts": ("a list of names", (str, list, tuple)),
+    "poles": ("a list of poles", (list, tuple, np.ndarray)),
+    "texts": ("a list of names", (str, list, tuple)),
     "fault sets": ("'detect', 'isolate' or lists of names", (str, list, tuple)),
     "named bounds": ("a number, 0 or more, or one for each name", (int, float, np.integer, np.floating, Mapping)),
-    "free faults": ("'others', 'none' or a list of names", (str, list, tuple)), "text": ("a text", (str,)),
-}  # fmt: skip
+    "free faults": ("'others', 'none' or a list of names", (str, list, tuple)),
+    "text": ("a text", (str,)),
+}
 
 
 def _problem_with_written(value: Any, name: str, kind: str) -> str | None:

@@ -149,7 +149,7 @@ def _solve_estimate(right: FloatArray, head: FloatArray, x: FloatArray, state: F
 @compiled
 def _solve(
     work: FloatArray, right: FloatArray, head: FloatArray, x: FloatArray, factor: FloatArray, state: FloatArray
-) -> None:  # fmt: skip
+) -> None:
     """Solve with R_H for the estimate and for the square root of its covariance."""
     n = len(head)
     m = len(right) - n
@@ -187,9 +187,18 @@ def _note_spreads(factor: FloatArray, deviations: FloatArray, covariance: FloatA
 
 
 def _steps(
-    x: FloatArray, factor: FloatArray, moved: FloatArray, known: FloatArray, head: FloatArray, data: FloatArray,
-    states: FloatArray, innovations: FloatArray, deviations: FloatArray, covariances: FloatArray, share: float,
-) -> int:  # fmt: skip
+    x: FloatArray,
+    factor: FloatArray,
+    moved: FloatArray,
+    known: FloatArray,
+    head: FloatArray,
+    data: FloatArray,
+    states: FloatArray,
+    innovations: FloatArray,
+    deviations: FloatArray,
+    covariances: FloatArray,
+    share: float,
+) -> int:
     """Take steps of the square-root recursion until one needs a decision about a rank; return how many were taken.
 
     Arrays in C order, writeable; what does not change with k has one entry along its first axis.  Shapes: ``x (n,),

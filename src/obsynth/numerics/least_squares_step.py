@@ -188,8 +188,10 @@ def _whitened(
     left = scaled[rank:] - (t[:rank, rank:].T @ innovation if rank else 0.0)
     terms = ((np.abs(q2.T) @ np.abs(Y)) / sizes[:, None])[order][rank:]
     if mapped:
-        _require_consistent(np.hstack([np.zeros((len(left), 1)), left[:, mapped:]]),
-                            np.hstack([np.zeros((len(left), 1)), terms[:, mapped:]]))  # fmt: skip
+        _require_consistent(
+            np.hstack([np.zeros((len(left), 1)), left[:, mapped:]]),
+            np.hstack([np.zeros((len(left), 1)), terms[:, mapped:]]),
+        )
     else:
         _require_consistent(left, terms)
     rotated = q1.T @ S @ z
@@ -202,10 +204,12 @@ def _require_consistent(left: FloatArray, terms: FloatArray) -> None:
     if np.any(bad[:, :1]):
         raise PreconditionError(
             "Equations or outputs without noise contradict each other: no state fits them. Give the ones that are only "
-            "nearly true a variance in Q or R.", condition="consistent perfect constraints",
-        )  # fmt: skip
+            "nearly true a variance in Q or R.",
+            condition="consistent perfect constraints",
+        )
     if np.any(bad):
         raise PreconditionError(
             "Equations or outputs without noise determine the parameters exactly, which a filter cannot weigh against "
-            "noisy data. Give them a variance in Q or R.", condition="parity covariance nonsingular",
-        )  # fmt: skip
+            "noisy data. Give them a variance in Q or R.",
+            condition="parity covariance nonsingular",
+        )

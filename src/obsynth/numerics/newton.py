@@ -111,8 +111,11 @@ def newton(
 
 def _damped(
     evaluate: Callable[[FloatArray], tuple[FloatArray, FloatArray]],
-    x: FloatArray, step: FloatArray, rows: FloatArray, before: float,
-) -> tuple[FloatArray, FloatArray, FloatArray] | None:  # fmt: skip
+    x: FloatArray,
+    step: FloatArray,
+    rows: FloatArray,
+    before: float,
+) -> tuple[FloatArray, FloatArray, FloatArray] | None:
     """Return the first of x + step, x + step / 2, ... at which the scaled residual is smaller, with what is there."""
     for halvings in range(MOST_HALVINGS + 1):
         tried = x + 0.5**halvings * step

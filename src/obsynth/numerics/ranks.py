@@ -196,12 +196,15 @@ def covariance_factor(covariance: FloatArray, name: str) -> FloatArray:
         i, j = int(worst[0]) + 1, int(worst[1]) + 1
         raise SpecError(
             f"{name} is not symmetric: entry ({i}, {j}) is {covariance[worst]:.6g}, entry ({j}, {i}) is "
-            f"{covariance.T[worst]:.6g}.", path=name,
-        )  # fmt: skip
+            f"{covariance.T[worst]:.6g}.",
+            path=name,
+        )
     zero = bounds == 0.0
     if np.any(diagonal < 0.0) or np.any(covariance[zero]):
-        raise SpecError(f"{name} is no covariance: it has a negative variance, or a covariance with a signal that has "
-                        "none.", path=name)  # fmt: skip
+        raise SpecError(
+            f"{name} is no covariance: it has a negative variance, or a covariance with a signal that has none.",
+            path=name,
+        )
     scale = np.where(deviations > 0.0, deviations, 1.0)
     correlation = 0.5 * (covariance + covariance.T) / np.outer(scale, scale)
     try:

@@ -6,7 +6,7 @@ Source: M. Chilali, P. Gahinet, IEEE TAC 41 (3), 1996, section II.
 from __future__ import annotations
 
 import operator
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import reduce
 from typing import Any
@@ -157,14 +157,15 @@ def checked_region(region: Any, name: str = "region") -> LMIRegion:
     if not isinstance(region, LMIRegion):
         raise SpecError(
             f"{name} is {shown(region)}: give conditions.disk(center, radius), conditions.half_plane(decay), "
-            "conditions.sector(damping), or several of them joined by &.", path=name,
-        )  # fmt: skip
+            "conditions.sector(damping), or several of them joined by &.",
+            path=name,
+        )
     return region
 
 
 def _written(part: Mapping[str, Any], name: str) -> LMIRegion:
     """Return a region that a document writes: ``{disk: [center, radius]}`` and its like."""
-    makers = {"disk": disk, "half_plane": half_plane, "sector": sector}
+    makers: dict[str, Callable[..., LMIRegion]] = {"disk": disk, "half_plane": half_plane, "sector": sector}
     if len(part) != 1 or next(iter(part)) not in makers:
         raise SpecError(f"{name} is {shown(dict(part))}: use one of disk, half_plane, sector in each.", path=name)
     ((kind, value),) = part.items()

@@ -112,9 +112,12 @@ class SparseFactor:
         if not self.size:
             return 1.0
         inverse = LinearOperator(
-            (self.size, self.size), matvec=self._lu.solve, rmatvec=lambda x: self._lu.solve(x, trans="T"),
-            matmat=self._lu.solve, dtype=np.float64,
-        )  # fmt: skip
+            (self.size, self.size),
+            matvec=self._lu.solve,
+            rmatvec=lambda x: self._lu.solve(x, trans="T"),
+            matmat=self._lu.solve,
+            dtype=np.float64,
+        )
         peak = float(np.max(np.asarray(abs(self.matrix).sum(axis=0)), initial=0.0))
         return peak * float(onenormest(inverse))
 
@@ -188,10 +191,12 @@ def scales_by_all_entries(matrix: Any) -> tuple[FloatArray, FloatArray]:
     entries.eliminate_zeros()
     sizes = np.log2(np.abs(entries.data))
     pattern = coo_array((np.ones(len(sizes)), (entries.row, entries.col)), shape=matrix.shape)
-    sums = np.concatenate([
-        np.bincount(entries.row, weights=sizes, minlength=count),
-        np.bincount(entries.col, weights=sizes, minlength=matrix.shape[1]),
-    ])  # fmt: skip
+    sums = np.concatenate(
+        [
+            np.bincount(entries.row, weights=sizes, minlength=count),
+            np.bincount(entries.col, weights=sizes, minlength=matrix.shape[1]),
+        ]
+    )
     numbers = np.asarray(pattern.sum(axis=1)).ravel(), np.asarray(pattern.sum(axis=0)).ravel()
     system = csr(block_array([[diags_array(numbers[0]), pattern], [pattern.T, diags_array(numbers[1])]]))
     weights = diags_array(1.0 / np.maximum(np.concatenate(numbers), 1.0))

@@ -58,7 +58,7 @@ def joint_step(
     unknown: FloatArray,
     *,
     complete: bool = True,
-) -> JointStep:  # fmt: skip
+) -> JointStep:
     """Solve ``H x = right + [known noise] e + unknown d``, where known and unknown multiply the coordinates before.
 
     Where the step is not complete, as samples are missing, the rank of H may be short.
@@ -130,10 +130,11 @@ def _by_rank(H: FloatArray, S: FloatArray, width: int, right: FloatArray, unknow
     upper = np.hstack((before @ compact[:, :most], np.zeros((width, kept))))
     lower = np.hstack((solved[n:, columns:] @ compact[:, :most], lost @ into))
     back = SmootherGain(
-        np.vstack((turned[:width, :count] @ white, solved[n:, :columns])), np.vstack((upper, lower)),
+        np.vstack((turned[:width, :count] @ white, solved[n:, :columns])),
+        np.vstack((upper, lower)),
         np.vstack((before @ compact[:, most:], solved[n:, columns:] @ compact[:, most:])),
         np.vstack((np.zeros((width, free.shape[1] - kept)), lost @ right_vectors[kept:].T)),
-    )  # fmt: skip
+    )
     return JointStep(solved[:n, :columns], triangle[:most].T, basis, back)
 
 

@@ -92,9 +92,12 @@ def pull_of_the_start(observer: RecursiveObserver, estimates: Estimates, error: 
     """Return what is left at each sample of an error ``(nq,)`` of the initial parameters, ``(samples, nq)``."""
     adaptation, nx = observer.adaptation, observer.plant.nx
     if adaptation is not None and adaptation.reset:
-        raise SpecError("chi-square with reset needs nominal parameters that are the observer's initial ones: what a "
-                        "reset forgets of the start is not known. Use glr or cusum, or design with "
-                        "initial_parameters at their nominal values.", path="nominal")  # fmt: skip
+        raise SpecError(
+            "chi-square with reset needs nominal parameters that are the observer's initial ones: what a "
+            "reset forgets of the start is not known. Use glr or cusum, or design with "
+            "initial_parameters at their nominal values.",
+            path="nominal",
+        )
     random_walk = adaptation is not None and adaptation.form == "random-walk"
     left = np.concatenate([np.zeros(nx if random_walk else 0), error])
     pulls = np.tile(error, (len(estimates.parameters), 1))

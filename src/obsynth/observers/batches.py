@@ -31,9 +31,13 @@ WORTH_COMPILING = 50_000
 
 
 def run_dae_batch(
-    observer: DAEObserver, y: ArrayLike, u: ArrayLike | None = None, *, compiled: bool | None = None,
+    observer: DAEObserver,
+    y: ArrayLike,
+    u: ArrayLike | None = None,
+    *,
+    compiled: bool | None = None,
     progress: bool | Callable[[int], None] | None = None,
-) -> Estimates:  # fmt: skip
+) -> Estimates:
     """Run many trials; see `obsynth.run_batch` (``y (trials, samples, ny)``)."""
     outputs, inputs = batch_record(y, u, observer.model.ny, observer.model.input_names)
     trials, samples = outputs.shape[:2]
@@ -47,10 +51,16 @@ def run_dae_batch(
         parts = take(observer, outputs, inputs, note)
     received = ~np.isnan(outputs)
     return named_estimates(
-        observer, states=parts["posterior"], faults=parts["theta"], residuals=parts["residual"],
-        fault_covariances=parts["spread"], innovations=np.where(received, parts["innovation"], np.nan),
-        nis=parts["nis"][..., 0], nis_degrees=received.sum(axis=2).astype(np.float64), received=received,
-    )  # fmt: skip
+        observer,
+        states=parts["posterior"],
+        faults=parts["theta"],
+        residuals=parts["residual"],
+        fault_covariances=parts["spread"],
+        innovations=np.where(received, parts["innovation"], np.nan),
+        nis=parts["nis"][..., 0],
+        nis_degrees=received.sum(axis=2).astype(np.float64),
+        received=received,
+    )
 
 
 def _of_trial(inputs: FloatArray, trials: slice | int) -> FloatArray:

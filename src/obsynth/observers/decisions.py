@@ -71,17 +71,24 @@ def decide(
     chosen(statistic, "statistic", STATISTICS)
     start, form = observer.initial_parameters, observer.form
     if not len(start) and statistic != "nis":
-        raise SpecError("A decision on parameters needs an observer that estimates them; of a filter alone, statistic "
-                        "'nis' tells whether the model still explains the data.", path="observer")  # fmt: skip
+        raise SpecError(
+            "A decision on parameters needs an observer that estimates them; of a filter alone, statistic "
+            "'nis' tells whether the model still explains the data.",
+            path="observer",
+        )
     false_alarms = real_number(false_alarms, "false_alarms", "a probability between 0 and 1")
     if not 0.0 < false_alarms < 1.0:
         raise SpecError(f"false_alarms is {false_alarms}: give a probability between 0 and 1.", path="false_alarms")
     if form in WALKING_FORMS and statistic in ("cusum", "glr"):
-        raise SpecError(f"{statistic} needs regressors, which form {form!r} does not have: use a form that forgets.",
-                        path="statistic")  # fmt: skip
+        raise SpecError(
+            f"{statistic} needs regressors, which form {form!r} does not have: use a form that forgets.",
+            path="statistic",
+        )
     if isinstance(observer, DAEObserver) and statistic == "glr":
-        raise SpecError("glr restarts signatures, which nonlinear observers do not carry: use chi-square, cusum or "
-                        "nis.", path="statistic")  # fmt: skip
+        raise SpecError(
+            "glr restarts signatures, which nonlinear observers do not carry: use chi-square, cusum or nis.",
+            path="statistic",
+        )
     nq = len(start)
     theta = start if nominal is None else real_vector(nominal, nq, "nominal")
     size = real_array(change, "change")
@@ -89,8 +96,10 @@ def decide(
     if size.shape != (nq,) or not ((size > 0.0) & (size < np.inf)).all():
         raise SpecError(f"change must be one positive number, or {nq}.", path="change")
     if (estimates.state_names, estimates.parameter_names) != (observer.state_names, observer.fault_names):
-        raise SpecError("The estimates are of other states or parameters than this observer's: give the run of this "
-                        "very observer.", path="estimates")  # fmt: skip
+        raise SpecError(
+            "The estimates are of other states or parameters than this observer's: give the run of this very observer.",
+            path="estimates",
+        )
     if not len(estimates.states):
         return Decision(statistic, read_only(np.zeros(0)), read_only(np.zeros(0)), None)
     if statistic == "chi-square":
@@ -167,8 +176,11 @@ def _chi_square(
     if start.any():
         # Where the observer starts is no evidence: only what data have said since may raise an alarm.
         if isinstance(observer, DAEObserver):
-            raise SpecError("chi-square of a nonlinear observer asks about the parameters that it starts from: design "
-                            "it with initial_parameters at what is nominal.", path="nominal")  # fmt: skip
+            raise SpecError(
+                "chi-square of a nonlinear observer asks about the parameters that it starts from: design "
+                "it with initial_parameters at what is nominal.",
+                path="nominal",
+            )
         gaps = gaps - pull_of_the_start(observer, estimates, start)
     values = np.einsum("ki,kij,kj->k", gaps, np.linalg.pinv(estimates.parameter_covariances, hermitian=True), gaps)
     looks = len(values)

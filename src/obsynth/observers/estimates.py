@@ -128,10 +128,13 @@ class Estimates:
         if not self.state_covariances.size:
             return NOTHING
         across = self.cross_covariances
-        return np.concatenate([
-            np.concatenate([self.state_covariances, across], axis=-1),
-            np.concatenate([np.swapaxes(across, -1, -2), self.fault_covariances], axis=-1),
-        ], axis=-2)  # fmt: skip
+        return np.concatenate(
+            [
+                np.concatenate([self.state_covariances, across], axis=-1),
+                np.concatenate([np.swapaxes(across, -1, -2), self.fault_covariances], axis=-1),
+            ],
+            axis=-2,
+        )
 
     @property
     def parameters(self) -> FloatArray:

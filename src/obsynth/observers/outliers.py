@@ -42,8 +42,9 @@ def checked_limit(kind: str, limit: float | None) -> float:
     if limit is None:
         return LIMITS.get(kind, float("inf"))
     if not is_finite_number(limit) or not limit > 0.0:
-        raise SpecError(f"outlier_limit is {limit!r}: give a positive number of standard deviations.",
-                        path="outlier_limit")  # fmt: skip
+        raise SpecError(
+            f"outlier_limit is {limit!r}: give a positive number of standard deviations.", path="outlier_limit"
+        )
     return float(limit)
 
 
@@ -53,10 +54,16 @@ def no_refusals(outputs: int) -> FloatArray:
 
 
 def robust_advance(
-    kind: str, limit: float, plain: Callable[[State, FloatArray, FloatArray], tuple[State, Row]],
-    predicted: Callable[[State, FloatArray, FloatArray], tuple[FloatArray, FloatArray]], state: State, y: FloatArray,
-    u: FloatArray, *, predicted_outputs: Callable[[State, FloatArray], tuple[FloatArray, FloatArray]] | None = None,
-) -> tuple[State, Row]:  # fmt: skip
+    kind: str,
+    limit: float,
+    plain: Callable[[State, FloatArray, FloatArray], tuple[State, Row]],
+    predicted: Callable[[State, FloatArray, FloatArray], tuple[FloatArray, FloatArray]],
+    state: State,
+    y: FloatArray,
+    u: FloatArray,
+    *,
+    predicted_outputs: Callable[[State, FloatArray], tuple[FloatArray, FloatArray]] | None = None,
+) -> tuple[State, Row]:
     """Take a step; where its innovation is too long, ask each sensor and take the step again without the outliers.
     ``predicted(state, heard, u)``: mean and deviation of each output ``(ny,)`` from the samples that are heard;
     ``predicted_outputs(state, u)``: of outputs that determine the state; these may be `BLIND` times further off."""
@@ -92,9 +99,12 @@ def robust_advance(
 
 
 def _judged(
-    limit: float, predicted: Callable[[State, FloatArray, FloatArray], tuple[FloatArray, FloatArray]], state: State,
-    y: FloatArray, u: FloatArray,
-) -> tuple[FloatArray, FloatArray, BoolArray]:  # fmt: skip
+    limit: float,
+    predicted: Callable[[State, FloatArray, FloatArray], tuple[FloatArray, FloatArray]],
+    state: State,
+    y: FloatArray,
+    u: FloatArray,
+) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Return mean and deviation of each output, and which are too far from them. Where the model alone predicts nothing
     of an output, the others of the same sample do."""
     with np.errstate(all="ignore"):

@@ -40,8 +40,9 @@ def require_horizon(horizon: int | None, samples: int, *, early: bool) -> None:
         raise SpecError(
             f"The record has {samples} samples, but the plant's horizon of {horizon} steps is good for {reach}"
             f"{' (early constraints need one step more)' if early else ''}: extend the model, or "
-            "shorten the record.", path="horizon",
-        )  # fmt: skip
+            "shorten the record.",
+            path="horizon",
+        )
 
 
 def measured_record(value: ArrayLike, columns: int) -> FloatArray:
@@ -49,8 +50,9 @@ def measured_record(value: ArrayLike, columns: int) -> FloatArray:
     try:
         array = real_array(value, "y")
     except SpecError:
-        raise SpecError("y must be numbers (NaN for a missing sample), with the same number at each sample.",
-                        path="y") from None  # fmt: skip
+        raise SpecError(
+            "y must be numbers (NaN for a missing sample), with the same number at each sample.", path="y"
+        ) from None
     if array.ndim == 1 and columns == 1:
         array = array.reshape(-1, 1)
     if array.ndim != 2 or array.shape[1] != columns:
@@ -119,8 +121,9 @@ def named_covariance(
     """Return a covariance from a matrix, one variance, or variances by name, beside which ``others`` have theirs."""
     if value is None:
         if default is None:
-            raise SpecError(f"{what} is missing: give variances, for example by the names {', '.join(names)}.",
-                            path=what)  # fmt: skip
+            raise SpecError(
+                f"{what} is missing: give variances, for example by the names {', '.join(names)}.", path=what
+            )
         return np.diag(default)
     if isinstance(value, Mapping):
         variances = np.zeros(len(names)) if others is None else others
@@ -147,8 +150,9 @@ def named_bounds(value: Any, names: Sequence[str], what: str) -> FloatArray:
         if np.shape(pair) != (2,) or not all(map(is_number, pair)):
             raise SpecError(f"{path} is {pair!r}: give [low, high].", path=path)
         if not pair[0] < pair[1]:
-            raise SpecError(f"{path}: the lower bound ({pair[0]:g}) must be below the upper one ({pair[1]:g}).",
-                            path=path)  # fmt: skip
+            raise SpecError(
+                f"{path}: the lower bound ({pair[0]:g}) must be below the upper one ({pair[1]:g}).", path=path
+            )
         found[i] = pair
     return found
 
@@ -165,11 +169,13 @@ def batch_record(
     trials, samples = outputs.shape[:2]
     known = np.zeros((samples, 0)) if u is None and not nu else real_array(u, "u")
     if known.shape not in ((samples, nu), (trials, samples, nu)):
-        raise SpecError(f"u has shape {known.shape}, but {(samples, nu)} or {(trials, samples, nu)} is needed.",
-                        path="u")  # fmt: skip
+        raise SpecError(
+            f"u has shape {known.shape}, but {(samples, nu)} or {(trials, samples, nu)} is needed.", path="u"
+        )
     if not np.isfinite(known).all():
         *trial, k, i = np.argwhere(~np.isfinite(known))[0]
         where = f" of trial {trial[0]}" if trial else ""
-        raise SpecError(f"The input {input_names[i]!r}{where} is {known[*trial, k, i]} at k = {k}: inputs must be "
-                        "known.", path="u")  # fmt: skip
+        raise SpecError(
+            f"The input {input_names[i]!r}{where} is {known[*trial, k, i]} at k = {k}: inputs must be known.", path="u"
+        )
     return outputs, known

@@ -211,9 +211,16 @@ def named_estimates(observer: StepSettings, *, states: FloatArray, faults: Float
     residuals = known.pop("residuals", np.zeros((*states.shape[:-1], 0)))
     arrays: dict[str, Any] = {name: value if value.dtype == bool else read_only(value) for name, value in known.items()}
     return Estimates(
-        read_only(states), read_only(faults), read_only(residuals), observer.state_names, observer.fault_names,
-        STEP_RESIDUAL[: residuals.shape[-1]], observer.state_delays, observer.fault_delays, **arrays,
-    )  # fmt: skip
+        read_only(states),
+        read_only(faults),
+        read_only(residuals),
+        observer.state_names,
+        observer.fault_names,
+        STEP_RESIDUAL[: residuals.shape[-1]],
+        observer.state_delays,
+        observer.fault_delays,
+        **arrays,
+    )
 
 
 def changed(observer: Robust, **options: Any) -> Robust:

@@ -34,8 +34,10 @@ def checked_sensors(value: Any, names: Sequence[str]) -> dict[str, dict[str, int
     for name, entry in value.items():
         index_of(name, names, what="sensors")
         if not isinstance(entry, Mapping) or not set(entry) <= {"every", "delay"}:
-            raise SpecError(f"sensors.{name} is {entry!r}: give every (rows) and delay (rows), or one of them.",
-                            path=f"sensors.{name}")  # fmt: skip
+            raise SpecError(
+                f"sensors.{name} is {entry!r}: give every (rows) and delay (rows), or one of them.",
+                path=f"sensors.{name}",
+            )
         timing = {"every": entry.get("every", 1), "delay": entry.get("delay", 0)}
         for key, least in (("every", 1), ("delay", 0)):
             count = timing[key]
@@ -43,7 +45,7 @@ def checked_sensors(value: Any, names: Sequence[str]) -> dict[str, dict[str, int
                 raise SpecError(
                     f"sensors.{name}.{key} is {count!r}: give a whole number of rows from {least} to {LONGEST_DELAY}.",
                     path=f"sensors.{name}.{key}",
-                )  # fmt: skip
+                )
             timing[key] = int(count)
         if timing != {"every": 1, "delay": 0}:
             found[str(name)] = timing
@@ -70,9 +72,12 @@ class WaitingState(NamedTuple):
 
     def from_data(self, data: Mapping[str, Any], restored: Callable[[Any, Any], Any]) -> WaitingState:
         """Return the state that data describe, by what restores that of an observer without late sensors."""
-        return WaitingState(tuple(restored(self.latest, part) for part in data["before"]),
-                            restored(self.latest, data["latest"]), np.array(data["outputs"]),
-                            np.array(data["inputs"]))  # fmt: skip
+        return WaitingState(
+            tuple(restored(self.latest, part) for part in data["before"]),
+            restored(self.latest, data["latest"]),
+            np.array(data["outputs"]),
+            np.array(data["inputs"]),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,8 +92,11 @@ class SensorTiming:
     def of(cls, sensors: Mapping[str, Mapping[str, int]] | None, names: Sequence[str], inputs: int) -> SensorTiming:
         """Return the timing of outputs by name."""
         entries = [(sensors or {}).get(name, {}) for name in names]
-        return cls(np.array([entry.get("every", 1) for entry in entries], dtype=np.int64),
-                   np.array([entry.get("delay", 0) for entry in entries], dtype=np.int64), inputs)  # fmt: skip
+        return cls(
+            np.array([entry.get("every", 1) for entry in entries], dtype=np.int64),
+            np.array([entry.get("delay", 0) for entry in entries], dtype=np.int64),
+            inputs,
+        )
 
     @cached_property
     def is_plain(self) -> bool:
@@ -156,5 +164,6 @@ def require_plain(observer: Any, what: str) -> None:
     """Raise `SpecError` where an observer has sensors of their own times, or bounds on states."""
     for option in ("sensors", "state_bounds"):
         if getattr(observer, option) is not None:
-            raise SpecError(f"{what} knows no {option}: leave the option out of the design, or run it by obsynth run.",
-                            path=option)  # fmt: skip
+            raise SpecError(
+                f"{what} knows no {option}: leave the option out of the design, or run it by obsynth run.", path=option
+            )

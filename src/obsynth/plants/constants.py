@@ -48,11 +48,15 @@ class Constant:
             if not is_finite_number(value):
                 raise SpecError(
                     f"The {key} of {self.name!r} is {value!r}: give finite numbers. A box with an open side bounds "
-                    "nothing.", path=path,
-                )  # fmt: skip
+                    "nothing.",
+                    path=path,
+                )
         if not self.low <= self.nominal <= self.high:
-            raise SpecError(f"The nominal value {self.nominal:g} of {self.name!r} is outside its range {self.low:g} .. "
-                            f"{self.high:g}.", path=path)  # fmt: skip
+            raise SpecError(
+                f"The nominal value {self.nominal:g} of {self.name!r} is outside its range {self.low:g} .. "
+                f"{self.high:g}.",
+                path=path,
+            )
 
     @property
     def half(self) -> float:
@@ -123,8 +127,9 @@ class ConstantsBox:
             raise SpecError(f"source is {self.source!r}: use one of {', '.join(SOURCES)}.", path="source")
         calibrated = self.source == "calibrated"
         if calibrated and not (is_finite_number(self.level) and 0.0 < float(self.level or 0.0) < 1.0):
-            raise SpecError(f"level is {self.level!r}: a calibrated box needs its probability, between 0 and 1.",
-                            path="level")  # fmt: skip
+            raise SpecError(
+                f"level is {self.level!r}: a calibrated box needs its probability, between 0 and 1.", path="level"
+            )
         if not calibrated and (self.level is not None or self.digest or self.calibrated):
             raise SpecError("level and digest are for a calibrated box (source: calibrated).", path="level")
 
@@ -222,11 +227,13 @@ def tolerance_share(value: Any, path: str) -> float:
             raise SpecError(f"The tolerance {value!r} is no per cent: write it as '5 %'.", path=path)
         return float(found.group(1)) / 100.0
     if not (is_finite_number(value) and value >= 0.0):
-        raise SpecError(f"The tolerance is {value!r}: write it as '5 %' (a box with an open side bounds nothing).",
-                        path=path)  # fmt: skip
+        raise SpecError(
+            f"The tolerance is {value!r}: write it as '5 %' (a box with an open side bounds nothing).", path=path
+        )
     if value >= 1.0:
-        raise SpecError(f"The tolerance is {value!r}, a share of {100.0 * value:g} %: write it as '5 %' or 0.05.",
-                        path=path)  # fmt: skip
+        raise SpecError(
+            f"The tolerance is {value!r}, a share of {100.0 * value:g} %: write it as '5 %' or 0.05.", path=path
+        )
     return float(value)
 
 
@@ -261,8 +268,9 @@ def _with_range(name: str, given: Mapping[str, Any], middle: Any, unit: str) -> 
         if not (two and all(map(is_finite_number, ends)) and ends[0] <= ends[1]):
             raise SpecError(
                 f"The range of {name!r} is {ends!r}: give [low, high], finite and the lower one first. A box with an "
-                "open side bounds nothing.", path=f"{path}.range",
-            )  # fmt: skip
+                "open side bounds nothing.",
+                path=f"{path}.range",
+            )
         low, high = map(float, ends)
         inside = middle is not None and is_finite_number(middle)
         return Constant(name, float(middle) if inside else (middle or low + (high - low) / 2.0), low, high, unit)
@@ -271,17 +279,23 @@ def _with_range(name: str, given: Mapping[str, Any], middle: Any, unit: str) -> 
     center = float(middle)
     share = tolerance_share(given.get("tolerance", 0.0), f"{path}.tolerance")
     if share and center == 0.0:
-        raise SpecError(f"The nominal value of {name!r} is zero, which has no per cent: give a range.",
-                        path=f"{path}.tolerance")  # fmt: skip
+        raise SpecError(
+            f"The nominal value of {name!r} is zero, which has no per cent: give a range.", path=f"{path}.tolerance"
+        )
     half = share * abs(center)
     return Constant(name, center, center - half, center + half, unit)
 
 
 def constants_box(
-    given: Mapping[str, Any] | ConstantsBox, *, known: Mapping[str, Constant] | None = None,
-    variation: str | None = None, source: str | None = None, level: float | None = None, digest: str | None = None,
+    given: Mapping[str, Any] | ConstantsBox,
+    *,
+    known: Mapping[str, Constant] | None = None,
+    variation: str | None = None,
+    source: str | None = None,
+    level: float | None = None,
+    digest: str | None = None,
     calibrated: Sequence[str] | None = None,
-) -> ConstantsBox:  # fmt: skip
+) -> ConstantsBox:
     """Return a box from a mapping by name; nominal values that are left out are those of ``known``."""
     if isinstance(given, ConstantsBox):
         return given
@@ -293,6 +307,5 @@ def constants_box(
         if not isinstance(name, str) or not name:
             raise SpecError(f"{name!r} is no name of a constant.", path="constants")
         found[name] = constant_of(name, value, nominal=before[name].nominal if name in before else None)
-    more = {"variation": variation, "source": source, "level": level, "digest": digest,
-            "calibrated": calibrated}  # fmt: skip
+    more = {"variation": variation, "source": source, "level": level, "digest": digest, "calibrated": calibrated}
     return ConstantsBox(found, **{key: value for key, value in more.items() if value is not None})  # type: ignore[arg-type]

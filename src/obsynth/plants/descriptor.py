@@ -35,8 +35,14 @@ from obsynth.plants.validation import (
 )
 
 #: Names of the signals of each kind.
-_FIELDS = {"x": "state_names", "u": "input_names", "y": "output_names", "f": "fault_names", "d": "disturbance_names",
-           "w": "noise_names"}  # fmt: skip
+_FIELDS = {
+    "x": "state_names",
+    "u": "input_names",
+    "y": "output_names",
+    "f": "fault_names",
+    "d": "disturbance_names",
+    "w": "noise_names",
+}
 
 
 def _without_frames(
@@ -70,8 +76,9 @@ def _order(labels: Any, kind: str, known: dict[str, Sequence[str] | None], what:
     if missing or foreign:
         texts = [f"lack {', '.join(map(repr, missing))}"] if missing else []
         texts += [f"have {', '.join(map(repr, foreign))}"] if foreign else []
-        raise SpecError(f"{what[0].upper()}{what[1:]} {' and '.join(texts)}: the {kind} are {', '.join(wanted)}.",
-                        path=kind)  # fmt: skip
+        raise SpecError(
+            f"{what[0].upper()}{what[1:]} {' and '.join(texts)}: the {kind} are {', '.join(wanted)}.", path=kind
+        )
     return [found.index(name) for name in wanted]
 
 
@@ -107,12 +114,16 @@ def plant_fields(
     sizes = {"x": nx, **signal_counts(given)}
     # What depends on a matrix that could not be read is not judged: its own message is enough.
     broken = {name for name, value in matrices.items() if value is not None and given.get(name) is None}
-    unknown = {signal for signal, telling in COUNTED_BY.items()
-               if broken.intersection(telling) and all(given.get(name) is None for name in telling)}  # fmt: skip
+    unknown = {
+        signal
+        for signal, telling in COUNTED_BY.items()
+        if broken.intersection(telling) and all(given.get(name) is None for name in telling)
+    }
     values: dict[str, Any] = {
         name: problems.shaped(given.get(name), name, (sizes[rows], sizes[columns]))
-        for name, rows, columns in MATRIX_LAYOUT if not unknown.intersection((rows, columns))
-    }  # fmt: skip
+        for name, rows, columns in MATRIX_LAYOUT
+        if not unknown.intersection((rows, columns))
+    }
     values |= {"dt": problems.collect(lambda: checked_dt(dt)), "state_names": states}
     for signal, field in _FIELDS.items():
         if signal in unknown or signal == "x":
@@ -197,15 +208,19 @@ def _noise_of_sensors(
     if sensor_noise is None:
         return ()
     if not isinstance(sensor_noise, Mapping):
-        raise SpecError(f"sensor_noise is a {type(sensor_noise).__name__}: give a standard deviation by output, such "
-                        "as {'speed': 0.01}.", path="sensor_noise")  # fmt: skip
+        raise SpecError(
+            f"sensor_noise is a {type(sensor_noise).__name__}: give a standard deviation by output, such "
+            "as {'speed': 0.01}.",
+            path="sensor_noise",
+        )
     require_picked(sensor_noise, outputs, what="sensor_noise")
     columns = np.zeros((len(outputs), len(sensor_noise)))
     for column, (name, value) in enumerate(sensor_noise.items()):
         deviation = float(as_matrix(value, f"sensor_noise[{name!r}]")[0, 0])
         if deviation <= 0.0:
-            raise SpecError(f"sensor_noise[{name!r}] is {deviation:g}: give a standard deviation above 0.",
-                            path="sensor_noise")  # fmt: skip
+            raise SpecError(
+                f"sensor_noise[{name!r}] is {deviation:g}: give a standard deviation above 0.", path="sensor_noise"
+            )
         columns[list(outputs).index(name), column] = deviation
     others = [matrix for name in ("Bw", "Dw") if (matrix := given.get(name)) is not None and 0 not in matrix.shape]
     nw, nx = others[0].shape[1] if others else 0, _size(given)
@@ -340,9 +355,13 @@ class DescriptorSystem:
             raise SpecError("A is missing: give the matrix (nx, nx) of the dynamics.", path="A")
         asked = {"E": E, "A": A, "B": B, "C": C, "D": D, "Bf": Bf, "Df": Df, "Bd": Bd, "Dd": Dd, "Bw": Bw, "Dw": Dw}
         names = {
-            "state_names": state_names, "input_names": input_names, "output_names": output_names,
-            "fault_names": fault_names, "disturbance_names": disturbance_names, "noise_names": noise_names,
-        }  # fmt: skip
+            "state_names": state_names,
+            "input_names": input_names,
+            "output_names": output_names,
+            "fault_names": fault_names,
+            "disturbance_names": disturbance_names,
+            "noise_names": noise_names,
+        }
         values = plant_fields(
             asked, names, dt=dt, operating_point=operating_point, scales=scales, units=units, sensor_noise=sensor_noise
         )
@@ -426,8 +445,11 @@ class DescriptorSystem:
             kept[label] = {name: value for name, value in kept[label].items() if name not in gone}
         new = DescriptorSystem(**{**kept, **changes})
         if self.uncertainty is not None and "uncertainty" not in changes:
-            moved = [name for name in UNCERTAIN_MATRICES if name in changes
-                     and not same_matrix(getattr(self, name), getattr(new, name))]  # fmt: skip
+            moved = [
+                name
+                for name in UNCERTAIN_MATRICES
+                if name in changes and not same_matrix(getattr(self, name), getattr(new, name))
+            ]
             if moved or self.dt != new.dt:
                 what = f"{', '.join(moved or ['dt'])} {'were' if len(moved) > 1 else 'was'} changed"
                 object.__setattr__(new, "uncertainty", self.uncertainty.left_behind(what))

@@ -132,8 +132,9 @@ class FaultModel:
 def polynomial(order: int) -> FaultModel:
     """Return the model of a polynomial in time: order 0 is a step, 1 a ramp."""
     if not is_whole(order) or not 0 <= order <= HIGHEST_ORDER:
-        raise _refused(f"A polynomial fault model has order {order!r}: give a whole number from 0 (step) to "
-                       f"{HIGHEST_ORDER}.")  # fmt: skip
+        raise _refused(
+            f"A polynomial fault model has order {order!r}: give a whole number from 0 (step) to {HIGHEST_ORDER}."
+        )
     words = [*POLYNOMIAL_WORDS, f"polynomial of order {order}"]
     return FaultModel(np.eye(order + 1, k=1), np.eye(1, order + 1), words[min(order, len(POLYNOMIAL_WORDS))])
 
@@ -157,8 +158,10 @@ def from_matrices(Phi: Any, Cw: Any) -> FaultModel:
     transition, row = as_matrix(Phi, "Phi"), as_matrix(Cw, "Cw")
     count = transition.shape[0]
     if transition.shape != (count, count) or count == 0 or row.shape != (1, count):
-        raise _refused(f"A fault model has Phi {transition.shape} and Cw {row.shape}: Phi must be square and Cw one "
-                       "row of the same length.")  # fmt: skip
+        raise _refused(
+            f"A fault model has Phi {transition.shape} and Cw {row.shape}: Phi must be square and Cw one "
+            "row of the same length."
+        )
     return _observable(FaultModel(transition, row, f"given exosystem of order {count}", sampled=True))
 
 
@@ -167,8 +170,9 @@ def summed(models: Sequence[FaultModel]) -> FaultModel:
     from scipy.linalg import block_diag
 
     if not models or len({model.sampled for model in models}) > 1:
-        raise _refused("A sum of fault models needs at least one part, and either built-in parts or given matrices, "
-                       "not both.")  # fmt: skip
+        raise _refused(
+            "A sum of fault models needs at least one part, and either built-in parts or given matrices, not both."
+        )
     description = " plus ".join(model.description for model in models)
     phi, row = block_diag(*(model.Phi for model in models)), np.hstack([model.Cw for model in models])
     return _observable(FaultModel(phi, row, description, models[0].sampled))
@@ -206,8 +210,10 @@ def fault_model(data: Any) -> FaultModel:
             return makers[key](value)
         if key == "sum" and isinstance(value, Sequence) and not isinstance(value, str):
             return summed([fault_model(part) for part in value])
-    raise _refused(f"There is no fault model {data!r}: use {', '.join(POLYNOMIAL_WORDS)}, or one of {{polynomial: "
-                   "order}, {sinusoid: rad/s}, {exponential: 1/s}, {Phi: ..., Cw: ...}, {sum: [...]}.")  # fmt: skip
+    raise _refused(
+        f"There is no fault model {data!r}: use {', '.join(POLYNOMIAL_WORDS)}, or one of {{polynomial: "
+        "order}, {sinusoid: rad/s}, {exponential: 1/s}, {Phi: ..., Cw: ...}, {sum: [...]}."
+    )
 
 
 def _observable(model: FaultModel) -> FaultModel:
@@ -217,8 +223,10 @@ def _observable(model: FaultModel) -> FaultModel:
     for value in model.eigenvalues(0.0):
         tested = np.vstack([balanced - value * np.eye(model.order), (size or 1.0) * shown.astype(complex)])
         if not decide_rank(tested, expected=model.order, equilibrated=False).full:
-            raise _refused(f"Some state of the fault model ({model.description}) never shows in the fault, at the "
-                           f"eigenvalue {value:.6g}: leave it out.")  # fmt: skip
+            raise _refused(
+                f"Some state of the fault model ({model.description}) never shows in the fault, at the "
+                f"eigenvalue {value:.6g}: leave it out."
+            )
     return model
 
 
@@ -290,6 +298,8 @@ def _by_fault(data: Any, fault_names: Sequence[str]) -> list[FaultModel]:
         index_of(name, fault_names, what="fault_model")
     missing = [name for name in fault_names if name not in data]
     if missing:
-        raise _refused(f"fault_model says nothing about {', '.join(map(repr, missing))}: give a model for each fault, "
-                       "or one for all.")  # fmt: skip
+        raise _refused(
+            f"fault_model says nothing about {', '.join(map(repr, missing))}: give a model for each fault, "
+            "or one for all."
+        )
     return [fault_model(data[name]) for name in fault_names]

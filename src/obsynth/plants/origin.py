@@ -65,8 +65,10 @@ def carry_origin(old: Written, new: Plant) -> Plant:
     )
     if made is not None and unchanged:
         written, time = made
-        if not (same_matrix(getattr(old, "Bw", None), getattr(new, "Bw", None))
-                and same_matrix(getattr(old, "Dw", None), getattr(new, "Dw", None))):  # fmt: skip
+        if not (
+            same_matrix(getattr(old, "Bw", None), getattr(new, "Bw", None))
+            and same_matrix(getattr(old, "Dw", None), getattr(new, "Dw", None))
+        ):
             # The noise was stated anew since: that of the plant as written says nothing about it.
             written = written.replace(Bw=None, Dw=None, noise_names=None)
         object.__setattr__(new, "_made_from", (written, time))

@@ -84,8 +84,10 @@ class MatrixSequence:
             if self.values.ndim == 2:
                 return self.values
             if not 0 <= k < len(self.values):
-                raise SpecError(f"{self.name}({k}) is asked for, but the stack ends at {len(self.values) - 1}.",
-                                path=f"{self.name}({k})")  # fmt: skip
+                raise SpecError(
+                    f"{self.name}({k}) is asked for, but the stack ends at {len(self.values) - 1}.",
+                    path=f"{self.name}({k})",
+                )
             return np.asarray(self.values[k])
         matrix = _named(partial(self._computed, k), self.name, k)
         if matrix.shape != self.shape:
@@ -108,8 +110,11 @@ class MatrixSequence:
     def as_data(self) -> Any:
         """Return an array or rows of texts."""
         if self.function is not None:
-            raise SpecError(f"{self.name} is a Python function, and only data can be saved: give a stack of matrices, "
-                            f"or expressions in {INDEX_NAME}.", path=self.name)  # fmt: skip
+            raise SpecError(
+                f"{self.name} is a Python function, and only data can be saved: give a stack of matrices, "
+                f"or expressions in {INDEX_NAME}.",
+                path=self.name,
+            )
         return self.values if self.entries is None else [[entry.text for entry in row] for row in self.entries]
 
 
@@ -120,8 +125,9 @@ def _named(make: Callable[[], FloatArray], name: str, k: int) -> FloatArray:
         raise SpecError(f"At k = {k}: {error}", path=f"{name}({k})") from error
     except Exception as error:
         # A function of the user may raise anything: say for which k it did.
-        raise SpecError(f"The function for {name} fails at k = {k}: {type(error).__name__}: {error}.",
-                        path=f"{name}({k})") from error  # fmt: skip
+        raise SpecError(
+            f"The function for {name} fails at k = {k}: {type(error).__name__}: {error}.", path=f"{name}({k})"
+        ) from error
 
 
 def _has_text(value: Any) -> bool:
@@ -183,9 +189,13 @@ def _split(
 
 #: Matrix, signal of its rows ("e" counts the equations), signal of its columns, first k at which it is needed.
 LAYOUT = (
-    ("E", "e", "x", 1), ("A", "e", "x", 0), ("C", "y", "x", 1),
-    ("B", "e", "u", 0), ("Phi", "e", "p", 0), ("Psi", "y", "p", 0),
-)  # fmt: skip
+    ("E", "e", "x", 1),
+    ("A", "e", "x", 0),
+    ("C", "y", "x", 1),
+    ("B", "e", "u", 0),
+    ("Phi", "e", "p", 0),
+    ("Psi", "y", "p", 0),
+)
 #: E and C are needed at k = 1 ... N for N steps: as stacks they have N + 1 entries, of which the first is not used.
 _FIRST = {name: first for name, *_, first in LAYOUT}
 
@@ -194,8 +204,9 @@ def positive_dt(dt: Any) -> float:
     """Return a sampling time in seconds that is not zero."""
     checked = checked_dt(dt)
     if checked == 0.0:
-        raise SpecError("dt is 0: a time-varying plant is discrete in time, give the seconds between samples.",
-                        path="dt")  # fmt: skip
+        raise SpecError(
+            "dt is 0: a time-varying plant is discrete in time, give the seconds between samples.", path="dt"
+        )
     return checked
 
 
@@ -247,11 +258,14 @@ def checked_horizon(horizon: int | None, values: Mapping[str, MatrixSequence]) -
         listed = ", ".join(f"{name} for {steps}" for name, steps in lengths.items())
         raise SpecError(
             f"The stacks are good for different numbers of steps: {listed}. For N steps E and C need N + 1 matrices, "
-            "A, B, Phi and Psi need N; or give the horizon.", path="horizon",
-        )  # fmt: skip
+            "A, B, Phi and Psi need N; or give the horizon.",
+            path="horizon",
+        )
     if horizon is not None and horizon > lengths[shortest]:
-        raise SpecError(f"horizon is {horizon}, but the stack {shortest} is good for {lengths[shortest]} steps only.",
-                        path="horizon")  # fmt: skip
+        raise SpecError(
+            f"horizon is {horizon}, but the stack {shortest} is good for {lengths[shortest]} steps only.",
+            path="horizon",
+        )
     return lengths[shortest] if horizon is None else int(horizon)
 
 

@@ -130,13 +130,21 @@ class TimeVaryingDescriptorSystem:
         problems.raise_if_any()
         values = completed(found, problems)
         problems.raise_if_any()
-        sizes = {"x": values["A"].shape[1], "u": values["B"].shape[1], "y": values["C"].shape[0],
-                 "theta": values["Phi"].shape[1]}  # fmt: skip
+        sizes = {
+            "x": values["A"].shape[1],
+            "u": values["B"].shape[1],
+            "y": values["C"].shape[0],
+            "theta": values["Phi"].shape[1],
+        }
         fields: dict[str, Any] = dict(values)
         fields |= {"dt": problems.collect(lambda: positive_dt(dt)), "constants": known}
         fields["horizon"] = problems.collect(lambda: checked_horizon(horizon, values))
-        named = {"state_names": (state_names, "x"), "input_names": (input_names, "u"),
-                 "output_names": (output_names, "y"), "parameter_names": (parameter_names, "theta")}  # fmt: skip
+        named = {
+            "state_names": (state_names, "x"),
+            "input_names": (input_names, "u"),
+            "output_names": (output_names, "y"),
+            "parameter_names": (parameter_names, "theta"),
+        }
         for field, (names, signal) in named.items():
             fields[field] = problems.collect(partial(checked_names, names, sizes[signal], prefix=signal, what=field))
         problems.raise_if_any()
@@ -171,17 +179,26 @@ class TimeVaryingDescriptorSystem:
         if plant.nd:
             raise SpecError(
                 "The plant has unknown disturbances, which these methods do not know: remove Bd and Dd, or call them "
-                "faults.", path="Bd",
-            )  # fmt: skip
+                "faults.",
+                path="Bd",
+            )
         signals = {*plant.state_names, *plant.input_names, *plant.output_names, *plant.fault_names}
         return cls(
-            plant.E, plant.A, plant.B, plant.C, Phi=plant.Bf, Psi=plant.Df, dt=plant.dt,
-            state_names=plant.state_names, input_names=plant.input_names, output_names=plant.output_names,
+            plant.E,
+            plant.A,
+            plant.B,
+            plant.C,
+            Phi=plant.Bf,
+            Psi=plant.Df,
+            dt=plant.dt,
+            state_names=plant.state_names,
+            input_names=plant.input_names,
+            output_names=plant.output_names,
             parameter_names=plant.fault_names,
             operating_point={name: value for name, value in plant.operating_point.items() if name in signals},
             scales=plant.scales,
             units={name: unit for name, unit in plant.units.items() if name in signals},
-        )  # fmt: skip
+        )
 
     @property
     def nx(self) -> int:
@@ -242,9 +259,14 @@ class TimeVaryingDescriptorSystem:
         names = ("state_names", "input_names", "output_names", "parameter_names")
         labels = {name: list(getattr(self, name)) for name in names}
         return {
-            **labels, "dt": self.dt, "horizon": self.horizon, "constants": self.constants,
-            "operating_point": self.operating_point, "scales": self.scales, "units": self.units,
-        }  # fmt: skip
+            **labels,
+            "dt": self.dt,
+            "horizon": self.horizon,
+            "constants": self.constants,
+            "operating_point": self.operating_point,
+            "scales": self.scales,
+            "units": self.units,
+        }
 
     def __repr__(self) -> str:
         steps = "no horizon" if self.horizon is None else f"{self.horizon} steps"

@@ -40,8 +40,9 @@ def stated_box(given: Any, variation: str | None = None) -> Any:
     """Return a calibrated box as a box of constants, with its level and digest; all else as it is."""
     if isinstance(given, ConstantsBox) or not isinstance(given, Calibrated) or isinstance(given, Mapping):
         return given
-    return constants_box(given.constants(), variation=variation, source="calibrated", level=given.level,
-                         digest=given.digest)  # fmt: skip
+    return constants_box(
+        given.constants(), variation=variation, source="calibrated", level=given.level, digest=given.digest
+    )
 
 
 def uncertain_system(
@@ -134,9 +135,13 @@ def uncertain_system(
 
 
 def with_expressions(
-    system: DescriptorSystem, entries: Mapping[str, list[Entry]], constants: Any, *, tolerance: Any = None,
+    system: DescriptorSystem,
+    entries: Mapping[str, list[Entry]],
+    constants: Any,
+    *,
+    tolerance: Any = None,
     **options: Any,
-) -> DescriptorSystem:  # fmt: skip
+) -> DescriptorSystem:
     """Return a plant with expressions in some entries, at the nominal values of the constants."""
     names = set(constants.constants if isinstance(constants, ConstantsBox) else constants or {})
     # What an expression puts into an entry is no number of its own, to have a tolerance of its own.
@@ -161,7 +166,7 @@ def _require_used(uncertainty: Uncertainty, stated: set[str]) -> None:
         raise SpecError(
             f"The constant {unknown[0]!r} stands in no matrix: write an entry as an expression in it, or remove it.",
             path=f"constants.{unknown[0]}",
-        )  # fmt: skip
+        )
 
 
 def _with_tolerances(
@@ -176,16 +181,20 @@ def _with_tolerances(
     box, more = _boxed(constants, tolerance, before.box.constants, written, entries, kept)
     after = replace(before, box=box, entries=_joined(entries, more))
     _require_used(after, set(box.constants))
-    moved = [name for name, item in before.box.constants.items() if name not in box.constants
-             or abs(box.constants[name].nominal - item.nominal) > SAME_SHARE * abs(item.nominal)]  # fmt: skip
+    moved = [
+        name
+        for name, item in before.box.constants.items()
+        if name not in box.constants or abs(box.constants[name].nominal - item.nominal) > SAME_SHARE * abs(item.nominal)
+    ]
     if moved and before.written is None and moved[0] in box.constants:
         return filled_plant(plant, after, set())
     if moved:
         raise SpecError(
             f"The nominal value of {moved[0]!r} is {before.box.constants[moved[0]].nominal:g} in this plant, which was "
             "transformed since it was written: its tolerance may change, but another nominal value is another plant. "
-            "Give the plant as written.", path=f"constants.{moved[0]}",
-        )  # fmt: skip
+            "Give the plant as written.",
+            path=f"constants.{moved[0]}",
+        )
     return plant.replace(uncertainty=after)
 
 
@@ -200,16 +209,25 @@ def _kept_source(box: ConstantsBox, constants: Any, stated: Mapping[str, Any]) -
 
 
 def _boxed(
-    constants: Any, tolerance: Any, known: Mapping[str, Constant], matrices: Mapping[str, FloatArray],
-    entries: Mapping[str, list[Entry]], options: Mapping[str, Any],
-) -> tuple[ConstantsBox, dict[str, list[Entry]]]:  # fmt: skip
+    constants: Any,
+    tolerance: Any,
+    known: Mapping[str, Constant],
+    matrices: Mapping[str, FloatArray],
+    entries: Mapping[str, list[Entry]],
+    options: Mapping[str, Any],
+) -> tuple[ConstantsBox, dict[str, list[Entry]]]:
     """Return the box, and entries that are constants of their own."""
     if isinstance(constants, ConstantsBox):
         if not tolerance and not known.keys() - constants.constants.keys():
             return constants, {}
         logged = (constants.calibrated or tuple(constants.constants)) if constants.source == "calibrated" else None
-        own = {"variation": constants.variation, "source": constants.source, "level": constants.level,
-               "digest": constants.digest, "calibrated": logged}  # fmt: skip
+        own = {
+            "variation": constants.variation,
+            "source": constants.source,
+            "level": constants.level,
+            "digest": constants.digest,
+            "calibrated": logged,
+        }
         options = own | {key: value for key, value in options.items() if value is not None}
         constants = constants.constants
     found, shares, more = dict[str, Any](), dict(tolerance or {}), dict[str, list[Entry]]()
@@ -220,8 +238,10 @@ def _boxed(
             found[name] = value
     for matrix, value in shares.items():
         if matrix not in UNCERTAIN_MATRICES:
-            raise SpecError(f"{matrix!r} is no matrix: {', '.join(UNCERTAIN_MATRICES)} may have a tolerance.",
-                            path=f"tolerance.{matrix}")  # fmt: skip
+            raise SpecError(
+                f"{matrix!r} is no matrix: {', '.join(UNCERTAIN_MATRICES)} may have a tolerance.",
+                path=f"tolerance.{matrix}",
+            )
         share = tolerance_share(value, f"tolerance.{matrix}")
         present = {text for _, _, text in entries.get(matrix, ())}
         taken = {(row, column) for row, column, text in entries.get(matrix, ()) if text != _entry(matrix, row, column)}

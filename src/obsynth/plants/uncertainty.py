@@ -80,8 +80,11 @@ class Uncertainty:
         expression = self._parsed.setdefault(text, parse_expression(text))
         unknown = sorted(expression.names - known.keys())
         if unknown:
-            raise SpecError(f"{place}: {text!r} has the unknown name {unknown[0]!r}; the constants are "
-                            f"{', '.join(known) or 'none'}.", path=matrix)  # fmt: skip
+            raise SpecError(
+                f"{place}: {text!r} has the unknown name {unknown[0]!r}; the constants are "
+                f"{', '.join(known) or 'none'}.",
+                path=matrix,
+            )
 
     @cached_property
     def used(self) -> frozenset[str]:
@@ -225,8 +228,9 @@ def require_carried(uncertain: Uncertainty | None) -> None:
         raise PreconditionError(
             f"The tolerances of the constants ({names}) were left behind: {uncertain.lost}. Nothing over the box is "
             "known of this plant. Let obsynth eliminate and sample it (transform) without other changes, or leave the "
-            "tolerances out for an exact model (plant.replace(uncertainty=None)).", condition="tolerances carried",
-        )  # fmt: skip
+            "tolerances out for an exact model (plant.replace(uncertainty=None)).",
+            condition="tolerances carried",
+        )
 
 
 def uncertainty_of(data: Any) -> Uncertainty | None:
@@ -235,9 +239,13 @@ def uncertainty_of(data: Any) -> Uncertainty | None:
         return data
     box = dict(data["box"])
     return Uncertainty(
-        constants_box(box.pop("constants"), **box), data["entries"], data["written"], data["steps"], data.get("shift"),
+        constants_box(box.pop("constants"), **box),
+        data["entries"],
+        data["written"],
+        data["steps"],
+        data.get("shift"),
         str(data.get("lost", "")),
-    )  # fmt: skip
+    )
 
 
 def expressions_in(rows: Any) -> tuple[Any, list[Entry]]:

@@ -34,8 +34,9 @@ def checked_names(names: Sequence[str] | None, count: int, *, prefix: str, what:
         if not name.isprintable() and any(unicodedata.category(sign) in _UNWRITABLE for sign in name)
     ]
     if unwritable:
-        raise SpecError(f"{what} has the name {unwritable[0]!r}: use no line ends and no control characters.",
-                        path=what)  # fmt: skip
+        raise SpecError(
+            f"{what} has the name {unwritable[0]!r}: use no line ends and no control characters.", path=what
+        )
     repeated = sorted(name for name, times in Counter(given).items() if times > 1)
     if repeated:
         raise SpecError(f"{what} repeats {', '.join(map(repr, repeated))}: names must be unique.", path=what)
@@ -58,8 +59,11 @@ def suggestion(name: str, names: Iterable[str]) -> str:
 def require_known(given: Iterable[Any], known: Iterable[str], *, what: str, kind: str) -> None:
     """Raise one `SpecError` that names every text which is no signal of ``kind``, each with what may be meant."""
     listed = sorted(known)
-    told = [f"{what} names {name!r}, which is no {kind} of the plant.{suggestion(str(name), listed)}"
-            for name in given if name not in listed]  # fmt: skip
+    told = [
+        f"{what} names {name!r}, which is no {kind} of the plant.{suggestion(str(name), listed)}"
+        for name in given
+        if name not in listed
+    ]
     _raise(told, f"{what} names {len(told)} that are no {kind} of the plant:", what)
 
 
@@ -98,9 +102,18 @@ def rows_picking(picked: Sequence[str], names: Sequence[str], *, what: str) -> F
 
 #: Matrix, signal of its rows, signal of its columns.
 MATRIX_LAYOUT = (
-    ("E", "x", "x"), ("A", "x", "x"), ("C", "y", "x"), ("B", "x", "u"), ("D", "y", "u"), ("Bf", "x", "f"),
-    ("Df", "y", "f"), ("Bd", "x", "d"), ("Dd", "y", "d"), ("Bw", "x", "w"), ("Dw", "y", "w"),
-)  # fmt: skip
+    ("E", "x", "x"),
+    ("A", "x", "x"),
+    ("C", "y", "x"),
+    ("B", "x", "u"),
+    ("D", "y", "u"),
+    ("Bf", "x", "f"),
+    ("Df", "y", "f"),
+    ("Bd", "x", "d"),
+    ("Dd", "y", "d"),
+    ("Bw", "x", "w"),
+    ("Dw", "y", "w"),
+)
 #: Matrices that tell how many signals of a kind there are.
 COUNTED_BY = {"y": ("C",), "u": ("B", "D"), "f": ("Bf", "Df"), "d": ("Bd", "Dd"), "w": ("Bw", "Dw")}
 

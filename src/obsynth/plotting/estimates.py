@@ -68,8 +68,17 @@ def plot_faults(
         ``faults`` has the wrong shape, or there are too few or too many axes.
     """
     panels = new_panels(axes, len(estimates.fault_names))
-    _draw(panels, range(len(panels)), estimates.faults, estimates.fault_names, faults, dt, units, what="faults",
-          delays=estimates.fault_delays)  # fmt: skip
+    _draw(
+        panels,
+        range(len(panels)),
+        estimates.faults,
+        estimates.fault_names,
+        faults,
+        dt,
+        units,
+        what="faults",
+        delays=estimates.fault_delays,
+    )
     for panel in panels:
         legend_above(panel)
     return panels
@@ -109,8 +118,17 @@ def plot_parameters(
         The true parameters have the wrong shape, or there are too few or too many axes.
     """
     panels = new_panels(axes, len(estimates.parameter_names))
-    _draw(panels, range(len(panels)), estimates.parameters, estimates.parameter_names, parameters, dt, units,
-          what="parameters", deviations=estimates.parameter_deviations)  # fmt: skip
+    _draw(
+        panels,
+        range(len(panels)),
+        estimates.parameters,
+        estimates.parameter_names,
+        parameters,
+        dt,
+        units,
+        what="parameters",
+        deviations=estimates.parameter_deviations,
+    )
     return panels
 
 
@@ -153,16 +171,34 @@ def plot_states(
     known = estimates.state_names
     chosen = range(len(known)) if names is None else [index_of(name, known, what="The estimates") for name in names]
     panels = new_panels(axes, len(chosen))
-    _draw(panels, chosen, estimates.states, known, states, dt, units, what="states", delays=estimates.state_delays,
-          deviations=estimates.state_deviations if estimates.has_deviations else None)  # fmt: skip
+    _draw(
+        panels,
+        chosen,
+        estimates.states,
+        known,
+        states,
+        dt,
+        units,
+        what="states",
+        delays=estimates.state_delays,
+        deviations=estimates.state_deviations if estimates.has_deviations else None,
+    )
     return panels
 
 
 def _draw(
-    panels: Sequence[Axes], chosen: Sequence[int], values: FloatArray, names: Sequence[str], truth: ArrayLike | None,
-    dt: float, units: Mapping[str, str] | None, *, what: str, delays: Sequence[int] | None = None,
+    panels: Sequence[Axes],
+    chosen: Sequence[int],
+    values: FloatArray,
+    names: Sequence[str],
+    truth: ArrayLike | None,
+    dt: float,
+    units: Mapping[str, str] | None,
+    *,
+    what: str,
+    delays: Sequence[int] | None = None,
     deviations: FloatArray | None = None,
-) -> None:  # fmt: skip
+) -> None:
     """Draw one chosen column of ``values (samples, n)`` on each panel, on the truth delayed as the estimate is."""
     true, word = _matching(truth, values.shape, what), "fault" if what == "faults" else "true"
     time, steps = dt * np.arange(len(values)), len(values)
@@ -191,8 +227,9 @@ def _matching(given: ArrayLike | None, shape: tuple[int, ...], what: str) -> Flo
     raw = np.asarray(given)
     true = as_matrix(raw[:, None] if raw.ndim == 1 else raw, "true signals")
     if true.shape != shape:
-        raise SpecError(f"The true signals have shape {true.shape}, but the estimates {shape} (samples by signals).",
-                        path=what)  # fmt: skip
+        raise SpecError(
+            f"The true signals have shape {true.shape}, but the estimates {shape} (samples by signals).", path=what
+        )
     return true
 
 

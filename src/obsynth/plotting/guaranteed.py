@@ -49,9 +49,14 @@ def plot_least_thresholds(design: ObserverDesign, *, axes: Axes | None = None) -
     panel.plot(seconds, table[:, 1], color="black", marker="o", markersize=4, label="least threshold of any test")
     panel.fill_between(seconds, 0.0, table[:, 1], color="0.9", label="no test without false alarms goes here")
     panel.plot(
-        (found.samples - 1 - before) * plant.dt, found.threshold, marker="s", markersize=9, color="tab:red",
-        linestyle="none", label=f"chosen: {found.samples} samples, proved",
-    )  # fmt: skip
+        (found.samples - 1 - before) * plant.dt,
+        found.threshold,
+        marker="s",
+        markersize=9,
+        color="tab:red",
+        linestyle="none",
+        label=f"chosen: {found.samples} samples, proved",
+    )
     sizes = table[:, 1]
     if sizes.size and sizes.min() > 0.0 and sizes.max() > WIDE_SPREAD * sizes.min():
         panel.set_yscale("log")

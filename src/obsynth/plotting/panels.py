@@ -33,8 +33,11 @@ THRESHOLD_STYLES: tuple[dict[str, Any], ...] = (
 )
 #: A ring where something happens.
 MARK_STYLE: dict[str, Any] = {
-    "markersize": 9, "markerfacecolor": "none", "markeredgewidth": 1.6, "linestyle": "none",
-}  # fmt: skip
+    "markersize": 9,
+    "markerfacecolor": "none",
+    "markeredgewidth": 1.6,
+    "linestyle": "none",
+}
 
 #: Letters of small print that fit in an inch, and those that the sample of a line takes.
 LETTERS_PER_INCH, KEY_LETTERS = 12.5, 8
@@ -52,9 +55,13 @@ def new_panels(axes: Iterable[Axes] | None, count: int, *, size: tuple[float, fl
     import matplotlib.pyplot as plt
 
     _, grid = plt.subplots(
-        count, 1, sharex=True, squeeze=False, layout="constrained",
+        count,
+        1,
+        sharex=True,
+        squeeze=False,
+        layout="constrained",
         figsize=size or (WIDTH, PANEL_HEIGHT * count + 0.8),
-    )  # fmt: skip
+    )
     return list(grid[:, 0])
 
 
@@ -117,9 +124,15 @@ def legend_above(panel: Axes) -> None:
     while columns > 1 and _letters(labels, columns) > inches * LETTERS_PER_INCH:
         columns -= 1
     panel.legend(
-        loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=columns, frameon=False, fontsize="small",
-        borderaxespad=0.1, columnspacing=1.4, handlelength=2.4,
-    )  # fmt: skip
+        loc="lower left",
+        bbox_to_anchor=(0.0, 1.0),
+        ncols=columns,
+        frameon=False,
+        fontsize="small",
+        borderaxespad=0.1,
+        columnspacing=1.4,
+        handlelength=2.4,
+    )
     names_as_they_are(panel)
 
 

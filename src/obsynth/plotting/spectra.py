@@ -25,12 +25,22 @@ _LIMIT: dict[str, Any] = {"color": "0.45", "linewidth": 1.0, "linestyle": "--"}
 _REGION_EDGE: dict[str, Any] = {"color": "tab:green", "linewidth": 1.4, "linestyle": "-."}
 _REGION_SHADE = "0.93"
 _POLES: dict[str, Any] = {
-    "marker": "x", "markersize": 9, "markeredgewidth": 1.6, "linestyle": "none", "color": "black", "zorder": 3,
-}  # fmt: skip
+    "marker": "x",
+    "markersize": 9,
+    "markeredgewidth": 1.6,
+    "linestyle": "none",
+    "color": "black",
+    "zorder": 3,
+}
 _ZEROS: dict[str, Any] = {
-    "marker": "o", "markersize": 9, "markeredgewidth": 1.6, "linestyle": "none", "color": "tab:red",
-    "markerfacecolor": "none", "zorder": 3,
-}  # fmt: skip
+    "marker": "o",
+    "markersize": 9,
+    "markeredgewidth": 1.6,
+    "linestyle": "none",
+    "color": "tab:red",
+    "markerfacecolor": "none",
+    "zorder": 3,
+}
 #: How far a complex number is outside of a part of the region: negative inside.
 Excess = Callable[[ComplexArray], FloatArray]
 
@@ -140,9 +150,15 @@ def _draw_region(axes: Axes, parts: list[Excess]) -> None:
     axes.contourf(x, y, excess, levels=[-np.inf, 0.0], colors=[_REGION_SHADE], zorder=-1)
     if excess.min() < 0.0 < excess.max():
         axes.contour(
-            x, y, excess, levels=[0.0], colors=[_REGION_EDGE["color"]], linestyles=[_REGION_EDGE["linestyle"]],
-            linewidths=[_REGION_EDGE["linewidth"]], zorder=1,
-        )  # fmt: skip
+            x,
+            y,
+            excess,
+            levels=[0.0],
+            colors=[_REGION_EDGE["color"]],
+            linestyles=[_REGION_EDGE["linestyle"]],
+            linewidths=[_REGION_EDGE["linewidth"]],
+            zorder=1,
+        )
     axes.plot([], [], label="region asked for", **_REGION_EDGE)
 
 

@@ -79,8 +79,9 @@ def _number(design: ObserverDesign, name: str) -> float:
             return float(source[name])
     raise SpecError(
         f"Design {design.name!r} has no {name!r}: its claims are {', '.join(claims) or 'none'}; names of checks and "
-        f"numeric options ({', '.join(options) or 'none'}) go too.", path=name,
-    )  # fmt: skip
+        f"numeric options ({', '.join(options) or 'none'}) go too.",
+        path=name,
+    )
 
 
 #: Inches: height of one panel.
@@ -211,10 +212,13 @@ def plot_sweep(results: Sequence[Any], claim: str | None = None, *, parameter: s
     for number, (label, points) in enumerate(lines.items()):
         points.sort(key=lambda point: point[0])
         panel.plot(
-            [place for place, _ in points], [result.claims.get(claim, np.nan) for _, result in points],
-            linewidth=1.0, marker=MARKERS[number % len(MARKERS)], markersize=4,
+            [place for place, _ in points],
+            [result.claims.get(claim, np.nan) for _, result in points],
+            linewidth=1.0,
+            marker=MARKERS[number % len(MARKERS)],
+            markersize=4,
             label=label if label and number < MOST_LINES else None,
-        )  # fmt: skip
+        )
     _mark_failures(panel, lines)
     values = [result.claims[claim] for result in results if claim in result.claims]
     if _spread(values):
@@ -235,9 +239,15 @@ def _mark_failures(panel: Axes, lines: Mapping[str, list[tuple[float, Any]]]) ->
         places = [place for points in lines.values() for place, result in points if result.status == status]
         if places:
             panel.plot(
-                places, [0.03] * len(places), marker, color="tab:red", markersize=8, clip_on=False,
-                transform=panel.get_xaxis_transform(), label=f"{status}: {len(places)}",
-            )  # fmt: skip
+                places,
+                [0.03] * len(places),
+                marker,
+                color="tab:red",
+                markersize=8,
+                clip_on=False,
+                transform=panel.get_xaxis_transform(),
+                label=f"{status}: {len(places)}",
+            )
 
 
 def _claim(results: Sequence[Any], claim: str | None) -> str:

@@ -134,8 +134,9 @@ class AffineMatrix:
 def affine_block(rows: Sequence[Sequence[AffineMatrix]]) -> AffineMatrix:
     """Return the matrix with the given rows of blocks."""
     # Blocks are joined along the last two axes, whatever is before these.
-    center, parts, radius = (np.block([[getattr(item, part) for item in row] for row in rows])
-                             for part in ("center", "parts", "radius"))  # fmt: skip
+    center, parts, radius = (
+        np.block([[getattr(item, part) for item in row] for row in rows]) for part in ("center", "parts", "radius")
+    )
     return AffineMatrix(center, parts, radius)
 
 
@@ -155,8 +156,9 @@ def affine_inverse(matrix: AffineMatrix) -> AffineMatrix:
     if neumann is None:
         raise PreconditionError(
             f"A matrix is not proved regular on the whole box (spectral radius {spectral_radius_bound(bound):.3g} of "
-            "the deviation, which must be below 1): give smaller tolerances.", condition="regularity",
-        )  # fmt: skip
+            "the deviation, which must be below 1): give smaller tolerances.",
+            condition="regularity",
+        )
     series = (deviation + np.eye(size)).enlarged(_up(bound @ (bound @ neumann), 2 * size + 4))
     return series @ near
 

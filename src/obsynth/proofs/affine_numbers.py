@@ -95,9 +95,11 @@ class AffineNumber:
         affine, theirs = float(np.abs(self.parts).sum()), float(np.abs(given.parts).sum())
         radius = affine * theirs + self.radius * given.magnitude + self.magnitude * given.radius
         return self._rounded(
-            self.center * given.center, self.center * given.parts + given.center * self.parts, radius,
+            self.center * given.center,
+            self.center * given.parts + given.center * self.parts,
+            radius,
             self.magnitude * given.magnitude,
-        )  # fmt: skip
+        )
 
     def __truediv__(self, other: Any) -> AffineNumber:
         """Return the quotient at the same q."""
@@ -110,8 +112,10 @@ class AffineNumber:
         """Return one over this; refused where it can be zero."""
         low, high = self.interval
         if low <= 0.0 <= high:
-            raise _unbounded(f"A divisor lies between {low:.4g} and {high:.4g} in the box and can be zero: the box "
-                             "leaves the matrices unbounded. Give smaller tolerances.")  # fmt: skip
+            raise _unbounded(
+                f"A divisor lies between {low:.4g} and {high:.4g} in the box and can be zero: the box "
+                "leaves the matrices unbounded. Give smaller tolerances."
+            )
         least = min(abs(low), abs(high))
         return self.through(1.0 / self.center, -1.0 / self.center**2, 2.0 / least**3)
 
@@ -139,8 +143,10 @@ class AffineNumber:
             return (self ** (-n)).reciprocal()
         low, high = self.interval
         if not low > 0.0:
-            raise _unbounded(f"The base of a power lies between {low:.4g} and {high:.4g} in the box: a power that is "
-                             "no whole number needs a positive one.")  # fmt: skip
+            raise _unbounded(
+                f"The base of a power lies between {low:.4g} and {high:.4g} in the box: a power that is "
+                "no whole number needs a positive one."
+            )
         if exponent.spread:
             return _exp(exponent * _log(self))
         steepest = max(abs(n * (n - 1.0)) * low ** (n - 2.0), abs(n * (n - 1.0)) * high ** (n - 2.0))
@@ -159,8 +165,9 @@ def _exp(x: AffineNumber) -> AffineNumber:
 def _positive(x: AffineNumber, name: str) -> float:
     low, high = x.interval
     if not low > 0.0:
-        raise _unbounded(f"The argument of {name} lies between {low:.4g} and {high:.4g} in the box: it must be "
-                         "positive.")  # fmt: skip
+        raise _unbounded(
+            f"The argument of {name} lies between {low:.4g} and {high:.4g} in the box: it must be positive."
+        )
     return low
 
 
@@ -253,20 +260,34 @@ _OF_ONE: dict[Callable[..., Any], Callable[[AffineNumber], AffineNumber]] = {
     np.cosh: lambda x: x.through(
         _finite(math.cosh, x.center), _finite(math.sinh, x.center), _finite(math.cosh, x.magnitude)
     ),
-    np.tan: _tan, np.arctan: lambda x: x.through(math.atan(x.center), 1.0 / (1.0 + x.center**2), ATAN_CURVATURE),
+    np.tan: _tan,
+    np.arctan: lambda x: x.through(math.atan(x.center), 1.0 / (1.0 + x.center**2), ATAN_CURVATURE),
     np.tanh: lambda x: x.through(math.tanh(x.center), 1.0 - math.tanh(x.center) ** 2, TANH_CURVATURE),
-    np.exp: _exp, np.log: _log, np.log10: lambda x: _log(x) * (1.0 / math.log(10.0)), np.sqrt: _sqrt,
-    np.arcsin: _arc(math.asin, 1.0, "asin"), np.arccos: _arc(math.acos, -1.0, "acos"), np.abs: _absolute,
-    np.sign: _jumps(np.sign, "sign"), np.floor: _jumps(np.floor, "floor"), np.ceil: _jumps(np.ceil, "ceil"),
+    np.exp: _exp,
+    np.log: _log,
+    np.log10: lambda x: _log(x) * (1.0 / math.log(10.0)),
+    np.sqrt: _sqrt,
+    np.arcsin: _arc(math.asin, 1.0, "asin"),
+    np.arccos: _arc(math.acos, -1.0, "acos"),
+    np.abs: _absolute,
+    np.sign: _jumps(np.sign, "sign"),
+    np.floor: _jumps(np.floor, "floor"),
+    np.ceil: _jumps(np.ceil, "ceil"),
     step_function: _jumps(step_function, "step"),
-}  # fmt: skip
+}
 _OF_TWO: dict[Callable[..., Any], Callable[[AffineNumber, AffineNumber], Any]] = {
-    np.add: lambda x, y: x + y, np.subtract: lambda x, y: x - y, np.multiply: lambda x, y: x * y,
-    np.divide: lambda x, y: x / y, np.power: lambda x, y: x**y,
-    np.minimum: partial(_extreme, largest=False), np.maximum: partial(_extreme, largest=True),
-    np.less: _definite(np.less), np.less_equal: _definite(np.less_equal), np.greater: _definite(np.greater),
+    np.add: lambda x, y: x + y,
+    np.subtract: lambda x, y: x - y,
+    np.multiply: lambda x, y: x * y,
+    np.divide: lambda x, y: x / y,
+    np.power: lambda x, y: x**y,
+    np.minimum: partial(_extreme, largest=False),
+    np.maximum: partial(_extreme, largest=True),
+    np.less: _definite(np.less),
+    np.less_equal: _definite(np.less_equal),
+    np.greater: _definite(np.greater),
     np.greater_equal: _definite(np.greater_equal),
-}  # fmt: skip
+}
 
 
 def affine_translation(count: int) -> Callable[[Callable[..., Any]], Callable[..., Any]]:

@@ -43,9 +43,16 @@ class PeakSums(NamedTuple):
 
 
 def peak_sums(
-    matrix: Ball, rows: FloatArray, columns: Ball, contraction: Contraction, *, least: int = 0, left: float = LEFT,
-    each: bool = False, most: int = MOST_STEPS,
-) -> PeakSums:  # fmt: skip
+    matrix: Ball,
+    rows: FloatArray,
+    columns: Ball,
+    contraction: Contraction,
+    *,
+    least: int = 0,
+    left: float = LEFT,
+    each: bool = False,
+    most: int = MOST_STEPS,
+) -> PeakSums:
     """Return bounds on the sums over j of ``|c M^j b|`` (Euclidean; ``each``: by row) of columns ``b``, ``c (p, n)``.
 
     From ``least`` to ``most`` terms, in blocks of 64, until the rest is bounded by the share ``left``.

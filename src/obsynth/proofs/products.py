@@ -183,9 +183,9 @@ def _in_units(ball: Ball, units: FloatArray) -> Ball:
     return Ball(ball.midpoint * scale, ball.radius * scale + UNDERFLOW)
 
 
-def stacked_product(first: tuple[FloatArray, FloatArray], second: tuple[FloatArray, FloatArray]) -> tuple[
-    FloatArray, FloatArray
-]:  # fmt: skip
+def stacked_product(
+    first: tuple[FloatArray, FloatArray], second: tuple[FloatArray, FloatArray]
+) -> tuple[FloatArray, FloatArray]:
     """Return the products of two stacks of balls ``(count, rows, n)``, ``(count, n, columns)``, as `Ball` does."""
     (a, ra), (b, rb) = first, second
     length = a.shape[2]

@@ -110,11 +110,16 @@ def check_rows(checks: Sequence[Check]) -> Iterator[str]:
         yield "</tbody>"
     yield "</table></div>"
     yield "<h3>What each kind of check is worth</h3>"
-    yield from fact_rows([
-        *((kind, meaning) for kind, meaning in KINDS.items() if any(check.kind == kind for check in checks)),
-        *((f"({status})", meaning) for status, meaning in STATUSES.items()
-          if any(check.status == status for check in checks)),
-    ])  # fmt: skip
+    yield from fact_rows(
+        [
+            *((kind, meaning) for kind, meaning in KINDS.items() if any(check.kind == kind for check in checks)),
+            *(
+                (f"({status})", meaning)
+                for status, meaning in STATUSES.items()
+                if any(check.status == status for check in checks)
+            ),
+        ]
+    )
 
 
 def _group(check: Check) -> str:
@@ -180,8 +185,10 @@ def _text(value: Any) -> str:
     return str(value)
 
 
-_TEXT = ("Measured and predicted signals, innovations in a band of two deviations as the design expects them, and "
-         "estimates in bands of two deviations.")  # fmt: skip
+_TEXT = (
+    "Measured and predicted signals, innovations in a band of two deviations as the design expects them, and "
+    "estimates in bands of two deviations."
+)
 
 
 def agreement_section(design: ObserverDesign, run: DataRun, rows: str | None) -> Iterator[str]:
@@ -223,10 +230,14 @@ def _sensors(design: ObserverDesign, found: Validation) -> Table:
     for name, sensor in found.sensors.items():
         ratio = found.ratios.get(name)
         table.add_row(
-            Text(name), design.plant.units.get(name, ""), number(sensor.nis.value),
-            f"{sensor.nis.low:.2f} to {sensor.nis.high:.2f}", f"{sensor.mean:+.2g}",
-            f"{sensor.whiteness.probability:.2g}", "as designed" if ratio is None else f"{ratio:.2g} times R",
-        )  # fmt: skip
+            Text(name),
+            design.plant.units.get(name, ""),
+            number(sensor.nis.value),
+            f"{sensor.nis.low:.2f} to {sensor.nis.high:.2f}",
+            f"{sensor.mean:+.2g}",
+            f"{sensor.whiteness.probability:.2g}",
+            "as designed" if ratio is None else f"{ratio:.2g} times R",
+        )
     return table
 
 
@@ -234,8 +245,10 @@ def data_section(design: ObserverDesign, run: DataRun, statement: str) -> Iterat
     """Yield a picture of a run, what was counted, and statistics of estimates and residuals in decided rows."""
     count = panel_count(run)
     if count:
-        text = ("Measured outputs and their estimates, fault estimates, residuals and the monitor's statistic, as far "
-                "as there are any. Nothing is decided in grey rows; rows with an alarm are red.")  # fmt: skip
+        text = (
+            "Measured outputs and their estimates, fault estimates, residuals and the monitor's statistic, as far "
+            "as there are any. Nothing is decided in grey rows; rows with an alarm are red."
+        )
         yield stacked("", text, count, lambda axes: plot_data(run, design=design, axes=axes)).html()
     yield from fact_rows(_counts(run, statement))
     yield from (f'<p class="warning">Warning: {escape(text)}</p>' for text in run.warnings)
@@ -279,10 +292,18 @@ MOST_ENTRIES = 900
 
 
 def html_report(
-    design: ObserverDesign, path: str | Path, *, report: VerificationReport | None = None,
-    gains_file: str | None = None, scenario: Scenario | None = None, system_file: str | None = None,
-    run: DataRun | None = None, data_file: str | None = None, statement: str = "", rows: str | None = None,
-) -> Path:  # fmt: skip
+    design: ObserverDesign,
+    path: str | Path,
+    *,
+    report: VerificationReport | None = None,
+    gains_file: str | None = None,
+    scenario: Scenario | None = None,
+    system_file: str | None = None,
+    run: DataRun | None = None,
+    data_file: str | None = None,
+    statement: str = "",
+    rows: str | None = None,
+) -> Path:
     """Write one HTML page about a design, complete in itself: it needs no network and no other file.
 
     Parameters
@@ -323,8 +344,10 @@ def html_report(
     """
     digest, own = gain_set_digest(design), {}
     if run is not None:
-        own = {"On your data": list(data_section(design, run, statement)),
-               "Does your data agree": list(agreement_section(design, run, rows))}  # fmt: skip
+        own = {
+            "On your data": list(data_section(design, run, statement)),
+            "Does your data agree": list(agreement_section(design, run, rows)),
+        }
     shown = design if report in (None, design.report) else design.replace(report=report)
     reproduction = list(_reproduction(shown, digest, gains_file, system_file, data_file))
     return write_atomically(path, _page_text(shown, scenario, own, reproduction))
@@ -353,13 +376,20 @@ def _page_text(
     shown = {heading: lines for heading, lines in sections.items() if lines}
     links = "".join(f'<a href="#{_anchor(heading)}">{heading}</a>' for heading in shown)
     parts = [
-        "<!DOCTYPE html>", '<html lang="en">', "<head>", '<meta charset="utf-8">',
+        "<!DOCTYPE html>",
+        '<html lang="en">',
+        "<head>",
+        '<meta charset="utf-8">',
         '<meta name="generator" content="obsynth">',
-        '<meta name="viewport" content="width=device-width, initial-scale=1">', f"<title>{title}</title>",
-        f"<style>{style}</style>", "</head>", "<body>", f"<h1>{title}</h1>",
+        '<meta name="viewport" content="width=device-width, initial-scale=1">',
+        f"<title>{title}</title>",
+        f"<style>{style}</style>",
+        "</head>",
+        "<body>",
+        f"<h1>{title}</h1>",
         f'<p class="verdict {state}">{escape(verdict_line(report.checks).plain)}</p>',
         f"<nav>{links}</nav>",
-    ]  # fmt: skip
+    ]
     for heading, lines in shown.items():
         parts += [f'<section id="{_anchor(heading)}">', f"<h2>{heading}</h2>", *lines, "</section>"]
     return "\n".join([*parts, "</body>", "</html>"]) + "\n"

@@ -47,8 +47,10 @@ class Picture(NamedTuple):
     def html(self) -> str:
         """Return the picture as a figure; a wide one takes a row of its own."""
         title = f"<h3>{escape(self.title)}</h3>" if self.title else ""
-        return (f'<figure class="{"wide" if self.wide else "half"}">{title}<img alt="{escape(self.text)}" '
-                f'src="{self.source}"><figcaption>{escape(self.text)}</figcaption></figure>')  # fmt: skip
+        return (
+            f'<figure class="{"wide" if self.wide else "half"}">{title}<img alt="{escape(self.text)}" '
+            f'src="{self.source}"><figcaption>{escape(self.text)}</figcaption></figure>'
+        )
 
 
 def pictures_of(design: ObserverDesign, *, scenario: Scenario | None = None) -> Iterator[Picture]:
@@ -60,20 +62,25 @@ def pictures_of(design: ObserverDesign, *, scenario: Scenario | None = None) -> 
     if design.observer.order:
         region = "inside the circle" if sampled else "left of the dashed line"
         yield Picture(
-            "Spectrum", f"Eigenvalues of the observer: its initial-condition response decays where all are {region}.",
+            "Spectrum",
+            f"Eigenvalues of the observer: its initial-condition response decays where all are {region}.",
             drawn((HALF, 5.4 if sampled else 4.2), 1, lambda axes: plot_poles(design, axes=axes[0])),
-        )  # fmt: skip
+        )
     if design.observer.fault_names:
         yield _gains(
-            design, "faults", "What reaches the fault estimates",
+            design,
+            "faults",
+            "What reaches the fault estimates",
             "Singular values over the frequency: from the faults, where 1 is faithful, and from disturbances and "
             "noise, where less is better.",
-        )  # fmt: skip
+        )
     if design.observer.state_names:
         yield _gains(
-            design, "states", "What reaches the state estimates",
+            design,
+            "states",
+            "What reaches the state estimates",
             "Largest singular values over the frequency, to the errors of the states: less is better.",
-        )  # fmt: skip
+        )
 
 
 def _gains(design: ObserverDesign, to: str, title: str, text: str) -> Picture:
@@ -100,15 +107,21 @@ def _at_work(design: ObserverDesign, scenario: Scenario | None) -> Iterator[Pict
     units, dt = design.plant.units, float(simulation.time[1]) if len(simulation.time) > 1 else 1.0
     seen = [*_watched(design, shown, simulation)] if given else []
     if faults or seen:
-        yield stacked("The design at work", text, faults + len(seen),
-                      lambda axes: plot_simulation(simulation, detections=seen, units=units, axes=axes))  # fmt: skip
+        yield stacked(
+            "The design at work",
+            text,
+            faults + len(seen),
+            lambda axes: plot_simulation(simulation, detections=seen, units=units, axes=axes),
+        )
     if 0 < len(states) <= MOST_STATES:
         run = "in the same run" if faults or seen else "in a run with the stated noise"
         bands = "" if linear else ", with 95 % bands"
         yield stacked(
-            "States", f"States {run}, and their estimates{bands}.", len(states),
+            "States",
+            f"States {run}, and their estimates{bands}.",
+            len(states),
             lambda axes: plot_states(simulation.estimates, states=simulation.states, dt=dt, units=units, axes=axes),
-        )  # fmt: skip
+        )
 
 
 def _watched(design: ObserverDesign, scenario: Scenario, simulation: Simulation) -> Iterator[Detection | Decision]:

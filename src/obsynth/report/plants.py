@@ -152,8 +152,9 @@ def method_lines(methods: Mapping[str, VerificationReport], *, own: str = "") ->
 def print_methods(methods: Mapping[str, VerificationReport], *, own: str, console: Console) -> None:
     """Print the lines of all methods."""
     for method, text, style in method_lines(methods, own=own):
-        lines = textwrap.wrap(f"{method}: {text}", min(console.width, 120), subsequent_indent="  ",
-                              break_on_hyphens=False)  # fmt: skip
+        lines = textwrap.wrap(
+            f"{method}: {text}", min(console.width, 120), subsequent_indent="  ", break_on_hyphens=False
+        )
         for line in lines:
             console.print(Text(line, style=style), soft_wrap=True)
 
@@ -177,9 +178,15 @@ def linear_plant_text(plant: DescriptorSystem) -> str:
     for name, value in plant.operating_point.items():
         unit = plant.units.get(name, "1")
         lines.append(f"  {name} = {value:.8g}{'' if unit == '1' else ' ' + unit}")
-    for name, signals in (("E", plant.state_names), ("A", plant.state_names), ("B", plant.input_names),
-                          ("C", plant.state_names), ("Bf", plant.fault_names), ("Df", plant.fault_names),
-                          ("Bd", plant.disturbance_names)):  # fmt: skip
+    for name, signals in (
+        ("E", plant.state_names),
+        ("A", plant.state_names),
+        ("B", plant.input_names),
+        ("C", plant.state_names),
+        ("Bf", plant.fault_names),
+        ("Df", plant.fault_names),
+        ("Bd", plant.disturbance_names),
+    ):
         matrix = getattr(plant, name)
         if matrix.size and (np.any(matrix) or name in "EABC"):
             lines += [f"{name}, columns {', '.join(signals)}:"]

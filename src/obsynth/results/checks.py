@@ -71,16 +71,18 @@ def upper_bound_check(
     name: str, claim: str, value: float, bound: float, *, source: str, kind: CheckKind = "computed", detail: str = ""
 ) -> Check:
     """Return a check that passes when ``value <= bound``; NaN fails."""
-    return Check(name, claim, float(value), float(bound), float(bound - value), bool(value <= bound), source, kind,
-                 detail)  # fmt: skip
+    return Check(
+        name, claim, float(value), float(bound), float(bound - value), bool(value <= bound), source, kind, detail
+    )
 
 
 def lower_bound_check(
     name: str, claim: str, value: float, bound: float, *, source: str, kind: CheckKind = "computed", detail: str = ""
 ) -> Check:
     """Return a check that passes when ``value >= bound``; NaN fails."""
-    return Check(name, claim, float(value), float(bound), float(value - bound), bool(value >= bound), source, kind,
-                 detail)  # fmt: skip
+    return Check(
+        name, claim, float(value), float(bound), float(value - bound), bool(value >= bound), source, kind, detail
+    )
 
 
 def information(

@@ -217,8 +217,11 @@ class ObserverDesign:
 
         observer = self._constant_observer()
         matrices = (
-            observer.Az, np.hstack([observer.Bu, observer.By]), observer.Cz, np.hstack([observer.Du, observer.Dy])
-        )  # fmt: skip
+            observer.Az,
+            np.hstack([observer.Bu, observer.By]),
+            observer.Cz,
+            np.hstack([observer.Du, observer.Dy]),
+        )
         return StateSpace(*matrices, dt=observer.dt) if observer.dt > 0.0 else StateSpace(*matrices)
 
     def _constant_observer(self) -> LinearObserver:
@@ -247,7 +250,13 @@ class ObserverDesign:
 
         observer = self._constant_observer()
         return control.ss(
-            observer.Az, np.hstack([observer.Bu, observer.By]), observer.Cz, np.hstack([observer.Du, observer.Dy]),
-            observer.dt, inputs=[*observer.input_names, *observer.output_names], outputs=list(observer.row_names),
-            states=[f"z[{i + 1}]" for i in range(observer.order)], name=self.name,
-        )  # fmt: skip
+            observer.Az,
+            np.hstack([observer.Bu, observer.By]),
+            observer.Cz,
+            np.hstack([observer.Du, observer.Dy]),
+            observer.dt,
+            inputs=[*observer.input_names, *observer.output_names],
+            outputs=list(observer.row_names),
+            states=[f"z[{i + 1}]" for i in range(observer.order)],
+            name=self.name,
+        )

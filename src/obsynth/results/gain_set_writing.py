@@ -136,9 +136,11 @@ def _fields_of(record: StateRecovery) -> dict[str, Any]:
     if (operator := record.by_operator) is not None:
         # Sparse equations take less room than the map that they stand for.
         return {
-            "names": record.names, "noise_kept": record.noise_kept, "operating_point": record.operating_point,
+            "names": record.names,
+            "noise_kept": record.noise_kept,
+            "operating_point": record.operating_point,
             "operator": operator.as_dict(),
-        }  # fmt: skip
+        }
     return {field.name: getattr(record, field.name) for field in fields(record)}
 
 

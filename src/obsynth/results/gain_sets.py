@@ -43,9 +43,20 @@ from obsynth.results.gain_set_writing import (
 from obsynth.results.plant_source import PlantSource
 
 __all__ = [
-    "GAIN_SET", "SCHEMA_VERSION", "design_as_dict", "digest_of", "gain_set_bytes", "gain_set_digest", "load", "loaded",
-    "place_of", "plain", "restored", "save", "written_for",
-]  # fmt: skip
+    "GAIN_SET",
+    "SCHEMA_VERSION",
+    "design_as_dict",
+    "digest_of",
+    "gain_set_bytes",
+    "gain_set_digest",
+    "load",
+    "loaded",
+    "place_of",
+    "plain",
+    "restored",
+    "save",
+    "written_for",
+]
 
 #: Larger gain sets are refused before they fill the memory.
 MAXIMUM_CHARACTERS = 2_000_000_000

@@ -57,9 +57,11 @@ class PlantSource:
 def _entries(matrix: FloatArray) -> dict[str, Any]:
     rows, columns = np.nonzero(matrix)
     return {
-        "size": list(matrix.shape), "rows": rows.tolist(), "columns": columns.tolist(),
+        "size": list(matrix.shape),
+        "rows": rows.tolist(),
+        "columns": columns.tolist(),
         "values": matrix[rows, columns].tolist(),
-    }  # fmt: skip
+    }
 
 
 def _matrix(entries: Mapping[str, Any]) -> FloatArray:

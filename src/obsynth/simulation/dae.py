@@ -107,8 +107,9 @@ def _parameters(model: DAEModel, value: ArrayLike | None, samples: int) -> Float
         return np.tile(theta, (samples, 1))
     theta = as_matrix(value, "parameters")
     if theta.shape != (samples, model.nq):
-        raise SpecError(f"parameters is {theta.shape}, but ({model.nq},) or ({samples}, {model.nq}) is needed.",
-                        path="parameters")  # fmt: skip
+        raise SpecError(
+            f"parameters is {theta.shape}, but ({model.nq},) or ({samples}, {model.nq}) is needed.", path="parameters"
+        )
     return theta
 
 

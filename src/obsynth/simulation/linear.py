@@ -56,9 +56,15 @@ def simulate_plant(
     outputs = states @ plant.C.T + _sum_of(signals, {"u": plant.D, "f": plant.Df, "d": plant.Dd, "w": plant.Dw})
     inconsistency = 0.0 if initial_state is None else float(np.linalg.norm(states[0] - start))
     return Trajectory(
-        states, outputs, signals["u"], signals["f"], signals["d"], signals["w"],
-        time=plant.dt * np.arange(steps, dtype=np.float64), inconsistency=inconsistency,
-    )  # fmt: skip
+        states,
+        outputs,
+        signals["u"],
+        signals["f"],
+        signals["d"],
+        signals["w"],
+        time=plant.dt * np.arange(steps, dtype=np.float64),
+        inconsistency=inconsistency,
+    )
 
 
 def _sum_of(signals: dict[str, FloatArray], matrices: dict[str, FloatArray]) -> FloatArray:
@@ -135,11 +141,15 @@ def make_stepper(
         noisy, heard, shown = _sampled_noise(reduced, recovery, a, drive)
     direct = np.hstack([recovery.from_input, recovery.from_fault, recovery.from_disturbance])
     return Stepper(
-        transition, held, ramped, noisy,
+        transition,
+        held,
+        ramped,
+        noisy,
         (recovery.from_state - recovery.from_input @ closing, direct, shown),
         (reduced.C - reduced.D @ closing, np.hstack([reduced.D, reduced.Df, reduced.Dd]), heard),
-        start, gain,
-    )  # fmt: skip
+        start,
+        gain,
+    )
 
 
 def _sampled_noise(
@@ -151,8 +161,9 @@ def _sampled_noise(
     if recovery.from_noise.any():
         raise PreconditionError(
             "Process noise enters an algebraic equation, where continuous white noise has infinite variance: filter it "
-            "by a state, or leave the noise out (noise: 0).", condition="noise without a direct path",
-        )  # fmt: skip
+            "by a state, or leave the noise out (noise: 0).",
+            condition="noise without a direct path",
+        )
     sampled = discretise(reduced.replace(A=a), drive.dt).plant
     return sampled.Bw, sampled.Dw, np.zeros((len(recovery.names), sampled.nw))
 
@@ -229,17 +240,26 @@ def simulate_time_varying(
     nu = signal_of(output_noise, "output_noise", (samples - 1, plant.ny))
     start = np.zeros(plant.nx) if initial_state is None else real_vector(initial_state, plant.nx, "initial_state")
     states, outputs = varying_runs(
-        plant, parameters=theta, inputs=inputs, initial_state=start, equation_noise=mu[:, None],
+        plant,
+        parameters=theta,
+        inputs=inputs,
+        initial_state=start,
+        equation_noise=mu[:, None],
         output_noise=nu[:, None],
-    )  # fmt: skip
+    )
     time = plant.dt * np.arange(samples, dtype=np.float64)
     return Trajectory(states[:, 0], outputs[:, 0], inputs, theta, time=time)
 
 
 def varying_runs(
-    plant: TimeVaryingDescriptorSystem, *, parameters: FloatArray, inputs: FloatArray, initial_state: FloatArray,
-    equation_noise: FloatArray, output_noise: FloatArray,
-) -> tuple[FloatArray, FloatArray]:  # fmt: skip
+    plant: TimeVaryingDescriptorSystem,
+    *,
+    parameters: FloatArray,
+    inputs: FloatArray,
+    initial_state: FloatArray,
+    equation_noise: FloatArray,
+    output_noise: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
     """Simulate many runs with ``equation_noise (samples, runs, ne)`` and ``output_noise (samples - 1, runs, ny)``."""
     if plant.ne != plant.nx:
         raise SpecError(f"{plant.ne} equations do not determine {plant.nx} states.", path="E")
@@ -267,8 +287,9 @@ def varying_runs(
         if not decision.full:
             raise PreconditionError(
                 f"The plant cannot be simulated step by step: at k = {k + 1} its equations do not determine the state "
-                f"({decision.describe()}), so its index is higher than one there.", condition="index one",
-            )  # fmt: skip
+                f"({decision.describe()}), so its index is higher than one there.",
+                condition="index one",
+            )
         x = np.asarray(np.linalg.solve(matrix, value), dtype=np.float64)
         states[k + 1] = x.T
         known = plant.Psi.at(k) @ parameters[k]

@@ -297,6 +297,13 @@ class Gaussian(Random):
 
 #: The profiles by their names in a spec.
 KINDS: dict[str, type[Profile]] = {
-    "step": Step, "ramp": Ramp, "sine": Sine, "drift": Drift, "intermittent": Intermittent, "stuck": Stuck,
-    "lost-effectiveness": LostEffectiveness, "uniform": Uniform, "gaussian": Gaussian,
-}  # fmt: skip
+    "step": Step,
+    "ramp": Ramp,
+    "sine": Sine,
+    "drift": Drift,
+    "intermittent": Intermittent,
+    "stuck": Stuck,
+    "lost-effectiveness": LostEffectiveness,
+    "uniform": Uniform,
+    "gaussian": Gaussian,
+}

@@ -21,14 +21,20 @@ _FAILING = tuple(kind for kind in KINDS.values() if issubclass(kind, Failure))
 _RANDOM = tuple(kind for kind in KINDS.values() if issubclass(kind, Random))
 #: What each group of signals may do.
 _ALLOWED: dict[str, tuple[type[Profile], ...]] = {
-    "inputs": _ADDITIVE, "faults": (*_ADDITIVE, *_FAILING), "disturbances": (*_ADDITIVE, *_RANDOM),
+    "inputs": _ADDITIVE,
+    "faults": (*_ADDITIVE, *_FAILING),
+    "disturbances": (*_ADDITIVE, *_RANDOM),
     "sensors": (*_ADDITIVE, *_FAILING),
-}  # fmt: skip
+}
 #: The names of a plant's signals that each group speaks of; the faults of a plant with parameters are these.
 _NAMES = {
-    "inputs": "input_names", "faults": "fault_names", "disturbances": "disturbance_names", "sensors": "output_names",
-    "sensor_noise": "output_names", "initial_state": "state_names",
-}  # fmt: skip
+    "inputs": "input_names",
+    "faults": "fault_names",
+    "disturbances": "disturbance_names",
+    "sensors": "output_names",
+    "sensor_noise": "output_names",
+    "initial_state": "state_names",
+}
 Profiles = Mapping[str, Profile | Sequence[Profile]]
 
 
@@ -193,8 +199,9 @@ def _checked_profiles(given: Any, group: str, kinds: tuple[type[Profile], ...]) 
             if not isinstance(profile, kinds):
                 raise SpecError(
                     f"{type(profile).__name__} has no meaning among the {group}: use "
-                    f"{', '.join(kind.__name__ for kind in kinds)}.", path=where,
-                )  # fmt: skip
+                    f"{', '.join(kind.__name__ for kind in kinds)}.",
+                    path=where,
+                )
         if len(profiles) > 1 and any(isinstance(profile, Failure) for profile in profiles):
             raise SpecError("Stuck and LostEffectiveness must be a signal's only profile.", path=where)
         found[str(name)] = profiles

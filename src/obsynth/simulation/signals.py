@@ -95,8 +95,9 @@ def resolve_parameters(
     if isinstance(plant, TimeVaryingDescriptorSystem) and plant.horizon is not None and drive.steps > plant.horizon:
         raise SpecError(
             f"The scenario has {drive.steps} samples, but the plant is known for {plant.horizon} steps: its horizon "
-            f"must be below {plant.horizon * dt:g} s.", path="horizon",
-        )  # fmt: skip
+            f"must be below {plant.horizon * dt:g} s.",
+            path="horizon",
+        )
     return drive
 
 
@@ -107,8 +108,9 @@ def check_parameters(plant: TimeVaryingDescriptorSystem | DAEModel, scenario: Sc
         if isinstance(profile, Failure):
             raise SpecError(
                 "A parameter neither sticks nor loses effectiveness: give a step or another profile, which is added to "
-                "it.", path=f"faults.{name}",
-            )  # fmt: skip
+                "it.",
+                path=f"faults.{name}",
+            )
     for group, why in {
         "disturbances": "Such a plant has no disturbances: give noise, or make one of them a parameter.",
         "observer_state": "A recursive observer starts where its design says: leave observer_state out.",
@@ -119,14 +121,18 @@ def check_parameters(plant: TimeVaryingDescriptorSystem | DAEModel, scenario: Sc
 
 
 def _resolved(
-    plant: DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel, scenario: Scenario, dt: float,
-    faults: tuple[str, ...], disturbances: tuple[str, ...],
-) -> ScenarioSignals:  # fmt: skip
+    plant: DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel,
+    scenario: Scenario,
+    dt: float,
+    faults: tuple[str, ...],
+    disturbances: tuple[str, ...],
+) -> ScenarioSignals:
     if scenario.horizon / dt > MAXIMUM_SAMPLES:
         raise SpecError(
             f"{scenario.horizon:g} s are {scenario.horizon / dt:.3g} samples of {dt:g} s, more than "
-            f"{MAXIMUM_SAMPLES:,}: shorten the horizon.", path="horizon",
-        )  # fmt: skip
+            f"{MAXIMUM_SAMPLES:,}: shorten the horizon.",
+            path="horizon",
+        )
     steps, before = int(scenario.horizon / dt + SAMPLE_SLACK) + 1, 0
     groups = {"inputs": plant.input_names, "faults": faults, "disturbances": disturbances}
     left, right = np.zeros((2, steps, sum(map(len, groups.values()))))
@@ -172,8 +178,9 @@ def _actuator(plant: DescriptorSystem, fault: str, scenario: Scenario) -> int:
     if scenario.stabilise:
         raise SpecError(
             "With a stabilising feedback the commands depend on the fault, and such a failure is no signal of time: "
-            "give a step or another profile.", path=where,
-        )  # fmt: skip
+            "give a step or another profile.",
+            path=where,
+        )
     column = plant.fault_names.index(fault)
     of_fault = np.concatenate([plant.Bf[:, column], plant.Df[:, column]])
     of_inputs = np.vstack([plant.B, plant.D])
@@ -181,8 +188,9 @@ def _actuator(plant: DescriptorSystem, fault: str, scenario: Scenario) -> int:
     if len(found) != 1:
         raise SpecError(
             f"Fault {fault!r} must enter exactly where one input does to be a failing actuator, but "
-            f"{len(found)} inputs have its columns.", path=where,
-        )  # fmt: skip
+            f"{len(found)} inputs have its columns.",
+            path=where,
+        )
     return found[0]
 
 

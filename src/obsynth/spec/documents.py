@@ -168,8 +168,9 @@ def _options_of_any(given: dict[str, Any], source: Path) -> dict[str, Any]:
             return {name: getattr(found, name) for name in found.model_fields_set}
     raise SpecError(
         f"{source}: no single method has the options {', '.join(sorted(given))} with these values: name the method "
-        "that they are for.", path="method.options",
-    )  # fmt: skip
+        "that they are for.",
+        path="method.options",
+    )
 
 
 def checked_plant(document: Mapping[str, Any], source: Path) -> PlantSection | TimeVaryingSection | DAESection:
@@ -252,10 +253,16 @@ def _wanted(kind: str, context: Mapping[str, Any]) -> str:
         limit = next(iter(context.values()))
         return f"{limits[kind]} {limit:g}"
     plain = {
-        "float_type": "a number", "int_type": "a whole number", "string_type": "a text", "bool_type": "true or false",
-        "string_too_short": "a non-empty text", "list_type": "a list", "dict_type": "a mapping (key: value)",
-        "model_type": "a mapping (key: value)", "too_short": "a list with at least one entry",
-    }  # fmt: skip
+        "float_type": "a number",
+        "int_type": "a whole number",
+        "string_type": "a text",
+        "bool_type": "true or false",
+        "string_too_short": "a non-empty text",
+        "list_type": "a list",
+        "dict_type": "a mapping (key: value)",
+        "model_type": "a mapping (key: value)",
+        "too_short": "a list with at least one entry",
+    }
     return plain.get(kind, f"valid ({kind.replace('_', ' ')})")
 
 
@@ -265,10 +272,15 @@ def _known_keys(location: Sequence[str | int]) -> list[str]:
     from obsynth.spec.schema_values import MatrixFile
 
     sections: dict[str, type[BaseModel]] = {
-        "<file>": MatrixFile, "<inline>": schema.PlantSection, "<varying>": schema.TimeVaryingSection,
-        "<dae>": schema.DAESection, "<one>": schema.ProfileSection, "method": schema.MethodSection,
-        "transform": schema.TransformSection, "scenario": schema.ScenarioSection,
-    }  # fmt: skip
+        "<file>": MatrixFile,
+        "<inline>": schema.PlantSection,
+        "<varying>": schema.TimeVaryingSection,
+        "<dae>": schema.DAESection,
+        "<one>": schema.ProfileSection,
+        "method": schema.MethodSection,
+        "transform": schema.TransformSection,
+        "scenario": schema.ScenarioSection,
+    }
     if "<pick>" in location:
         return ["outputs" if {"C", "Df", "Dd"} & set(location) else "states", "file"]
     if "<list>" in location and location[0] == "scenario":

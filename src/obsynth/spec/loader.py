@@ -51,9 +51,21 @@ if TYPE_CHECKING:
 MAXIMUM_ENTRIES = 50_000_000
 # What the readers of numpy and scipy raise for a damaged file.
 _READING_ERRORS = (
-    OSError, ValueError, TypeError, KeyError, IndexError, EOFError, OverflowError, RuntimeError, MemoryError,
-    AttributeError, UserWarning, struct.error, zlib.error, zipfile.BadZipFile,
-)  # fmt: skip
+    OSError,
+    ValueError,
+    TypeError,
+    KeyError,
+    IndexError,
+    EOFError,
+    OverflowError,
+    RuntimeError,
+    MemoryError,
+    AttributeError,
+    UserWarning,
+    struct.error,
+    zlib.error,
+    zipfile.BadZipFile,
+)
 
 
 def read_matrix(path: Path, *, variable: str | None = None, where: str, keep_sparse: bool = False) -> Any:
@@ -80,8 +92,9 @@ def read_matrices(path: Path, *, variable: str | None = None, count: int | None 
             return matrix
         rows, columns = matrix.shape
         if rows % count:
-            raise SpecError(f"{path.name} has {rows} rows, which cannot be shared out among {count} matrices.",
-                            path=where)  # fmt: skip
+            raise SpecError(
+                f"{path.name} has {rows} rows, which cannot be shared out among {count} matrices.", path=where
+            )
         return read_only(matrix.reshape(count, rows // count, columns))
     stack = np.moveaxis(array, -1, 0) if path.suffix.lower() == ".mat" else array
     if not stack.size:
@@ -339,9 +352,15 @@ def _names(value: Any, folder: Path, where: str, problems: DocumentProblems) -> 
 
 
 def _read(
-    section: Any, source: Path, prefix: str, kept: Sequence[str], matrices: Sequence[str], names: Sequence[str],
-    *, keep_sparse: bool = False,
-) -> dict[str, Any]:  # fmt: skip
+    section: Any,
+    source: Path,
+    prefix: str,
+    kept: Sequence[str],
+    matrices: Sequence[str],
+    names: Sequence[str],
+    *,
+    keep_sparse: bool = False,
+) -> dict[str, Any]:
     """Return entries of a section by name: some as they are, matrices and lists of names with their files read."""
     problems = DocumentProblems(source, what="plant" if not prefix else "spec")
     arguments: dict[str, Any] = {name: getattr(section, name) for name in kept}
@@ -357,8 +376,9 @@ def _read(
 
 def _varying_plant(section: TimeVaryingSection, source: Path, prefix: str) -> TimeVaryingDescriptorSystem:
     names = ("state_names", "input_names", "output_names", "parameter_names")
-    arguments = _read(section, source, prefix, ("dt", "horizon", "constants", *_LABELS),
-                      ("E", "A", "B", "C", "Phi", "Psi"), names)  # fmt: skip
+    arguments = _read(
+        section, source, prefix, ("dt", "horizon", "constants", *_LABELS), ("E", "A", "B", "C", "Phi", "Psi"), names
+    )
     return _placed(lambda: TimeVaryingDescriptorSystem(**arguments), source, prefix)
 
 
@@ -379,8 +399,9 @@ def _nonlinear_plant(section: DAESection, source: Path, prefix: str) -> DAEModel
 
 
 def _invariant_plant(section: PlantSection, source: Path, prefix: str) -> DescriptorSystem:
-    arguments = _read(section, source, prefix, ("dt", "sensor_noise", *_LABELS), MATRICES, SIGNAL_NAMES,
-                      keep_sparse=True)  # fmt: skip
+    arguments = _read(
+        section, source, prefix, ("dt", "sensor_noise", *_LABELS), MATRICES, SIGNAL_NAMES, keep_sparse=True
+    )
     for matrix, names in _SIGNAL_OF_PICK.items():
         if isinstance(arguments[matrix], list) and arguments[names] is None:
             arguments[names] = arguments[matrix]
@@ -397,14 +418,21 @@ def matlab_plant(reference: PlantReference, spec: Path) -> DescriptorSystem | No
     if arguments:
         raise SpecError(
             f"{spec}: plant.{next(iter(arguments))}: unknown key beside a file that is no .mat file: it belongs "
-            f"into {reference.file}.", path=f"plant.{next(iter(arguments))}",
-        )  # fmt: skip
+            f"into {reference.file}.",
+            path=f"plant.{next(iter(arguments))}",
+        )
     return None
 
 
 #: Signals that name the columns of a matrix; rows are equations (states) or outputs.
-_COLUMNS = {"B": "input_names", "D": "input_names", "Bf": "fault_names", "Df": "fault_names",
-            "Bd": "disturbance_names", "Dd": "disturbance_names"}  # fmt: skip
+_COLUMNS = {
+    "B": "input_names",
+    "D": "input_names",
+    "Bf": "fault_names",
+    "Df": "fault_names",
+    "Bd": "disturbance_names",
+    "Dd": "disturbance_names",
+}
 _OUTPUT_ROWS = ("C", "D", "Df", "Dd")
 
 
@@ -417,9 +445,7 @@ def with_constants(plant: DescriptorSystem, section: PlantSection, folder: Path)
         return plant
     constants, box = boxed_constants(section, folder)
     entries = {name: [_entry(plant, name, item) for item in found] for name, found in (section.entries or {}).items()}
-    return with_expressions(
-        plant, entries, constants, tolerance=section.tolerance, variation=section.variation, **box
-    )  # fmt: skip
+    return with_expressions(plant, entries, constants, tolerance=section.tolerance, variation=section.variation, **box)
 
 
 def boxed_constants(section: PlantSection | DAESection, folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -431,8 +457,10 @@ def boxed_constants(section: PlantSection | DAESection, folder: Path) -> tuple[d
     file = box.pop("file", None)
     if file is None:
         if "source" not in box:
-            raise SpecError("box has no source: give source (stated, set-membership or calibrated), or the file of a "
-                            "calibration.", path="box.source")  # fmt: skip
+            raise SpecError(
+                "box has no source: give source (stated, set-membership or calibrated), or the file of a calibration.",
+                path="box.source",
+            )
         return constants, box
     if box:
         raise SpecError("box has a file, which says where it comes from: remove source, level and digest.", path="box")
@@ -447,8 +475,9 @@ def boxed_constants(section: PlantSection | DAESection, folder: Path) -> tuple[d
     for name in calibrated:
         stated = constants.get(name)
         if isinstance(stated, dict) and ("range" in stated or "tolerance" in stated):
-            raise SpecError(f"{name!r} has a tolerance here, and one in {file}: remove one of them.",
-                            path=f"constants.{name}")  # fmt: skip
+            raise SpecError(
+                f"{name!r} has a tolerance here, and one in {file}: remove one of them.", path=f"constants.{name}"
+            )
     return constants | calibrated, {**options, "calibrated": tuple(calibrated)}
 
 
@@ -457,8 +486,9 @@ def _calibrated(name: str, item: Mapping[str, Any]) -> dict[str, Any]:
     if item["open"]:
         raise SpecError(
             f"The box of {name!r} has an open {item['open'][0]} side: the log bounds nothing there. State its range, "
-            "or take a log that moves it.", path=f"constants.{name}",
-        )  # fmt: skip
+            "or take a log that moves it.",
+            path=f"constants.{name}",
+        )
     return {"nominal": item["nominal"], "range": list(item["range"]), "unit": item["unit"]}
 
 
@@ -493,10 +523,12 @@ def built_scenario(
     given: dict[str, Any] = {name: getattr(section, name) for name in section.model_fields_set}
     for group in _GROUPS:
         given[group] = {
-            name: [_profile(item, f"scenario.{group}.{name}", problems)
-                   for item in (value if isinstance(value, list) else [value])]
+            name: [
+                _profile(item, f"scenario.{group}.{name}", problems)
+                for item in (value if isinstance(value, list) else [value])
+            ]
             for name, value in getattr(section, group).items()
-        }  # fmt: skip
+        }
     problems.raise_if_any()
     try:
         scenario = Scenario(**given)
@@ -644,8 +676,10 @@ def spec_of(document: Mapping[str, Any], source: Path, *, plant_changes: Mapping
         linear = _linearised(asked[0], model, section, plant_source.parent, *asked[1:])
         plant = plant if linear is None else linear
     elif asked[0] is not None and asked[0].linearise is not None:
-        raise SpecError(f"{asked[1]}: transform.linearise is for nonlinear plants (kind: dae): remove it.",
-                        path="plant.transform.linearise")  # fmt: skip
+        raise SpecError(
+            f"{asked[1]}: transform.linearise is for nonlinear plants (kind: dae): remove it.",
+            path="plant.transform.linearise",
+        )
     if isinstance(plant, DescriptorSystem):
         if asked[0] is not None:
             with one_thread_if_small(plant.nx):
@@ -654,14 +688,21 @@ def spec_of(document: Mapping[str, Any], source: Path, *, plant_changes: Mapping
     elif model is None and reference is not None and reference.transform is not None:
         raise SpecError(
             f"{source}: plant.transform is for linear plants with constant matrices, which {plant_source.name} is not: "
-            "remove it.", path="plant.transform",
-        )  # fmt: skip
+            "remove it.",
+            path="plant.transform",
+        )
     return Spec(
-        name=checked.name, description=checked.description or "", path=source, plant=plant,
-        transformation=transformation, method=checked.method.id, options=options,
-        scenario=built_scenario(checked.scenario, plant, source), model=model,
+        name=checked.name,
+        description=checked.description or "",
+        path=source,
+        plant=plant,
+        transformation=transformation,
+        method=checked.method.id,
+        options=options,
+        scenario=built_scenario(checked.scenario, plant, source),
+        model=model,
         calibrate=None if checked.calibrate is None else checked.calibrate.model_dump(exclude_none=True),
-    )  # fmt: skip
+    )
 
 
 def _linearised(
@@ -674,23 +715,27 @@ def _linearised(
         if tolerances or section.variation is not None or section.box is not None:
             raise SpecError(
                 f"{source}: {joined(prefix, 'constants')}: tolerances are for the linear model of a nonlinear plant: "
-                "add transform: {linearise: {at: equilibrium}}, or write numbers.", path=joined(prefix, "constants"),
-            )  # fmt: skip
+                "add transform: {linearise: {at: equilibrium}}, or write numbers.",
+                path=joined(prefix, "constants"),
+            )
         return None
     where = joined(prefix, "transform")
     if wanted.linearise is None:
         raise SpecError(
             f"{source}: {where} is for linear plants: say where this one is linearised, such as linearise: {{at: "
-            "equilibrium}, or remove it.", path=where,
-        )  # fmt: skip
+            "equilibrium}, or remove it.",
+            path=where,
+        )
     from obsynth.analysis.transformations.entries_in_constants import box_of_model
     from obsynth.analysis.transformations.linearisation import linearise
 
     arguments = wanted.linearise.model_dump(exclude_none=True)
     tolerances |= arguments.pop("constants", {})
     if not tolerances and (box or section.variation is not None):
-        raise SpecError(f"{source}: {joined(prefix, 'variation')} and box are for constants with tolerances: give "
-                        "some.", path=joined(prefix, "constants"))  # fmt: skip
+        raise SpecError(
+            f"{source}: {joined(prefix, 'variation')} and box are for constants with tolerances: give some.",
+            path=joined(prefix, "constants"),
+        )
     try:
         if tolerances:
             given = arguments.get("given", {})

@@ -131,14 +131,19 @@ class Sweep(ResultTable):
         header = ["case", *parameters, "status", *facts, *claims, "condition", "signals", "message", "seconds", "file"]
         rows = [
             [
-                result.name, *(_cell(result.parameters.get(name, "")) for name in parameters), result.status,
+                result.name,
+                *(_cell(result.parameters.get(name, "")) for name in parameters),
+                result.status,
                 *(result.facts.get(name, "") for name in facts),
-                *(result.claims.get(name, float("nan")) for name in claims), result.condition,
-                ", ".join(result.signals), result.message, result.seconds,
+                *(result.claims.get(name, float("nan")) for name in claims),
+                result.condition,
+                ", ".join(result.signals),
+                result.message,
+                result.seconds,
                 "" if result.file is None else result.file.name,
             ]
             for result in self.results
-        ]  # fmt: skip
+        ]
         return header, rows
 
     def plot(self, claim: str | None = None, *, parameter: str | None = None) -> Figure:
@@ -205,11 +210,17 @@ def sweep(
     made = _cases(cases, parameters or {}, method)
     place = None if folder is None else ResultFolder(folder, _KIND, _KEPT, letters=LONGEST_STEM)
     with progress_of_runs(progress) as told:
-        return Sweep(carried_out(
-            made, run_case, executor=executor, told=told, at_start=True,
-            known=lambda case: None if place is None else _known(case, place),
-            kept=lambda case, result: result if place is None else _kept(case, result, place),
-        ))  # fmt: skip
+        return Sweep(
+            carried_out(
+                made,
+                run_case,
+                executor=executor,
+                told=told,
+                at_start=True,
+                known=lambda case: None if place is None else _known(case, place),
+                kept=lambda case, result: result if place is None else _kept(case, result, place),
+            )
+        )
 
 
 def _cases(cases: Any, parameters: Mapping[str, Sequence[Any]], method: str | None) -> list[SweepCase]:
@@ -243,18 +254,26 @@ def run_case(case: SweepCase) -> SweepResult:
     except ObsynthError as error:
         told = error.as_dict()
         return result(
-            STATUSES[error.exit_code], message=str(error), condition=str(told.get("condition") or ""),
-            signals=tuple(told.get("signals", ())), seconds=time.process_time() - started,
-        )  # fmt: skip
+            STATUSES[error.exit_code],
+            message=str(error),
+            condition=str(told.get("condition") or ""),
+            signals=tuple(told.get("signals", ())),
+            seconds=time.process_time() - started,
+        )
     checks = made.report.checks
     facts = {
-        "method": made.method, "nx": made.plant.nx, "ny": made.plant.ny,
+        "method": made.method,
+        "nx": made.plant.nx,
+        "ny": made.plant.ny,
         "checks": f"{sum(check.passed for check in checks)} of {len(checks)}",
-    }  # fmt: skip
+    }
     return result(
-        STATUSES[0], claims={name: float(value) for name, value in made.certificate.claims.items()}, facts=facts,
-        content=gain_set_bytes(made), seconds=time.process_time() - started,
-    )  # fmt: skip
+        STATUSES[0],
+        claims={name: float(value) for name, value in made.certificate.claims.items()},
+        facts=facts,
+        content=gain_set_bytes(made),
+        seconds=time.process_time() - started,
+    )
 
 
 def _designed(case: SweepCase) -> ObserverDesign:

@@ -213,10 +213,15 @@ def all_of(mappings: Iterable[Mapping[str, Any]]) -> list[str]:
 
 
 def carried_out(
-    items: Sequence[_Item], work: Callable[[_Item], _Outcome], *, executor: Executor | None,
-    known: Callable[[_Item], _Result | None], kept: Callable[[_Item, _Outcome], _Result],
-    told: Callable[[int, int], object] | None, at_start: bool = False,
-) -> tuple[_Result, ...]:  # fmt: skip
+    items: Sequence[_Item],
+    work: Callable[[_Item], _Outcome],
+    *,
+    executor: Executor | None,
+    known: Callable[[_Item], _Result | None],
+    kept: Callable[[_Item, _Outcome], _Result],
+    told: Callable[[int, int], object] | None,
+    at_start: bool = False,
+) -> tuple[_Result, ...]:
     """Return the result of every item, in order; ``known`` ones are not worked on, others ``kept`` as they come."""
     found = {i: result for i, item in enumerate(items) if (result := known(item)) is not None}
     waiting = [i for i in range(len(items)) if i not in found]

@@ -70,9 +70,17 @@ class ErrorStructure:
 
 
 def error_structure(
-    observer: LinearObserver, affine: AffinePlant, tracking: Tracking, bounds: FloatArray, noise_bound: float, *,
-    faults: bool = False, states: bool = False, reading: FloatArray | None = None, varying: bool = False,
-) -> ErrorStructure:  # fmt: skip
+    observer: LinearObserver,
+    affine: AffinePlant,
+    tracking: Tracking,
+    bounds: FloatArray,
+    noise_bound: float,
+    *,
+    faults: bool = False,
+    states: bool = False,
+    reading: FloatArray | None = None,
+    varying: bool = False,
+) -> ErrorStructure:
     """Return the error system of an observer over a box; ``bounds (nd,)``, ``noise_bound`` in standard deviations.
 
     With ``faults`` these are estimated like states; else outputs are fault estimates and residuals, or (``states``)
@@ -129,12 +137,21 @@ def error_structure(
     more, single, remainders = _remainder_channels(rest, sizes)
     input_parts, input_rest = _about_nominal(known, offsets)
     return ErrorStructure(
-        observer.Az, c[: n + nf], c[n + nf :], AffineMatrix(np.zeros_like(rest), parts, rest),
-        AffineMatrix(np.zeros_like(input_rest), input_parts, input_rest), disturbances,
-        np.concatenate([bounds, np.full(plant.nw, noise_bound)]), np.vstack([rows, more]), len(rows) + single,
-        np.hstack([effects, remainders]), tuple(owner), offsets, picked[: n + nf],
+        observer.Az,
+        c[: n + nf],
+        c[n + nf :],
+        AffineMatrix(np.zeros_like(rest), parts, rest),
+        AffineMatrix(np.zeros_like(input_rest), input_parts, input_rest),
+        disturbances,
+        np.concatenate([bounds, np.full(plant.nw, noise_bound)]),
+        np.vstack([rows, more]),
+        len(rows) + single,
+        np.hstack([effects, remainders]),
+        tuple(owner),
+        offsets,
+        picked[: n + nf],
         picked[n + nf :],
-    )  # fmt: skip
+    )
 
 
 def _sizes(observer: LinearObserver, affine: AffinePlant, t: FloatArray, c: FloatArray, dy: FloatArray) -> FloatArray:
@@ -153,8 +170,9 @@ def _require_identities(state: AffineMatrix, known: AffineMatrix, sizes: FloatAr
     if not missed <= IDENTITY_SHARE:
         raise PreconditionError(
             f"The observer's identities do not hold on the nominal plant (by {missed:.1e} of their terms): a bound "
-            "over tolerances needs z to follow T E x. Run obsynth.verify on the design.", condition="identities",
-        )  # fmt: skip
+            "over tolerances needs z to follow T E x. Run obsynth.verify on the design.",
+            condition="identities",
+        )
 
 
 def _missed(matrix: AffineMatrix, offsets: FloatArray) -> FloatArray:
@@ -172,23 +190,26 @@ def _fault_columns(
     target[nz + n + nf :] = np.eye(nf)
     late = np.array(observer.fault_delays, dtype=np.int64)
     if (late > 1).any():
-        raise PreconditionError("A fault estimate that lags by more than one sample has no guaranteed interval.",
-                                condition="fault interval")  # fmt: skip
+        raise PreconditionError(
+            "A fault estimate that lags by more than one sample has no guaranteed interval.", condition="fault interval"
+        )
     into = direct[:nz, :]
     moved = affine_block([[into.after(observer.Az)], [into.after(c)]])
     reached = direct.magnitude[nz:, late == 1]
     if reached.size and reached.max() > EFFECT_RANK_SHARE:
         raise PreconditionError(
             "A fault that is estimated one sample late reaches the estimates at once: its estimate has no guaranteed "
-            "interval.", condition="fault interval",
-        )  # fmt: skip
+            "interval.",
+            condition="fault interval",
+        )
     chosen = [moved[:, [j]] if late[j] else direct[:, [j]] for j in range(nf)]
     found = affine_block([chosen]) + (-target)
     if float(np.max(_missed(found, offsets), initial=0.0)) > IDENTITY_SHARE:
         raise PreconditionError(
             "The estimate of a fault, or of the state, depends on how the fault came about: it has no guaranteed "
-            "interval (a filter that estimates each sample of a fault on its own has one).", condition="fault interval",
-        )  # fmt: skip
+            "interval (a filter that estimates each sample of a fault on its own has one).",
+            condition="fault interval",
+        )
     return found
 
 

@@ -40,7 +40,7 @@ def tracking_of(design: ObserverDesign, affine: AffinePlant) -> Tracking:
             "The state estimate lags by some samples: what a tolerance does to newer states is not known from it, and "
             "no bound exists. Use a design whose estimate has no delay (detectability indexes of 1).",
             condition="full state estimate",
-        )  # fmt: skip
+        )
     if observer.state_names != plant.state_names:
         raise PreconditionError(
             "The design does not estimate the full state, which a bound over tolerances needs.",
@@ -137,9 +137,11 @@ def vertex_gains(
     if uncertain is None or not plant.nd or not labels:
         return {}
     count = len(uncertain.box.names)
-    corners = np.array(list(itertools.product((-1.0, 1.0), repeat=count))) if 2**count <= MOST_VERTICES else (
-        np.random.default_rng(0).choice([-1.0, 1.0], (MOST_VERTICES, count))
-    )  # fmt: skip
+    corners = (
+        np.array(list(itertools.product((-1.0, 1.0), repeat=count)))
+        if 2**count <= MOST_VERTICES
+        else (np.random.default_rng(0).choice([-1.0, 1.0], (MOST_VERTICES, count)))
+    )
     followed, basis = tracking.T, affine.coordinates
     nominal = eliminate_algebraic_states(plant)
     if plant.nx != nominal.plant.nx:
@@ -164,16 +166,19 @@ def _peak_gain(
     into = observer.Az @ followed + observer.By @ smooth.C - followed @ smooth.A
     through = observer.Cz[shown] @ followed + observer.Dy[shown] @ smooth.C
     seen = np.vstack([back @ smooth.A, into, through])
-    terms = np.concatenate([
-        np.abs(back @ smooth.A).sum(axis=1),
-        (np.abs(observer.Az @ followed) + np.abs(observer.By) @ np.abs(smooth.C)).sum(axis=1),
-        (np.abs(observer.Cz[shown]) @ np.abs(followed) + np.abs(observer.Dy[shown]) @ np.abs(smooth.C)).sum(axis=1),
-    ])  # fmt: skip
+    terms = np.concatenate(
+        [
+            np.abs(back @ smooth.A).sum(axis=1),
+            (np.abs(observer.Az @ followed) + np.abs(observer.By) @ np.abs(smooth.C)).sum(axis=1),
+            (np.abs(observer.Cz[shown]) @ np.abs(followed) + np.abs(observer.Dy[shown]) @ np.abs(smooth.C)).sum(axis=1),
+        ]
+    )
     apart = untouched_states(seen @ basis, terms)
     kept = [i for i in range(smooth.nx) if i not in apart]
     nx, nz = len(kept), observer.order
-    a = np.block([[(back @ smooth.A @ basis)[np.ix_(kept, kept)], np.zeros((nx, nz))],
-                  [(into @ basis)[:, kept], observer.Az]])  # fmt: skip
+    a = np.block(
+        [[(back @ smooth.A @ basis)[np.ix_(kept, kept)], np.zeros((nx, nz))], [(into @ basis)[:, kept], observer.Az]]
+    )
     b = np.vstack([(back @ smooth.Bd)[kept], observer.By @ smooth.Dd - followed @ smooth.Bd])
     c = np.hstack([(through @ basis)[:, kept], observer.Cz[shown]])
     total = np.abs(observer.Dy[shown] @ smooth.Dd).sum(axis=1)
@@ -229,9 +234,13 @@ def _told(matrices: Mapping[str, FloatArray], directions: FloatArray, dt: float)
     n = len(matrices["A"])
     try:
         zeros, _, outside = zeros_of_system(
-            matrices["E"], matrices["A"], np.hstack([matrices["Bf"], directions[:n]]), matrices["C"],
-            np.hstack([matrices["Df"], directions[n:]]), dt=dt,
-        )  # fmt: skip
+            matrices["E"],
+            matrices["A"],
+            np.hstack([matrices["Bf"], directions[:n]]),
+            matrices["C"],
+            np.hstack([matrices["Df"], directions[n:]]),
+            dt=dt,
+        )
     except ObsynthError as error:
         return Told(False, False, str(error))
     if zeros.normal_rank < n + both.shape[1]:

@@ -82,8 +82,9 @@ def ring_length(az: FloatArray) -> int:
         if length > LONGEST or not np.isfinite(power).all():
             raise PreconditionError(
                 f"The observer forgets too slowly for a bound over tolerances (not within {LONGEST} samples): ask for "
-                "a faster one, or sample more slowly.", condition="observer's decay",
-            )  # fmt: skip
+                "a faster one, or sample more slowly.",
+                condition="observer's decay",
+            )
     return length
 
 
@@ -96,8 +97,14 @@ def responses_of(structure: ErrorStructure) -> Responses:
         powers[j] = az @ powers[j - 1]
     _, state, outputs = structure.rows
     rows = structure.channel_rows @ structure.Cx
-    kernels = np.concatenate([_sizes(structure, rows, powers[:-1]), _plain(structure, structure.Co, powers[:-1]),
-                              _plain(structure, np.eye(nz), powers[:-1])], axis=1)  # fmt: skip
+    kernels = np.concatenate(
+        [
+            _sizes(structure, rows, powers[:-1]),
+            _plain(structure, structure.Co, powers[:-1]),
+            _plain(structure, np.eye(nz), powers[:-1]),
+        ],
+        axis=1,
+    )
     signed = structure.channel_rows @ structure.effects[state]
     absolute = np.abs(structure.channel_rows) @ np.abs(structure.effects[state])
     own = len(structure.owner)
@@ -110,9 +117,16 @@ def responses_of(structure: ErrorStructure) -> Responses:
     if repeated is None:
         raise PreconditionError("The observer does not contract within its ring.", condition="observer's decay")
     return Responses(
-        structure, powers, np.ascontiguousarray(kernels.transpose(0, 2, 1)) * OUTWARD, same * OUTWARD,
-        np.abs(structure.effects[outputs]) * OUTWARD, tail * OUTWARD, out * OUTWARD, inside, repeated,
-    )  # fmt: skip
+        structure,
+        powers,
+        np.ascontiguousarray(kernels.transpose(0, 2, 1)) * OUTWARD,
+        same * OUTWARD,
+        np.abs(structure.effects[outputs]) * OUTWARD,
+        tail * OUTWARD,
+        out * OUTWARD,
+        inside,
+        repeated,
+    )
 
 
 def _plain(structure: ErrorStructure, left: FloatArray, powers: FloatArray) -> FloatArray:
@@ -142,8 +156,9 @@ def same_sample_inverse(responses: Responses) -> FloatArray:
     if found is None:
         raise PreconditionError(
             f"No bound: the loop at one and the same sample has radius {spectral_radius_bound(responses.same):.3g}, "
-            "which must be below 1. Give smaller tolerances of C and D.", condition="same-sample loop",
-        )  # fmt: skip
+            "which must be below 1. Give smaller tolerances of C and D.",
+            condition="same-sample loop",
+        )
     return found
 
 

@@ -130,14 +130,24 @@ class Robustness:
     def as_dict(self) -> dict[str, Any]:
         """Return everything as plain data."""
         return {
-            "box": self.box.as_dict(), "assumes_exact_model": self.assumes_exact_model, "regular": self.regular,
-            "breaking": dict(self.breaking), "loop_radius": self.loop_radius, "largest_factor": self.largest_factor,
-            "largest_tolerance": self.largest_tolerance, "blame": dict(self.blame), "rows": dict(self.rows),
+            "box": self.box.as_dict(),
+            "assumes_exact_model": self.assumes_exact_model,
+            "regular": self.regular,
+            "breaking": dict(self.breaking),
+            "loop_radius": self.loop_radius,
+            "largest_factor": self.largest_factor,
+            "largest_tolerance": self.largest_tolerance,
+            "blame": dict(self.blame),
+            "rows": dict(self.rows),
             "error_per_unit": {name: dict(row) for name, row in self.error_per_unit.items()},
-            "vertex_gains": dict(self.vertex_gains), "stable": self.stable, "boxes": self.boxes, "reason": self.reason,
-            "sharing": list(self.sharing), "untouched": [[value.real, value.imag] for value in self.untouched],
+            "vertex_gains": dict(self.vertex_gains),
+            "stable": self.stable,
+            "boxes": self.boxes,
+            "reason": self.reason,
+            "sharing": list(self.sharing),
+            "untouched": [[value.real, value.imag] for value in self.untouched],
             "not_covered": self.not_covered,
-        }  # fmt: skip
+        }
 
     def __str__(self) -> str:
         return "\n".join(f"{label}: {text}" for label, text in self.facts())

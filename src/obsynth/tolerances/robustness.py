@@ -162,16 +162,35 @@ def robustness(
         except PreconditionError as error:
             reason = str(error)
     return Robustness(
-        uncertain.box, False, regular.verdict, breaking, radius, factor, shares, rows, errors, gains, stable.verdict,
-        stable.boxes, reason, tuple(name for name, found in told_from_faults(plant).items() if found.shares), untouched,
+        uncertain.box,
+        False,
+        regular.verdict,
+        breaking,
+        radius,
+        factor,
+        shares,
+        rows,
+        errors,
+        gains,
+        stable.verdict,
+        stable.boxes,
+        reason,
+        tuple(name for name, found in told_from_faults(plant).items() if found.shares),
+        untouched,
         uncertain.not_covered,
-    )  # fmt: skip
+    )
 
 
 def structure_of(
-    design: ObserverDesign, affine: AffinePlant, tracking: Tracking, *, bounds: FloatArray | None = None,
-    noise_bound: float = 0.0, faults: bool = False, states: bool = False,
-) -> ErrorStructure:  # fmt: skip
+    design: ObserverDesign,
+    affine: AffinePlant,
+    tracking: Tracking,
+    *,
+    bounds: FloatArray | None = None,
+    noise_bound: float = 0.0,
+    faults: bool = False,
+    states: bool = False,
+) -> ErrorStructure:
     """Return the error system of a discrete design over its box."""
     plant, observer = design.linear
     if not plant.is_discrete:
@@ -179,12 +198,18 @@ def structure_of(
             "The design is continuous in time: bounds over tolerances are for sampled designs. Sample the plant first "
             "(transform: sample_time, or obsynth.discretise), or give online_monitor the sample time of its data.",
             condition="discrete time",
-        )  # fmt: skip
+        )
     sizes = np.zeros(plant.nd) if bounds is None else bounds
     return error_structure(
-        observer, affine, tracking, sizes, noise_bound, faults=faults, states=states,
+        observer,
+        affine,
+        tracking,
+        sizes,
+        noise_bound,
+        faults=faults,
+        states=states,
         varying=affine.box.variation == "varying",
-    )  # fmt: skip
+    )
 
 
 def _named(names: tuple[str, ...], shares: FloatArray) -> dict[str, float]:

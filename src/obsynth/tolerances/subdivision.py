@@ -44,9 +44,14 @@ class BoxVerdict:
 
 
 def subdivided(
-    build: Build, count: int, holds_on: Callable[[AffineMatrix], bool], fails_at: Callable[[FloatArray], bool],
-    exact_at: Callable[[FloatArray], FloatArray], *, most: int = MOST_BOXES,
-) -> BoxVerdict:  # fmt: skip
+    build: Build,
+    count: int,
+    holds_on: Callable[[AffineMatrix], bool],
+    fails_at: Callable[[FloatArray], bool],
+    exact_at: Callable[[FloatArray], FloatArray],
+    *,
+    most: int = MOST_BOXES,
+) -> BoxVerdict:
     """Cut the box along the constant that matters most; ``build``: the matrix over a part, ``exact_at``: at a point."""
     if count <= MOST_VERTEX_CONSTANTS:
         for corner in itertools.product((-1.0, 1.0), repeat=count):
@@ -113,9 +118,13 @@ def proved_regular(build: Build, count: int, exact_at: Callable[[FloatArray], Fl
 
 
 def proved_stable(
-    build: Build, count: int, exact_at: Callable[[FloatArray], FloatArray], *, discrete: bool,
+    build: Build,
+    count: int,
+    exact_at: Callable[[FloatArray], FloatArray],
+    *,
+    discrete: bool,
     most: int = MOST_BOXES,
-) -> BoxVerdict:  # fmt: skip
+) -> BoxVerdict:
     """Return whether a matrix is stable on the whole box, in the norm of a Lyapunov function of each part's centre."""
 
     def stable(part: AffineMatrix) -> bool:
@@ -222,4 +231,4 @@ def require_algebraic(e: AffineMatrix, algebraic: FloatArray) -> None:
             f"A tolerance puts a derivative into an algebraic equation (rows {', '.join(str(i + 1) for i in rows)}): "
             "the plant's order changes inside the box. Give these rows of E no tolerance of their own.",
             condition="algebraic rows",
-        )  # fmt: skip
+        )

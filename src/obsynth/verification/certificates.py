@@ -151,9 +151,16 @@ def decay_row(a: FloatArray, dt: float, claimed: float) -> Check:
         source, passed, status = "enclosure of each eigenvalue of the stored numbers", bool(slowest >= wanted), "proved"
     slow = f"slowest time constant {1.0 / slowest:.3g} s; " if 0.0 < slowest < np.inf else ""
     return Check(
-        "decay", "every mode decays at the claimed rate (1/s) or faster", slowest, wanted, slowest - wanted, passed,
-        source, status, f"{slow}{status} for {wanted:.6g} 1/s",
-    )  # fmt: skip
+        "decay",
+        "every mode decays at the claimed rate (1/s) or faster",
+        slowest,
+        wanted,
+        slowest - wanted,
+        passed,
+        source,
+        status,
+        f"{slow}{status} for {wanted:.6g} 1/s",
+    )
 
 
 def slowest_decay(a: FloatArray, dt: float) -> float:

@@ -46,16 +46,22 @@ def claim_rows(plant: DescriptorSystem, claims: Mapping[str, Any]) -> Iterator[C
     if "gamma" in claims and not claimed(claims, "gamma") > 0.0 and "gamma" not in wrong:
         wrong.append("gamma")
     yield upper_bound_check(
-        "claims", "every claim is known and a finite number, and none is missing", float(len(wrong)), 0.0,
-        source="certificate", detail=f"wrong: {', '.join(map(str, wrong))}" if wrong else "",
-    )  # fmt: skip
+        "claims",
+        "every claim is known and a finite number, and none is missing",
+        float(len(wrong)),
+        0.0,
+        source="certificate",
+        detail=f"wrong: {', '.join(map(str, wrong))}" if wrong else "",
+    )
     if "gamma_min" in claims or bracketed:
         yield upper_bound_check(
-            "claimed gains", "0 <= bracket's lower end <= gamma_min <= its upper end, and gamma_min <= gamma",
-            _disorder(claims, bracketed=bracketed), ORDER_TOLERANCE,
+            "claimed gains",
+            "0 <= bracket's lower end <= gamma_min <= its upper end, and gamma_min <= gamma",
+            _disorder(claims, bracketed=bracketed),
+            ORDER_TOLERANCE,
             source="certificate; whether a filter reaches less is said by the row 'least gain'",
             detail="the largest step backwards, as a share of gamma",
-        )  # fmt: skip
+        )
 
 
 def _disorder(claims: Mapping[str, Any], *, bracketed: bool) -> float:
@@ -77,22 +83,36 @@ def recovery_rows(plant: DescriptorSystem, recovery: StateRecovery | None) -> It
     wrong = _misfits(plant, recovery)
     source = "the plant; the one before its transformation is not stored"
     yield upper_bound_check(
-        "recovery fits", "the map back to the original states has unique names, the plant's signals and finite entries",
-        float(len(wrong)), 0.0, source=source, detail=f"wrong: {', '.join(wrong)}" if wrong else "",
-    )  # fmt: skip
+        "recovery fits",
+        "the map back to the original states has unique names, the plant's signals and finite entries",
+        float(len(wrong)),
+        0.0,
+        source=source,
+        detail=f"wrong: {', '.join(wrong)}" if wrong else "",
+    )
     if wrong:
         return
     kept = [name for name in recovery.names if name in plant.state_names]
-    whole = np.hstack([
-        recovery.from_state, recovery.from_input, recovery.from_fault, recovery.from_disturbance, recovery.from_noise,
-    ])  # fmt: skip
+    whole = np.hstack(
+        [
+            recovery.from_state,
+            recovery.from_input,
+            recovery.from_fault,
+            recovery.from_disturbance,
+            recovery.from_noise,
+        ]
+    )
     rows = [recovery.names.index(name) for name in kept]
     expected = np.eye(plant.nx, whole.shape[1])[[plant.state_names.index(name) for name in kept]]
     yield upper_bound_check(
-        "recovery of kept states", "a state that the plant still has is recovered as itself",
-        float(np.max(np.abs(whole[rows] - expected), initial=0.0)), EQUALITY_TOLERANCE, source=source, kind="equality",
+        "recovery of kept states",
+        "a state that the plant still has is recovered as itself",
+        float(np.max(np.abs(whole[rows] - expected), initial=0.0)),
+        EQUALITY_TOLERANCE,
+        source=source,
+        kind="equality",
         detail=f"{len(kept)} of {len(recovery.names)} states; how the others follow from these is not checked",
-    )  # fmt: skip
+    )
 
 
 def _misfits(plant: DescriptorSystem, recovery: StateRecovery) -> list[str]:
@@ -100,9 +120,12 @@ def _misfits(plant: DescriptorSystem, recovery: StateRecovery) -> list[str]:
     valid = isinstance(names, tuple) and all(isinstance(name, str) and name.strip() for name in names)
     wrong = [] if valid and len(set(names)) == len(names) else ["names"]
     widths = {
-        "from_state": plant.nx, "from_input": plant.nu, "from_fault": plant.nf, "from_disturbance": plant.nd,
+        "from_state": plant.nx,
+        "from_input": plant.nu,
+        "from_fault": plant.nf,
+        "from_disturbance": plant.nd,
         "from_noise": plant.nw,
-    }  # fmt: skip
+    }
     for field, width in widths.items():
         matrix = getattr(recovery, field)
         if matrix.shape != (len(names), width) or not np.all(np.isfinite(matrix)):
@@ -117,15 +140,19 @@ def _misfits(plant: DescriptorSystem, recovery: StateRecovery) -> list[str]:
 STATED = "stated by the search"
 #: Matrices that the certificate of any linear design may hold, with the rows that cover them.
 WITNESS_CLAIMS: Mapping[str, str] = {
-    "state_error": "stored numbers: states", "input_error": "stored numbers: inputs",
+    "state_error": "stored numbers: states",
+    "input_error": "stored numbers: inputs",
     "disturbance_error": "stored numbers: disturbances",
-}  # fmt: skip
+}
 
 
 def closed_claims(
-    design: ObserverDesign, rows: Iterable[Check], covered: Mapping[str, str], meanings: Mapping[str, str],
+    design: ObserverDesign,
+    rows: Iterable[Check],
+    covered: Mapping[str, str],
+    meanings: Mapping[str, str],
     witnesses: frozenset[str],
-) -> Iterator[Check]:  # fmt: skip
+) -> Iterator[Check]:
     """Yield the row on claims that no row covers (``covered``, by claim), and one for each that is only stated."""
     # Where a row fails already nothing more is said: a report that ends early covers little.
     given = tuple(rows)
@@ -144,16 +171,22 @@ def closed_claims(
         if name not in witnesses and WITNESS_CLAIMS.get(name) not in names:
             wrong.append(str(name))
     yield upper_bound_check(
-        "claims covered", "every claim is one that this method can make, and a row of this report checks it",
-        float(len(wrong)), 0.0, source="certificate",
+        "claims covered",
+        "every claim is one that this method can make, and a row of this report checks it",
+        float(len(wrong)),
+        0.0,
+        source="certificate",
         detail=f"not covered: {', '.join(wrong)}" if wrong else "",
-    )  # fmt: skip
+    )
     for name, value in claims.items():
         if covered.get(name) == STATED and name not in wrong:
             yield information(
-                f"stated: {name}", f"{meanings[name]}; stated by the search, not recomputed", float(value),
-                source="certificate", status="assumed",
-            )  # fmt: skip
+                f"stated: {name}",
+                f"{meanings[name]}; stated by the search, not recomputed",
+                float(value),
+                source="certificate",
+                status="assumed",
+            )
 
 
 def before_the_mean(design: ObserverDesign) -> tuple[ObserverDesign, tuple[Check, ...]]:
@@ -166,15 +199,16 @@ def before_the_mean(design: ObserverDesign) -> tuple[ObserverDesign, tuple[Check
     tracking = design.certificate.matrices.get("tracking")
     fitting = base is not None and tracking is not None and len(tracking) == observer.order
     row = upper_bound_check(
-        "mean", f"each fault estimate is exactly the mean of the last {mean} of the filter that is checked below",
-        float(not fitting), 0.0, source="shipped realisation",
-    )  # fmt: skip
+        "mean",
+        f"each fault estimate is exactly the mean of the last {mean} of the filter that is checked below",
+        float(not fitting),
+        0.0,
+        source="shipped realisation",
+    )
     if base is None or tracking is None or not fitting:
         return design, (row,)
     matrices = {**design.certificate.matrices, "tracking": tracking[: base.order]}
-    return replace(
-        design, observer=base, certificate=Certificate(matrices, design.certificate.claims)
-    ), (row,)  # fmt: skip
+    return replace(design, observer=base, certificate=Certificate(matrices, design.certificate.claims)), (row,)
 
 
 def mean_noise_rows(design: ObserverDesign) -> Iterator[Check]:
@@ -190,5 +224,6 @@ def mean_noise_rows(design: ObserverDesign) -> Iterator[Check]:
         yield information(
             f"noise in the mean of fhat[{name}]",
             f"standard deviation under the stated noise of what is shipped, a mean of {mean}",
-            float(np.sqrt(max(float(variance), 0.0))), source="recomputed, Lyapunov equation",
-        )  # fmt: skip
+            float(np.sqrt(max(float(variance), 0.0))),
+            source="recomputed, Lyapunov equation",
+        )

@@ -66,9 +66,13 @@ def consistency(stated: RecursiveObserver, shipped: RecursiveObserver, steps: in
         products = np.concatenate([found.ravel() for found in pairs])
         if products.size:
             yield _estimated(
-                "whiteness", "mean product of innovations of successive samples: they are uncorrelated",
-                float(products.mean()), 0.0, BAND / float(np.sqrt(products.size)), f"{products.size} products",
-            )  # fmt: skip
+                "whiteness",
+                "mean product of innovations of successive samples: they are uncorrelated",
+                float(products.mean()),
+                0.0,
+                BAND / float(np.sqrt(products.size)),
+                f"{products.size} products",
+            )
 
 
 def _joint_root(gains: GainStep) -> FloatArray:
@@ -128,9 +132,13 @@ def _error_rows(scores: dict[int, Scores]) -> Iterator[Check]:
     exact = [float(np.max(np.abs(found.known))) for found in scores.values() if found.known.size]
     if exact:
         yield upper_bound_check(
-            "known directions", "where the covariance is zero, so is the error (in units of what it is made of)",
-            float(np.max(exact)), BAND * KNOWN_SHARE, source=_SOURCE, detail=f"{TRIALS} trials",
-        )  # fmt: skip
+            "known directions",
+            "where the covariance is zero, so is the error (in units of what it is made of)",
+            float(np.max(exact)),
+            BAND * KNOWN_SHARE,
+            source=_SOURCE,
+            detail=f"{TRIALS} trials",
+        )
 
 
 def _band(name: str, claim: str, squares: FloatArray, where: str = "") -> Check:
@@ -143,8 +151,15 @@ def _estimated(name: str, claim: str, mean: float, expected: float, width: float
     """Return the row that a mean is within so much of what is expected."""
     low, high = expected - width, expected + width
     return Check(
-        name, claim, mean, high if mean >= expected else low, width - abs(mean - expected),
-        bool(low <= mean <= high), _SOURCE, "computed",
-        f"{detail}; chance alone keeps it within {low:.4g} to {high:.4g}, but one time in two million", "estimated",
+        name,
+        claim,
+        mean,
+        high if mean >= expected else low,
+        width - abs(mean - expected),
+        bool(low <= mean <= high),
+        _SOURCE,
+        "computed",
+        f"{detail}; chance alone keeps it within {low:.4g} to {high:.4g}, but one time in two million",
+        "estimated",
         (low, high),
-    )  # fmt: skip
+    )

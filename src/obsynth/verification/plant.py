@@ -40,12 +40,20 @@ def plant_information(plant: DescriptorSystem, structure: PencilStructure | None
         verdict = "admissible" if admissible else "not admissible: an observer may exist all the same"
         rows += [
             ("index", "index of the pencil (0: E nonsingular)", float(structure.index or 0), ""),
-            ("finite eigenvalues", "number of dynamic modes", float(len(structure.finite_eigenvalues)),
-             _eigenvalue_text(structure.finite_eigenvalues)),
-            ("infinite eigenvalues", "number of infinite eigenvalues", float(sum(blocks)),
-             f"block sizes {list(blocks)}" if blocks else ""),
+            (
+                "finite eigenvalues",
+                "number of dynamic modes",
+                float(len(structure.finite_eigenvalues)),
+                _eigenvalue_text(structure.finite_eigenvalues),
+            ),
+            (
+                "infinite eigenvalues",
+                "number of infinite eigenvalues",
+                float(sum(blocks)),
+                f"block sizes {list(blocks)}" if blocks else "",
+            ),
             ("admissible", "regular, impulse-free and stable", float(admissible), verdict),
-        ]  # fmt: skip
+        ]
     for name, claim, value, detail in rows:
         yield information(f"plant: {name}", claim, value, source="the plant", detail=detail)
 
@@ -62,10 +70,16 @@ def condition_rows(conditions: Iterable[Condition]) -> Iterator[Check]:
     """Yield one row per existence condition."""
     for condition in conditions:
         yield Check(
-            f"exists: {condition.name}", condition.claim, condition.value, condition.bound,
-            abs(condition.bound - condition.value), condition.holds, condition.source, "condition",
+            f"exists: {condition.name}",
+            condition.claim,
+            condition.value,
+            condition.bound,
+            abs(condition.bound - condition.value),
+            condition.holds,
+            condition.source,
+            "condition",
             f"Unclear: {condition.detail}" if condition.unclear else condition.detail,
-        )  # fmt: skip
+        )
 
 
 #: Matrices found again may differ by this share of the largest entry of their row or column: another order of sums.
@@ -82,30 +96,42 @@ def derivation_rows(design: ObserverDesign, model: ErrorModel) -> Iterator[Check
     if source is None:
         if design.recovery is not None:
             yield information(
-                "plant as written", "elimination, sampling and recovery are those of the plant as written: assumed, as "
-                "the design does not hold it", np.nan, source="given by hand",
+                "plant as written",
+                "elimination, sampling and recovery are those of the plant as written: assumed, as "
+                "the design does not hold it",
+                np.nan,
+                source="given by hand",
                 status="assumed",
-            )  # fmt: skip
+            )
         return
     try:
         found = source.derived()
     except ObsynthError as error:
-        yield upper_bound_check("plant as written", "it can be eliminated and sampled again", 1.0, 0.0, source=_SOURCE,
-                                detail=str(error))  # fmt: skip
+        yield upper_bound_check(
+            "plant as written", "it can be eliminated and sampled again", 1.0, 0.0, source=_SOURCE, detail=str(error)
+        )
         return
     follows = upper_bound_check(
-        "plant as written", "the plant of the design follows from it", _difference(found.plant, plant, _MATRICES),
-        DERIVED_TOLERANCE, source=_SOURCE, kind="equality",
+        "plant as written",
+        "the plant of the design follows from it",
+        _difference(found.plant, plant, _MATRICES),
+        DERIVED_TOLERANCE,
+        source=_SOURCE,
+        kind="equality",
         detail=found.description or "nothing had to be done",
-    )  # fmt: skip
+    )
     yield follows
     if not follows.passed:
         return
     if design.recovery is not None and design.recovery.names == found.recovery.names:
         yield upper_bound_check(
-            "recovery as written", "the states as written follow from those of the design as its recovery says",
-            _difference(found.recovery, design.recovery, _MAPS), DERIVED_TOLERANCE, source=_SOURCE, kind="equality",
-        )  # fmt: skip
+            "recovery as written",
+            "the states as written follow from those of the design as its recovery says",
+            _difference(found.recovery, design.recovery, _MAPS),
+            DERIVED_TOLERANCE,
+            source=_SOURCE,
+            kind="equality",
+        )
     if source.sample_time is not None and observer.fault_names:
         yield from _sampling_rows(source.plant, source.sample_time, plant, observer, model)
 
@@ -132,10 +158,13 @@ def _sampling_rows(
     """Yield what the hold has to do with gains and delays, and the gain over disturbances of any course."""
     delays = ", ".join(f"{delay}" for delay in observer.fault_delays)
     yield information(
-        "sampling: delay", "samples by which the fault estimates lag, for faults that are held between samples; of a "
-        "fault that moves they show its mean over a sample, half a sample later", float(max(observer.fault_delays)),
-        source="zero-order hold", detail=f"delays {delays}",
-    )  # fmt: skip
+        "sampling: delay",
+        "samples by which the fault estimates lag, for faults that are held between samples; of a "
+        "fault that moves they show its mean over a sample, half a sample later",
+        float(max(observer.fault_delays)),
+        source="zero-order hold",
+        detail=f"delays {delays}",
+    )
     if not plant.nd:
         return
     from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
@@ -153,18 +182,22 @@ def _sampling_rows(
         root = vectors * np.sqrt(np.maximum(values, 0.0) + slack)
         norm = hinf_norm(observer.Az, t @ root, observer.Cz[rows], np.zeros((len(observer.Cz[rows]), plant.nx)))
         yield information(
-            "gain over all d(t)", "l2 gain from disturbances of any course to the fault error, in the norm h sum r^2 "
+            "gain over all d(t)",
+            "l2 gain from disturbances of any course to the fault error, in the norm h sum r^2 "
             "over the integral of d^2; gamma is of disturbances that are held between samples",
-            float(np.sqrt(dt) * norm.upper), source="lifted system, from an enclosure of its energy",
+            float(np.sqrt(dt) * norm.upper),
+            source="lifted system, from an enclosure of its energy",
             detail=f"largest at {norm.angle:.4g} rad per sample",
-        )  # fmt: skip
+        )
         return
     peak = _peak_gain(smooth, dt, observer, t, direct)
     yield information(
-        "gain over all d(t)", "peak gain from disturbances of any course to a fault error, |d(t)| <= 1 at all times: a "
+        "gain over all d(t)",
+        "peak gain from disturbances of any course to a fault error, |d(t)| <= 1 at all times: a "
         "disturbance reaches a sample at once, so that its l2 gain is infinite; gamma is of disturbances that are held",
-        peak, source="sums over all samples, outward rounded",
-    )  # fmt: skip
+        peak,
+        source="sums over all samples, outward rounded",
+    )
 
 
 _PARTS = ("midpoint", "radius")

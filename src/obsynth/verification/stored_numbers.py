@@ -112,12 +112,16 @@ def stored_number_rows(design: ObserverDesign, model: ErrorModel, gamma: float |
     claimed = {name: design.certificate.matrices.get(name) for name in _WITNESSES}
     if found is None:
         yield information(
-            "stored numbers", "what rounding of the stored numbers adds to the errors: no bound was found", np.nan,
-            source="stored numbers", status="assumed",
-        )  # fmt: skip
+            "stored numbers",
+            "what rounding of the stored numbers adds to the errors: no bound was found",
+            np.nan,
+            source="stored numbers",
+            status="assumed",
+        )
         if any(value is not None for value in claimed.values()):
-            yield upper_bound_check("stored numbers: states", "the claimed bounds are found again", np.nan, 0.0,
-                                    source="stored numbers")  # fmt: skip
+            yield upper_bound_check(
+                "stored numbers: states", "the claimed bounds are found again", np.nan, 0.0, source="stored numbers"
+            )
         return
     if any(_exceeds(bound, claimed[name]) for name, bound in zip(_WITNESSES, found.bounds, strict=True)):
         found = found.least(observer)
@@ -126,8 +130,9 @@ def stored_number_rows(design: ObserverDesign, model: ErrorModel, gamma: float |
         if bound.size:
             yield _per_unit(observer, kind, bound, claimed[name], labels)
         elif claimed[name] is not None:
-            yield upper_bound_check(f"stored numbers: {kind}", "there is something to claim", 1.0, 0.0,
-                                    source="certificate")  # fmt: skip
+            yield upper_bound_check(
+                f"stored numbers: {kind}", "there is something to claim", 1.0, 0.0, source="certificate"
+            )
     yield from _gain_rows(design, model, gamma)
 
 
@@ -157,9 +162,14 @@ def _per_unit(
     if not ratios[row_found, column] > 0.0:
         row_found, column = first + int(i), int(j)
     return upper_bound_check(
-        name, f"{what}: at most as claimed", float(bound[row_found, column]), float(allowed[row_found, column]),
-        source=source, kind="proved", detail=text,
-    )  # fmt: skip
+        name,
+        f"{what}: at most as claimed",
+        float(bound[row_found, column]),
+        float(allowed[row_found, column]),
+        source=source,
+        kind="proved",
+        detail=text,
+    )
 
 
 def _gain_rows(design: ObserverDesign, model: ErrorModel, gamma: float | None) -> Iterator[Check]:
@@ -187,19 +197,30 @@ def _gain_rows(design: ObserverDesign, model: ErrorModel, gamma: float | None) -
         drifting = np.isfinite(seconds) and np.all(nearest <= MOST_DISTANCE)
         if beyond.size and drifting and model.rounding() <= ROUNDED:
             # Nobody could store better numbers: no finite gain exists, and what can be said is for how long it holds.
-            yield information("gain with stored numbers", f"{text}; above gamma by rounding alone", float(gains[worst]),
-                              source="recomputed, plant included", detail=detail)  # fmt: skip
+            yield information(
+                "gain with stored numbers",
+                f"{text}; above gamma by rounding alone",
+                float(gains[worst]),
+                source="recomputed, plant included",
+                detail=detail,
+            )
         else:
             yield upper_bound_check(
-                "gain with stored numbers", text, float(gains[worst]), level, source="recomputed, plant included",
+                "gain with stored numbers",
+                text,
+                float(gains[worst]),
+                level,
+                source="recomputed, plant included",
                 detail=detail,
-            )  # fmt: skip
+            )
     yield information(
         "stored numbers: horizon",
         "seconds for which a unit disturbance may last before rounding of the stored numbers "
         + ("reaches the claimed gain" if gamma is not None else f"makes an error of {NOTICED:g} of it"),
-        seconds, source="recomputed, plant included", detail=verdict,
-    )  # fmt: skip
+        seconds,
+        source="recomputed, plant included",
+        detail=verdict,
+    )
 
 
 def _around(angles: FloatArray, unit: float, dt: float) -> FloatArray:

@@ -29,18 +29,25 @@ def tolerance_rows(design: ObserverDesign) -> Iterator[Check]:
         return
     if uncertain.lost:
         yield information(
-            "tolerances", f"left behind ({uncertain.lost}): the design is for the nominal plant, and whatever would "
-            "use them refuses", np.nan, source="the plant", status="assumed",
-        )  # fmt: skip
+            "tolerances",
+            f"left behind ({uncertain.lost}): the design is for the nominal plant, and whatever would use them refuses",
+            np.nan,
+            source="the plant",
+            status="assumed",
+        )
         return
     wrong = [*_not_nominal(plant, uncertain), *(_not_of(uncertain, source) if source is not None else ())]
     if any(kind not in (ELIMINATED, SAMPLED) for kind, _ in uncertain.steps):
         wrong.append("steps")
     yield upper_bound_check(
-        "tolerances as written", "the entries at nominal values are those of the plant as written, and the steps since "
-        "are those of the design's plant", float(len(wrong)), 0.0, source=_SOURCE,
+        "tolerances as written",
+        "the entries at nominal values are those of the plant as written, and the steps since "
+        "are those of the design's plant",
+        float(len(wrong)),
+        0.0,
+        source=_SOURCE,
         detail=f"wrong: {', '.join(wrong)}" if wrong else "",
-    )  # fmt: skip
+    )
     if wrong:
         return
     try:
@@ -50,9 +57,14 @@ def tolerance_rows(design: ObserverDesign) -> Iterator[Check]:
         # No bound over the box exists: who asks for one is told so.  The nominal plant alone is compared.
         missed, detail = 0.0, f"no family over the box: {error}"
     yield upper_bound_check(
-        "tolerances of the plant", "eliminated and sampled over the box, the plant as written contains the plant of "
-        "the design", missed, FAMILY_TOLERANCE, source=_SOURCE, kind="equality", detail=detail,
-    )  # fmt: skip
+        "tolerances of the plant",
+        "eliminated and sampled over the box, the plant as written contains the plant of the design",
+        missed,
+        FAMILY_TOLERANCE,
+        source=_SOURCE,
+        kind="equality",
+        detail=detail,
+    )
 
 
 def _not_nominal(plant: DescriptorSystem, uncertain: Uncertainty) -> Iterator[str]:
@@ -88,9 +100,7 @@ def _not_of(uncertain: Uncertainty, source: PlantSource) -> Iterator[str]:
 def _family_difference(plant: DescriptorSystem, uncertain: Uncertainty) -> float:
     """Return by how much the nominal plant of the family differs from the plant, beyond the family's remainders."""
     box = uncertain.box
-    alone = {
-        name: replace(item, low=item.nominal, high=item.nominal) for name, item in box.constants.items()
-    }  # fmt: skip
+    alone = {name: replace(item, low=item.nominal, high=item.nominal) for name, item in box.constants.items()}
     family = affine_plant(plant, replace(box, constants=alone))
     worst = 0.0
     if len(family.coordinates) != plant.nx:
@@ -119,9 +129,10 @@ def stored_twice_rows(design: ObserverDesign) -> Iterator[Check]:
     if not isinstance(plant, DescriptorSystem):
         return
     wrong = [
-        f"{name} of the observer" for name in ("input_names", "output_names")
+        f"{name} of the observer"
+        for name in ("input_names", "output_names")
         if tuple(getattr(observer, name)) != tuple(getattr(plant, name))
-    ]  # fmt: skip
+    ]
     if source is not None:
         wrong += [f"{name} as written" for name in _KEPT_NAMES if getattr(source.plant, name) != getattr(plant, name)]
         signals = {name for field in _KEPT_NAMES for name in getattr(plant, field)}
@@ -135,9 +146,13 @@ def stored_twice_rows(design: ObserverDesign) -> Iterator[Check]:
     if source is None and not wrong:
         return
     yield upper_bound_check(
-        "stored twice", "names, units, operating point, sample time and noise agree wherever they are stored",
-        float(len(wrong)), 0.0, source=_SOURCE, detail=f"wrong: {', '.join(wrong)}" if wrong else "",
-    )  # fmt: skip
+        "stored twice",
+        "names, units, operating point, sample time and noise agree wherever they are stored",
+        float(len(wrong)),
+        0.0,
+        source=_SOURCE,
+        detail=f"wrong: {', '.join(wrong)}" if wrong else "",
+    )
 
 
 def _noise_of(source: PlantSource, plant: DescriptorSystem) -> list[str]:

@@ -105,12 +105,22 @@ class DecoupledPlant:
         p, ny = len(self.C), self.By.shape[1]
         source = self.source
         return DescriptorSystem(
-            self.E, self.A, np.hstack([self.Bu, self.By]), self.C if p else np.zeros((0, self.order)),
-            D=np.hstack([self.Du, np.zeros((p, ny))]), Bf=self.F, Df=self.G, Bw=self.N, Dw=self.M, dt=source.dt,
+            self.E,
+            self.A,
+            np.hstack([self.Bu, self.By]),
+            self.C if p else np.zeros((0, self.order)),
+            D=np.hstack([self.Du, np.zeros((p, ny))]),
+            Bf=self.F,
+            Df=self.G,
+            Bw=self.N,
+            Dw=self.M,
+            dt=source.dt,
             input_names=(*source.input_names, *(f"measured {name}" for name in source.output_names)),
-            output_names=[f"r{i + 1}" for i in range(p)], state_names=[f"z{i + 1}" for i in range(self.order)],
-            fault_names=self.faults, noise_names=source.noise_names,
-        )  # fmt: skip
+            output_names=[f"r{i + 1}" for i in range(p)],
+            state_names=[f"z{i + 1}" for i in range(self.order)],
+            fault_names=self.faults,
+            noise_names=source.noise_names,
+        )
 
 
 @on_one_thread_if_small
@@ -190,17 +200,28 @@ def decoupled(plant: DescriptorSystem, removed: Sequence[int], kept: Sequence[in
         "w": rows @ np.vstack([plant.Bw, plant.Dw]),
     }
     return DecoupledPlant(
-        E=read_only(found.E / units.time), A=read_only(found.A), C=read_only(found.C),
-        Bu=read_only(parts["u"][:k]), By=read_only(parts["y"][:k]), F=read_only(parts["f"][:k]),
-        N=read_only(parts["w"][:k]), Du=read_only(parts["u"][k:]), H=read_only(-parts["y"][k:]),
-        G=read_only(parts["f"][k:]), M=read_only(parts["w"][k:]), rows=read_only(rows),
-        states=read_only((found.right / units.columns)[:, :nx]), removed=finite_values(found) * units.time,
+        E=read_only(found.E / units.time),
+        A=read_only(found.A),
+        C=read_only(found.C),
+        Bu=read_only(parts["u"][:k]),
+        By=read_only(parts["y"][:k]),
+        F=read_only(parts["f"][:k]),
+        N=read_only(parts["w"][:k]),
+        Du=read_only(parts["u"][k:]),
+        H=read_only(-parts["y"][k:]),
+        G=read_only(parts["f"][k:]),
+        M=read_only(parts["w"][k:]),
+        rows=read_only(rows),
+        states=read_only((found.right / units.columns)[:, :nx]),
+        removed=finite_values(found) * units.time,
         source=plant,
         faults=tuple(plant.fault_names[i] for i in kept),
         without=(*plant.disturbance_names, *(plant.fault_names[i] for i in removed)),
         fault_sizes=read_only(np.linalg.norm(units.rows[:, None] * faults, axis=0)),
-        signal_sizes=read_only(np.where(sizes > 0.0, sizes, 1.0)), time=units.time, decisions=found.decisions,
-    )  # fmt: skip
+        signal_sizes=read_only(np.where(sizes > 0.0, sizes, 1.0)),
+        time=units.time,
+        decisions=found.decisions,
+    )
 
 
 def unknowns_pencil(plant: DescriptorSystem, removed: Sequence[int]) -> tuple[FloatArray, FloatArray]:

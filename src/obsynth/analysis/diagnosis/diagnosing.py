@@ -93,8 +93,9 @@ def diagnose(
     if whole_bank and plant.nf > MOST_FAULTS_OF_WHOLE_BANK:
         raise SpecError(
             f"The plant has {plant.nf} faults: the whole bank of residuals is listed for up to "
-            f"{MOST_FAULTS_OF_WHOLE_BANK}. Leave faults out, or whole_bank.", path="whole_bank",
-        )  # fmt: skip
+            f"{MOST_FAULTS_OF_WHOLE_BANK}. Leave faults out, or whole_bank.",
+            path="whole_bank",
+        )
     report_stage = progress or (lambda _: None)
     exactly = decided_exactly(plant)
     report_stage("asking what shows each fault")
@@ -110,9 +111,15 @@ def diagnose(
     bank = residual_bank(asked, whole_bank)
     part = () if whole_bank or plant.nf <= MOST_FAULTS else (_PART_OF_THE_BANK.format(count=plant.nf),)
     return Diagnosis(
-        faults, weak, strong, bank, plant.disturbance_names, "; ".join(dict.fromkeys(model.descriptions)), exactly,
+        faults,
+        weak,
+        strong,
+        bank,
+        plant.disturbance_names,
+        "; ".join(dict.fromkeys(model.descriptions)),
+        exactly,
         (*_warnings(plant, [*shown, *free, *pairs]), *part),
-    )  # fmt: skip
+    )
 
 
 def model_points(model: Exosystem, fault: int) -> list[complex]:
@@ -125,9 +132,14 @@ def model_points(model: Exosystem, fault: int) -> list[complex]:
 
 
 def _verdict(
-    plant: DescriptorSystem, shown: Question, free: Question, frequencies: Sequence[float], modes: Sequence[complex],
-    *, suggest: bool,
-) -> FaultDiagnosis:  # fmt: skip
+    plant: DescriptorSystem,
+    shown: Question,
+    free: Question,
+    frequencies: Sequence[float],
+    modes: Sequence[complex],
+    *,
+    suggest: bool,
+) -> FaultDiagnosis:
     points = [complex(np.exp(1j * w * plant.dt)) if plant.dt > 0.0 else 1j * w for w in frequencies]
     return FaultDiagnosis(
         name=plant.fault_names[shown.number],

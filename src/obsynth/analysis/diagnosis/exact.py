@@ -176,9 +176,13 @@ class ReducedQuestion(ExactQuestion):
         nf = self.source.nf
         rest = range(nf, right.ncols())
         return _Parts(
-            a, c, _columns(right, [self.number]), _columns(outputs, [self.number]), _columns(right, rest),
+            a,
+            c,
+            _columns(right, [self.number]),
+            _columns(outputs, [self.number]),
+            _columns(right, rest),
             _columns(outputs, rest),
-        )  # fmt: skip
+        )
 
     @cached_property
     def order(self) -> int:

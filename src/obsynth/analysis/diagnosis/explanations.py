@@ -57,16 +57,24 @@ def with_sensors(plant: DescriptorSystem, sensors: Sequence[Sensor]) -> Descript
         noise[plant.ny + i, plant.nw + column] = float(sensors[i].deviation or 0.0)
     names = [*plant.noise_names, *(f"noise of {sensors[i].name}" for i in stated)]
     return plant.replace(
-        C=stacked(plant.C, "C"), D=stacked(plant.D, "D"), Dd=stacked(plant.Dd, "Dd"), Df=stacked(plant.Df, "Df"),
-        Bw=np.hstack([plant.Bw, np.zeros((plant.nx, len(stated)))]), Dw=noise, noise_names=names,
+        C=stacked(plant.C, "C"),
+        D=stacked(plant.D, "D"),
+        Dd=stacked(plant.Dd, "Dd"),
+        Df=stacked(plant.Df, "Df"),
+        Bw=np.hstack([plant.Bw, np.zeros((plant.nx, len(stated)))]),
+        Dw=noise,
+        noise_names=names,
         output_names=[*plant.output_names, *(sensor.name for sensor in sensors)],
-    )  # fmt: skip
+    )
 
 
 def least_additions(
-    plant: DescriptorSystem, sensors: Sequence[Sensor], reached: Callable[[DescriptorSystem], bool],
-    *, most: tuple[int, int] = (MOST_FOR_ONE, MOST_FOR_PAIRS),
-) -> tuple[tuple[str, ...], ...]:  # fmt: skip
+    plant: DescriptorSystem,
+    sensors: Sequence[Sensor],
+    reached: Callable[[DescriptorSystem], bool],
+    *,
+    most: tuple[int, int] = (MOST_FOR_ONE, MOST_FOR_PAIRS),
+) -> tuple[tuple[str, ...], ...]:
     """Return all single sensors that do it, or else all pairs; none for plants of more states than ``most``."""
     if plant.nx > most[0]:
         return ()

@@ -67,9 +67,13 @@ class Removal:
         units = (sizes * traces)[places]
         known = np.block([[plant.Bu, plant.By], [plant.Du, -plant.H]]) / plant.signal_sizes
         found = residual_orders(
-            inverse @ plant.A, plant.C, inverse @ plant.F[:, places] / units, plant.G[:, places] / units,
-            inverse @ known[: plant.order], known[plant.order :],
-        )  # fmt: skip
+            inverse @ plant.A,
+            plant.C,
+            inverse @ plant.F[:, places] / units,
+            plant.G[:, places] / units,
+            inverse @ known[: plant.order],
+            known[plant.order :],
+        )
         return {self.kept[place]: order for place, order in zip(places, found, strict=True) if order is not None}
 
 
@@ -97,9 +101,12 @@ class Question:
             return decoupled(self.source, self.removed, [self.number])
         whole, place = self.shared.plant, [self.shared.kept.index(self.number)]
         return replace(
-            whole, F=whole.F[:, place], G=whole.G[:, place], fault_sizes=whole.fault_sizes[place],
+            whole,
+            F=whole.F[:, place],
+            G=whole.G[:, place],
+            fault_sizes=whole.fault_sizes[place],
             faults=(whole.faults[place[0]],),
-        )  # fmt: skip
+        )
 
     @cached_property
     def _scaled(self) -> tuple[FloatArray, FloatArray]:

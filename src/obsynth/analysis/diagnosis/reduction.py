@@ -85,9 +85,14 @@ def left_part(E: FloatArray, A: FloatArray) -> LeftPart:
 
 
 def _without_zeros(
-    e: FloatArray, a: FloatArray, c: FloatArray, left: FloatArray, right: FloatArray, size: float,
+    e: FloatArray,
+    a: FloatArray,
+    c: FloatArray,
+    left: FloatArray,
+    right: FloatArray,
+    size: float,
     decisions: list[RankDecision],
-) -> LeftPart:  # fmt: skip
+) -> LeftPart:
     """Take out the unobservable part: what stays are the states that the outputs see."""
     k, p = e.shape[0], c.shape[0]
     hidden = np.eye(k)
@@ -115,9 +120,15 @@ def _without_zeros(
     seen = np.linalg.qr(hidden, mode="complete")[0][:, count:]
     left = np.vstack([kept @ left[:k], left[k : k + p]])
     return LeftPart(
-        kept @ e @ seen, kept @ a @ seen, c @ seen, left, seen.T @ right, zero @ e @ hidden, zero @ a @ hidden,
+        kept @ e @ seen,
+        kept @ a @ seen,
+        c @ seen,
+        left,
+        seen.T @ right,
+        zero @ e @ hidden,
+        zero @ a @ hidden,
         tuple(decisions),
-    )  # fmt: skip
+    )
 
 
 def finite_values(left: LeftPart) -> ComplexArray:

@@ -19,9 +19,7 @@ from obsynth.numerics.ranks import RANK_TOLERANCE, TRACE_TOLERANCE
 from obsynth.proofs.exact_arithmetic import blocks, zeros_matrix
 
 
-def exact_residual_order(
-    A: fmpq_mat, C: fmpq_mat, F: fmpq_mat, G: fmpq_mat, K: fmpq_mat, L: fmpq_mat
-) -> int | None:  # fmt: skip
+def exact_residual_order(A: fmpq_mat, C: fmpq_mat, F: fmpq_mat, G: fmpq_mat, K: fmpq_mat, L: fmpq_mat) -> int | None:
     """Return the least order for one fault, over the rational numbers; ``None`` where no equation shows it."""
     n, known, free = A.nrows(), K.ncols(), -1
     # Rows [w | z | f, f', ...] in echelon form: those without w come last, then those without z.
@@ -93,7 +91,7 @@ class _Rows(NamedTuple):
 
 def residual_orders(
     A: FloatArray, C: FloatArray, F: FloatArray, G: FloatArray, K: FloatArray, L: FloatArray
-) -> list[int | None]:  # fmt: skip
+) -> list[int | None]:
     """Return the least order for each fault, in floating point; ``None`` where no equation shows it.
 
     The columns of ``[F; G]`` and of ``[K; L]`` have entries near one, as A and C; rows of zeros are equations as well.
@@ -112,9 +110,7 @@ def residual_orders(
     return found
 
 
-def _of_degree_zero(
-    A: FloatArray, C: FloatArray, F: FloatArray, G: FloatArray, K: FloatArray, L: FloatArray
-) -> _Rows:  # fmt: skip
+def _of_degree_zero(A: FloatArray, C: FloatArray, F: FloatArray, G: FloatArray, K: FloatArray, L: FloatArray) -> _Rows:
     """Return the equations in which no derivative of w stands."""
     n, count = A.shape[0], F.shape[1]
     rows, w = _Rows(C, G[:, None]), L

@@ -141,9 +141,10 @@ class SensorSearch:
         count = len(picked)
         own = np.vstack([np.zeros((self.plant.ny, count)), np.eye(count)])
         return plant.replace(
-            Bf=np.hstack([plant.Bf, np.zeros((plant.nx, count))]), Df=np.hstack([plant.Df, own]),
+            Bf=np.hstack([plant.Bf, np.zeros((plant.nx, count))]),
+            Df=np.hstack([plant.Df, own]),
             fault_names=[*plant.fault_names, *(f"sensor {sensor.name}" for sensor in picked)],
-        )  # fmt: skip
+        )
 
     def feasible(self, chosen: Sequence[int], wanted: Sequence[Task]) -> bool:
         """Whether a set reaches all that is wanted (and all about its own faults)."""

@@ -133,9 +133,11 @@ class FaultDiagnosis:
         plain = {field.name: getattr(self, field.name) for field in fields(self)}
         return plain | {
             "detectable_at": {f"{frequency:g}": found for frequency, found in self.detectable_at.items()},
-            "zeros": _pairs(self.zeros), "blocking": _pairs(self.blocking), "sentences": list(self.sentences),
+            "zeros": _pairs(self.zeros),
+            "blocking": _pairs(self.blocking),
+            "sentences": list(self.sentences),
             "gap": None if np.isinf(self.gap) else self.gap,
-        }  # fmt: skip
+        }
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,11 +190,17 @@ class Diagnosis:
         header = ("fault", "detectable", "at rest", "as a step", "any course", "delay", "residual", "filter")
         rows = [
             (
-                fault.name, _word(fault.detectable), _word(fault.detectable_at_rest), _word(fault.step_estimable),
-                _word(fault.estimable), _count(fault.order), _count(fault.residual_order), str(fault.filter_order),
+                fault.name,
+                _word(fault.detectable),
+                _word(fault.detectable_at_rest),
+                _word(fault.step_estimable),
+                _word(fault.estimable),
+                _count(fault.order),
+                _count(fault.residual_order),
+                str(fault.filter_order),
             )
             for fault in self.faults
-        ]  # fmt: skip
+        ]
         return (header, *rows)
 
     def isolability_rows(self) -> tuple[tuple[str, ...], ...]:
@@ -210,15 +218,18 @@ class Diagnosis:
     def to_dict(self) -> dict[str, Any]:
         """Return the diagnosis as plain data."""
         return {
-            "faults": [fault.to_dict() for fault in self.faults], "isolable": self.isolable.tolist(),
+            "faults": [fault.to_dict() for fault in self.faults],
+            "isolable": self.isolable.tolist(),
             "isolable_at_rest": self.isolable_at_rest.tolist(),
             "bank": [
                 {"sees": list(r.sees), "blind_to": list(r.blind_to), "at_rest": list(r.at_rest), "order": r.order}
                 for r in self.bank
             ],
-            "unknown_inputs": list(self.unknown_inputs), "model": self.model, "exact": self.exact,
+            "unknown_inputs": list(self.unknown_inputs),
+            "model": self.model,
+            "exact": self.exact,
             "warnings": list(self.warnings),
-        }  # fmt: skip
+        }
 
     @property
     def heading(self) -> str:

@@ -40,9 +40,14 @@ class Distance:
 
 
 def distance_to_loss(
-    E: FloatArray, A: FloatArray, *, nx: int, discrete: bool, zeros: tuple[complex, ...] = (),
+    E: FloatArray,
+    A: FloatArray,
+    *,
+    nx: int,
+    discrete: bool,
+    zeros: tuple[complex, ...] = (),
     sizes: FloatArray | None = None,
-) -> Distance:  # fmt: skip
+) -> Distance:
     """Return how far ``A - s E (m, n)`` is from losing column rank on or outside the stability boundary.
     ``sizes (m, n)`` of the terms of A: what rounding of the data behind it may change is relative to those."""
     candidates = [*_boundary(E, A, discrete), *(_to_boundary(zero, discrete) for zero in zeros)]

@@ -178,9 +178,12 @@ def _placed(point: complex, digits: int, dt: float | None) -> tuple[Fraction, Fr
 
 
 def named_pencil(
-    plant: DescriptorSystem, units: PlantUnits, layout: Sequence[Sequence[Cell]], *,
+    plant: DescriptorSystem,
+    units: PlantUnits,
+    layout: Sequence[Sequence[Cell]],
+    *,
     kept: Mapping[str, Sequence[int]] | None = None,
-) -> NamedPencil:  # fmt: skip
+) -> NamedPencil:
     """Return a block matrix of the plant's matrices by name, such as ``[["A", "Bf"], ["C", "Df"]]``, minus s times E.
     ``kept``: the columns of a matrix that are taken, all by default.  E by name stands for itself, not for s."""
     exact, chosen, sized = rational_matrices(plant), kept or {}, sized_plant(plant)
@@ -214,9 +217,13 @@ def named_pencil(
             own = None if sized is None or name is None else np.abs(getattr(sized, name)[:, picked])
             terms[-1].append(nearest(nothing) if own is None else own)
     return NamedPencil(
-        np.block(blocks), np.block(moving), np.block(owners), np.concatenate(rows), np.concatenate(columns),
+        np.block(blocks),
+        np.block(moving),
+        np.block(owners),
+        np.concatenate(rows),
+        np.concatenate(columns),
         None if sized is None else np.block(terms),
-    )  # fmt: skip
+    )
 
 
 def named_augmented(
@@ -255,9 +262,13 @@ def named_augmented(
         terms = stacked(whole.terms, between, np.abs(nearest(middle)))
     columns = np.concatenate([whole.columns[states], units.model, whole.columns[rest]])
     return NamedPencil(
-        stacked(whole.A, through, middle), stacked(whole.E, 0 * through, slope), stacked(whole.owners, named, owners),
-        np.concatenate([whole.rows[:nx], 1.0 / units.model, whole.rows[nx:]]), columns, terms,
-    )  # fmt: skip
+        stacked(whole.A, through, middle),
+        stacked(whole.E, 0 * through, slope),
+        stacked(whole.owners, named, owners),
+        np.concatenate([whole.rows[:nx], 1.0 / units.model, whole.rows[nx:]]),
+        columns,
+        terms,
+    )
 
 
 def _owned(name: Cell, height: int, columns: Sequence[int]) -> Rational:
@@ -270,9 +281,16 @@ def _owned(name: Cell, height: int, columns: Sequence[int]) -> Rational:
 
 
 def unclear(
-    plant: DescriptorSystem, named: NamedPencil, *, tolerance: float, other: str, decider: str,
-    point: complex | None = None, dt: float | None = None, last: bool = False,
-) -> Unclear:  # fmt: skip
+    plant: DescriptorSystem,
+    named: NamedPencil,
+    *,
+    tolerance: float,
+    other: str,
+    decider: str,
+    point: complex | None = None,
+    dt: float | None = None,
+    last: bool = False,
+) -> Unclear:
     """Return why an answer is unclear: the tolerance is never less than what the witness needs."""
     witness = named.witness(tolerance, point, dt=dt, last=last)
     return Unclear(max(tolerance, 0.0 if witness is None else witness.size), witness, other, decider)

@@ -133,10 +133,16 @@ def sampled_numbers(exact: Mapping[str, fmpq_mat], sample_time: Any) -> SampledN
     states, faults, unknown = (int(exact[name].ncols()) for name in ("A", "Bf", "Bd"))
     width = faults + unknown
     step = flint.fmpq(sample_time.numerator, sample_time.denominator)
-    whole = blocks([
-        [exact["A"], exact["Bf"], exact["Bd"]],
-        [zeros_matrix(width, states), zeros_matrix(width, faults), zeros_matrix(width, unknown)],
-    ]) if width else exact["A"]  # fmt: skip
+    whole = (
+        blocks(
+            [
+                [exact["A"], exact["Bf"], exact["Bd"]],
+                [zeros_matrix(width, states), zeros_matrix(width, faults), zeros_matrix(width, unknown)],
+            ]
+        )
+        if width
+        else exact["A"]
+    )
     bits = bits_for(states)
     with flint.ctx.workprec(bits):
         rows = exponential(whole * step)[:states]

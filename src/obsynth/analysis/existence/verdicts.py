@@ -134,10 +134,16 @@ def unclear_detail(verdict: ZeroVerdict, what: str) -> str:
 
 
 def verdict_condition(
-    verdict: ZeroVerdict, holding: Condition, plant: DescriptorSystem, *, what: str, doubt: Callable[[], Unclear],
-    lost: Callable[[Sequence[complex]], Condition], gain: Callable[[complex], str],
+    verdict: ZeroVerdict,
+    holding: Condition,
+    plant: DescriptorSystem,
+    *,
+    what: str,
+    doubt: Callable[[], Unclear],
+    lost: Callable[[Sequence[complex]], Condition],
+    gain: Callable[[complex], str],
     seen: Callable[[], Sequence[complex]],
-) -> Condition:  # fmt: skip
+) -> Condition:
     """Return the condition of a verdict: as it holds; lost, with the gain that anything else would need; or in doubt.
     ``lost(zeros)`` says what hides there, ``seen()`` which zeros floating point has outside, ``what`` would exist."""
     if verdict.answer == "no":
@@ -154,18 +160,28 @@ def verdict_condition(
 
 
 def zero_doubt(
-    plant: DescriptorSystem, units: PlantUnits, verdict: ZeroVerdict, layout: Sequence[Sequence[str | None]],
-    *, kept: Mapping[str, Sequence[int]] | None = None, what: str,
-) -> Unclear:  # fmt: skip
+    plant: DescriptorSystem,
+    units: PlantUnits,
+    verdict: ZeroVerdict,
+    layout: Sequence[Sequence[str | None]],
+    *,
+    kept: Mapping[str, Sequence[int]] | None = None,
+    what: str,
+) -> Unclear:
     """Return why it is unclear whether a pencil has a zero outside, with the point in the time of the plant."""
     found = verdict.distance
     point = 0j if found is None else found.point
     where = f"{point.real:.6g}" if point.imag == 0.0 else f"{point:.6g}"
     tolerance = ROUNDING_LEVEL if found is None else max(ROUNDING_LEVEL, found.value)
     return unclear(
-        plant, named_pencil(plant, units, layout, kept=kept), tolerance=tolerance, point=point, dt=plant.dt,
-        other=f"has a zero at {where}, and no {what}", decider=DECIDER,
-    )  # fmt: skip
+        plant,
+        named_pencil(plant, units, layout, kept=kept),
+        tolerance=tolerance,
+        point=point,
+        dt=plant.dt,
+        other=f"has a zero at {where}, and no {what}",
+        decider=DECIDER,
+    )
 
 
 def needed_gain(plant: DescriptorSystem, units: PlantUnits, point: complex, *, inputs: str = "") -> str:
@@ -197,15 +213,23 @@ def needed_gain(plant: DescriptorSystem, units: PlantUnits, point: complex, *, i
 
 
 def rank_doubt(
-    plant: DescriptorSystem, units: PlantUnits, decision: RankDecision, layout: Sequence[Sequence[str | None]],
-    *, rows: bool = False, kept: Mapping[str, Sequence[int]] | None = None,
-) -> Unclear:  # fmt: skip
+    plant: DescriptorSystem,
+    units: PlantUnits,
+    decision: RankDecision,
+    layout: Sequence[Sequence[str | None]],
+    *,
+    rows: bool = False,
+    kept: Mapping[str, Sequence[int]] | None = None,
+) -> Unclear:
     """Return why it is unclear whether a block matrix has full column rank (row rank with ``rows``)."""
     named = named_pencil(plant, units, layout, kept=kept)
     return unclear(
-        plant, named.transposed if rows else named, tolerance=ROUNDING_LEVEL,
-        other=f"has rank {decision.expected - 1}", decider=DECIDER,
-    )  # fmt: skip
+        plant,
+        named.transposed if rows else named,
+        tolerance=ROUNDING_LEVEL,
+        other=f"has rank {decision.expected - 1}",
+        decider=DECIDER,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,8 +256,8 @@ def hidden_modes(plant: DescriptorSystem) -> HiddenModes:
     exact = numbers.system(numbers.zeros(plant.nx, 0), numbers.zeros(plant.ny, 0))
     exact = believed(exact, tall_e, tall_a, nx=plant.nx)
     scaled = PlantUnits.of(plant).rounded().scaled_pencil(tall_e, tall_a)
-    hidden = zeros_at_rounding_level(*scaled, found, exact.zeros, nx=plant.nx)
+    unclear_ones = zeros_at_rounding_level(*scaled, found, exact.zeros, nx=plant.nx)
     unstable = {value for value, out in zip(found, outside, strict=True) if out}
-    modes = tuple(sorted((*exact.zeros, *hidden), key=lambda value: (value.real, value.imag)))
-    undetectable = (*exact.outside, *(value for value in hidden if value in unstable))
+    modes = tuple(sorted((*exact.zeros, *unclear_ones), key=lambda value: (value.real, value.imag)))
+    undetectable = (*exact.outside, *(value for value in unclear_ones if value in unstable))
     return HiddenModes(modes, undetectable, exact.normal_rank, ())

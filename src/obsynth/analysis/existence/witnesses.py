@@ -37,14 +37,20 @@ class EntryChange:
     def described(self, plant: DescriptorSystem, *, parameters: bool = False) -> str:
         """Return the change in words; with ``parameters`` Bf and Df are called Phi and Psi."""
         sides = {
-            "E": ("equation", "state"), "A": ("equation", "state"), "C": ("output", "state"),
-            "Bf": ("equation", "fault"), "Df": ("output", "fault"), "Bd": ("equation", "unknown input"),
+            "E": ("equation", "state"),
+            "A": ("equation", "state"),
+            "C": ("output", "state"),
+            "Bf": ("equation", "fault"),
+            "Df": ("output", "fault"),
+            "Bd": ("equation", "unknown input"),
             "Dd": ("output", "unknown input"),
-        }.get(self.matrix)  # fmt: skip
+        }.get(self.matrix)
         names = {
-            "state": plant.state_names, "output": plant.output_names, "fault": plant.fault_names,
+            "state": plant.state_names,
+            "output": plant.output_names,
+            "fault": plant.fault_names,
             "unknown input": plant.disturbance_names,
-        }  # fmt: skip
+        }
         called = {"Bf": "Phi", "Df": "Psi"}.get(self.matrix, self.matrix) if parameters else self.matrix
         place = f"entry ({self.row + 1}, {self.column + 1}) of {called}"
         if sides is None:

@@ -101,9 +101,14 @@ def eliminated_by_sparsity(plant: DescriptorSystem) -> Transformation:
     new = with_states(part, found.names, E=None, **found.matrices)
     recovery = StateRecovery.from_operator(part.state_names, found.operator, np.eye(plant.nw), state_point(part))
     return Transformation(
-        plant, new, _description(part, len(found.names), active.dropped), recovery, active.dropped,
-        tuple(filter(None, (active.note(), found.note()))), found.bounds,
-    )  # fmt: skip
+        plant,
+        new,
+        _description(part, len(found.names), active.dropped),
+        recovery,
+        active.dropped,
+        tuple(filter(None, (active.note(), found.note()))),
+        found.bounds,
+    )
 
 
 def _without_idle_variables(plant: DescriptorSystem, refusal: PreconditionError) -> Transformation:
@@ -123,9 +128,12 @@ def _without_idle_variables(plant: DescriptorSystem, refusal: PreconditionError)
             active, error = everything_active(plant), refusal
         raise not_index_one(plant, active, error) from None
     return replace(
-        found, source=plant, description=_description(part, found.plant.nx, active.dropped), dropped=active.dropped,
+        found,
+        source=plant,
+        description=_description(part, found.plant.nx, active.dropped),
+        dropped=active.dropped,
         notes=(active.note(),),
-    )  # fmt: skip
+    )
 
 
 def _description(plant: DescriptorSystem, count: int, dropped: Sequence[str] = ()) -> str:
@@ -152,9 +160,15 @@ def eliminated_exactly(plant: DescriptorSystem, basis: FloatArray | None = None)
     matrices, states, sizes = rounded_once(exact, plant, None if whole else basis)
     new = with_states(plant, names, E=None, **matrices)
     recovery = StateRecovery(
-        plant.state_names, states["A"], states["B"], states["Bf"], states["Bd"], states["Bw"], np.eye(plant.nw),
+        plant.state_names,
+        states["A"],
+        states["B"],
+        states["Bf"],
+        states["Bd"],
+        states["Bw"],
+        np.eye(plant.nw),
         state_point(plant),
-    )  # fmt: skip
+    )
     return Transformation(plant, with_origin(new, exact.origin(sizes)), _description(plant, count), recovery)
 
 
@@ -193,9 +207,15 @@ def _eliminated_densely(plant: DescriptorSystem, count: int) -> Transformation:
     )
     new = with_states(plant, names, E=None, A=A, B=B, Bf=Bf, Bd=Bd, Bw=Bw, C=C, D=D, Df=Df, Dd=Dd, Dw=Dw)
     recovery = StateRecovery(
-        plant.state_names, from_state, from_input, from_fault, from_disturbance, from_noise, np.eye(plant.nw),
+        plant.state_names,
+        from_state,
+        from_input,
+        from_fault,
+        from_disturbance,
+        from_noise,
+        np.eye(plant.nw),
         state_point(plant),
-    )  # fmt: skip
+    )
     return Transformation(plant, new, _description(plant, count), recovery)
 
 

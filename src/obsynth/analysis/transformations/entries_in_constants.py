@@ -31,8 +31,10 @@ def promoted(model: DAEModel, names: Sequence[str]) -> DAEModel:
     if not new:
         return model
     if not model.is_data:
-        raise SpecError(f"{new[0]!r} is a constant of Python functions, which only texts can give up: make it a "
-                        "parameter.", path=f"unknown.{new[0]}")  # fmt: skip
+        raise SpecError(
+            f"{new[0]!r} is a constant of Python functions, which only texts can give up: make it a parameter.",
+            path=f"unknown.{new[0]}",
+        )
     return model.replace(
         constants={name: value for name, value in model.constants.items() if name not in new},
         parameters={**{name: model.constants[name] for name in new}, **model.parameters},
@@ -48,22 +50,26 @@ def box_of_model(model: DAEModel, constants: Any, given: Mapping[str, float], **
     unknown = [name for name in names if name not in known] if isinstance(names, Mapping) else []
     if unknown:
         raise SpecError(
-            f"{unknown[0]!r} is no constant and no parameter of the model; there are "
-            f"{', '.join(known) or 'none'}.", path=f"constants.{unknown[0]}",
-        )  # fmt: skip
+            f"{unknown[0]!r} is no constant and no parameter of the model; there are {', '.join(known) or 'none'}.",
+            path=f"constants.{unknown[0]}",
+        )
     nominal = {name: Constant(name, value, value, value) for name, value in known.items() if name in names}
     box = constants_box(constants, known=nominal, **options)
     for name, item in box.constants.items():
         if name in given and item.nominal != given[name]:
-            raise SpecError(f"{name!r} is given as {given[name]:g}, and its nominal value as {item.nominal:g}.",
-                            path=f"given.{name}")  # fmt: skip
+            raise SpecError(
+                f"{name!r} is given as {given[name]:g}, and its nominal value as {item.nominal:g}.",
+                path=f"given.{name}",
+            )
     return replace(box, constants={item.name: item for item in box.uncertain})
 
 
 def at_nominal(model: DAEModel, box: ConstantsBox) -> DAEModel:
     """Return the model with the nominal values of a box, whose constants are parameters then."""
-    kept, changed = ({name: box.constants[name].nominal if name in box.constants else value
-                      for name, value in given.items()} for given in (model.constants, model.parameters))  # fmt: skip
+    kept, changed = (
+        {name: box.constants[name].nominal if name in box.constants else value for name, value in given.items()}
+        for given in (model.constants, model.parameters)
+    )
     same = kept == dict(model.constants) and changed == dict(model.parameters)
     return promoted(model if same else model.replace(constants=kept, parameters=changed), box.names)
 
@@ -83,9 +89,14 @@ def entries_in_constants(
     known, unknown, faults = ([int(i) for i in columns[name]] for name in ("B", "Bd", "Bf"))
     b = -by_input[:, known]
     found = {
-        "E": e, "A": -by_state, "B": ca.horzcat(b, e @ ca.DM(point.rates)) if moving else b, "C": c,
-        "Bf": -by_parameter[:, faults], "Df": seen[:, faults], "Bd": -by_input[:, unknown],
-    }  # fmt: skip
+        "E": e,
+        "A": -by_state,
+        "B": ca.horzcat(b, e @ ca.DM(point.rates)) if moving else b,
+        "C": c,
+        "Bf": -by_parameter[:, faults],
+        "Df": seen[:, faults],
+        "Bd": -by_input[:, unknown],
+    }
     writer = _Writer(symbols)
     entries = {name: texts for name, matrix in found.items() if (texts := writer.entries(matrix, name))}
     nominal = {name: box.constants[name].nominal for name in box.names}
@@ -100,29 +111,51 @@ class _Writer:
 
         self.ca, self.symbols = ca, ca.vertcat(*symbols.values())
         self.operators = {
-            ca.OP_ADD: ("+", _SUM, _SUM), ca.OP_SUB: ("-", _SUM, _PRODUCT), ca.OP_MUL: ("*", _PRODUCT, _PRODUCT),
-            ca.OP_DIV: ("/", _PRODUCT, _SIGN), ca.OP_POW: ("**", _ATOM, _SIGN),
+            ca.OP_ADD: ("+", _SUM, _SUM),
+            ca.OP_SUB: ("-", _SUM, _PRODUCT),
+            ca.OP_MUL: ("*", _PRODUCT, _PRODUCT),
+            ca.OP_DIV: ("/", _PRODUCT, _SIGN),
+            ca.OP_POW: ("**", _ATOM, _SIGN),
             ca.OP_CONSTPOW: ("**", _ATOM, _SIGN),
-        }  # fmt: skip
+        }
         self.functions = {
-            ca.OP_SQRT: "sqrt", ca.OP_EXP: "exp", ca.OP_LOG: "log", ca.OP_SIN: "sin", ca.OP_COS: "cos",
-            ca.OP_TAN: "tan", ca.OP_ASIN: "asin", ca.OP_ACOS: "acos", ca.OP_ATAN: "atan", ca.OP_SINH: "sinh",
-            ca.OP_COSH: "cosh", ca.OP_TANH: "tanh", ca.OP_FABS: "abs", ca.OP_SIGN: "sign", ca.OP_FLOOR: "floor",
-            ca.OP_CEIL: "ceil", ca.OP_FMIN: "min", ca.OP_FMAX: "max",
-        }  # fmt: skip
+            ca.OP_SQRT: "sqrt",
+            ca.OP_EXP: "exp",
+            ca.OP_LOG: "log",
+            ca.OP_SIN: "sin",
+            ca.OP_COS: "cos",
+            ca.OP_TAN: "tan",
+            ca.OP_ASIN: "asin",
+            ca.OP_ACOS: "acos",
+            ca.OP_ATAN: "atan",
+            ca.OP_SINH: "sinh",
+            ca.OP_COSH: "cosh",
+            ca.OP_TANH: "tanh",
+            ca.OP_FABS: "abs",
+            ca.OP_SIGN: "sign",
+            ca.OP_FLOOR: "floor",
+            ca.OP_CEIL: "ceil",
+            ca.OP_FMIN: "min",
+            ca.OP_FMAX: "max",
+        }
         self.forms = {
-            ca.OP_NEG: ("-{}", _SIGN, _SIGN), ca.OP_SQ: ("{}**2", _ATOM, _POWER),
-            ca.OP_INV: ("1 / {}", _SIGN, _PRODUCT), ca.OP_TWICE: ("2 * {}", _SIGN, _PRODUCT),
-            ca.OP_LOG1P: ("log(1 + {})", _SUM, _ATOM), ca.OP_EXPM1: ("exp({}) - 1", _SUM, _SUM),
-        }  # fmt: skip
+            ca.OP_NEG: ("-{}", _SIGN, _SIGN),
+            ca.OP_SQ: ("{}**2", _ATOM, _POWER),
+            ca.OP_INV: ("1 / {}", _SIGN, _PRODUCT),
+            ca.OP_TWICE: ("2 * {}", _SIGN, _PRODUCT),
+            ca.OP_LOG1P: ("log(1 + {})", _SUM, _ATOM),
+            ca.OP_EXPM1: ("exp({}) - 1", _SUM, _SUM),
+        }
         self.comparisons = {ca.OP_LT: "<", ca.OP_LE: "<="}
 
     def entries(self, matrix: Any, name: str) -> list[Entry]:
         """Return row, column and text of the entries that depend on the constants."""
         return [
             (i, j, self.whole(matrix[i, j], f"{name}, row {i + 1}, column {j + 1}"))
-            for i in range(matrix.shape[0]) for j in range(matrix.shape[1]) if self._depends(matrix[i, j])
-        ]  # fmt: skip
+            for i in range(matrix.shape[0])
+            for j in range(matrix.shape[1])
+            if self._depends(matrix[i, j])
+        ]
 
     def changes(self, column: Any, sign: float, nominal: Mapping[str, float]) -> list[Entry]:
         """Return texts of ``sign`` times how a column changes from its nominal value."""
@@ -143,7 +176,7 @@ class _Writer:
                 f"{place} of the linear model depends on the constants through what cannot be written as an "
                 "expression, or is too long for one: give them no tolerance, or write the equations in fewer steps.",
                 condition="expressions",
-            ) from error  # fmt: skip
+            ) from error
         return text
 
     def _depends(self, node: Any) -> bool:

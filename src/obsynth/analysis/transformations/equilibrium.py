@@ -87,13 +87,18 @@ class _Problem:
             if name not in given:
                 self.base.x[index_of(name, model.state_names, what="start")] = float(value)
         self.states = [i for i, name in enumerate(model.state_names) if name not in given]
-        self.inputs, self.parameters = ([names.index(name) for name in free if name in names]
-                                        for names in (model.input_names, model.parameter_names))  # fmt: skip
+        self.inputs, self.parameters = (
+            [names.index(name) for name in free if name in names]
+            for names in (model.input_names, model.parameter_names)
+        )
         others = (*model.state_names, *model.input_names, *model.parameter_names)
         self.seen = [i for i, name in enumerate(model.output_names) if name in given and name not in others]
         self.wanted = np.array([given[model.output_names[i]] for i in self.seen])
-        groups = ((model.state_names, self.states), (model.input_names, self.inputs),
-                  (model.parameter_names, self.parameters))  # fmt: skip
+        groups = (
+            (model.state_names, self.states),
+            (model.input_names, self.inputs),
+            (model.parameter_names, self.parameters),
+        )
         self.names = [names[i] for names, places in groups for i in places]
         self.rows = [*model.equation_names, *(f"given {model.output_names[i]}" for i in self.seen)]
         begin = np.concatenate([self.base.x[self.states], self.base.u[self.inputs], self.base.theta[self.parameters]])
@@ -102,8 +107,9 @@ class _Problem:
         self.begin: FloatArray = np.asarray(begin / self.sizes)
         jacobian = self.raw(self.begin)[1]
         if not np.isfinite(jacobian).all():
-            raise SpecError("The model is not defined at its nominal values: give other ones by start or given.",
-                            path="start")  # fmt: skip
+            raise SpecError(
+                "The model is not defined at its nominal values: give other ones by start or given.", path="start"
+            )
         self.weights = _row_weights(jacobian)
 
     def point(self, z: FloatArray) -> Point:
@@ -118,10 +124,16 @@ class _Problem:
         """Return what is left of each row, and its derivatives with respect to the scaled unknowns."""
         p = self.point(z)
         local = local_equations(self.model, p.rates, p.x, p.u, p.theta)
-        top = np.hstack([local.by_state[:, self.states], local.by_input[:, self.inputs],
-                         local.by_parameter[:, self.parameters]])  # fmt: skip
-        bottom = np.hstack([local.C[:, self.states], np.zeros((self.model.ny, len(self.inputs))),
-                            local.outputs_by_parameter[:, self.parameters]])[self.seen]  # fmt: skip
+        top = np.hstack(
+            [local.by_state[:, self.states], local.by_input[:, self.inputs], local.by_parameter[:, self.parameters]]
+        )
+        bottom = np.hstack(
+            [
+                local.C[:, self.states],
+                np.zeros((self.model.ny, len(self.inputs))),
+                local.outputs_by_parameter[:, self.parameters],
+            ]
+        )[self.seen]
         return np.concatenate([local.value, local.y[self.seen] - self.wanted]), np.vstack([top, bottom]) * self.sizes
 
     def scaled(self, z: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -142,10 +154,18 @@ class _Problem:
 
         # As far as rounding allows.
         exact = np.finfo(np.float64).eps * 4.0
-        z = np.asarray(least_squares(
-            finite(0), self.begin, jac=finite(1), xtol=exact, ftol=exact, gtol=exact, max_nfev=MOST_EVALUATIONS,
-            method="lm" if len(self.rows) >= len(self.names) else "trf",
-        ).x)  # fmt: skip
+        z = np.asarray(
+            least_squares(
+                finite(0),
+                self.begin,
+                jac=finite(1),
+                xtol=exact,
+                ftol=exact,
+                gtol=exact,
+                max_nfev=MOST_EVALUATIONS,
+                method="lm" if len(self.rows) >= len(self.names) else "trf",
+            ).x
+        )
         for _ in range(POLISH):
             residual, jacobian = self.scaled(z)
             if not (np.isfinite(residual).all() and np.isfinite(jacobian).all()):
@@ -158,28 +178,39 @@ class _Problem:
 
     def undefined(self, residual: FloatArray, jacobian: FloatArray) -> PreconditionError:
         """Return the refusal of a place where equations have no value."""
-        bad = [name for name, value, row in zip(self.rows, residual, jacobian, strict=True)
-               if not (np.isfinite(value) and np.isfinite(row).all())]  # fmt: skip
+        bad = [
+            name
+            for name, value, row in zip(self.rows, residual, jacobian, strict=True)
+            if not (np.isfinite(value) and np.isfinite(row).all())
+        ]
         return PreconditionError(
             f"There is no equilibrium: the equations {', '.join(map(repr, bad))} are not defined where the search ends "
             "(a root or a logarithm of a negative number, a division by zero?). Give other values, or a start.",
-            condition="no-equilibrium", signals=bad,
-        )  # fmt: skip
+            condition="no-equilibrium",
+            signals=bad,
+        )
 
     def without_root(self, residual: FloatArray, left: FloatArray) -> PreconditionError:
         """Return the refusal: what is left, and the combination of equations that no unknown changes."""
         fixed = left @ (left.T @ residual)
         names, told = self._combination(fixed * self.weights)
-        rest = ", ".join(f"{self.rows[i]}: {residual[i] / self.weights[i]:.4g}"
-                         for i in np.argsort(-np.abs(residual))[:4] if abs(residual[i]) > ROOT)  # fmt: skip
+        rest = ", ".join(
+            f"{self.rows[i]}: {residual[i] / self.weights[i]:.4g}"
+            for i in np.argsort(-np.abs(residual))[:4]
+            if abs(residual[i]) > ROOT
+        )
         unknowns = ", ".join(self.names) or "nothing"
-        why = (f"No unknown ({unknowns}) changes the combination {told} of the equations, which is not zero."
-               if names else f"The search over {unknowns} ends where its equations leave a rest.")  # fmt: skip
+        why = (
+            f"No unknown ({unknowns}) changes the combination {told} of the equations, which is not zero."
+            if names
+            else f"The search over {unknowns} ends where its equations leave a rest."
+        )
         return PreconditionError(
             f"There is no equilibrium: F(0, x, u, theta) = 0 has no root ({rest}). {why} Free an input or a parameter "
             "that enters it, give other values, or linearise at a point with drift=True.",
-            condition="no-equilibrium", signals=names or [self.rows[int(np.argmax(np.abs(residual)))]],
-        )  # fmt: skip
+            condition="no-equilibrium",
+            signals=names or [self.rows[int(np.argmax(np.abs(residual)))]],
+        )
 
     def not_unique(self, null: FloatArray) -> PreconditionError:
         """Return the refusal: the directions that nothing determines."""
@@ -192,8 +223,9 @@ class _Problem:
         return PreconditionError(
             f"The equilibrium is not unique: {len(self.names)} unknowns and {len(self.names) - len(null)} conditions. "
             f"Nothing determines the direction {', '.join(directions)}: give the value of one of these.",
-            condition="equilibrium-not-unique", signals=list(dict.fromkeys(signals)),
-        )  # fmt: skip
+            condition="equilibrium-not-unique",
+            signals=list(dict.fromkeys(signals)),
+        )
 
     def _combination(self, weights: FloatArray) -> tuple[list[str], str]:
         largest = np.abs(weights).max(initial=0.0)
@@ -218,8 +250,9 @@ def consistent_point(model: DAEModel, point: Point, fixed: Collection[str] = ())
         left, values, _ = np.linalg.svd(E)
         rank = int((values > JACOBIAN_RANK_TOLERANCE * values.max()).sum()) if values.any() else 0
         null = left[:, rank:]
-        x = x + sizes * _algebraic_step(null.T @ (weights[:, None] * local.by_state * sizes),
-                                        -null.T @ (weights * local.value), E, movable)  # fmt: skip
+        x = x + sizes * _algebraic_step(
+            null.T @ (weights[:, None] * local.by_state * sizes), -null.T @ (weights * local.value), E, movable
+        )
         local = local_equations(model, rates, x, point.u, point.theta)
         if not local.is_defined:
             break
@@ -230,8 +263,9 @@ def consistent_point(model: DAEModel, point: Point, fixed: Collection[str] = ())
     raise PreconditionError(
         "No derivatives satisfy the equations at that point: the values that are given contradict the constraints, or "
         "the index is above one. Give fewer states.",
-        condition="no-consistent-point", signals=list(model.equation_names),
-    )  # fmt: skip
+        condition="no-consistent-point",
+        signals=list(model.equation_names),
+    )
 
 
 def _algebraic_step(constraint: FloatArray, right: FloatArray, E: FloatArray, movable: NDArray[np.bool_]) -> FloatArray:

@@ -52,9 +52,12 @@ class ExactElimination:
         exact = {name: fractions_of(found[name]) for name in DECISIVE}
         before = None if self.uncleaned is None else {"E": found["E"], **self.uncleaned}
         return PlantOrigin(
-            exact, computed=self.computed, sizes=kept if known else None, states=int(self.recovery["A"].nrows()),
+            exact,
+            computed=self.computed,
+            sizes=kept if known else None,
+            states=int(self.recovery["A"].nrows()),
             uncleaned=None if before is None else {name: fractions_of(before[name]) for name in DECISIVE},
-        )  # fmt: skip
+        )
 
 
 def exact_elimination(plant: DescriptorSystem) -> ExactElimination | None:
@@ -117,9 +120,13 @@ def _eliminated(plant: DescriptorSystem, *, clean: bool, sized: bool = True) -> 
 
 
 def _term_sizes(
-    constraints: tuple[fmpq_mat, fmpq_mat], coupling: fmpq_mat, equations: tuple[fmpq_mat, fmpq_mat],
-    outputs: tuple[fmpq_mat, fmpq_mat], moving: fmpq_mat, inverses: Sequence[FloatArray],
-) -> list[FloatArray]:  # fmt: skip
+    constraints: tuple[fmpq_mat, fmpq_mat],
+    coupling: fmpq_mat,
+    equations: tuple[fmpq_mat, fmpq_mat],
+    outputs: tuple[fmpq_mat, fmpq_mat],
+    moving: fmpq_mat,
+    inverses: Sequence[FloatArray],
+) -> list[FloatArray]:
     """Return the sums of the sizes of all terms, of the dynamic equations and of the outputs.
     ``inverses``: sizes of the inverses of ``coupling`` and ``moving``."""
     (left, right), (take, across), (direct, shown) = constraints, equations, outputs
@@ -260,9 +267,7 @@ def _sampled_sizes(
     smooth: DescriptorSystem, sizes: Mapping[str, FloatArray], sample_time: float
 ) -> dict[str, FloatArray] | None:
     """Return the sizes of terms once sampled: what cancelled before goes through the integral of ``exp(A t)``."""
-    transition, held = zero_order_hold(
-        smooth.A, np.hstack([smooth.Bf, smooth.Bd, np.eye(smooth.nx)]), sample_time
-    )  # fmt: skip
+    transition, held = zero_order_hold(smooth.A, np.hstack([smooth.Bf, smooth.Bd, np.eye(smooth.nx)]), sample_time)
     faults, disturbances, integral = np.split(np.abs(held), [smooth.nf, smooth.nf + smooth.nd], axis=1)
     found = dict(sizes)
     for name, own in (("A", np.abs(transition)), ("Bf", faults), ("Bd", disturbances)):

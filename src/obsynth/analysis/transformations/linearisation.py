@@ -120,8 +120,10 @@ def linearise(
         box = box_of_model(model, constants, values)
         both = [name for name in box.names if name in freed or name in (faults or ())]
         if both:
-            raise SpecError(f"{both[0]!r} has a tolerance, and is {'free' if both[0] in freed else 'a fault'}: choose "
-                            "one.", path=f"constants.{both[0]}")  # fmt: skip
+            raise SpecError(
+                f"{both[0]!r} has a tolerance, and is {'free' if both[0] in freed else 'a fault'}: choose one.",
+                path=f"constants.{both[0]}",
+            )
         model = at_nominal(model, box)
     if at == "equilibrium":
         point = equilibrium(model, values, freed, start)
@@ -132,21 +134,30 @@ def linearise(
         others = (*model.state_names, *model.input_names, *model.parameter_names)
         wrong = [name for name in values if name in model.output_names and name not in others]
         if wrong:
-            raise SpecError(f"The output {wrong[0]!r} cannot be given at a point: give states.",
-                            path=f"given.{wrong[0]}")  # fmt: skip
+            raise SpecError(
+                f"The output {wrong[0]!r} cannot be given at a point: give states.", path=f"given.{wrong[0]}"
+            )
         point = consistent_point(model, nominal_point(model, values), values)
     return linear_model(model, point, faults=faults, disturbances=disturbances, drift=drift, box=box)
 
 
 def linear_model(
-    model: DAEModel, point: Point, *, faults: Sequence[str] | None, disturbances: Sequence[str], drift: bool,
+    model: DAEModel,
+    point: Point,
+    *,
+    faults: Sequence[str] | None,
+    disturbances: Sequence[str],
+    drift: bool,
     box: ConstantsBox | None = None,
-) -> DescriptorSystem:  # fmt: skip
+) -> DescriptorSystem:
     """Return the linear model at a point that satisfies the equations, over the box of its constants if it has one."""
     local = local_equations(model, point.rates, point.x, point.u, point.theta)
     if not local.is_defined:
-        raise PreconditionError("The derivatives of the model are not finite at the point: move it.",
-                                condition="not-differentiable", signals=list(model.equation_names))  # fmt: skip
+        raise PreconditionError(
+            "The derivatives of the model are not finite at the point: move it.",
+            condition="not-differentiable",
+            signals=list(model.equation_names),
+        )
     motion = local.E @ point.rates
     moves = np.abs(motion) > MOVING * np.maximum(np.abs(local.by_state) @ model.state_scales, np.abs(motion).min())
     if moves.any() and not drift:
@@ -154,8 +165,9 @@ def linear_model(
         raise PreconditionError(
             f"The point moves: E x' = ({', '.join(f'{name}: {value:.4g}' for name, value in moved.items())}), so that "
             f"it is no equilibrium. With drift=True this motion becomes an input {DRIFT!r}, which is 1 in every row.",
-            condition="no-equilibrium", signals=list(moved),
-        )  # fmt: skip
+            condition="no-equilibrium",
+            signals=list(moved),
+        )
     uncertain = () if box is None else box.names
     every = [name for name in model.parameter_names if name not in uncertain]
     chosen = every if faults is None else _names(faults, "faults")
@@ -167,24 +179,40 @@ def linear_model(
         inputs, B = [*inputs, DRIFT], np.column_stack([B, motion])
     # A state must not have the name of an output with another value.
     shown = dict(zip(model.output_names, local.y, strict=True))
-    names = [name if shown.get(name, x) == x else f"{name} (state)"
-             for name, x in zip(model.state_names, point.x, strict=True)]  # fmt: skip
-    values = dict(zip((*model.parameter_names, *model.input_names, *names, *model.output_names),
-                      map(float, (*point.theta, *point.u, *point.x, *local.y)), strict=True))  # fmt: skip
+    names = [
+        name if shown.get(name, x) == x else f"{name} (state)"
+        for name, x in zip(model.state_names, point.x, strict=True)
+    ]
+    values = dict(
+        zip(
+            (*model.parameter_names, *model.input_names, *names, *model.output_names),
+            map(float, (*point.theta, *point.u, *point.x, *local.y)),
+            strict=True,
+        )
+    )
     values |= {DRIFT: 0.0} if moves.any() else {}
     signals = {*names, *inputs, *model.output_names, *chosen, *disturbances}
     units = {name: unit for name, unit in model.units.items() if name in signals}
-    units |= {name: model.units[given] for name, given in zip(names, model.state_names, strict=True)
-              if given in model.units}  # fmt: skip
+    units |= {
+        name: model.units[given] for name, given in zip(names, model.state_names, strict=True) if given in model.units
+    }
     linear = DescriptorSystem(
-        local.E, -local.by_state, B if inputs else None, local.C, dt=0.0,
+        local.E,
+        -local.by_state,
+        B if inputs else None,
+        local.C,
+        dt=0.0,
         Bf=-local.by_parameter[:, fault_columns] if fault_columns else None,
         Df=local.outputs_by_parameter[:, fault_columns] if fault_columns else None,
         Bd=-local.by_input[:, unknown] if unknown else None,
-        state_names=names, input_names=inputs or None, output_names=list(model.output_names),
-        fault_names=list(chosen) or None, disturbance_names=list(disturbances) or None, units=units,
+        state_names=names,
+        input_names=inputs or None,
+        output_names=list(model.output_names),
+        fault_names=list(chosen) or None,
+        disturbance_names=list(disturbances) or None,
+        units=units,
         operating_point={name: value for name, value in values.items() if name in signals},
-    )  # fmt: skip
+    )
     if box is None or not box.names:
         return linear
     columns = {"B": known, "Bd": unknown, "Bf": fault_columns}
@@ -192,25 +220,37 @@ def linear_model(
 
 
 def _over_box(
-    linear: DescriptorSystem, model: DAEModel, point: Point, box: ConstantsBox, columns: Mapping[str, Sequence[int]], *,
+    linear: DescriptorSystem,
+    model: DAEModel,
+    point: Point,
+    box: ConstantsBox,
+    columns: Mapping[str, Sequence[int]],
+    *,
     moving: bool,
-) -> DescriptorSystem:  # fmt: skip
+) -> DescriptorSystem:
     """Return a linear model that knows the tolerances of its constants."""
     entries, moved, shown = entries_in_constants(model, point, box, columns, moving=moving)
     shift = ""
     if moved or shown:
-        taken = {*linear.state_names, *linear.input_names, *linear.output_names, *linear.fault_names,
-                 *linear.disturbance_names}  # fmt: skip
+        taken = {
+            *linear.state_names,
+            *linear.input_names,
+            *linear.output_names,
+            *linear.fault_names,
+            *linear.disturbance_names,
+        }
         shift = SHIFT if SHIFT not in taken else f"equilibrium {SHIFT}"
         nu = linear.nu
         for name, found in (("B", moved), ("D", shown)):
             if found:
                 entries[name] = [*entries.get(name, []), *((i, nu, text) for i, _, text in found)]
         linear = linear.replace(
-            B=np.column_stack([linear.B, np.zeros(linear.nx)]), D=np.column_stack([linear.D, np.zeros(linear.ny)]),
-            input_names=[*linear.input_names, shift], operating_point={**linear.operating_point, shift: 0.0},
+            B=np.column_stack([linear.B, np.zeros(linear.nx)]),
+            D=np.column_stack([linear.D, np.zeros(linear.ny)]),
+            input_names=[*linear.input_names, shift],
+            operating_point={**linear.operating_point, shift: 0.0},
             units={**linear.units, shift: "1"} if linear.units else linear.units,
-        )  # fmt: skip
+        )
     uncertainty = Uncertainty(box, {name: tuple(found) for name, found in entries.items()}, shift=shift)
     kept = {name: item for name, item in box.constants.items() if name in uncertainty.used}
     return filled_plant(linear, uncertainty.with_box(replace(box, constants=kept)), set(kept))
@@ -226,10 +266,15 @@ def _require_bounds(model: DAEModel, point: Point, free: Sequence[str] | Mapping
     if not isinstance(free, Mapping):
         return
     values = dict(zip((*model.input_names, *model.parameter_names), (*point.u, *point.theta), strict=True))
-    outside = {name: f"{name} = {values[name]:.6g} is outside [{float(low):g}, {float(high):g}]"
-               for name, (low, high) in free.items() if not float(low) <= values[name] <= float(high)}  # fmt: skip
+    outside = {
+        name: f"{name} = {values[name]:.6g} is outside [{float(low):g}, {float(high):g}]"
+        for name, (low, high) in free.items()
+        if not float(low) <= values[name] <= float(high)
+    }
     if outside:
         raise PreconditionError(
             f"The equilibrium is not admissible: {'; '.join(outside.values())}. Give other values, or free something "
-            "else.", condition="outside-bounds", signals=list(outside),
-        )  # fmt: skip
+            "else.",
+            condition="outside-bounds",
+            signals=list(outside),
+        )

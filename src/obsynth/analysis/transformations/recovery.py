@@ -25,9 +25,12 @@ if TYPE_CHECKING:
 
 #: Map of a recovery -> the signal that it maps.
 _MAPS = {
-    "from_state": "state", "from_input": "input", "from_fault": "fault", "from_disturbance": "disturbance",
+    "from_state": "state",
+    "from_input": "input",
+    "from_fault": "fault",
+    "from_disturbance": "disturbance",
     "from_noise": "noise",
-}  # fmt: skip
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,8 +90,12 @@ class StateRecovery:
             kept = self.noise_kept @ later.noise_kept
             return StateRecovery.from_operator(self.names, through, kept, self.operating_point)
         step = self.from_state
-        own = {"from_input": self.from_input, "from_fault": self.from_fault, "from_disturbance": self.from_disturbance,
-               "from_noise": self.from_noise @ later.noise_kept}  # fmt: skip
+        own = {
+            "from_input": self.from_input,
+            "from_fault": self.from_fault,
+            "from_disturbance": self.from_disturbance,
+            "from_noise": self.from_noise @ later.noise_kept,
+        }
         maps = {name: step @ getattr(later, name) + direct for name, direct in own.items()}
         return replace(self, from_state=step @ later.from_state, noise_kept=self.noise_kept @ later.noise_kept, **maps)
 
@@ -117,9 +124,14 @@ class Transformation:
         """Return both steps as one, for a ``later`` that starts from this one's plant."""
         description = "; ".join(text for text in (self.description, later.description) if text)
         return Transformation(
-            self.source, later.plant, description, self.recovery.then(later.recovery), self.dropped + later.dropped,
-            self.notes + later.notes, self.bounds or later.bounds,
-        )  # fmt: skip
+            self.source,
+            later.plant,
+            description,
+            self.recovery.then(later.recovery),
+            self.dropped + later.dropped,
+            self.notes + later.notes,
+            self.bounds or later.bounds,
+        )
 
 
 def plant_and_recovery(given: Any, recovery: StateRecovery | None = None) -> tuple[Any, StateRecovery | None]:
@@ -158,8 +170,10 @@ def with_states(plant: DescriptorSystem, names: Sequence[str], **changes: Any) -
     # An output or a fault may carry the name of the state it was picked by, and outlives it.
     gone = set(plant.state_names) - set(names) - {name for signals in others for name in signals}
 
-    labels = {label: {name: value for name, value in getattr(plant, label).items() if name not in gone}
-              for label in ("operating_point", "units")}  # fmt: skip
+    labels = {
+        label: {name: value for name, value in getattr(plant, label).items() if name not in gone}
+        for label in ("operating_point", "units")
+    }
     return plant.replace(state_names=names, **labels, **changes)
 
 
@@ -180,9 +194,15 @@ def augment_faults(plant: DescriptorSystem, faults: Sequence[str]) -> Transforma
     below["Bf"] = np.eye(plant.nf)[chosen]
     inputs = {name: np.vstack([getattr(plant, name), rows]) for name, rows in below.items()}
     new = with_states(
-        plant, (*plant.state_names, *names), E=E, A=A, C=output, Df=remaining, **inputs,
+        plant,
+        (*plant.state_names, *names),
+        E=E,
+        A=A,
+        C=output,
+        Df=remaining,
+        **inputs,
         uncertainty=None if plant.uncertainty is None else _augmented(plant.uncertainty, plant.nx, chosen),
-    )  # fmt: skip
+    )
     description = f"appended {', '.join(names)} as states" if names else ""
     return Transformation(plant, new, description, unchanged_states(plant, new, from_state=np.eye(nx, nx + count)))
 

@@ -81,9 +81,12 @@ class RecoveryOperator:
         for name in ("dynamic", "algebraic", "coupling", "right"):
             matrix = csr(getattr(self, name))
             found[name] = {
-                "rows": matrix.shape[0], "columns": matrix.shape[1], "values": matrix.data,
-                "indices": matrix.indices.astype(np.float64), "starts": matrix.indptr.astype(np.float64),
-            }  # fmt: skip
+                "rows": matrix.shape[0],
+                "columns": matrix.shape[1],
+                "values": matrix.data,
+                "indices": matrix.indices.astype(np.float64),
+                "starts": matrix.indptr.astype(np.float64),
+            }
         return found
 
     @classmethod

@@ -186,9 +186,13 @@ class _Pieces:
             state_names[piece[1][0]] if len(piece[1]) == 1 else f"xi {k}" for k, piece in enumerate(moving, 1)
         )
         return SparseCoordinates(
-            self._matrix(self.dynamic_rows), self._matrix(self.algebraic_rows), csr(self._matrix(self.dynamic).T),
-            csr(self._matrix(self.algebraic).T), names, tuple(state_names[i] for i in sorted(set(self.neglected))),
-        )  # fmt: skip
+            self._matrix(self.dynamic_rows),
+            self._matrix(self.algebraic_rows),
+            csr(self._matrix(self.dynamic).T),
+            csr(self._matrix(self.algebraic).T),
+            names,
+            tuple(state_names[i] for i in sorted(set(self.neglected))),
+        )
 
     def _matrix(self, pieces: list[tuple[int, Any, FloatArray]]) -> Any:
         from scipy.sparse import csr_array

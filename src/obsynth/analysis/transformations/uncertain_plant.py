@@ -176,9 +176,11 @@ def _split(whole: AffineMatrix, like: Mapping[str, AffineMatrix], names: tuple[s
 
 
 def _reduced(
-    written: Mapping[str, FloatArray], matrices: Mapping[str, AffineMatrix], basis: FloatArray | None,
+    written: Mapping[str, FloatArray],
+    matrices: Mapping[str, AffineMatrix],
+    basis: FloatArray | None,
     divided_by: FloatArray | None = None,
-) -> dict[str, AffineMatrix]:  # fmt: skip
+) -> dict[str, AffineMatrix]:
     """Return the plant with its algebraic states eliminated, in coordinates of its dynamic state.
     ``x2 = X0 z + xi``, X0 that of the middle, z dynamic state and inputs: what constants do not touch stays so.
     E is inverted over the box; where ``divided_by`` is given, rows are only multiplied by the inverse of this E."""
@@ -222,7 +224,7 @@ def _require_algebraic(rows: AffineMatrix, columns: AffineMatrix) -> None:
         "state": "The tolerances give a derivative to what is algebraic at the nominal values (state {} of those "
         "without one): which states are dynamic would change in the box. Multiply whole rows of E by a "
         "constant, or give E no tolerance there.",
-    }  # fmt: skip
+    }
     for what, found, axis in (("row", rows, 1), ("state", columns, 0)):
         moving = (np.abs(found.center) + found.spread + found.radius).any(axis=axis)
         if moving.any():

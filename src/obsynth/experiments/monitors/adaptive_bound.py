@@ -111,9 +111,14 @@ class Start:
     """What is known of eps at the start: nothing, ``norm``, or ``center, radius (nz,)``; ``state`` for rounding."""
 
     def __init__(
-        self, nz: int, *, norm: float | None = None, center: FloatArray | None = None, radius: FloatArray | None = None,
+        self,
+        nz: int,
+        *,
+        norm: float | None = None,
+        center: FloatArray | None = None,
+        radius: FloatArray | None = None,
         state: FloatArray | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.norm, self.stated = norm, norm is not None or center is not None
         self.center = np.zeros(nz) if center is None else center
         self.radius = np.zeros(nz) if radius is None else radius
@@ -147,20 +152,42 @@ def adaptive_bound(
     kernels[:, :, :m] = kernels[:, :, :m] @ solved.T * OUTWARD
     kernels = np.ascontiguousarray(kernels[::-1].reshape(-1, kernels.shape[2]))
     through = structure.seen(np.abs(rows) @ rest[state][:, driven])
-    same = np.hstack([np.vstack([solved @ responses.same, responses.direct]),
-                      np.vstack([solved @ through, rest[outputs][:, driven]])]) * OUTWARD  # fmt: skip
+    same = (
+        np.hstack(
+            [
+                np.vstack([solved @ responses.same, responses.direct]),
+                np.vstack([solved @ through, rest[outputs][:, driven]]),
+            ]
+        )
+        * OUTWARD
+    )
     tail = np.vstack([solved @ responses.tail_channels, responses.tail_outputs, responses.tail_eps]) * OUTWARD
     table, later = _start_table(structure, responses, start)
-    outward = np.vstack([np.hstack([solved, np.zeros((m, len(table[0]) - m))]),
-                         np.hstack([np.zeros((len(table[0]) - m, m)), np.eye(len(table[0]) - m)])])  # fmt: skip
+    outward = np.vstack(
+        [
+            np.hstack([solved, np.zeros((m, len(table[0]) - m))]),
+            np.hstack([np.zeros((len(table[0]) - m, m)), np.eye(len(table[0]) - m)]),
+        ]
+    )
     theta, settled = later
     return AdaptiveBound(
-        structure, responses, varying, drive, np.vstack([rows @ structure.Cx, structure.Co]), kernels,
-        np.ascontiguousarray(same.T), solved, tail, outward @ _nominal(structure, responses),
+        structure,
+        responses,
+        varying,
+        drive,
+        np.vstack([rows @ structure.Cx, structure.Co]),
+        kernels,
+        np.ascontiguousarray(same.T),
+        solved,
+        tail,
+        outward @ _nominal(structure, responses),
         _nominal(structure, responses, center=False)[m:],
-        outward @ _rounding(structure, responses, observer, start.state), table @ outward.T * OUTWARD,
-        (theta, outward @ settled * OUTWARD), 1.0 + np.abs(structure.offsets), tuple(driven.tolist()),
-    )  # fmt: skip
+        outward @ _rounding(structure, responses, observer, start.state),
+        table @ outward.T * OUTWARD,
+        (theta, outward @ settled * OUTWARD),
+        1.0 + np.abs(structure.offsets),
+        tuple(driven.tolist()),
+    )
 
 
 def _driven(structure: ErrorStructure, responses: Responses, columns: FloatArray) -> FloatArray:

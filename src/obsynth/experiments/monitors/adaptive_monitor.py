@@ -66,8 +66,9 @@ class SampledProblem(NamedTuple):
             if known.stated and not self.affine.C.is_certain:
                 raise PreconditionError(
                     "A constant with a tolerance is in C: the norm of the error at the start bounds too little; give "
-                    "initial_set (--initial).", condition="start",
-                )  # fmt: skip
+                    "initial_set (--initial).",
+                    condition="start",
+                )
             radius = self.unknown if known.stated else np.zeros(len(z))
             return Start(len(z), norm=known.norm, radius=radius, state=z)
         center, radius = self.reading @ box[0], np.abs(self.reading) @ box[1]
@@ -88,7 +89,7 @@ def sampled_problem(design: ObserverDesign, dt: float, bounds: FloatArray, noise
             "The constants may vary, and the design is continuous in time: between samples nothing is known of them. "
             "Sample the plant first (transform: sample_time), or state constants that stay the same.",
             condition="discrete time",
-        )  # fmt: skip
+        )
     exact = AffinePlant(plant, uncertain.box, {}, np.eye(plant.nx))
     followed = tracking_of(design, exact).T
     reduced, basis = reduced_family(plant, uncertain)
@@ -104,15 +105,29 @@ def sampled_problem(design: ObserverDesign, dt: float, bounds: FloatArray, noise
     bd, dd = affine_block([[*pieces, zero]]), affine_block([[blind, reduced["Dd"]]])
     bw, dw = _noise(smooth, back, dt)
     matrices = {
-        "E": AffineMatrix.exact(np.eye(len(basis)), moving.count), "A": moving, "B": held, "C": reduced["C"],
-        "D": reduced["D"], "Bd": bd, "Dd": dd, "Bf": AffineMatrix.exact(np.zeros((len(basis), nf)), moving.count),
+        "E": AffineMatrix.exact(np.eye(len(basis)), moving.count),
+        "A": moving,
+        "B": held,
+        "C": reduced["C"],
+        "D": reduced["D"],
+        "Bd": bd,
+        "Dd": dd,
+        "Bf": AffineMatrix.exact(np.zeros((len(basis), nf)), moving.count),
         "Df": reduced["Df"],
-    }  # fmt: skip
+    }
     offsets = uncertain.box.offsets
     sampled = DescriptorSystem(
-        None, moving.at(offsets), held.at(offsets), C=reduced["C"].at(offsets), D=reduced["D"].at(offsets),
-        Bd=bd.at(offsets), Dd=dd.at(offsets), Bw=bw, Dw=dw, dt=dt,
-    )  # fmt: skip
+        None,
+        moving.at(offsets),
+        held.at(offsets),
+        C=reduced["C"].at(offsets),
+        D=reduced["D"].at(offsets),
+        Bd=bd.at(offsets),
+        Dd=dd.at(offsets),
+        Bw=bw,
+        Dw=dw,
+        dt=dt,
+    )
     affine = AffinePlant(sampled, uncertain.box, matrices, np.eye(len(basis)))
     inputs = np.hstack([observer.Bu, observer.By])
     ramp = first_order_hold(observer.Az, inputs, dt)[2]
@@ -121,8 +136,9 @@ def sampled_problem(design: ObserverDesign, dt: float, bounds: FloatArray, noise
     if plant.nu and not affine.D.is_certain:
         raise PreconditionError(
             "A constant with a tolerance is in D, and the design is continuous in time: sample the plant first "
-            "(transform: sample_time).", condition="discrete time",
-        )  # fmt: skip
+            "(transform: sample_time).",
+            condition="discrete time",
+        )
     unknown = np.abs(through_y) @ (reduced["Dd"].magnitude @ bounds + np.abs(dw).sum(axis=1) * noise_bound)
     first = -(through_u + through_y @ affine.D.center)
     sizes = np.concatenate([np.tile(bounds, PIECES), bounds])
@@ -161,8 +177,9 @@ def _noise(smooth: DescriptorSystem, back: FloatArray, dt: float) -> tuple[Float
     """Return the noise of the plant gathered in a sample, and that of the sensors, as columns side by side."""
     process, sensors = smooth.Bw.any(axis=0), smooth.Dw.any(axis=0)
     if (process & sensors).any():
-        raise PreconditionError("A noise drives the plant and a sensor at once, which is not known between samples.",
-                                condition="noise")  # fmt: skip
+        raise PreconditionError(
+            "A noise drives the plant and a sensor at once, which is not known between samples.", condition="noise"
+        )
     gathered = np.zeros((smooth.nx, 0))
     if process.any():
         whole = DescriptorSystem(None, smooth.A, C=np.eye(smooth.nx), Bw=smooth.Bw[:, process])
@@ -181,9 +198,15 @@ EXACT = f"; {EXACT_MODEL}"
 
 
 def adaptive_plan(
-    design: ObserverDesign, bounds: FloatArray, noise_bound: float, *, initial_error: float | None,
-    initial_set: Mapping[str, Any] | None, observer_state: FloatArray | None = None, sample_time: float | None = None,
-) -> tuple[AdaptivePlan, AdaptivePlan]:  # fmt: skip
+    design: ObserverDesign,
+    bounds: FloatArray,
+    noise_bound: float,
+    *,
+    initial_error: float | None,
+    initial_set: Mapping[str, Any] | None,
+    observer_state: FloatArray | None = None,
+    sample_time: float | None = None,
+) -> tuple[AdaptivePlan, AdaptivePlan]:
     """Return the plans from the first start on and after a later one, over the plant's box, if there is a bound."""
     plant, observer = design.linear
     _require_regular(plant)
@@ -210,18 +233,28 @@ def adaptive_plan(
     def plan(begin: Start) -> AdaptivePlan:
         return AdaptivePlan(
             adaptive_bound(structure, observer, begin, varying=varying),
-            None if faults is None else adaptive_bound(faults, observer, begin, varying=varying), same, reason,
-            begin.norm is None, watches_estimates(design), affine.box.names, observer.fault_names,
+            None if faults is None else adaptive_bound(faults, observer, begin, varying=varying),
+            same,
+            reason,
+            begin.norm is None,
+            watches_estimates(design),
+            affine.box.names,
+            observer.fault_names,
             observer.residual_names,
-        )  # fmt: skip
+        )
 
     return plan(start), plan(later)
 
 
 def _sampled_plan(
-    design: ObserverDesign, bounds: FloatArray, noise_bound: float, initial_error: float | None,
-    initial_set: Mapping[str, Any] | None, observer_state: FloatArray | None, sample_time: float | None,
-) -> tuple[AdaptivePlan, AdaptivePlan]:  # fmt: skip
+    design: ObserverDesign,
+    bounds: FloatArray,
+    noise_bound: float,
+    initial_error: float | None,
+    initial_set: Mapping[str, Any] | None,
+    observer_state: FloatArray | None,
+    sample_time: float | None,
+) -> tuple[AdaptivePlan, AdaptivePlan]:
     """Return the plans of a continuous design, whose observer runs on samples."""
     plant, observer = design.linear
     if sample_time is None:
@@ -240,9 +273,17 @@ def _sampled_plan(
     def plan(begin: Start) -> AdaptivePlan:
         bound = adaptive_bound(structure, problem.observer, begin, varying=False)
         return AdaptivePlan(
-            replace(bound, first=problem.first), None, False, why, True, watches_estimates(design),
-            (*problem.affine.box.names, SAMPLING), observer.fault_names, observer.residual_names, sample_time,
-        )  # fmt: skip
+            replace(bound, first=problem.first),
+            None,
+            False,
+            why,
+            True,
+            watches_estimates(design),
+            (*problem.affine.box.names, SAMPLING),
+            observer.fault_names,
+            observer.residual_names,
+            sample_time,
+        )
 
     return plan(problem.start(stated, box)), plan(problem.start(stated, None))
 
@@ -251,8 +292,9 @@ def _require_bounds(structure: ErrorStructure, bounds: FloatArray) -> None:
     """Raise `SpecError` where a disturbance without a bound reaches the error."""
     reached = structure.disturbances.magnitude.max(axis=0, initial=0.0)[: len(bounds)] > 0.0
     if np.any(reached & ~np.isfinite(bounds)):
-        raise SpecError("A disturbance has no bound: give disturbance_bounds (--disturbance).",
-                        path="disturbance_bounds")  # fmt: skip
+        raise SpecError(
+            "A disturbance has no bound: give disturbance_bounds (--disturbance).", path="disturbance_bounds"
+        )
 
 
 def _require_regular(plant: DescriptorSystem) -> None:
@@ -270,9 +312,12 @@ def _require_regular(plant: DescriptorSystem) -> None:
 
 
 def start_of(
-    affine: AffinePlant, tracking: Tracking, initial_error: float | None, initial_set: Mapping[str, Any] | None,
+    affine: AffinePlant,
+    tracking: Tracking,
+    initial_error: float | None,
+    initial_set: Mapping[str, Any] | None,
     z: FloatArray,
-) -> Start:  # fmt: skip
+) -> Start:
     """Return what is known of eps at the start, ``z - T E(q) x`` for x in a box."""
     plant = affine.plant
     if initial_set is None:
@@ -292,21 +337,27 @@ def initial_box(plant: DescriptorSystem, given: Mapping[str, Any]) -> tuple[Floa
     needed = np.abs(plant.E).max(axis=0, initial=0.0) > 0.0
     unknown = sorted(set(given) - set(plant.state_names))
     if unknown:
-        raise SpecError(f"initial_set has the unknown state {unknown[0]!r}; there are {', '.join(plant.state_names)}.",
-                        path="initial_set")  # fmt: skip
+        raise SpecError(
+            f"initial_set has the unknown state {unknown[0]!r}; there are {', '.join(plant.state_names)}.",
+            path="initial_set",
+        )
     for i, name in enumerate(plant.state_names):
         if name not in given:
             if needed[i]:
-                raise SpecError(f"initial_set has no entry for the state {name!r}: give a bound, or [low, high].",
-                                path="initial_set")  # fmt: skip
+                raise SpecError(
+                    f"initial_set has no entry for the state {name!r}: give a bound, or [low, high].",
+                    path="initial_set",
+                )
             continue
         value = given[name]
         ends = list(value) if isinstance(value, (list, tuple, np.ndarray)) else [value]
         if len(ends) == 1 and is_finite_number(value):
             ends = [-value, value]
         if len(ends) != 2 or not all(map(is_finite_number, ends)) or not ends[0] <= ends[1]:
-            raise SpecError(f"initial_set of {name!r} is {value!r}: give a bound of its absolute value, or "
-                            "[low, high].", path="initial_set")  # fmt: skip
+            raise SpecError(
+                f"initial_set of {name!r} is {value!r}: give a bound of its absolute value, or [low, high].",
+                path="initial_set",
+            )
         low, high = map(float, ends)
         center[i], radius[i] = (low + high) / 2.0, (high - low) / 2.0
     return center, radius
@@ -326,14 +377,24 @@ def adaptive_statement(plan: AdaptivePlan, design: ObserverDesign) -> str:
         return text + EXACT
     steps = () if uncertain is None else uncertain.steps
     sampled = any(kind == SAMPLED for kind, _ in steps)
-    kept = "constants stay the same" if box.variation == "constant" else (
-        "constants may change at each sample (where the state does not jump)" if sampled else
-        "constants may change at each sample (the value at k + 1 multiplies x(k+1))"
-    )  # fmt: skip
+    kept = (
+        "constants stay the same"
+        if box.variation == "constant"
+        else (
+            "constants may change at each sample (where the state does not jump)"
+            if sampled
+            else "constants may change at each sample (the value at k + 1 multiplies x(k+1))"
+        )
+    )
     radius = loop_radius(plan.bound.responses)
-    ever = "" if radius < 1.0 else (
-        f"; the loop through the tolerances has radius {radius:.3g}: the threshold holds at each sample, but may grow"
-    )  # fmt: skip
+    ever = (
+        ""
+        if radius < 1.0
+        else (
+            f"; the loop through the tolerances has radius {radius:.3g}: the threshold holds at each sample, but may "
+            "grow"
+        )
+    )
     held = "; inputs and disturbances are held between samples" if sampled else ""
     if plan.sample_time is not None:
         held = "; known inputs are held between rows, which are the sample time apart, disturbances may move in between"
@@ -343,9 +404,12 @@ def adaptive_statement(plan: AdaptivePlan, design: ObserverDesign) -> str:
 
 
 def tolerances_of(
-    design: ObserverDesign, kind: str, constants: Any, initial_set: Mapping[str, Any] | None,
+    design: ObserverDesign,
+    kind: str,
+    constants: Any,
+    initial_set: Mapping[str, Any] | None,
     initial_error: float | None,
-) -> tuple[ObserverDesign, bool]:  # fmt: skip
+) -> tuple[ObserverDesign, bool]:
     """Return the design with the tolerances asked for, and whether its threshold adapts to the signals."""
     asked = [name for name, given in (("constants", constants), ("initial_set", initial_set)) if given is not None]
     if asked and kind != "pointwise":

@@ -248,8 +248,14 @@ class AdaptiveMonitor(Monitor):
         if not len(chosen):
             return passed
         reading = plan.bound.structure.reading
-        records = Records(runs.rows[:, chosen] @ reading.T, runs.inputs[:, chosen], runs.outputs[:, chosen],
-                          values[:, chosen], norm[:, chosen], self.threshold + self.floor)  # fmt: skip
+        records = Records(
+            runs.rows[:, chosen] @ reading.T,
+            runs.inputs[:, chosen],
+            runs.outputs[:, chosen],
+            values[:, chosen],
+            norm[:, chosen],
+            self.threshold + self.floor,
+        )
         sure, left = first_passed(self._screening, records, candidates[:, chosen], onset)
         passed[:, chosen] = sure
         if left.any():
@@ -287,8 +293,9 @@ class AdaptiveMonitor(Monitor):
         """Refuse: the threshold needs the record of inputs and outputs."""
         raise SpecError(
             "An adaptive threshold follows inputs and outputs, which estimates do not hold: use obsynth.evaluate, or "
-            "obsynth.online_monitor with obsynth.run_on_data.", path="monitor",
-        )  # fmt: skip
+            "obsynth.online_monitor with obsynth.run_on_data.",
+            path="monitor",
+        )
 
 
 def _by_run(runs: Runs, chosen: Any) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -300,9 +307,15 @@ def _by_run(runs: Runs, chosen: Any) -> tuple[FloatArray, FloatArray, FloatArray
 
 
 def with_box(
-    design: ObserverDesign, scenario: Scenario, nominal: Monitor, bounds: FloatArray, noise_bound: float | None, *,
-    initial_error: float | None, initial_set: Mapping[str, Any] | None,
-) -> AdaptiveMonitor:  # fmt: skip
+    design: ObserverDesign,
+    scenario: Scenario,
+    nominal: Monitor,
+    bounds: FloatArray,
+    noise_bound: float | None,
+    *,
+    initial_error: float | None,
+    initial_set: Mapping[str, Any] | None,
+) -> AdaptiveMonitor:
     """Return a pointwise monitor over the box of the design's plant, from the scenario's start unless one is given."""
     plant, _ = design.linear
     if not plant.is_discrete and scenario.inputs:
@@ -315,8 +328,13 @@ def with_box(
     if initial_set is None and initial_error is None:
         initial_set = {name: (scenario.initial_state.get(name, 0.0),) * 2 for name in plant.state_names}
     first, _ = adaptive_plan(
-        noisy_design(design, scenario), bounds, noise_bound or 0.0, initial_error=initial_error,
-        initial_set=initial_set, observer_state=state, sample_time=None if plant.is_discrete else scenario.sample_time,
-    )  # fmt: skip
+        noisy_design(design, scenario),
+        bounds,
+        noise_bound or 0.0,
+        initial_error=initial_error,
+        initial_set=initial_set,
+        observer_state=state,
+        sample_time=None if plant.is_discrete else scenario.sample_time,
+    )
     values = {item.name: getattr(nominal, item.name) for item in fields(nominal)}
     return AdaptiveMonitor(**{**values, "statement": adaptive_statement(first, design)}, plan=first)

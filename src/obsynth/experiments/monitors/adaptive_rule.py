@@ -142,9 +142,10 @@ class AdaptivePlan:
         watched = (*(f"fhat[{name}]" for name in self.fault_names), *(f"r[{name}]" for name in self.residual_names))
         faults = [f"{end} {name}" for name in self.fault_names for end in ("lowest", "highest")]
         return (
-            *(f"threshold {name}" for name in watched), *(faults if self.intervals else ()),
+            *(f"threshold {name}" for name in watched),
+            *(faults if self.intervals else ()),
             *(f"share {name}" for name in self.names),
-        )  # fmt: skip
+        )
 
     @property
     def intervals(self) -> bool:
@@ -255,10 +256,12 @@ class AdaptiveRule(Rule):
     def as_dict(self) -> dict[str, Any]:
         """Return the state that goes from row to row, as data."""
         return {
-            **super().as_dict(), "nominal": self._nominal.as_dict(), "first": self._bound is self.plan.bound,
+            **super().as_dict(),
+            "nominal": self._nominal.as_dict(),
+            "first": self._bound is self.plan.bound,
             "state": self._state.as_dict(),
             "faults": None if self._fault_state is None else self._fault_state.as_dict(),
-        }  # fmt: skip
+        }
 
     def resume(self, data: Mapping[str, Any]) -> None:
         """Go on from what `as_dict` returned."""

@@ -53,9 +53,15 @@ class BetweenSamples:
 
     @classmethod
     def of(
-        cls, plant: DescriptorSystem, observer: LinearObserver, tracking: FloatArray, dt: float, *, rows: slice,
+        cls,
+        plant: DescriptorSystem,
+        observer: LinearObserver,
+        tracking: FloatArray,
+        dt: float,
+        *,
+        rows: slice,
         endless: bool = True,
-    ) -> BetweenSamples:  # fmt: skip
+    ) -> BetweenSamples:
         """Return the design at samples ``dt`` apart, for ``tracking V (nz, nx)``; raise `SpecError` without a bound.
         Without ``endless`` a record of known length is bounded whether or not anything dies out."""
         try:
@@ -91,9 +97,14 @@ class BetweenSamples:
 
     @classmethod
     def of_sampled(
-        cls, written: DescriptorSystem, plant: DescriptorSystem, observer: LinearObserver, tracking: FloatArray,
-        *, rows: slice,
-    ) -> BetweenSamples:  # fmt: skip
+        cls,
+        written: DescriptorSystem,
+        plant: DescriptorSystem,
+        observer: LinearObserver,
+        tracking: FloatArray,
+        *,
+        rows: slice,
+    ) -> BetweenSamples:
         """Return a design for a sampled plant, with states of ``written``: ``eps+ = Az eps - T q + By Dd d``."""
         smooth = eliminate_algebraic_states(written).plant
         n, nz, exact = smooth.nx, observer.order, Ball.exact
@@ -101,9 +112,18 @@ class BetweenSamples:
         shown = np.hstack([np.zeros((len(observer.Cz[rows]), n)), observer.Cz[rows]])
         into = Ball.exact(np.vstack([np.zeros((n, n)), -tracking]))
         return cls(
-            smooth, plant.dt, m, shown, prove_contraction(m, discrete=True), into, np.zeros((nz, plant.ny)),
-            observer.By, observer.Dy[rows], rows, 0.0,
-        )  # fmt: skip
+            smooth,
+            plant.dt,
+            m,
+            shown,
+            prove_contraction(m, discrete=True),
+            into,
+            np.zeros((nz, plant.ny)),
+            observer.By,
+            observer.Dy[rows],
+            rows,
+            0.0,
+        )
 
     @cached_property
     def per_unit(self) -> FloatArray:
@@ -270,8 +290,9 @@ def _split(
         raise SpecError(
             "The residual at the samples has no bound that double precision could prove: the observer, or a mode of "
             "the plant that is not straight between samples, dies out too slowly. Sample the plant first "
-            "(transform.sample_time), or use a statistical monitor.", path="sample_time",
-        )  # fmt: skip
+            "(transform.sample_time), or use a statistical monitor.",
+            path="sample_time",
+        )
     # What the split misses, and the modes that it leaves: driven by the state, whatever it is.
     defect = projector @ phi - moving @ projector if followed else exact(np.zeros((n, n)))
     rest = block([[defect], [k @ others if followed else k]])

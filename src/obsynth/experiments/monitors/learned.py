@@ -40,8 +40,15 @@ MOST_WATCHED, LEAST_NEW = 8, 1e-6
 #: Rows without faults below which nothing is learned.
 LEAST_NORMAL = 100
 #: Seconds of the units of time in which a rate is told.
-UNITS = {"second": 1.0, "minute": 60.0, "hour": 3600.0, "day": 86400.0, "week": 604800.0, "month": 2629800.0,
-         "year": 31557600.0}  # fmt: skip
+UNITS = {
+    "second": 1.0,
+    "minute": 60.0,
+    "hour": 3600.0,
+    "day": 86400.0,
+    "week": 604800.0,
+    "month": 2629800.0,
+    "year": 31557600.0,
+}
 _RATE = re.compile(r"\s*([0-9.eE+-]+)\s*(?:per|/)\s*([0-9.eE+]*)\s*([a-z]+?)s?\s*")
 
 
@@ -59,11 +66,15 @@ def rows_per_alarm(rate: str | float, dt: float) -> float:
             alarms, count = 0.0, 0.0
         found = count * unit / alarms if alarms > 0.0 and math.isfinite(alarms) and count * unit > 0.0 else None
     if found is None or not math.isfinite(found):
-        raise SpecError(f"false_alarms is {rate!r}: give a rate, such as '1 per week' or '1 per 1000 rows'.",
-                        path="false_alarms")  # fmt: skip
+        raise SpecError(
+            f"false_alarms is {rate!r}: give a rate, such as '1 per week' or '1 per 1000 rows'.", path="false_alarms"
+        )
     if found < 2 * HOLD:
-        raise SpecError(f"false_alarms is {rate!r}, one per {found:.3g} rows, but an alarm lasts {HOLD} rows at least: "
-                        "ask for rarer ones.", path="false_alarms")  # fmt: skip
+        raise SpecError(
+            f"false_alarms is {rate!r}, one per {found:.3g} rows, but an alarm lasts {HOLD} rows at least: "
+            "ask for rarer ones.",
+            path="false_alarms",
+        )
     return found
 
 
@@ -131,20 +142,33 @@ class LearnedThresholds:
         other = f"the rate that {self.rows} rows can hold is one per {rarest:.6g} rows ({_duration(rarest * self.dt)})"
         if rows_needed(model, 1.0) > self.rows:
             other = "the residuals remember so long, or are so many, that these rows hold no rate"
-        return (f"{text}. The rate is not sure: it needs {self.needed} rows without faults "
-                f"({_duration(self.needed * self.dt)}); {other}")  # fmt: skip
+        return (
+            f"{text}. The rate is not sure: it needs {self.needed} rows without faults "
+            f"({_duration(self.needed * self.dt)}); {other}"
+        )
 
     def as_dict(self) -> dict[str, Any]:
         """Return all of it as data."""
         model = self.statistics.model
         return {
-            "gains": self.gains, "columns": list(self.columns), "left_out": list(self.left_out),
-            "offset": model.offset, "A": model.A, "whitener": model.whitener,
-            "signatures": self.statistics.signatures, "statistics": list(self.statistics.names),
-            "levels": self.levels, "every": self.every, "rows": self.rows, "needed": self.needed, "dt": self.dt,
-            "centres": self.centres, "scales": self.scales, "extrapolated": self.extrapolated,
+            "gains": self.gains,
+            "columns": list(self.columns),
+            "left_out": list(self.left_out),
+            "offset": model.offset,
+            "A": model.A,
+            "whitener": model.whitener,
+            "signatures": self.statistics.signatures,
+            "statistics": list(self.statistics.names),
+            "levels": self.levels,
+            "every": self.every,
+            "rows": self.rows,
+            "needed": self.needed,
+            "dt": self.dt,
+            "centres": self.centres,
+            "scales": self.scales,
+            "extrapolated": self.extrapolated,
             "settling": self.settling,
-        }  # fmt: skip
+        }
 
     def save(self, path: str | Path) -> Path:
         """Write the thresholds as one JSON document, atomically.
@@ -195,8 +219,9 @@ def load_thresholds(path: str | Path) -> LearnedThresholds:
     if not isinstance(document, dict) or document.get("kind") != KIND:
         raise SpecError(f"{file} holds no learned thresholds.", path=str(file))
     if document.get("schema_version") != SCHEMA_VERSION:
-        raise SpecError(f"{file} was written by another version of obsynth: learn the thresholds again.",
-                        path=str(file))  # fmt: skip
+        raise SpecError(
+            f"{file} was written by another version of obsynth: learn the thresholds again.", path=str(file)
+        )
     try:
         body = document["thresholds"]
         if digest_of(body) != document["sha256"]:
@@ -220,11 +245,20 @@ def _from_dict(data: Mapping[str, Any]) -> LearnedThresholds:
         raise ValueError("its parts do not fit together")
     model = Autoregression(read_only(offset), read_only(a), read_only(whitener))
     return LearnedThresholds(
-        columns, Statistics(model, read_only(signatures), names), read_only(levels), float(data["every"]),
-        int(data["rows"]), int(data["needed"]), float(data["dt"]), read_only(np.asarray(data["centres"])),
-        read_only(np.asarray(data["scales"])), str(data["gains"]), bool(data["extrapolated"]),
-        tuple(map(str, data["left_out"])), int(data["settling"]),
-    )  # fmt: skip
+        columns,
+        Statistics(model, read_only(signatures), names),
+        read_only(levels),
+        float(data["every"]),
+        int(data["rows"]),
+        int(data["needed"]),
+        float(data["dt"]),
+        read_only(np.asarray(data["centres"])),
+        read_only(np.asarray(data["scales"])),
+        str(data["gains"]),
+        bool(data["extrapolated"]),
+        tuple(map(str, data["left_out"])),
+        int(data["settling"]),
+    )
 
 
 def watched_names(design: ObserverDesign) -> tuple[str, ...]:
@@ -265,13 +299,17 @@ def thresholds_from_rows(
     names, known = watched_names(design), np.asarray(np.isfinite(rows).all(axis=1))
     count = int(known.sum())
     if count < LEAST_NORMAL:
-        raise SpecError(f"Only {count} rows of the log can be learned from, as warm-up and gaps do not count: give "
-                        f"{LEAST_NORMAL} and more.", path="normal")  # fmt: skip
+        raise SpecError(
+            f"Only {count} rows of the log can be learned from, as warm-up and gaps do not count: give "
+            f"{LEAST_NORMAL} and more.",
+            path="normal",
+        )
     faults = len(design.observer.fault_names)
     choices = [part for part in (independent(rows[known], 0), independent(rows[known], faults)) if part]
     if not choices:
-        raise SpecError("Nothing that is watched ever moves in these rows: there is no noise to learn from.",
-                        path="normal")  # fmt: skip
+        raise SpecError(
+            "Nothing that is watched ever moves in these rows: there is no noise to learn from.", path="normal"
+        )
     fits = [(kept, fitted_autoregression(np.where(known[:, None], rows[:, kept], np.nan))) for kept in choices]
     enough = [fit for fit in fits if rows_needed(fit[1], 1.0) <= count]
     kept, model = enough[0] if enough else min(fits, key=lambda fit: rows_needed(fit[1], 1.0))
@@ -281,10 +319,20 @@ def thresholds_from_rows(
     levels = learned_levels(x, every, statistics, seed)
     centres, scales = rows[known, :faults].mean(axis=0), rows[known, :faults].std(axis=0)
     return LearnedThresholds(
-        told, statistics, read_only(levels.own * levels.factor), every, count, rows_needed(model, every), dt,
-        read_only(centres), read_only(np.where(scales > 0.0, scales, 1.0)), gain_set_digest(design),
-        levels.extrapolated, tuple(name for i, name in enumerate(names) if i not in kept), settling_rows(design),
-    )  # fmt: skip
+        told,
+        statistics,
+        read_only(levels.own * levels.factor),
+        every,
+        count,
+        rows_needed(model, every),
+        dt,
+        read_only(centres),
+        read_only(np.where(scales > 0.0, scales, 1.0)),
+        gain_set_digest(design),
+        levels.extrapolated,
+        tuple(name for i, name in enumerate(names) if i not in kept),
+        settling_rows(design),
+    )
 
 
 def independent(rows: FloatArray, first: int) -> list[int]:
@@ -363,8 +411,9 @@ class LearnedRule(Rule):
     def _add(self, x: FloatArray | None) -> None:
         """Take a row, or `None` for one that is as predicted."""
         model = self._model
-        predicted = model.offset + sum((a @ row for a, row in zip(model.A, self.past, strict=True)),
-                                       np.zeros(model.channels))  # fmt: skip
+        predicted = model.offset + sum(
+            (a @ row for a, row in zip(model.A, self.past, strict=True)), np.zeros(model.channels)
+        )
         with np.errstate(over="ignore", invalid="ignore"):
             e = np.zeros(model.channels) if x is None else model.whitener @ (x - predicted)
         self.white = np.vstack([self.white[1:], e])
@@ -391,6 +440,10 @@ def learned_monitor(design: ObserverDesign, learned: LearnedThresholds) -> Onlin
         raise SpecError(f"The thresholds watch {missing[0]!r}, which the design does not say.", path="normal")
     residuals = len(observer.residual_names) if isinstance(observer, LinearObserver) else innovations(observer)
     return OnlineMonitor(
-        "learned", learned.statement, LearnedRule(learned, names), residuals=residuals,
-        fault_names=observer.fault_names, fault_scales=learned.scales,
-    )  # fmt: skip
+        "learned",
+        learned.statement,
+        LearnedRule(learned, names),
+        residuals=residuals,
+        fault_names=observer.fault_names,
+        fault_scales=learned.scales,
+    )

@@ -218,9 +218,14 @@ class Monitor:
         k = int(hits[0]) if hits.size else None
         fault = "" if k is None or not self.fault_names else self.fault_names[self.isolated(estimates.faults, k)]
         return Detection(
-            self.kind, self.statement, read_only(self.statistic(residuals)[:, 0]), self.threshold, k,
-            None if k is None else k * self.dt, fault,
-        )  # fmt: skip
+            self.kind,
+            self.statement,
+            read_only(self.statistic(residuals)[:, 0]),
+            self.threshold,
+            k,
+            None if k is None else k * self.dt,
+            fault,
+        )
 
 
 def _windows(values: FloatArray, window: int) -> list[FloatArray]:

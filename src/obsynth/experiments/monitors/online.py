@@ -111,9 +111,15 @@ class OnlineMonitor:
     """
 
     def __init__(
-        self, kind: str, statement: str, rule: Rule, *, residuals: int, fault_names: tuple[str, ...],
+        self,
+        kind: str,
+        statement: str,
+        rule: Rule,
+        *,
+        residuals: int,
+        fault_names: tuple[str, ...],
         fault_scales: FloatArray,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.kind, self.statement, self._rule = kind, statement, rule
         self._residuals, self._names, self._scales = residuals, fault_names, fault_scales
         self._decided = False
@@ -201,8 +207,9 @@ class OnlineMonitor:
             The state is of another kind of monitor, or one with other options.
         """
         if data["kind"] != self.kind:
-            raise SpecError(f"The saved state is of a run with the monitor {data['kind']!r}: use the same options.",
-                            path="state")  # fmt: skip
+            raise SpecError(
+                f"The saved state is of a run with the monitor {data['kind']!r}: use the same options.", path="state"
+            )
         self._decided = data["decided"]
         self._rule.resume(data["rule"])
 

@@ -63,8 +63,10 @@ def sampled_errors(errors: ErrorModel, dt: float) -> SampledErrors:
     plant, observer = errors.plant, errors.observer
     process, sensors = plant.Bw.any(axis=0), plant.Dw.any(axis=0)
     if (process & sensors).any():
-        raise SpecError("A noise drives the plant and a sensor at once, which is not known between samples: state two.",
-                        path="noise")  # fmt: skip
+        raise SpecError(
+            "A noise drives the plant and a sensor at once, which is not known between samples: state two.",
+            path="noise",
+        )
     held = sample_observer(observer, dt)
     transition, gathered_d, _ = first_order_hold(observer.Az, errors.disturbance, dt)
     driven = errors.noise[:, process]
@@ -73,9 +75,13 @@ def sampled_errors(errors: ErrorModel, dt: float) -> SampledErrors:
     heard = plant.Dw[:, sensors]
     ramp = first_order_hold(observer.Az, observer.By, dt)[2]
     return SampledErrors(
-        transition, gathered_d, np.hstack([-held.By @ heard, gathered]), held.Dy @ heard, ramp @ heard,
+        transition,
+        gathered_d,
+        np.hstack([-held.By @ heard, gathered]),
+        held.Dy @ heard,
+        ramp @ heard,
         gathered.shape[1],
-    )  # fmt: skip
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +118,7 @@ class ResidualModel:
         """Return ``A^k`` for every sample."""
         triangular, basis = schur_form(self.A)
         power = np.eye(len(self.A), dtype=triangular.dtype)
-        found = []
+        found: list[FloatArray] = []
         while len(found) < self.steps:
             found.append(np.asarray((basis @ power @ basis.conj().T).real))
             power = np.triu(power @ triangular)
@@ -176,8 +182,9 @@ def noisy_plant(plant: DescriptorSystem, scenario: Scenario, drive: ScenarioSign
     """Return a plant with the noise of a scenario: its own, as often, and that of the sensors."""
     return plant.replace(
         Bw=np.hstack([scenario.noise * plant.Bw, np.zeros((plant.nx, plant.ny))]),
-        Dw=np.hstack([scenario.noise * plant.Dw, np.diag(drive.deviations)]), noise_names=None,
-    )  # fmt: skip
+        Dw=np.hstack([scenario.noise * plant.Dw, np.diag(drive.deviations)]),
+        noise_names=None,
+    )
 
 
 def residual_model(
@@ -209,9 +216,27 @@ def residual_model(
     if plant.is_discrete and plant.nd and design.source is not None and design.source.sample_time is not None:
         between = BetweenSamples.of_sampled(design.source.plant, plant, observer, errors.own, rows=rows)
     return ResidualModel(
-        a, -shown, driven, direct_d, noise, direct_w, -faults, faults_d, faults_w,
-        drive.steps, initial, bounds, means, deviations, steady, flow, start_noise, heard, continuous, between,
-    )  # fmt: skip
+        a,
+        -shown,
+        driven,
+        direct_d,
+        noise,
+        direct_w,
+        -faults,
+        faults_d,
+        faults_w,
+        drive.steps,
+        initial,
+        bounds,
+        means,
+        deviations,
+        steady,
+        flow,
+        start_noise,
+        heard,
+        continuous,
+        between,
+    )
 
 
 def _disturbances(

@@ -39,10 +39,16 @@ class NormRule(Rule):
     SAME = "limit"
 
     def __init__(
-        self, table: FloatArray, limit: float, *, window: int, dt: float,
-        irregular: UnlimitedHorizonBound | None = None, watched: slice | None = None,
+        self,
+        table: FloatArray,
+        limit: float,
+        *,
+        window: int,
+        dt: float,
+        irregular: UnlimitedHorizonBound | None = None,
+        watched: slice | None = None,
         driven: InputResponse | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self._table, self._limit, self._dt = table, limit, dt
         self._watched, self._driven = watched, driven
         self.states = None if driven is None else driven.start()
@@ -116,9 +122,16 @@ class WhitenedRule(Rule):
     KEPT = ("window", "levels", "looks", "last")
 
     def __init__(
-        self, whitener: FloatArray, mean: FloatArray, *, window: int, change: float | None, false_alarms: float,
-        dt: float, white: bool = True,
-    ) -> None:  # fmt: skip
+        self,
+        whitener: FloatArray,
+        mean: FloatArray,
+        *,
+        window: int,
+        change: float | None,
+        false_alarms: float,
+        dt: float,
+        white: bool = True,
+    ) -> None:
         self._whitener, self._mean, self._change = whitener, mean, change
         self._probability, self._dt, self._white = false_alarms, dt, white
         self.window: deque[FloatArray] = deque(maxlen=window)
@@ -221,9 +234,10 @@ class ParameterRule(Rule):
         away = found.theta - self._nominal
         weights = np.linalg.pinv(found.covariance, hermitian=True)
         return (
-            float(away @ weights @ away), float(chdtri(len(away), self._share())),
+            float(away @ weights @ away),
+            float(chdtri(len(away), self._share())),
             alone(weights @ away, np.diag(weights)),
-        )  # fmt: skip
+        )
 
     def _nis(self, gap: FloatArray) -> tuple[float, float, int | None]:
         from scipy.special import chdtri
@@ -263,9 +277,12 @@ def _whole_record(observer: RecursiveObserver | DAEObserver) -> str:
 
 
 def parameter_monitor(
-    observer: RecursiveObserver | DAEObserver, kind: str, nominal: Mapping[str, float], change: float,
+    observer: RecursiveObserver | DAEObserver,
+    kind: str,
+    nominal: Mapping[str, float],
+    change: float,
     false_alarms: float,
-) -> OnlineMonitor:  # fmt: skip
+) -> OnlineMonitor:
     """Return the monitor of parameters, or of innovations, for data of any length."""
     if kind not in PARAMETER_KINDS:
         hint = _whole_record(observer) if kind == "glr" else ""
@@ -283,10 +300,15 @@ def parameter_monitor(
     if kind != "nis" and not len(theta):
         raise SpecError(f"{kind} watches parameters, and this design estimates none: use nis.", path="kind")
     if kind == "cusum" and observer.form in WALKING_FORMS:
-        raise SpecError(f"cusum needs regressors, which a {observer.form} design does not have: use chi-square or nis.",
-                        path="kind")  # fmt: skip
+        raise SpecError(
+            f"cusum needs regressors, which a {observer.form} design does not have: use chi-square or nis.", path="kind"
+        )
     rule = ParameterRule(kind, theta, np.full(len(theta), float(change)), false_alarms)
     return OnlineMonitor(
-        kind, _PARAMETER_STATEMENTS[kind] + ANY_LENGTH, rule, residuals=observer.innovation_count, fault_names=names,
+        kind,
+        _PARAMETER_STATEMENTS[kind] + ANY_LENGTH,
+        rule,
+        residuals=observer.innovation_count,
+        fault_names=names,
         fault_scales=np.ones(len(names)),
-    )  # fmt: skip
+    )

@@ -37,13 +37,15 @@ def scaled_inputs(
     if np.any(reached & ~np.isfinite(bounds)):
         raise SpecError(
             "A disturbance has no bound (a Gaussian one has none): give disturbance_bounds (--disturbance), or use "
-            "a statistical threshold.", path="disturbance_bounds",
-        )  # fmt: skip
+            "a statistical threshold.",
+            path="disturbance_bounds",
+        )
     if model.noisy and noise_bound is None:
         raise SpecError(
             "Gaussian noise has no pointwise bound: say by noise_bound (--noise-bound) how many standard deviations "
-            "yours never exceeds, or use a statistical threshold (chi-square or cusum).", path="noise_bound",
-        )  # fmt: skip
+            "yours never exceeds, or use a statistical threshold (chi-square or cusum).",
+            path="noise_bound",
+        )
     sizes = np.where(reached, bounds, 0.0)
     factor = 0.0 if noise_bound is None else noise_bound
     none = np.zeros((len(model.A), 0))
@@ -81,8 +83,7 @@ def _at_any_stamps(model: ResidualModel, between: BetweenSamples, sizes: FloatAr
 def paper_threshold(model: ResidualModel, bounds: FloatArray, initial_error: float, gamma: float | None) -> FloatArray:
     """Return (66) of Wang et al. 2015 with the norm of the power where the paper has the power of the norm."""
     if model.flow is not None:
-        raise SpecError("Eq. (66) is for discrete designs: use pointwise, or sample the plant first.",
-                        path="kind")  # fmt: skip
+        raise SpecError("Eq. (66) is for discrete designs: use pointwise, or sample the plant first.", path="kind")
     if not np.isfinite(bounds).all():
         raise SpecError("The paper's threshold needs a bound of each disturbance.", path="disturbance_bounds")
     gain = hinf_norm(model.A, model.Bd, model.C, model.Dd).upper if gamma is None else gamma
@@ -164,8 +165,9 @@ def samples_of(transition: FloatArray, window: int) -> int:
         if count > MOST_SAMPLES or count * power.size > MOST_NUMBERS or not np.isfinite(power).all():
             raise SpecError(
                 "The observer forgets too slowly at this sampling for a bound for ever: use a statistical monitor, or "
-                "obsynth.monitor for a record of known length.", path="monitor",
-            )  # fmt: skip
+                "obsynth.monitor for a record of known length.",
+                path="monitor",
+            )
     return max(count, 1) + window
 
 

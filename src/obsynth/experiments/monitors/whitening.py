@@ -26,8 +26,9 @@ def window_covariance(model: ResidualModel, window: int) -> FloatArray:
     if any(bool(hit) and not calm for hit, calm in zip(reached, model.steady, strict=True)):
         raise SpecError(
             "A disturbance that reaches the residual has a part that is not random or does not last: its covariance "
-            "is not known. Use pointwise or window.", path="disturbances",
-        )  # fmt: skip
+            "is not known. Use pointwise or window.",
+            path="disturbances",
+        )
     b, d, spread = _driving(model)
     lagged = [model.C @ spread @ model.C.T + d @ d.T]
     ahead = model.A @ spread @ model.C.T + b @ d.T
@@ -36,9 +37,7 @@ def window_covariance(model: ResidualModel, window: int) -> FloatArray:
         ahead = model.A @ ahead
     if not np.max(np.abs(lagged[0]), initial=0.0) > 0.0:
         raise SpecError("No noise reaches the residual: any threshold would be a matter of rounding.", path="noise")
-    return np.block([
-        [lagged[i - j] if i >= j else lagged[j - i].T for j in range(window)] for i in range(window)
-    ])  # fmt: skip
+    return np.block([[lagged[i - j] if i >= j else lagged[j - i].T for j in range(window)] for i in range(window)])
 
 
 def _driving(model: ResidualModel) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -139,6 +138,7 @@ def settled(model: ResidualModel, initial_error: float, window: int) -> int:
     if spectral_radius(model.A) >= 1.0 or first >= model.steps:
         raise SpecError(
             f"The start still shows in the residual, or fills the window, at the end of {model.steps} samples: a "
-            "statistical threshold needs a longer horizon.", path="horizon",
-        )  # fmt: skip
+            "statistical threshold needs a longer horizon.",
+            path="horizon",
+        )
     return first

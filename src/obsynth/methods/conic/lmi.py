@@ -47,8 +47,9 @@ def semidefinite_solvers() -> tuple[str, ...]:
 
     taken = {
         name: {cone.__name__ for cone in SOLVER_MAP_CONIC[name].SUPPORTED_CONSTRAINTS}
-        for name in cvxpy.installed_solvers() if name in SOLVER_MAP_CONIC
-    }  # fmt: skip
+        for name in cvxpy.installed_solvers()
+        if name in SOLVER_MAP_CONIC
+    }
     # Newer versions know a cone of scaled triangles besides that of matrices.
     return tuple(name for name, cones in taken.items() if cones & {"PSD", "SvecPSD"})
 

@@ -33,20 +33,28 @@ def synthesise(plant: DAEModel, asked: DaeAdaptiveObserver, *, progress: Callabl
     progress("running the observer on its own model")
     facts = dae_facts(plain_recursion(observer))
     claims = {
-        "index": float(facts.index.index), "condition": facts.condition, "contraction": facts.contraction,
+        "index": float(facts.index.index),
+        "condition": facts.condition,
+        "contraction": facts.contraction,
         "steps": float(NOMINAL_STEPS),
-    }  # fmt: skip
+    }
     return Synthesis(
-        resolved_options(observer), {"K": facts.K, "Upsilon": facts.Upsilon}, observer, Certificate({}, claims),
+        resolved_options(observer),
+        {"K": facts.K, "Upsilon": facts.Upsilon},
+        observer,
+        Certificate({}, claims),
         notes=tuple(_notes(observer, facts)),
-    )  # fmt: skip
+    )
 
 
 def _notes(observer: DAEObserver, facts: DAEFacts) -> Iterator[str]:
     if np.any(facts.projection):
         sizes = PROJECTION_NOTICE * observer.model.state_scales
-        moved = [f"{name} by {move:.4g}" for name, move, size in
-                 zip(observer.state_names, facts.projection, sizes, strict=True) if abs(move) > size]  # fmt: skip
+        moved = [
+            f"{name} by {move:.4g}"
+            for name, move, size in zip(observer.state_names, facts.projection, sizes, strict=True)
+            if abs(move) > size
+        ]
         yield f"The initial state does not meet the algebraic equations; it is moved onto them: {', '.join(moved)}."
     turn = largest_turn(observer.model, observer.dt)
     if observer.integration == "backward-euler" and turn > LARGEST_TURN:

@@ -47,8 +47,9 @@ class WithoutUnknownInputs:
         if callable(given) or np.ndim(given) != 2:  # type: ignore[arg-type]
             raise SpecError(
                 "Q changes with k, which is not known how to be combined with unknown inputs: give a constant "
-                "covariance.", path="Q",
-            )  # fmt: skip
+                "covariance.",
+                path="Q",
+            )
         matrix = as_matrix(given, "Q")
         count = self.equations.shape[1]
         if matrix.shape != (count, count):
@@ -106,11 +107,17 @@ def without_unknown_inputs(plant: DescriptorSystem) -> WithoutUnknownInputs:
         np.hstack([equations @ plant.A, through]),
         equations @ plant.B,
         np.hstack([plant.C, direct]),
-        Phi=equations @ plant.Bf, Psi=plant.Df, dt=plant.dt, state_names=(*plant.state_names, *names),
-        input_names=plant.input_names, output_names=plant.output_names, parameter_names=plant.fault_names,
-        operating_point=known.operating_point, scales=known.scales,
+        Phi=equations @ plant.Bf,
+        Psi=plant.Df,
+        dt=plant.dt,
+        state_names=(*plant.state_names, *names),
+        input_names=plant.input_names,
+        output_names=plant.output_names,
+        parameter_names=plant.fault_names,
+        operating_point=known.operating_point,
+        scales=known.scales,
         units={**known.units, **{name: plant.units[name] for name in names if name in plant.units}},
-    )  # fmt: skip
+    )
     parts = []
     if rank:
         parts.append(f"{', '.join(map(repr, names))} {'is' if rank == 1 else 'are'} estimated with the states")

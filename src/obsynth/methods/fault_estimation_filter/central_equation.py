@@ -59,10 +59,19 @@ class CentralEquation:
         weight = np.zeros((m + q, m + q))
         weight[:m, :m] = known.T @ moved[:, :m]
         return cls(
-            problem, hidden.T @ lift, np.vstack([known.T @ lift, problem.Z @ hidden]), hidden.T @ moved[:, m:], weight,
-            np.hstack([hidden.T @ moved[:, :m], np.zeros((n - m, q))]), process, np.zeros((m + q, m + q)),
-            np.zeros((n, m + q)), lift, h, last,
-        )  # fmt: skip
+            problem,
+            hidden.T @ lift,
+            np.vstack([known.T @ lift, problem.Z @ hidden]),
+            hidden.T @ moved[:, m:],
+            weight,
+            np.hstack([hidden.T @ moved[:, :m], np.zeros((n - m, q))]),
+            process,
+            np.zeros((m + q, m + q)),
+            np.zeros((n, m + q)),
+            lift,
+            h,
+            last,
+        )
 
     def filter_at(self, level: float) -> Injection | None:
         """Return the gains of the central filter at ``level``, or ``None`` when the equation gives none."""

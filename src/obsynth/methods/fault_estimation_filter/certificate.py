@@ -28,9 +28,15 @@ NEAR_ONE = 1.05
 
 
 def bounded_real_certificate(
-    plant: DescriptorSystem, observer: LinearObserver, tracking: FloatArray, gain: float, *, core: int, lag: int,
+    plant: DescriptorSystem,
+    observer: LinearObserver,
+    tracking: FloatArray,
+    gain: float,
+    *,
+    core: int,
+    lag: int,
     tries: int | None = None,
-) -> tuple[FloatArray, bool]:  # fmt: skip
+) -> tuple[FloatArray, bool]:
     """Return Q ``(core, core)``, upper triangular with P = Q'Q, at level ``gain``, and whether it proves.
 
     The Riccati solution with the largest slack that does, else the last try; at most ``tries`` coordinates are tried.

@@ -180,9 +180,16 @@ def _checked_bound(dual: _DualProblem, z1: FloatArray, corner: FloatArray, last:
 
 
 def least_gain_certificate(
-    problem: GainProblem, work: DescriptorSystem, gains: Mapping[str, FloatArray], factor: FloatArray, *, gain: float,
-    free_weight: bool, solver: str, thorough: bool,
-) -> tuple[dict[str, FloatArray], float]:  # fmt: skip
+    problem: GainProblem,
+    work: DescriptorSystem,
+    gains: Mapping[str, FloatArray],
+    factor: FloatArray,
+    *,
+    gain: float,
+    free_weight: bool,
+    solver: str,
+    thorough: bool,
+) -> tuple[dict[str, FloatArray], float]:
     """Return a proof that no such filter has a gain below ``gain``, and what it proves; else none.
 
     ``factor (n, n)`` maps errors to coordinates in which they are of natural sizes.  What is not thorough is tried
@@ -286,9 +293,14 @@ def _first_two(
 
 
 def _two_steps(
-    top: FloatArray, bottom: FloatArray, image: FloatArray, shown: FloatArray, z: FloatArray, zd: FloatArray,
+    top: FloatArray,
+    bottom: FloatArray,
+    image: FloatArray,
+    shown: FloatArray,
+    z: FloatArray,
+    zd: FloatArray,
     free_weight: bool,
-) -> tuple[FloatArray, FloatArray, FloatArray]:  # fmt: skip
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the best disturbance of one sample from rest that no gain sees, with one more where W is fixed."""
     starts, both = _first_two(top, bottom, image, shown, z, zd)
     nd, s = zd.shape[1], top.shape[0]
@@ -307,9 +319,14 @@ def _strongest(matrix: FloatArray) -> FloatArray:
 
 
 def _mixture(
-    top: FloatArray, bottom: FloatArray, image: FloatArray, z: FloatArray, zd: FloatArray, free_weight: bool,
+    top: FloatArray,
+    bottom: FloatArray,
+    image: FloatArray,
+    z: FloatArray,
+    zd: FloatArray,
+    free_weight: bool,
     best: Callable[[_DualProblem], tuple[FloatArray, FloatArray, FloatArray]],
-) -> tuple[FloatArray, FloatArray, FloatArray]:  # fmt: skip
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return a mixture of pairs of all kinds that comes from a point of the dual inequalities."""
     dual, invisible, states = _DualProblem.on(top, bottom, image, z, zd, free_weight)
     z1, corner, last = best(dual)

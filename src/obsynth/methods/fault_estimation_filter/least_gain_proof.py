@@ -121,26 +121,40 @@ class InvisiblePairs:
 
 
 def least_gain_row(
-    work: DescriptorSystem | None, gains: Mapping[str, FloatArray], matrices: Mapping[str, FloatArray], claimed: float,
-    *, free_weight: bool, thorough: bool,
-) -> Check:  # fmt: skip
+    work: DescriptorSystem | None,
+    gains: Mapping[str, FloatArray],
+    matrices: Mapping[str, FloatArray],
+    claimed: float,
+    *,
+    free_weight: bool,
+    thorough: bool,
+) -> Check:
     """Return the row on the least gain: proved from the certificate, or named as the least that was found."""
     family = "these T and N" if free_weight else "these T, N and W"
     detail = "" if thorough else "prove_least = true asks for a proof"
     if not WITNESSES & matrices.keys():
         return information(
-            "least gain", f"the least gain found of all filters with {family}; that none is below is not proved",
-            claimed, source="stated by the search", status="assumed", detail=detail,
-        )  # fmt: skip
+            "least gain",
+            f"the least gain found of all filters with {family}; that none is below is not proved",
+            claimed,
+            source="stated by the search",
+            status="assumed",
+            detail=detail,
+        )
     pairs = None if work is None else InvisiblePairs.of(work, gains)
     found = 0.0 if pairs is None else pairs.bound(matrices, free_weight=free_weight)
     holds = found * (1.0 - NORM_TOLERANCE) <= claimed and claimed * (1.0 - PROVED_SHARE) <= found
     return Check(
-        "least gain", f"no filter with {family} has a smaller gain than the claimed one, to {PROVED_SHARE:.0e} of it",
-        found, claimed, min(claimed * (1.0 + NORM_TOLERANCE) - found, found - claimed * (1.0 - PROVED_SHARE)),
-        bool(holds), "disturbances that no gain sees, exactly; sums in ball arithmetic", "proved",
+        "least gain",
+        f"no filter with {family} has a smaller gain than the claimed one, to {PROVED_SHARE:.0e} of it",
+        found,
+        claimed,
+        min(claimed * (1.0 + NORM_TOLERANCE) - found, found - claimed * (1.0 - PROVED_SHARE)),
+        bool(holds),
+        "disturbances that no gain sees, exactly; sums in ball arithmetic",
+        "proved",
         f"proved: at least {found:.9g}",
-    )  # fmt: skip
+    )
 
 
 def _definite(matrix: Any) -> bool:

@@ -296,9 +296,14 @@ def synthesise(plant: DescriptorSystem, asked: FaultEstimationFilter, *, progres
 
 
 def _found(
-    problem: GainProblem, limited: GainProblem | None, asked: FaultEstimationFilter, *, exactly: bool, noisy: bool,
+    problem: GainProblem,
+    limited: GainProblem | None,
+    asked: FaultEstimationFilter,
+    *,
+    exactly: bool,
+    noisy: bool,
     progress: Callable[[str], None],
-) -> FoundGains:  # fmt: skip
+) -> FoundGains:
     problem = replace(problem, judged_exactly=exactly)
     if limited is None:
         return found_gains(problem, asked, asked.engine, noisy=noisy, progress=progress)
@@ -318,9 +323,15 @@ class _Shipped(NamedTuple):
 
     @classmethod
     def of(
-        cls, plant: DescriptorSystem, prepared: PreparedPlant, parts: _Parts, found: FoundGains, nominal: float,
-        *, tries: int | None,
-    ) -> _Shipped:  # fmt: skip
+        cls,
+        plant: DescriptorSystem,
+        prepared: PreparedPlant,
+        parts: _Parts,
+        found: FoundGains,
+        nominal: float,
+        *,
+        tries: int | None,
+    ) -> _Shipped:
         gains = _gains(prepared, parts, found.chosen)
         observer, tracking, lag = realise_filter(plant, prepared.plant, gains, prepared.detectability)
         level = found.gamma if found.problem.disturbances else nominal

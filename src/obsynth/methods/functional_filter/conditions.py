@@ -59,10 +59,15 @@ def fault_conditions(
     asked = question(plant, [j for j in range(plant.nf) if j != fault], fault, exactly)
     rest = dc_point(plant.dt)
     seen = Condition(
-        f"{name} shows", f"{name} shows free of {_rest(plant, fault)}", asked.visible, float(asked.visible), 1.0,
-        _SOURCE, _gap(asked) if asked.visible else _hidden(plant, asked, rest),
+        f"{name} shows",
+        f"{name} shows free of {_rest(plant, fault)}",
+        asked.visible,
+        float(asked.visible),
+        1.0,
+        _SOURCE,
+        _gap(asked) if asked.visible else _hidden(plant, asked, rest),
         signals=() if asked.visible else (name,),
-    )  # fmt: skip
+    )
     if not asked.visible:
         return (_in_doubt(seen, plant, asked, rest) if _may_show(asked) else seen,)
     points = model_points(model, fault)
@@ -72,11 +77,16 @@ def fault_conditions(
     least = min(points, key=lambda point: shares[point], default=rest)
     share = f", {shares[least]:.2g} of it at least at the poles of its model" if shares else ""
     kept = Condition(
-        f"{name} follows its model", f"{name} has no zero at a pole of its model ({model.descriptions[fault]})",
-        not lost, float(len(lost)), 0.0, _SOURCE,
+        f"{name} follows its model",
+        f"{name} has no zero at a pole of its model ({model.descriptions[fault]})",
+        not lost,
+        float(len(lost)),
+        0.0,
+        _SOURCE,
         f"{_gap(asked)}{share}" if not lost else _hidden(plant, asked, lost[0]),
-        mode=lost[0] if lost else None, signals=(name,) if lost else (),
-    )  # fmt: skip
+        mode=lost[0] if lost else None,
+        signals=(name,) if lost else (),
+    )
     if doubtful and len(doubtful) == len(lost):
         return seen, _in_doubt(kept, plant, asked, doubtful[0])
     at_rounding_level = not lost and bool(shares) and shares[least] <= ROUNDING_LEVEL
@@ -107,9 +117,14 @@ def _in_doubt(condition: Condition, plant: DescriptorSystem, asked: Question, po
     named, name = _named(plant, asked), plant.fault_names[asked.number]
     share = named.last_share(point)
     doubt = unclear(
-        plant, named, tolerance=max(ROUNDING_LEVEL, share), point=point, last=True, decider=DECIDER,
+        plant,
+        named,
+        tolerance=max(ROUNDING_LEVEL, share),
+        point=point,
+        last=True,
+        decider=DECIDER,
         other=f"hides {name} at {'z' if plant.dt > 0.0 else 's'} = {_place(point)}, and no filter estimates it",
-    )  # fmt: skip
+    )
     detail = f"{share:.1g} of {name} shows at {_place(point)}: rounding of the data is as large."
     return replace(condition, detail=detail, mode=point, signals=(name,)).in_doubt(doubt, plant)
 
@@ -125,10 +140,14 @@ def _residual_conditions(plant: DescriptorSystem, seen: Sequence[int], exactly: 
         rest = dc_point(plant.dt)
         shown = Condition(
             f"{name} shows" + (f" without {', '.join(plant.fault_names[j] for j in removed)}" if removed else ""),
-            f"{name} shows free of {', '.join(blind) or 'the initial state'}", asked.visible, float(asked.visible), 1.0,
-            _SOURCE, _gap(asked) if asked.visible else _hidden(plant, asked, rest),
+            f"{name} shows free of {', '.join(blind) or 'the initial state'}",
+            asked.visible,
+            float(asked.visible),
+            1.0,
+            _SOURCE,
+            _gap(asked) if asked.visible else _hidden(plant, asked, rest),
             signals=() if asked.visible else (name,),
-        )  # fmt: skip
+        )
         found.append(_in_doubt(shown, plant, asked, rest) if not asked.visible and _may_show(asked) else shown)
     return found
 

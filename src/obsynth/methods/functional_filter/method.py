@@ -148,9 +148,12 @@ class FunctionalFilter(Method):
         from obsynth.methods.functional_filter.conditions import conditions
 
         return conditions(
-            plant, fault_model=self.fault_model, faults=self.faults, residuals=self.residuals,
+            plant,
+            fault_model=self.fault_model,
+            faults=self.faults,
+            residuals=self.residuals,
             exactly=None if exactly else False,
-        )  # fmt: skip
+        )
 
     def for_plant(self, plant: DescriptorSystem) -> Self:
         """Return the method without the faults that a plant no longer has."""

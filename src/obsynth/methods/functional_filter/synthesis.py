@@ -175,11 +175,21 @@ def assembled(
         for mine, other in ((estimate.C, residual.C), (estimate.D, residual.D), (estimate.T0, residual.T0))
     )
     observer = LinearObserver(
-        Az=a, Bu=b[:, :nu], By=b[:, nu:], Cz=cz, Du=d[:, :nu], Dy=d[:, nu:], dt=plant.dt,
-        input_names=plant.input_names, output_names=plant.output_names, state_names=(),
-        fault_names=tuple(plant.fault_names[faults[i][0]] for i in rows), residual_names=tuple(residual_names),
-        state_delays=(), fault_delays=tuple(faults[i][1] for i in rows),
-    )  # fmt: skip
+        Az=a,
+        Bu=b[:, :nu],
+        By=b[:, nu:],
+        Cz=cz,
+        Du=d[:, :nu],
+        Dy=d[:, nu:],
+        dt=plant.dt,
+        input_names=plant.input_names,
+        output_names=plant.output_names,
+        state_names=(),
+        fault_names=tuple(plant.fault_names[faults[i][0]] for i in rows),
+        residual_names=tuple(residual_names),
+        state_delays=(),
+        fault_delays=tuple(faults[i][1] for i in rows),
+    )
     return observer, _stacked([part.dynamics.T for part in parts], nx), t0
 
 
@@ -215,19 +225,26 @@ def synthesise(plant: DescriptorSystem, asked: FunctionalFilter, *, progress: Ca
     estimated = [plant.fault_names.index(name) for name in observer.fault_names]
     walks = _walks(model, models, rates)
     matrices = {
-        "T": t, "T0": t0, "Phi": model.Phi, "Cw": model.Cw, "walks": np.diag(walks),
+        "T": t,
+        "T0": t0,
+        "Phi": model.Phi,
+        "Cw": model.Cw,
+        "walks": np.diag(walks),
         "stability": lyapunov_factor(observer.Az, plant.dt),
         "tracking": tracking_map(plant, observer, t, model.Phi, model.Cw),
-    }  # fmt: skip
+    }
     matrices["deviations"] = estimate_deviations(noisy, observer, matrices)
     slowest = slowest_decay(observer.Az, plant.dt)
     claims = {"order": float(observer.order), **({"decay": slowest} if np.isfinite(slowest) else {})}
     options = _resolved(asked, plant, model, rates, estimated)
     return Synthesis(
-        options, {"T": t, "T0": t0}, observer, Certificate(matrices, claims),
+        options,
+        {"T": t, "T0": t0},
+        observer,
+        Certificate(matrices, claims),
         notes=(*notes, *_notes(plant, asked, slowest, rates)),
         plant=noisy if noisy is not plant else None,
-    )  # fmt: skip
+    )
 
 
 def _require_samples(plant: DescriptorSystem, asked: FunctionalFilter) -> None:
@@ -331,9 +348,11 @@ def _placed_filter(
 
 
 def _residual_names(
-    plant: DescriptorSystem, models: Sequence[FilterModel], parts: Sequence[FilterPart],
+    plant: DescriptorSystem,
+    models: Sequence[FilterModel],
+    parts: Sequence[FilterPart],
     asked: FunctionalFilter,
-) -> list[str]:  # fmt: skip
+) -> list[str]:
     sets = residual_sets(asked.residuals, plant)
     names = []
     for number, part in enumerate(parts):
@@ -353,9 +372,12 @@ def _walks(model: Exosystem, models: Sequence[FilterModel], rates: Sequence[Floa
 
 
 def _resolved(
-    asked: FunctionalFilter, plant: DescriptorSystem, model: Exosystem, rates: Sequence[FloatArray],
+    asked: FunctionalFilter,
+    plant: DescriptorSystem,
+    model: Exosystem,
+    rates: Sequence[FloatArray],
     estimated: Sequence[int],
-) -> dict[str, Any]:  # fmt: skip
+) -> dict[str, Any]:
     """Return the options as plain data, for the gain set."""
     found = asked.as_plain()
     found["faults"] = None if asked.residuals is not None else [plant.fault_names[i] for i in estimated]

@@ -20,20 +20,35 @@ TOLD = 1e-6
 def conditions(plant: DescriptorSystem, asked: Asked) -> tuple[Condition, ...]:
     """Return the conditions in order; the first that fails ends the list."""
     discrete = Condition(
-        "discrete time", "dt > 0", plant.dt > 0.0, plant.dt, 0.0, SOURCE,
+        "discrete time",
+        "dt > 0",
+        plant.dt > 0.0,
+        plant.dt,
+        0.0,
+        SOURCE,
         "" if plant.dt > 0.0 else "the plant is continuous: sample it (transform: sample_time, obsynth.discretise).",
-    )  # fmt: skip
+    )
     named = asked.fault is not None or plant.nf == 1
     listed = ", ".join(plant.fault_names)
     fault = Condition(
-        "fault named", "one fault is looked for", named, float(plant.nf), 1.0, SOURCE,
+        "fault named",
+        "one fault is looked for",
+        named,
+        float(plant.nf),
+        1.0,
+        SOURCE,
         "" if named else (f"name one of {listed} (fault)." if plant.nf else "the plant has no fault (Bf, Df)."),
-    )  # fmt: skip
+    )
     lacking = list(missing_bounds(plant, asked))
     stated = Condition(
-        "bounds stated", "disturbances and noise have bounds", not lacking, float(len(lacking)), 0.0, SOURCE,
+        "bounds stated",
+        "disturbances and noise have bounds",
+        not lacking,
+        float(len(lacking)),
+        0.0,
+        SOURCE,
         " ".join(lacking),
-    )  # fmt: skip
+    )
     first = (discrete, fault, stated)
     if not all(condition.holds for condition in first):
         return first
@@ -92,9 +107,15 @@ SEEN = 1e-6
 def _condition(problem: Problem, window: Window, holds: bool, detail: str) -> Condition:
     fault = problem.plant.fault_names[problem.question.fault]
     return Condition(
-        "fault told", f"{fault} changes samples as nothing free does", holds, float(holds), 1.0, SOURCE, detail,
+        "fault told",
+        f"{fault} changes samples as nothing free does",
+        holds,
+        float(holds),
+        1.0,
+        SOURCE,
+        detail,
         signals=() if holds else (fault,),
-    )  # fmt: skip
+    )
 
 
 def _why(problem: Problem, asked: Asked, window: Window) -> str:

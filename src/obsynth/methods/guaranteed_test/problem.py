@@ -81,9 +81,19 @@ def problem_of(plant: DescriptorSystem, asked: Asked) -> Problem:
     if asked.disturbance == "rate":
         rates = _by_name(asked.disturbance_rate, plant.disturbance_names, "disturbance_rate", every=True)
     question = Question(
-        fault, asked.course, before + 1, asked.lag or 0, before, free, asked.free_course, asked.disturbance, rates,
-        float(asked.fault_rate or 0.0), asked.norm == "ellipsoid", closing,
-    )  # fmt: skip
+        fault,
+        asked.course,
+        before + 1,
+        asked.lag or 0,
+        before,
+        free,
+        asked.free_course,
+        asked.disturbance,
+        rates,
+        float(asked.fault_rate or 0.0),
+        asked.norm == "ellipsoid",
+        closing,
+    )
     return Problem(plant, bounds_of(plant, asked), question, before)
 
 
@@ -202,11 +212,21 @@ def observer_of(window: Window, on_y: FloatArray, on_u: FloatArray, delay: int) 
     first = np.zeros((1, count))
     first[0, :1] = 1.0
     return LinearObserver(
-        Az=np.eye(count, k=1), Bu=on_u[1:], By=on_y[1:], Cz=first, Du=on_u[:1], Dy=on_y[:1], dt=plant.dt,
-        input_names=plant.input_names, output_names=plant.output_names, state_names=(),
-        fault_names=name if estimated else (), residual_names=() if estimated else name, state_delays=(),
+        Az=np.eye(count, k=1),
+        Bu=on_u[1:],
+        By=on_y[1:],
+        Cz=first,
+        Du=on_u[:1],
+        Dy=on_y[:1],
+        dt=plant.dt,
+        input_names=plant.input_names,
+        output_names=plant.output_names,
+        state_names=(),
+        fault_names=name if estimated else (),
+        residual_names=() if estimated else name,
+        state_delays=(),
         fault_delays=late,
-    )  # fmt: skip
+    )
 
 
 def rounding_of(window: Window, multipliers: FloatArray, radius: FloatArray) -> FloatArray:

@@ -44,9 +44,7 @@ ZERO = 1e-9
 TRADE_OFF = "trade_off"
 
 
-def synthesise(
-    plant: DescriptorSystem, asked: Asked, *, progress: Callable[[str], None]
-) -> Synthesis:  # fmt: skip
+def synthesise(plant: DescriptorSystem, asked: Asked, *, progress: Callable[[str], None]) -> Synthesis:
     """Return weights, observer and certificate."""
     problem = problem_of(plant, asked)
     require_all(conditions(plant, asked))
@@ -108,37 +106,40 @@ def with_room(found: Repaired) -> Repaired:
     return Repaired(found.values, RADIUS_ROOM * found.radius)
 
 
-def _synthesis(
-    problem: Problem, asked: Asked, window: Window, shipped: Shipped, table: FloatArray
-) -> Synthesis:  # fmt: skip
+def _synthesis(problem: Problem, asked: Asked, window: Window, shipped: Shipped, table: FloatArray) -> Synthesis:
     on_y, on_u, delay = window.weights(shipped.test.values)
     observer = observer_of(window, on_y, on_u, delay)
     question, plant = window.question, problem.plant
     matrices = {
-        "multipliers": shipped.test.values, "multiplier_radius": shipped.test.radius,
-        "rounding": rounding_of(window, shipped.test.values, shipped.test.radius), TRADE_OFF: table,
-    }  # fmt: skip
+        "multipliers": shipped.test.values,
+        "multiplier_radius": shipped.test.radius,
+        "rounding": rounding_of(window, shipped.test.values, shipped.test.radius),
+        TRADE_OFF: table,
+    }
     claims = {
-        "threshold": shipped.threshold, "surely_found": 2.0 * shipped.threshold,
+        "threshold": shipped.threshold,
+        "surely_found": 2.0 * shipped.threshold,
         "delay": delay_in_samples(window, delay) * plant.dt,
-    }  # fmt: skip
+    }
     if shipped.witness is not None:
         matrices |= {"witness": shipped.witness.values, "witness_radius": shipped.witness.radius}
     if np.isfinite(shipped.least):
         claims["least"] = shipped.least
     options: dict[str, Any] = {option.name: getattr(asked, option.name) for option in fields(asked)} | {
-        "samples": question.samples, "lag": question.lag if question.course in ("any", "ramp", "rate") else None,
+        "samples": question.samples,
+        "lag": question.lag if question.course in ("any", "ramp", "rate") else None,
         "fault": plant.fault_names[question.fault],
-    }  # fmt: skip
+    }
     return Synthesis(
-        options, {"h": on_y, "g": on_u}, observer, Certificate(matrices, claims),
+        options,
+        {"h": on_y, "g": on_u},
+        observer,
+        Certificate(matrices, claims),
         notes=tuple(_notes(problem, asked, window, shipped, table)),
-    )  # fmt: skip
+    )
 
 
-def _notes(
-    problem: Problem, asked: Asked, window: Window, shipped: Shipped, table: FloatArray
-) -> list[str]:  # fmt: skip
+def _notes(problem: Problem, asked: Asked, window: Window, shipped: Shipped, table: FloatArray) -> list[str]:
     question = window.question
     words = []
     if shipped.threshold == 0.0:

@@ -62,31 +62,53 @@ def _all_conditions(plant: DescriptorSystem) -> Iterator[Condition]:
     """Yield the conditions; each may rely on those before it."""
     plant = plant.dense()
     yield _condition(
-        "continuous time", "a continuous-time plant (dt = 0)", not plant.is_discrete, plant.dt, 0.0, _SOURCE,
+        "continuous time",
+        "a continuous-time plant (dt = 0)",
+        not plant.is_discrete,
+        plant.dt,
+        0.0,
+        _SOURCE,
         f"a plant sampled every {plant.dt:g} s. Give the continuous one (no sample_time in its transform): the "
         "observer is sampled afterwards, by obsynth.sample_observer.",
-    )  # fmt: skip
+    )
     yield _condition(
-        "faults", "at least one fault", plant.nf > 0, float(plant.nf), 1.0, _SOURCE,
+        "faults",
+        "at least one fault",
+        plant.nf > 0,
+        float(plant.nf),
+        1.0,
+        _SOURCE,
         "none. Name the fault to estimate in Bf or Df.",
-    )  # fmt: skip
+    )
     normal_rank, index, dynamic = _form(plant)
     yield _condition(
-        "regularity", "a regular pencil (det(A - sE) not identically zero)", normal_rank == plant.nx,
-        float(normal_rank), float(plant.nx), "definition of a descriptor plant",
+        "regularity",
+        "a regular pencil (det(A - sE) not identically zero)",
+        normal_rank == plant.nx,
+        float(normal_rank),
+        float(plant.nx),
+        "definition of a descriptor plant",
         f"normal rank {normal_rank} of {plant.nx}: the equations do not determine the states. Add what is missing.",
-    )  # fmt: skip
+    )
     yield _condition(
-        "index", "index 0 or 1: the algebraic states can be eliminated", index <= 1, float(index), 1.0,
+        "index",
+        "index 0 or 1: the algebraic states can be eliminated",
+        index <= 1,
+        float(index),
+        1.0,
         "ours: elimination of algebraic states",
         f"index {index}: the algebraic equations cannot be solved for the algebraic states without differentiating. "
         "Differentiate the constraints first.",
-    )  # fmt: skip
+    )
     yield _condition(
-        "dynamic states", "at least one dynamic state", dynamic > 0, float(dynamic), 1.0,
+        "dynamic states",
+        "at least one dynamic state",
+        dynamic > 0,
+        float(dynamic),
+        1.0,
         "ours: elimination of algebraic states",
         "none: every state is algebraic. Solve the equations directly.",
-    )  # fmt: skip
+    )
     form = explicit_form(plant)
     yield from _explicit_conditions(plant if form is None else form.plant)
 
@@ -105,11 +127,15 @@ def _form(plant: DescriptorSystem) -> tuple[int, int, int]:
 def _explicit_conditions(plant: DescriptorSystem) -> Iterator[Condition]:
     numbers = numbers_of(plant)
     yield _condition(
-        "nf <= ny", "no more faults than outputs (nf <= ny)", plant.nf <= plant.ny, float(plant.nf), float(plant.ny),
+        "nf <= ny",
+        "no more faults than outputs (nf <= ny)",
+        plant.nf <= plant.ny,
+        float(plant.nf),
+        float(plant.ny),
         "Filasova et al., eq. (3)",
         f"{plant.nf} faults and {plant.ny} output(s). Measure more, or leave a fault out.",
         signals=plant.fault_names,
-    )  # fmt: skip
+    )
 
     def alike(columns: FloatArray) -> tuple[str, tuple[str, ...]]:
         told = "some faults act nowhere, or in the same direction as others, and cannot be told apart."
@@ -130,9 +156,12 @@ def _explicit_conditions(plant: DescriptorSystem) -> Iterator[Condition]:
 
 
 def _full_rank(
-    plant: DescriptorSystem, numbers: PlantNumbers | None, name: str, layout: list[list[str]],
+    plant: DescriptorSystem,
+    numbers: PlantNumbers | None,
+    name: str,
+    layout: list[list[str]],
     failure: Callable[[FloatArray], tuple[str, tuple[str, ...]]],
-) -> Condition:  # fmt: skip
+) -> Condition:
     """Return the condition that blocks of the plant make up a matrix of full column rank, decided in its own units."""
     units, terms = PlantUnits.of(plant).rounded(), sized_plant(plant)
 
@@ -151,9 +180,16 @@ def _full_rank(
 
 
 def _condition(
-    name: str, claim: str, holds: bool, value: float, bound: float, source: str, failure: str,
-    *, signals: tuple[str, ...] = (),
-) -> Condition:  # fmt: skip
+    name: str,
+    claim: str,
+    holds: bool,
+    value: float,
+    bound: float,
+    source: str,
+    failure: str,
+    *,
+    signals: tuple[str, ...] = (),
+) -> Condition:
     return Condition(
         name, claim, holds, value, bound, source, "" if holds else failure, signals=() if holds else signals
     )
@@ -177,10 +213,15 @@ def _detectability(plant: DescriptorSystem, numbers: PlantNumbers) -> Condition:
         return hidden or ([] if verdict.distance is None else [verdict.distance.point])
 
     return verdict_condition(
-        verdict, _detectable(verdict.facts.zeros), plant, what="An observer", seen=seen,
-        lost=lambda zeros: _hidden_mode(plant, zeros), gain=lambda mode: needed_gain(plant, units, mode),
+        verdict,
+        _detectable(verdict.facts.zeros),
+        plant,
+        what="An observer",
+        seen=seen,
+        lost=lambda zeros: _hidden_mode(plant, zeros),
+        gain=lambda mode: needed_gain(plant, units, mode),
         doubt=lambda: zero_doubt(plant, units, verdict, [["A"], ["C"]], what="observer"),
-    )  # fmt: skip
+    )
 
 
 def _detectability_in_floating_point(plant: DescriptorSystem) -> Condition:

@@ -178,9 +178,14 @@ def _solved(
 
 
 def _task(
-    plant: DescriptorSystem, asked: PdObserver, delta: float, decay: float, states: FloatArray, outputs: FloatArray,
+    plant: DescriptorSystem,
+    asked: PdObserver,
+    delta: float,
+    decay: float,
+    states: FloatArray,
+    outputs: FloatArray,
     unit: float,
-) -> PdTask:  # fmt: skip
+) -> PdTask:
     nx, nf = plant.nx, plant.nf
     g = _inner_gain(plant, asked)
     ends = asked.range_numbers
@@ -191,13 +196,18 @@ def _task(
     shown[:, nx:], rate[nx:] = np.eye(nf) if g is None else g, np.eye(nf) if g is None else np.linalg.inv(g)
     padded = np.vstack([noisy.Bw, np.zeros((nf, noisy.nw))])
     return PdTask(
-        plants=tuple(
-            (unit * p.A * states / states[:, None], p.C * states / outputs[:, None]) for p in plants
-        ),
-        theorem=asked.theorem, delta=delta / unit, decay=decay * unit,
+        plants=tuple((unit * p.A * states / states[:, None], p.C * states / outputs[:, None]) for p in plants),
+        theorem=asked.theorem,
+        delta=delta / unit,
+        decay=decay * unit,
         disk=None if asked.disk_numbers is None else (asked.disk_numbers[0] * unit, asked.disk_numbers[1] * unit),
-        gain_bound=asked.gain_bound, gain_unit=1.0 / unit, rate_gain=asked.fault_rate_gain,
-        noise_gain=asked.noise_gain, rate=unit * rate / states[:, None], shown=shown * states,
-        process=unit * padded / states[:, None], sensor=noisy.Dw / outputs[:, None],
+        gain_bound=asked.gain_bound,
+        gain_unit=1.0 / unit,
+        rate_gain=asked.fault_rate_gain,
+        noise_gain=asked.noise_gain,
+        rate=unit * rate / states[:, None],
+        shown=shown * states,
+        process=unit * padded / states[:, None],
+        sensor=noisy.Dw / outputs[:, None],
         sensor_rate=unit * noisy.Dw / outputs[:, None],
-    )  # fmt: skip
+    )

@@ -132,8 +132,13 @@ def _certified_range(plant: DescriptorSystem, gains: PdGains, ends: tuple[float,
     p3 = back.T @ gains.P3 @ back
     p3 = symmetric(p3) if gains.theorem == 2 else p3
     moved = replace(
-        gains, J=gain_j, L=gain_l, P1=symmetric(back.T @ middle @ back), P3=p3, ends=p1,
+        gains,
+        J=gain_j,
+        L=gain_l,
+        P1=symmetric(back.T @ middle @ back),
+        P3=p3,
+        ends=p1,
         observer=realise_pd_observer(plant, with_faults_as_states(plant), gain_j, gain_l),
-    )  # fmt: skip
+    )
     moved = _judged(moved)
     return replace(moved, proved=proved and moved.proved)

@@ -134,12 +134,14 @@ def _further(task: PdTask, found: _Variables) -> list[Any]:
 def _bounded(task: PdTask, found: _Variables, proportional: Any, bound: float) -> Any:
     n, ny = task.shown.shape[1], task.sensor.shape[0]
     return lmi.at_least(
-        lmi.symmetric_blocks([
-            [found.P3 + found.P3.T - np.eye(n)],
-            [task.gain_unit * proportional.T / bound, np.eye(ny)],
-            [found.Z.T / bound, np.zeros((ny, ny)), np.eye(ny)],
-        ])
-    )  # fmt: skip
+        lmi.symmetric_blocks(
+            [
+                [found.P3 + found.P3.T - np.eye(n)],
+                [task.gain_unit * proportional.T / bound, np.eye(ny)],
+                [found.Z.T / bound, np.zeros((ny, ny)), np.eye(ny)],
+            ]
+        )
+    )
 
 
 def _gain(task: PdTask, found: _Variables, moving: Any, c: FloatArray, row: Any, level: float) -> list[Any]:

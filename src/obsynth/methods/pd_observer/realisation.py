@@ -60,10 +60,21 @@ def with_faults_as_states(plant: DescriptorSystem, gain: FloatArray | None = Non
     b, bd, bw = (np.vstack([part, np.zeros((nf, part.shape[1]))]) for part in (plant.B, plant.Bd, plant.Bw))
     states = [*(f"state:{name}" for name in plant.state_names), *(f"fault:{name}" for name in plant.fault_names)]
     return DescriptorSystem(
-        None, a, b, np.hstack([plant.C, plant.Df @ g]), Bf=np.eye(nx + nf)[:, nx:], Bd=bd, Bw=bw, D=plant.D,
-        Dd=plant.Dd, Dw=plant.Dw, state_names=states, input_names=plant.input_names, output_names=plant.output_names,
+        None,
+        a,
+        b,
+        np.hstack([plant.C, plant.Df @ g]),
+        Bf=np.eye(nx + nf)[:, nx:],
+        Bd=bd,
+        Bw=bw,
+        D=plant.D,
+        Dd=plant.Dd,
+        Dw=plant.Dw,
+        state_names=states,
+        input_names=plant.input_names,
+        output_names=plant.output_names,
         fault_names=[f"rate:{name}" for name in plant.fault_names],
-    )  # fmt: skip
+    )
 
 
 def with_sensor_noise(plant: DescriptorSystem) -> DescriptorSystem:
@@ -95,12 +106,15 @@ class PdErrorSystem:
         errors = ErrorModel(augmented, observer, np.eye(n))
         gain_l = solved(observer.Cz[rows], direct)
         return cls(
-            observer.Az, observer.Cz[rows],
+            observer.Az,
+            observer.Cz[rows],
             (errors.fault, -direct @ augmented.Df),
             (errors.disturbance, -direct @ augmented.Dd),
             (errors.noise, -direct @ augmented.Dw),
-            observer.By - observer.Az @ gain_l, gain_l, nx,
-        )  # fmt: skip
+            observer.By - observer.Az @ gain_l,
+            gain_l,
+            nx,
+        )
 
     def fault_norm(self, driven: tuple[FloatArray, FloatArray]) -> ContinuousHinfNorm:
         """Return the H-infinity norm to the fault error from one of ``rate``, ``disturbance``, ``noise``."""

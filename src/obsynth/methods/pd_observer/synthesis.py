@@ -123,8 +123,10 @@ def listed_gains(plant: DescriptorSystem, J: FloatArray, L: FloatArray, g: Float
 def _certificate(asked: PdObserver, gains: PdGains) -> Certificate:
     claims = {"theorem": float(gains.theorem), "delta": gains.delta, "decay": gains.decay}
     bounds: dict[str, float | None] = {
-        "gain_bound": asked.gain_bound, "fault_rate_gain": asked.fault_rate_gain, "noise_gain": asked.noise_gain,
-    }  # fmt: skip
+        "gain_bound": asked.gain_bound,
+        "fault_rate_gain": asked.fault_rate_gain,
+        "noise_gain": asked.noise_gain,
+    }
     claims |= {name: float(bound) for name, bound in bounds.items() if bound is not None}
     matrices = {"P1": gains.P1, "P3": gains.P3, **gains.gain_certificates}
     if asked.disk_numbers is not None:

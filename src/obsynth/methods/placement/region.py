@@ -52,9 +52,10 @@ class Region:
                 problems.append("radius and damping are for continuous time: give decay alone.")
         if problems or not data:
             raise SpecError(
-                "Option region of ui-pi-observer:", path="method.options.region",
+                "Option region of ui-pi-observer:",
+                path="method.options.region",
                 problems=problems or ["give at least one of decay, radius, damping."],
-            )  # fmt: skip
+            )
         return cls(**data)
 
     def in_time(self, unit: float) -> Region:
@@ -102,11 +103,13 @@ def region_gain(problem: KalmanProblem, region: Region, *, solver: str) -> tuple
             continue
         if region.holds(eigenvalues(problem.F - gain @ problem.C), dt):
             return gain, record
-        failures.append(SolverError(
-            f"{solver} ended with poles outside the region: the result is inconclusive. Widen the region, or "
-            "use decay= instead.",
-            record=record,
-        ))  # fmt: skip
+        failures.append(
+            SolverError(
+                f"{solver} ended with poles outside the region: the result is inconclusive. Widen the region, or "
+                "use decay= instead.",
+                record=record,
+            )
+        )
     raise failures[ways.index(_by_inequality)]
 
 
@@ -130,9 +133,13 @@ def _partly(problem: KalmanProblem, region: Region, *, solver: str) -> tuple[Flo
     apart = np.vstack([solve_sylvester(first, -second, -mixed), np.eye(len(second))])
     moved, rows = turn @ apart, turn[:, good:].T
     rest = replace(
-        problem, F=second, C=problem.C @ moved, B=rows @ (problem.B - gain @ problem.D), drive=rows @ problem.drive,
+        problem,
+        F=second,
+        C=problem.C @ moved,
+        B=rows @ (problem.B - gain @ problem.D),
+        drive=rows @ problem.drive,
         estimates=problem.estimates @ moved,
-    )  # fmt: skip
+    )
     more, record = _by_inequality(rest, region, solver=solver)
     return np.asarray(gain + moved @ more), record
 
@@ -153,8 +160,9 @@ def _by_inequality(problem: KalmanProblem, region: Region, *, solver: str) -> tu
     moved = p @ f - y @ c
     noise = p @ entering - y @ direct
     constraints = [
-        lmi.at_least(p, LEAST_LYAPUNOV), lmi.at_least(lmi.symmetric_blocks([[z], [noise, p]])),
-    ]  # fmt: skip
+        lmi.at_least(p, LEAST_LYAPUNOV),
+        lmi.at_least(lmi.symmetric_blocks([[z], [noise, p]])),
+    ]
     if dt > 0.0:
         radius = float(np.exp(-region.decay * dt)) * (1.0 - INNER_SHARE * min(1.0, region.decay * dt))
         constraints += [

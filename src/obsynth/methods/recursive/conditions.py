@@ -73,10 +73,16 @@ class ConstantPlant:
             plant = given.dense()
         else:
             plant = DescriptorSystem(
-                varying.E.at(1), varying.A.at(0), C=varying.C.at(1), Bf=varying.Phi.at(0), Df=varying.Psi.at(0),
-                dt=varying.dt, state_names=varying.state_names, output_names=varying.output_names,
+                varying.E.at(1),
+                varying.A.at(0),
+                C=varying.C.at(1),
+                Bf=varying.Phi.at(0),
+                Df=varying.Psi.at(0),
+                dt=varying.dt,
+                state_names=varying.state_names,
+                output_names=varying.output_names,
                 fault_names=varying.parameter_names,
-            )  # fmt: skip
+            )
         numbers = numbers_of(plant)
         return None if numbers is None else cls(plant, numbers)
 
@@ -129,9 +135,13 @@ class ConstantPlant:
         """Return why the second rank is unclear."""
         named = named_pencil(self.plant, self.units, [["A", "Bf"], ["C", "Df"]])
         found = unclear(
-            self.plant, named, tolerance=ROUNDING_LEVEL, point=1 + 0j, other=f"has rank {decision.expected - 1}",
+            self.plant,
+            named,
+            tolerance=ROUNDING_LEVEL,
+            point=1 + 0j,
+            other=f"has rank {decision.expected - 1}",
             decider=DECIDER,
-        )  # fmt: skip
+        )
         return replace(found, parameters=True)
 
     def mode_doubt(self) -> Unclear:
@@ -279,8 +289,15 @@ def recursive_conditions(
     try:
         varying = as_time_varying(plant)
     except SpecError as error:
-        yield Condition("plant of this kind", "discrete time, no feedthrough, no unknown disturbance", False, 0.0, 1.0,
-                        f"{_SOURCE}, eq. (4)", str(error))  # fmt: skip
+        yield Condition(
+            "plant of this kind",
+            "discrete time, no feedthrough, no unknown disturbance",
+            False,
+            0.0,
+            1.0,
+            f"{_SOURCE}, eq. (4)",
+            str(error),
+        )
         return
     ranks = horizon_ranks(varying, early=early)
     constant = ConstantPlant.of(plant, varying)
@@ -295,8 +312,15 @@ def recursive_conditions(
             return
     if not parameters:
         return
-    yield Condition("parameters", "the plant has parameters (Phi or Psi)", varying.nq > 0, float(varying.nq), 1.0,
-                    f"{_SOURCE}, eq. (4)", f"{varying.nq} parameter(s)")  # fmt: skip
+    yield Condition(
+        "parameters",
+        "the plant has parameters (Phi or Psi)",
+        varying.nq > 0,
+        float(varying.nq),
+        1.0,
+        f"{_SOURCE}, eq. (4)",
+        f"{varying.nq} parameter(s)",
+    )
     if not varying.nq:
         return
     yield identifiability_condition(varying, early=early, constant=constant)
@@ -328,8 +352,10 @@ def _rank_of_steps(
         if algebraic and horizon_ranks(plant, early=True).worst.full:
             remedies.append("use the algebraic equations one step earlier (early_constraints: true)")
         if algebraic:
-            remedies.append("eliminate the algebraic states (transform: {eliminate_algebraic_states: true} in "
-                            "continuous time, before sampling)")  # fmt: skip
+            remedies.append(
+                "eliminate the algebraic states (transform: {eliminate_algebraic_states: true} in "
+                "continuous time, before sampling)"
+            )
     remedies.append("leave out states that nothing depends on")
     at = "" if ranks.steps == 1 else f"at k = {ranks.worst_k} "
     detail = f"{worst.describe()}: {at}equations and outputs do not determine {_listed(names)}. {_sentence(remedies)}"
@@ -362,11 +388,15 @@ def _decided_detectability(constant: ConstantPlant) -> Condition:
         "detectability", _detectable(plant), True, 0.0, 0.0, _DETECTABLE, _dying(len(verdict.facts.zeros))
     )
     return verdict_condition(
-        verdict, holding, plant, what="A filter", doubt=constant.mode_doubt,
+        verdict,
+        holding,
+        plant,
+        what="A filter",
+        doubt=constant.mode_doubt,
         lost=lambda zeros: _hidden_modes(plant, tall_e, tall_a, zeros or [1 + 0j]),
         gain=lambda mode: needed_gain(plant, constant.units, mode),
         seen=lambda: [1 + 0j if verdict.distance is None else verdict.distance.point],
-    )  # fmt: skip
+    )
 
 
 def _detectable(plant: TimeVaryingDescriptorSystem | DescriptorSystem) -> str:
@@ -401,12 +431,20 @@ def _hidden_modes(
 def residual_condition(ranks: HorizonRanks) -> Condition:
     """Return the condition that (18) can learn at all, which the paper never states."""
     return Condition(
-        "residual directions", "rank E_k + ny - nx >= 1 for every k", ranks.directions >= 1, float(ranks.directions),
-        1.0, "our finding: missing in Moussa Ali, Zhang 2013",
+        "residual directions",
+        "rank E_k + ny - nx >= 1 for every k",
+        ranks.directions >= 1,
+        float(ranks.directions),
+        1.0,
+        "our finding: missing in Moussa Ali, Zhang 2013",
         f"at k = {ranks.directions_k} (18) sees only rank E + ny - nx = {ranks.directions} residual directions"
-        + ("" if ranks.directions >= 1 else ": y - C xhat is zero whatever the parameters are, so it never learns. Use "
-           "form 'innovation', which sees all the parity directions."),
-    )  # fmt: skip
+        + (
+            ""
+            if ranks.directions >= 1
+            else ": y - C xhat is zero whatever the parameters are, so it never learns. Use "
+            "form 'innovation', which sees all the parity directions."
+        ),
+    )
 
 
 def _open_states(

@@ -133,15 +133,25 @@ def reached_condition(plant: TimeVaryingDescriptorSystem, Q_root: FloatArray, R_
         complex(z) for z, out in zip(zeros.values, outside, strict=True) if out and abs(z) <= 1.0 + BOUNDARY_TOLERANCE
     ]
     listed = ", ".join(described_mode(z) for z in on_circle if z.imag >= 0.0)
-    detail = "no mode lies on the unit circle unreached" if not on_circle else (
-        f"at z = {listed} the noise does not act: what is known there grows without end, so that the gains tend to "
-        "zero like 1 / k and later changes are not followed. Give the equations that move this mode a variance in Q."
-    )  # fmt: skip
+    detail = (
+        "no mode lies on the unit circle unreached"
+        if not on_circle
+        else (
+            f"at z = {listed} the noise does not act: what is known there grows without end, so that the gains tend "
+            "to zero like 1 / k and later changes are not followed. Give the equations that move this "
+            "mode a variance in Q."
+        )
+    )
     return Condition(
-        "noise on the unit circle", "[A - zE, Q^(1/2), 0; -zC, 0, R^(1/2)] has its full rank for all |z| = 1",
-        not on_circle, float(len(on_circle)), 0.0, "Nikoukhah, Willsky, Levy 1992", detail,
+        "noise on the unit circle",
+        "[A - zE, Q^(1/2), 0; -zC, 0, R^(1/2)] has its full rank for all |z| = 1",
+        not on_circle,
+        float(len(on_circle)),
+        0.0,
+        "Nikoukhah, Willsky, Levy 1992",
+        detail,
         on_circle[0] if on_circle else None,
-    )  # fmt: skip
+    )
 
 
 def _is_fixed(P: FloatArray, following: FloatArray) -> bool:
@@ -178,8 +188,10 @@ def _from_recursion(E: FloatArray, A: FloatArray, C: FloatArray, noise: FloatArr
         P = following
         gain, following = _step(E, A, C, noise, _root(P))
     else:
-        raise SolverError(f"The gains of the filter are not stable after {MOST_STEPS} steps: its convergence is too "
-                          "slow for a steady state. Run the filter instead.")  # fmt: skip
+        raise SolverError(
+            f"The gains of the filter are not stable after {MOST_STEPS} steps: its convergence is too "
+            "slow for a steady state. Run the filter instead."
+        )
     for _ in range(MOST_NEWTON_STEPS):
         driven = gain @ noise
         last, P = P, solve_discrete_lyapunov(gain[:, :ne] @ A, driven @ driven.T)

@@ -38,8 +38,9 @@ def with_stated_noise(
     if np.any(plant.Bw @ plant.Dw.T):
         raise SpecError(
             "The plant's noise drives equations and outputs at once (Bw Dw' is not zero), which these methods do not "
-            "know: state independent noises, or give Q and R.", path="Dw",
-        )  # fmt: skip
+            "know: state independent noises, or give Q and R.",
+            path="Dw",
+        )
     for name, matrix in (("Q", plant.Bw), ("R", plant.Dw)):
         if resolved[name] is None:
             resolved[name] = matrix @ matrix.T
@@ -80,15 +81,18 @@ def _require_contraction(observer: RecursiveObserver, facts: GainScheduleSummary
         return
     names = leading_names(facts.survivors, observer.state_names)
     kept = (
-        f"keeps the mean factor {facts.contraction:.6g} per step" if facts.contraction < float("inf")
+        f"keeps the mean factor {facts.contraction:.6g} per step"
+        if facts.contraction < float("inf")
         else "grows without bound"
-    )  # fmt: skip
+    )
     raise PreconditionError(
         f"Errors do not die out: over {facts.steps} steps the product of L_k A_k {kept}, in "
         f"{', '.join(map(repr, names))}. Either the outputs do not show these "
         "states: measure more, or leave them out; or Q and initial_covariance claim that they are known exactly: give "
-        "them a variance.", condition="contraction", signals=names,
-    )  # fmt: skip
+        "them a variance.",
+        condition="contraction",
+        signals=names,
+    )
 
 
 def _notes(
@@ -120,9 +124,12 @@ def _notes(
         yield (
             f"The parameters are hardly excited in the window that ends at k = {facts.excitation_k} (information "
             f"{facts.excitation:.3g}, the prior has {prior:.3g}): what is reported there is what was known before"
-            + ("." if adaptation.form == "random-walk" or adaptation.guard != "none" else
-               ", and without a guard S winds up.")
-        )  # fmt: skip
+            + (
+                "."
+                if adaptation.form == "random-walk" or adaptation.guard != "none"
+                else ", and without a guard S winds up."
+            )
+        )
     if adaptation.form == "literal" and ranks.directions < observer.plant.ny:
         yield (
             f"The literal form (18) sees {ranks.directions} residual direction(s) of {observer.plant.ny} output(s); "

@@ -215,10 +215,21 @@ def realise(
         plant.output_names if np.array_equal(seen, np.eye(plant.ny)) else tuple(f"r{i + 1}" for i in range(len(seen)))
     )
     observer = LinearObserver(
-        Az=a_hat, Bu=j_hat - b_hat @ plant.D, By=b_hat, Cz=rows, Du=-direct @ plant.D, Dy=direct, dt=plant.dt,
-        input_names=plant.input_names, output_names=plant.output_names, state_names=plant.state_names,
-        fault_names=plant.fault_names, residual_names=names, state_delays=(0,) * nx, fault_delays=(0,) * plant.nf,
-    )  # fmt: skip
+        Az=a_hat,
+        Bu=j_hat - b_hat @ plant.D,
+        By=b_hat,
+        Cz=rows,
+        Du=-direct @ plant.D,
+        Dy=direct,
+        dt=plant.dt,
+        input_names=plant.input_names,
+        output_names=plant.output_names,
+        state_names=plant.state_names,
+        fault_names=plant.fault_names,
+        residual_names=names,
+        state_delays=(0,) * nx,
+        fault_delays=(0,) * plant.nf,
+    )
     letters = {"U_a": gains.U, "D_a": gains.D, "K_a": gains.K, "Ahat": a_hat, "Bhat": b_hat, "Jhat": j_hat}
     return observer, letters
 

@@ -119,18 +119,22 @@ class _ModelPencil:
         """Return the matrix; ``sizes`` of the terms that the entries of the plant are sums of."""
         inputs, direct = independent_disturbances(plant)
         courses = model.Cw @ kernel(model.Phi - value * np.eye(model.order))
-        matrix = np.block([
-            [value * plant.E - plant.A, -plant.Bf @ courses, -inputs],
-            [plant.C.astype(complex), plant.Df @ courses, direct],
-        ])  # fmt: skip
+        matrix = np.block(
+            [
+                [value * plant.E - plant.A, -plant.Bf @ courses, -inputs],
+                [plant.C.astype(complex), plant.Df @ courses, direct],
+            ]
+        )
         if sizes is None:
             return cls(*equilibrated(matrix), courses, inputs, direct)
         # Disturbances that are combinations of others are judged as those: their own terms are not known.
         own = inputs.shape == plant.Bd.shape
-        whole = np.block([
-            [abs(value) * sizes.E + sizes.A, sizes.Bf @ np.abs(courses), sizes.Bd if own else np.abs(inputs)],
-            [sizes.C, sizes.Df @ np.abs(courses), sizes.Dd if own else np.abs(direct)],
-        ])  # fmt: skip
+        whole = np.block(
+            [
+                [abs(value) * sizes.E + sizes.A, sizes.Bf @ np.abs(courses), sizes.Bd if own else np.abs(inputs)],
+                [sizes.C, sizes.Df @ np.abs(courses), sizes.Dd if own else np.abs(direct)],
+            ]
+        )
         return cls(*equilibrated(matrix), courses, inputs, direct, least_share(matrix, whole))
 
     def decision(self, lost: int | None) -> RankDecision:
@@ -140,9 +144,13 @@ class _ModelPencil:
 
 
 def _model_condition(
-    plant: DescriptorSystem, model: Exosystem, value: complex, units: PlantUnits, lost: int | None,
+    plant: DescriptorSystem,
+    model: Exosystem,
+    value: complex,
+    units: PlantUnits,
+    lost: int | None,
     sizes: DescriptorSystem | None,
-) -> tuple[Condition, RankDecision]:  # fmt: skip
+) -> tuple[Condition, RankDecision]:
     pencil = _ModelPencil.of(plant, model, value, sizes)
     decision = pencil.decision(lost)
     scaled, columns, courses = pencil.scaled, pencil.columns, pencil.courses
@@ -178,9 +186,17 @@ def _model_condition(
 
 
 def _model_doubt(
-    plant: DescriptorSystem, model: Exosystem, units: PlantUnits, value: complex, *, other: str,
-    decider: str = DECIDER, of_the_model: bool = False, tolerance: float = ROUNDING_LEVEL, moving: bool = False,
-) -> Unclear:  # fmt: skip
+    plant: DescriptorSystem,
+    model: Exosystem,
+    units: PlantUnits,
+    value: complex,
+    *,
+    other: str,
+    decider: str = DECIDER,
+    of_the_model: bool = False,
+    tolerance: float = ROUNDING_LEVEL,
+    moving: bool = False,
+) -> Unclear:
     """Return why it is unclear whether plant and fault model hide something at a point, in the plant's own time."""
     kept = kept_disturbances(plant, numbers_of(plant))
     named = named_augmented(plant, model, units, kept=kept, of_the_model=of_the_model)
@@ -232,10 +248,16 @@ def order_conditions(
 
 def _order_doubt(plant: DescriptorSystem, model: Exosystem, units: PlantUnits, point: complex) -> Unclear:
     return _model_doubt(
-        plant, model, units, point, of_the_model=True, tolerance=RANK_TOLERANCE, moving=True,
+        plant,
+        model,
+        units,
+        point,
+        of_the_model=True,
+        tolerance=RANK_TOLERANCE,
+        moving=True,
         other=f"hides a motion of plant and fault model at {number(point)}, and no observer sees it",
         decider="A fault model of lower order, or an output nearer to the fault, would decide it.",
-    )  # fmt: skip
+    )
 
 
 def lost_in_rounding(
@@ -283,11 +305,13 @@ def decoupling_rank(plant: DescriptorSystem) -> RankDecision:
         return decide_rank(_decoupling_matrix(scaled), expected=plant.nx + _rank(scaled.Dd) + disturbance_rank(plant))
     bd, dd = numbers.matrix("Bd"), numbers.matrix("Dd")
     nothing, square = numbers.zeros(plant.nx, plant.nd), numbers.zeros(plant.ny, plant.nd)
-    matrix = numbers.blocks([
-        [numbers.matrix("E"), nothing, bd],
-        [numbers.matrix("C"), dd, square],
-        [numbers.zeros(plant.ny, plant.nx), square, dd],
-    ])  # fmt: skip
+    matrix = numbers.blocks(
+        [
+            [numbers.matrix("E"), nothing, bd],
+            [numbers.matrix("C"), dd, square],
+            [numbers.zeros(plant.ny, plant.nx), square, dd],
+        ]
+    )
     expected = plant.nx + numbers.rank(dd) + disturbance_rank(plant)
     decision, terms = decide_rank(_decoupling_matrix(scaled), expected=expected), sized_plant(plant)
     if terms is None:
@@ -364,17 +388,26 @@ def _in_given_units(found: Transformation, plant: DescriptorSystem, units: Plant
     kept = dict(zip(plant.state_names, units.states, strict=True))
     states = np.array([kept.get(name, 1.0) for name in found.plant.state_names])
     back = replace(
-        units, time=1.0 / units.time, equations=states, states=1.0 / states, outputs=1.0 / units.outputs,
-        faults=1.0 / units.faults, disturbances=1.0 / units.disturbances,
-    )  # fmt: skip
+        units,
+        time=1.0 / units.time,
+        equations=states,
+        states=1.0 / states,
+        outputs=1.0 / units.outputs,
+        faults=1.0 / units.faults,
+        disturbances=1.0 / units.disturbances,
+    )
     old = found.recovery
     # A source state that cannot be recovered is not among these.
     own = np.array([kept.get(name, 1.0) for name in old.names])[:, None]
     recovery = StateRecovery(
-        old.names, own * old.from_state / states, own * old.from_input, own * old.from_fault / units.faults,
+        old.names,
+        own * old.from_state / states,
+        own * old.from_input,
+        own * old.from_fault / units.faults,
         own * old.from_disturbance / units.disturbances,
-        own * old.from_noise * (1.0 if units.discrete else np.sqrt(units.time)), old.noise_kept,
-    )  # fmt: skip
+        own * old.from_noise * (1.0 if units.discrete else np.sqrt(units.time)),
+        old.noise_kept,
+    )
     return replace(
         found, source=plant, plant=back.scaled_plant(found.plant).replace(E=None, dt=plant.dt), recovery=recovery
     )
@@ -472,9 +505,10 @@ def existence(plant: DescriptorSystem, model: Exosystem) -> Existence:
     """Return the existence conditions of the unknown-input PI observer, and the plant to design for."""
     dense = plant.dense()
     found = reconsidered(
-        lambda: _decided(dense, model), lambda found: is_refused(found.conditions),
+        lambda: _decided(dense, model),
+        lambda found: is_refused(found.conditions),
         lambda found: is_doubted(found.conditions),
-    )  # fmt: skip
+    )
     _known(plant)[_key(model)] = found.conditions
     return found
 
@@ -560,9 +594,15 @@ def _zero_condition(given: DescriptorSystem, plant: DescriptorSystem, units: Pla
         return zero_doubt(given, units, own, [["A", "Bd"], ["C", "Dd"]], kept=kept_columns, what="observer")
 
     return verdict_condition(
-        own, holding, given, what="An observer", lost=lost, seen=seen, doubt=doubt,
+        own,
+        holding,
+        given,
+        what="An observer",
+        lost=lost,
+        seen=seen,
+        doubt=doubt,
         gain=lambda mode: needed_gain(given, units, mode, inputs="Bd" if given.nd else ""),
-    )  # fmt: skip
+    )
 
 
 def _zeros(holds: bool, value: float, bound: float, detail: str) -> Condition:

@@ -155,12 +155,14 @@ def _augmented(numbers: PlantNumbers, plant: DescriptorSystem, model: Exosystem)
     course = own(written_matrix(model.Cw))
     changed = {
         "E": numbers.blocks([[numbers.matrix("E"), own(across)], [own(down), own(identity(count))]]),
-        "A": numbers.blocks([
-            [numbers.matrix("A"), numbers.product(numbers.matrix("Bf"), course)],
-            [own(down), own(written_matrix(model.Phi))],
-        ]),
+        "A": numbers.blocks(
+            [
+                [numbers.matrix("A"), numbers.product(numbers.matrix("Bf"), course)],
+                [own(down), own(written_matrix(model.Phi))],
+            ]
+        ),
         "C": numbers.blocks([[numbers.matrix("C"), numbers.product(numbers.matrix("Df"), course)]]),
-    }  # fmt: skip
+    }
     rational = {"E": blocks([[numbers.rational["E"], across], [down, identity(count)]])}
     return numbers.with_matrices(changed, rational=rational)
 

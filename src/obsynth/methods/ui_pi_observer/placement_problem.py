@@ -192,10 +192,12 @@ def kalman_problem(problem: PlacementProblem, weights: NoiseWeights) -> KalmanPr
     if problem.free:
         # The free outputs carry the noise of derivatives; as a stand-in they get the size of the others.
         entering = np.hstack([entering, np.zeros((len(entering), problem.free))])
-        measured = np.block([
-            [np.zeros((problem.free, measured.shape[1])), size * np.eye(problem.free)],
-            [measured, np.zeros((len(measured), problem.free))],
-        ])  # fmt: skip
+        measured = np.block(
+            [
+                [np.zeros((problem.free, measured.shape[1])), size * np.eye(problem.free)],
+                [measured, np.zeros((len(measured), problem.free))],
+            ]
+        )
     per_step = problem.rate * (plant.dt if plant.dt > 0.0 else 1.0)
     strength = np.concatenate([np.full(plant.nx, PROCESS_SHARE * weights.process), np.full(order, weights.fault)])
     faults = np.hstack([np.zeros((plant.nf, plant.nx)), problem.model.Cw])

@@ -131,9 +131,13 @@ def _placed(problem: PlacementProblem, wanted: Sequence[complex], objective: str
     outputs = units.outputs if plain_outputs else np.ones(len(split.C))
     scaled_poles = [units.rate * pole for pole in wanted]
     found = place(
-        split.F, split.C / outputs[:, None], scaled_poles, dt=plant.dt, objective=objective,
+        split.F,
+        split.C / outputs[:, None],
+        scaled_poles,
+        dt=plant.dt,
+        objective=objective,
         weight=units.augmented_states[:, None] * split.lift(np.eye(split.order)),
-    )  # fmt: skip
+    )
     return _Chosen(found.K / outputs, wanted, {"condition": found.condition})
 
 

@@ -31,8 +31,9 @@ def largest_turn(model: DAEModel, dt: float) -> float:
     """Return by how many radians the fastest oscillation at the nominal point turns in a step."""
     from scipy.linalg import eigvals
 
-    local = local_equations(model, np.zeros(model.nx), model.nominal_state, model.nominal_input,
-                            model.nominal_parameters)  # fmt: skip
+    local = local_equations(
+        model, np.zeros(model.nx), model.nominal_state, model.nominal_input, model.nominal_parameters
+    )
     if not local.is_defined:
         return 0.0
     homogeneous = eigvals(-local.by_state * model.state_scales, local.E * model.state_scales, homogeneous_eigvals=True)
@@ -48,13 +49,31 @@ DEFAULT_STATE_SHARE = 0.01
 DEFAULT_PARAMETER_SHARE = 0.1
 #: Options that are fields of the observer as they are given.
 AS_GIVEN = (
-    "forgetting", "guard", "weight", "largest_move", "window", "outliers", "outlier_limit", "sensors", "state_bounds",
+    "forgetting",
+    "guard",
+    "weight",
+    "largest_move",
+    "window",
+    "outliers",
+    "outlier_limit",
+    "sensors",
+    "state_bounds",
     "reset",
-)  # fmt: skip
+)
 OPTIONS = (
-    "dt", "Q", "R", "form", "integration", "random_walk", "initial_state", "initial_covariance", "initial_parameters",
-    "initial_parameter_covariance", "bounds", *AS_GIVEN,
-)  # fmt: skip
+    "dt",
+    "Q",
+    "R",
+    "form",
+    "integration",
+    "random_walk",
+    "initial_state",
+    "initial_covariance",
+    "initial_parameters",
+    "initial_parameter_covariance",
+    "bounds",
+    *AS_GIVEN,
+)
 
 
 def dae_observer_from_options(model: DAEModel, options: Mapping[str, Any]) -> DAEObserver:
@@ -68,25 +87,33 @@ def dae_observer_from_options(model: DAEModel, options: Mapping[str, Any]) -> DA
         integration = "radau" if turns_far else "backward-euler"
     bounds = named_bounds(options["bounds"], parameters, "bounds")
     return DAEObserver(
-        model=model, dt=options["dt"],
+        model=model,
+        dt=options["dt"],
         Q=named_covariance(options["Q"], model.equation_names, "Q", None),
         R=named_covariance(options["R"], model.output_names, "R", None),
         initial_state=named_vector(options["initial_state"], states, model.nominal_state, "initial_state"),
         initial_covariance=named_covariance(
-            options["initial_covariance"], states, "initial_covariance",
+            options["initial_covariance"],
+            states,
+            "initial_covariance",
             (DEFAULT_STATE_SHARE * model.state_scales) ** 2,
         ),
         initial_parameters=named_vector(
             options["initial_parameters"], parameters, model.nominal_parameters, "initial_parameters"
         ),
         initial_parameter_covariance=named_covariance(
-            options["initial_parameter_covariance"], parameters, "initial_parameter_covariance",
+            options["initial_parameter_covariance"],
+            parameters,
+            "initial_parameter_covariance",
             _default_parameter_variances(model, options["initial_parameter_covariance"]),
         ),
         random_walk=named_covariance(options["random_walk"], parameters, "random_walk", np.zeros(model.nq)),
-        lower=bounds[:, 0], upper=bounds[:, 1], form=form, integration=integration,
+        lower=bounds[:, 0],
+        upper=bounds[:, 1],
+        form=form,
+        integration=integration,
         **{name: options[name] for name in AS_GIVEN if name in options},
-    )  # fmt: skip
+    )
 
 
 def resolved_options(observer: DAEObserver) -> dict[str, Any]:
@@ -101,8 +128,9 @@ def _default_parameter_variances(model: DAEModel, given: Any) -> FloatArray:
         name = model.parameter_names[int(np.argmin(sizes))]
         raise SpecError(
             f"initial_parameter_covariance is missing, and the nominal value of {name!r} is zero: say how large it may "
-            "be.", path="initial_parameter_covariance",
-        )  # fmt: skip
+            "be.",
+            path="initial_parameter_covariance",
+        )
     return np.asarray((DEFAULT_PARAMETER_SHARE * sizes) ** 2)
 
 
@@ -154,17 +182,30 @@ def dae_facts(observer: DAEObserver) -> DAEFacts:
     deviations = np.sqrt(np.diag(covariance))
     safe = np.where(deviations > 0.0, deviations, 1.0)
     identifiable = identifiability(
-        model, np.tile(u, (NOMINAL_STEPS + 1, 1)), dt=observer.dt, R=observer.R, method=observer.integration,
-        initial_state=observer.initial_state, parameters=observer.initial_parameters,
+        model,
+        np.tile(u, (NOMINAL_STEPS + 1, 1)),
+        dt=observer.dt,
+        R=observer.R,
+        method=observer.integration,
+        initial_state=observer.initial_state,
+        parameters=observer.initial_parameters,
         parameter_scales=np.sqrt(np.diag(observer.initial_parameter_covariance)),
-    )  # fmt: skip
+    )
     return DAEFacts(
         index_report(model, observer.dt, x=found.states[-1], u=u, theta=found.parameters[-1]),
-        float(found.conditions.max()), int(np.argmax(found.conditions)), float(found.residuals.max()),
-        float(found.contraction[-1]), read_only(deviations), read_only(covariance / np.outer(safe, safe)),
-        found.projection, identifiable, read_only(observer.steps.part(end, "K")),
-        read_only(observer.steps.part(end, "Upsilon")), read_only(np.concatenate(kept)[1:]), read_only(covariance),
-    )  # fmt: skip
+        float(found.conditions.max()),
+        int(np.argmax(found.conditions)),
+        float(found.residuals.max()),
+        float(found.contraction[-1]),
+        read_only(deviations),
+        read_only(covariance / np.outer(safe, safe)),
+        found.projection,
+        identifiable,
+        read_only(observer.steps.part(end, "K")),
+        read_only(observer.steps.part(end, "Upsilon")),
+        read_only(np.concatenate(kept)[1:]),
+        read_only(covariance),
+    )
 
 
 def _nominal_outputs(observer: DAEObserver, u: FloatArray) -> FloatArray:

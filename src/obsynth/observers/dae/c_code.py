@@ -48,10 +48,19 @@ def observer_code(steps: Steps) -> str:
     functions = {"project": short.newton, "newton": graph.step.newton, "first": graph.first, "sample": graph.sample}
     if steps.settings.outliers != "none":
         functions["forecast"] = graph.forecast
-    return "\n".join([
-        "#include <math.h>", "", *_constants(steps, graph, functions.values()), *_option_constants(steps), "",
-        _generated(functions), "", _template("advance"), _template("options"),
-    ])  # fmt: skip
+    return "\n".join(
+        [
+            "#include <math.h>",
+            "",
+            *_constants(steps, graph, functions.values()),
+            *_option_constants(steps),
+            "",
+            _generated(functions),
+            "",
+            _template("advance"),
+            _template("options"),
+        ]
+    )
 
 
 def observer_struct(steps: Steps, name: str) -> Iterator[str]:
@@ -91,29 +100,48 @@ def _constants(steps: Steps, graph: ObserverGraph, functions: Iterable[Any]) -> 
     """Return sizes, settings and tables."""
     model, move = steps.settings.model, steps.settings.largest_move
     listed = list(functions)
-    work = {name: max(max(getattr(function, f"sz_{name}")() for function in listed), 1) for name in
-            ("arg", "res", "iw", "w")}  # fmt: skip
+    work = {
+        name: max(max(getattr(function, f"sz_{name}")() for function in listed), 1)
+        for name in ("arg", "res", "iw", "w")
+    }
     numbers = {
-        "NX": model.nx, "NU": model.nu, "NY": model.ny, "NQ": model.nq, "STAGES": graph.functions.stages,
-        "MEMORY": graph.memory.size, "ROW": graph.row.size, "AT_POSTERIOR": graph.memory.slices["posterior"].start,
-        "AT_X": graph.memory.slices["x"].start, "AT_THETA": graph.memory.slices["theta"].start,
-        "AT_SPREAD": graph.memory.slices["spread"].start, "AT_INNOVATION": graph.row.slices["innovation"].start,
-        "AT_COVARIANCE": graph.row.slices["covariance"].start, "AT_NIS": graph.row.slices["nis"].start,
+        "NX": model.nx,
+        "NU": model.nu,
+        "NY": model.ny,
+        "NQ": model.nq,
+        "STAGES": graph.functions.stages,
+        "MEMORY": graph.memory.size,
+        "ROW": graph.row.size,
+        "AT_POSTERIOR": graph.memory.slices["posterior"].start,
+        "AT_X": graph.memory.slices["x"].start,
+        "AT_THETA": graph.memory.slices["theta"].start,
+        "AT_SPREAD": graph.memory.slices["spread"].start,
+        "AT_INNOVATION": graph.row.slices["innovation"].start,
+        "AT_COVARIANCE": graph.row.slices["covariance"].start,
+        "AT_NIS": graph.row.slices["nis"].start,
         "AT_RESIDUAL": graph.row.slices["residual"].start,
-        "MOST_ITERATIONS": newton.MOST_ITERATIONS, "MOST_HALVINGS": newton.MOST_HALVINGS,
-        "MOST_SUBSOLVES": implicit_step.MOST_SUBSOLVES, "LAST_STEP": newton.LAST_STEP,
-        "LARGEST_RESIDUAL": newton.LARGEST_RESIDUAL, "FIRST_FRACTION": implicit_step.FIRST_FRACTION,
-        "LEAST_FRACTION": implicit_step.LEAST_FRACTION, "PROJECTION_NOTICE": PROJECTION_NOTICE,
+        "MOST_ITERATIONS": newton.MOST_ITERATIONS,
+        "MOST_HALVINGS": newton.MOST_HALVINGS,
+        "MOST_SUBSOLVES": implicit_step.MOST_SUBSOLVES,
+        "LAST_STEP": newton.LAST_STEP,
+        "LARGEST_RESIDUAL": newton.LARGEST_RESIDUAL,
+        "FIRST_FRACTION": implicit_step.FIRST_FRACTION,
+        "LEAST_FRACTION": implicit_step.LEAST_FRACTION,
+        "PROJECTION_NOTICE": PROJECTION_NOTICE,
         "LARGEST_MOVE": "HUGE_VAL" if move is None else float(move),
         **{f"WORK_{name.upper()}": size for name, size in work.items()},
-    }  # fmt: skip
+    }
     return [
-        *(f"#define {name} {value!r}" if not isinstance(value, str) else f"#define {name} {value}"
-          for name, value in numbers.items()),
-        "/* Arrays of no length are none in C. */", "#define LENGTH(n) ((n) > 0 ? (n) : 1)", "",
+        *(
+            f"#define {name} {value!r}" if not isinstance(value, str) else f"#define {name} {value}"
+            for name, value in numbers.items()
+        ),
+        "/* Arrays of no length are none in C. */",
+        "#define LENGTH(n) ((n) > 0 ? (n) : 1)",
+        "",
         *c_table("SIZES", np.asarray(model.state_scales)),
         *c_table("START", initial_memory(steps.settings, steps.settings.initial_state)),
-    ]  # fmt: skip
+    ]
 
 
 def _option_constants(steps: Steps) -> list[str]:
@@ -128,19 +156,28 @@ def _option_constants(steps: Steps) -> list[str]:
     numbers = {
         "AT_S": memory.slices["S"].start if "S" in memory.shapes else -1,
         "AT_CROSS": memory.slices["cross"].start if "cross" in memory.shapes else -1,
-        "OUTLIERS": int(settings.outliers != "none"), "GATE": int(settings.outliers == "gate"),
-        "OUTLIER_LIMIT": steps.limit if np.isfinite(steps.limit) else 0.0, "OVERFLOW_LIMIT": OVERFLOW,
-        "LONGEST_REFUSAL": LONGEST, "RESETS": int(bool(settings.reset)), "RESET_WINDOW": RESET_WINDOW,
-        "BOUNDS": len(ends), "DEPENDENT": DEPENDENT_BOUND, "SLACK": SLACK, "WAITS": int(not timing.is_plain),
+        "OUTLIERS": int(settings.outliers != "none"),
+        "GATE": int(settings.outliers == "gate"),
+        "OUTLIER_LIMIT": steps.limit if np.isfinite(steps.limit) else 0.0,
+        "OVERFLOW_LIMIT": OVERFLOW,
+        "LONGEST_REFUSAL": LONGEST,
+        "RESETS": int(bool(settings.reset)),
+        "RESET_WINDOW": RESET_WINDOW,
+        "BOUNDS": len(ends),
+        "DEPENDENT": DEPENDENT_BOUND,
+        "SLACK": SLACK,
+        "WAITS": int(not timing.is_plain),
         "LATEST": timing.longest,
-    }  # fmt: skip
+    }
     lines = [f"#define {name} {value!r}" for name, value in numbers.items()]
     if limits:
         lines += c_table("RESET_LIMITS", np.array(limits))
     if ends:
-        lines += [*_integers("BOUND_STATES", [i for i, _, _ in ends]),
-                  *c_table("BOUND_SIGNS", np.array([sign for _, sign, _ in ends])),
-                  *c_table("BOUND_ENDS", np.array([end for _, _, end in ends]))]  # fmt: skip
+        lines += [
+            *_integers("BOUND_STATES", [i for i, _, _ in ends]),
+            *c_table("BOUND_SIGNS", np.array([sign for _, sign, _ in ends])),
+            *c_table("BOUND_ENDS", np.array([end for _, _, end in ends])),
+        ]
     if not timing.is_plain:
         lines += [*_integers("EVERY", timing.every.tolist()), *_integers("DELAYS", timing.delays.tolist())]
     return lines
@@ -165,15 +202,26 @@ def _generated(functions: dict[str, Any]) -> str:
     generator = ca.CodeGenerator("observer", options)
     for name, function in functions.items():
         generator.add(_renamed(function, name))
-    return "\n".join([
-        "/* What follows was written by CasADi, with parameters and functions that are not used. */",
-        "#if defined(__GNUC__)", "#pragma GCC diagnostic push",
-        *(f'#pragma GCC diagnostic ignored "-W{name}"' for name in ("unused-parameter", "unused-function",
-                                                                     "unused-const-variable")),
-        "#if !defined(__clang__)", '#pragma GCC diagnostic ignored "-Wmaybe-uninitialized"', "#endif", "#endif",
-        "#define CASADI_SYMBOL_EXPORT static", _HELPER.sub(r"static \1", generator.dump().rstrip()),
-        "#if defined(__GNUC__)", "#pragma GCC diagnostic pop", "#endif",
-    ])  # fmt: skip
+    return "\n".join(
+        [
+            "/* What follows was written by CasADi, with parameters and functions that are not used. */",
+            "#if defined(__GNUC__)",
+            "#pragma GCC diagnostic push",
+            *(
+                f'#pragma GCC diagnostic ignored "-W{name}"'
+                for name in ("unused-parameter", "unused-function", "unused-const-variable")
+            ),
+            "#if !defined(__clang__)",
+            '#pragma GCC diagnostic ignored "-Wmaybe-uninitialized"',
+            "#endif",
+            "#endif",
+            "#define CASADI_SYMBOL_EXPORT static",
+            _HELPER.sub(r"static \1", generator.dump().rstrip()),
+            "#if defined(__GNUC__)",
+            "#pragma GCC diagnostic pop",
+            "#endif",
+        ]
+    )
 
 
 def _renamed(function: Any, name: str) -> Any:
@@ -210,8 +258,9 @@ class DAELibrary:
         if command is None:
             raise SpecError(
                 "There is no C compiler (cc, gcc or clang, or what CC in the environment names): install one, or leave "
-                "compiled=True out.", path="compiled",
-            )  # fmt: skip
+                "compiled=True out.",
+                path="compiled",
+            )
         with tempfile.TemporaryDirectory(prefix="obsynth-", ignore_cleanup_errors=True) as folder:
             source, library = Path(folder) / "observer.c", Path(folder) / "observer.so"
             source.write_text(record_code(steps), encoding="utf-8", newline="\n")
@@ -249,8 +298,9 @@ class DAELibrary:
         """Run over records; return how many could be finished, and what is said by name."""
         graph, (runs, samples, _) = self.steps.graph, y.shape
         layouts = [graph.memory if name in graph.memory.shapes else graph.row for name in BATCH_PARTS]
-        sizes = [layout.shapes[name][0] * layout.shapes[name][1] for layout, name in
-                 zip(layouts, BATCH_PARTS, strict=True)]  # fmt: skip
+        sizes = [
+            layout.shapes[name][0] * layout.shapes[name][1] for layout, name in zip(layouts, BATCH_PARTS, strict=True)
+        ]
         out = np.zeros((runs, samples, sum(sizes)))
         inputs, outputs = _plain(u), _plain(y)
         apart = 0 if u.ndim == 2 else samples * self.steps.settings.model.nu

@@ -38,8 +38,9 @@ class DAERow:
 
     def part(self, name: str) -> FloatArray:
         """Return one array by its name in the layouts `obsynth.observers.dae.settings`."""
-        layout, values = (self.graph.memory, self.memory) if name in self.graph.memory.shapes else (
-            self.graph.row, self.said)  # fmt: skip
+        layout, values = (
+            (self.graph.memory, self.memory) if name in self.graph.memory.shapes else (self.graph.row, self.said)
+        )
         return layout.part(values, name)
 
     x = _part("posterior", "The state after the measurement ``(nx,)``.")
@@ -173,14 +174,22 @@ def require_regular(observer: DAESettings, rows: DAERow, conditions: FloatArray)
 def _columns(rows: DAERow) -> dict[str, FloatArray]:
     """Return what the estimates keep of some samples."""
     return {
-        "states": rows.x, "state_deviations": rows.state_deviations,
-        "state_covariances": rows.covariance, "cross_covariances": rows.cross_covariance,
-        "faults": rows.theta, "fault_covariances": rows.parameter_covariance,
-        "innovations": rows.innovation, "innovation_covariances": rows.part("expected"), "nis": rows.nis,
-        "nis_degrees": rows.seen.sum(axis=1).astype(np.float64), "residuals": rows.part("residual"),
-        "conditions": rows.conditions, "contraction": rows.contractions, "informations": rows.information,
+        "states": rows.x,
+        "state_deviations": rows.state_deviations,
+        "state_covariances": rows.covariance,
+        "cross_covariances": rows.cross_covariance,
+        "faults": rows.theta,
+        "fault_covariances": rows.parameter_covariance,
+        "innovations": rows.innovation,
+        "innovation_covariances": rows.part("expected"),
+        "nis": rows.nis,
+        "nis_degrees": rows.seen.sum(axis=1).astype(np.float64),
+        "residuals": rows.part("residual"),
+        "conditions": rows.conditions,
+        "contraction": rows.contractions,
+        "informations": rows.information,
         "scores": rows.score,
-    }  # fmt: skip
+    }
 
 
 def _excitation(observer: DAESettings, informations: FloatArray) -> FloatArray:

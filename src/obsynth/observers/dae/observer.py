@@ -37,9 +37,13 @@ def _nothing(steps: Steps) -> DAERow:
 
 
 def _in_c(
-    steps: Steps, library: DAELibrary, y: FloatArray, u: FloatArray, keep: Callable[[DAERow], object],
+    steps: Steps,
+    library: DAELibrary,
+    y: FloatArray,
+    u: FloatArray,
+    keep: Callable[[DAERow], object],
     note: Callable[[int], object],
-) -> None:  # fmt: skip
+) -> None:
     moved = np.zeros(0)
     state = library.started()
     for begin in range(0, len(y), SAMPLES_PER_CALL):
@@ -56,9 +60,12 @@ def _in_c(
 
 
 def advanced(
-    steps: Steps, y: FloatArray, u: FloatArray, keep: Callable[[DAERow], object],
+    steps: Steps,
+    y: FloatArray,
+    u: FloatArray,
+    keep: Callable[[DAERow], object],
     note: Callable[[int], object] = bool,
-) -> DAEState:  # fmt: skip
+) -> DAEState:
     """Lead an observer from its start through a record; return its state at the end."""
     calls: dict[int, Compiled] = {}
     state = steps.first
@@ -175,9 +182,13 @@ class DAEObserver(DAESettings, StepObserver[DAEState, DAERow]):
         return DAELibrary(self.steps)
 
     def run(
-        self, y: ArrayLike, u: ArrayLike | None = None, *, compiled: bool | None = None,
+        self,
+        y: ArrayLike,
+        u: ArrayLike | None = None,
+        *,
+        compiled: bool | None = None,
         progress: bool | Callable[[int], None] | None = None,
-    ) -> Estimates:  # fmt: skip
+    ) -> Estimates:
         """Run over a whole record.
 
         Parameters
@@ -212,8 +223,10 @@ class DAEObserver(DAESettings, StepObserver[DAEState, DAERow]):
         inputs = checked_inputs(self.model, u, len(outputs))
         alone = self.outside_graph
         if compiled and not self.is_plain:
-            raise SpecError("The C knows neither sensors of their own times nor state_bounds: leave compiled=True out.",
-                            path="compiled")  # fmt: skip
+            raise SpecError(
+                "The C knows neither sensors of their own times nor state_bounds: leave compiled=True out.",
+                path="compiled",
+            )
         if compiled and alone:
             raise SpecError(f"The C knows no {alone}: leave compiled=True out, or leave {alone} out.", path="compiled")
         library = self.library if compiled else None

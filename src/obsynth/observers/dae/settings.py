@@ -24,10 +24,15 @@ Guard: TypeAlias = Literal["regularise", "none"]
 Weight: TypeAlias = Literal["innovation", "paper"]
 Integration: TypeAlias = Literal["backward-euler", "radau"]
 _KINDS = {
-    "form": Form, "guard": Guard, "weight": Weight, "integration": Integration, "forgetting": ForgettingFactor,
-    "window": Count, "largest_move": Positive | None,
+    "form": Form,
+    "guard": Guard,
+    "weight": Weight,
+    "integration": Integration,
+    "forgetting": ForgettingFactor,
+    "window": Count,
+    "largest_move": Positive | None,
     "reset": Probability,
-}  # fmt: skip
+}
 _DEFINITE = ("R", "initial_parameter_covariance")
 
 
@@ -91,16 +96,18 @@ class DAESettings(StepSettings):
             if not (low < high and low <= start <= high):
                 raise SpecError(
                     f"bounds.{name}: the lower bound ({low:g}) must be below the upper one ({high:g}), and the start "
-                    f"({start:g}) between.", path=f"bounds.{name}",
-                )  # fmt: skip
+                    f"({start:g}) between.",
+                    path=f"bounds.{name}",
+                )
 
     def _require_definite(self, name: str, matrix: FloatArray, factor: FloatArray) -> None:
         signals = self.model.output_names if name == "R" else self.model.parameter_names
         variances = np.diag(matrix)
         for signal, variance in zip(signals, variances, strict=True):
             if not variance > 0.0:
-                raise SpecError(f"{name} must be positive definite, but the variance of {signal!r} is {variance:g}.",
-                                path=name)  # fmt: skip
+                raise SpecError(
+                    f"{name} must be positive definite, but the variance of {signal!r} is {variance:g}.", path=name
+                )
         if not is_definite(matrix, factor):
             raise SpecError(f"{name} must be positive definite, but it is singular.", path=name)
 
@@ -189,10 +196,26 @@ class Layout:
 
 
 #: Arrays that stay matrices when they have one column.
-MATRICES = frozenset({
-    "P", "S", "spread", "cross", "Upsilon", "K", "H", "L", "information", "covariance", "F", "G", "noise", "kept",
-    "scaled", "expected",
-})  # fmt: skip
+MATRICES = frozenset(
+    {
+        "P",
+        "S",
+        "spread",
+        "cross",
+        "Upsilon",
+        "K",
+        "H",
+        "L",
+        "information",
+        "covariance",
+        "F",
+        "G",
+        "noise",
+        "kept",
+        "scaled",
+        "expected",
+    }
+)
 
 
 def memory_layout(observer: DAESettings) -> Layout:
@@ -201,10 +224,20 @@ def memory_layout(observer: DAESettings) -> Layout:
     forgetting is not."""
     nx, ny, nq = observer.model.nx, observer.model.ny, observer.model.nq
     learning = {"cross": (nx, nq)} if observer.form == "augmented-kalman" else {"S": (nq, nq)}
-    return Layout({
-        "posterior": (nx, 1), "x": (nx, 1), "theta": (nq, 1), "P": (nx, nx), **learning, "spread": (nq, nq),
-        "Upsilon": (nx, nq), "K": (nx, ny), "H": (ny, nx), "L": (ny, nq),
-    })  # fmt: skip
+    return Layout(
+        {
+            "posterior": (nx, 1),
+            "x": (nx, 1),
+            "theta": (nq, 1),
+            "P": (nx, nx),
+            **learning,
+            "spread": (nq, nq),
+            "Upsilon": (nx, nq),
+            "K": (nx, ny),
+            "H": (ny, nx),
+            "L": (ny, nq),
+        }
+    )
 
 
 def row_layout(observer: DAESettings) -> Layout:
@@ -215,17 +248,35 @@ def row_layout(observer: DAESettings) -> Layout:
     # ``information``; expected: covariance of the innovation, the identity for what is not seen; noise: derivative by
     # what is added to the equations; kept: F (I - K H) with K and H of the sample before; scaled: the equilibrated
     # matrix of (7); trusted: one where the step of the compiled graph was solved
-    return Layout({
-        "innovation": (ny, 1), "expected": (ny, ny), "nis": (1, 1), "information": (nq, nq), "score": (nq, 1),
-        "covariance": (nx, nx), "F": (nx, nx), "G": (nx, nq), "noise": (nx, nx), "kept": (nx, nx), "scaled": (n, n),
-        "residual": (1, 1), "trusted": (1, 1),
-    })  # fmt: skip
+    return Layout(
+        {
+            "innovation": (ny, 1),
+            "expected": (ny, ny),
+            "nis": (1, 1),
+            "information": (nq, nq),
+            "score": (nq, 1),
+            "covariance": (nx, nx),
+            "F": (nx, nx),
+            "G": (nx, nq),
+            "noise": (nx, nx),
+            "kept": (nx, nx),
+            "scaled": (n, n),
+            "residual": (1, 1),
+            "trusted": (1, 1),
+        }
+    )
 
 
 def initial_memory(observer: DAESettings, x: FloatArray) -> FloatArray:
     """Return what is remembered before the first sample (``x (nx,)``)."""
     layout = memory_layout(observer)
     start = {name: np.zeros(shape) for name, shape in layout.shapes.items()}
-    start |= {"posterior": x, "x": x, "theta": observer.initial_parameters, "P": observer.initial_covariance,
-              "S": observer.initial_parameter_covariance, "spread": observer.initial_parameter_covariance}  # fmt: skip
+    start |= {
+        "posterior": x,
+        "x": x,
+        "theta": observer.initial_parameters,
+        "P": observer.initial_covariance,
+        "S": observer.initial_parameter_covariance,
+        "spread": observer.initial_parameter_covariance,
+    }
     return layout.packed(start)

@@ -55,8 +55,9 @@ def observer_graph(observer: DAESettings) -> ObserverGraph:
     u, y, seen = ca.MX.sym("u", nu), ca.MX.sym("y", ny), ca.MX.sym("seen", ny)
     nothing = {name: ca.MX(*shape) for name, shape in row.shapes.items()}
     begun = {**nothing, **memory.symbols(packed)}
-    first = ca.Function("first", [packed, y, seen], _outcome(_Update(observer, functions, y, seen).first(begun),
-                                                             memory, row))  # fmt: skip
+    first = ca.Function(
+        "first", [packed, y, seen], _outcome(_Update(observer, functions, y, seen).first(begun), memory, row)
+    )
     before = memory.symbols(packed)
     local = step.sensitivities(X, before["posterior"], u, before["theta"])
     predicted = _predicted(observer, before, X[-nx:], local)
@@ -170,11 +171,17 @@ class _Update:
         else:
             covariance = Sigma + Omega @ found["spread"] @ Omega.T
         return {
-            **found, "innovation": e, "expected": covariance, "nis": e.T @ definite_solved(covariance, e),
-            "Sigma": Sigma, "Omega": Omega,
+            **found,
+            "innovation": e,
+            "expected": covariance,
+            "nis": e.T @ definite_solved(covariance, e),
+            "Sigma": Sigma,
+            "Omega": Omega,
             "information": Omega.T @ definite_solved(Sigma, Omega),
-            "score": Omega.T @ definite_solved(Sigma, e + Omega @ found["theta"]), "seen H": H, "seen L": L,
-        }  # fmt: skip
+            "score": Omega.T @ definite_solved(Sigma, e + Omega @ found["theta"]),
+            "seen H": H,
+            "seen L": L,
+        }
 
     def _learnt(self, found: Arrays) -> Arrays:
         """Steps 7 to 9 and 11: (17)-(19); a sample of which nothing is seen changes nothing and forgets nothing."""
@@ -189,9 +196,11 @@ class _Update:
         theta = self._bounded(found["theta"] + gain @ found["innovation"])
         spread = kept @ spread @ kept.T + gain @ Sigma @ gain.T
         after = {
-            "S": 0.5 * (S + S.T), "spread": 0.5 * (spread + spread.T), "theta": theta,
+            "S": 0.5 * (S + S.T),
+            "spread": 0.5 * (spread + spread.T),
+            "theta": theta,
             "x": found["x"] + found["Upsilon"] @ (theta - found["theta"]),
-        }  # fmt: skip
+        }
         anything = ca.sum1(self.seen) > 0.0
         return {**found, **{name: ca.if_else(anything, value, found[name]) for name, value in after.items()}}
 
@@ -249,9 +258,14 @@ class _Update:
         whole = 0.5 * (whole + whole.T)
         correction = gain @ found["innovation"]
         after = {
-            **found, "P": whole[:nx, :nx], "cross": whole[:nx, nx:], "spread": whole[nx:, nx:],
-            "x": found["x"] + correction[:nx], "theta": self._bounded(found["theta"] + correction[nx:]),
-            "K": gain[:nx, :], "covariance": whole[:nx, :nx],
-        }  # fmt: skip
+            **found,
+            "P": whole[:nx, :nx],
+            "cross": whole[:nx, nx:],
+            "spread": whole[nx:, nx:],
+            "x": found["x"] + correction[:nx],
+            "theta": self._bounded(found["theta"] + correction[nx:]),
+            "K": gain[:nx, :],
+            "covariance": whole[:nx, :nx],
+        }
         full_H, full_L, *_ = self._seen_outputs(after)
         return {**after, "H": full_H, "L": full_L, "posterior": after["x"]}

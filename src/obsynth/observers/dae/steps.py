@@ -45,8 +45,15 @@ class Steps:
         self._compiled: dict[str, Compiled] = {}
         self.limit = checked_limit(settings.outliers, settings.outlier_limit)
         self.implicit = ImplicitStep(self.graph.functions, settings.dt, largest_move=settings.largest_move)
-        self.first = DAEState(initial_memory(settings, settings.initial_state), 0, np.zeros(settings.model.nu), (),
-                              no_refusals(settings.model.ny), np.zeros((0, 2)), 0)  # fmt: skip
+        self.first = DAEState(
+            initial_memory(settings, settings.initial_state),
+            0,
+            np.zeros(settings.model.nu),
+            (),
+            no_refusals(settings.model.ny),
+            np.zeros((0, 2)),
+            0,
+        )
 
     def part(self, state: DAEState, name: str) -> FloatArray:
         """Return a part of what is remembered, by its name in `memory_layout`."""
@@ -115,8 +122,9 @@ class Steps:
         if not np.isfinite(after).all():
             raise SolverError(
                 f"The matrix of (7), dF/dx' / dt + dF/dx, is singular at k = {state.k}, or the model is not defined "
-                "there: the step has no unique solution.", record={"k": state.k},
-            )  # fmt: skip
+                "there: the step has no unique solution.",
+                record={"k": state.k},
+            )
         row = DAERow(self.graph, state.k, after[:, 0], said[:, 0], seen, moved)
         informations = (*state.informations, row.part("information"))[-self.settings.window :]
         return state._replace(memory=after[:, 0], k=state.k + 1, u=u, informations=informations), row

@@ -54,9 +54,14 @@ def sample_observer(observer: LinearObserver, dt: float) -> LinearObserver:
     transition, constant, ramp = first_order_hold(observer.Az, b, dt)
     into, through = transition @ ramp + constant - ramp, d + observer.Cz @ ramp
     return replace(
-        observer, Az=transition, Bu=into[:, :inputs], By=into[:, inputs:], Du=through[:, :inputs],
-        Dy=through[:, inputs:], dt=dt,
-    )  # fmt: skip
+        observer,
+        Az=transition,
+        Bu=into[:, :inputs],
+        By=into[:, inputs:],
+        Du=through[:, :inputs],
+        Dy=through[:, inputs:],
+        dt=dt,
+    )
 
 
 def averaged(observer: LinearObserver, mean: int) -> LinearObserver:
@@ -81,9 +86,15 @@ def averaged(observer: LinearObserver, mean: int) -> LinearObserver:
     du, dy = observer.Du.copy(), observer.Dy.copy()
     du[rows], dy[rows] = du[rows] / mean, dy[rows] / mean
     return replace(
-        observer, Az=az, Bu=widened(observer.Bu, observer.Du), By=widened(observer.By, observer.Dy), Cz=cz, Du=du,
-        Dy=dy, fault_delays=tuple(delay + (mean - 1) // 2 for delay in observer.fault_delays),
-    )  # fmt: skip
+        observer,
+        Az=az,
+        Bu=widened(observer.Bu, observer.Du),
+        By=widened(observer.By, observer.Dy),
+        Cz=cz,
+        Du=du,
+        Dy=dy,
+        fault_delays=tuple(delay + (mean - 1) // 2 for delay in observer.fault_delays),
+    )
 
 
 def unaveraged(observer: LinearObserver, mean: int) -> LinearObserver | None:
@@ -99,9 +110,15 @@ def unaveraged(observer: LinearObserver, mean: int) -> LinearObserver | None:
     if min(earlier, default=0) < 0:
         return None
     base = replace(
-        observer, Az=observer.Az[:order, :order], Bu=observer.Bu[:order], By=observer.By[:order], Cz=cz, Du=du, Dy=dy,
+        observer,
+        Az=observer.Az[:order, :order],
+        Bu=observer.Bu[:order],
+        By=observer.By[:order],
+        Cz=cz,
+        Du=du,
+        Dy=dy,
         fault_delays=earlier,
-    )  # fmt: skip
+    )
     again = averaged(base, mean)
     same = all(np.array_equal(getattr(again, n), getattr(observer, n)) for n in ("Az", "Bu", "By", "Cz", "Du", "Dy"))
     return base if same else None

@@ -231,7 +231,12 @@ class LinearObserver:
 def split_rows(observer: LinearObserver, rows: FloatArray) -> Estimates:
     """Return the estimates in the output rows ``(..., samples, nx + nf + nr)`` of an observer."""
     return Estimates(
-        read_only(rows[..., observer.state_rows]), read_only(rows[..., observer.fault_rows]),
-        read_only(rows[..., observer.residual_rows]), observer.state_names, observer.fault_names,
-        observer.residual_names, observer.state_delays, observer.fault_delays,
-    )  # fmt: skip
+        read_only(rows[..., observer.state_rows]),
+        read_only(rows[..., observer.fault_rows]),
+        read_only(rows[..., observer.residual_rows]),
+        observer.state_names,
+        observer.fault_names,
+        observer.residual_names,
+        observer.state_delays,
+        observer.fault_delays,
+    )

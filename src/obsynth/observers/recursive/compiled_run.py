@@ -116,8 +116,9 @@ def kernel_is_chosen(observer: RecursiveSettings, samples: int, compiled: bool |
         return False
     if observer.outliers != "none":
         if compiled:
-            raise SpecError("compiled=True: the kernel knows no outliers: leave it out, or take outliers='none'.",
-                            path="compiled")  # fmt: skip
+            raise SpecError(
+                "compiled=True: the kernel knows no outliers: leave it out, or take outliers='none'.", path="compiled"
+            )
         return False
     # The recursion of a filter, with parameters as a random walk or none.
     covered, installed = observer.form in ("", "random-walk"), importlib.util.find_spec("numba") is not None
@@ -131,8 +132,9 @@ def kernel_is_chosen(observer: RecursiveSettings, samples: int, compiled: bool |
     if not covered:
         raise SpecError(
             "compiled=True: the kernel runs filters, without parameters or with form 'random-walk'. The forms "
-            "'innovation' and 'literal' run without it: leave the option out.", path="compiled",
-        )  # fmt: skip
+            "'innovation' and 'literal' run without it: leave the option out.",
+            path="compiled",
+        )
     return True
 
 
@@ -142,10 +144,13 @@ def run_compiled(recursion: Recursion, y: FloatArray, u: FloatArray) -> Estimate
     nx, nq, rows = observer.plant.nx, len(observer.fault_names), observer.innovation_count + observer.order
     # Innovations are padded by NaN.
     record = {
-        "states": np.empty((samples, nx)), "state_deviations": np.empty((samples, nx)),
-        "faults": np.empty((samples, nq)), "fault_covariances": np.empty((samples, nq, nq)),
-        "innovations": np.full((samples, rows), np.nan), "nis_degrees": np.zeros(samples),
-    }  # fmt: skip
+        "states": np.empty((samples, nx)),
+        "state_deviations": np.empty((samples, nx)),
+        "faults": np.empty((samples, nq)),
+        "fault_covariances": np.empty((samples, nq, nq)),
+        "innovations": np.full((samples, rows), np.nan),
+        "nis_degrees": np.zeros(samples),
+    }
     stretches = _complete_stretches(y)
     pause, patience = 1, 1
     k = 0
@@ -153,8 +158,15 @@ def run_compiled(recursion: Recursion, y: FloatArray, u: FloatArray) -> Estimate
         count = min(int(stretches[k]), CHUNK)
         if pause or count < SHORT_STRETCH or state.diffuse.shape[1]:
             state, row = recursion.advance(state, y[k], u[k])
-            _fill(record, slice(k, k + 1), row.x, row.state_deviations, row.theta, row.parameter_covariance,
-                  row.innovation)  # fmt: skip
+            _fill(
+                record,
+                slice(k, k + 1),
+                row.x,
+                row.state_deviations,
+                row.theta,
+                row.parameter_covariance,
+                row.innovation,
+            )
             k, pause = k + 1, max(pause - 1, 0)
             continue
         state = _kernel_steps(recursion, state, record, y[k : k + count], u[k - 1 : k + count])
@@ -167,9 +179,13 @@ def run_compiled(recursion: Recursion, y: FloatArray, u: FloatArray) -> Estimate
     # Without parameters there is nothing to excite; with a random walk no window is watched.
     excitation = np.full(samples, 0.0 if observer.adaptation is None else np.nan)
     return named_estimates(
-        observer, **record, regressors=np.full((samples, most, nq), np.nan), excitation=excitation,
-        nis=np.nansum(innovations * innovations, axis=1), received=received_in(y),
-    )  # fmt: skip
+        observer,
+        **record,
+        regressors=np.full((samples, most, nq), np.nan),
+        excitation=excitation,
+        nis=np.nansum(innovations * innovations, axis=1),
+        received=received_in(y),
+    )
 
 
 def _fill(record: dict[str, FloatArray], kept: slice, *parts: FloatArray) -> None:
@@ -203,6 +219,13 @@ def _kernel_steps(
     states, innovations = np.empty((count, n)), np.empty((count, rows - n))
     deviations, covariances = np.empty((count, nx)), np.empty((count, n - nx, n - nx))
     taken = square_root_steps(x, factor, *stack, states, innovations, deviations, covariances, SUSPECT_PARITY)
-    _fill(record, slice(first, first + taken), states[:taken, :nx], deviations[:taken], states[:taken, nx:],
-          covariances[:taken], innovations[:taken])  # fmt: skip
+    _fill(
+        record,
+        slice(first, first + taken),
+        states[:taken, :nx],
+        deviations[:taken],
+        states[:taken, nx:],
+        covariances[:taken],
+        innovations[:taken],
+    )
     return state._replace(x=x, factor=factor, k=first + taken, u=u[taken])

@@ -77,9 +77,14 @@ def gain_steps(
             if recursion.literal and len(H) > ne:
                 seen, regressor, noise = posterior_residual(found, H, S, right, ne, unknown=unknown, columns=rows)
             parameters, theta_gain = update(
-                parameters, np.zeros(len(regressor)), regressor, forgetting=adaptation.forgetting,
-                regular=recursion.regular, directional=recursion.directional, noise=noise,
-            )  # fmt: skip
+                parameters,
+                np.zeros(len(regressor)),
+                regressor,
+                forgetting=adaptation.forgetting,
+                regular=recursion.regular,
+                directional=recursion.directional,
+                noise=noise,
+            )
             learn, forget = theta_gain @ seen, np.eye(nq) - theta_gain @ regressor
         yield GainStep(step, gain, parity, G, Upsilon, factor, learn, forget, parameters.spread)
 
@@ -156,7 +161,7 @@ def steady_observer(observer: RecursiveObserver) -> SteadyObserver:
             f"The steady filter is not stable (spectral radius {radius:.6g}): a mode is neither seen by the outputs "
             "nor damped, or parameters are not excited by a plant at rest. Run the recursion itself (obsynth run).",
             condition="stable steady filter",
-        )  # fmt: skip
+        )
     return SteadyObserver(realisation, read_only(start), steps)
 
 
@@ -166,13 +171,15 @@ def _require_constant(observer: RecursiveObserver) -> None:
     if moving:
         raise SpecError(
             f"{', '.join(moving)} may change with k (given as more than constants), so the gains do too and there is "
-            "no constant realisation to hand on: use the recursion itself, obsynth run or observer.step.", path="plant",
-        )  # fmt: skip
+            "no constant realisation to hand on: use the recursion itself, obsynth run or observer.step.",
+            path="plant",
+        )
     if observer.adaptation is not None and observer.adaptation.reset:
         raise SpecError(
             "This design resets its gains when the data ask for it, so there is no constant realisation to hand on: "
-            "use the recursion itself (obsynth run), or design without reset.", path="reset",
-        )  # fmt: skip
+            "use the recursion itself (obsynth run), or design without reset.",
+            path="reset",
+        )
 
 
 def _settled(observer: RecursiveObserver) -> tuple[GainStep, int]:
@@ -193,8 +200,9 @@ def _settled(observer: RecursiveObserver) -> tuple[GainStep, int]:
         last = found
     raise SolverError(
         f"The gains do not settle within {MOST_STEPS} steps: a mode is hardly seen, or hardly driven by noise. Run the "
-        "recursion itself (obsynth run), or state more noise in Q.", record={"steps": MOST_STEPS},
-    )  # fmt: skip
+        "recursion itself (obsynth run), or state more noise in Q.",
+        record={"steps": MOST_STEPS},
+    )
 
 
 def _parts(found: GainStep) -> tuple[FloatArray, ...]:
@@ -231,10 +239,21 @@ def _realised(observer: RecursiveObserver, found: GainStep) -> tuple[LinearObser
     residuals = tuple(f"innovation {i + 1}" for i in range(len(found.parity)))
     names = observer.fault_names if random_walk or q else ()
     realisation = LinearObserver(
-        Az=az, Bu=bu, By=by, Cz=np.vstack(shown), Du=np.vstack(fed), Dy=np.vstack(seen), dt=observer.dt,
-        input_names=plant.input_names, output_names=plant.output_names, state_names=plant.state_names,
-        fault_names=names, residual_names=residuals, state_delays=(0,) * nx, fault_delays=(0,) * len(names),
-    )  # fmt: skip
+        Az=az,
+        Bu=bu,
+        By=by,
+        Cz=np.vstack(shown),
+        Du=np.vstack(fed),
+        Dy=np.vstack(seen),
+        dt=observer.dt,
+        input_names=plant.input_names,
+        output_names=plant.output_names,
+        state_names=plant.state_names,
+        fault_names=names,
+        residual_names=residuals,
+        state_delays=(0,) * nx,
+        fault_delays=(0,) * len(names),
+    )
     begin = observer.init()
     # z = E x gives back x, as [L K] [E; C] = I, where the first outputs agree with it.
     return realisation, np.concatenate([step.H[:ne] @ begin.x, begin.parameters.theta])

@@ -110,8 +110,10 @@ class RecursiveObserver(RecursiveSettings, StepObserver[RecursiveState, RawEstim
         outputs, inputs = whole_record(y, u, self.plant.ny, self.plant.nu)
         require_horizon(self.plant.horizon, len(outputs), early=self.early_constraints)
         if compiled and not self.is_plain:
-            raise SpecError("compiled=True: the kernel knows neither sensors of their own times nor state_bounds: "
-                            "leave it out.", path="compiled")  # fmt: skip
+            raise SpecError(
+                "compiled=True: the kernel knows neither sensors of their own times nor state_bounds: leave it out.",
+                path="compiled",
+            )
         if self.is_plain and kernel_is_chosen(self, len(outputs), compiled):
             return run_compiled(self.recursion, outputs, inputs)
         rows, state = [], self.init()
@@ -151,12 +153,18 @@ def observer_from_options(plant: TimeVaryingDescriptorSystem, options: Mapping[s
             reset=options["reset"],
         )
     return RecursiveObserver(
-        plant, _sequence(options["Q"], plant.ne, "Q", plant), _sequence(options["R"], plant.ny, "R", plant),
+        plant,
+        _sequence(options["Q"], plant.ne, "Q", plant),
+        _sequence(options["R"], plant.ny, "R", plant),
         _vector(options["initial_state"], plant.nx, "initial_state"),
-        _square(options["initial_covariance"], plant.nx, 1.0, "initial_covariance"), adaptation,
-        options["early_constraints"], options.get("outliers", "none"), options.get("outlier_limit"),
-        options.get("sensors"), options.get("state_bounds"),
-    )  # fmt: skip
+        _square(options["initial_covariance"], plant.nx, 1.0, "initial_covariance"),
+        adaptation,
+        options["early_constraints"],
+        options.get("outliers", "none"),
+        options.get("outlier_limit"),
+        options.get("sensors"),
+        options.get("state_bounds"),
+    )
 
 
 def plain_options(options: Mapping[str, Any]) -> dict[str, Any]:
@@ -186,8 +194,11 @@ def _sequence(value: Any, size: int, name: str, plant: TimeVaryingDescriptorSyst
         value = real_number(value, name, "a variance, or a covariance matrix") * np.eye(size)
     found = MatrixSequence.of(value, name, constants=plant.constants)
     if found.length is not None and (plant.horizon is None or found.length < plant.horizon):
-        raise SpecError(f"{name} is a stack for {found.length} steps: it must reach as far as the plant's horizon "
-                        f"({plant.horizon or 'without end'}).", path=name)  # fmt: skip
+        raise SpecError(
+            f"{name} is a stack for {found.length} steps: it must reach as far as the plant's horizon "
+            f"({plant.horizon or 'without end'}).",
+            path=name,
+        )
     return found
 
 

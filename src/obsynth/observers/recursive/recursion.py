@@ -71,8 +71,9 @@ def posterior_residual(
     gaps = right[ne:] - H[ne:] @ found.estimate
     triangle = np.asarray(np.linalg.qr(S[ne:].T, mode="r")).T
     if not np.all(np.abs(np.diag(triangle)) > 0.0):
-        raise PreconditionError("The literal form (18) divides by R, which is singular: use form 'innovation'.",
-                                condition="R nonsingular")  # fmt: skip
+        raise PreconditionError(
+            "The literal form (18) divides by R, which is singular: use form 'innovation'.", condition="R nonsingular"
+        )
     data = np.eye(len(H))
     gains = None if unknown.shape[1] else least_squares_step(H, S, data)
     if gains is None:
@@ -101,10 +102,18 @@ class Recursion:
         factor = covariance_factor(settings.initial_covariance, "initial_covariance")
         nq = 0 if adaptation is None else settings.plant.nq
         self.first = RecursiveState(
-            0, settings.initial_state.copy(), factor, np.zeros((nx, nq)), np.zeros((nx, 0)),
-            start_of(np.zeros(0), np.zeros((0, 0))), np.zeros(settings.plant.nu), (), np.zeros((0, 2)), 0,
+            0,
+            settings.initial_state.copy(),
+            factor,
+            np.zeros((nx, nq)),
+            np.zeros((nx, 0)),
+            start_of(np.zeros(0), np.zeros((0, 0))),
+            np.zeros(settings.plant.nu),
+            (),
+            np.zeros((0, 2)),
+            0,
             no_refusals(settings.plant.ny),
-        )  # fmt: skip
+        )
         if adaptation is None:
             return
         spread = covariance_factor(adaptation.initial_covariance, "initial_covariance")
@@ -222,13 +231,23 @@ class Recursion:
                     resets += 1
             seen, regressor, noise = lesson or (v, G, None)
             parameters, _ = update(
-                parameters, seen, regressor, forgetting=self.settings.adaptation.forgetting, regular=self.regular,
-                directional=self.directional, noise=noise,
-            )  # fmt: skip
+                parameters,
+                seen,
+                regressor,
+                forgetting=self.settings.adaptation.forgetting,
+                regular=self.regular,
+                directional=self.directional,
+                noise=noise,
+            )
         after = state._replace(
-            x=found.estimate[:, 0], Upsilon=found.estimate[:, 1:], factor=found.factor, diffuse=found.diffuse,
-            parameters=parameters, surprises=surprises, resets=resets,
-        )  # fmt: skip
+            x=found.estimate[:, 0],
+            Upsilon=found.estimate[:, 1:],
+            factor=found.factor,
+            diffuse=found.diffuse,
+            parameters=parameters,
+            surprises=surprises,
+            resets=resets,
+        )
         return after, v, G
 
     def _careful(
@@ -250,8 +269,9 @@ class Recursion:
             if complete and found.diffuse.shape[1] > unknown.shape[1]:
                 raise PreconditionError(
                     f"rank H_k is lost at k = {state.k}: the equations and outputs of that step do not determine the "
-                    "state.", condition="rank [E; C]",
-                )  # fmt: skip
+                    "state.",
+                    condition="rank [E; C]",
+                )
         if not self.literal or len(H) <= ne:
             return found, None
         seen, regressor, noise = posterior_residual(found, H, S, right, ne, unknown=unknown)

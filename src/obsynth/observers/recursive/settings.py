@@ -143,9 +143,12 @@ class RecursiveSettings(StepSettings):
         if self.adaptation is not None:
             found["adaptation"] = {field.name: getattr(self.adaptation, field.name) for field in fields(Adaptation)}
         return {
-            **found, "plant": self.plant.as_dict(), "Q": self.Q.as_data(), "R": self.R.as_data(),
+            **found,
+            "plant": self.plant.as_dict(),
+            "Q": self.Q.as_data(),
+            "R": self.R.as_data(),
             "noise_constants": {**(self.Q.constants or {}), **(self.R.constants or {})},
-        }  # fmt: skip
+        }
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
@@ -153,7 +156,11 @@ class RecursiveSettings(StepSettings):
         given = dict(data)
         constants, adaptation = given.pop("noise_constants"), given["adaptation"]
         noise = {name: MatrixSequence.of(given[name], name, constants=constants) for name in ("Q", "R")}
-        return cls(**{
-            **given, **noise, "plant": TimeVaryingDescriptorSystem(**given["plant"]),
-            "adaptation": None if adaptation is None else Adaptation(**adaptation),
-        })  # fmt: skip
+        return cls(
+            **{
+                **given,
+                **noise,
+                "plant": TimeVaryingDescriptorSystem(**given["plant"]),
+                "adaptation": None if adaptation is None else Adaptation(**adaptation),
+            }
+        )

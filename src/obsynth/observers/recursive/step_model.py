@@ -88,8 +88,9 @@ def require_in_range(S: FloatArray, factor: FloatArray, k: int, state_names: Seq
     raise PreconditionError(
         f"The errors outgrow double precision at k = {k}: the outputs do not show, or not often enough, what grows in "
         f"{', '.join(map(repr, names))}. Measure more, shorten the horizon, or leave out what grows unseen.",
-        condition="bounded errors", signals=names,
-    )  # fmt: skip
+        condition="bounded errors",
+        signals=names,
+    )
 
 
 def spreads(
@@ -163,8 +164,9 @@ class EarlyConstraintSteps(StepModel):
         if np.any(covariance[np.ix_(self.others, self.rows)]):
             raise SpecError(
                 f"Q({k}) couples the noise of algebraic equations with that of the others: early_constraints needs "
-                "them independent.", path="method.options.early_constraints",
-            )  # fmt: skip
+                "them independent.",
+                path="method.options.early_constraints",
+            )
         name = f"Q({k})"
         return (
             covariance_factor(covariance[np.ix_(self.others, self.others)], name),
@@ -177,10 +179,14 @@ class EarlyConstraintSteps(StepModel):
         H = np.vstack([plant.E.at(k + 1)[others], plant.C.at(k + 1), plant.A.at(k + 1)[late]])
         outputs = stacked_noise(covariance_factor(self.R.at(k), f"R({k})"), self._factors(k + 1)[1])
         return StepMatrices(
-            np.asfortranarray(H), plant.A.at(k)[others], plant.B.at(k)[others], plant.Phi.at(k)[others],
-            np.vstack([plant.Psi.at(k), plant.Phi.at(k + 1)[late]]), -plant.B.at(k + 1)[late],
+            np.asfortranarray(H),
+            plant.A.at(k)[others],
+            plant.B.at(k)[others],
+            plant.Phi.at(k)[others],
+            np.vstack([plant.Psi.at(k), plant.Phi.at(k + 1)[late]]),
+            -plant.B.at(k + 1)[late],
             stacked_noise(self._factors(k)[0], outputs),
-        )  # fmt: skip
+        )
 
     def first(self) -> StepMatrices:
         """Return the correction of x(0) by the algebraic equations of step 0."""
@@ -192,9 +198,14 @@ class EarlyConstraintSteps(StepModel):
         H = np.vstack([np.eye(plant.nx), plant.A.at(k)[late]])
         noise = stacked_noise(np.zeros((plant.nx, 0)), self._factors(k)[1])
         return StepMatrices(
-            H, np.eye(plant.nx), np.zeros((plant.nx, plant.nu)), np.zeros((plant.nx, plant.nq)),
-            plant.Phi.at(k)[late], -plant.B.at(k)[late], noise,
-        )  # fmt: skip
+            H,
+            np.eye(plant.nx),
+            np.zeros((plant.nx, plant.nu)),
+            np.zeros((plant.nx, plant.nq)),
+            plant.Phi.at(k)[late],
+            -plant.B.at(k)[late],
+            noise,
+        )
 
 
 @dataclass
@@ -250,9 +261,14 @@ def with_walking_parameters(step: StepMatrices, walk: FloatArray, *, early: bool
         measured = len(step.Psi) - len(step.Dn)
         noise[ne + nq : ne + nq + measured, width:] = step.Psi[:measured] @ walk
     return StepMatrices(
-        np.asfortranarray(H), A, np.vstack([step.B, np.zeros((nq, step.B.shape[1]))]), np.zeros((ne + nq, 0)),
-        np.zeros((len(step.Psi), 0)), step.Dn, noise,
-    )  # fmt: skip
+        np.asfortranarray(H),
+        A,
+        np.vstack([step.B, np.zeros((nq, step.B.shape[1]))]),
+        np.zeros((ne + nq, 0)),
+        np.zeros((len(step.Psi), 0)),
+        step.Dn,
+        noise,
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -74,8 +74,17 @@ class _DAELinks(Links):
         seen = row.seen
         _, H, L = self.steps.graph.functions.outputs(x, theta)
         R = self.steps.settings.R[np.ix_(seen, seen)]
-        return _Sample(x, theta, row.part("F"), row.part("G"), row.part("noise") @ self.Q, row.innovation[seen],
-                       H[seen], L[seen], R)  # fmt: skip
+        return _Sample(
+            x,
+            theta,
+            row.part("F"),
+            row.part("G"),
+            row.part("noise") @ self.Q,
+            row.innovation[seen],
+            H[seen],
+            L[seen],
+            R,
+        )
 
     def through(self, state: DAEState) -> FloatArray:
         """Return the derivative of the state after the measurement by the parameters."""
@@ -101,8 +110,13 @@ class _ConstantLinks(_DAELinks):
     def begun(self, state: DAEState) -> Node:
         """Return the node of a state from which a chain begins; y(0) corrects the states alone."""
         nothing = np.zeros((0, self.nq))
-        return Node(self._origin(state), self.own_factor(state), np.zeros((self.nx, 0)), None,
-                    self._lesson(state, np.zeros(0), nothing, np.zeros((0, 0))))  # fmt: skip
+        return Node(
+            self._origin(state),
+            self.own_factor(state),
+            np.zeros((self.nx, 0)),
+            None,
+            self._lesson(state, np.zeros(0), nothing, np.zeros((0, 0))),
+        )
 
     def next(self, node: Node, before: DAEState, after: DAEState, row: DAERow, u: FloatArray) -> Node:
         """Return the node of the next sample."""
@@ -116,18 +130,25 @@ class _ConstantLinks(_DAELinks):
         right[:nx, 1:], right[nx:, 0], right[nx:, 1:] = self.steps.part(after, "Upsilon"), y - expected, -L
         root = covariance_factor(at.R, "R") if count else np.zeros((0, 0))
         known = np.vstack((at.F @ node.factor, np.zeros((count, node.factor.shape[1]))))
-        found = joint_step(np.vstack((np.eye(nx), H)), known, stacked_noise(at.noise, root), right,
-                           np.zeros((nx + count, 0)))  # fmt: skip
+        found = joint_step(
+            np.vstack((np.eye(nx), H)), known, stacked_noise(at.noise, root), right, np.zeros((nx + count, 0))
+        )
         # Its way back is written about the parameters of this sample.
         offset = found.back.offset.copy()
         offset[:, 0] -= offset[:, 1:] @ theta
-        return Node(self._origin(after), found.factor, found.diffuse, found.back._replace(offset=offset),
-                    self._learnt(before, after, at, node.factor))  # fmt: skip
+        return Node(
+            self._origin(after),
+            found.factor,
+            found.diffuse,
+            found.back._replace(offset=offset),
+            self._learnt(before, after, at, node.factor),
+        )
 
     def _origin(self, state: DAEState) -> FloatArray:
         through = self.through(state)
-        return np.column_stack((self.steps.part(state, "posterior") - through @ self.steps.part(state, "theta"),
-                                through))  # fmt: skip
+        return np.column_stack(
+            (self.steps.part(state, "posterior") - through @ self.steps.part(state, "theta"), through)
+        )
 
     def _learnt(self, before: DAEState, after: DAEState, at: _Sample, factor: FloatArray) -> Lesson | None:
         """Return what a sample says of the parameters: its innovation at parameters zero, and how it follows them."""
@@ -186,8 +207,12 @@ class _WalkingLinks(_DAELinks):
         factor = node.factor
         if after.resets > before.resets:
             # Nothing is known of the parameters from before: they begin anew, beside the states.
-            begun = np.vstack((np.zeros((nx, nq)), covariance_factor(
-                self.steps.settings.initial_parameter_covariance, "initial_parameter_covariance")))  # fmt: skip
+            begun = np.vstack(
+                (
+                    np.zeros((nx, nq)),
+                    covariance_factor(self.steps.settings.initial_parameter_covariance, "initial_parameter_covariance"),
+                )
+            )
             factor = np.vstack((factor[:nx], np.zeros((nq, factor.shape[1]))))
             noise = np.hstack((noise, F @ begun))
         right = np.concatenate((np.zeros(nx + nq), at.e))[:, None]
@@ -206,8 +231,9 @@ class _RecursiveLinks(Links):
         if recursion.literal:
             raise PreconditionError(
                 "Form 'literal' learns from residuals that are correlated in time, of which no smoother exists: use "
-                "form 'innovation' or 'random-walk'.", condition="white residuals",
-            )  # fmt: skip
+                "form 'innovation' or 'random-walk'.",
+                condition="white residuals",
+            )
         self.recursion, self.start, settings = recursion, recursion.first, recursion.settings
         self.forgetting = 1.0 if settings.adaptation is None else settings.adaptation.forgetting
         self.bounds = settings.state_bounds
@@ -250,8 +276,15 @@ class _RecursiveLinks(Links):
         if not len(known.theta):
             return None
         G = row.regressor if row.regressor.size else np.zeros((len(row.innovation), len(known.theta)))
-        return Lesson(known.theta, known.triangle, known.spread, row.innovation, G, np.eye(len(row.innovation)),
-                      after.resets > before.resets)  # fmt: skip
+        return Lesson(
+            known.theta,
+            known.triangle,
+            known.spread,
+            row.innovation,
+            G,
+            np.eye(len(row.innovation)),
+            after.resets > before.resets,
+        )
 
 
 SmoothedObserver = RecursiveObserver | DAEObserver
@@ -359,8 +392,10 @@ def checked_lag(lag: Any) -> int | None:
     if lag is None:
         return None
     if not is_whole(lag) or lag < 1:
-        raise SpecError(f"lag is {lag!r}: give how many samples are waited for, 1 or more, or None for the whole "
-                        "record.", path="lag")  # fmt: skip
+        raise SpecError(
+            f"lag is {lag!r}: give how many samples are waited for, 1 or more, or None for the whole record.",
+            path="lag",
+        )
     return int(lag)
 
 

@@ -70,8 +70,9 @@ def check_distinct(model: DAEFields) -> None:
     if repeated:
         raise SpecError(
             f"{', '.join(map(repr, repeated))} is named in more than one of states, inputs, parameters, constants and "
-            "definitions.", path="states",
-        )  # fmt: skip
+            "definitions.",
+            path="states",
+        )
 
 
 def check_structure(model: DAEFields, problems: Problems) -> None:
@@ -87,15 +88,19 @@ def _square(model: DAEFields, symbols: DAESymbols) -> None:
     rows, ny = symbols.equations.numel(), symbols.outputs.numel()
     if rows != model.nx:
         few = "few" if rows < model.nx else "many"
-        raise SpecError(f"There are {rows} equations for {model.nx} states ({', '.join(model.state_names)}): "
-                        f"{abs(rows - model.nx)} too {few}.", path="equations")  # fmt: skip
+        raise SpecError(
+            f"There are {rows} equations for {model.nx} states ({', '.join(model.state_names)}): "
+            f"{abs(rows - model.nx)} too {few}.",
+            path="equations",
+        )
     if ny != model.ny:
         raise SpecError(f"outputs returns {ny} expressions, but output_names has {model.ny} names.", path="outputs")
     if not ny:
         raise SpecError("outputs is empty: an observer needs at least one.", path="outputs")
     if _depends(symbols.outputs, symbols.u).any():
-        raise SpecError("An output depends on an input: add a state that equals the input, or subtract it from y.",
-                        path="outputs")  # fmt: skip
+        raise SpecError(
+            "An output depends on an input: add a state that equals the input, or subtract it from y.", path="outputs"
+        )
 
 
 def _only_states_stored(model: DAEFields, symbols: DAESymbols) -> None:
@@ -104,15 +109,22 @@ def _only_states_stored(model: DAEFields, symbols: DAESymbols) -> None:
         name = model.input_names[int(np.argmax(found.any(axis=0)))]
         raise SpecError(
             f"der(...) is taken of the input {name!r}, whose derivative is not known: give the derivative as an input "
-            "of its own, or write the balance with states only.", path="equations",
-        )  # fmt: skip
+            "of its own, or write the balance with states only.",
+            path="equations",
+        )
     still = ~_depends(symbols.stored, symbols.x).any(axis=1)
     if still.any():
-        where = [name for name, row in zip(model.equation_names, _depends(symbols.equations, symbols.rates)[:, still],
-                                           strict=False) if row.any()]  # fmt: skip
+        where = [
+            name
+            for name, row in zip(
+                model.equation_names, _depends(symbols.equations, symbols.rates)[:, still], strict=False
+            )
+            if row.any()
+        ]
         told = f" in the equation {where[0]!r}" if where else ""
-        raise SpecError(f"der(...){told} is taken of what contains no state, and is zero: take it of a state.",
-                        path="equations")  # fmt: skip
+        raise SpecError(
+            f"der(...){told} is taken of what contains no state, and is zero: take it of a state.", path="equations"
+        )
 
 
 def _no_empty_equation(model: DAEFields, symbols: DAESymbols) -> None:
@@ -123,8 +135,9 @@ def _no_empty_equation(model: DAEFields, symbols: DAESymbols) -> None:
     if empty:
         raise SpecError(
             f"The equation {', '.join(empty)} contains neither a state nor a derivative of one: no solution can "
-            "depend on it. Remove it together with a state, or correct it.", path="equations",
-        )  # fmt: skip
+            "depend on it. Remove it together with a state, or correct it.",
+            path="equations",
+        )
     through_rates = _depends(symbols.equations, symbols.rates) @ _depends(symbols.stored, symbols.x)
     free = ~(_depends(symbols.equations, symbols.x) | through_rates).any(axis=0)
     if free.any():
@@ -140,13 +153,25 @@ def _every_signal_used(model: DAEFields, symbols: DAESymbols, problems: Problems
     everything = ca.vertcat(symbols.equations, symbols.stored, symbols.outputs)
     seen = _depends(symbols.outputs, ca.vertcat(symbols.x, symbols.theta)).any(axis=1)
     for path, names, used, text in (
-        ("inputs", model.input_names, _depends(everything, symbols.u).any(axis=0),
-         "The input {!r} enters no equation: remove it, or use it."),
-        ("parameters", model.parameter_names, _depends(everything, symbols.theta).any(axis=0),
-         "The parameter {!r} enters no equation and no output: remove it, or use it."),
-        ("outputs", model.output_names, seen, "The output {!r} contains neither a state nor a parameter: it tells "
-         "nothing."),
-    ):  # fmt: skip
+        (
+            "inputs",
+            model.input_names,
+            _depends(everything, symbols.u).any(axis=0),
+            "The input {!r} enters no equation: remove it, or use it.",
+        ),
+        (
+            "parameters",
+            model.parameter_names,
+            _depends(everything, symbols.theta).any(axis=0),
+            "The parameter {!r} enters no equation and no output: remove it, or use it.",
+        ),
+        (
+            "outputs",
+            model.output_names,
+            seen,
+            "The output {!r} contains neither a state nor a parameter: it tells nothing.",
+        ),
+    ):
         idle = [name for name, enters in zip(names, used, strict=False) if not enters]
         if idle:
             problems.note(text.format(idle[0]), f"{path}.{idle[0]}")
@@ -182,8 +207,9 @@ def require_known(model: DAEFields, u: FloatArray, first: int = 0) -> None:
         k, i = np.argwhere(~np.isfinite(u))[0]
         raise SpecError(
             f"The input {model.input_names[i]!r} is {u[k, i]} at k = {first + k}: inputs must be known. Fill the gap, "
-            "or make the signal a state with a sensor.", path="u",
-        )  # fmt: skip
+            "or make the signal a state with a sensor.",
+            path="u",
+        )
 
 
 def finite_vector(value: Any, names: Sequence[str], default: FloatArray, what: str) -> FloatArray:

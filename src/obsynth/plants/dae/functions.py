@@ -17,12 +17,14 @@ _ROOT = np.sqrt(6.0)
 #: Butcher matrices of the implicit methods whose last stage is the result (stiffly accurate).
 BUTCHER: dict[str, FloatArray] = {
     "backward-euler": np.array([[1.0]]),
-    "radau": np.array([
-        [(88 - 7 * _ROOT) / 360, (296 - 169 * _ROOT) / 1800, (-2 + 3 * _ROOT) / 225],
-        [(296 + 169 * _ROOT) / 1800, (88 + 7 * _ROOT) / 360, (-2 - 3 * _ROOT) / 225],
-        [(16 - _ROOT) / 36, (16 + _ROOT) / 36, 1 / 9],
-    ]),
-}  # fmt: skip
+    "radau": np.array(
+        [
+            [(88 - 7 * _ROOT) / 360, (296 - 169 * _ROOT) / 1800, (-2 + 3 * _ROOT) / 225],
+            [(296 + 169 * _ROOT) / 1800, (88 + 7 * _ROOT) / 360, (-2 - 3 * _ROOT) / 225],
+            [(16 - _ROOT) / 36, (16 + _ROOT) / 36, 1 / 9],
+        ]
+    ),
+}
 
 
 class Compiled:
@@ -86,9 +88,10 @@ def _graphs(model: DAEModel, method: str) -> tuple[Any, Any, Any]:
     jacobians = [ca.jacobian(residual, X), ca.jacobian(residual, start), ca.jacobian(residual, symbols.theta)]
     seen = [symbols.outputs, ca.jacobian(symbols.outputs, symbols.x), ca.jacobian(symbols.outputs, symbols.theta)]
     return (
-        _dense("residual", inputs, [residual, jacobians[0]]), _dense("derivatives", inputs, jacobians),
+        _dense("residual", inputs, [residual, jacobians[0]]),
+        _dense("derivatives", inputs, jacobians),
         _dense("outputs", [symbols.x, symbols.theta], seen),
-    )  # fmt: skip
+    )
 
 
 def _dense(name: str, inputs: list[Any], outputs: list[Any]) -> Any:
@@ -109,8 +112,9 @@ def _stage_equations(symbols: DAESymbols, stages: Any, start: Any, dt: Any, weig
     rows = []
     for i in range(count):
         rates = sum((weights[i, j] * gained[j] for j in range(1, count)), weights[i, 0] * gained[0]) / dt
-        rows.append(ca.substitute(symbols.equations, ca.vertcat(symbols.x, symbols.rates),
-                                  ca.vertcat(stages[:, i], rates)))  # fmt: skip
+        rows.append(
+            ca.substitute(symbols.equations, ca.vertcat(symbols.x, symbols.rates), ca.vertcat(stages[:, i], rates))
+        )
     return ca.vertcat(*rows)
 
 
@@ -120,9 +124,12 @@ STRETCHES = (16, 256)
 
 
 def take_samples(
-    first: int, samples: int, together: Callable[[int, int], int], alone: Callable[[int], object],
+    first: int,
+    samples: int,
+    together: Callable[[int, int], int],
+    alone: Callable[[int], object],
     note: Callable[[int], object] = bool,
-) -> None:  # fmt: skip
+) -> None:
     """Go through samples in stretches."""
     k, allowed = first, STRETCHES[-1]
     while k < samples:

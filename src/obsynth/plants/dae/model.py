@@ -109,8 +109,10 @@ class DAEModel(DAEFields):
         for field, texts in (("equations", equations), ("outputs", outputs), ("definitions", definitions or {})):
             fields[field] = texts if callable(texts) else problems.collect(partial(checked_texts, texts, field))
         problems.raise_if_any()
-        for field, names, what in (("equation_names", equation_names, "equations"),
-                                   ("output_names", output_names, "outputs")):  # fmt: skip
+        for field, names, what in (
+            ("equation_names", equation_names, "equations"),
+            ("output_names", output_names, "outputs"),
+        ):
             fields[field] = problems.collect(partial(checked_equation_names, names, fields[what], field, len(states)))
         problems.raise_if_any()
         for field, value in fields.items():

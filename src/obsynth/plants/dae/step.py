@@ -253,4 +253,4 @@ class ImplicitStep:
             f"No solution at k = {k}{where}: Newton stopped after iteration {found.iterations}, and the worst equation "
             f"is {name!r} ({worst}). Check that input and state at this k are possible, or take smaller steps.",
             record={"k": k, "iteration": found.iterations, "equation": name, "residual": found.residual},
-        )  # fmt: skip
+        )

@@ -114,8 +114,9 @@ def _from_texts(model: DAEFields, equations: Mapping[str, str]) -> DAESymbols:
     with_rates = known | {key: rates[i] for i, key in enumerate(stored)}
     rows = [_value(expression, with_rates, f"equations.{name}") for name, expression in parsed.items()]
     if callable(model.outputs):
-        raise SpecError("The equations are texts, but the outputs are a function: give both in one way.",
-                        path="outputs")  # fmt: skip
+        raise SpecError(
+            "The equations are texts, but the outputs are a function: give both in one way.", path="outputs"
+        )
     seen = [_text_value(text, known, f"outputs.{name}") for name, text in model.outputs.items()]
     return DAESymbols(rates, x, u, theta, ca.vertcat(*rows), ca.vertcat(*stored.values()), ca.vertcat(*seen))
 
@@ -146,8 +147,9 @@ def _value(expression: Expression, known: Mapping[str, Any], path: str) -> Any:
     if unknown:
         raise SpecError(
             f"{path}: {expression.text!r} uses {', '.join(map(repr, unknown))}, which is no state, input, parameter, "
-            f"constant or earlier definition; there are: {', '.join(n for n in known if 'der(' not in n)}.", path=path,
-        )  # fmt: skip
+            f"constant or earlier definition; there are: {', '.join(n for n in known if 'der(' not in n)}.",
+            path=path,
+        )
     return symbolic_value(expression, known)
 
 
@@ -163,12 +165,25 @@ def _translation(operation: Callable[..., Any]) -> Callable[..., Any]:
     import casadi as ca
 
     special: dict[Callable[..., Any], Callable[..., Any]] = {
-        np.add: ca.plus, np.subtract: ca.minus, np.multiply: ca.times,
-        np.divide: ca.rdivide, np.power: ca.power, np.negative: lambda a: -a, np.arcsin: ca.asin, np.arccos: ca.acos,
-        np.arctan: ca.atan, np.abs: ca.fabs, np.minimum: ca.fmin, np.maximum: ca.fmax,
-        step_function: lambda a: ca.if_else(a >= 0.0, 1.0, 0.0), np.where: ca.if_else, np.less: ca.lt,
-        np.less_equal: ca.le, np.greater: ca.gt, np.greater_equal: ca.ge,
-    }  # fmt: skip
+        np.add: ca.plus,
+        np.subtract: ca.minus,
+        np.multiply: ca.times,
+        np.divide: ca.rdivide,
+        np.power: ca.power,
+        np.negative: lambda a: -a,
+        np.arcsin: ca.asin,
+        np.arccos: ca.acos,
+        np.arctan: ca.atan,
+        np.abs: ca.fabs,
+        np.minimum: ca.fmin,
+        np.maximum: ca.fmax,
+        step_function: lambda a: ca.if_else(a >= 0.0, 1.0, 0.0),
+        np.where: ca.if_else,
+        np.less: ca.lt,
+        np.less_equal: ca.le,
+        np.greater: ca.gt,
+        np.greater_equal: ca.ge,
+    }
     found = special.get(operation) or getattr(ca, operation.__name__)
 
     return lambda *values: found(*(ca.SX(value) for value in values))
@@ -181,8 +196,9 @@ def _from_functions(model: DAEFields) -> DAESymbols:
     stored = x if model.storage is None else _called(model.storage, (x, theta), "storage")
     rates = ca.SX.sym("rates", stored.numel())
     if not callable(model.outputs) or not callable(model.equations):
-        raise SpecError("The equations are a function, but the outputs are texts: give both in one way.",
-                        path="outputs")  # fmt: skip
+        raise SpecError(
+            "The equations are a function, but the outputs are texts: give both in one way.", path="outputs"
+        )
     rows = _called(model.equations, (rates, x, u, theta), "equations")
     seen = _called(model.outputs, (x, theta), "outputs")
     return DAESymbols(rates, x, u, theta, rows, stored, seen)
@@ -205,8 +221,9 @@ def _called(function: Callable[..., Any], columns: Sequence[Any], path: str) -> 
         if "truth value" in str(error):
             raise SpecError(
                 f"The function {path} decides with `if` (or `and`, `or`, `min`, `max`) on a state, which has no value "
-                "yet: use numpy.where(condition, a, b), numpy.logical_and, numpy.minimum or numpy.maximum.", path=path,
-            ) from error  # fmt: skip
+                "yet: use numpy.where(condition, a, b), numpy.logical_and, numpy.minimum or numpy.maximum.",
+                path=path,
+            ) from error
         raise _not_symbolic(path, len(columns), f"{type(error).__name__}: {str(error).splitlines()[0]}") from error
     finally:
         ca.GlobalOptions.setNumpyMode(mode)
@@ -221,14 +238,18 @@ def _not_symbolic(path: str, count: int, reason: str) -> SpecError:
     return SpecError(
         f"The function {path} cannot be called on symbols: {reason}. It takes lists ({taken}), in the order of the "
         "names, and returns a list; use numpy's functions (sqrt, where, minimum, ...) in place of those of math, and "
-        "no numbers that are made of a state, such as int(x) or range(x).", path=path,
-    )  # fmt: skip
+        "no numbers that are made of a state, such as int(x) or range(x).",
+        path=path,
+    )
 
 
 def _holds_nan(column: Any, columns: Sequence[Any]) -> bool:
     import casadi as ca
 
     function = ca.Function("found", list(columns), [column], {"allow_free": True})
-    constants = (function.instruction_constant(i) for i in range(function.n_instructions())
-                 if function.instruction_id(i) == ca.OP_CONST)  # fmt: skip
+    constants = (
+        function.instruction_constant(i)
+        for i in range(function.n_instructions())
+        if function.instruction_id(i) == ca.OP_CONST
+    )
     return any(np.isnan(constant) for constant in constants)

@@ -64,9 +64,14 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
         return
     problem = misfit(design)
     yield upper_bound_check(
-        "fits the plant", "observer, options and plant hold the same model and numbers", float(bool(problem)), 0.0,
-        source="shipped observer", kind="equality", detail=problem,
-    )  # fmt: skip
+        "fits the plant",
+        "observer, options and plant hold the same model and numbers",
+        float(bool(problem)),
+        0.0,
+        source="shipped observer",
+        kind="equality",
+        detail=problem,
+    )
     yield from refinement_rows(observer)
     # What is checked is the recursion; records that no plant made would seem full of outliers.
     observer = plain_recursion(observer)
@@ -74,13 +79,18 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
         facts = dae_facts(observer)
         yield from _model_rows(observer, facts)
         yield listed_gains(design, {"K": facts.K, "Upsilon": facts.Upsilon})
-        found = {"index": float(facts.index.index), "condition": facts.condition, "contraction": facts.contraction,
-                 "steps": float(NOMINAL_STEPS)}  # fmt: skip
+        found = {
+            "index": float(facts.index.index),
+            "condition": facts.condition,
+            "contraction": facts.contraction,
+            "steps": float(NOMINAL_STEPS),
+        }
         yield claims_row(design, found, rough=found)
         yield from _consistency_rows(design, observer)
     except (ObsynthError, np.linalg.LinAlgError, ValueError, KeyError, TypeError) as error:
-        yield upper_bound_check("runs", "the observer runs on its own model", 1.0, 0.0, source="shipped observer",
-                                detail=str(error))  # fmt: skip
+        yield upper_bound_check(
+            "runs", "the observer runs on its own model", 1.0, 0.0, source="shipped observer", detail=str(error)
+        )
 
 
 def misfit(design: ObserverDesign) -> str:
@@ -105,33 +115,58 @@ def misfit(design: ObserverDesign) -> str:
 def _model_rows(observer: DAEObserver, facts: DAEFacts) -> Iterator[Check]:
     names, priors = observer.fault_names, np.sqrt(np.diag(observer.initial_parameter_covariance))
     yield upper_bound_check(
-        "condition of (7)", "dF/dx' / dt + dF/dx is far from singular along the nominal run", facts.condition,
-        SINGULAR_CONDITION, source=f"{_SOURCE}, (7)", detail=f"worst at k = {facts.condition_k}",
-    )  # fmt: skip
+        "condition of (7)",
+        "dF/dx' / dt + dF/dx is far from singular along the nominal run",
+        facts.condition,
+        SINGULAR_CONDITION,
+        source=f"{_SOURCE}, (7)",
+        detail=f"worst at k = {facts.condition_k}",
+    )
     yield upper_bound_check(
-        "Newton residual", "every step of the nominal run solves its equations", facts.residual, LARGEST_RESIDUAL,
-        source="recomputed", kind="equality",
-    )  # fmt: skip
+        "Newton residual",
+        "every step of the nominal run solves its equations",
+        facts.residual,
+        LARGEST_RESIDUAL,
+        source="recomputed",
+        kind="equality",
+    )
     yield upper_bound_check(
-        "derivatives", "F, G, H and L equal central differences of converged steps", _derivative_gap(observer),
-        DERIVATIVE_TOLERANCE, source=f"{_SOURCE}, (8), (9)", kind="equality",
-    )  # fmt: skip
+        "derivatives",
+        "F, G, H and L equal central differences of converged steps",
+        _derivative_gap(observer),
+        DERIVATIVE_TOLERANCE,
+        source=f"{_SOURCE}, (8), (9)",
+        kind="equality",
+    )
     yield from _proved_rows(observer, facts)
     deviations = facts.identifiable.deviations[observer.model.nx :]
     for name, prior, bound, deviation in zip(names, priors, deviations, facts.deviations, strict=True):
         unit = observer.model.units.get(name, "")
         told = "the outputs alone do not tell it" if not np.isfinite(bound) else f"Cramer-Rao {bound:.3g} {unit}"
         yield information(
-            f"excitation: {name}", "what nominal constant inputs say, in prior deviations to the power -2",
-            float((prior / bound) ** 2), source=f"{_SOURCE}, (26)", detail=told,
-        )  # fmt: skip
-        yield information(f"noise in fhat[{name}]", "standard deviation after the nominal run", float(deviation),
-                          source="recomputed", detail=unit)  # fmt: skip
+            f"excitation: {name}",
+            "what nominal constant inputs say, in prior deviations to the power -2",
+            float((prior / bound) ** 2),
+            source=f"{_SOURCE}, (26)",
+            detail=told,
+        )
+        yield information(
+            f"noise in fhat[{name}]",
+            "standard deviation after the nominal run",
+            float(deviation),
+            source="recomputed",
+            detail=unit,
+        )
     if len(names) > 1:
         off = np.abs(facts.correlations - np.diag(np.diag(facts.correlations)))
         i, j = np.unravel_index(int(np.argmax(off)), off.shape)
-        yield information("crosstalk", "largest correlation between errors of parameters", float(off[i, j]),
-                          source="recomputed", detail=f"{names[int(i)]}, {names[int(j)]}")  # fmt: skip
+        yield information(
+            "crosstalk",
+            "largest correlation between errors of parameters",
+            float(off[i, j]),
+            source="recomputed",
+            detail=f"{names[int(i)]}, {names[int(j)]}",
+        )
 
 
 def _proved_rows(observer: DAEObserver, facts: DAEFacts) -> Iterator[Check]:
@@ -146,30 +181,48 @@ def _proved_rows(observer: DAEObserver, facts: DAEFacts) -> Iterator[Check]:
     source, decay = f"{_SOURCE}, convergence", f"decay in {facts.decay_time:.3g} steps"
     told = f"for all derivatives within {DERIVATIVE_TOLERANCE:g} of the computed ones, in sizes of the signals"
     if rate is None:
-        yield upper_bound_check("contraction", claim, facts.contraction, np.nextafter(1.0, 0.0), source=source,
-                                detail=f"eigenvalues computed, no inequality was proved; {decay}")  # fmt: skip
+        yield upper_bound_check(
+            "contraction",
+            claim,
+            facts.contraction,
+            np.nextafter(1.0, 0.0),
+            source=source,
+            detail=f"eigenvalues computed, no inequality was proved; {decay}",
+        )
     else:
         yield upper_bound_check(
-            "contraction", f"{claim} is at most", rate, np.nextafter(1.0, 0.0), source=source, kind="proved",
+            "contraction",
+            f"{claim} is at most",
+            rate,
+            np.nextafter(1.0, 0.0),
+            source=source,
+            kind="proved",
             detail=f"Lyapunov inequality {told}; computed {facts.contraction:.6g}, {decay}",
-        )  # fmt: skip
+        )
     powers = np.exp2(np.round(np.log2(units)))
     pairs = zip(facts.kept, allowed, strict=True)
     mean = float(np.exp(logarithm_of_product([Ball(*pair) for pair in pairs], powers) / len(facts.kept)))
     proved = mean < 1.0
     yield information(
-        "contraction along the run", "bound on the mean factor per step of the product of F (I - K H), in sizes of the "
-        "states", mean, source=source, status="proved" if proved else "assumed",
+        "contraction along the run",
+        "bound on the mean factor per step of the product of F (I - K H), in sizes of the states",
+        mean,
+        source=source,
+        status="proved" if proved else "assumed",
         detail=f"{len(facts.kept)} steps, outward rounding, {told}" if proved else "not proved to be below one",
-    )  # fmt: skip
+    )
     deviations = np.where(facts.deviations > 0.0, facts.deviations, 1.0)
     inverse = np.diag(np.exp2(-np.round(np.log2(deviations))))
     proof = prove_positive_definite(inverse @ facts.parameter_covariance @ inverse)
     yield information(
-        "covariance", "the covariance of the parameters after the nominal run is positive definite, in units of their "
-        "deviations: lower bound on its smallest eigenvalue", proof.lower_bound, source="recomputed",
-        status="proved" if proof.proved else "computed twice", detail=proof.text,
-    )  # fmt: skip
+        "covariance",
+        "the covariance of the parameters after the nominal run is positive definite, in units of their "
+        "deviations: lower bound on its smallest eigenvalue",
+        proof.lower_bound,
+        source="recomputed",
+        status="proved" if proof.proved else "computed twice",
+        detail=proof.text,
+    )
 
 
 def _derivative_gap(observer: DAEObserver) -> float:
@@ -214,18 +267,30 @@ def _consistency_rows(design: ObserverDesign, shipped: DAEObserver) -> Iterator[
         if max(_ratio(float(np.mean(errors))), _ratio(squares / degrees)) <= CONSISTENCY_FACTOR:
             break
     for name, claim, mean, count in (
-        ("NEES", "squared errors of the parameters per degree of freedom are one, within a factor",
-         float(np.mean(errors)), float(errors.size * stated.model.nq)),
+        (
+            "NEES",
+            "squared errors of the parameters per degree of freedom are one, within a factor",
+            float(np.mean(errors)),
+            float(errors.size * stated.model.nq),
+        ),
         ("NIS", "squared innovations per degree of freedom are one, within a factor", squares / degrees, degrees),
-    ):  # fmt: skip
+    ):
         low, high = _band(count)
         bound = CONSISTENCY_FACTOR if mean >= 1.0 else 1.0 / CONSISTENCY_FACTOR
         yield Check(
-            name, claim, mean, bound, CONSISTENCY_FACTOR - _ratio(mean), bool(_ratio(mean) <= CONSISTENCY_FACTOR),
-            "recomputed, Monte Carlo with a fixed seed", "computed",
+            name,
+            claim,
+            mean,
+            bound,
+            CONSISTENCY_FACTOR - _ratio(mean),
+            bool(_ratio(mean) <= CONSISTENCY_FACTOR),
+            "recomputed, Monte Carlo with a fixed seed",
+            "computed",
             f"mean of {errors.size} runs of {STEPS} steps at nominal inputs; by chance alone, with exact covariances, "
-            f"it lies within {low:.3f} to {high:.3f} in 95 % of such samples", "estimated", (low, high),
-        )  # fmt: skip
+            f"it lies within {low:.3f} to {high:.3f} in 95 % of such samples",
+            "estimated",
+            (low, high),
+        )
 
 
 def _ratio(mean: float) -> float:
@@ -237,8 +302,10 @@ def _trials(
     stated: DAEObserver, shipped: DAEObserver, rng: np.random.Generator, trials: range
 ) -> tuple[FloatArray, float, float]:
     """Return squared errors of the parameters per degree of freedom, and squared innovations with their number."""
-    roots = [covariance_factor(stated.initial_parameter_covariance, "initial_parameter_covariance"),
-             covariance_factor(stated.initial_covariance, "initial_covariance")]  # fmt: skip
+    roots = [
+        covariance_factor(stated.initial_parameter_covariance, "initial_parameter_covariance"),
+        covariance_factor(stated.initial_covariance, "initial_covariance"),
+    ]
     u = np.tile(stated.model.nominal_input, (STEPS + 1, 1))
     walk = np.zeros((stated.model.nq, stated.model.nq))
     if stated.form != "forgetting":
@@ -253,8 +320,17 @@ def _trials(
         path = np.clip(path, stated.lower, stated.upper)
         parameters.append(path[-1])
         start = stated.initial_state + roots[1] @ rng.standard_normal(stated.model.nx)
-        truth = simulate_dae(stated.model, u, dt=stated.dt, parameters=path, initial_state=start, Q=stated.Q,
-                             R=stated.R, integration=stated.integration, seed=SEED + trial)  # fmt: skip
+        truth = simulate_dae(
+            stated.model,
+            u,
+            dt=stated.dt,
+            parameters=path,
+            initial_state=start,
+            Q=stated.Q,
+            R=stated.R,
+            integration=stated.integration,
+            seed=SEED + trial,
+        )
         outputs.append(truth.outputs)
     # As C it would be faster, but the compiler takes longer than all of this.
     found = run_dae_batch(shipped, np.array(outputs), u, compiled=False, progress=False)

@@ -34,8 +34,14 @@ def gains_fit(work: DescriptorSystem, gains: Mapping[str, FloatArray], observer:
     """Return the row on letters and shapes of the gain set."""
     na, ny, nf = work.nx, work.ny, work.nf
     shapes = {
-        "T": (na, na), "N": (na, ny), "L": (na, ny), "W": (nf, ny), "Psi": (na, nf), "Upsilon": (ny, nf), "R": (na, ny),
-    }  # fmt: skip
+        "T": (na, na),
+        "N": (na, ny),
+        "L": (na, ny),
+        "W": (nf, ny),
+        "Psi": (na, nf),
+        "Upsilon": (ny, nf),
+        "R": (na, ny),
+    }
     wrong = [letter for letter in NEEDED if letter not in gains]
     wrong += [letter for letter in gains if letter not in shapes]
     wrong += [
@@ -65,10 +71,8 @@ def gain_identities(
     peaks = np.max(np.abs(w) @ np.abs(upsilon), axis=0, initial=0.0)
     return {
         RESTRICTED: Identity((t @ work.E, n @ work.C, -np.eye(work.nx)), ((t, work.E), (n, work.C)), scaling.states),
-        WEIGHT: Identity(
-            (w @ upsilon, -np.eye(work.nf)), ((w, upsilon),), 1.0 / np.where(peaks > 0.0, peaks, 1.0)
-        ),
-    }  # fmt: skip
+        WEIGHT: Identity((w @ upsilon, -np.eye(work.nf)), ((w, upsilon),), 1.0 / np.where(peaks > 0.0, peaks, 1.0)),
+    }
 
 
 def gain_rows(

@@ -36,9 +36,10 @@ def leak_rows(design: ObserverDesign) -> Iterator[Check]:
             continue
         columns = [plant.fault_names.index(fault) for fault in blind]
         other = plant.replace(
-            Bd=np.hstack([plant.Bd, plant.Bf[:, columns]]), Dd=np.hstack([plant.Dd, plant.Df[:, columns]]),
+            Bd=np.hstack([plant.Bd, plant.Bf[:, columns]]),
+            Dd=np.hstack([plant.Dd, plant.Df[:, columns]]),
             disturbance_names=[*plant.disturbance_names, *(f"fault {fault}" for fault in blind)],
-        )  # fmt: skip
+        )
         claim = f"neither unknown inputs nor {', '.join(blind)} reach it, whatever their course"
         yield _leak_row(f"free of others: {name}", claim, other, _only(observer, rows))
 
@@ -46,9 +47,13 @@ def leak_rows(design: ObserverDesign) -> Iterator[Check]:
 def _leak_row(name: str, claim: str, plant: DescriptorSystem, observer: LinearObserver) -> Check:
     found = decoupling_norm(plant, observer)
     return upper_bound_check(
-        name, claim, found.relative, LEAK_TOLERANCE, source="measured on the plant, without T and T0",
+        name,
+        claim,
+        found.relative,
+        LEAK_TOLERANCE,
+        source="measured on the plant, without T and T0",
         detail=f"relative to the terms; worst at {found.frequency:.3g} rad/s",
-    )  # fmt: skip
+    )
 
 
 def _blind_to(design: ObserverDesign) -> Iterator[tuple[str, list[int], list[str]]]:
@@ -71,9 +76,14 @@ def _blind_to(design: ObserverDesign) -> Iterator[tuple[str, list[int], list[str
 def _only(observer: LinearObserver, rows: list[int]) -> LinearObserver:
     """Return the observer with some of its rows, as residuals: a fault estimate that must vanish is one."""
     return replace(
-        observer, Cz=observer.Cz[rows], Du=observer.Du[rows], Dy=observer.Dy[rows], fault_names=(), fault_delays=(),
+        observer,
+        Cz=observer.Cz[rows],
+        Du=observer.Du[rows],
+        Dy=observer.Dy[rows],
+        fault_names=(),
+        fault_delays=(),
         residual_names=tuple(f"row {row + 1}" for row in rows),
-    )  # fmt: skip
+    )
 
 
 #: The regulator equation may miss by this much, relative to its terms: its solution is no part of the gains.
@@ -94,21 +104,28 @@ def noise_rows(design: ObserverDesign) -> Iterator[Check]:
     ):
         if np.isnan(alone) or np.isnan(claimed):
             yield information(
-                f"noise in fhat[{name}]", "standard deviation under the stated noise", alone,
+                f"noise in fhat[{name}]",
+                "standard deviation under the stated noise",
+                alone,
                 source="recomputed, Lyapunov equation",
                 detail="all digits are rounding" + (": no deviation is claimed" if np.isnan(claimed) else ""),
-            )  # fmt: skip
+            )
             continue
         yield upper_bound_check(
-            f"noise in fhat[{name}]", f"standard deviation under the stated noise is at most the claimed one{unit}",
-            float(alone), float(claimed) * (1.0 + DEVIATION_TOLERANCE), source="recomputed, Lyapunov equation",
-        )  # fmt: skip
+            f"noise in fhat[{name}]",
+            f"standard deviation under the stated noise is at most the claimed one{unit}",
+            float(alone),
+            float(claimed) * (1.0 + DEVIATION_TOLERANCE),
+            source="recomputed, Lyapunov equation",
+        )
         if np.isfinite(total) and matrices["walks"].any():
             yield upper_bound_check(
-                f"error of fhat[{name}]", f"standard deviation of the error with the walk of the fault{unit}",
-                float(total), float(claimed_total) * (1.0 + DEVIATION_TOLERANCE),
+                f"error of fhat[{name}]",
+                f"standard deviation of the error with the walk of the fault{unit}",
+                float(total),
+                float(claimed_total) * (1.0 + DEVIATION_TOLERANCE),
                 source="recomputed, Lyapunov equation",
-            )  # fmt: skip
+            )
 
 
 _MATRICES = ("T", "T0", "Phi", "Cw", "walks", "stability", "tracking", "deviations")
@@ -121,9 +138,12 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
     yield from plant_information(plant)
     fitting = _fits(design)
     yield upper_bound_check(
-        "fits the plant", "observer, certificate and plant have matching signals and shapes", float(not fitting), 0.0,
+        "fits the plant",
+        "observer, certificate and plant have matching signals and shapes",
+        float(not fitting),
+        0.0,
         source="shipped realisation",
-    )  # fmt: skip
+    )
     if not fitting:
         return
     options = design.options
@@ -157,10 +177,15 @@ def _fits(design: ObserverDesign) -> bool:
         return False
     order, count = observer.order, len(matrices["Phi"])
     shapes = {
-        "T": (order, plant.nx), "T0": (len(observer.Cz), plant.nx), "Phi": (count, count), "Cw": (plant.nf, count),
-        "walks": (count, count), "stability": (order, order), "tracking": (order, count),
+        "T": (order, plant.nx),
+        "T0": (len(observer.Cz), plant.nx),
+        "Phi": (count, count),
+        "Cw": (plant.nf, count),
+        "walks": (count, count),
+        "stability": (order, order),
+        "tracking": (order, count),
         "deviations": (len(observer.fault_names), 2),
-    }  # fmt: skip
+    }
     finite = all(np.all(np.isfinite(part)) for part in (observer.Az, observer.Bu, observer.By, observer.Cz))
     return bool(
         all(matrices[name].shape == shape for name, shape in shapes.items())
@@ -189,10 +214,15 @@ def _identities(
     units = scaling.states
     # What cancels down to rounding is judged by the terms that it was formed of.
     size_t, size_t0 = (_in_equations(matrix, scaling.equations) for matrix in (t, t0))
-    yield "state in the error", "Az T E + By C = T A", Identity(
-        (az @ (t @ plant.E), by @ plant.C, -t @ plant.A),
-        ((az, t, plant.E), (by, plant.C), (size_t, plant.A), (az, t, plant.A)), units,
-    )  # fmt: skip
+    yield (
+        "state in the error",
+        "Az T E + By C = T A",
+        Identity(
+            (az @ (t @ plant.E), by @ plant.C, -t @ plant.A),
+            ((az, t, plant.E), (by, plant.C), (size_t, plant.A), (az, t, plant.A)),
+            units,
+        ),
+    )
     yield (
         "inputs in the error",
         "Bu + By D = T B",
@@ -204,10 +234,15 @@ def _identities(
         Identity((by @ plant.Dd, -t @ plant.Bd), ((by, plant.Dd), (size_t, plant.Bd))),
     )
     yield "algebraic rows", "T0 E = 0", Identity((t0 @ plant.E,), ((size_t0, plant.E), (size_t0, plant.A)), units)
-    yield "state in the estimates", "Cz T E + Dy C = T0 A", Identity(
-        (cz @ (t @ plant.E), dy @ plant.C, -t0 @ plant.A),
-        ((cz, t, plant.E), (dy, plant.C), (size_t0, plant.A), (cz, t, plant.A)), units,
-    )  # fmt: skip
+    yield (
+        "state in the estimates",
+        "Cz T E + Dy C = T0 A",
+        Identity(
+            (cz @ (t @ plant.E), dy @ plant.C, -t0 @ plant.A),
+            ((cz, t, plant.E), (dy, plant.C), (size_t0, plant.A), (cz, t, plant.A)),
+            units,
+        ),
+    )
     yield (
         "inputs in the estimates",
         "Du + Dy D = T0 B",
@@ -246,20 +281,26 @@ def _tracking(
     wanted = wanted_faults(plant, observer, matrices, mean=int(design.options.get("mean", 1)))[observer.fault_rows]
     rows = observer.fault_rows
     yield (
-        "fault models", "the gain of each estimate for its own fault model is one, for all others zero",
+        "fault models",
+        "the gain of each estimate for its own fault model is one, for all others zero",
         Identity(
             (observer.Cz[rows] @ pi, direct[rows] @ cw, -wanted),
             ((observer.Cz[rows], largest), (np.abs(direct[rows]), cw)),
         ),
-    )  # fmt: skip
+    )
 
 
 def _claimed(design: ObserverDesign) -> Iterator[Check]:
     (plant, observer), claims = design.linear, design.certificate.claims
     order = claims.get("order", float("nan"))
     yield upper_bound_check(
-        "order", "the filter has as many states as claimed: difference", abs(observer.order - order), 0.0,
-        source="shipped realisation", kind="equality", detail=f"{observer.order} states",
-    )  # fmt: skip
+        "order",
+        "the filter has as many states as claimed: difference",
+        abs(observer.order - order),
+        0.0,
+        source="shipped realisation",
+        kind="equality",
+        detail=f"{observer.order} states",
+    )
     if "decay" in claims:
         yield decay_row(observer.Az, plant.dt, claims["decay"])

@@ -48,9 +48,16 @@ def prove_shipped_stability(
 
 
 def prove_gains(
-    A: FloatArray, C: FloatArray, J: FloatArray, L: FloatArray, P1: FloatArray, P3: FloatArray, *, delta: float,
+    A: FloatArray,
+    C: FloatArray,
+    J: FloatArray,
+    L: FloatArray,
+    P1: FloatArray,
+    P3: FloatArray,
+    *,
+    delta: float,
     decay: float,
-) -> DefinitenessProof:  # fmt: skip
+) -> DefinitenessProof:
     """Try to prove the inequality for gains on an augmented plant ``A (n, n)``, ``C (ny, n)``."""
 
     def formula(kind: type[Enclosed]) -> Enclosed:
@@ -70,9 +77,7 @@ def prove_symmetric_positive(matrix: FloatArray) -> DefinitenessProof:
     return prove_positive_definite(matrix)
 
 
-def error_inputs(
-    plant: DescriptorSystem, J: FloatArray, L: FloatArray, kind: Literal["rate", "noise"]
-) -> Ball:  # fmt: skip
+def error_inputs(plant: DescriptorSystem, J: FloatArray, L: FloatArray, kind: Literal["rate", "noise"]) -> Ball:
     """Return B ``(nx + nf, *)`` of f', or of ``[w; w']``, in ``eps' = Az eps + B v``; ``J, L (nx + nf, ny)``."""
     if kind == "rate":
         return Ball.exact(np.vstack([np.zeros((plant.nx, plant.nf)), np.eye(plant.nf)]))
@@ -93,11 +98,13 @@ def prove_gain(a: FloatArray, b: Ball, c: FloatArray, P: FloatArray, gain: float
         through, entering = p @ kind.exact(a), p @ kind.of(b)
         level = kind.exact(np.eye(inputs)).scaled(gain).scaled(gain)
         none = kind.exact(np.zeros((inputs, outputs)))
-        return block([
-            [-(through + through.T), -entering, shown.T],
-            [-entering.T, level, none],
-            [shown, none.T, kind.exact(np.eye(outputs))],
-        ])  # fmt: skip
+        return block(
+            [
+                [-(through + through.T), -entering, shown.T],
+                [-entering.T, level, none],
+                [shown, none.T, kind.exact(np.eye(outputs))],
+            ]
+        )
 
     return prove_positive_definite(formula)
 

@@ -52,8 +52,9 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
     """Yield every check of ``design``; see `obsynth.verify`."""
     plant, observer = design.recursive
     form = None if observer.adaptation is None else observer.adaptation.form
-    yield information("plant: steps", "length of the horizon (0: without end)", float(plant.horizon or 0),
-                      source="the plant")  # fmt: skip
+    yield information(
+        "plant: steps", "length of the horizon (0: without end)", float(plant.horizon or 0), source="the plant"
+    )
     conditions = tuple(
         recursive_conditions(
             plant, parameters=form is not None, literal=form == "literal", early=observer.early_constraints
@@ -64,9 +65,14 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
         return
     problem = misfit(design)
     yield upper_bound_check(
-        "fits the plant", "observer, options and plant hold the same matrices at every k", float(bool(problem)), 0.0,
-        source="shipped observer", kind="equality", detail=problem,
-    )  # fmt: skip
+        "fits the plant",
+        "observer, options and plant hold the same matrices at every k",
+        float(bool(problem)),
+        0.0,
+        source="shipped observer",
+        kind="equality",
+        detail=problem,
+    )
     yield from refinement_rows(observer)
     stated = _stated(design)
     if stated is None or observer.plant.nx != plant.nx or observer.plant.ne != plant.ne:
@@ -75,8 +81,9 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
         # What is checked is the recursion; records that no plant made would seem full of outliers.
         yield from _dynamic_rows(design, plain_recursion(observer), plain_recursion(stated), same=not problem)
     except (ObsynthError, np.linalg.LinAlgError, ValueError) as error:
-        yield upper_bound_check("runs", "the observer runs on its own model", 1.0, 0.0, source="shipped observer",
-                                detail=str(error))  # fmt: skip
+        yield upper_bound_check(
+            "runs", "the observer runs on its own model", 1.0, 0.0, source="shipped observer", detail=str(error)
+        )
 
 
 def refinement_rows(observer: RecursiveObserver | DAEObserver) -> Iterator[Check]:
@@ -87,17 +94,23 @@ def refinement_rows(observer: RecursiveObserver | DAEObserver) -> Iterator[Check
         is_fed_back = isinstance(observer, DAEObserver)
         goes_on = "the next step begins there" if is_fed_back else "the recursion goes on without them"
         yield information(
-            "state bounds", "estimates are projected onto bounds in the metric of their covariance, which stays that "
-            "without bounds", float(len(bounded)), source="options: state_bounds", status="assumed",
+            "state bounds",
+            "estimates are projected onto bounds in the metric of their covariance, which stays that without bounds",
+            float(len(bounded)),
+            source="options: state_bounds",
+            status="assumed",
             detail=f"active for {', '.join(bounded)}; {goes_on}. That the true states keep the bounds is assumed: then "
             "no projection makes a squared error larger in units of the covariance",
-        )  # fmt: skip
+        )
     for name, entry in (observer.sensors or {}).items():
         yield information(
-            f"sensor {name}", "rows between its samples", float(entry["every"]), source="options: sensors",
+            f"sensor {name}",
+            "rows between its samples",
+            float(entry["every"]),
+            source="options: sensors",
             detail=f"its values arrive {entry['delay']} row(s) late; the other rows of this report are about samples "
             "of every sensor at once",
-        )  # fmt: skip
+        )
 
 
 def _dynamic_rows(
@@ -107,22 +120,33 @@ def _dynamic_rows(
     ranks = horizon_ranks(observer.plant, early=observer.early_constraints)
     facts = gain_schedule_summary(observer)
     yield information(
-        "condition of H", "largest condition number of [E_k; C_k]", ranks.condition, source=f"{_SOURCE}, (6)",
+        "condition of H",
+        "largest condition number of [E_k; C_k]",
+        ranks.condition,
+        source=f"{_SOURCE}, (6)",
         detail=f"at k = {ranks.condition_k}",
-    )  # fmt: skip
+    )
     yield information(
-        "residual directions", "least rank E_k + ny - nx: what (18f) can see", float(ranks.directions),
-        source="our finding", detail=f"at k = {ranks.directions_k}",
-    )  # fmt: skip
+        "residual directions",
+        "least rank E_k + ny - nx: what (18f) can see",
+        float(ranks.directions),
+        source="our finding",
+        detail=f"at k = {ranks.directions_k}",
+    )
     in_batch = batch_steps(stated)
     said = f"{in_batch} steps at once" + (
         ", which the size of the plant allows" if in_batch < min(BATCH_STEPS, looked_at(stated)) else ""
     )
     for name, found in batch_residuals(stated, observer).items():
         yield upper_bound_check(
-            f"batch: {name}", "the recursion equals the least-squares solution of the whole record", found,
-            BATCH_TOLERANCE * ranks.condition, source=f"{_SOURCE}, (6)-(10)", kind="equality", detail=said,
-        )  # fmt: skip
+            f"batch: {name}",
+            "the recursion equals the least-squares solution of the whole record",
+            found,
+            BATCH_TOLERANCE * ranks.condition,
+            source=f"{_SOURCE}, (6)-(10)",
+            kind="equality",
+            detail=said,
+        )
     # Where both hold the same matrices, they need not be computed twice.
     proof = horizon_proof(observer if same else stated, observer, looked_at(observer))
     yield _contraction_row(facts, proof)
@@ -133,15 +157,20 @@ def _dynamic_rows(
         yield from steady_rows(stated, design.gains, proof.last, ranks.condition)
     if observer.adaptation is not None:
         yield information(
-            "excitation", "least information on the parameters in a window", facts.excitation,
+            "excitation",
+            "least information on the parameters in a window",
+            facts.excitation,
             source=f"{_SOURCE}, (26)",
             detail=f"window of {observer.adaptation.window} ends at k = {facts.excitation_k}",
-        )  # fmt: skip
+        )
         for name, deviation in zip(observer.fault_names, facts.deviations, strict=True):
             yield information(
-                f"noise in fhat[{name}]", "standard deviation of the parameter after the last step", float(deviation),
-                source="recomputed", detail=observer.plant.units.get(name, ""),
-            )  # fmt: skip
+                f"noise in fhat[{name}]",
+                "standard deviation of the parameter after the last step",
+                float(deviation),
+                source="recomputed",
+                detail=observer.plant.units.get(name, ""),
+            )
     yield listed_gains(design, {"L": facts.L, "K": facts.K})
     yield _claims(design, facts, ranks)
     yield from consistency(stated, observer, looked_at(observer))
@@ -158,10 +187,18 @@ def _contraction_row(facts: GainScheduleSummary, proof: HorizonProof | None) -> 
         )
     value = proof.contraction if proof is not None and proved else facts.contraction
     if facts.steps < STEPS_TO_CONTRACT:
-        return information("contraction", claim, value, source=source, detail=detail,
-                           status="proved" if proved else "computed twice")  # fmt: skip
-    return upper_bound_check("contraction", claim, value, np.nextafter(1.0, 0.0), source=source, detail=detail,
-                             kind="proved" if proved else "computed")  # fmt: skip
+        return information(
+            "contraction", claim, value, source=source, detail=detail, status="proved" if proved else "computed twice"
+        )
+    return upper_bound_check(
+        "contraction",
+        claim,
+        value,
+        np.nextafter(1.0, 0.0),
+        source=source,
+        detail=detail,
+        kind="proved" if proved else "computed",
+    )
 
 
 def listed_gains(design: ObserverDesign, found: Mapping[str, FloatArray]) -> Check:
@@ -175,17 +212,24 @@ def listed_gains(design: ObserverDesign, found: Mapping[str, FloatArray]) -> Che
         elif matrix.size:
             gap = max(gap, float(np.max(np.abs(listed - matrix)) / max(float(np.max(np.abs(matrix))), LEAST_GAIN)))
     return upper_bound_check(
-        "gains", "the listed gains are those of the run that is looked at", np.inf if wrong else gap, CLAIM_TOLERANCE,
-        source="gain set", kind="equality", detail=f"wrong: {', '.join(wrong)}" if wrong else "",
-    )  # fmt: skip
+        "gains",
+        "the listed gains are those of the run that is looked at",
+        np.inf if wrong else gap,
+        CLAIM_TOLERANCE,
+        source="gain set",
+        kind="equality",
+        detail=f"wrong: {', '.join(wrong)}" if wrong else "",
+    )
 
 
 def _claims(design: ObserverDesign, facts: GainScheduleSummary, ranks: HorizonRanks) -> Check:
     claims = design.certificate.claims
     found = {
-        "condition": ranks.condition, "residual_directions": float(ranks.directions), "contraction": facts.contraction,
+        "condition": ranks.condition,
+        "residual_directions": float(ranks.directions),
+        "contraction": facts.contraction,
         "steps": float(facts.steps),
-    }  # fmt: skip
+    }
     places = {
         "condition_k": (ranks.condition_k, ranks.condition),
         "excitation_k": (facts.excitation_k, facts.excitation),

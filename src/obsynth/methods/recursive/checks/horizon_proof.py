@@ -130,9 +130,12 @@ def _sizes(step: StepMatrices, found: GainStep) -> tuple[tuple[int, ...], ...]:
 
 
 def _closed(
-    pairs: list[tuple[StepMatrices, GainStep]], errors: list[Ball], joint: list[Ball], lengths: list[int],
+    pairs: list[tuple[StepMatrices, GainStep]],
+    errors: list[Ball],
+    joint: list[Ball],
+    lengths: list[int],
     units: FloatArray,
-) -> float:  # fmt: skip
+) -> float:
     """Multiply some steps, add the products to the lists, and return how far the gains are from unbiased."""
     state, learned = _transitions(pairs)
     errors.append(product_of_stack(*state))
@@ -203,10 +206,14 @@ def _deviations(factor: FloatArray) -> FloatArray:
 def bias_row(proof: HorizonProof, condition: float) -> Check:
     """Return the row that the gains leave an exact estimate exact."""
     return upper_bound_check(
-        "unbiased", "[L_k K_k] [E_k; C_k] = I at every step: without noise and start error there is no error",
-        proof.bias, EQUALITY_TOLERANCE * condition, source=f"{_SOURCE}, (10)-(11)", kind="proved",
+        "unbiased",
+        "[L_k K_k] [E_k; C_k] = I at every step: without noise and start error there is no error",
+        proof.bias,
+        EQUALITY_TOLERANCE * condition,
+        source=f"{_SOURCE}, (10)-(11)",
+        kind="proved",
         detail=f"largest entry in units of its terms, of the gains as computed, outward rounded; {proof.steps} steps",
-    )  # fmt: skip
+    )
 
 
 def parameter_row(proof: HorizonProof) -> Iterator[Check]:
@@ -215,12 +222,15 @@ def parameter_row(proof: HorizonProof) -> Iterator[Check]:
         return
     proved = proof.with_parameters < 1.0
     yield information(
-        "contraction with parameters", "bound on the mean factor per step of errors of states and constant parameters "
-        "together", proof.with_parameters, source=f"{_SOURCE}, Theorem 3.1",
+        "contraction with parameters",
+        "bound on the mean factor per step of errors of states and constant parameters together",
+        proof.with_parameters,
+        source=f"{_SOURCE}, Theorem 3.1",
         status="proved" if proved else "assumed",
-        detail="of the gains as computed, in outward rounding" if proved else
-        "not proved: parameters that are not excited are not forgotten, and slow ones too little for the bound",
-    )  # fmt: skip
+        detail="of the gains as computed, in outward rounding"
+        if proved
+        else "not proved: parameters that are not excited are not forgotten, and slow ones too little for the bound",
+    )
 
 
 def covariance_row(stated: RecursiveObserver, shipped: RecursiveObserver, last: GainStep) -> Check:
@@ -233,10 +243,24 @@ def covariance_row(stated: RecursiveObserver, shipped: RecursiveObserver, last: 
     if definite and not proof.proved and noise_is_definite(shipped):
         return definite_by_its_noise("covariance", claim, last.gain, last.step.H, natural_units(stated))
     if definite:
-        return Check("covariance", claim, proof.lower_bound, 0.0, proof.lower_bound, proof.proved,
-                     "recomputed, the square root as computed", "proved", proof.text)  # fmt: skip
-    return information("covariance", claim, proof.lower_bound, source="recomputed", detail="not definite, or not "
-                       "proved to be: Q or R is singular, and what they hold exact is known exactly")  # fmt: skip
+        return Check(
+            "covariance",
+            claim,
+            proof.lower_bound,
+            0.0,
+            proof.lower_bound,
+            proof.proved,
+            "recomputed, the square root as computed",
+            "proved",
+            proof.text,
+        )
+    return information(
+        "covariance",
+        claim,
+        proof.lower_bound,
+        source="recomputed",
+        detail="not definite, or not proved to be: Q or R is singular, and what they hold exact is known exactly",
+    )
 
 
 def definite_by_its_noise(name: str, claim: str, gain: FloatArray, H: FloatArray, units: FloatArray) -> Check:
@@ -248,9 +272,18 @@ def definite_by_its_noise(name: str, claim: str, gain: FloatArray, H: FloatArray
     missed = Ball.exact(gain) @ Ball.exact(H) - Ball.exact(np.eye(len(gain)))
     scale = units[None, :] / units[:, None]  # powers of two
     least = 1.0 - Ball(missed.midpoint * scale, rounded_up(missed.radius * scale, 1)).frobenius_norm
-    return Check(name, claim, least, 0.0, least, least > 0.0, "P >= L Q L' + K R K' with definite Q and R, outward "
-                 "rounded", "proved", "value: least singular value of [L K] [E; C] in natural units, which is to be "
-                 "above zero; the covariance as computed is too near a singular one to tell")  # fmt: skip
+    return Check(
+        name,
+        claim,
+        least,
+        0.0,
+        least,
+        least > 0.0,
+        "P >= L Q L' + K R K' with definite Q and R, outward rounded",
+        "proved",
+        "value: least singular value of [L K] [E; C] in natural units, which is to be "
+        "above zero; the covariance as computed is too near a singular one to tell",
+    )
 
 
 def noise_is_definite(stated: RecursiveObserver) -> bool:

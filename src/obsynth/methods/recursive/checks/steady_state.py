@@ -54,10 +54,14 @@ def steady_rows(
     step = StepMatrices(np.vstack([E, C]), A, *recomputed.step[2:])
     listed = recomputed._replace(gain=np.hstack([L, K]))
     yield upper_bound_check(
-        "steady state: unbiased", "L E + K C = I for the listed gains",
-        largest_bias([(step, listed)], natural_units(stated)[: plant.nx]), EQUALITY_TOLERANCE * condition,
-        source=f"{_SOURCE}, (10)-(11)", kind="proved", detail="in units of its terms, outward rounded",
-    )  # fmt: skip
+        "steady state: unbiased",
+        "L E + K C = I for the listed gains",
+        largest_bias([(step, listed)], natural_units(stated)[: plant.nx]),
+        EQUALITY_TOLERANCE * condition,
+        source=f"{_SOURCE}, (10)-(11)",
+        kind="proved",
+        detail="in units of its terms, outward rounded",
+    )
     transition = Ball.exact(L) @ Ball.exact(A)
     contraction = prove_contraction(transition, discrete=True)
     claim = "errors die out with the listed gains, were they kept: modulus per step in a norm"
@@ -65,23 +69,44 @@ def steady_rows(
     if contraction is None:
         radius = spectral_radius(transition.midpoint)
         if spectral_radius(recomputed.gain[:, :ne] @ A) >= CLEARLY_STABLE:
-            yield information("steady state: contraction", claim, radius, source=source,
-                              detail="the gains of the last step make no steady filter (yet)")  # fmt: skip
+            yield information(
+                "steady state: contraction",
+                claim,
+                radius,
+                source=source,
+                detail="the gains of the last step make no steady filter (yet)",
+            )
             return
-        yield upper_bound_check("steady state: contraction", claim, radius, np.nextafter(1.0, 0.0), source=source,
-                                detail="eigenvalues computed: no inequality was proved")  # fmt: skip
+        yield upper_bound_check(
+            "steady state: contraction",
+            claim,
+            radius,
+            np.nextafter(1.0, 0.0),
+            source=source,
+            detail="eigenvalues computed: no inequality was proved",
+        )
         return
     rate = proved_rate(transition, contraction)
-    yield upper_bound_check("steady state: contraction", claim, np.nan if rate is None else rate,
-                            np.nextafter(1.0, 0.0), source=source, kind="proved", detail="outward rounded")  # fmt: skip
+    yield upper_bound_check(
+        "steady state: contraction",
+        claim,
+        np.nan if rate is None else rate,
+        np.nextafter(1.0, 0.0),
+        source=source,
+        kind="proved",
+        detail="outward rounded",
+    )
     variances = np.einsum("ij,ij->i", recomputed.factor, recomputed.factor)[: plant.nx]
     yield _steady_covariance(stated, transition, (L, K), contraction, variances)
 
 
 def _steady_covariance(
-    stated: RecursiveObserver, transition: Ball, gains: tuple[FloatArray, FloatArray], contraction: Contraction,
+    stated: RecursiveObserver,
+    transition: Ball,
+    gains: tuple[FloatArray, FloatArray],
+    contraction: Contraction,
     variances: FloatArray,
-) -> Check:  # fmt: skip
+) -> Check:
     """Return the row on the covariance that errors reach with kept gains; ``variances (nx,)`` after the last step.
 
     Of X, with ``D = F X F' + L Q L' + K R K' - X``, the true one is ``X + sum F^j D F'^j``; the sum is at most
@@ -108,20 +133,29 @@ def _steady_covariance(
     low, high = np.sqrt(np.maximum(middle - spread, 0.0)), np.sqrt(rounded_up(np.abs(middle) + spread, 4))
     proof = prove_positive_definite(enclosed)
     certain = bool(np.all(spread <= WIDEST * variances))
-    listed = [f"{name} {low[i]:.4g} to {high[i]:.4g}" if high[i] > low[i] * TOLD_APART else f"{name} {high[i]:.4g}"
-              for i, name in enumerate(stated.plant.state_names[:LISTED])]  # fmt: skip
+    listed = [
+        f"{name} {low[i]:.4g} to {high[i]:.4g}" if high[i] > low[i] * TOLD_APART else f"{name} {high[i]:.4g}"
+        for i, name in enumerate(stated.plant.state_names[:LISTED])
+    ]
     more = f", and {len(low) - LISTED} more" if len(low) > LISTED else ""
     detail = (
         f"standard deviations {', '.join(listed)}{more}; the filter itself, whose gains move on, ends at these or below"
     )
     source = "P = L A P A' L' + L Q L' + K R K', outward rounded"
     if proof.proved:
-        return Check("steady state: covariance", claim, proof.lower_bound, 0.0, proof.lower_bound, True, source,
-                     "proved", detail)  # fmt: skip
+        return Check(
+            "steady state: covariance", claim, proof.lower_bound, 0.0, proof.lower_bound, True, source, "proved", detail
+        )
     if certain and noise_is_definite(stated):
         plant = stated.plant
         H = np.vstack([plant.E.at(1), plant.C.at(1)])
         row = definite_by_its_noise("steady state: covariance", claim, np.hstack(gains), H, natural_units(stated))
         return replace(row, detail=f"{detail}; {row.detail}")
-    return information("steady state: covariance", "largest standard deviation that the listed gains lead to, enclosed",
-                       float(np.max(high, initial=0.0)), source=source, status="proved", detail=detail)  # fmt: skip
+    return information(
+        "steady state: covariance",
+        "largest standard deviation that the listed gains lead to, enclosed",
+        float(np.max(high, initial=0.0)),
+        source=source,
+        status="proved",
+        detail=detail,
+    )

@@ -51,9 +51,12 @@ def _realisation_rows(design: ObserverDesign, printed_digits: int | None) -> Ite
     yield from plant_information(plant)
     fitting = _fits(design)
     yield upper_bound_check(
-        "fits the plant", "observer, certificate and plant have matching signals and shapes", float(not fitting), 0.0,
+        "fits the plant",
+        "observer, certificate and plant have matching signals and shapes",
+        float(not fitting),
+        0.0,
         source="shipped realisation",
-    )  # fmt: skip
+    )
     if not fitting:
         return
     tracking, phi, cw, poles, factor = (certificate.matrices[name] for name in _MATRICES)
@@ -88,9 +91,12 @@ def _fits(design: ObserverDesign) -> bool:
         return False
     order = matrices["Phi"].shape[0]
     shapes = {
-        "tracking": (observer.order, plant.nx + order), "Phi": (order, order), "Cw": (plant.nf, order),
-        "poles": (observer.order, 2), "stability": (observer.order, observer.order),
-    }  # fmt: skip
+        "tracking": (observer.order, plant.nx + order),
+        "Phi": (order, order),
+        "Cw": (plant.nf, order),
+        "poles": (observer.order, 2),
+        "stability": (observer.order, observer.order),
+    }
     return bool(
         all(matrices[name].shape == shape and np.all(np.isfinite(matrices[name])) for name, shape in shapes.items())
         and observer.order == plant.nx + order
@@ -117,11 +123,14 @@ def _identities(
         "Sylvester",
         "Ahat U_a E_a + Bhat C_a = U_a A_a",
         residual(
-            az @ ve, by @ augmented.C, -tracking @ augmented.A,
-            factors=((az, tracking, augmented.E), (by, augmented.C), (tracking, augmented.A), formed), units=units,
+            az @ ve,
+            by @ augmented.C,
+            -tracking @ augmented.A,
+            factors=((az, tracking, augmented.E), (by, augmented.C), (tracking, augmented.A), formed),
+            units=units,
         ),
         _PAPER,
-    )  # fmt: skip
+    )
     yield (
         "inputs",
         "Jhat = U_a B_a (and Bhat D, where u reaches y)",
@@ -132,11 +141,12 @@ def _identities(
         "disturbance in the error",
         "U_a Bd_a = 0 (Bhat Dd, where d reaches y)",
         residual(
-            tracking @ augmented.Bd, -by @ plant.Dd,
+            tracking @ augmented.Bd,
+            -by @ plant.Dd,
             factors=((tracking, augmented.Bd), (by, plant.Dd), (own_u, augmented.Bd)),
         ),
         _PAPER,
-    )  # fmt: skip
+    )
     yield (
         "disturbance in the estimates",
         "D_a Dd = 0: no estimate sees d directly",

@@ -104,9 +104,10 @@ def noise_rows(design: ObserverDesign) -> Iterator[Check]:
             largest,
             claims["noise_amplification"] * (1.0 + CLAIM_TOLERANCE),
             source="recomputed, Lyapunov equation",
-            detail="outputs in their own units" + ("" if plant.dt else "; times the root of the sample time in s")
+            detail="outputs in their own units"
+            + ("" if plant.dt else "; times the root of the sample time in s")
             + (f"; besides, y enters fhat directly by {float(np.linalg.norm(direct, 2)):.3g}" if direct.any() else ""),
-        )  # fmt: skip
+        )
     elif np.any(np.isnan(unit)):
         text = "H2 norm from white noise on every output to a fault estimate"
         yield information("noise amplification", text, np.nan, source="recomputed, Lyapunov equation", detail=UNCERTAIN)
@@ -127,9 +128,13 @@ def noise_rows(design: ObserverDesign) -> Iterator[Check]:
 
 
 def gain_rows(
-    gains: Mapping[str, FloatArray], plant: DescriptorSystem, observer: LinearObserver, model: Exosystem,
-    tracking: FloatArray, tolerance: float,
-) -> Iterator[Check]:  # fmt: skip
+    gains: Mapping[str, FloatArray],
+    plant: DescriptorSystem,
+    observer: LinearObserver,
+    model: Exosystem,
+    tracking: FloatArray,
+    tolerance: float,
+) -> Iterator[Check]:
     """Yield the row on the listed gains; nothing where none are listed, as the realisation stands for itself."""
     if not gains:
         return
@@ -148,16 +153,29 @@ def gain_rows(
 def _shapes(plant: DescriptorSystem, observer: LinearObserver, model: Exosystem) -> dict[str, tuple[int, int]]:
     nx, ny, nz, count = plant.nx, plant.ny, observer.order, model.order
     return {
-        "U_a": (nz, nz), "D_a": (nz, ny), "K_a": (nz, ny), "Ahat": (nz, nz), "Bhat": (nz, ny), "Jhat": (nz, plant.nu),
-        "U": (nx, nx), "D": (nx, ny), "K": (nx, ny), "F": (count, ny), "Hhat": (nx, plant.nf), "Phi": (count, count),
+        "U_a": (nz, nz),
+        "D_a": (nz, ny),
+        "K_a": (nz, ny),
+        "Ahat": (nz, nz),
+        "Bhat": (nz, ny),
+        "Jhat": (nz, plant.nu),
+        "U": (nx, nx),
+        "D": (nx, ny),
+        "K": (nx, ny),
+        "F": (count, ny),
+        "Hhat": (nx, plant.nf),
+        "Phi": (count, count),
         "Cw": (plant.nf, count),
-    }  # fmt: skip
+    }
 
 
 def _residuals(
-    gains: Mapping[str, FloatArray], plant: DescriptorSystem, observer: LinearObserver, model: Exosystem,
+    gains: Mapping[str, FloatArray],
+    plant: DescriptorSystem,
+    observer: LinearObserver,
+    model: Exosystem,
     tracking: FloatArray,
-) -> Iterator[Residual]:  # fmt: skip
+) -> Iterator[Residual]:
     """Yield, for every letter that is listed, how far it is from what it stands for."""
     nx, count = plant.nx, observer.order
     augmented = AugmentedPlant.of(plant, model)
