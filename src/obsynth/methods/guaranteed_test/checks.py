@@ -87,7 +87,7 @@ def _of_the_test(design: ObserverDesign, window: Window, test: Repaired) -> Iter
     claims, observer = design.certificate.claims, design.linear[1]
     threshold = float(claims.get("threshold", np.nan))
     zero = threshold == 0.0
-    exact = repaired_multipliers(window, test.values, refine=False, exact_zero=zero)
+    exact = repaired_multipliers(window, test.values, refine=False, exact_zero=zero, among=test.radius)
     yield upper_bound_check(
         "multipliers", "exact multipliers that see the fault with weight one and nothing free lie within the shipped "
         "distance of the shipped ones", _excess(exact, test.radius), 1.0,
@@ -155,7 +155,7 @@ def _of_the_least(design: ObserverDesign, window: Window) -> Iterator[Check]:
         found = np.nan
     else:
         witness = Repaired(_flat(shipped["witness"]), _flat(shipped["witness_radius"]))
-        exact = repaired_point(window, witness.values, refine=False)
+        exact = repaired_point(window, witness.values, refine=False, among=witness.radius)
         yield upper_bound_check(
             "witness", "a course of the fault that satisfies every equation exactly lies within the shipped distance "
             "of the shipped one", _excess(exact, witness.radius), 1.0,

@@ -29,6 +29,10 @@ BITS, MOST_ROWS_IN_BALLS = 256, 700
 AT_BOUND = 1e-9
 #: Least room that a bounded number counts for when a square part is chosen, as a share of its bound.
 LEAST_ROOM = 1e-4
+#: Values below this share of the largest, in their units, are rounding of zeros.
+ROUNDED = 1e-13
+#: Room for what another processor finds for the distance to the exact solution: a factor.
+RADIUS_ROOM = 8.0
 _MANTISSA = 53
 
 
@@ -98,11 +102,13 @@ class _Square:
     inverse: FloatArray
     contraction: float  # bound of the infinity norm of I - inverse K
     part: Ball
-    kept: np.ndarray  # rows of K: all of them, or those that others follow from
 
     @classmethod
-    def of(cls, matrix: FloatArray, radius: FloatArray, weight: FloatArray) -> _Square | None:
-        """Choose columns of ``matrix (m, n)``, the heavier the better; ``None`` where rows depend on each other."""
+    def of(cls, matrix: FloatArray, radius: FloatArray, weight: FloatArray, units: np.ndarray) -> _Square | None:
+        """Choose columns of ``matrix (m, n)``, the heavier the better; ``None`` where rows depend on each other.
+
+        What is proved is scaled by ``units (n,)``, exponents that depend on the window alone.
+        """
         from scipy.linalg import qr
 
         columns = np.frexp(np.where(weight > 0.0, weight, 1.0))[1].astype(np.int64)
@@ -119,15 +125,18 @@ class _Square:
         if count and not diagonal[count - 1] > DEPENDENT * diagonal[0]:
             return None
         chosen = np.sort(order[:count])
-        spread = np.ldexp(np.ldexp(radius[:, chosen], columns[chosen]), rows[:, None])
-        part = Ball(scaled[:, chosen], spread)
+        columns = units[chosen]
+        part = np.ldexp(matrix[:, chosen], columns)
+        rows = -np.frexp(np.abs(part).max(axis=1, initial=0.0))[1].astype(np.int64)
+        spread = np.ldexp(np.ldexp(radius[:, chosen], columns), rows[:, None])
+        part = Ball(np.ldexp(part, rows[:, None]), spread)
         try:
             inverse = np.asarray(np.linalg.inv(part.midpoint), dtype=np.float64)
         except np.linalg.LinAlgError:
             return None
         missing = Ball.exact(np.eye(count)) - Ball.exact(inverse) @ part
         contraction = float(np.max(rounded_up(missing.magnitude.sum(axis=1), count + 2), initial=0.0))
-        return cls(chosen, rows, columns[chosen], inverse, contraction, part, np.arange(count))
+        return cls(chosen, rows, columns, inverse, contraction, part)
 
     def step(self, right: FloatArray) -> FloatArray:
         """Return the approximate correction ``(chosen,)`` that takes away a right side."""
@@ -179,6 +188,13 @@ class Repaired:
     values: FloatArray
     radius: FloatArray
 
+    def with_room(self, exponents: np.ndarray) -> Repaired:
+        """Return the same with a radius that other processors find too; ``exponents`` of the units of the values."""
+        chosen = self.radius > 0.0
+        largest = float(np.max(np.ldexp(self.radius, -exponents), initial=0.0))
+        floor = np.ldexp(LEAST_ROOM * largest, exponents) + UNIT_ROUNDOFF * np.abs(self.values)
+        return Repaired(self.values, np.where(chosen, RADIUS_ROOM * self.radius + floor, 0.0))
+
 
 def _multiplier_system(window: Window, *, exact_zero: bool) -> tuple[np.ndarray, list[int]]:
     """Return the columns whose products with multipliers are told: 0, or 1 for that of theta."""
@@ -188,11 +204,12 @@ def _multiplier_system(window: Window, *, exact_zero: bool) -> tuple[np.ndarray,
 
 
 def repaired_multipliers(
-    window: Window, multipliers: FloatArray, *, refine: bool, exact_zero: bool = False
+    window: Window, multipliers: FloatArray, *, refine: bool, exact_zero: bool = False, among: FloatArray | None = None
 ) -> Repaired | None:
     """Return multipliers with the distance to exact ones: no free column is seen, theta with weight one.
 
     ``exact_zero``: no bounded column is seen either.  ``refine``: move them to the nearest doubles first.
+    ``among``: only those with a positive number there differ from the exact ones.
     """
     _, told = _multiplier_system(window, exact_zero=exact_zero)
     wanted = [Fraction(int(column == 0)) for column in told]
@@ -205,10 +222,13 @@ def repaired_multipliers(
     rows, _ = window.scales
     sizes = np.ldexp(np.abs(multipliers), -rows)
     weight = np.ldexp(np.maximum(sizes, LEAST_WEIGHT * float(np.max(sizes, initial=0.0))), rows)
-    return _repaired(matrix.T, radius.T, weight, np.array(multipliers), missing, refine=refine)
+    weight = weight if among is None else np.where(among > 0.0, weight, 0.0)
+    return _repaired(matrix.T, radius.T, (weight, rows), np.array(multipliers), missing, refine=refine)
 
 
-def repaired_point(window: Window, point: FloatArray, *, refine: bool) -> Repaired | None:
+def repaired_point(
+    window: Window, point: FloatArray, *, refine: bool, among: FloatArray | None = None
+) -> Repaired | None:
     """Return a hidden fault's point ``(columns,)`` with the distance to one that satisfies every equation exactly."""
     bar, bounded = window.bar, window.bounded
     values = np.array(point)
@@ -221,18 +241,27 @@ def repaired_point(window: Window, point: FloatArray, *, refine: bool) -> Repair
     held = np.where(bounded, bar, 0.0)
     weight = np.where(bounded, np.maximum(held - np.abs(values), LEAST_ROOM * held), room)
     weight[0] = 0.0
+    weight = weight if among is None else np.where(among > 0.0, weight, 0.0)
     matrix, radius = _dense(window, np.arange(len(bar)))
 
     def missing(values: FloatArray) -> list[Fraction]:
         return [-value for value in rows_of(window, values)]
 
-    return _repaired(matrix, radius, weight, values, missing, refine=refine)
+    return _repaired(matrix, radius, (weight, columns), values, missing, refine=refine)
 
 
 def _repaired(
-    matrix: FloatArray, radius: FloatArray, weight: FloatArray, values: FloatArray, missing: Any, *, refine: bool
+    matrix: FloatArray,
+    radius: FloatArray,
+    heavy: tuple[FloatArray, np.ndarray],
+    values: FloatArray,
+    missing: Any,
+    *,
+    refine: bool,
 ) -> Repaired | None:
-    square = _Square.of(matrix, radius, weight)
+    """Return values next to an exact solution; ``heavy``: weights by which entries are chosen, and their units."""
+    weight, units = heavy
+    square = _Square.of(matrix, radius, weight, units)
     if square is None:
         return _in_rationals(matrix, weight, values, missing, refine=refine)
     if refine:
@@ -244,11 +273,14 @@ def _repaired(
                 break
             left = size
             values[square.chosen] += square.step(lacking)
+        sizes = np.abs(np.ldexp(values, -units))
+        values[sizes < ROUNDED * float(np.max(sizes, initial=0.0))] = 0.0
     bound = square.proved_step(missing(values))
     if bound is None:
         return None
     distance = np.zeros(len(values))
-    distance[square.chosen] = bound
+    # What is chosen is seen by its radius, though it may be exact.
+    distance[square.chosen] = np.maximum(bound, np.finfo(np.float64).tiny)
     return Repaired(values, distance)
 
 
@@ -292,7 +324,8 @@ def _in_rationals(
     if refine:
         values[columns] = [float(value) for value in moved]
     distance = np.zeros(len(values))
-    distance[columns] = [up(abs(v - Fraction(float(values[c])))) for v, c in zip(moved, columns, strict=True)]
+    away = [up(abs(v - Fraction(float(values[c])))) for v, c in zip(moved, columns, strict=True)]
+    distance[columns] = np.maximum(away, np.finfo(np.float64).tiny)
     return Repaired(values, distance)
 
 
@@ -365,7 +398,7 @@ def proved_ray(window: Window) -> FloatArray | None:
         return [-value for value in rows_of(window, whole)]
 
     weight = np.ldexp(np.maximum(np.abs(found), 1.0), columns[told])
-    repaired = _repaired(matrix, radius, weight, point[told].copy(), missing, refine=True)
+    repaired = _repaired(matrix, radius, (weight, columns[told]), point[told].copy(), missing, refine=True)
     if repaired is None:
         return None
     point[told] = repaired.values

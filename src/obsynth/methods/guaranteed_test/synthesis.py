@@ -36,8 +36,6 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import Certificate
 
-#: Room for what another processor finds for the distance to the exact solution.
-RADIUS_ROOM = 8.0
 #: A threshold below this share of what all bounds could do is tried as an exact zero.
 ZERO = 1e-9
 #: The table of samples against threshold in a certificate.
@@ -82,28 +80,24 @@ def proved_test(window: Window, found: Optimum) -> Shipped:
     """Return the proved test next to a solution; raise `SolverError` where nothing can be proved."""
     if found.multipliers is None or found.point is None:
         raise SolverError("The linear programme is unbounded on this window: nothing is known.")
+    rows, columns = window.scales
     # What all bounds together could do to these weights.
     able = float(np.abs(window.matrix[:, window.bounded]).T @ np.abs(found.multipliers) @ window.bar[window.bounded])
     if found.size <= ZERO * able:
         exact = repaired_multipliers(window, found.multipliers, refine=True, exact_zero=True)
         if exact is not None:
-            return Shipped(with_room(exact), 0.0, None, 0.0)
+            return Shipped(exact.with_room(rows), 0.0, None, 0.0)
     test = repaired_multipliers(window, found.multipliers, refine=True)
     if test is None:
         raise SolverError(
             f"Weights of {window.question.samples} samples were found, but double precision cannot tell how far they "
             "are from exact ones: nothing is known. Fewer samples, or signals in units near one, help."
         )
-    test = with_room(test)
+    test = test.with_room(rows)
     witness = repaired_point(window, found.point, refine=True)
-    witness = None if witness is None else with_room(witness)
+    witness = None if witness is None else witness.with_room(columns)
     least = np.nan if witness is None else proved_least(window, witness)
     return Shipped(test, proved_threshold(window, test), witness, least)
-
-
-def with_room(found: Repaired) -> Repaired:
-    """Return the same with a radius that other processors find too."""
-    return Repaired(found.values, RADIUS_ROOM * found.radius)
 
 
 def _synthesis(problem: Problem, asked: Asked, window: Window, shipped: Shipped, table: FloatArray) -> Synthesis:
