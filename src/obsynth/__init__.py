@@ -123,6 +123,7 @@ provide({
     "design summary": "obsynth.report.summary:summary",
     "rows of a log": "obsynth.data.alarm_proof:rows_of",
     "picture of a guaranteed test": "obsynth.plotting.guaranteed:plot_least_thresholds",
+    "table of a log": "obsynth.data.log_tables:log_table",
     "thresholds from a log": "obsynth.data.normal_rows:learn_thresholds",
     "designs with model error": "obsynth.experiments.tolerant_designs:with_model_error",
 })  # fmt: skip

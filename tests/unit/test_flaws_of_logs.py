@@ -163,3 +163,47 @@ def test_exported_observers_are_called_from_cplusplus(tmp_path: Path) -> None:
     subprocess.run([*command, "-std=c99", "-c", "one.c", "two.c"], cwd=tmp_path, check=True)
     subprocess.run(["g++", "-Wall", "main.cpp", "one.o", "two.o", "-o", "main"], cwd=tmp_path, check=True)
     subprocess.run([tmp_path / "main"], check=True)
+
+
+DIALECTS = {
+    "commas": {"sep": ","},
+    "semicolons and decimal commas": {"sep": ";", "decimal": ","},
+    "tabs": {"sep": "\t"},
+    "bars": {"sep": "|"},
+}
+
+
+@pytest.mark.parametrize("dialect", DIALECTS)
+@pytest.mark.parametrize("dated", [False, True])
+def test_all_commands_read_the_same_logs(tmp_path: Path, dialect: str, dated: bool) -> None:
+    from obsynth.calibration.logs import read_log
+    from obsynth.comparison.comparing import _log
+
+    data, plain = log(), log()
+    if dated:
+        data["time"] = pd.to_datetime(data["time"], unit="s", origin="2026-05-01").dt.strftime("%Y-%m-%dT%H:%M:%S.%f")
+    data = data.rename(columns={"time": "stamp", "a": "sensor a"})[["b", "sensor a", "stamp", "u"]]
+    data["remark"] = "some text"
+    file, columns = tmp_path / "log.csv", {"time": "stamp", "a": "sensor a"}
+    data.to_csv(file, index=False, **DIALECTS[dialect])
+    read = read_log(file, ["u"], ["a", "b"], columns=columns)
+    np.testing.assert_allclose(read.y, plain[["a", "b"]].to_numpy())
+    np.testing.assert_allclose(read.dt, DT)
+    np.testing.assert_allclose(_log(file, heated(), columns, {"b": 2.0}).y, plain[["a", "b"]].to_numpy() * [1.0, 2.0])
+    found = obsynth.run_on_data(designed("ui-pi-observer"), file, columns=columns).measured
+    assert found is not None
+    np.testing.assert_allclose(found[["u", "a", "b"]], plain[["u", "a", "b"]])
+    frame = read_log(pd.read_csv(file, **DIALECTS[dialect]), ["u"], ["a", "b"], columns=columns)
+    np.testing.assert_allclose(frame.u, read.u)
+
+
+def test_a_log_without_stamps_takes_those_that_are_told(tmp_path: Path) -> None:
+    from obsynth.calibration.logs import read_log
+
+    log().drop(columns="time").to_csv(tmp_path / "log.csv", index=False, sep=";", decimal=",")
+    read = read_log(tmp_path / "log.csv", ["u"], ["a", "b"], dt=DT)
+    np.testing.assert_allclose(read.time, log()["time"])
+    with pytest.raises(obsynth.SpecError, match="has no column 'time'"):
+        read_log(tmp_path / "log.csv", ["u"], ["a", "b"])
+    with pytest.raises(obsynth.SpecError, match="has no column 'c'"):
+        read_log(tmp_path / "log.csv", ["u"], ["a", "c"], dt=DT)

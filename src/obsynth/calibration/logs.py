@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.errors import PreconditionError, SpecError
-from obsynth.files.inputs import input_file
+from obsynth.extensions import extension
 from obsynth.numerics.arrays import FloatArray, read_only
 
 if TYPE_CHECKING:
@@ -159,7 +159,6 @@ def read_log(
             y=log.y[first:last],
             rows=(log.rows[0] + first, log.rows[0] + last),
         )
-    table, source = _table(log)
     signals = ("time", *input_names, *output_names)
     for what, given in (("columns", columns or {}), ("scales", scales or {})):
         wrong = [name for name in given if name not in signals]
@@ -168,6 +167,7 @@ def read_log(
                 f"{what} names {wrong[0]!r}, which is no signal: there are {', '.join(signals)}.",
                 path=f"{what}.{wrong[0]}",
             )
+    table, names, source = _table(log, [(columns or {}).get(name, name) for name in signals])
     length = max((len(values) for values in table.values()), default=0)
     first, last = parsed_rows(rows, length)
 
@@ -175,7 +175,7 @@ def read_log(
         wanted = (columns or {}).get(name, name)
         if wanted not in table:
             raise SpecError(
-                f"The log has no column {wanted!r} for {name!r}: there are {', '.join(table)}.", path=f"columns.{name}"
+                f"The log has no column {wanted!r} for {name!r}: there are {', '.join(names)}.", path=f"columns.{name}"
             )
         numbers = _numbers(table[wanted], wanted, length)[first:last]
         return np.asarray(numbers * float((scales or {}).get(name, 1.0)), dtype=np.float64)
@@ -189,19 +189,13 @@ def read_log(
     return _on_grid(time, u, y, dt, tuple(input_names), tuple(output_names), (first, last), source)
 
 
-def _table(log: Any) -> tuple[dict[str, Any], str]:
-    if isinstance(log, str | Path):
-        path = input_file(Path(log))
-        import pandas as pd
-
-        try:
-            frame = pd.read_parquet(path) if path.suffix.lower() == ".parquet" else pd.read_csv(path)
-        except (ValueError, OSError, ImportError) as error:
-            raise SpecError(f"{path} cannot be read: {' '.join(str(error).split())}", path=str(path)) from error
-        return {str(name).strip(): frame[name].to_numpy() for name in frame.columns}, path.name
-    if isinstance(log, Mapping) or hasattr(log, "columns"):
-        names = log.keys() if isinstance(log, Mapping) else log.columns
-        return {str(name): np.asarray(log[name]) for name in names}, ""
+def _table(log: Any, wanted: Sequence[str]) -> tuple[dict[str, Any], list[str], str]:
+    """Return columns that are wanted, the time first, names of all columns, and where they come from."""
+    if isinstance(log, str | Path) or (hasattr(log, "columns") and hasattr(log, "index")):
+        found, names = extension("table of a log")(log, wanted[1:], wanted[0])
+        return found, names, Path(log).name if isinstance(log, str | Path) else ""
+    if isinstance(log, Mapping):
+        return {str(name): np.asarray(log[name]) for name in log}, list(map(str, log)), ""
     raise SpecError(
         "log must be the name of a file, a pandas.DataFrame, or a mapping from names to columns.", path="log"
     )

@@ -127,6 +127,12 @@ def digits(text: str) -> int:
     return count
 
 
+def columns_of(options: argparse.Namespace) -> dict[str, str]:
+    """Return the columns of signals, and of the time, that the command line names."""
+    named = dict(options.map)
+    return {**named, "time": options.time_column} if options.time_column else named
+
+
 def delay(text: str) -> int | str:
     """Return a delay in rows, or ``auto``."""
     return text if text == "auto" else int(text)
@@ -143,9 +149,11 @@ CLUSTER = option("--cluster", "ADDRESS", "of the scheduler of a Dask cluster, in
 MAP = option("--map", "SIGNAL=COLUMN", "column of a signal (or of time) where the names differ; may be repeated")
 SCALE = option("--scale", "SIGNAL=FACTOR", "the column's value times the factor is in the signal's unit; may be "
                "repeated")  # fmt: skip
+TIME_COLUMN = option("--time-column", "COLUMN", "column of the time, in seconds or as dates (ISO 8601); default: time")
 #: How a log without faults is read.
 LOG_OPTIONS = (
     option("--rows", "A:B", "rows of the log without faults, as Python counts (default: all)"), MAP, SCALE,
+    Settings((TIME_COLUMN,)),
 )  # fmt: skip
 #: What a monitor is made of.
 MONITOR = Group("monitor", (
@@ -170,7 +178,7 @@ DATA_OPTIONS = (
     option("--normal", "FILE", "monitor 'learned': what the verb thresholds wrote (.json), or a log without faults"),
     MONITOR_SETTINGS,
     Settings((
-        option("--time-column", "COLUMN", "column of the time, in seconds or as dates (ISO 8601); default: time"),
+        TIME_COLUMN,
         SCALE,
         option("--threshold", "COLUMN=LEVEL", "alarm when the absolute value of a column of the output passes a level; "
                "may be repeated"),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from obsynth.cli.arguments import pair
+from obsynth.cli.arguments import columns_of, pair
 from obsynth.cli.data_run import numbers_of
 from obsynth.cli.output import answer, output_file, progress
 from obsynth.errors import SpecError, VerificationError
@@ -29,7 +29,7 @@ def _range(name: str, text: str) -> tuple[float, float]:
 
 
 def _log_arguments(options: argparse.Namespace) -> dict[str, Any]:
-    given = {"rows": options.rows, "columns": dict(options.map), "scales": dict(numbers_of(options.scale))}
+    given = {"rows": options.rows, "columns": columns_of(options), "scales": dict(numbers_of(options.scale))}
     return {name: value for name, value in given.items() if value}
 
 

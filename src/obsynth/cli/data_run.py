@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
+from obsynth.cli.arguments import columns_of
 from obsynth.cli.output import output_file
 from obsynth.errors import SpecError
 from obsynth.files.inputs import protect, protect_stream
@@ -44,8 +45,8 @@ def run_of(
 
     with rows_done(options.data, quiet=getattr(options, "quiet", True) or out is sys.stdout) as progress:
         found = run_on_data(
-            design, sys.stdin if options.data == STREAM else Path(options.data), out, columns=dict(options.map),
-            time_column=options.time_column, scales=numbers_of(options.scale),
+            design, sys.stdin if options.data == STREAM else Path(options.data), out, columns=columns_of(options),
+            scales=numbers_of(options.scale),
             thresholds=numbers_of(options.threshold), monitor=watched, gap=options.gap, warm_up=options.warm_up,
             progress=progress, **more,
         )  # fmt: skip
@@ -228,7 +229,7 @@ def proof_of(design: ObserverDesign, options: argparse.Namespace, row: int, **mo
     from obsynth.data.alarm_proof import prove_alarm
 
     return prove_alarm(
-        design, Path(options.data), row, window=options.window, columns=dict(options.map),
+        design, Path(options.data), row, window=options.window, columns=columns_of(options),
         scales=numbers_of(options.scale), disturbance_bounds=numbers_of(options.disturbance),
         noise_bound=options.noise_bound, initial_set=ranges_of(options.initial) or None, **more,
     )  # fmt: skip

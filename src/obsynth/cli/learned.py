@@ -6,6 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
+from obsynth.cli.arguments import columns_of
 from obsynth.cli.data_run import STREAM, numbers_of
 from obsynth.cli.output import answer, output_file
 from obsynth.errors import SpecError
@@ -34,8 +35,7 @@ def run_thresholds(options: argparse.Namespace) -> int:
         sys.stdin if is_stream else Path(options.data),
         false_alarms=options.false_alarms or FALSE_ALARMS,
         rows=options.rows,
-        columns=dict(options.map),
-        time_column=options.time_column,
+        columns=columns_of(options),
         scales=numbers_of(options.scale),
         gap=options.gap,
         warm_up=options.warm_up,

@@ -33,6 +33,7 @@ from obsynth.cli.arguments import (
     SCALE,
     SPEC_GAINS,
     SYSTEM,
+    TIME_COLUMN,
     Argument,
     Group,
     Settings,
@@ -164,7 +165,9 @@ VERBS = {
         "Design by every method that exists for a spec's plant, and show them side by side on its scenario.",
         (
             SYSTEM,
-            option("--data", "FILE", "a log (CSV) to replay through every method", type=Path),
+            option("--data", "FILE", "a log, as for run, to replay through every method", type=Path),
+            MAP,
+            SCALE,
             option("--out", "FILE", "write a page (HTML) with table and picture", type=Path),
             option("--runs", "N", "drawn runs of the scenario (default: 20)", type=int, default=20),
             Settings(
@@ -174,6 +177,7 @@ VERBS = {
                     ),
                     option("--within", "SECONDS", "90 %% of a step must be shown within this time", type=float),
                     option("--sample-time", "SECONDS", "the clock of a continuous plant", type=float),
+                    TIME_COLUMN,
                 )
             ),
             FORCE,
@@ -299,11 +303,6 @@ VERBS = {
             *LOG_OPTIONS,
             Settings(
                 (
-                    option(
-                        "--time-column",
-                        "COLUMN",
-                        "column of the time, in seconds or as dates (ISO 8601); default: time",
-                    ),
                     option("--gap", "SECONDS", "continuous designs: longer intervals are gaps", type=float),
                     option(
                         "--warm-up", "SECONDS", "how long to leave out the start, and what follows gaps", type=float
@@ -408,7 +407,7 @@ VERBS = {
                     flag("--drift", "take a moving point, with an input 'drift'"),
                 )
             ),
-            option("--data", "FILE", "the log (CSV or Parquet)", type=Path),
+            option("--data", "FILE", "the log, as for run", type=Path),
             *LOG_OPTIONS,
             option(
                 "--out",
@@ -427,7 +426,7 @@ VERBS = {
         "Fit constants and noise of a plant to a log of rows without faults, with boxes and a verdict.",
         (
             SYSTEM,
-            option("--data", "FILE", "the log (CSV or Parquet)", type=Path),
+            option("--data", "FILE", "the log, as for run", type=Path),
             *LOG_OPTIONS,
             option(
                 "--unknown",
@@ -456,7 +455,7 @@ VERBS = {
         "Ask whether a recorded log without faults agrees with a design.",
         (
             GAINS,
-            option("--data", "FILE", "the log (CSV or Parquet)", type=Path, required=True),
+            option("--data", "FILE", "the log, as for run", type=Path, required=True),
             *LOG_OPTIONS,
             JSON,
             QUIET,
@@ -467,13 +466,14 @@ VERBS = {
         "Prove that data up to a row are not explained without a fault by any plant within its tolerances.",
         (
             GAINS,
-            option("--data", "FILE", "CSV or Parquet file, as for run", type=Path, required=True),
+            option("--data", "FILE", "the log, as for run", type=Path, required=True),
             option("--row", "K", "last row of the window, from 1", type=int, required=True),
             option("--out", "FILE", "write the certificate (JSON) if there is a proof", type=Path),
             MAP,
             SCALE,
             Settings(
                 (
+                    TIME_COLUMN,
                     option("--window", "N", "samples (default: 20)", type=int, default=20),
                     option("--disturbance", "NAME=BOUND", "largest absolute value of a disturbance; may be repeated"),
                     option(

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from obsynth.cli.arguments import columns_of
 from obsynth.cli.commands import designed_or_loaded, spec_output
 from obsynth.cli.data_commands import picture_kind, written_picture
 from obsynth.cli.data_run import monitor_settings, numbers_of, required_scenario
@@ -143,7 +144,8 @@ def run_compare(options: argparse.Namespace) -> int:
         given = {} if spec.method == "auto" else {spec.method: spec.options}
         found = compare(
             plant, scenario=spec.scenario, options=given, sample_time=clock, within=options.within,
-            tolerance=options.tolerance, runs=options.runs, data=options.data, progress=report_stage,
+            tolerance=options.tolerance, runs=options.runs, data=options.data, columns=columns_of(options),
+            scales=numbers_of(options.scale), progress=report_stage,
         )  # fmt: skip
         if options.out is not None:
             report_stage(f"writing {options.out}")

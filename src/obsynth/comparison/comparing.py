@@ -14,6 +14,8 @@ import numpy as np
 
 from obsynth.analysis.transformations.recovery import Transformation, linear_plant
 from obsynth.comparison.result import ComparedMethod, Comparison, FaultComparison
+from obsynth.data.log_tables import log_table
+from obsynth.data.signals import TIME
 from obsynth.errors import SpecError
 from obsynth.methods.automatic import Candidate, candidate, linear_methods
 from obsynth.methods.designing import design
@@ -177,6 +179,8 @@ def compare(
     runs: int = RUNS,
     false_alarms: float = 0.05,
     data: Any = None,
+    columns: Mapping[str, str] | None = None,
+    scales: Mapping[str, float] | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Comparison:
     """Design every method that exists for a plant and put them side by side, on one clock and the same draws.
@@ -208,6 +212,8 @@ def compare(
         Share of fault-free runs that pass the threshold of an alarm.
     data : str, Path or DataFrame, optional
         A log with the outputs and inputs by name, replayed through every method; columns named as faults are the truth.
+    columns, scales : mapping, optional
+        Columns of signals where their names differ, and factors of their values, as for `obsynth.run_on_data`.
     progress : callable, optional
         Called with a text at the start of each stage.
 
@@ -255,7 +261,7 @@ def compare(
     drawn = drawn_runs(
         plant, sampled, happening, runs=runs, tolerance=float(tolerance), seed=SEED, feedback=kept.feedback
     )
-    log = None if data is None else _log(data, sampled)
+    log = None if data is None else _log(data, sampled, columns, scales)
     limit = within if within is not None else settling_time(plant)
     compared = [_compared(entry, sampled, drawn, log, kept, limit, false_alarms) for entry in found]
     compared.sort(key=lambda entry: (bool(entry.refused), not entry.fast_enough, entry.rms))
@@ -325,53 +331,43 @@ class _Log(NamedTuple):
     known: bool
 
 
-def _log(data: Any, plant: DescriptorSystem) -> _Log:
+def _log(
+    data: Any, plant: DescriptorSystem, columns: Mapping[str, str] | None, scales: Mapping[str, float] | None
+) -> _Log:
     import pandas as pd
 
-    if isinstance(data, (str, Path)):
-        from obsynth.files.inputs import input_file
-
-        try:
-            frame = pd.read_csv(input_file(Path(data)))
-        except (ValueError, OSError) as error:
-            raise SpecError(f"{data} cannot be read: {' '.join(str(error).split())}", path=str(data)) from error
-    else:
+    if not isinstance(data, (str, Path)):
         require_kind(data, pd.DataFrame, "data", "a file name or a pandas.DataFrame")
-        frame = data
-    missing = [name for name in (*plant.input_names, *plant.output_names) if name not in frame.columns]
+    wanted = {
+        name: (columns or {}).get(name, name) for name in (*plant.input_names, *plant.output_names, *plant.fault_names)
+    }
+    table, _ = log_table(data, list(wanted.values()), (columns or {}).get(TIME, TIME))
+    frame = {name: table[column] for name, column in wanted.items() if column in table}
+    missing = [wanted[name] for name in (*plant.input_names, *plant.output_names) if name not in frame]
     if missing:
         raise SpecError(f"The log has no column {', '.join(map(repr, missing))}.", path="data")
-    if not len(frame):
+    count = max(map(len, frame.values()), default=0)
+    if not count:
         raise SpecError("The log has no rows.", path="data")
 
-    def columns(names: Sequence[str]) -> FloatArray:
+    def signals(names: Sequence[str]) -> FloatArray:
         offsets = np.array([plant.operating_point.get(name, 0.0) for name in names])
-        scales = np.array([plant.scales.get(name, 1.0) for name in names])
-        values = _numbers(frame, list(names))
+        factors = np.array([(scales or {}).get(name, plant.scales.get(name, 1.0)) for name in names])
+        values = np.column_stack([frame[name] for name in names]) if names else np.zeros((count, 0))
         if not np.all(np.isfinite(values)):
             raise SpecError("The log has gaps: give rows without missing values.", path="data")
-        return np.asarray(values * scales - offsets)
+        return np.asarray(values * factors - offsets)
 
-    there = [name for name in plant.fault_names if name in frame.columns]
-    truth = np.zeros((len(frame), plant.nf))
+    there = [name for name in plant.fault_names if name in frame]
+    truth = np.zeros((count, plant.nf))
     for name in there:
-        truth[:, plant.fault_names.index(name)] = _numbers(frame, [name])[:, 0]
-    u, y = columns(plant.input_names), columns(plant.output_names)
-    return _Log(_clock(len(frame), plant.dt), u, y, truth, bool(there))
+        truth[:, plant.fault_names.index(name)] = frame[name]
+    u, y = signals(plant.input_names), signals(plant.output_names)
+    return _Log(_clock(count, plant.dt), u, y, truth, bool(there))
 
 
 def _clock(samples: int, dt: float) -> FloatArray:
     return np.asarray(np.arange(samples) * float(dt), dtype=np.float64)
-
-
-def _numbers(frame: Any, names: list[str]) -> FloatArray:
-    """Return columns of a log as numbers, ``(rows, names)``."""
-    try:
-        return np.asarray(frame[names].to_numpy(dtype=np.float64))
-    except (ValueError, TypeError, OverflowError) as error:
-        raise SpecError(
-            f"{', '.join(map(repr, names))}: the log holds what is no number: {error}.", path="data"
-        ) from error
 
 
 def _compared(

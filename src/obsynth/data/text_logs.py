@@ -76,7 +76,7 @@ def stream_rows(stream: TextIO, signals: Signals, stamps: Stamps) -> Iterator[Fl
     first = next(lines, "")
     told = _SEPARATOR_LINE.fullmatch(first)
     head = next(lines, "") if told else first
-    dialect = Dialect(told.group(1)) if told else _dialect_of(head, signals)
+    dialect = Dialect(told.group(1)) if told else _dialect_of(head, signals.columns)
     # A name in quotes may go on in the next line.
     table = _cells(itertools.chain([head], lines), dialect)
     header = tuple(unquoted(name.strip()) for name in next(table, []))
@@ -97,15 +97,31 @@ def stream_rows(stream: TextIO, signals: Signals, stamps: Stamps) -> Iterator[Fl
         raise SpecError("The data have no rows.", path="data")
 
 
+def header_of(path: Path, wanted: Sequence[str]) -> list[str]:
+    """Return the names of the columns of a file, of which some are wanted."""
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as stream:
+            lines = _text_lines(stream)
+            first = next(lines, "")
+            told = _SEPARATOR_LINE.fullmatch(first)
+            head = next(lines, "") if told else first
+            dialect = Dialect(told.group(1)) if told else _dialect_of(head, wanted)
+            return [unquoted(name.strip()) for name in next(_cells(itertools.chain([head], lines), dialect), [])]
+    except UnicodeDecodeError as error:
+        raise SpecError(f"{path} is no UTF-8 text (byte {error.start}).", path=str(path)) from error
+    except OSError as error:
+        raise SpecError(f"{path} cannot be read: {error.strerror or error}.", path=str(path)) from error
+
+
 def _together(rows: Iterator[FloatArray], count: int) -> Iterator[FloatArray]:
     while block := list(itertools.islice(rows, count)):
         yield np.concatenate(block)
 
 
-def _dialect_of(head: str, signals: Signals) -> Dialect:
+def _dialect_of(head: str, wanted: Sequence[str]) -> Dialect:
     """Return how a log is written: by the separator that finds the columns that are read, or that finds most."""
     found = {separator: _names(head, separator) for separator in SEPARATORS}
-    whole = next((s for s, names in found.items() if set(signals.columns) <= set(names)), None)
+    whole = next((s for s, names in found.items() if set(wanted) <= set(names)), None)
     return Dialect(whole or max(SEPARATORS, key=lambda s: len(found[s])))
 
 

@@ -1,0 +1,60 @@
+"""Columns of a whole log by name, for what needs all rows at once: read as `obsynth.run_on_data` reads them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from obsynth.data.signals import TIME, Signals, Stamps
+from obsynth.data.sources import CHUNK_ROWS, PACKAGES, TEXTS, check_suffix, chunks
+from obsynth.data.text_logs import header_of
+from obsynth.files.inputs import input_file
+from obsynth.numerics.arrays import FloatArray
+
+#: Decimals of seconds that dates are told to.
+MICROSECONDS = 6
+
+
+def log_table(
+    data: str | Path | Any, names: Sequence[str], time: str = TIME
+) -> tuple[dict[str, FloatArray], list[str]]:
+    """Return those of some columns that a log has ``(rows,)``, dates as seconds since the first, and names of all of its
+    columns; ``data`` is the name of a file or a data frame, ``time`` the column of the stamps."""
+    header = _header(data, [time, *names])
+    there = [name for name in dict.fromkeys(names) if name in header and name != time]
+    # A log without stamps is read like others: a column stands where they would.
+    first = time if time in header else next(iter(there), None)
+    if first is None:
+        return {}, header
+    signals = Signals(tuple(there), (first, *there), np.ones(len(there)), np.zeros(len(there)), {})
+    stamps = Stamps()
+    rows = np.concatenate(list(chunks(data, signals, stamps, CHUNK_ROWS)))
+    found, times = dict(zip(there, rows[:, 1:].T, strict=True)), rows[:, 0]
+    if stamps.is_dated:
+        # Seconds since 1970 in double precision have lost what is below a microsecond.
+        times = np.round(times - times[0], MICROSECONDS)
+    return {**({time: times} if time in header else {}), **found}, header
+
+
+def _header(data: Any, wanted: Sequence[str]) -> list[str]:
+    """Return the names of all columns; those that are wanted where a file tells them only when it is read."""
+    if not isinstance(data, str | Path):
+        names = [str(name) for name in data.columns]
+        dated = getattr(data.index, "dtype", None) is not None and data.index.dtype.kind in "Mm"
+        return [*([TIME] if TIME not in names and (dated or data.index.name == TIME) else []), *names]
+    path = Path(data)
+    check_suffix(path, (*TEXTS, *PACKAGES))
+    input_file(path)
+    if path.suffix.lower() in TEXTS:
+        return header_of(path, wanted)
+    if path.suffix.lower() == ".parquet":
+        import pyarrow.parquet
+
+        try:
+            return list(pyarrow.parquet.read_schema(path).names)
+        except (ValueError, OSError):  # the reader says what is wrong with it
+            return list(wanted)
+    return list(wanted)
