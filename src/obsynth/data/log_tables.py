@@ -21,7 +21,7 @@ MICROSECONDS = 6
 def log_table(
     data: str | Path | Any, names: Sequence[str], time: str = TIME
 ) -> tuple[dict[str, FloatArray], list[str]]:
-    """Return those of some columns that a log has ``(rows,)``, dates as seconds since the first, and names of all of its
+    """Return those of some columns that a log has ``(rows,)``, dates as seconds since the first, and the names of all
     columns; ``data`` is the name of a file or a data frame, ``time`` the column of the stamps."""
     header = _header(data, [time, *names])
     there = [name for name in dict.fromkeys(names) if name in header and name != time]
