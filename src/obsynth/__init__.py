@@ -65,7 +65,7 @@ _NAMES = {
     "importing.python_objects": "from_control from_pandas from_scipy from_sympy",
     "methods.fault_figures": "FaultFigures",
     "methods.designing": "check design design_from_gains",
-    "methods.functional_filter.detection": "detection_filter DetectionFilter",
+    "methods.detection_filter.public": "detection_filter DetectionFilter",
     "methods.guaranteed_test.result": "GuaranteedTest guaranteed_test",
     "methods.functions": (
         "adaptive_observer dae_adaptive_observer descriptor_kalman fault_estimation_filter functional_filter "

@@ -65,9 +65,9 @@ from obsynth.importing.python_objects import from_sympy as from_sympy
 from obsynth.methods.designing import check as check
 from obsynth.methods.designing import design as design
 from obsynth.methods.designing import design_from_gains as design_from_gains
+from obsynth.methods.detection_filter.public import DetectionFilter as DetectionFilter
+from obsynth.methods.detection_filter.public import detection_filter as detection_filter
 from obsynth.methods.fault_figures import FaultFigures as FaultFigures
-from obsynth.methods.functional_filter.detection import DetectionFilter as DetectionFilter
-from obsynth.methods.functional_filter.detection import detection_filter as detection_filter
 from obsynth.methods.functions import adaptive_observer as adaptive_observer
 from obsynth.methods.functions import dae_adaptive_observer as dae_adaptive_observer
 from obsynth.methods.functions import descriptor_kalman as descriptor_kalman

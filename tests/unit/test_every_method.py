@@ -47,8 +47,9 @@ TANK = obsynth.DAEModel(
     units={"level": "m", "inflow": "m3/s", "leak": "m2.5/s", "gauge": "m"},
 )  # fmt: skip
 MEASURED = obsynth.DescriptorSystem(None, [[1.1, 0.1], [0.0, 0.9]], [[0.0], [1.0]], np.eye(2), dt=0.1)
+NOISY = CONTINUOUS.replace(Bd=[[0.3], [0.0], [0.1]], Dd=[[0.2], [0.0]], Bw=np.zeros((3, 2)), Dw=0.3 * np.eye(2))
 #: Plants in the order in which a method takes the first that it has an observer for.
-PLANTS: tuple[Any, ...] = (DISCRETE, CONTINUOUS, TANK, MEASURED)
+PLANTS: tuple[Any, ...] = (DISCRETE, CONTINUOUS, TANK, MEASURED, NOISY)
 #: What a method cannot do without.
 OPTIONS: dict[str, dict[str, Any]] = {
     "descriptor-kalman": {"Q": 0.01, "R": 0.01},

@@ -149,7 +149,9 @@ class DataObserver(Engine):
         # Since when nothing is left of a gap: bounds that are never passed hold from there on.
         self.forgotten_at, self.begun = -math.inf, False
         self.transient = transient(self.observer)
-        self.fault = np.zeros(len(self.fault_names))
+        # Of every fault of the plant; those of which nothing is estimated are held to be absent.
+        self.fault = np.zeros(self.plant.nf)
+        self.told_faults = [self.plant.fault_names.index(name) for name in self.observer.fault_names]
         self.measured = self.v
         self.inputs: deque[FloatArray] = deque(maxlen=max(lags) + 1)
 
@@ -186,7 +188,7 @@ class DataObserver(Engine):
         if self.z is None or not (np.isfinite(self.z).all() and np.isfinite(found).all()):
             self._restart()
             return Row(GAP, self._held(), missing)
-        self.fault = found[self.observer.fault_rows].copy()
+        self.fault = self._faults_in(found)
         sample = LinearSample(found, values[: self.nu], values[self.nu :], len(self.state_names))
         return Row(status, found, missing, sample, time >= self.forgotten_at)
 
@@ -232,10 +234,10 @@ class DataObserver(Engine):
         last = count - 1
         self.clock.take(times[:count], steps[:count])
         self.z, self.v, self.row, self.measured = np.array(after[last]), values[last], rows[last], values[last]
-        self.fault = rows[last][observer.fault_rows].copy()
+        self.fault = self._faults_in(rows[last])
         self.seen = (
             rows[last][observer.state_rows] if self.partial is None
-            else self.partial.state(states[last], values[last], rows[last][observer.fault_rows])
+            else self.partial.state(states[last], values[last], self.fault)
         )  # fmt: skip
         self.inputs.extend(v[: self.nu] for v in values[max(count - (self.inputs.maxlen or count), 0) : count])
         settled, phase, forgotten = self.settled_at, self.phase, self.forgotten_at
@@ -251,10 +253,16 @@ class DataObserver(Engine):
         z = _running(self.z)
         self.row = np.asarray(self.observer.Cz @ z + self.d @ v)
         self.measured = v
-        faults = self.row[self.observer.fault_rows]
+        faults = self._faults_in(self.row)
         self.seen = self.row[self.observer.state_rows] if self.partial is None else self.partial.state(z, v, faults)
         self._taken(v)
         return self.row
+
+    def _faults_in(self, row: FloatArray) -> FloatArray:
+        """Return every fault of the plant ``(nf,)`` as a row of estimates says."""
+        faults = np.zeros(self.plant.nf)
+        faults[self.told_faults] = row[self.observer.fault_rows]
+        return faults
 
     def _lost(self, seconds: float, v: FloatArray) -> bool:
         """Whether the model, after a gap, misses the outputs by more than their whole size before and after it."""
@@ -309,7 +317,7 @@ class DataObserver(Engine):
             self._flow(seconds, v)
         row = np.asarray(self.observer.Cz @ self.z + self.d @ v)
         self._taken(v)
-        row[self.observer.fault_rows] = self.fault
+        row[self.observer.fault_rows] = self.fault[self.told_faults]
         row[self.observer.residual_rows] = np.nan
         if not np.isfinite(self.z).all():
             self._restart()
@@ -328,7 +336,7 @@ class DataObserver(Engine):
 
     def _held(self) -> FloatArray:
         row = np.full(len(self.observer.Cz), np.nan)
-        row[self.observer.fault_rows] = self.fault
+        row[self.observer.fault_rows] = self.fault[self.told_faults]
         return row
 
     def _own_data(self) -> dict[str, Any]:

@@ -1,0 +1,1 @@
+"""The detection filter as a method."""

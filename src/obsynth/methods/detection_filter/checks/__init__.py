@@ -1,0 +1,127 @@
+"""Checks of a detection filter, from the plant and the shipped realisation alone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from obsynth.methods.detection_filter.conditions import conditions, unknown_inputs
+from obsynth.methods.detection_filter.norm_proofs import gain_is_proved, sensitivity_is_proved
+from obsynth.methods.detection_filter.transfers import added_gain, error_transfer
+from obsynth.numerics.spectra import abscissa
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.results.checks import Check, information, upper_bound_check
+from obsynth.results.design import ObserverDesign
+from obsynth.verification.identities import Identity, equality, relative_tolerance
+from obsynth.verification.plant import condition_rows, plant_information
+
+#: The row on the plant together with the stored filter.
+TOGETHER = "with stored numbers"
+_SOURCE = "Ding et al. 2000; proofs ours"
+_CLAIMS = ("disturbance_gain", "fault_sensitivity", "band_from", "band_to")
+
+
+def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
+    """Yield every check of ``design``; see `obsynth.methods.verifying.verify`."""
+    plant, observer = design.linear
+    yield from plant_information(plant)
+    fitting = _fits(design)
+    yield upper_bound_check(
+        "fits the plant", "observer, claims, options and plant have matching signals, shapes and bands",
+        float(not fitting), 0.0, source="shipped realisation",
+    )  # fmt: skip
+    if not fitting:
+        return
+    yield from condition_rows(conditions(plant))
+    tolerance = relative_tolerance(printed_digits, plant.nx + plant.ny + observer.order)
+    for name, claim, identity in _identities(plant, observer):
+        yield equality(name, claim, identity.residual(), _SOURCE, bound=tolerance)
+    yield from _norm_rows(design)
+
+
+def _fits(design: ObserverDesign) -> bool:
+    plant, observer = design.linear
+    claims = design.certificate.claims
+    if any(name not in claims or not np.isfinite(float(claims[name])) for name in _CLAIMS):
+        return False
+    band = [float(claims[name]) for name in ("band_from", "band_to")]
+    parts = observer.Az, observer.Bu, observer.By, observer.Cz, observer.Du, observer.Dy
+    return bool(
+        all(np.all(np.isfinite(part)) for part in parts)
+        and np.array_equal(plant.E, np.eye(plant.nx))
+        and observer.order == plant.nx
+        and observer.input_names == plant.input_names
+        and observer.output_names == plant.output_names
+        and (observer.state_names, observer.fault_names) == ((), ())
+        and len(observer.residual_names) == plant.ny
+        and observer.dt == plant.dt == 0.0
+        and 0.0 <= band[0] < band[1]
+        and list(design.options.get("band", ())) == band
+        and float(claims["disturbance_gain"]) > 0.0
+        and float(claims["fault_sensitivity"]) >= 0.0
+    )
+
+
+def _identities(plant: DescriptorSystem, observer: LinearObserver) -> Iterator[tuple[str, str, Identity]]:
+    """Yield what makes the error obey equations of its own: name, claim, terms."""
+    az, bu, by, cz, du, dy = observer.Az, observer.Bu, observer.By, observer.Cz, observer.Du, observer.Dy
+    state = Identity((az, by @ plant.C, -plant.A), ((az,), (by, plant.C), (plant.A,)))
+    yield "state in the error", "Az = A - By C", state
+    inputs = Identity((bu, by @ plant.D, -plant.B), ((by, plant.D), (plant.B,)))
+    yield "inputs in the error", "Bu = B - By D", inputs
+    yield "state in the residuals", "Cz = -Dy C", Identity((cz, dy @ plant.C), ((dy, plant.C),))
+    yield "inputs in the residuals", "Du = -Dy D", Identity((du, dy @ plant.D), ((dy, plant.D),))
+
+
+def _norm_rows(design: ObserverDesign) -> Iterator[Check]:
+    """Yield the two norms on the error's own equations, and on the plant together with the stored filter."""
+    (plant, observer), claims = design.linear, design.certificate.claims
+    gain, sensitivity = float(claims["disturbance_gain"]), float(claims["fault_sensitivity"])
+    band = float(claims["band_from"]), float(claims["band_to"])
+    unknown, faults = unknown_inputs(plant), (plant.Bf, plant.Df)
+
+    felt, sensed = error_transfer(plant, observer, *unknown), error_transfer(plant, observer, *faults)
+
+    def shows(level: float) -> bool:
+        return sensitivity == 0.0 or sensitivity_is_proved(sensed, level, *band)
+
+    by_itself = gain_is_proved(felt, gain), shows(sensitivity)
+    yield Check(
+        "disturbance gain", "the error dies out, and the H-infinity norm from unknown inputs and noise to the "
+        "residuals is at most the claimed one", gain, gain, 0.0, by_itself[0], _SOURCE, "proved",
+    )  # fmt: skip
+    yield Check(
+        "fault sensitivity", "the least singular value from the faults to the residuals is at least the claimed one "
+        f"from {band[0]:g} to {band[1]:g} rad/s", sensitivity, sensitivity, 0.0, by_itself[1], _SOURCE, "proved",
+    )  # fmt: skip
+    if not all(by_itself):
+        return
+    what = "both norms hold for the plant together with the filter as it is stored, rounding included"
+    added = [added_gain(plant, observer, *signal) for signal in (unknown, faults)]
+    if not any(added):
+        yield _together(what, True, "the stored numbers meet the equations of the error exactly")
+        return
+    detail = f"they add at most {added[0]:.2g} to the gain, and take {added[1]:.2g} from the sensitivity"
+    less, more = np.nextafter(gain - added[0], -np.inf), np.nextafter(sensitivity + added[1], np.inf)
+    holds = bool(np.all(np.isfinite(added))) and less > 0.0 and gain_is_proved(felt, less) and shows(more)
+    yield _together(what, holds, detail if holds else _why_not(plant))
+
+
+def _together(what: str, holds: bool, detail: str) -> Check:
+    source = "plant and stored filter, outward rounded"
+    return information(
+        TOGETHER, what, float(not holds), source=source, detail=detail, status="proved" if holds else "assumed"
+    )
+
+
+def _why_not(plant: DescriptorSystem) -> str:
+    rate = abscissa(plant.A, 0.0)
+    if rate >= 0.0:
+        return (
+            f"not proved: the plant does not forget (a pole at {rate:.3g} 1/s), and the stored numbers miss the "
+            "equations of the error by rounding: together they have no finite gain. How much a state of the plant adds "
+            "to the residuals is told by 'stored numbers: states'"
+        )
+    return f"not proved: the plant forgets at {-rate:.3g} 1/s only, too slowly for what the stored numbers miss"

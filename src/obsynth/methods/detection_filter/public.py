@@ -1,0 +1,71 @@
+"""The public function of the detection filter, and its result: a design whose two norms have names."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from inspect import signature
+from typing import Any
+
+from obsynth.methods.designing import design
+from obsynth.methods.detection_filter.checks import TOGETHER
+from obsynth.methods.detection_filter.method import DetectionFilterMethod
+from obsynth.methods.functions import design_function
+from obsynth.results.checks import VerificationReport
+from obsynth.results.design import ObserverDesign
+
+
+@dataclass(frozen=True, repr=False)
+class DetectionFilter(ObserverDesign):
+    """The design of a residual filter of least gain from the unknown inputs for what it shows of the faults.
+
+    An `ObserverDesign` in every respect; made by `detection_filter`.
+    """
+
+    @property
+    def disturbance_gain(self) -> float:
+        """Bound on the H-infinity norm from unknown inputs and noise to the residuals."""
+        return float(self.certificate.claims["disturbance_gain"])
+
+    @property
+    def fault_sensitivity(self) -> float:
+        """H-minus: the least singular value from the faults to the residuals on the band is at least this."""
+        return float(self.certificate.claims["fault_sensitivity"])
+
+    @property
+    def frequency(self) -> float:
+        """Where on the band it is least, rad/s."""
+        return float(self.certificate.claims["frequency"])
+
+    @property
+    def band(self) -> tuple[float, float]:
+        """The range of frequencies, rad/s."""
+        claims = self.certificate.claims
+        return float(claims["band_from"]), float(claims["band_to"])
+
+    @property
+    def ratio(self) -> float:
+        """H-minus over H-infinity: the largest that any filter has, but for the margins of the proofs."""
+        return self.fault_sensitivity / self.disturbance_gain
+
+    @property
+    def proved(self) -> bool:
+        """Whether both norms are proved for the plant together with the filter as it is stored, rounding included."""
+        rows = {row.name: row for row in self.report.checks}
+        return self.report.passed and TOGETHER in rows and rows[TOGETHER].status == "proved"
+
+    def verify(self) -> VerificationReport:
+        """Prove both norms again, from the plant and the shipped filter alone."""
+        from obsynth.methods.verifying import verify
+
+        return verify(self)
+
+
+def detection_filter(plant: Any, **options: Any) -> DetectionFilter:
+    """Design a detection filter; the docstring is that of the method."""
+    found = design(plant, DetectionFilterMethod.id, **options)
+    return DetectionFilter(**{field.name: getattr(found, field.name) for field in fields(found)})
+
+
+_like = design_function(DetectionFilterMethod)
+detection_filter.__doc__ = _like.__doc__
+detection_filter.__signature__ = signature(_like).replace(return_annotation="DetectionFilter")  # type: ignore[attr-defined]

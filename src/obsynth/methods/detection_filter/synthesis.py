@@ -1,0 +1,110 @@
+"""The gain and the weight that make the transfer from the unknown inputs co-inner; how much is left of the faults."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from obsynth.analysis.conditions import require_all
+from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
+from obsynth.errors import SolverError
+from obsynth.methods.detection_filter.conditions import unknown_inputs
+from obsynth.methods.detection_filter.method import DetectionFilterMethod
+from obsynth.methods.detection_filter.norm_proofs import gain_is_proved, sensitivity_is_proved
+from obsynth.methods.detection_filter.transfers import error_transfer
+from obsynth.methods.method import Synthesis
+from obsynth.methods.riccati import continuous_solution
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.norms import response
+from obsynth.numerics.spectra import abscissa
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.results.design import Certificate
+
+#: The grid of frequencies begins at this share of its end, where the band begins at zero.
+LEAST_FREQUENCY = 1e-6
+#: The proved gain is this much above one, and the proved sensitivity one of these below what a grid finds.
+MARGIN, SENSITIVITY_MARGINS = 1e-6, (1e-4, 1e-3, 1e-2, 0.1, 0.5)
+#: Frequencies of the grid, and how often the least value is refined between its neighbours.
+GRID, REFINEMENTS = 400, 40
+
+
+def synthesise(plant: DescriptorSystem, asked: DetectionFilterMethod, *, progress: Callable[[str], None]) -> Synthesis:
+    """Design the filter; see `obsynth.detection_filter` for the options, results and errors."""
+    progress("checking the existence conditions")
+    require_all(asked.existence(plant))
+    found = eliminate_algebraic_states(plant)
+    smooth = found.plant if found.description else plant
+    progress("choosing the gains")
+    gain, weight = _gains(smooth)
+    observer = LinearObserver(
+        Az=smooth.A - gain @ smooth.C, Bu=smooth.B - gain @ smooth.D, By=gain, Cz=-weight @ smooth.C,
+        Du=-weight @ smooth.D, Dy=weight, dt=0.0, input_names=smooth.input_names, output_names=smooth.output_names,
+        state_names=(), fault_names=(), residual_names=tuple(f"r{i + 1}" for i in range(smooth.ny)), state_delays=(),
+        fault_delays=(),
+    )  # fmt: skip
+    if not gain_is_proved(error_transfer(smooth, observer, *unknown_inputs(smooth)), 1.0 + MARGIN):
+        raise SolverError(
+            "The Riccati equation of the detection filter has no solution of which a gain can be proved: the slowest "
+            f"pole is at {abscissa(observer.Az, 0.0):.3g} 1/s, next to a zero from the unknown inputs to the outputs "
+            "on the imaginary axis. State noise of the states (Bw)."
+        )
+    low, high = (float(value) for value in asked.band)
+    least, where = _sensitivity(smooth, observer, low, high)
+    claims = {
+        "disturbance_gain": 1.0 + MARGIN, "fault_sensitivity": _provable(smooth, observer, least, low, high),
+        "band_from": low, "band_to": high, "frequency": where,
+    }  # fmt: skip
+    return Synthesis(
+        asked.as_plain(), {"L": gain, "V": weight}, observer, Certificate({}, claims),
+        transformation=found if found.description else None,
+    )  # fmt: skip
+
+
+def _provable(plant: DescriptorSystem, observer: LinearObserver, least: float, low: float, high: float) -> float:
+    """Return the largest share of the sensitivity found that is proved; zero, which says nothing, where none is."""
+    felt = error_transfer(plant, observer, plant.Bf, plant.Df)
+    shares = (least * (1.0 - margin) for margin in SENSITIVITY_MARGINS)
+    return next((level for level in shares if sensitivity_is_proved(felt, level, low, high)), 0.0)
+
+
+def _gains(plant: DescriptorSystem) -> tuple[FloatArray, FloatArray]:
+    """Return L ``(nx, ny)`` and V ``(ny, ny)`` that make the transfer from the unknown inputs co-inner."""
+    b, d = unknown_inputs(plant)
+    measured = d @ d.T
+    y = continuous_solution(plant.A, plant.C, b @ b.T, measured, b @ d.T)
+    gain = None if y is None else np.linalg.solve(measured, (y @ plant.C.T + b @ d.T).T).T
+    if gain is None or not np.all(np.isfinite(gain)) or not abscissa(plant.A - gain @ plant.C, 0.0) < 0.0:
+        raise SolverError(
+            "The Riccati equation of the detection filter has no stabilising solution: a zero from the unknown inputs "
+            "to the outputs lies on the imaginary axis, or a mode shows in no output. State noise of the states (Bw)."
+        )
+    sizes, directions = np.linalg.eigh(measured)
+    return np.asarray(gain), np.asarray((directions / np.sqrt(sizes)) @ directions.T)
+
+
+def _sensitivity(plant: DescriptorSystem, observer: LinearObserver, low: float, high: float) -> tuple[float, float]:
+    """Return the least singular value from the faults to the residuals on a band, and where."""
+    entering = plant.Bf - observer.By @ plant.Df
+    shown, direct = -observer.Cz, observer.Dy @ plant.Df
+
+    def least(points: FloatArray) -> FloatArray:
+        if plant.nf > plant.ny:
+            return np.zeros(len(points))
+        found = response(observer.Az, entering, shown, direct, np.asarray(1j * points, dtype=np.complex128))
+        return np.asarray(np.linalg.svd(found, compute_uv=False)[:, -1])
+
+    grid = np.unique(
+        np.concatenate([np.linspace(low, high, GRID), np.geomspace(max(low, LEAST_FREQUENCY * high), high, GRID)])
+    )
+    values = least(grid)
+    at = int(np.argmin(values))
+    left, right = grid[max(at - 1, 0)], grid[min(at + 1, len(grid) - 1)]
+    for _ in range(REFINEMENTS):
+        inner = np.linspace(left, right, 5)
+        best = int(np.argmin(least(inner)))
+        left, right = inner[max(best - 1, 0)], inner[min(best + 1, 4)]
+    place = 0.5 * (left + right)
+    value = float(least(np.array([place]))[0])
+    return (value, float(place)) if value < values[at] else (float(values[at]), float(grid[at]))
