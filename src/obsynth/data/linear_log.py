@@ -260,7 +260,7 @@ class DataObserver(Engine):
 
     def _faults_in(self, row: FloatArray) -> FloatArray:
         """Return every fault of the plant ``(nf,)`` as a row of estimates says."""
-        faults = np.zeros(self.plant.nf)
+        faults = np.zeros(len(self.fault))
         faults[self.told_faults] = row[self.observer.fault_rows]
         return faults
 

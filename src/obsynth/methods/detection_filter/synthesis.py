@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from obsynth.errors import SolverError
 from obsynth.methods.detection_filter.conditions import unknown_inputs
 from obsynth.methods.detection_filter.method import DetectionFilterMethod
 from obsynth.methods.detection_filter.norm_proofs import gain_is_proved, sensitivity_is_proved
-from obsynth.methods.detection_filter.transfers import error_transfer
+from obsynth.methods.detection_filter.transfers import added_gain, error_transfer
 from obsynth.methods.method import Synthesis
 from obsynth.methods.riccati import continuous_solution
 from obsynth.numerics.arrays import FloatArray
@@ -58,8 +58,24 @@ def synthesise(plant: DescriptorSystem, asked: DetectionFilterMethod, *, progres
     }  # fmt: skip
     return Synthesis(
         asked.as_plain(), {"L": gain, "V": weight}, observer, Certificate({}, claims),
+        notes=_notes(smooth, observer, claims),
         transformation=found if found.description else None,
     )  # fmt: skip
+
+
+def _notes(plant: DescriptorSystem, observer: LinearObserver, claims: Mapping[str, float]) -> tuple[str, ...]:
+    told = (
+        f"Unknown inputs and noise reach the residuals with a gain of at most {claims['disturbance_gain']:.7g}, the "
+        f"faults with at least {claims['fault_sensitivity']:.4g} from {claims['band_from']:g} to {claims['band_to']:g} "
+        f"rad/s (least at {claims['frequency']:.3g} rad/s).",
+    )
+    if np.isfinite(added_gain(plant, observer, *unknown_inputs(plant))):
+        return told
+    return (
+        *told,
+        "The plant does not forget: both norms are those of the error's own equations, and what rounding of the stored "
+        "numbers adds has no finite gain. It matters for disturbances that last very long.",
+    )
 
 
 def _provable(plant: DescriptorSystem, observer: LinearObserver, least: float, low: float, high: float) -> float:

@@ -33,8 +33,9 @@ def missed(plant: DescriptorSystem, observer: LinearObserver) -> tuple[Ball, Bal
     if plant.nx > MOST_STATES:
         az, by, a, cz, dy, c = (Ball.exact(part) for part in parts)
         return az + by @ c - a, cz + dy @ c
-    az, by, a, cz, dy, c = (stored_matrix(part) for part in parts)
-    return _enclosed(nearest_doubles(az + by * c - a)), _enclosed(nearest_doubles(cz + dy * c))
+    stored = [stored_matrix(part) for part in parts]
+    k, j = stored[0] + stored[1] * stored[5] - stored[2], stored[3] + stored[4] * stored[5]
+    return _enclosed(nearest_doubles(k)), _enclosed(nearest_doubles(j))
 
 
 def _enclosed(rounded: FloatArray) -> Ball:
