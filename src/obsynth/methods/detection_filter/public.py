@@ -60,6 +60,10 @@ class DetectionFilter(ObserverDesign):
         return verify(self)
 
 
+# Its parameters are those of every design.
+DetectionFilter.__doc__ = (DetectionFilter.__doc__ or "") + (ObserverDesign.__doc__ or "").partition("\n")[2]
+
+
 def detection_filter(plant: Any, **options: Any) -> DetectionFilter:
     """Design a detection filter; the docstring is that of the method."""
     found = design(plant, DetectionFilterMethod.id, **options)
