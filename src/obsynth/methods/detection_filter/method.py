@@ -81,6 +81,7 @@ class DetectionFilterMethod(Method):
     summary: ClassVar[str] = "residuals only, that show the faults most where unknown inputs reach every output"
     source: ClassVar[str] = "Ding, Jeinsch, Frank, Ding 2000"
     claims: ClassVar[Mapping[str, ClaimMeaning]] = CLAIMS
+    witnesses: ClassVar[frozenset[str]] = frozenset({"P"})
 
     band: Annotated[Any, WrittenAs("pair")] = (0.0, 1e3)
 

@@ -14,15 +14,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from obsynth.methods.riccati import continuous_solution
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.scaling import balanced_matrix
 from obsynth.proofs.balls import Ball, rounded_up
 from obsynth.proofs.definiteness import prove_positive_definite
 from obsynth.proofs.extended_balls import Enclosed, block
 
-#: Strictness of the equation that proves a gain, relative to what drives it.
-STRICTNESS = 1e-9
 #: Intervals that a range may take, the share of an interval's reach that is used, and its first guess.
 MOST_INTERVALS, REACH, FIRST_SHARE = 20_000, 0.9, 1e-3
 #: Intervals this short, relative to where they are, end at a frequency at which the pencil is singular.
@@ -80,24 +77,18 @@ def _equal_shares(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
     return np.asarray(np.exp2(exponents))
 
 
-def gain_is_proved(transfer: Transfer, bound: float) -> bool:
-    """Prove that the system is stable and its H-infinity norm at most a bound."""
-    a, b, c, d = (part.midpoint for part in (transfer.dynamics, transfer.B, transfer.C, transfer.D))
-    if not len(a):
+def gain_is_proved(transfer: Transfer, bound: float, p: FloatArray) -> bool:
+    """Prove by a matrix p ``(n, n)`` that the system is stable and its H-infinity norm at most a bound."""
+    if not transfer.order:
         corner = Ball.exact(bound**2 * np.eye(transfer.D.shape[0])) - transfer.D @ transfer.D.T
         return prove_positive_definite(corner).proved
-    gap = bound**2 * np.eye(len(c)) - d @ d.T
-    slack = STRICTNESS * max(float(np.linalg.norm(b @ b.T, 2)), np.finfo(np.float64).tiny)
-    found = continuous_solution(a, c, b @ b.T + slack * np.eye(len(a)), -gap, b @ d.T)
-    if found is None:
-        return False
-    p = 0.5 * (found + found.T)
+    p = 0.5 * (p + p.T)
 
     def inequality(kind: type[Enclosed]) -> Enclosed:
         parts = transfer.dynamics, transfer.B, transfer.C, transfer.D
         closed, into, out, through = (kind.of(part) for part in parts)
         moved = closed @ kind.exact(p)
-        corner = kind.exact(bound**2 * np.eye(len(c))) - through @ through.T
+        corner = kind.exact(bound**2 * np.eye(transfer.D.shape[0])) - through @ through.T
         side = kind.exact(p) @ out.T + into @ through.T
         return block([[-(moved + moved.T) - into @ into.T, -side], [-side.T, corner]])
 

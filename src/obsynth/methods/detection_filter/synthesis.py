@@ -11,7 +11,7 @@ from obsynth.analysis.transformations.elimination import eliminate_algebraic_sta
 from obsynth.errors import SolverError
 from obsynth.methods.detection_filter.conditions import unknown_inputs
 from obsynth.methods.detection_filter.method import DetectionFilterMethod
-from obsynth.methods.detection_filter.norm_proofs import gain_is_proved, sensitivity_is_proved
+from obsynth.methods.detection_filter.norm_proofs import Transfer, gain_is_proved, sensitivity_is_proved
 from obsynth.methods.detection_filter.transfers import added_gain, error_transfer
 from obsynth.methods.method import Synthesis
 from obsynth.methods.riccati import continuous_solution
@@ -26,6 +26,8 @@ from obsynth.results.design import Certificate
 LEAST_FREQUENCY = 1e-6
 #: The proved gain is this much above one, and the proved sensitivity one of these below what a grid finds.
 MARGIN, SENSITIVITY_MARGINS = 1e-6, (1e-4, 1e-3, 1e-2, 0.1, 0.5)
+#: Strictness of the equation that proves a gain, relative to what drives it.
+STRICTNESS = 1e-9
 #: Frequencies of the grid, and how often the least value is refined between its neighbours.
 GRID, REFINEMENTS = 400, 40
 
@@ -44,7 +46,9 @@ def synthesise(plant: DescriptorSystem, asked: DetectionFilterMethod, *, progres
         state_names=(), fault_names=(), residual_names=tuple(f"r{i + 1}" for i in range(smooth.ny)), state_delays=(),
         fault_delays=(),
     )  # fmt: skip
-    if not gain_is_proved(error_transfer(smooth, observer, *unknown_inputs(smooth)), 1.0 + MARGIN):
+    felt = error_transfer(smooth, observer, *unknown_inputs(smooth))
+    witness = _gain_witness(felt, 1.0 + MARGIN)
+    if witness is None or not gain_is_proved(felt, 1.0 + MARGIN, witness):
         raise SolverError(
             "The Riccati equation of the detection filter has no solution of which a gain can be proved: the slowest "
             f"pole is at {abscissa(observer.Az, 0.0):.3g} 1/s, next to a zero from the unknown inputs to the outputs "
@@ -57,10 +61,22 @@ def synthesise(plant: DescriptorSystem, asked: DetectionFilterMethod, *, progres
         "band_from": low, "band_to": high, "frequency": where,
     }  # fmt: skip
     return Synthesis(
-        asked.as_plain(), {"L": gain, "V": weight}, observer, Certificate({}, claims),
+        asked.as_plain(), {"L": gain, "V": weight}, observer, Certificate({"P": witness}, claims),
         notes=_notes(smooth, observer, claims),
         transformation=found if found.description else None,
     )  # fmt: skip
+
+
+def _gain_witness(transfer: Transfer, bound: float) -> FloatArray | None:
+    """Return the matrix ``(n, n)`` that proves a gain, from a bounded real equation."""
+    parts = transfer.dynamics, transfer.B, transfer.C, transfer.D
+    a, b, c, d = (part.midpoint for part in parts)
+    if not len(a):
+        return a
+    slack = STRICTNESS * max(float(np.linalg.norm(b @ b.T, 2)), np.finfo(np.float64).tiny)
+    gap = bound**2 * np.eye(len(c)) - d @ d.T
+    found = continuous_solution(a, c, b @ b.T + slack * np.eye(len(a)), -gap, b @ d.T)
+    return None if found is None or not np.all(np.isfinite(found)) else np.asarray(0.5 * (found + found.T))
 
 
 def _notes(plant: DescriptorSystem, observer: LinearObserver, claims: Mapping[str, float]) -> tuple[str, ...]:

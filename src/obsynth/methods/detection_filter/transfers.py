@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from obsynth.methods.detection_filter.norm_proofs import Transfer, gain_is_proved
+from obsynth.methods.detection_filter.norm_proofs import Transfer
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.continuous import continuous_hinf_norm
-from obsynth.numerics.spectra import abscissa
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.balls import UNDERFLOW, UNIT_ROUNDOFF, Ball, rounded_up
+from obsynth.proofs.contraction import prove_contraction
 from obsynth.proofs.exact_arithmetic import nearest_doubles, stored_matrix
+from obsynth.verification.error_system import contraction_of
 
 #: With more states what the stored numbers miss is enclosed, not computed exactly.
 MOST_STATES = 64
-#: A norm is proved to be at most so many times what was found for it.
-ROOM = (2.0, 16.0, 1024.0)
 
 
 def error_transfer(plant: DescriptorSystem, observer: LinearObserver, b: FloatArray, d: FloatArray) -> Transfer:
@@ -52,24 +50,10 @@ def added_gain(plant: DescriptorSystem, observer: LinearObserver, b: FloatArray,
     k, j = missed(plant, observer)
     if not any(part.midpoint.any() or part.radius.any() for part in (k, j)):
         return 0.0
-    exact, order = Ball.exact, plant.nx
-    moved = Transfer(plant.A, exact(b), exact(np.eye(order)), exact(np.zeros((order, b.shape[1]))))
-    return _proved_norm(moved) * _proved_norm(Transfer(observer.Az, k, exact(observer.Cz), j))
-
-
-def _proved_norm(transfer: Transfer) -> float:
-    """Return a proved bound on an H-infinity norm, infinite where none is proved."""
-    parts = transfer.dynamics, transfer.B, transfer.C, transfer.D
-    a, b, c, d = (part.midpoint for part in parts)
-    if not abscissa(a, 0.0) < 0.0 or not np.all(np.isfinite(b)):
+    own, plant_itself = contraction_of(observer), prove_contraction(plant.A, discrete=False)
+    if own is None or plant_itself is None:
         return np.inf
-    found = max(float(continuous_hinf_norm(a, b, c, d).value), float(np.max(transfer.D.magnitude, initial=0.0)))
-    if not np.isfinite(found) or found == 0.0:
-        return np.inf
-    # Near one: the proof squares what may be as small as rounding.
-    unit = float(np.exp2(-np.round(np.log2(found))))
-    scaled = Transfer(transfer.A, transfer.B, transfer.C.scaled(unit), transfer.D.scaled(unit))
-    for room in ROOM:
-        if gain_is_proved(scaled, room * found * unit):
-            return room * found * (1.0 + 4.0 * UNIT_ROUNDOFF)
-    return np.inf
+    # Sums over time of absolute responses bound every entry of a transfer on the axis.
+    moved = plant_itself.gain(np.eye(plant.nx), b)
+    shown = rounded_up(own.gain(observer.Cz, k.midpoint, k.radius) + j.magnitude, 2)
+    return Ball.exact(moved).frobenius_norm * Ball.exact(shown).frobenius_norm * (1.0 + 4.0 * UNIT_ROUNDOFF)

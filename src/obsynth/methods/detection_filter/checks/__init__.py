@@ -47,6 +47,9 @@ def _fits(design: ObserverDesign) -> bool:
     if any(name not in claims or not np.isfinite(float(claims[name])) for name in _CLAIMS):
         return False
     band = [float(claims[name]) for name in ("band_from", "band_to")]
+    witness = design.certificate.matrices.get("P")
+    if witness is None or witness.shape != (observer.order, observer.order) or not np.all(np.isfinite(witness)):
+        return False
     parts = observer.Az, observer.Bu, observer.By, observer.Cz, observer.Du, observer.Dy
     return bool(
         all(np.all(np.isfinite(part)) for part in parts)
@@ -79,7 +82,7 @@ def _norm_rows(design: ObserverDesign) -> Iterator[Check]:
     """Yield the two norms on the error's own equations, and on the plant together with the stored filter."""
     (plant, observer), claims = design.linear, design.certificate.claims
     gain, sensitivity = float(claims["disturbance_gain"]), float(claims["fault_sensitivity"])
-    band = float(claims["band_from"]), float(claims["band_to"])
+    band, witness = (float(claims["band_from"]), float(claims["band_to"])), design.certificate.matrices["P"]
     unknown, faults = unknown_inputs(plant), (plant.Bf, plant.Df)
 
     felt, sensed = error_transfer(plant, observer, *unknown), error_transfer(plant, observer, *faults)
@@ -87,7 +90,7 @@ def _norm_rows(design: ObserverDesign) -> Iterator[Check]:
     def shows(level: float) -> bool:
         return sensitivity == 0.0 or sensitivity_is_proved(sensed, level, *band)
 
-    by_itself = gain_is_proved(felt, gain), shows(sensitivity)
+    by_itself = gain_is_proved(felt, gain, witness), shows(sensitivity)
     yield Check(
         "disturbance gain", "the error dies out, and the H-infinity norm from unknown inputs and noise to the "
         "residuals is at most the claimed one", gain, gain, 0.0, by_itself[0], _SOURCE, "proved",
@@ -105,7 +108,7 @@ def _norm_rows(design: ObserverDesign) -> Iterator[Check]:
         return
     detail = f"they add at most {added[0]:.2g} to the gain, and take {added[1]:.2g} from the sensitivity"
     less, more = np.nextafter(gain - added[0], -np.inf), np.nextafter(sensitivity + added[1], np.inf)
-    holds = bool(np.all(np.isfinite(added))) and less > 0.0 and gain_is_proved(felt, less) and shows(more)
+    holds = bool(np.all(np.isfinite(added))) and less > 0.0 and gain_is_proved(felt, less, witness) and shows(more)
     yield _together(what, holds, detail if holds else _why_not(plant))
 
 
