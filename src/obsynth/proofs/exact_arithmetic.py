@@ -96,12 +96,18 @@ SHORT_BITS = 34
 FractionRows: TypeAlias = Sequence[Sequence[Fraction]]
 
 
+# Matrices hold the same numbers many times, and what is asked of a plant is asked of its numbers again.
+@lru_cache(maxsize=1 << 14)
 def written_fraction(value: float) -> Fraction:
     """Return the rational number that a finite double was written as."""
     return Fraction(*_written(float(value)))
 
 
-# Matrices hold the same numbers many times, and conditions ask for the same plant's again.
+def written_rows(matrix: FloatArray) -> tuple[tuple[Fraction, ...], ...]:
+    """Return the rows of a matrix ``(m, n)`` of doubles as the rational numbers that were written."""
+    return tuple(tuple(map(written_fraction, row)) for row in matrix.tolist())
+
+
 @lru_cache(maxsize=1 << 14)
 def _written(value: float) -> tuple[int, int]:
     """Return numerator and denominator, which may have common factors, of what a finite double was written as."""
@@ -118,7 +124,8 @@ def is_computed(value: float) -> bool:
 
 def computed_entries(matrix: FloatArray) -> int:
     """Return how many entries of a matrix were computed."""
-    return sum(is_computed(value) for value in np.ravel(matrix).tolist())
+    long = np.ldexp(np.frexp(matrix)[0], SHORT_BITS)
+    return sum(is_computed(value) for value in matrix[long != np.rint(long)].tolist())
 
 
 def written_matrix(matrix: FloatArray) -> fmpq_mat:

@@ -22,8 +22,8 @@ from obsynth.proofs.products import exponential
 
 #: Most steps that are summed up one by one, and the share of the sum that the rest may then have.
 MOST_STEPS, LEFT = 65_536, 1e-3
-#: Steps that are taken together.
-BLOCK = 64
+#: Steps that are taken together; what is left is looked at when their number has grown by one in so many.
+BLOCK, LOOKS = 64, 8
 #: A piece of an interval is at most this share of one over the norm of A; most pieces.
 PIECE, MOST_PIECES = 0.05, 1_024
 #: More than the square root of what underflows in a square.
@@ -60,7 +60,7 @@ def peak_sums(
     moving, n, growth = matrix.midpoint, len(matrix.midpoint), gamma(len(matrix.midpoint) + 2)
     driven, sizes = columns.midpoint, contraction.sizes(columns.midpoint, columns.radius)
     powers, idle = np.array(rows, dtype=np.float64), ~driven.any(axis=0)
-    terms: list[FloatArray] = []
+    terms, looked = list[FloatArray](), 1
     collected = np.zeros_like(powers)
     total: FloatArray | float = 0.0
     while True:
@@ -70,7 +70,8 @@ def peak_sums(
         terms.append(products if each else _norms(products))
         total, collected = total + np.sum(terms[-1], axis=0), collected + np.sum(np.abs(block), axis=0)
         done = BLOCK * len(terms) >= max(most, least)
-        if done or BLOCK * len(terms) >= least:
+        if done or (BLOCK * len(terms) >= least and len(terms) >= looked):
+            looked = len(terms) + len(terms) // LOOKS + 1
             after = contraction.factor * _seen(contraction, powers, _missed(matrix, np.abs(block[-1]), growth), each)
             after = np.asarray(after * sizes)
             # A column that is nothing but its radius has no terms to compare with.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -30,7 +31,11 @@ class PlantSource:
     sample_time: float | None = None
 
     def derived(self) -> Transformation:
-        """Return the elimination, and the sampling where there was one, done again."""
+        """Return the elimination, and the sampling where there was one, done again; once for all checks."""
+        return self._derived
+
+    @cached_property
+    def _derived(self) -> Transformation:
         from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
         from obsynth.analysis.transformations.sampling import discretise
 

@@ -249,13 +249,11 @@ def _split(matrix: fmpq_mat, widths: list[int]) -> list[fmpq_mat]:
 
 def sampled_origin(smooth: DescriptorSystem, sample_time: float) -> PlantOrigin:
     """Return what a plant that is sampled from one with ``E = I`` remembers."""
-    from obsynth.proofs.exact_arithmetic import computed_entries, fractions_of, written_fraction, written_matrix
+    from obsynth.proofs.exact_arithmetic import computed_entries, written_fraction, written_rows
 
     origin = origin_of(smooth)
     exact: Mapping[str, tuple[tuple[Fraction, ...], ...]] = (
-        origin.exact
-        if origin is not None
-        else {name: fractions_of(written_matrix(getattr(smooth, name))) for name in DECISIVE}
+        origin.exact if origin is not None else {name: written_rows(getattr(smooth, name)) for name in DECISIVE}
     )
     computed = origin.computed if origin else any(computed_entries(getattr(smooth, name)) for name in DECISIVE)
     sizes = None if origin is None or origin.sizes is None else _sampled_sizes(smooth, origin.sizes, sample_time)

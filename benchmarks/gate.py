@@ -1,0 +1,291 @@
+"""Twelve cases, each as a ratio to an anchor measured in the same run: what has become slow is seen at once.
+
+``python benchmarks/gate.py`` takes five seeds from the commit's hash (``--commit HASH`` where there is no repository),
+prints a table, and ends with exit code 1 where a ratio is more than twice its bound in ``gate_bounds.json``.
+``--write`` takes ten seeds and writes the table into ``benchmarks/README.md``; ``--small`` runs one small instance of
+each case.
+Processor time (user and system) on one BLAS thread; memory is the peak of the process until the case was done.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import argparse
+import hashlib
+import json
+import resource
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from fault_estimation_filter import FAMILIES, direct_inequality, random_plant
+from networks import random_network
+from recursive_filters import Problem, observer_of
+from run_on_data import made_up
+
+import obsynth
+from obsynth.methods.fault_estimation_filter.prepared_plant import prepare
+from obsynth.methods.fault_estimation_filter.synthesis import gain_problem
+
+HERE = Path(__file__).resolve().parent
+ROOT, BOUNDS = HERE.parent, HERE / "gate_bounds.json"
+SEEDS, SEEDS_OF_THE_TABLE = 5, 10
+#: Fails where a ratio is above its bound by more than this factor.
+ALLOWED = 2.0
+#: The table in the README stands between these lines.
+BEGIN, END = "<!-- gate -->", "<!-- end of gate -->"
+
+
+@dataclass(frozen=True)
+class Case:
+    """Seconds of ours for each seed, and those of what it is compared with."""
+
+    name: str
+    anchor: str
+    ours: Sequence[float]
+    anchored: float
+
+    @property
+    def ratio(self) -> float:
+        """Worst of ours over the anchor."""
+        return max(self.ours) / self.anchored
+
+
+def seconds(action: Callable[[], object], runs: int = 1) -> float:
+    """Return processor seconds, the least of some runs."""
+    found = []
+    for _ in range(runs):
+        began = time.process_time()
+        action()
+        found.append(time.process_time() - began)
+    return min(found)
+
+
+def seconds_of_process(arguments: Sequence[str], runs: int = 3) -> float:
+    """Return processor seconds of a process of its own, the least of some runs."""
+    found = []
+    for _ in range(runs):
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        subprocess.run(arguments, stdout=subprocess.DEVNULL, check=True)
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        found.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
+    return min(found)
+
+
+def riccati_solution(order: int) -> Callable[[], object]:
+    """Return a solution of a discrete Riccati equation of this order by scipy."""
+    from scipy.linalg import solve_discrete_are
+
+    rng = np.random.default_rng(order)
+    a = rng.normal(size=(order, order)) / np.sqrt(order)
+    b = rng.normal(size=(order, 4))
+    return lambda: solve_discrete_are(a, b, np.eye(order), np.eye(4))
+
+
+def singular_values(order: int) -> Callable[[], object]:
+    """Return ten singular value decompositions of this order."""
+    matrix = np.random.default_rng(order).normal(size=(order, order))
+    return lambda: [np.linalg.svd(matrix) for _ in range(10)]
+
+
+def filters(seeds: Sequence[int], *, small: bool) -> Iterator[Case]:
+    """Yield fault-estimation filters beside the paper's inequality as written, and beside a Riccati solution."""
+    nx = 8 if small else 16
+    obsynth.fault_estimation_filter(random_plant(nx, "brief", 0))  # imports
+    for family in FAMILIES:
+        ours = [seconds(lambda p=plant: obsynth.fault_estimation_filter(p), 2) for plant in plants(nx, family, seeds)]
+        yield Case(f"filter, nx {nx}, {family}", "cvxpy and Clarabel", ours, direct(nx, family, seeds[:3]))
+    nx = 10 if small else 32
+    ours = [seconds(lambda p=plant: obsynth.fault_estimation_filter(p), 2) for family in FAMILIES
+            for plant in plants(nx, family, seeds)]  # fmt: skip
+    yield Case(f"filter, nx {nx}, all families", "solve_discrete_are", ours, seconds(riccati_solution(nx), 5))
+    nx = 12 if small else 100
+    ours = [seconds(lambda p=plant: obsynth.fault_estimation_filter(p)) for plant in plants(nx, "noise", seeds[:2])]
+    yield Case(f"filter, nx {nx}, noise", "solve_discrete_are", ours, seconds(riccati_solution(nx), 3))
+
+
+def direct(nx: int, family: str, seeds: Sequence[int]) -> float:
+    """Return the seconds of the paper's inequality, the median of some plants: on one it may end early, in an error."""
+    import cvxpy  # noqa: F401 - not part of the time
+
+    found = []
+    for plant in plants(nx, family, seeds):
+        problem, _ = gain_problem(prepare(plant), free_weight=False)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # Clarabel's answer may be inaccurate
+            found.append(seconds(lambda p=problem: direct_inequality(p)))
+    return statistics.median(found)
+
+
+def plants(nx: int, family: str, seeds: Sequence[int]) -> list[obsynth.DescriptorSystem]:
+    """Return random plants; never the same twice, as what is decided of a plant is kept."""
+    return [random_plant(nx, family, seed) for seed in seeds]
+
+
+def verifications(*, small: bool) -> Iterator[Case]:
+    """Yield the share of verification in whole designs."""
+    from obsynth.methods.designing import design
+
+    shares = []
+    for file in ("smib/spec.yaml",) if small else ("kundur/spec_fault_filter.yaml", "smib/functional.yaml"):
+        spec = obsynth.load_spec(ROOT / "designs" / file)
+        kept: list[obsynth.ObserverDesign] = []
+        whole = seconds(lambda s=spec, k=kept: k.append(design(s.plant, s.method, **dict(s.options))))
+        shares.append(seconds(lambda k=kept: obsynth.verify(k[0]), 2) / whole)
+    yield Case("verify of kundur, smib functional", "their designs", shares, 1.0)
+
+
+def commands() -> Iterator[Case]:
+    """Yield the README's first command, without the installation."""
+    spec = ROOT / "designs" / "wang2015" / "spec.yaml"
+    with tempfile.TemporaryDirectory() as folder:
+        code = (
+            "import sys; from obsynth.cli.main import design_command; sys.exit(design_command(['--quiet', '--force', "
+            f"'--system', {str(spec)!r}, '--output', {str(Path(folder) / 'wang2015.gains.json')!r}]))"
+        )
+        ours = seconds_of_process([sys.executable, "-c", code])
+    yield Case(
+        "README's first command", "import numpy", [ours], seconds_of_process([sys.executable, "-c", "import numpy"])
+    )
+
+
+def networks(seeds: Sequence[int], *, small: bool) -> Iterator[Case]:
+    """Yield what can be asked of networks: kundur in orders of the states that are new, and random ones."""
+    spec = obsynth.load_spec(ROOT / "designs" / ("smib" if small else "kundur") / "spec.yaml")
+    orders = [reordered(spec.plant, seed) for seed in seeds[:2]]
+    ours = [seconds(lambda p=plant: obsynth.check(p)) for plant in orders]
+    yield Case("check of kundur", "10 SVDs of 196", ours, seconds(singular_values(196), 2))
+    size = (60, 20) if small else (700, 150)
+    ours = []
+    for seed in seeds[:2]:
+        made = replace(random_network(*size, seed), faults=tuple(f"tm GENROU {k + 1}" for k in range(2)))
+        sampled = obsynth.discretise(obsynth.eliminate_algebraic_states(made.plant()), 0.02)
+        ours.append(seconds(lambda p=sampled: (obsynth.diagnose(p), obsynth.check(p))))
+    yield Case(f"check, diagnose, network of {size[1]}", "10 SVDs of 196", ours, seconds(singular_values(196), 2))
+
+
+def reordered(plant: obsynth.DescriptorSystem, seed: int) -> obsynth.DescriptorSystem:
+    """Return a plant with its states and equations in another order."""
+    plant, order = plant.dense(), np.random.default_rng(seed).permutation(plant.nx)
+    parts = {name: getattr(plant, name)[order] for name in ("B", "Bf", "Bd", "Bw")}
+    return plant.replace(
+        E=plant.E[np.ix_(order, order)], A=plant.A[np.ix_(order, order)], C=plant.C[:, order],
+        state_names=[plant.state_names[i] for i in order], **parts,
+    )  # fmt: skip
+
+
+def records(*, small: bool) -> Iterator[Case]:
+    """Yield Kalman filters beside a numpy loop over covariances, and a log beside the reading of it."""
+    problem = Problem.of(20, 5, 3)
+    observer, loop = observer_of(problem, adaptive=False), seconds(lambda: by_numpy(problem), 3)
+    yield Case("Kalman run, 20 states", "numpy loop",
+               [seconds(lambda: observer.run(problem.y, problem.u, compiled=False), 3)], loop)  # fmt: skip
+    try:
+        observer.run(problem.y, problem.u, compiled=True)
+    except obsynth.SpecError:  # no numba
+        return
+    yield Case("Kalman run, 20 states, compiled", "numpy loop",
+               [seconds(lambda: observer.run(problem.y, problem.u, compiled=True), 3)], loop)  # fmt: skip
+
+
+def by_numpy(problem: Problem) -> np.ndarray:
+    """Run a plain filter of covariances."""
+    x, p, c = np.zeros(problem.nx), np.eye(problem.nx), problem.C
+    for k in range(1, len(problem.y)):
+        x, p = problem.A @ x + problem.u[k - 1], problem.A @ p @ problem.A.T + problem.Q
+        gain = np.linalg.solve(c @ p @ c.T + problem.R, c @ p).T
+        x, p = x + gain @ (problem.y[k] - c @ x), p - gain @ c @ p
+    return x
+
+
+def logs(*, small: bool) -> Iterator[Case]:
+    """Yield a log as CSV beside the reading of it."""
+    import pandas as pd
+
+    design = made_up(4)
+    names = [*design.linear[1].input_names, *design.linear[1].output_names]
+    rows = 500 if small else 20_000
+    frame = pd.DataFrame(np.random.default_rng(0).normal(size=(rows, len(names))), columns=names)
+    frame.insert(0, "time", 0.01 * np.arange(rows))
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "log.csv"
+        frame.to_csv(file, index=False)
+        anchored = seconds(lambda: pd.read_csv(file), 5)
+        yield Case("run on a log (CSV), 4 states", "pandas.read_csv",
+                   [seconds(lambda: obsynth.run_on_data(design, file), 3)], anchored)  # fmt: skip
+
+
+def cases(seeds: Sequence[int], *, small: bool) -> Iterator[tuple[Case, int]]:
+    """Yield each case with the peak memory of the process until there, MB."""
+    parts = (filters(seeds, small=small), verifications(small=small), commands(), networks(seeds, small=small),
+             records(small=small), logs(small=small))  # fmt: skip
+    for part in parts:
+        for case in part:
+            yield case, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
+
+
+def commit(given: str | None) -> str:
+    """Return the commit whose hash gives the seeds."""
+    if given:
+        return given
+    found = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=False, cwd=ROOT)
+    return found.stdout.strip() or "no repository"
+
+
+def seeds_of(text: str, count: int) -> list[int]:
+    """Return seeds that nobody chose."""
+    return [int.from_bytes(hashlib.sha256(f"{text} {i}".encode()).digest()[:4], "big") for i in range(count)]
+
+
+def main() -> int:
+    """Print the table; return 1 where a bound is missed by more than a factor of two."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--commit", help="hash that gives the seeds (default: that of the repository)")
+    parser.add_argument("--write", action="store_true", help="ten seeds; the table goes into benchmarks/README.md")
+    parser.add_argument("--small", action="store_true", help="one small instance of each, to see that it runs")
+    options = parser.parse_args()
+    count = 1 if options.small else SEEDS_OF_THE_TABLE if options.write else SEEDS
+    bounds = json.loads(BOUNDS.read_text())
+    lines = ["| case | ours, s: median, worst | anchor | anchor, s | worst / anchor | bound | MB so far |",
+             "| --- | --- | --- | --- | --- | --- | --- |"]  # fmt: skip
+    print("\n".join(lines), flush=True)
+    missed = []
+    for case, memory in cases(seeds_of(commit(options.commit), count), small=options.small):
+        bound = bounds.get(case.name)
+        lines.append(
+            f"| {case.name} | {statistics.median(case.ours):.3g}, {max(case.ours):.3g} | {case.anchor} | "
+            f"{case.anchored:.3g} | {case.ratio:.3g} | {'-' if bound is None else bound} | {memory} |"
+        )
+        print(lines[-1], flush=True)
+        if bound is None and not options.small:
+            missed.append(f"{case.name}: no bound in {BOUNDS.name}")
+        elif bound is not None and not options.small and case.ratio > ALLOWED * bound:
+            missed.append(f"{case.name}: {case.ratio:.3g} times {case.anchor}, more than {ALLOWED:g} times {bound}")
+    if options.write:
+        write(lines)
+    for text in missed:
+        print(f"MISSED: {text}", file=sys.stderr)
+    return 1 if missed else 0
+
+
+def write(lines: Sequence[str]) -> None:
+    """Put the table into the README."""
+    file = HERE / "README.md"
+    before, _, rest = file.read_text().partition(BEGIN)
+    _, _, after = rest.partition(END)
+    file.write_text("\n".join([before + BEGIN, "", *lines, "", END]) + after)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
