@@ -141,6 +141,7 @@ def delay(text: str) -> int | str:
 SYSTEM = option("--system", "FILE", "the spec (YAML)", type=Path, required=True)
 GAINS = option("--gains", "FILE", "a gain set (JSON) that design wrote", type=Path, required=True)
 SPEC_GAINS = option("--gains", "FILE", "a gain set for the spec's plant: nothing is designed", type=Path)
+UNVERIFIED = flag("--unverified", "hand on what fails its verification all the same; whatever is written says so")
 JSON = flag("--json", "print JSON on stdout, for programs; errors too")
 FORCE = flag("--force", "replace an existing file whatever it is; never an input")
 QUIET = flag("--quiet", "print no progress")

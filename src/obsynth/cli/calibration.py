@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from obsynth.cli.arguments import columns_of, pair
 from obsynth.cli.data_run import numbers_of
-from obsynth.cli.output import answer, output_file, progress
+from obsynth.cli.output import answer, gains_to_hand_on, output_file, progress
 from obsynth.errors import SpecError, VerificationError
 from obsynth.files.inputs import protect
 from obsynth.files.outputs import FileKind, write_atomically
@@ -130,9 +130,8 @@ def _asked(spec: Spec | None, options: argparse.Namespace) -> dict[str, Any]:
 def run_validate(options: argparse.Namespace) -> int:
     """Run ``validate``: gain set and log in, verdict out; the exit code is 6 where they do not agree."""
     from obsynth.calibration.validating import validate
-    from obsynth.results.gain_sets import load
 
-    design = load(options.gains)
+    design, _ = gains_to_hand_on(options.gains, unverified=options.unverified)
     protect(options.data)
     with progress(quiet=options.quiet) as report_stage:
         report_stage(f"running {options.gains} over {options.data}")

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from obsynth.cli.output import answer, output_file, print_json, progress, stdout_console
+from obsynth.cli.output import answer, gains_to_hand_on, output_file, print_json, progress, stdout_console
 from obsynth.errors import PreconditionError, SolverError, SpecError, VerificationError
 from obsynth.files.outputs import write_atomically
 
@@ -96,13 +96,13 @@ def designed(spec: Spec, report_stage: Any) -> ObserverDesign:
     return found.replace(notes=(*noted, *found.notes)) if noted else found
 
 
-def designed_or_loaded(spec: Spec, gains: Path | None, report_stage: Any) -> ObserverDesign:
-    """Return the design that a spec asks for, or a saved one of the same plant."""
+def designed_or_loaded(
+    spec: Spec, gains: Path | None, report_stage: Any, *, unverified: bool = False
+) -> ObserverDesign:  # fmt: skip
+    """Return the design that a spec asks for, or a saved one of the same plant, verified again."""
     if gains is None:
         return designed(spec, report_stage)
-    from obsynth.results.gain_sets import load
-
-    design = load(gains)
+    design, _ = gains_to_hand_on(gains, unverified=unverified)
     require_same_signals(design, gains, spec)
     return design
 

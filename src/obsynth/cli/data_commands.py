@@ -20,7 +20,7 @@ from obsynth.cli.data_run import (
     run_of,
     summary_of_run,
 )
-from obsynth.cli.output import answer, output_file, print_json
+from obsynth.cli.output import answer, gains_to_hand_on, output_file, print_json
 from obsynth.errors import SpecError, VerificationError
 from obsynth.files.outputs import FileKind, require_distinct, write_atomically
 
@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 
 def run_run(options: argparse.Namespace) -> int:
     """Run ``run``: gain set and data in, estimates out."""
-    from obsynth.results.gain_sets import load
-
     if options.gains.is_dir():
         from obsynth.cli.sweep import run_many
 
@@ -41,7 +39,7 @@ def run_run(options: argparse.Namespace) -> int:
         raise SpecError("--json and the estimates cannot both go to stdout: give --out a file.", path="--json")
     out = _target(options)
     certificate = certificate_target(options)
-    design = load(options.gains)
+    design, mark = gains_to_hand_on(options.gains, unverified=options.unverified)
     watched = monitor_of(design, options)
     found = run_of(design, options, watched, out, recovered=_recovered(options.recovered), outliers=options.outliers,
                    smooth=options.smooth, lag=options.lag, state=options.state)  # fmt: skip
@@ -49,13 +47,13 @@ def run_run(options: argparse.Namespace) -> int:
     if options.json:
         print_json({
             "command": "run", **({} if proof is None else {"proof": proof}), "gains": str(options.gains),
-            "file": str(out), **found.as_dict(),
+            "file": str(out), **found.as_dict(), **({"unverified": mark} if mark else {}),
             "monitor": None if watched is None else {"kind": watched.kind, "statement": watched.statement},
         })  # fmt: skip
     elif not options.quiet:
         # The estimates themselves may be on stdout.
         stream = sys.stderr if out is sys.stdout else sys.stdout
-        print(summary_of_run(found, watched), file=stream)
+        print(*([mark] if mark else []), summary_of_run(found, watched), sep="\n", file=stream)
         if proof is not None:
             print(proof["statement"], *(["Certificate:", proof["file"]] if proof["file"] else []), file=stream)
     return 0
@@ -68,16 +66,16 @@ def _recovered(names: list[str] | None) -> str | list[str] | None:
 def run_export(options: argparse.Namespace) -> int:
     """Run ``export``: gain set in, file for another program out."""
     from obsynth.exporting.files import export, exported_files
-    from obsynth.results.gain_sets import load
 
-    design = load(options.gains)
+    design, mark = gains_to_hand_on(options.gains, unverified=options.unverified)
     for file, kind in exported_files(options.to).items():
         output_file(file, kind, options, option="--to")
     files = export(
         design, options.to, sample_time=options.sample_time, fmi=options.fmi,
         thresholds=numbers_of(options.threshold) or None, warm_up=options.warm_up,
+        unverified=options.unverified,
     )  # fmt: skip
-    answer(options, {"gains": options.gains, "files": files})
+    answer(options, {"gains": options.gains, "files": files, **({"unverified": mark} if mark else {})}, mark)
     return 0
 
 
@@ -86,7 +84,7 @@ def run_prove_alarm(options: argparse.Namespace) -> int:
     from obsynth.experiments.alarm_proof import CERTIFICATE
     from obsynth.results.gain_sets import load
 
-    design = load(options.gains)
+    design = load(options.gains)  # `prove_alarm` verifies it
     target = None if options.out is None else output_file(options.out, CERTIFICATE, options)
     found = proof_of(design, options, options.row, state_bounds=numbers_of(options.state_bound) or None)
     file = str(found.save(target)) if found.proved and target is not None else None
@@ -111,6 +109,7 @@ def run_report(options: argparse.Namespace) -> int:
     system = None if options.system is None else str(options.system)
     output_file(options.out, PAGE, options)
     report = verify(design)
+    design = design if report.passed else design.replace(report=report)
     run, watched = None, None
     if options.data is not None:
         protect_inputs(options)
@@ -150,20 +149,20 @@ PICTURES = {".png": rb"\A\x89PNG", ".svg": rb"<svg", ".pdf": rb"\A%PDF"}
 
 def run_plot(options: argparse.Namespace) -> int:
     """Run ``plot``: gain set and data in, a picture or a window out."""
-    from obsynth.results.gain_sets import load
-
     target: Path | None = options.out
     if target is not None:
         kind = picture_kind(target)
         protect_inputs(options)
         output_file(target, kind, options)
     parts = [part.strip() for part in options.show.split(",") if part.strip()]
-    design = load(options.gains)
+    design, mark = gains_to_hand_on(options.gains, unverified=options.unverified)
     watched = monitor_of(design, options, has_scenario=True)
     found = run_of(design, options, watched)
     _draw(found, design, parts, target)
     if options.json or not options.quiet:
-        answer(options, {"gains": options.gains, "file": target, **found.as_dict()}, summary_of_run(found, watched))
+        told = "\n".join([*([mark] if mark else []), summary_of_run(found, watched)])
+        unverified = {"unverified": mark} if mark else {}
+        answer(options, {"gains": options.gains, "file": target, **found.as_dict(), **unverified}, told)
     return 0
 
 

@@ -95,7 +95,7 @@ def monitor_settings(design: ObserverDesign, options: argparse.Namespace) -> dic
         "disturbance_bounds": numbers_of(options.disturbance), "noise_bound": options.noise_bound,
         "initial_error": options.initial_error, "window": options.window, "false_alarms": options.false_alarms,
         "change": options.change, "initial_set": ranges_of(options.initial) or None,
-        "constants": own_tolerances(design, options.monitor),
+        "constants": own_tolerances(design, options.monitor), "unverified": options.unverified,
     }  # fmt: skip
 
 
@@ -231,5 +231,6 @@ def proof_of(design: ObserverDesign, options: argparse.Namespace, row: int, **mo
     return prove_alarm(
         design, Path(options.data), row, window=options.window, columns=columns_of(options),
         scales=numbers_of(options.scale), disturbance_bounds=numbers_of(options.disturbance),
-        noise_bound=options.noise_bound, initial_set=ranges_of(options.initial) or None, **more,
+        noise_bound=options.noise_bound, initial_set=ranges_of(options.initial) or None, unverified=options.unverified,
+        **more,
     )  # fmt: skip

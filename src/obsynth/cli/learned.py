@@ -8,7 +8,7 @@ from pathlib import Path
 
 from obsynth.cli.arguments import columns_of
 from obsynth.cli.data_run import STREAM, numbers_of
-from obsynth.cli.output import answer, output_file
+from obsynth.cli.output import answer, gains_to_hand_on, output_file
 from obsynth.errors import SpecError
 from obsynth.files.inputs import protect, protect_stream
 from obsynth.files.outputs import require_distinct
@@ -18,7 +18,6 @@ def run_thresholds(options: argparse.Namespace) -> int:
     """Run ``thresholds``: 0 whether the rows suffice for the rate or not, which is told; every failure is an error."""
     from obsynth.data.normal_rows import FALSE_ALARMS, learn_thresholds
     from obsynth.experiments.monitors.learned import LEARNED
-    from obsynth.results.gain_sets import load
 
     is_stream = options.data == STREAM
     require_distinct({"--gains": options.gains, "--out": options.out, "--data": None if is_stream else options.data})
@@ -30,8 +29,9 @@ def run_thresholds(options: argparse.Namespace) -> int:
     target = None if options.out is None else output_file(options.out, LEARNED, options)
     if target is not None and target.suffix.lower() != ".json":
         raise SpecError(f"{target}: thresholds are written as JSON (.json).", path="--out")
+    design, _ = gains_to_hand_on(options.gains, unverified=options.unverified)
     found = learn_thresholds(
-        load(options.gains),
+        design,
         sys.stdin if is_stream else Path(options.data),
         false_alarms=options.false_alarms or FALSE_ALARMS,
         rows=options.rows,

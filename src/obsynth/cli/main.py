@@ -154,6 +154,7 @@ VERBS = {
         (
             SYSTEM,
             SPEC_GAINS,
+            UNVERIFIED,
             option("--out", "FILE", "write every signal to this file (CSV)", type=Path),
             JSON,
             FORCE,
@@ -191,6 +192,7 @@ VERBS = {
         (
             SYSTEM,
             SPEC_GAINS,
+            UNVERIFIED,
             option("--runs", "N", "how many, each with its seed (default: 100)", type=int, default=100),
             Settings((option("--confidence", "P", "of the intervals (default: 0.95)", type=float, default=0.95),)),
             option("--plants", "N", "draw N plants from the tolerances, half of them vertices", type=int),
@@ -229,6 +231,7 @@ VERBS = {
         "Run a design on measured data: a log, or a stream on standard input, a row in, a row out.",
         (
             GAINS,
+            UNVERIFIED,
             option("--data", "FILE", _LOG, required=True),
             option(
                 "--out",
@@ -292,6 +295,7 @@ VERBS = {
         "Learn the thresholds of a design from a log without faults, for a rate of false alarms.",
         (
             GAINS,
+            UNVERIFIED,
             option("--data", "FILE", _LOG, required=True),
             option("--false-alarms", "RATE", "such as '1 per week' or '2 per 1000 rows' (default: '1 per 1000 rows')"),
             option(
@@ -321,6 +325,7 @@ VERBS = {
         "time-invariant plant, its steady state.",
         (
             GAINS,
+            UNVERIFIED,
             option("--to", "FILE", ".mat, .npz, .c (with a header), or .fmu", type=Path, required=True),
             option("--sample-time", "SECONDS", "sample a continuous-time observer (needed for C and FMU)", type=float),
             option("--fmi", None, "version of FMI for .fmu (default: 2.0)", choices=("2.0", "3.0"), default="2.0"),
@@ -344,6 +349,7 @@ VERBS = {
         "Run a design on measured data and draw it: outputs, estimates, residuals, thresholds and alarms.",
         (
             GAINS,
+            UNVERIFIED,
             option("--data", "FILE", _LOG, required=True),
             option("--out", "FILE", "picture (.png, .svg or .pdf); without it, a window", type=Path),
             option(
@@ -364,6 +370,7 @@ VERBS = {
         "Verify a gain set again and write one self-contained HTML page about it.",
         (
             GAINS,
+            UNVERIFIED,
             option("--out", "FILE", "the page (HTML)", type=Path, required=True),
             option("--system", "SPEC", "show the design on the scenario of this spec", type=Path),
             option("--data", "FILE", "show the design on this log as well: text, Parquet, TDMS or MDF file"),
@@ -455,6 +462,7 @@ VERBS = {
         "Ask whether a recorded log without faults agrees with a design.",
         (
             GAINS,
+            UNVERIFIED,
             option("--data", "FILE", "the log, as for run", type=Path, required=True),
             *LOG_OPTIONS,
             JSON,
@@ -466,6 +474,7 @@ VERBS = {
         "Prove that data up to a row are not explained without a fault by any plant within its tolerances.",
         (
             GAINS,
+            UNVERIFIED,
             option("--data", "FILE", "the log, as for run", type=Path, required=True),
             option("--row", "K", "last row of the window, from 1", type=int, required=True),
             option("--out", "FILE", "write the certificate (JSON) if there is a proof", type=Path),

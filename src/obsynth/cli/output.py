@@ -17,6 +17,8 @@ from obsynth.files.outputs import FileKind, check_output, check_replaceable
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from obsynth.results.design import ObserverDesign
+
 
 _TITLES = {
     "SpecError": "Malformed input",
@@ -58,6 +60,24 @@ def print_json(data: Any, *, is_plain: bool = False) -> None:
     from obsynth.results.gain_sets import plain
 
     print(json.dumps(data if is_plain else plain(data), indent=1, allow_nan=False))
+
+
+def gains_to_hand_on(path: Path, *, unverified: bool) -> tuple[ObserverDesign, str]:
+    """Return a saved design verified again, and the mark of one that fails; `VerificationError` unless that is wanted.
+    A file's digest is no signature, and its report may be edited like all else: only a new one counts."""
+    from obsynth.methods.handing_on import require_verified, unverified_mark
+    from obsynth.methods.verifying import verify
+    from obsynth.results.gain_sets import load
+
+    design = load(path)
+    report = verify(design)
+    mark = unverified_mark(report)
+    if not mark:
+        return design, ""
+    design = design.replace(report=report)
+    require_verified(design, unverified=unverified)
+    print(f"Warning: {path}: {mark}", file=sys.stderr)
+    return design, mark
 
 
 def print_error(error: ObsynthError) -> None:

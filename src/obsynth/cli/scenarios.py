@@ -38,7 +38,9 @@ def _prepared(
     if options.gains is not None:
         protect(options.gains)
     target = None if options.out is None else spec_output(options.out, kind, spec, options, option="--out")
-    return spec, scenario, target, designed_or_loaded(spec, options.gains, report_stage)
+    return spec, scenario, target, designed_or_loaded(
+        spec, options.gains, report_stage, unverified=options.unverified
+    )  # fmt: skip
 
 
 def run_simulate(options: argparse.Namespace) -> int:

@@ -87,6 +87,7 @@ def run_many(options: argparse.Namespace) -> int:
         "columns": dict(options.map) or None, "time_column": options.time_column, "outliers": options.outliers,
         "scales": numbers_of(options.scale) or None, "thresholds": numbers_of(options.threshold) or None,
         "gap": options.gap, "warm_up": options.warm_up, "recovered": options.recovered,
+        "unverified": options.unverified or None,
     }  # fmt: skip
 
     def work(executor: Executor | None, done: Callable[[int, int], None]) -> Any:

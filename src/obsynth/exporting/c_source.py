@@ -74,7 +74,8 @@ def header_text(found: Realisation, prefix: str) -> str:
     before, after = found.operating_point
     lines = [
         comment(f"Observer {quoted(found.design.name)} by {quoted(found.design.method)}, written by obsynth."),
-        *([comment(found.note)] if found.note else []), f"#ifndef {guard}", f"#define {guard}", "",
+        *([comment(found.note)] if found.note else []), *([comment(quoted(found.mark))] if found.mark else []),
+        f"#ifndef {guard}", f"#define {guard}", "",
         comment("sha256 of the gain set"), f'#define {prefix.upper()}_SHA256 "{found.digest}"',
         comment("seconds between samples"), f"#define {prefix.upper()}_DT {observer.dt!r}",
         "", "typedef struct {", f"    double z[{max(observer.order, 1)}];", f"}} {prefix}_state;", "",
@@ -118,7 +119,8 @@ def source_text(found: Realisation, prefix: str, header: str) -> str:
         body += _product(target, parts)
     body += _loop("i", sizes["z"], ["state->z[i] = next[i];"]) if sizes["z"] else []
     return "\n".join([
-        comment(f"sha256 of the gain set: {found.digest}"), f'#include "{included(header)}"', "", "#include <math.h>",
+        comment(f"sha256 of the gain set: {found.digest}"), *([comment(quoted(found.mark))] if found.mark else []),
+        f'#include "{included(header)}"', "", "#include <math.h>",
         "", *([comment(ADVICE), ""] if large else []), *tables, *_reset(found, prefix),
         *_function(_step_signature(found, prefix), [*body, "return 0;"]),
     ]) + "\n"  # fmt: skip

@@ -16,6 +16,7 @@ from obsynth.errors import SpecError
 from obsynth.experiments.monitors.adaptive_bound import THRESHOLD_ROUNDING, AdaptiveBound
 from obsynth.exporting.c_source import c_identifier, comment, included, quoted, table_lines, with_c_linkage
 from obsynth.files.outputs import write_together
+from obsynth.methods.handing_on import unverified_mark
 from obsynth.observers.dae.c_code import observer_code, observer_struct
 from obsynth.plants.dae.model import DAEModel
 from obsynth.results.design import ObserverDesign
@@ -73,6 +74,8 @@ def _header(design: ObserverDesign, prefix: str, digest: str) -> Iterator[str]:
     sizes = {"states": model.nx, "state_deviations": model.nx, "parameters": model.nq,
              "parameter_deviations": model.nq, "innovations": model.ny}  # fmt: skip
     yield comment(f"Observer {quoted(design.name)} by {quoted(design.method)}, written by obsynth.")
+    if mark := unverified_mark(design.report):
+        yield comment(quoted(mark))
     yield from (f"#ifndef {guard}", f"#define {guard}", "", comment("sha256 of the gain set"))
     yield from (f'#define {upper}_SHA256 "{digest}"', comment("seconds between samples"))
     yield from (f"#define {upper}_DT {observer.dt!r}", "", *observer_struct(observer.steps, f"{prefix}_observer"))

@@ -14,6 +14,7 @@ from obsynth.exporting.c_source import c_identifier, header_text, source_text, w
 from obsynth.exporting.c_templates import threshold_header, threshold_source, write_dae_c
 from obsynth.exporting.realisation import Realisation
 from obsynth.files.outputs import FileKind, write_atomically, write_together
+from obsynth.methods.handing_on import require_verified
 from obsynth.numerics.arguments import require_kind
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.recursive.observer import RecursiveObserver
@@ -45,6 +46,7 @@ def export(
     thresholds: Mapping[str, float] | None = None,
     warm_up: float | None = None,
     monitor: OnlineMonitor | None = None,
+    unverified: bool = False,
 ) -> tuple[Path, ...]:
     """Write the observer of a design for MATLAB and Simulink, for numpy, as C99, or as a functional mock-up unit.
 
@@ -75,6 +77,8 @@ def export(
     monitor : OnlineMonitor, optional
         From `online_monitor` with ``constants``: its thresholds over the tolerances as ``<stem>_thresholds_step``, for
         constants that stay the same; for ``.c`` only.
+    unverified : bool, optional
+        Whether a design whose report fails is written all the same, with a mark in the file that says so.
 
     Returns
     -------
@@ -88,6 +92,8 @@ def export(
         or does not fit, or a file cannot be written.
     PreconditionError, SolverError
         A recursive design has no stable steady state, or none that is reached.
+    VerificationError
+        The report of the design fails.
 
     Notes
     -----
@@ -101,6 +107,8 @@ def export(
     suffix = target.suffix.lower()
     if suffix not in SUFFIXES:
         raise SpecError(f"{target} has an unknown suffix: use one of {', '.join(SUFFIXES)}.", path=str(target))
+    if isinstance(design, ObserverDesign):
+        require_verified(design, unverified=unverified)
     if isinstance(design, ObserverDesign) and isinstance(design.observer, RecursiveObserver):
         require_plain(design.observer, "An export")
     if suffix == ".fmu":

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SpecError
+from obsynth.methods.handing_on import unverified_mark
 from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.dae.observer import DAEObserver
@@ -67,6 +68,11 @@ class Realisation:
         return cls(design, observer, digest, np.zeros(observer.order))
 
     @property
+    def mark(self) -> str:
+        """What every file says of a design that fails its verification; empty where it holds."""
+        return unverified_mark(self.design.report)
+
+    @property
     def inputs(self) -> tuple[str, ...]:
         """Names of the inputs: known inputs, then outputs of the plant."""
         return self.observer.input_names + self.observer.output_names
@@ -98,4 +104,5 @@ class Realisation:
             "delays": np.array([*observer.state_delays, *observer.fault_delays], dtype=np.float64),
             "input_names": list(self.inputs), "output_names": list(self.outputs),
             "name": self.design.name, "method": self.design.method, "sha256": self.digest,
+            **({"unverified": self.mark} if self.mark else {}),
         }  # fmt: skip

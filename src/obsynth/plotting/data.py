@@ -11,6 +11,7 @@ import numpy as np
 from obsynth.data.log_estimator import DECIDING
 from obsynth.data.run import DataRun
 from obsynth.errors import SpecError
+from obsynth.methods.handing_on import unverified_mark
 from obsynth.numerics.arguments import require_kind
 from obsynth.observers.estimates import BAND_WIDTH
 from obsynth.plotting.panels import (
@@ -98,6 +99,10 @@ def plot_data(
         getattr(drawing, part)(panel, name)
         legend_above(panel)
         tidy(panel)
+    mark = "" if design is None or not design.report.checks else unverified_mark(design.report)
+    if panels and mark:
+        panels[0].annotate(mark, (0.0, 1.0), xycoords="figure fraction", xytext=(4, -4), textcoords="offset points",
+                           va="top", fontsize=8, color="tab:red")  # fmt: skip
     if panels:
         panels[-1].set_xlabel("time" if run.stamps.is_dated else "time (s)")
         if run.stamps.is_dated:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 
@@ -38,6 +39,8 @@ def tolerance_facts(design: ObserverDesign) -> list[tuple[str, str]]:
     uncertain = design.plant.uncertainty
     if uncertain is None or not uncertain.box.names:
         return [("model", f"{EXACT_MODEL} (no constant has a tolerance).")]
+    if design.report.checks and not design.report.passed:
+        return [("bounds", "none: the design fails its verification")]
     try:
         return list(robustness(design).facts())
     except PreconditionError as error:
@@ -141,12 +144,23 @@ def recovered_states(recovery: StateRecovery) -> Iterator[tuple[str, str]]:
         yield flag, f"{len(names_by_flag[flag])}: {name_list(names_by_flag[flag])}"
 
 
+#: What the meaning of a claim says of its proof, which is left out where checks fail.
+_PROOF_WORDS = re.compile(r"[,:;]? ?\bproved( where a row says so)?\b")
+
+
+def unproved(meaning: str) -> str:
+    """Return the meaning of a claim without the word that it is proved."""
+    return _PROOF_WORDS.sub("", meaning).strip()
+
+
 def promises(design: ObserverDesign) -> Iterator[tuple[str, str, str]]:
     """Yield name, value and meaning of what a design claims."""
     known = method_class(design.method).claims if design.method in REGISTRY else {}
     for name, value in design.certificate.claims.items():
         claim = known.get(name)
         unit, meaning = (claim.unit, claim.meaning) if claim else ("", "unknown to this version")
+        if not design.report.passed:
+            meaning = f"{unproved(meaning)} (claimed only: checks fail)"
         yield name, f"{number(value, digits=7)} {unit}".strip(), meaning
     for check in design.report.checks:
         if check.name == "H-infinity norm":

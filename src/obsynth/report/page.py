@@ -43,7 +43,7 @@ from obsynth.report.summary import summary
 from obsynth.results.checks import Check, CheckKind, Status, VerificationReport
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import gain_set_digest
-from obsynth.results.layout import headed_table, number, verdict, verdict_line
+from obsynth.results.layout import headed_table, number, verdict, verdict_line, worth
 from obsynth.simulation.scenario import Scenario
 
 #: Prefix of a check's name -> heading of its group; the others are about the shipped observer.
@@ -133,7 +133,8 @@ def _place(check: Check) -> int:
 def _row(check: Check) -> str:
     word = verdict(check).plain
     detail = f"<div>{escape(check.detail)}</div>" if check.detail else ""
-    parts = dict.fromkeys([*([] if word == "info" else [check.kind]), f"({check.status})"])
+    kind = "" if word == "info" or worth(check) != check.status else check.kind
+    parts = dict.fromkeys([*([kind] if kind else []), f"({worth(check)})"])
     kind = f'<span class="kind">{escape(" ".join(parts))}</span>'
     numbers = "".join(
         f'<td class="number{" none" if number(value) == "-" else ""}" data-label="{label}">{number(value)}</td>'

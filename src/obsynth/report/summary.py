@@ -21,7 +21,14 @@ from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.plotting.frequency import FaultGains
-from obsynth.report.designs import Followed, design_warnings, fault_estimates, followed_steps, gains_if_linear
+from obsynth.report.designs import (
+    Followed,
+    design_warnings,
+    fault_estimates,
+    followed_steps,
+    gains_if_linear,
+    unproved,
+)
 from obsynth.results.design import ObserverDesign
 from obsynth.results.layout import number, verdict_line
 
@@ -147,13 +154,17 @@ def _promise(design: ObserverDesign) -> Iterator[tuple[str, str]]:
     claims = design.certificate.claims
     for name in (name for name in _PROMISES if name in claims and name in known):
         unit = f" {known[name].unit}" if known[name].unit else ""
-        yield "promise", f"{name} = {number(claims[name])}{unit}, {known[name].meaning}"
+        label, meaning = ("promise", known[name].meaning) if design.report.passed else (
+            "claimed", f"{unproved(known[name].meaning)} (NOT proved: checks fail)")  # fmt: skip
+        yield label, f"{name} = {number(claims[name])}{unit}, {meaning}"
 
 
 def _slowest(design: ObserverDesign) -> str:
     """Return how long the observer remembers its start."""
     if isinstance(design.plant, DescriptorSystem):
         seconds = transient(design.linear[1])
+        if not math.isfinite(seconds):
+            return f"the start is never forgotten; observer of order {design.observer.order}"
         return (f"{100.0 * FORGOTTEN:g} % settling time {number(seconds)} s; observer of order "
                 f"{design.observer.order}")  # fmt: skip
     factor = design.certificate.claims.get("contraction", math.nan)

@@ -151,7 +151,7 @@ def _claim(check: Check) -> Text:
 
 def _numbers_and_verdict(check: Check) -> list[Text]:
     numbers = [Text(number(value)) for value in (check.value, check.bound, check.margin)]
-    return [*numbers, verdict(check), Text(check.status, style="dim")]
+    return [*numbers, verdict(check), Text(worth(check), style="dim")]
 
 
 def verdict(check: Check) -> Text:
@@ -181,6 +181,11 @@ def report_text(checks: Sequence[Check]) -> str:
     print_checks(checks, console=console)
     text: str = console.file.getvalue()  # type: ignore[attr-defined]
     return "\n".join(line.rstrip() for line in text.splitlines())
+
+
+def worth(check: Check) -> str:
+    """Return what a row is worth: a row that should be proved and fails proves nothing."""
+    return f"not {check.status}" if check.status == "proved" and not check.passed else check.status
 
 
 def print_checks(checks: Sequence[Check], *, console: Console) -> None:

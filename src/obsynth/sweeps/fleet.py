@@ -8,6 +8,7 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,8 +16,12 @@ import numpy as np
 
 from obsynth.data.run import run_on_data
 from obsynth.errors import ObsynthError, SpecError
+from obsynth.experiments.assumptions import file_digest
 from obsynth.files.inputs import input_file
 from obsynth.files.outputs import write_atomically
+from obsynth.methods.handing_on import require_verified
+from obsynth.methods.verifying import verify
+from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import load
 from obsynth.sweeps.work import STATUSES, ResultFolder, ResultTable, all_of, carried_out
 
@@ -125,7 +130,8 @@ class Fleet(ResultTable):
             for time in run.alarms.values():
                 axis.axvline(time, color="0.4", linestyle="--", linewidth=0.8)
             axis.set_title(run.name, fontsize=9, loc="left")
-            axis.legend(fontsize=7, loc="upper left")
+            if axis.get_legend_handles_labels()[0]:  # rows of warm-up alone show nothing
+                axis.legend(fontsize=7, loc="upper left")
             axis.tick_params(labelsize=8)
         axes[-1, 0].set_xlabel("time, s", fontsize=9)
         return figure
@@ -168,7 +174,8 @@ def run_fleet(
     progress : callable, optional
         Called with the number of runs done and their total.
     **options
-        As for `run_on_data`: ``columns, time_column, scales, thresholds, gap, warm_up, recovered, outliers``.
+        As for `run_on_data`: ``columns, time_column, scales, thresholds, gap, warm_up, recovered, outliers``; and
+        ``unverified``: whether designs that fail their verification are run all the same.
 
     Returns
     -------
@@ -180,7 +187,8 @@ def run_fleet(
     SpecError
         There is no gain set or no log, an option is unknown, or the folder cannot be used.
     """
-    known = ("columns", "time_column", "scales", "thresholds", "gap", "warm_up", "recovered", "outliers")
+    known = ("columns", "time_column", "scales", "thresholds", "gap", "warm_up", "recovered", "outliers",
+             "unverified")  # fmt: skip
     wrong = sorted(set(options) - set(known))
     if wrong:
         raise SpecError(f"{', '.join(wrong)}: use some of {', '.join(known)}.", path=wrong[0])
@@ -220,12 +228,21 @@ def _pairs(gains: Sequence[Path], logs: Sequence[Path], options: Mapping[str, An
     ]  # fmt: skip
 
 
+@lru_cache(maxsize=1)
+def _verified(path: Path, digest: str, *, unverified: bool) -> ObserverDesign:
+    """Return a design that was verified once for all its logs; ``digest`` is that of its file."""
+    design = load(path)
+    require_verified(design.replace(report=verify(design)), unverified=unverified)
+    return design
+
+
 def _run(pair: _Pair) -> tuple[FleetRun, str]:
     """Return what a run comes to, and its estimates as CSV; errors of the package are results."""
     stream = io.StringIO()
     try:
-        design = load(pair.gains)
-        found = run_on_data(design, pair.log, stream, **dict(pair.options))
+        options = dict(pair.options)
+        design = _verified(pair.gains, file_digest(pair.gains), unverified=bool(options.pop("unverified", False)))
+        found = run_on_data(design, pair.log, stream, **options)
     except ObsynthError as error:
         return FleetRun(pair.name, STATUSES[error.exit_code], str(error)), ""
     text = stream.getvalue()

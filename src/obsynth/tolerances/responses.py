@@ -78,7 +78,8 @@ def ring_length(az: FloatArray) -> int:
     length = SHORTEST
     power = np.linalg.matrix_power(az, length)
     while not spectral_radius_bound(power) < CONTRACTION:
-        length, power = 2 * length, power @ power
+        with np.errstate(over="ignore", invalid="ignore"):  # an observer that does not forget
+            length, power = 2 * length, power @ power
         if length > LONGEST or not np.isfinite(power).all():
             raise PreconditionError(
                 f"The observer forgets too slowly for a bound over tolerances (not within {LONGEST} samples): ask for "

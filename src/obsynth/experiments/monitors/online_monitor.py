@@ -21,6 +21,7 @@ from obsynth.experiments.monitors.rules import ANY_LENGTH, NormRule, WhitenedRul
 from obsynth.experiments.monitors.thresholds import samples_of, scaled_inputs, unlimited_bound, unlimited_paper
 from obsynth.experiments.monitors.whitening import steady_mean, whitened
 from obsynth.extensions import extension
+from obsynth.methods.handing_on import require_verified
 from obsynth.numerics.arguments import is_finite_number, require_kind, require_mapping
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import first_order_hold
@@ -53,6 +54,7 @@ def online_monitor(
     constants: Any = None,
     initial_set: Mapping[str, Any] | None = None,
     normal: Any = None,
+    unverified: bool = False,
 ) -> OnlineMonitor:
     """Return a monitor for measured data, for `run_on_data`: its threshold holds however long the data are.
 
@@ -97,6 +99,8 @@ def online_monitor(
     normal : LearnedThresholds, path or pandas.DataFrame, optional
         ``learned``: from `obsynth.learn_thresholds`, the file in which they were saved (``.json``), or a log without
         faults, whose rate is one false alarm per 1,000 rows.
+    unverified : bool, optional
+        Whether a design whose report fails is watched all the same; nothing is promised then.
 
     Returns
     -------
@@ -109,8 +113,11 @@ def online_monitor(
         The kind does not go with the design, an option is out of range, or a signal has no bound or covariance.
     PreconditionError
         No bound exists over the tolerances: the message says why.
+    VerificationError
+        The report of the design fails.
     """
     require_kind(design, ObserverDesign, "design", "an ObserverDesign, such as obsynth.load(path)")
+    require_verified(design, unverified=unverified)
     if scenario is not None:
         require_kind(scenario, Scenario, "scenario", "an obsynth.Scenario")
     for name, given in (("disturbance_bounds", disturbance_bounds), ("nominal", nominal)):

@@ -20,6 +20,7 @@ from obsynth.experiments.monitors.thresholds import (
     window_threshold,
 )
 from obsynth.experiments.monitors.whitening import settled, steady_mean, whitened
+from obsynth.methods.handing_on import require_verified
 from obsynth.numerics.arguments import is_finite_number, is_whole, require_kind, require_mapping
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.validation import index_of
@@ -45,6 +46,7 @@ def monitor(
     isolation_delay: int = 0,
     constants: Any = None,
     initial_set: Mapping[str, Any] | None = None,
+    unverified: bool = False,
 ) -> Monitor:
     """Return a threshold for the residual of a linear design, and the statistic it belongs to.
 
@@ -81,6 +83,8 @@ def monitor(
         ``pointwise``, discrete designs: tolerances and the plant's start, as for `obsynth.online_monitor`.  With either
         of them the monitor adapts to the signals (see `obsynth.evaluate`); the start is the scenario's own by
         default.
+    unverified : bool, optional
+        Whether a design whose report fails is watched all the same; nothing is promised then.
 
     Returns
     -------
@@ -92,6 +96,8 @@ def monitor(
     SpecError
         A recursive design, an option out of range, a signal without a bound (or without a covariance), or a record that
         is too short; the paper's threshold for a continuous design.
+    VerificationError
+        The report of the design fails.
 
     Notes
     -----
@@ -103,6 +109,7 @@ def monitor(
     use disturbances that are held between samples, and exact covariances of the noise.
     """
     require_kind(design, ObserverDesign, "design", "an ObserverDesign, such as obsynth.load(path)")
+    require_verified(design, unverified=unverified)
     require_kind(scenario, Scenario, "scenario", "an obsynth.Scenario")
     require_mapping(disturbance_bounds, "disturbance_bounds")
     if kind not in KINDS:

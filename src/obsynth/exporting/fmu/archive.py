@@ -26,6 +26,7 @@ from obsynth.exporting.c_source import c_identifier, comment, header_text, sourc
 from obsynth.exporting.c_templates import dae_c_texts, require_no_sample_time
 from obsynth.exporting.realisation import Realisation
 from obsynth.files.outputs import write_atomically
+from obsynth.methods.handing_on import unverified_mark
 from obsynth.numerics.arguments import chosen, is_finite_number, require_mapping
 from obsynth.observers.dae.c_code import FLAGS, compiler
 from obsynth.observers.dae.observer import DAEObserver
@@ -303,6 +304,8 @@ def write_fmu(
     identifier = c_identifier(target.stem)
     token = f"{{{uuid.uuid5(uuid.NAMESPACE_URL, ' '.join((digest, version, repr(signals))))}}}"
     sentence = f"Observer of {design.name} by {design.method}, written by obsynth; sha256 of the gain set {digest}"
+    mark = unverified_mark(design.report)
+    sentence = f"{mark}. {sentence}" if mark else sentence
     model = Model(identifier, token, design.name, sentence, signals)
     wrapper = f"fmi{version[0]}.c"
     sources = {f"{_PREFIX}.c": texts[0], f"{_PREFIX}.h": texts[1], "layout.h": _layout(design, model)}

@@ -128,7 +128,9 @@ def notes(
                 "the fault moves the outputs little within its delay."
             )
     radius = spectral_radius(observer.Az)
-    if radius > SLOW_FILTER:
+    if radius >= 1.0:
+        found.append(f"The filter never forgets its start: its spectral radius is {radius:.6g}, not below 1.")
+    elif radius > SLOW_FILTER:
         found.append(
             f"The filter settles slowly: spectral radius {radius:.6g}, time constant "
             f"{-plant.dt / np.log(radius):.3g} s."

@@ -85,7 +85,7 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
         radius,
         np.nextafter(1.0, 0.0),
         source="Wang 2015, Theorem 2",
-        detail=f"eigenvalues computed; proved by the row 'LMI'; {_time_constant(radius, plant.dt)}",
+        detail=f"eigenvalues computed; their proof is the row 'LMI'; {_time_constant(radius, plant.dt)}",
     )
     yield from _norm_rows(design, errors, modes, tracking, factor, lag)
     yield from _noise_rows(plant, errors)

@@ -121,7 +121,7 @@ def _spectra(design: ObserverDesign, errors: PdErrorSystem) -> Iterator[Check]:
     yield _negative(
         "error system", "every eigenvalue of the error system has a negative real part", abscissa,
         source="Filasova et al., eq. (33)",
-        detail=f"eigenvalues {spectrum_text(errors.Az)}; computed, and proved by the row 'LMI'",
+        detail=f"eigenvalues {spectrum_text(errors.Az)}; computed, their proof is the row 'LMI'",
     )  # fmt: skip
     decay = claims["decay"]
     if decay > 0.0:

@@ -1,0 +1,34 @@
+"""What fails its verification is not handed on in silence: refused, or marked wherever it goes."""
+
+from __future__ import annotations
+
+from obsynth.errors import VerificationError
+from obsynth.results.checks import VerificationReport
+from obsynth.results.design import ObserverDesign
+
+#: Checks that a mark names; the others are counted.
+_MOST_NAMED = 4
+
+
+def unverified_mark(report: VerificationReport) -> str:
+    """Return what is written beside a design whose report fails, in one line of plain text; empty where it holds."""
+    if report.passed:
+        return ""
+    names = [check.name for check in report.failures]
+    if not names:
+        return "UNVERIFIED: no check was made"
+    more = f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else ""
+    return f"UNVERIFIED: {len(names)} of {len(report.checks)} checks FAIL: {', '.join(names[:_MOST_NAMED])}{more}"
+
+
+def require_verified(design: ObserverDesign, *, unverified: bool = False) -> None:
+    """Raise `VerificationError` where the report of a design fails, unless it is wanted ``unverified``.
+    A design that was put together by hand and has no report is the caller's own: it is marked, not refused."""
+    report = design.report
+    if unverified or report.passed or not report.checks:
+        return
+    raise VerificationError(
+        f"{design.name!r} fails its verification ({unverified_mark(report).partition(': ')[2]}): it is not handed on. "
+        "Design it again, or ask for it as it is (--unverified, unverified=True): whatever is written then says so.",
+        report=report,
+    )

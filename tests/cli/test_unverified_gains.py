@@ -1,0 +1,122 @@
+"""What fails its verification is refused by every verb that hands it on, or marked wherever it is written."""
+
+from __future__ import annotations
+
+import json
+import re
+import zipfile
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.io import loadmat
+
+import obsynth
+from obsynth.cli.main import main
+
+DESIGNS = Path(__file__).parents[2] / "designs"
+VERBS = {
+    "export --to out.c": "out.h", "export --to out.mat": "out.mat", "export --to out.npz": "out.npz",
+    "export --to out.fmu": "out.fmu", "run --data log.csv --out out.csv": "out.csv",
+    "plot --data log.csv --out out.png --quiet": "out.png",
+    "prove-alarm --data log.csv --row 20 --state-bound x1=1 --disturbance w=1 --out out.json": None,
+}  # fmt: skip
+
+
+@cache
+def failing() -> obsynth.ObserverDesign:
+    """Gains times 1.3: a spectral radius of 1.116."""
+    plant = obsynth.load_spec(DESIGNS / "wang2015" / "spec.yaml").plant
+    gains = obsynth.fault_estimation_filter(plant).gains
+    return obsynth.design_from_gains(
+        plant, "fault-estimation-filter", T=gains["T"], N=gains["N"], L=1.3 * gains["L"], W=gains["W"], gamma=1.5,
+        name="wrong",
+    )  # fmt: skip
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    design = failing()
+    design.save(tmp_path / "wrong.gains.json")
+    names = (*design.plant.input_names, *design.plant.output_names)
+    pd.DataFrame({"time": np.arange(30), **dict.fromkeys(names, np.zeros(30))}).to_csv("log.csv", index=False)
+    return tmp_path
+
+
+def written(file: Path) -> str:
+    if file.suffix == ".fmu":
+        with zipfile.ZipFile(file) as archive:
+            return archive.read("modelDescription.xml").decode()
+    if file.suffix == ".mat":
+        return str(loadmat(file)["unverified"])
+    if file.suffix == ".npz":
+        return str(np.load(file)["unverified"])
+    return file.read_text()
+
+
+@pytest.mark.parametrize("line", VERBS)
+def test_failing_gains_are_refused_or_marked(folder: Path, line: str, capsys: pytest.CaptureFixture[str]) -> None:
+    verb, *rest = line.split()
+    words = [verb, "--gains", "wrong.gains.json", *rest]
+    assert main(words) == 6
+    captured = capsys.readouterr()
+    assert "spectral radius" in captured.err
+    assert not list(folder.glob("out*"))
+    assert main([*words, "--unverified"]) == 0
+    told = capsys.readouterr()
+    assert "nverified" in (told.out + told.err).lower()
+    target = VERBS[line]
+    if target is None:
+        assert "Cannot be proved" in told.out
+        assert not list(folder.glob("out*"))
+    elif Path(target).suffix not in (".csv", ".png"):
+        assert "UNVERIFIED: 4 of" in written(folder / target)
+
+
+def test_a_report_edited_to_pass_changes_nothing(folder: Path) -> None:
+    """The stored report is no signature: every row of it may be edited, and the digest made to fit."""
+    from obsynth.results.gain_sets import digest_of
+
+    content = json.loads((folder / "wrong.gains.json").read_text())
+    report = content["design"]["report"]
+    report["passed"] = True
+    for row in report["checks"]:
+        row["passed"] = True
+    content["sha256"] = digest_of(content["design"])
+    (folder / "wrong.gains.json").write_text(json.dumps(content))
+    assert obsynth.load("wrong.gains.json").report.passed
+    assert main(["export", "--gains", "wrong.gains.json", "--to", "out.c"]) == 6
+
+
+def test_functions_refuse_what_fails_and_many_runs_say_so(folder: Path) -> None:
+    design = failing()
+    with pytest.raises(obsynth.VerificationError, match="not handed on"):
+        obsynth.export(design, folder / "out.c")
+    with pytest.raises(obsynth.VerificationError, match="not handed on"):
+        obsynth.online_monitor(design, disturbance_bounds={"w": 1.0})
+    assert obsynth.export(design, folder / "out.c", unverified=True)
+    (folder / "many").mkdir()
+    design.save(folder / "many" / "wrong.gains.json")
+    assert main(["run", "--gains", "many", "--data", "log.csv", "--out", "runs", "--quiet"]) == 0
+    table = pd.read_csv(folder / "runs" / "table.csv")
+    assert table["status"].tolist() == ["unverified"]
+    assert main(["run", "--gains", "many", "--data", "log.csv", "--out", "all", "--quiet", "--unverified"]) == 0
+    assert pd.read_csv(folder / "all" / "table.csv")["status"].tolist() == ["run"]
+
+
+def test_proved_never_stands_beside_fails(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["verify", "wrong.gains.json"]) == 6
+    told = capsys.readouterr().out
+    assert "gamma = 1.5" in told
+    assert "NOT proved" in told
+    assert "promise" not in told
+    assert main(["report", "--gains", "wrong.gains.json", "--out", "page.html"]) == 6
+    page = re.sub(r"<[^>]+>", " ", (folder / "page.html").read_text())
+    assert "shipped, proved" not in page
+    assert "shipped: proved" not in page
+    assert "never forget" in page
+    assert "time constant -" not in page
+    assert not re.search(r"FAILS\s+(\(?proved)", page)
