@@ -34,6 +34,7 @@ from obsynth.cli.arguments import (
     SPEC_GAINS,
     SYSTEM,
     TIME_COLUMN,
+    UNVERIFIED,
     Argument,
     Group,
     Settings,
