@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 from dae_plants import DESIGNS, ROD, diode, exchanger, pendulum
 from ruamel.yaml import YAML
 
-from obsynth import DAEModel, PreconditionError, SpecError, linearise
+from obsynth import DAEModel, PreconditionError, SpecError, linearise, load_spec
+from obsynth.cli.main import main
 
 #: Published constants of the tanks, which their calibration replaces.
 PUBLISHED = {"a1": 0.0227, "a2": 0.0241, "b1": 0.0334, "b2": 0.0360}
@@ -179,3 +182,45 @@ def test_a_model_without_units_and_one_that_is_not_defined_where_the_search_ends
     np.testing.assert_allclose(linear.A, [[0.0, -1.0], [0.25, -1.0]], atol=1e-12)
     with pytest.raises(PreconditionError, match="'valve' are not defined where the search ends"):
         linearise(model, given={"h": -4.0}, free=["inflow"])
+
+
+TANK = """schema_version: 1
+name: tank
+plant:
+  kind: dae
+  states: {level: 1.0}
+  inputs: {inflow: 0.1}
+  parameters: {c: 0.1}
+  units: {level: m, inflow: m3/s, c: m2.5/s, gauge: m}
+  equations: {balance: der(level) = inflow - c * sqrt(level)}
+  outputs: {gauge: level}
+"""
+AT_FOUR = "  transform: {linearise: {given: {level: 4.0}, free: [inflow]}}\n"
+
+
+def test_a_spec_is_linearised_where_it_says_and_with_its_noise(tmp_path, capsys):
+    path = tmp_path / "tank.yaml"
+    path.write_text(TANK + "  sensor_noise: {gauge: 0.01}\n  process_noise: {balance: 0.002}\n" + AT_FOUR)
+    plant = load_spec(path).plant
+    np.testing.assert_array_equal(plant.Bw, [[0.002, 0.0]])
+    np.testing.assert_array_equal(plant.Dw, [[0.0, 0.01]])
+    assert main(["linearise", "--system", str(path), "--json"]) == 0
+    shown = json.loads(capsys.readouterr().out)
+    assert shown["operating_point"]["level"] == 4.0
+    assert np.ravel(shown["A"]["data"]).tolist() == [-0.025]
+
+
+@pytest.mark.parametrize(
+    ("more", "told"),
+    [
+        ("  sensor_noise: {gauge: 0.01}\n", "plant.sensor_noise is for the linear model"),
+        ("  process_noise: {scales: 0.01}\n" + AT_FOUR, "scales"),
+        ("  sensor_noise: {gauge: -0.01}\n" + AT_FOUR, "sensor_noise"),
+        ("  sensor_noise: {level gauge: 0.01}\n" + AT_FOUR, "level gauge"),
+    ],
+)
+def test_noise_that_fits_nothing_is_refused(tmp_path, more, told):
+    path = tmp_path / "tank.yaml"
+    path.write_text(TANK + more)
+    with pytest.raises(SpecError, match=told):
+        load_spec(path)

@@ -36,10 +36,11 @@ def _log_arguments(options: argparse.Namespace) -> dict[str, Any]:
 def run_linearise(options: argparse.Namespace) -> int:
     """Run ``linearise``: spec or plant in, matrices and operating point out."""
     from obsynth.analysis.transformations.linearisation import linearise
+    from obsynth.plants.descriptor import DescriptorSystem
     from obsynth.report.plants import linear_plant_text, plant_document
     from obsynth.spec.loader import load_model
 
-    model, _ = load_model(options.system)
+    model, spec = load_model(options.system)
     if options.data is not None:
         protect(options.data)
     target = None if options.out is None else output_file(options.out, PLANT, options)
@@ -48,10 +49,20 @@ def run_linearise(options: argparse.Namespace) -> int:
     if bounded:
         whole = (float("-inf"), float("inf"))
         free = {name: whole for name in free} | {name: _range(name, text) for name, text in bounded.items()}
-    linear = linearise(
-        model, at=options.at or "equilibrium", given=numbers_of(options.given), free=free, faults=options.fault,
-        disturbances=options.disturbance, drift=options.drift,
-    )  # fmt: skip
+    own = (options.at, options.given, options.free, options.fault, options.disturbance, options.drift)
+    if spec is not None and isinstance(spec.plant, DescriptorSystem) and not any(own):
+        # The point that the spec states, with its tolerances and noise.
+        linear = spec.plant if spec.transformation is None else spec.transformation.source
+    else:
+        linear = linearise(
+            model,
+            at=options.at or "equilibrium",
+            given=numbers_of(options.given),
+            free=free,
+            faults=options.fault,
+            disturbances=options.disturbance,
+            drift=options.drift,
+        )
     found = None
     if options.data is not None:
         from obsynth.calibration.validity import validity

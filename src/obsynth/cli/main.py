@@ -383,7 +383,8 @@ VERBS = {
     ),
     "linearise": Verb(
         "calibration:run_linearise",
-        "Linearise the nonlinear plant of a spec: exact matrices at rest, or the reason why it never rests.",
+        "Linearise the nonlinear plant of a spec: exact matrices at an equilibrium (that of the spec's own transform, "
+        "unless an option says otherwise), or the reason why there is none.",
         (
             SYSTEM,
             Settings(

@@ -382,8 +382,12 @@ def _varying_plant(section: TimeVaryingSection, source: Path, prefix: str) -> Ti
     return _placed(lambda: TimeVaryingDescriptorSystem(**arguments), source, prefix)
 
 
+#: White noise that the linear model of a nonlinear plant has.
+_NOISE = ("sensor_noise", "process_noise")
+
+
 def _nonlinear_plant(section: DAESection, source: Path, prefix: str) -> DAEModel:
-    left_out = {"kind", "schema_version", "transform", "variation", "box"}
+    left_out = {"kind", "schema_version", "transform", "variation", "box", *_NOISE}
     arguments = section.model_dump(exclude=left_out, exclude_none=True)
 
     def made() -> DAEModel:
@@ -718,6 +722,13 @@ def _linearised(
                 "add transform: {linearise: {at: equilibrium}}, or write numbers.",
                 path=joined(prefix, "constants"),
             )
+        stated = [name for name in _NOISE if getattr(section, name) is not None]
+        if stated:
+            raise SpecError(
+                f"{source}: {joined(prefix, stated[0])} is for the linear model of a nonlinear plant: add transform: "
+                "{linearise: {at: equilibrium}}, or state the variances R and Q of the nonlinear method.",
+                path=joined(prefix, stated[0]),
+            )
         return None
     where = joined(prefix, "transform")
     if wanted.linearise is None:
@@ -729,7 +740,7 @@ def _linearised(
     from obsynth.analysis.transformations.entries_in_constants import box_of_model
     from obsynth.analysis.transformations.linearisation import linearise
 
-    arguments = wanted.linearise.model_dump(exclude_none=True)
+    arguments = wanted.linearise.model_dump(exclude_none=True) | {name: getattr(section, name) for name in _NOISE}
     tolerances |= arguments.pop("constants", {})
     if not tolerances and (box or section.variation is not None):
         raise SpecError(

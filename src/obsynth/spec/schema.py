@@ -162,6 +162,8 @@ class DAESection(Section):
     variation: Literal["constant", "varying"] | None = None
     box: BoxSection | None = None
     definitions: dict[Text, Text] | None = None
+    sensor_noise: dict[Text, Positive] | None = None
+    process_noise: dict[Text, Positive] | None = None
     transform: TransformSection | None = None
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from obsynth.analysis.transformations.entries_in_constants import at_nominal, box_of_model, entries_in_constants
 from obsynth.analysis.transformations.equilibrium import Point, consistent_point, equilibrium, nominal_point
 from obsynth.errors import PreconditionError, SpecError
-from obsynth.numerics.arguments import require_kind
+from obsynth.numerics.arguments import is_finite_number, require_kind
 from obsynth.plants.constants import ConstantsBox
 from obsynth.plants.dae.functions import local_equations
 from obsynth.plants.dae.model import DAEModel
@@ -39,6 +39,8 @@ def linearise(
     start: Mapping[str, float] | None = None,
     drift: bool = False,
     constants: Mapping[str, Any] | ConstantsBox | None = None,
+    sensor_noise: Mapping[str, float] | None = None,
+    process_noise: Mapping[str, float] | None = None,
 ) -> DescriptorSystem:
     r"""Linearise a nonlinear plant: exact Jacobians, names, units and operating point.
 
@@ -74,6 +76,11 @@ def linearise(
         them are no faults.  Entries of the linear model are then expressions in them (CasADi's derivatives, at the one
         point), and the equilibrium that others have acts as an input ``shift``, which is 1 in every row and zero for
         the nominal ones.  What is not linear in the plant is not covered.
+    sensor_noise : mapping, optional
+        Standard deviation of white noise by output, in its unit: columns of ``Dw (ny, nw)``.
+    process_noise : mapping, optional
+        Intensity of white noise by equation, in the unit of the equation times the root of a second: columns of
+        ``Bw (nx, nw)``, which come before those of the sensors.
 
     Returns
     -------
@@ -138,7 +145,28 @@ def linearise(
                 f"The output {wrong[0]!r} cannot be given at a point: give states.", path=f"given.{wrong[0]}"
             )
         point = consistent_point(model, nominal_point(model, values), values)
-    return linear_model(model, point, faults=faults, disturbances=disturbances, drift=drift, box=box)
+    found = linear_model(model, point, faults=faults, disturbances=disturbances, drift=drift, box=box)
+    return _with_noise(found, model.equation_names, process_noise, sensor_noise)
+
+
+def _with_noise(
+    linear: DescriptorSystem,
+    equations: Sequence[str],
+    process_noise: Mapping[str, float] | None,
+    sensor_noise: Mapping[str, float] | None,
+) -> DescriptorSystem:
+    """Return a linear model with the noise of its equations and sensors, if any is stated."""
+    if process_noise:
+        columns = np.zeros((linear.nx, len(process_noise)))
+        for column, (name, value) in enumerate(process_noise.items()):
+            row = index_of(name, equations, what="process_noise")
+            if not is_finite_number(value) or not value > 0.0:
+                raise SpecError(
+                    f"process_noise[{name!r}] is {value!r}: give an intensity above 0.", path=f"process_noise.{name}"
+                )
+            columns[row, column] = value
+        linear = linear.replace(Bw=columns, Dw=np.zeros((linear.ny, len(process_noise))))
+    return linear.replace(sensor_noise=sensor_noise) if sensor_noise else linear
 
 
 def linear_model(
