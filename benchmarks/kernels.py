@@ -4,6 +4,7 @@ campaigns whose cases must come out the same.  Kernels are chosen by OpenBLAS's 
     python -m benchmarks.kernels designs                      every spec under designs/, all pairs of kernels
     python -m benchmarks.kernels campaigns --cases 200        cases of the campaigns on verdicts, every kernel
     python -m benchmarks.kernels designs --specs smib/spec    some specs alone
+    python -m benchmarks.kernels random --cases 200           the designs of the campaign on existence, all pairs
 
 Both print a table of differences and exit 1 where there is one; ``campaigns`` goes on where an ended run was.
 """
@@ -16,7 +17,7 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import asdict
 from pathlib import Path
@@ -66,8 +67,32 @@ def design_all(folder: Path, specs: Iterable[str]) -> None:
         print(json.dumps({"spec": spec, "code": code}), flush=True)
 
 
+def design_random(folder: Path, first: int, cases: int) -> None:
+    """Design the plants of the campaign on existence into a folder; a line of JSON for each."""
+    from benchmarks.campaigns import existence
+
+    from obsynth import ObserverDesign
+
+    kept: list[ObserverDesign] = []
+
+    def keeping(method: Callable[..., ObserverDesign]) -> Callable[..., ObserverDesign]:
+        def kept_design(*given: object, **options: object) -> ObserverDesign:
+            kept.append(method(*given, **options))
+            return kept[-1]
+
+        return kept_design
+
+    existence._METHODS = {name: keeping(method) for name, method in existence._METHODS.items()}
+    for seed in range(first, first + cases):
+        kept.clear()
+        outcome = existence.case(seed)
+        for design in kept:
+            design.save(folder / f"{outcome.group}-{seed}.json")
+        print(json.dumps({"spec": f"seed {seed}", "code": outcome.result}), flush=True)
+
+
 def verify_all(files: Iterable[Path]) -> None:
-    """Verify gain sets; a line of JSON for each: what fails, and the least room that any row has left."""
+    """Verify gain sets; a line of JSON for each: what fails."""
     from obsynth import load, verify
 
     for file in files:
@@ -76,7 +101,7 @@ def verify_all(files: Iterable[Path]) -> None:
         print(json.dumps({"file": str(file), "failed": failed}), flush=True)
 
 
-def compare_designs(machines: Sequence[str], specs: Sequence[str]) -> int:
+def compare_designs(machines: Sequence[str], what: Sequence[str], *, worker: str = "_design") -> int:
     """Design on every machine and verify on every other; print what differs."""
     wrong = 0
     with tempfile.TemporaryDirectory() as name:
@@ -84,7 +109,7 @@ def compare_designs(machines: Sequence[str], specs: Sequence[str]) -> int:
         for machine in machines:
             folder = Path(name) / machine
             folder.mkdir()
-            for line in started(machine, "_design", str(folder), *specs):
+            for line in started(machine, worker, str(folder), *what):
                 codes.setdefault(str(line["spec"]), {})[machine] = line["code"]
         for spec, found in codes.items():
             if len(set(found.values())) > 1:
@@ -93,13 +118,15 @@ def compare_designs(machines: Sequence[str], specs: Sequence[str]) -> int:
         files = sorted(Path(name).glob("*/*.json"))
         for machine in machines:
             others = [str(file) for file in files if file.parent.name != machine]
-            for line in started(machine, "_verify", *others):
+            listed = Path(name) / f"{machine}.txt"
+            listed.write_text("\n".join(others), encoding="utf-8", newline="\n")
+            for line in started(machine, "_verify", str(listed)):
                 if line["failed"]:
                     wrong += 1
                     print(f"{Path(str(line['file'])).stem}: made on {Path(str(line['file'])).parent.name}, "
                           f"verified on {machine}: {line['failed']}")  # fmt: skip
         made = len(files)
-    print(f"{len(codes)} specs, {made} gain sets, {made * (len(machines) - 1)} verifications: {wrong} differences")
+    print(f"{len(codes)} plants, {made} gain sets, {made * (len(machines) - 1)} verifications: {wrong} differences")
     return wrong
 
 
@@ -159,23 +186,29 @@ def main() -> int:
         design_all(Path(sys.argv[2]), sys.argv[3:])
         return 0
     if sys.argv[1:2] == ["_verify"]:
-        verify_all(map(Path, sys.argv[2:]))
+        verify_all(map(Path, Path(sys.argv[2]).read_text(encoding="utf-8").splitlines()))
+        return 0
+    if sys.argv[1:2] == ["_random"]:
+        design_random(Path(sys.argv[2]), int(sys.argv[3]), int(sys.argv[4]))
         return 0
     if sys.argv[1:2] == ["_cases"]:
         run_cases(sys.argv[2], int(sys.argv[3]), int(sys.argv[4]))
         return 0
     parser = argparse.ArgumentParser(prog="python -m benchmarks.kernels", description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)  # fmt: skip
-    parser.add_argument("what", choices=("designs", "campaigns"))
+    parser.add_argument("what", choices=("designs", "random", "campaigns"))
     parser.add_argument("--machines", nargs="+", default=list(KERNELS), help=f"kernels, or {TWO_THREADS!r}")
     parser.add_argument("--specs", nargs="+", help="designs: which, such as smib/spec (default: all)")
     parser.add_argument("--campaigns", nargs="+", default=list(CAMPAIGNS), choices=CAMPAIGNS)
-    parser.add_argument("--first", type=int, default=0, help="campaigns: seed of the first case")
-    parser.add_argument("--cases", type=int, default=1000, help="campaigns: cases of each")
+    parser.add_argument("--first", type=int, default=0, help="seed of the first case")
+    parser.add_argument("--cases", type=int, default=1000, help="how many cases")
     parser.add_argument("--journal", type=Path, default=ROOT / "benchmarks" / "kernels.jsonl")
     options = parser.parse_args()
     if options.what == "designs":
         return int(compare_designs(options.machines, options.specs or all_specs()) > 0)
+    if options.what == "random":
+        what = [str(options.first), str(options.cases)]
+        return int(compare_designs(options.machines, what, worker="_random") > 0)
     table = compare_campaigns(options.machines, options.campaigns, options.first, options.cases, options.journal)
     print(table)
     return int("Differences: 0." not in table)

@@ -85,4 +85,4 @@ def test_what_the_entries_leave_open_is_no_rounding() -> None:
 @pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="OpenBLAS's kernels of x86-64")
 def test_a_gain_set_that_one_processor_made_another_verifies(capfd: pytest.CaptureFixture[str]) -> None:
     assert kernels.compare_designs(("Haswell", "Nehalem"), ["sharepasand/spec"]) == 0
-    assert "1 specs, 2 gain sets, 2 verifications: 0 differences" in capfd.readouterr().out
+    assert "1 plants, 2 gain sets, 2 verifications: 0 differences" in capfd.readouterr().out
