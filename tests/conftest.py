@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -31,6 +32,12 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--whole", action="store_true", help="all random plants of the property tests, not every fourth (ten minutes)"
     )
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """With ``-m numerics`` the others are not even read: they may need what the oldest dependencies go without."""
+    is_test = collection_path.suffix == ".py" and collection_path.name.startswith("test_")
+    return True if config.option.markexpr == "numerics" and is_test and collection_path.name not in NUMERIC else None
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -87,4 +87,6 @@ def test_the_floors_are_in_pyproject_alone():
         *(entry for part in PROJECT["optional-dependencies"].values() for entry in part),
     ]
     assert not [entry for entry in listed if ">=" not in entry]
-    assert "--resolution lowest-direct '.[test]'" in (ROOT / ".ci" / "run").read_text(encoding="utf-8")
+    assert "--resolution lowest-direct '.[nonlinear,fast,parquet]'" in (ROOT / ".ci" / "run").read_text(
+        encoding="utf-8"
+    )

@@ -26,6 +26,8 @@ from obsynth.proofs.extended_balls import Enclosed, block
 RATES = (0.5, 0.2, 0.8, 0.95)
 #: Roundings of an entry, of every order n, that a Lyapunov equation by Schur vectors and its square root may take.
 OPERATIONS = 1e3
+#: Up to so many states Lyapunov equations are solved by sums first; doublings of these, and when they have settled.
+MANY_STATES, MOST_DOUBLINGS, SETTLED = 100, 80, 1e-17
 #: The same where the rate itself is what is asked for.
 TIGHT_RATES = (0.01, 0.1)
 
@@ -39,6 +41,7 @@ class Contraction:
     defect: float  # bounds |Q inverse - I|
     rate: float
     discrete: bool
+    speed: float = 1.0  # norm of A in these states
 
     @property
     def factor(self) -> float:
@@ -50,7 +53,8 @@ class Contraction:
         """How much, relatively, another machine's Q may be off this one: rounding times the condition of P = Q'Q."""
         lengths = np.linalg.norm(self.Q, axis=0)
         condition = float(np.linalg.cond(self.Q / np.where(lengths > 0.0, lengths, 1.0))) if self.Q.size else 1.0
-        return float(OPERATIONS * max(len(self.Q), 1) * UNIT_ROUNDOFF * condition**2)
+        slowness = self.factor if self.discrete else self.factor * self.speed
+        return float(OPERATIONS * max(len(self.Q), 1) * UNIT_ROUNDOFF * condition**2 * max(slowness, 1.0))
 
     def sizes(self, columns: FloatArray, radius: FloatArray | None = None) -> FloatArray:
         """Return upper bounds on ``|Q b|`` of columns ``(n, m)``, known to within ``radius``, as ``(m,)``."""
@@ -131,10 +135,18 @@ def proved_rate(matrix: FloatArray | Ball, known: Contraction | None = None) -> 
 
 
 def _tried(ball: Ball, rate: float, *, discrete: bool) -> Contraction | None:
-    found = _lyapunov_factor(ball.midpoint, rate, discrete=discrete)
-    if found is None:
-        return None
-    factor = found
+    # Sums of squares lose no digits to the slowest mode; with many states they take too long.
+    ways = (_summed_factor, _lyapunov_factor)
+    for way in ways if len(ball.midpoint) <= MANY_STATES else ways[::-1]:
+        factor = way(ball.midpoint, rate, discrete=discrete)
+        found = None if factor is None else _proved(ball, factor, rate, discrete=discrete)
+        if found is not None:
+            return found
+    return None
+
+
+def _proved(ball: Ball, factor: FloatArray, rate: float, *, discrete: bool) -> Contraction | None:
+    """Return the contraction in the norm of a triangular factor, where it is one."""
     inverse = np.triu(np.linalg.inv(factor))
     if not np.all(np.isfinite(inverse)) or np.any(np.diag(inverse) == 0.0) or np.any(np.diag(factor) == 0.0):
         return None
@@ -152,7 +164,43 @@ def _tried(ball: Ball, rate: float, *, discrete: bool) -> Contraction | None:
         return None
     product = Ball.exact(factor) @ Ball.exact(inverse) - Ball.exact(np.eye(n))
     defect = product.frobenius_norm
-    return Contraction(factor, inverse, defect, rate, discrete) if defect < 0.5 else None
+    speed = float(np.linalg.norm(factor @ ball.midpoint @ inverse, 2))
+    return Contraction(factor, inverse, defect, rate, discrete, speed) if defect < 0.5 else None
+
+
+def _summed_factor(a: FloatArray, rate: float, *, discrete: bool) -> FloatArray | None:
+    """Return an upper triangular Q with ``Q'Q`` near the sum of ``(A / rate)^k' W (A / rate)^k``, in doubled steps; in
+    continuous time of the Cayley transform's.  W is the sum with W = I: beside it this one is at most as large as the
+    slowest mode is slow, however far the states are from each other."""
+    one = np.eye(len(a))
+    with np.errstate(all="ignore"):
+        balanced, scale = balanced_matrix(a)
+        if discrete:
+            power, start = balanced / rate if rate > 0.0 else np.full_like(balanced, np.nan), one
+        else:
+            shifted = balanced + rate * one
+            size = float(np.linalg.norm(shifted, 2)) or 1.0
+            try:
+                inverse = np.linalg.inv(size * one - shifted)
+            except np.linalg.LinAlgError:
+                return None
+            power, start = inverse @ (size * one + shifted), np.sqrt(2.0 * size) * inverse
+        first = _summed(power, start)
+        second = None if first is None else _summed(power, first @ start)
+        return None if second is None else np.asarray(np.triu(np.linalg.qr(second / scale[None, :], mode="r")))
+
+
+def _summed(power: FloatArray, factor: FloatArray) -> FloatArray | None:
+    """Return a triangular factor of the sum of ``(F A^k)'(F A^k)`` over all k; ``None`` where it does not settle."""
+    for _ in range(MOST_DOUBLINGS):
+        later = factor @ power
+        if not np.all(np.isfinite(later)):
+            return None
+        factor = np.linalg.qr(np.vstack([factor, later]), mode="r")
+        if np.all(np.linalg.norm(later, axis=0) <= SETTLED * np.linalg.norm(factor, axis=0)):
+            return np.asarray(factor / (np.max(np.abs(factor), initial=0.0) or 1.0))
+        power = power @ power
+    return None
 
 
 def _lyapunov_factor(a: FloatArray, rate: float, *, discrete: bool) -> FloatArray | None:
