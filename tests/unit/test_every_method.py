@@ -20,8 +20,8 @@ from test_export import through_c
 
 import obsynth
 from obsynth.errors import SpecError
-from obsynth.methods.method import option_types
 from obsynth.methods.registry import REGISTRY, method_class
+from obsynth.numerics.arguments import field_types
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.estimates import Estimates
 from obsynth.observers.linear.observer import LinearObserver
@@ -333,7 +333,7 @@ NO_NUMBERS = (True, np.True_, [True], {"leak": True}, object())
 @EACH
 def test_no_option_takes_what_is_no_number_for_one(method: str) -> None:
     """True is not 1.0: every option that is no truth itself refuses it, in Python and in lists."""
-    for name, kind in option_types(method_class(method)).items():
+    for name, kind in field_types(method_class(method)).items():
         if bool in (kind, *get_args(kind)):
             continue
         for value in NO_NUMBERS:

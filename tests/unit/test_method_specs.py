@@ -10,10 +10,9 @@ import pytest
 
 import obsynth
 from obsynth.errors import SpecError
-from obsynth.methods.method import option_types
 from obsynth.methods.pd_observer.method import PdObserver
 from obsynth.methods.registry import REGISTRY, method_class, methods_for
-from obsynth.numerics.arguments import Count, ForgettingFactor, Positive, problem_with
+from obsynth.numerics.arguments import Count, ForgettingFactor, Positive, field_types, problem_with
 
 
 @pytest.mark.parametrize("method", REGISTRY)
@@ -41,7 +40,7 @@ def test_kinds_of_plants_have_their_methods() -> None:
         (True, Positive | None, "number above 0"), (0.0, Positive, "above 0"), (float("nan"), Positive, "above 0"),
         ("1", Positive, "give a number"), (None, Positive, "missing"), (1.5, ForgettingFactor, "above 0 and at most 1"),
         (2.0, Count, "whole number at least 1"), (True, Count, "whole number"), (1, bool, "True or False"),
-        (True, option_types(PdObserver)["theorem"], "use one of 1, 2"),
+        (True, field_types(PdObserver)["theorem"], "use one of 1, 2"),
     ],
 )  # fmt: skip
 def test_values_out_of_type_or_range_are_named(value: Any, kind: Any, problem: str) -> None:

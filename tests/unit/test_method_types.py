@@ -11,8 +11,10 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 import obsynth.methods
-from obsynth.methods.method import Method, option_types
+from obsynth.methods import functions
+from obsynth.methods.method import Method
 from obsynth.methods.registry import REGISTRY, method_class
+from obsynth.numerics.arguments import field_types
 
 STUB = Path(obsynth.methods.__file__).parent / "functions.pyi"
 HEAD = """\
@@ -45,7 +47,7 @@ def written(kind: Any) -> str:
 
 def function(method: type[Method]) -> str:
     """Return the declaration of a method's public function."""
-    options = [f"    {name}: {written(kind)} = ...," for name, kind in option_types(method).items()]
+    options = [f"    {name}: {written(kind)} = ...," for name, kind in field_types(method).items()]
     if any(option.name == "model_error" for option in fields(method)):
         options.append("    scenario: Scenario | None = ...,")
     name = method.id.replace("-", "_")
@@ -55,7 +57,8 @@ def function(method: type[Method]) -> str:
 
 def text() -> str:
     """Return the whole stub."""
-    body = "".join(function(method_class(method)) for method in REGISTRY)
+    made = [method for method in REGISTRY if hasattr(functions, method.replace("-", "_"))]
+    body = "".join(function(method_class(method)) for method in made)
     return HEAD + body
 
 

@@ -12,8 +12,9 @@ import numpy as np
 from obsynth.errors import ObsynthError, PreconditionError, SpecError
 from obsynth.methods.fault_figures import DECOUPLED, FaultFigures, fault_figures, on_the_clock
 from obsynth.methods.functional_filter.rates import settling_time
-from obsynth.methods.method import Method, Purpose, option_types
+from obsynth.methods.method import Method, Purpose
 from obsynth.methods.registry import REGISTRY, kind_of, method_class, methods_for
+from obsynth.numerics.arguments import field_types
 from obsynth.observers.linear.derived import sample_observer
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.recursive.gain_schedule import steady_observer
@@ -127,7 +128,7 @@ def automatic_design(plant: Any, options: Mapping[str, Any], maker: Maker, refus
         purpose: Purpose = "parameters" if plant.parameter_names else "state despite noise"
         known = methods_for(kind_of(plant))
         return maker(plant, next(iter(_methods_with(purpose, known)), known[0]), options)
-    possible = [method.id for method in linear_methods() if set(options) <= set(option_types(method))]
+    possible = [method.id for method in linear_methods() if set(options) <= set(field_types(method))]
     if not possible:
         raise SpecError(
             f"No single method has the options {', '.join(sorted(options))}: name the method they are for.",

@@ -5,16 +5,15 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields
-from functools import cache
 from importlib import import_module
-from typing import Any, ClassVar, Literal, Self, TypeAlias, get_type_hints
+from typing import Any, ClassVar, Literal, Self, TypeAlias
 
 import numpy as np
 
 from obsynth.analysis.conditions import Condition
 from obsynth.analysis.transformations.recovery import Transformation
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import problem_with
+from obsynth.numerics.arguments import field_types, problem_with
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.regions import LMIRegion
 from obsynth.observers.dae.observer import DAEObserver
@@ -92,7 +91,7 @@ class Method(ABC):
     placeholders: ClassVar[Mapping[str, Any]] = {}
 
     def __post_init__(self) -> None:
-        kinds = option_types(type(self))
+        kinds = field_types(type(self))
         problems = [text for name, kind in kinds.items() if (text := problem_with(getattr(self, name), name, kind))]
         # Rules across options presume that each of them is of its type.
         problems = problems or list(self.conflicts())
@@ -102,9 +101,9 @@ class Method(ABC):
     @classmethod
     def of(cls, given: Mapping[str, Any]) -> Self:
         """Return the method with these options; raise `SpecError` for unknown names, wrong types and broken rules."""
-        unknown = sorted(set(given) - set(option_types(cls)))
+        unknown = sorted(set(given) - set(field_types(cls)))
         if unknown:
-            listed = ", ".join(sorted(option_types(cls)))
+            listed = ", ".join(sorted(field_types(cls)))
             raise SpecError(
                 f"{cls.id} has no option {', '.join(map(repr, unknown))}; there are: {listed}.", path="method.options"
             )
@@ -177,10 +176,3 @@ def plain(value: Any) -> Any:
     if isinstance(value, np.ndarray):
         return value.tolist()
     return [plain(part) for part in value] if isinstance(value, (list, tuple)) else value
-
-
-@cache
-def option_types(method: type[Method]) -> dict[str, Any]:
-    """Return name -> annotated type of every option."""
-    hints = get_type_hints(method, include_extras=True)
-    return {option.name: hints[option.name] for option in fields(method)}

@@ -9,7 +9,9 @@ import math
 import operator
 import types
 from collections.abc import Callable, Mapping
-from typing import Annotated, Any, Literal, Union, get_args, get_origin
+from dataclasses import fields
+from functools import cache
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 from annotated_types import Ge, Gt, Le, Lt
@@ -192,3 +194,18 @@ def checked_value(value: Any, name: str, kind: Any) -> Any:
     if problem is not None:
         raise SpecError(problem, path=name)
     return value.item() if isinstance(value, np.generic) else value
+
+
+@cache
+def field_types(kind: Any) -> dict[str, Any]:
+    """Return name -> annotated type of every field of a dataclass."""
+    hints = get_type_hints(kind, include_extras=True)
+    return {field.name: hints[field.name] for field in fields(kind)}
+
+
+def check_fields(made: Any, kind: Any) -> None:
+    """Check each field of a dataclass ``kind`` whose type states a range or choices; numbers become plain ones."""
+    for name, stated in field_types(kind).items():
+        parts = get_args(stated) if get_origin(stated) in (Union, types.UnionType) else (stated,)
+        if any(get_origin(part) in (Annotated, Literal) for part in parts):
+            object.__setattr__(made, name, checked_value(getattr(made, name), name, stated))

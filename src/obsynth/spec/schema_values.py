@@ -26,9 +26,8 @@ from pydantic import (
 from pydantic_core import InitErrorDetails, PydanticCustomError
 from pydantic_core.core_schema import ErrorType
 
-from obsynth.methods.method import option_types
 from obsynth.methods.registry import method_class
-from obsynth.numerics.arguments import Count, NonNegative, OpenUnitInterval, Positive, WrittenAs, is_number
+from obsynth.numerics.arguments import Count, NonNegative, OpenUnitInterval, Positive, WrittenAs, field_types, is_number
 
 # Tags of unions appear in the locations of pydantic's errors; the bracket marks them for removal.
 _ROWS, _FILE, _PICK, _LIST, _STACK, _NUMBER = "<rows>", "<file>", "<pick>", "<list>", "<stack>", "<number>"
@@ -240,7 +239,7 @@ KINDS: Mapping[str, Any] = {
 def options_schema(method: str) -> type[Section]:
     """Return the schema of the options of a method, made from its typed options."""
     options: Any = method_class(method)
-    types, defaults = option_types(options), {field.name: field.default for field in fields(options)}
+    types, defaults = field_types(options), {field.name: field.default for field in fields(options)}
     entries: dict[str, Any] = {name: (_in_document(kind), defaults[name]) for name, kind in types.items()}
     return create_model(options.__name__, __base__=Section, __doc__=options.__doc__, **entries)
 

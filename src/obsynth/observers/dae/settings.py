@@ -10,7 +10,7 @@ from typing import Any, Literal, Self, TypeAlias
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import Count, ForgettingFactor, Positive, Probability, checked_value
+from obsynth.numerics.arguments import Count, ForgettingFactor, Positive, Probability, check_fields
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.numerics.ranks import covariance_factor, is_definite
 from obsynth.observers.outliers import Outliers
@@ -23,16 +23,6 @@ Form: TypeAlias = Literal["forgetting", "random-walk", "augmented-kalman"]
 Guard: TypeAlias = Literal["regularise", "none"]
 Weight: TypeAlias = Literal["innovation", "paper"]
 Integration: TypeAlias = Literal["backward-euler", "radau"]
-_KINDS = {
-    "form": Form,
-    "guard": Guard,
-    "weight": Weight,
-    "integration": Integration,
-    "forgetting": ForgettingFactor,
-    "window": Count,
-    "largest_move": Positive | None,
-    "reset": Probability,
-}
 _DEFINITE = ("R", "initial_parameter_covariance")
 
 
@@ -51,23 +41,22 @@ class DAESettings(StepSettings):
     random_walk: FloatArray
     lower: FloatArray
     upper: FloatArray
-    form: str = "forgetting"
-    forgetting: float = 0.98
-    guard: str = "regularise"
-    weight: str = "innovation"
-    integration: str = "backward-euler"
-    largest_move: float | None = None
-    window: int = 50
+    form: Form = "forgetting"
+    forgetting: ForgettingFactor = 0.98
+    guard: Guard = "regularise"
+    weight: Weight = "innovation"
+    integration: Integration = "backward-euler"
+    largest_move: Positive | None = None
+    window: Count = 50
     outliers: Outliers = "none"
     outlier_limit: float | None = None
     sensors: Mapping[str, Mapping[str, int]] | None = None
     state_bounds: FloatArray | None = None
-    reset: float = 0.0
+    reset: Probability = 0.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "dt", step_length(self.dt))
-        for name, kind in _KINDS.items():
-            checked_value(getattr(self, name), name, kind)
+        check_fields(self, DAESettings)
         self._check_options()
         self._check_arrays()
 

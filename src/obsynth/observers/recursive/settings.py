@@ -9,7 +9,7 @@ from typing import Any, Literal, Self, TypeAlias
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import Count, ForgettingFactor, Probability, checked_value, real_vector, truth
+from obsynth.numerics.arguments import Count, ForgettingFactor, Probability, check_fields, real_vector, truth
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.numerics.ranks import covariance_factor, rounding_rank
 from obsynth.observers.outliers import Outliers
@@ -19,7 +19,6 @@ from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 
 Form: TypeAlias = Literal["innovation", "literal", "random-walk"]
 Guard: TypeAlias = Literal["regularise", "directional", "none"]
-_KINDS = {"form": Form, "guard": Guard, "forgetting": ForgettingFactor, "window": Count, "reset": Probability}
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,18 +51,17 @@ class Adaptation:
         Something is out of range or has the wrong shape.
     """
 
-    form: str
-    forgetting: float
-    guard: str
+    form: Form
+    forgetting: ForgettingFactor
+    guard: Guard
     initial_parameters: FloatArray
     initial_covariance: FloatArray
     walk: FloatArray
-    window: int
-    reset: float = 0.0
+    window: Count
+    reset: Probability = 0.0
 
     def __post_init__(self) -> None:
-        for name, kind in _KINDS.items():
-            object.__setattr__(self, name, checked_value(getattr(self, name), name, kind))
+        check_fields(self, Adaptation)
         if self.reset and self.form == "random-walk":
             raise SpecError("reset belongs to the forms that forget: the random walk follows by itself.", path="reset")
         q = len(self.initial_parameters)
