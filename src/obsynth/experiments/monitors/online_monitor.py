@@ -12,6 +12,7 @@ from obsynth.errors import SpecError
 from obsynth.experiments.monitors.adaptive_monitor import EXACT, adaptive_plan, adaptive_statement, tolerances_of
 from obsynth.experiments.monitors.adaptive_records_monitor import noisy_design
 from obsynth.experiments.monitors.adaptive_rule import AdaptiveRule
+from obsynth.experiments.monitors.guaranteed import data_monitor, is_guaranteed
 from obsynth.experiments.monitors.learned import LearnedThresholds, learned_monitor, load_thresholds
 from obsynth.experiments.monitors.monitor import KINDS, statement_of
 from obsynth.experiments.monitors.online import OnlineMonitor, Rule
@@ -130,6 +131,17 @@ def online_monitor(
     if isinstance(design.observer, (RecursiveObserver, DAEObserver)):
         return parameter_monitor(design.observer, kind, nominal or {}, change, false_alarms)
     _require_linear_kind(kind, nominal)
+    if is_guaranteed(design):
+        return data_monitor(
+            design,
+            kind,
+            disturbance_bounds=disturbance_bounds,
+            noise_bound=noise_bound,
+            initial_error=initial_error,
+            gamma=gamma,
+            constants=constants,
+            initial_set=initial_set,
+        )
     design, adaptive = tolerances_of(design, kind, constants, initial_set, initial_error)
     estimates = watches_estimates(design) and kind in ("pointwise", "window")
     model, dt = _endless_model(design, scenario, window, sample_time, estimates=estimates)

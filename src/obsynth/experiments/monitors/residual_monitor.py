@@ -11,6 +11,7 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.experiments.benches import LinearBench, make_bench
 from obsynth.experiments.monitors.adaptive_monitor import EXACT, tolerances_of
+from obsynth.experiments.monitors.guaranteed import is_guaranteed, record_monitor
 from obsynth.experiments.monitors.monitor import KINDS, Monitor, statement_of
 from obsynth.experiments.monitors.residual_model import ResidualModel, residual_model, watches_estimates
 from obsynth.experiments.monitors.thresholds import (
@@ -115,6 +116,18 @@ def monitor(
     if kind not in KINDS:
         raise SpecError(f"kind is {kind!r}: use one of {', '.join(KINDS)}.", path="kind")
     require_options(noise_bound, initial_error, gamma, window, false_alarms, change, isolation_delay)
+    if is_guaranteed(design):
+        return record_monitor(
+            design,
+            scenario,
+            kind,
+            disturbance_bounds=disturbance_bounds,
+            noise_bound=noise_bound,
+            initial_error=initial_error,
+            gamma=gamma,
+            constants=constants,
+            initial_set=initial_set,
+        )
     design, adaptive = tolerances_of(design, kind, constants, initial_set, initial_error)
     estimates = watches_estimates(design) and kind in ("pointwise", "window")
     model = residual_model(design, scenario, estimates=estimates)
