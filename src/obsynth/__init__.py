@@ -44,6 +44,7 @@ _NAMES = {
     "comparison.comparing": "compare",
     "comparison.result": "ComparedMethod Comparison FaultComparison",
     "comparison.sensor_sets": "sensor_sets SensorSet SensorSets",
+    "data.alarm_events": "AlarmEvent",
     "data.alarm_proof": "prove_alarm",
     "data.normal_rows": "learn_thresholds",
     "data.run": "DataRun run_on_data",

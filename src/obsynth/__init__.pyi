@@ -26,6 +26,7 @@ from obsynth.comparison.result import FaultComparison as FaultComparison
 from obsynth.comparison.sensor_sets import SensorSet as SensorSet
 from obsynth.comparison.sensor_sets import SensorSets as SensorSets
 from obsynth.comparison.sensor_sets import sensor_sets as sensor_sets
+from obsynth.data.alarm_events import AlarmEvent as AlarmEvent
 from obsynth.data.alarm_proof import prove_alarm as prove_alarm
 from obsynth.data.normal_rows import learn_thresholds as learn_thresholds
 from obsynth.data.run import DataRun as DataRun

@@ -207,3 +207,54 @@ def test_a_log_without_stamps_takes_those_that_are_told(tmp_path: Path) -> None:
         read_log(tmp_path / "log.csv", ["u"], ["a", "b"])
     with pytest.raises(obsynth.SpecError, match="has no column 'c'"):
         read_log(tmp_path / "log.csv", ["u"], ["a", "c"], dt=DT)
+
+
+def test_the_summary_lists_alarms_and_rows_that_could_not_alarm() -> None:
+    from obsynth.cli.data_run import summary_of_run
+
+    data = log(rows=160)
+    data.loc[60:80, "a"] += 1.0
+    data.loc[130:, "a"] += 2.0
+    data.loc[100, "b"] = np.nan
+    run = obsynth.run_on_data(designed("ui-pi-observer"), data, thresholds={"fhat[f]": 0.5})
+    first, *_, last = run.events
+    table = run.table
+    assert table is not None
+    assert (first.by, first.fault) == ("fhat[f]", "f")
+    assert last.last_row <= 160
+    alarmed = table.index[table["alarm"] != ""] + 1
+    assert sum(event.rows for event in run.events) == len(alarmed)
+    assert (first.first_row, last.last_row) == (alarmed[0], alarmed[-1])
+    largest = table.loc[first.first_row - 1 : first.last_row - 1, "fhat[f]"]
+    assert abs(first.size) == largest[table["alarm"] != ""].abs().max()
+    assert first.evidence == pytest.approx(abs(first.size) / 0.5)
+    could = table["status"].isin(["ok", "partial"]).sum()
+    assert sum(run.silent.values()) == len(table) - could
+    printed = summary_of_run(run, None)
+    assert "alarm by" in printed
+    assert f"{len(table) - could} of 160 rows could not alarm" in printed
+    quiet = summary_of_run(obsynth.run_on_data(designed("ui-pi-observer"), log(), thresholds={"fhat[f]": 50.0}), None)
+    assert "No alarm by any threshold in the" in quiet
+    short = summary_of_run(obsynth.run_on_data(designed("ui-pi-observer"), log(rows=5), thresholds={"r[a]": 9.0}), None)
+    assert "No alarm" not in short
+    assert "5 of 5 rows could not alarm: 5 warm-up" in short
+
+
+def test_a_stream_keeps_its_state_every_few_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import io
+
+    from obsynth.data import run as runs
+
+    saved: list[int] = []
+    real = runs.save_state
+
+    def spied(path: Path, job: Any, digest: str) -> None:
+        saved.append(job.rows)
+        real(path, job, digest)
+
+    monkeypatch.setattr(runs, "save_state", spied)
+    text, state, out = io.StringIO(log().to_csv(index=False)), tmp_path / "state.json", io.StringIO()
+    obsynth.run_on_data(designed("ui-pi-observer"), text, out, state=state, state_every=20)
+    assert saved[:4] == [20, 40, 60, 80]
+    with pytest.raises(obsynth.SpecError, match="state_every"):
+        obsynth.run_on_data(designed("ui-pi-observer"), log(), state_every=0)

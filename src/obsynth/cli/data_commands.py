@@ -42,7 +42,8 @@ def run_run(options: argparse.Namespace) -> int:
     design, mark = gains_to_hand_on(options.gains, unverified=options.unverified)
     watched = monitor_of(design, options)
     found = run_of(design, options, watched, out, recovered=_recovered(options.recovered), outliers=options.outliers,
-                   smooth=options.smooth, lag=options.lag, state=options.state)  # fmt: skip
+                   smooth=options.smooth, lag=options.lag, state=options.state,
+                   state_every=options.state_every)  # fmt: skip
     proof = None if certificate is None else alarm_of_run(design, options, found, certificate)
     if options.json:
         print_json({

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
@@ -129,6 +130,8 @@ def monitor_of(
 
 def summary_of_run(found: DataRun, watched: OnlineMonitor | None) -> str:
     """Return what a run was, in a few lines."""
+    from obsynth.data.alarm_events import silent_rows
+
     counts = ", ".join(f"{count} {status}" for status, count in found.statuses.items())
     lines = [f"{found.rows} rows: {counts}."]
     if found.recovered:
@@ -136,21 +139,48 @@ def summary_of_run(found: DataRun, watched: OnlineMonitor | None) -> str:
         told = ", ".join(f"{count} {kind.replace('needs', 'with')}" for kind, count in kinds.items())
         count = len(found.recovered)
         lines.append(f"Of the plant as written, {count} more state{'s are' if count > 1 else ' is'} estimated: {told}.")
-    quiet = not found.alarms and (watched is not None or found.thresholds)
-    if quiet and 2 * sum(found.statuses.get(status, 0) for status in ("warm-up", "recovering")) > found.rows:
-        lines.append("More than half of the rows raise no alarm, as they are warm-up: it lasts until the slowest mode "
-                     "of the observer is forgotten, or as long as --warm-up says.")  # fmt: skip
     if found.outliers:
         told = ", ".join(f"{count} of {name}" for name, count in found.outliers.items())
         lines.append(f"{sum(found.outliers.values())} outliers: {told}.")
     for name, time in found.alarms.items():
         fault = f"; {found.isolated} stands out" if watched and name == watched.kind and found.isolated else ""
         lines.append(f"Alarm: {name} first above its threshold at {found.stamps.shown(time)}{fault}.")
+    lines += _alarm_table(found)
+    if watched is not None or found.thresholds:
+        silent = sum(found.silent.values())
+        if not found.alarms and silent < found.rows:
+            told = f" in the {found.rows - silent} rows that could alarm" if silent else ""
+            lines.append(f"No alarm by {watched.kind if watched else 'any threshold'}{told}.")
+        if silent:
+            lines.append(f"{silent} of {found.rows} rows could not alarm: {'; '.join(silent_rows(found.silent))}.")
     if watched is not None:
-        if watched.kind not in found.alarms:
-            lines.append(f"No alarm by {watched.kind}.")
         lines.append(f"The {watched.kind} threshold: {watched.statement}.")
     return "\n".join(lines)
+
+
+#: Alarms that a summary lists.
+MOST_LISTED = 20
+
+
+def _alarm_table(found: DataRun) -> list[str]:
+    """Return lines of a table of all alarms."""
+    if not found.events:
+        return []
+
+    def number(value: float) -> str:
+        return "" if math.isnan(value) else f"{value:.4g}"
+
+    rows = [("alarm by", "from", "to", "rows", "fault", "size", "interval", "of its threshold")]
+    for event in found.events[:MOST_LISTED]:
+        interval = "" if math.isnan(event.low) else f"{number(event.low)} to {number(event.high)}"
+        first, last = found.stamps.shown(event.start), found.stamps.shown(event.end)
+        evidence = f"{event.evidence:.3g} times"
+        rows.append((event.by, first, last, str(event.rows), event.fault, number(event.size), interval, evidence))
+    kept = [i for i in range(len(rows[0])) if any(row[i] for row in rows[1:])]
+    widths = {i: max(len(row[i]) for row in rows) for i in kept}
+    lines = ["  " + "  ".join(row[i].ljust(widths[i]) for i in kept).rstrip() for row in rows]
+    more = len(found.events) - MOST_LISTED
+    return [*lines, *([f"  and {more} more"] if more > 0 else [])]
 
 
 @contextmanager

@@ -260,6 +260,13 @@ VERBS = {
                         "of up to 300); may be repeated",
                         action="append",
                     ),
+                    option(
+                        "--state-every",
+                        "N",
+                        "rows of a stream after which --state is written anew (default: 100)",
+                        type=int,
+                        default=100,
+                    ),
                 )
             ),
             Group(

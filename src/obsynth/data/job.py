@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.analysis.transformations.recovery import StateRecovery
+from obsynth.data.alarm_events import NO_DECISION, AlarmLog
 from obsynth.data.log_estimator import DECIDING, Engine, Entry, LagBuffer, Row
 from obsynth.data.recovered import LATE, RecoveredStates
 from obsynth.data.signals import TIME, Signals
@@ -129,6 +130,7 @@ class Job:
         self.resumed_from: Path | None = None
         self.statuses, self.alarms, self.isolated = Counter[str](), dict[str, float](), ""
         self.alarm_rows = dict[str, int]()
+        self.events = AlarmLog(self.header)
 
     def take(self, chunk: FloatArray) -> list[list[Any]]:
         """Take rows ``[time, u, y]`` as read; return rows of output (``chunk (rows, 1 + nu + ny)``)."""
@@ -179,17 +181,20 @@ class Job:
         if self._levels or self.monitor is not None:
             first = self.rows - len(rows) + 1
             for number, ((time, _, row), values, cells) in enumerate(zip(entries, estimates, rows, strict=True), first):
-                cells.extend(self._decided(time, row, values, number))
+                cells.extend(self._decided(time, row, values, number, cells))
         return rows
 
-    def _decided(self, time: float, row: Row, values: FloatArray, number: int) -> list[Any]:
-        """Return statistic and threshold, if there is a monitor, and what alarms there are."""
+    def _decided(self, time: float, row: Row, values: FloatArray, number: int, said: Sequence[Any]) -> list[Any]:
+        """Return statistic and threshold, if there is a monitor, and what alarms there are; ``said``: cells so far."""
         deciding = row.status in DECIDING
-        names = [name for name, i, level in self._levels if deciding and np.abs(values[i]) > level]
-        for name in names:
-            self.alarms.setdefault(name, time)
-            self.alarm_rows.setdefault(name, number)
+        above = [(name, abs(float(values[i])) / level) for name, i, level in self._levels if deciding]
+        names = [name for name, evidence in above if evidence > 1.0]
+        for name, evidence in above:
+            if evidence > 1.0:
+                self.alarms.setdefault(name, time)
+                self.alarm_rows.setdefault(name, number)
         cells: list[Any] = []
+        undecided = not deciding
         if self.monitor is not None:
             deciding = deciding and (row.forgotten or not self.monitor.guarantees)
             seen = self.monitor.see(
@@ -202,11 +207,20 @@ class Job:
             )
             more = seen.more or (math.nan,) * len(self.monitor.columns)
             cells = [*(np.array(more) + self._shifts).tolist(), seen.statistic, seen.threshold]
+            undecided = undecided or (not self._levels and math.isnan(seen.statistic))
             if seen.alarm:
+                evidence = seen.statistic / seen.threshold if seen.threshold else math.inf
+                self.events.take(self.monitor.kind, seen.fault, evidence, time, number, [*said, *cells])
                 if self.monitor.kind not in self.alarms:
                     self.alarms[self.monitor.kind], self.isolated = time, seen.fault
                     self.alarm_rows[self.monitor.kind] = number
                 names.append(f"{self.monitor.kind}: {seen.fault}" if seen.fault else self.monitor.kind)
+        for name, evidence in above:
+            if evidence > 1.0:
+                fault = name[5:-1] if name.startswith("fhat[") else ""
+                self.events.take(name, fault, evidence, time, number, [*said, *cells])
+        if undecided:
+            self.events.silent[row.status if row.status not in DECIDING else NO_DECISION] += 1
         return [*cells, "; ".join(names)]
 
     def as_dict(self) -> dict[str, Any]:

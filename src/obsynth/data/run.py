@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
+from obsynth.data.alarm_events import AlarmEvent
 from obsynth.data.job import Job, resume_state, save_state
 from obsynth.data.linear_log import engine_of
 from obsynth.data.log_estimator import Engine, LagBuffer
@@ -26,6 +27,10 @@ from obsynth.results.gain_sets import gain_set_digest
 
 if TYPE_CHECKING:
     import pandas as pd
+
+
+#: Rows of a stream after which its state is saved.
+STATE_ROWS = 100
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +66,11 @@ class DataRun:
         Those that were given.
     alarm_rows : mapping of str to int
         Numbers of the rows of these alarms, from 1.
+    events : tuple of AlarmEvent
+        All alarms: from when to when, which fault, how large.  Rows above a threshold that are less than 20 rows apart
+        are one.
+    silent : mapping of str to int
+        How many rows could not alarm, by their status; ``undecided`` where the monitor decides nothing.
     """
 
     rows: int
@@ -76,6 +86,8 @@ class DataRun:
     stamps: Stamps = field(default_factory=Stamps, repr=False)
     thresholds: Mapping[str, float] = field(default_factory=dict, repr=False)
     alarm_rows: Mapping[str, int] = field(default_factory=dict)
+    events: tuple[AlarmEvent, ...] = ()
+    silent: Mapping[str, int] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the summary as plain data, without the table."""
@@ -85,6 +97,8 @@ class DataRun:
             "alarms": dict(self.alarms),
             "alarm_rows": dict(self.alarm_rows),
             "alarm_stamps": {name: self.stamps.shown(time) for name, time in self.alarms.items()},
+            "events": [event.as_dict() for event in self.events],
+            "silent": dict(self.silent),
             "isolated": self.isolated,
             "recovered": dict(self.recovered),
             "outliers": dict(self.outliers),
@@ -110,6 +124,7 @@ def run_on_data(
     lag: int | None = None,
     recovered: str | Sequence[str] | None = None,
     state: str | Path | None = None,
+    state_every: int = STATE_ROWS,
     chunk_rows: int = CHUNK_ROWS,
     progress: Callable[[int], None] | None = None,
 ) -> DataRun:
@@ -164,6 +179,9 @@ def run_on_data(
         by default all of up to 300, and none of more.
     state : path, optional
         A saved state to go on from, if the file exists; the state at the end is written to it.
+    state_every : int, optional
+        Rows of a stream after which the state is written anew, whole or not at all: so many are lost at most when the
+        process is killed.
     chunk_rows : int, optional
         Rows that are read and written at a time; the results do not depend on it.
     progress : callable, optional
@@ -206,8 +224,9 @@ def run_on_data(
         require_kind(state, (str, Path), "state", "the name of a file")
     if out is not None and not hasattr(out, "write"):
         require_kind(out, (str, Path), "out", "the name of a file, or a text stream")
-    if not is_whole(chunk_rows) or chunk_rows < 1:
-        raise SpecError(f"chunk_rows is {chunk_rows!r}: give a whole number, 1 or more.", path="chunk_rows")
+    for name, count in (("chunk_rows", chunk_rows), ("state_every", state_every)):
+        if not is_whole(count) or count < 1:
+            raise SpecError(f"{name} is {count!r}: give a whole number, 1 or more.", path=name)
     require_distinct(
         {
             "state": state,
@@ -235,7 +254,7 @@ def run_on_data(
     if not (state is None or out is None or isinstance(out, str | Path)):
         save = partial(save_state, Path(state), job, digest)
     with sink_for(out, job.header, stamps) as sink:
-        _run_rows(job, chunks(data, job.signals, stamps, chunk_rows), sink, kept, save, progress or bool)
+        _run_rows(job, chunks(data, job.signals, stamps, chunk_rows), sink, kept, save, progress or bool, state_every)
     if state is not None:
         save_state(Path(state), job, digest)
     table = sink.frame() if isinstance(sink, FrameSink) else None
@@ -254,6 +273,8 @@ def run_on_data(
         stamps,
         dict(thresholds or {}),
         dict(job.alarm_rows),
+        job.events.events(),
+        dict(job.events.silent),
     )
 
 
@@ -285,6 +306,7 @@ def _run_rows(
     kept: list[FloatArray] | None,
     save: Callable[[], None] | None,
     progress: Callable[[int], object],
+    state_every: int = STATE_ROWS,
 ) -> None:
     """Run over all rows: in chunks, or one by one where the state is to be saved after a stream."""
     held, is_whole = HeldSignals(), True
@@ -305,6 +327,8 @@ def _run_rows(
                         found = job.take(row[None])
                         is_whole = True
                         sink.write(found)
+                        if job.rows % state_every == 0:
+                            save()
                 progress(job.rows)
         except ObsynthError:
             # A refused row has changed nothing.

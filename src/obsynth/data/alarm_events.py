@@ -1,0 +1,117 @@
+"""Alarms as events: from when to when, which fault, how large, on what evidence; and rows that could not alarm."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from obsynth.data.log_estimator import GAP, PARTIAL, RECOVERING, WARM_UP
+from obsynth.observers.estimates import BAND_WIDTH
+
+#: An alarm ends when so many rows in a row were below the threshold.
+HOLD = 20
+#: What stands for the status of rows that are well, but in which the monitor decides nothing.
+NO_DECISION = "undecided"
+#: Why a row cannot alarm, by its status.
+REASONS = {
+    WARM_UP: "the start is not forgotten yet (--warm-up)",
+    RECOVERING: "a gap before them is not forgotten yet (--warm-up)",
+    GAP: "samples are missing",
+    NO_DECISION: "the monitor decides nothing there, as it waits for its window, its start, or the end of a gap",
+}
+
+
+@dataclass(frozen=True)
+class AlarmEvent:
+    """An alarm: rows above a threshold that are less than 20 rows apart.
+
+    Parameters
+    ----------
+    by : str
+        The column, or the kind of the monitor, whose threshold is passed.
+    fault : str
+        The fault that stands out; empty where none does.
+    start, end : float, seconds
+        Times of the first and the last row above the threshold.
+    first_row, last_row : int
+        Their numbers, from 1.
+    rows : int
+        Rows above the threshold.
+    size, low, high : float
+        Estimate of the fault at its largest evidence, and its interval there: 95 % of the stated noise, or guaranteed
+        by an adaptive threshold; NaN where it is not known.
+    evidence : float
+        Largest share of the threshold that was reached.
+    """
+
+    by: str
+    fault: str
+    start: float
+    end: float
+    first_row: int
+    last_row: int
+    rows: int
+    size: float
+    low: float
+    high: float
+    evidence: float
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the event as plain data."""
+        return asdict(self)
+
+
+class AlarmLog:
+    """Gathers alarms row by row; ``columns`` are those of the output that hold estimates and intervals."""
+
+    def __init__(self, columns: Sequence[str]) -> None:
+        self._places = {name: i for i, name in enumerate(columns)}
+        self._open, self._closed = dict[str, AlarmEvent](), list[AlarmEvent]()
+        self.silent = Counter[str]()
+
+    def take(self, by: str, fault: str, evidence: float, time: float, row: int, cells: Sequence[float]) -> None:
+        """Take a row above a threshold; ``cells`` are the numbers of its output."""
+        before = self._open.get(by)
+        if before is not None and row - before.last_row > HOLD:
+            self._closed.append(self._open.pop(by))
+            before = None
+        largest = before is None or evidence > before.evidence or math.isnan(before.evidence)
+        known = (math.nan,) * 3 if before is None else (before.size, before.low, before.high)
+        size, low, high = self._size(fault, cells) if largest else known
+        named = fault if largest or before is None else before.fault
+        self._open[by] = AlarmEvent(
+            by,
+            named,
+            time if before is None else before.start,
+            time,
+            row if before is None else before.first_row,
+            row,
+            1 if before is None else before.rows + 1,
+            size,
+            low,
+            high,
+            evidence if largest or before is None else before.evidence,
+        )
+
+    def _size(self, fault: str, cells: Sequence[float]) -> tuple[float, float, float]:
+        def cell(name: str) -> float:
+            place = self._places.get(name)
+            return math.nan if place is None else float(cells[place])
+
+        size, deviation = cell(f"fhat[{fault}]"), cell(f"sd fhat[{fault}]")
+        low, high = cell(f"lowest {fault}"), cell(f"highest {fault}")
+        if math.isnan(low) and math.isfinite(deviation):
+            low, high = size - BAND_WIDTH * deviation, size + BAND_WIDTH * deviation
+        return size, low, high
+
+    def events(self) -> tuple[AlarmEvent, ...]:
+        """Return all alarms, those that are not over too, by their start."""
+        return tuple(sorted([*self._closed, *self._open.values()], key=lambda event: (event.first_row, event.by)))
+
+
+def silent_rows(silent: Mapping[str, int]) -> list[str]:
+    """Return a text for each reason why rows could not alarm."""
+    return [f"{count} {status}: {REASONS.get(status, status)}" for status, count in silent.items() if status != PARTIAL]
