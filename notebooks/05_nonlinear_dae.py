@@ -8,8 +8,15 @@
 
 # %% [markdown]
 # # A nonlinear plant: from balances to faults
+#
+# Moussa Ali and Zhang (IFAC SSSC 2013) estimate states and parameters of $F(\dot x, x, u, \theta) = 0$. At a point of
+# operation their observer is a Kalman filter of the linearised plant, which `obsynth.conditions` has as a convex
+# problem: a way to see what the sensors are worth, and where it ends, before anything nonlinear runs.
 
 # %%
+import time
+from dataclasses import replace
+
 import matplotlib.pyplot as plt
 import numpy as np
 
@@ -17,35 +24,58 @@ import obsynth
 
 np.set_printoptions(precision=4, suppress=True)
 
+# %%
+spec = obsynth.load_spec("../designs/moussaali2013_dae/spec.yaml")
+model = spec.plant
+linear = obsynth.linearise(model)
+sampled = obsynth.discretise(obsynth.eliminate_algebraic_states(linear), 1.0).plant
+print(linear, "->", sampled)
+
 # %% [markdown]
-# ## A plant of your own first
+# Two parameters walk: the efficiency $\varphi$ and the drift $\psi$ of the pressure sensor become states. The trace of
+# the steady covariance is a squared H2 norm, least at the Kalman gain.
+
+# %%
+size = np.array([0.3, 0.5, 30.0, 1e-3, 25.0])  # a unit of each state, of phi, and of psi in Pa
+
+
+def walking(outputs, noise):
+    """Return the plant with its parameters as states, in those units, and some outputs in units of their noise."""
+    A = np.block([[sampled.A, sampled.Bf], [np.zeros((2, sampled.nx)), np.eye(2)]])
+    C = (np.hstack([sampled.C, sampled.Df]) * size / np.array(noise)[:, None])[outputs]
+    return obsynth.DescriptorSystem(None, A * size / size[:, None], C=C, dt=1.0)
+
+
+Q = np.diag((np.array([0.1, 0.1, 0.1, 1e-4, 1.0]) / size) ** 2)
+paper = obsynth.conditions.kalman(walking([0, 1], [100.0, 0.5]), Q=Q, R=1.0)
+for solver, settings in {"CLARABEL": {}, "SCS": {"eps_abs": 1e-6, "eps_rel": 1e-6}}.items():
+    paper.problem.solve(solver=solver, **settings)
+    phi, psi = (size * np.sqrt(np.diag(paper.gains()["covariance"])))[3:]
+    print(f"{solver:9} {paper.problem.status}: deviations of phi {phi:.5f}, of psi {psi:.1f} Pa")
+
+# %% [markdown]
+# ## 1. What the thermometer is worth, and where it ends
 #
-# A tank with a clogging outlet: the balance as text, the outlet's coefficient as the parameter.
+# The deviations against the noise of the thermometer. Without it there is no gain at all: the solver says infeasible,
+# and `existence` names the mode. At the point of operation the pressure alone does not tell the two parameters apart.
 
 # %%
-tank = obsynth.DAEModel(
-    equations={"balance": "area * der(level) = inflow - c * sqrt(level)"},
-    outputs={"gauge": "level"},
-    states={"level": 1.0},
-    inputs={"inflow": 0.1},
-    parameters={"c": 0.1},
-    constants={"area": 2.0},
-    units={"level": "m", "gauge": "m"},
-)
-own = obsynth.dae_adaptive_observer(tank, dt=5.0, Q=[[1e-6]], R=[[1e-6]], forgetting=0.95)
-print(own)
-
-# %%
-inflow = np.full((200, 1), 0.1)
-outlet = np.where(np.arange(200) < 100, 0.1, 0.085)[:, None]
-moves = obsynth.simulate(tank, dt=5.0, u=inflow, parameters=outlet)
-found = own.observer.run(moves.outputs + 1e-3 * np.random.default_rng(0).standard_normal((200, 1)), inflow)
-obsynth.plotting.plot_parameters(found, parameters=outlet, dt=5.0)
+noises, found = np.logspace(-1, 1, 5), []
+for noise in noises:
+    one = obsynth.conditions.kalman(walking([0, 1], [100.0, noise]), Q=Q, R=1.0)
+    one.problem.solve(solver="CLARABEL")
+    found.append((size * np.sqrt(np.diag(one.gains()["covariance"])))[3:])
+figure, axes = plt.subplots(figsize=(7.5, 3.2), layout="constrained")
+for values, name, style in zip(
+    (np.array(found) / [1e-3, 10.0]).T, ("phi / 0.001", "psi / 10 Pa"), ("k-o", "b--s"), strict=True
+):
+    axes.loglog(noises, values, style, label=name)
+axes.set(xlabel="noise of the thermometer (K)", ylabel="deviation")
+axes.legend()
 plt.show()
-
-# %% [markdown]
-# The band is that of the stated noise, for a parameter that keeps still: after a jump the estimate follows as fast as
-# `forgetting` lets it.
+lost = obsynth.conditions.kalman(walking([0], [100.0, 0.5]), Q=Q, R=1.0)
+lost.problem.solve(solver="CLARABEL")
+print(lost.problem.status, "-", lost.existence.failures[0].detail)
 
 # %% [markdown]
 # ## The published example
@@ -55,16 +85,10 @@ plt.show()
 # $$F(\dot x, x, u, \theta) = 0, \qquad y = h(x, \theta)$$
 #
 # and show a heat exchanger that loses efficiency while a pressure sensor drifts. Their printed equations cannot show
-# it. We see why, correct them, and follow both faults. `designs/moussaali2013_dae/NOTES.md` lists each misprint.
+# it. We see why, correct them, and follow both faults. `docs/papers.md` and `designs/moussaali2013_dae/NOTES.md` list
+# the misprints.
 
 # %%
-import time
-from dataclasses import replace
-
-from obsynth.plotting import plot_parameters, plot_states
-
-spec = obsynth.load_spec("../designs/moussaali2013_dae/spec.yaml")
-model = spec.plant
 for name, text in model.equations.items():
     print(f"{name:9s} {text}")
 
@@ -81,7 +105,7 @@ for name in ("M1", "U1", "m2"):
 print({name: f"{value:g} {model.units[name]}" for name, value in model.inputs.items()})
 
 # %% [markdown]
-# ## 2. What can the sensors tell?
+# ## 3. What can the sensors tell?
 #
 # Before any tuning: which directions of initial state and parameters leave a trace in the outputs along a trajectory of
 # 1,000 s? With both sensors everything is told, without any excitation.
@@ -150,7 +174,7 @@ for title, momentum in (
     print(f"{title}: cannot be told: {', '.join(found.unidentifiable)}")
 
 # %% [markdown]
-# ## 3. The observer
+# ## 4. The observer
 
 # %%
 design = obsynth.design(model, spec.method, name=spec.name, **spec.options)
@@ -159,7 +183,7 @@ for name in ("exists: index", "condition of (7)", "derivatives", "contraction", 
     print(f"{name:17s} {check.value:9.3g}  {'holds' if check.passed else 'FAILS'}  {check.detail}")
 
 # %% [markdown]
-# ## 4. Both faults
+# ## 5. Both faults
 #
 # The efficiency falls to 0.85 between 200 s and 400 s; at 600 s the sensor jumps by 3 kPa. The plant is integrated by
 # Radau IIA: it does not share the observer's discretisation. The bands are two standard deviations *for constant
@@ -171,22 +195,22 @@ faults = np.column_stack([np.interp(k, [200, 400], [1.0, 0.85]), np.where(k >= 6
 noise = {"Q": design.observer.Q, "R": design.observer.R}
 truth = obsynth.simulate_dae(model, u, dt=1.0, parameters=faults, seed=2, **noise)
 slow = design.observer.run(truth.outputs, u)
-axes = plot_parameters(slow, parameters=faults, dt=1.0, units=model.units)
+axes = obsynth.plotting.plot_parameters(slow, parameters=faults, dt=1.0, units=model.units)
 axes[0].figure.suptitle("lambda = 0.98: about 100 s")
 plt.show()
 
 # %%
 fast = replace(design.observer, forgetting=0.9).run(truth.outputs, u)
-axes = plot_parameters(fast, parameters=faults, dt=1.0, units=model.units)
+axes = obsynth.plotting.plot_parameters(fast, parameters=faults, dt=1.0, units=model.units)
 axes[0].figure.suptitle("lambda = 0.9: faster, and noisier")
 plt.show()
 
 # %%
-axes = plot_states(slow, states=truth.states, dt=1.0, units=model.units)
+axes = obsynth.plotting.plot_states(slow, states=truth.states, dt=1.0, units=model.units)
 plt.show()
 
 # %% [markdown]
-# ## 5. Beside the augmented Kalman filter
+# ## 6. Beside the augmented Kalman filter
 #
 # One option, the same interface. With `forgetting=1` the two are the same filter.
 
@@ -224,3 +248,32 @@ for name, observer in rivals.items():
 # %% [markdown]
 # There is no difference in cost that would matter: both spend their time on the implicit step and its derivatives. The
 # paper expects the adaptive observer to be cheaper; with four states and two parameters it is not.
+# %% [markdown]
+# ## A plant of your own first
+#
+# A tank with a clogging outlet: the balance as text, the outlet's coefficient as the parameter.
+
+# %%
+tank = obsynth.DAEModel(
+    equations={"balance": "area * der(level) = inflow - c * sqrt(level)"},
+    outputs={"gauge": "level"},
+    states={"level": 1.0},
+    inputs={"inflow": 0.1},
+    parameters={"c": 0.1},
+    constants={"area": 2.0},
+    units={"level": "m", "gauge": "m"},
+)
+own = obsynth.dae_adaptive_observer(tank, dt=5.0, Q=[[1e-6]], R=[[1e-6]], forgetting=0.95)
+print(own)
+
+# %%
+inflow = np.full((200, 1), 0.1)
+outlet = np.where(np.arange(200) < 100, 0.1, 0.085)[:, None]
+moves = obsynth.simulate(tank, dt=5.0, u=inflow, parameters=outlet)
+found = own.observer.run(moves.outputs + 1e-3 * np.random.default_rng(0).standard_normal((200, 1)), inflow)
+obsynth.plotting.plot_parameters(found, parameters=outlet, dt=5.0)
+plt.show()
+
+# %% [markdown]
+# The band is that of the stated noise, for a parameter that keeps still: after a jump the estimate follows as fast as
+# `forgetting` lets it.

@@ -22,10 +22,9 @@ import numpy as np
 import pandas as pd
 
 import obsynth
-from obsynth.spec import load_spec
 
 log = pd.read_csv("../designs/threetank/log.csv")
-model = load_spec("../designs/threetank/spec.yaml").model
+model = obsynth.load_spec("../designs/threetank/spec.yaml").model
 published = {"a1": 0.0227, "a2": 0.0241, "b1": 0.0334, "b2": 0.0360}
 textbook = model.replace(constants={**model.constants, **published})
 for name, text in model.equations.items():

@@ -19,10 +19,8 @@ import numpy as np
 import pandas as pd
 
 import obsynth
-from obsynth.spec import load_spec
-from obsynth.tolerances.exact_plant import plant_at
 
-spec = load_spec("../designs/drive/spec.yaml")
+spec = obsynth.load_spec("../designs/drive/spec.yaml")
 plant = spec.plant
 for name, constant in plant.uncertainty.box.constants.items():
     print(f"{name:3s} {constant.nominal:5.2f} {constant.unit:10s} {constant.low:.3f} .. {constant.high:.3f}")
@@ -42,7 +40,16 @@ print(obsynth.robustness(design))
 
 # %%
 box = plant.uncertainty.box
-true = plant_at(plant, box.values(np.array([1.0, -1.0, 1.0, -1.0, 1.0])))
+J1, J2, stiffness, c, b = (constant.high if up else constant.low for up, constant in zip(
+    (True, False, True, False, True), box.constants.values(), strict=True
+))  # fmt: skip
+true = obsynth.discretise(
+    obsynth.DescriptorSystem(
+        np.diag([J1, J2, 1.0]), [[-c - b, c, -stiffness], [c, -c - b, stiffness], [1.0, -1.0, 0.0]], [[1], [0], [0]],
+        [[1, 0, 0], [0, 1, 0]], Bf=[[1], [0], [0]], Bd=[[0], [1], [0]],
+    ),
+    plant.dt,
+).plant  # fmt: skip
 generator = np.random.default_rng(7)
 steps, dt = 300, plant.dt
 x, rows = np.zeros(3), []

@@ -18,9 +18,8 @@ import pandas as pd
 from IPython.display import display
 
 import obsynth
-from obsynth.spec import load_spec
 
-motor = load_spec("../designs/motor/one_encoder.yaml").plant
+motor = obsynth.load_spec("../designs/motor/one_encoder.yaml").plant
 obsynth.diagnose(motor)
 
 # %% [markdown]
@@ -36,7 +35,7 @@ for goal in ("detect", "estimate"):
 # So a second encoder, on the load. Is there a filter now?
 
 # %%
-better = load_spec("../designs/motor/sampled.yaml").plant
+better = obsynth.load_spec("../designs/motor/sampled.yaml").plant
 found = obsynth.diagnose(better)
 print(found)
 

@@ -5,6 +5,7 @@ After a change of a source: ``cd notebooks && python -m jupytext --to ipynb --ex
 
 from __future__ import annotations
 
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,8 @@ import jupytext
 import nbformat
 import pytest
 from nbclient import NotebookClient
+
+import obsynth
 
 ROOT = Path(__file__).parents[2]
 SOURCES = sorted((ROOT / "notebooks").glob("*.py"))
@@ -63,6 +66,40 @@ def test_it_runs_from_scratch(source: Path, tmp_path: Path) -> None:
     assert problems_in_outputs(done) == []
     kinds = {output.output_type for cell in done.cells for output in cell.get("outputs", [])}
     assert {"stream", "display_data"} <= kinds
+
+
+#: What a notebook may import of obsynth: all that is public comes with it.
+PUBLIC = {"obsynth"}
+OURS = re.compile(r"^\s*(?:import|from)\s+(obsynth[\w.]*)", re.MULTILINE)
+
+
+@EACH
+def test_nothing_private_is_imported(source: Path) -> None:
+    text = source.read_text(encoding="utf-8")
+    assert set(OURS.findall(text)) == PUBLIC
+    reached = set(re.findall(r"\bobsynth\.(\w+)", text)) - set(dir(obsynth))
+    assert not reached, f"not public: {sorted(reached)}"
+
+
+def test_a_private_import_is_found() -> None:
+    text = "import numpy\nfrom obsynth.methods.conic import lmi\n    import obsynth.spec\n"
+    assert OURS.findall(text) == ["obsynth.methods.conic", "obsynth.spec"]
+
+
+PAPERS = [source for source in SOURCES if source.stem[:2] in ("01", "02", "03", "04", "05")]
+
+
+@pytest.mark.parametrize("source", PAPERS, ids=[path.stem for path in PAPERS])
+def test_the_first_notebooks_begin_with_the_paper_s_problem(source: Path) -> None:
+    """Within the first cells: conditions, two solvers; later a design, and where it ends, with the reason."""
+    cells = [cell.source for cell in jupytext.read(source).cells if cell.cell_type == "code"]
+    first = "\n".join(cells[:4])
+    assert "obsynth.conditions." in first
+    assert "CLARABEL" in first
+    assert "SCS" in first
+    whole = "\n".join(cells)
+    assert ".existence" in whole
+    assert "docs/papers.md" in source.read_text(encoding="utf-8")
 
 
 def test_a_broken_run_is_seen() -> None:

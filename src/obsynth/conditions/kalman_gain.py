@@ -24,14 +24,14 @@ from obsynth.analysis.time_varying import as_time_varying
 from obsynth.analysis.transformations.recovery import Transformation, linear_plant
 from obsynth.conditions import atoms
 from obsynth.conditions.problem import Conditions, Values, require_data
-from obsynth.errors import SpecError, VerificationError
+from obsynth.errors import ObsynthError, SpecError, VerificationError
 from obsynth.methods.descriptor_kalman.unknown_inputs import kalman_conditions, without_unknown_inputs
 from obsynth.methods.functions import descriptor_kalman
 from obsynth.methods.recursive.steady_filter import steady_state_filter
 from obsynth.methods.recursive.synthesis_parts import with_stated_noise
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.numerics.norms import output_covariance
-from obsynth.numerics.ranks import covariance_factor
+from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, covariance_factor
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.results.design import ObserverDesign
@@ -64,8 +64,9 @@ def kalman(
     -------
     Conditions
         Variables ``P (nx, nx)``, ``Y``, ``Z``; the minimum is the trace of the steady covariance; constraints
-        ``"(13) stable"`` and ``"(13) covariance"``; gains ``L (nx, ne)``, ``K (nx, ny)`` and the ``covariance
-        (nx, nx)`` of the error with them.
+        ``"(13) stable"`` and ``"(13) covariance"``; data ``L0, K0, N1, N2``, and ``LA, N1A`` in the coordinates ``X``
+        of P and Y, in which the covariance of a Kalman filter is the identity: ``S = X P^-1 Y``; gains
+        ``L (nx, ne)``, ``K (nx, ny)`` and the ``covariance (nx, nx)`` of the error with them.
 
     Raises
     ------
@@ -126,30 +127,48 @@ def steady_gain(
     W, V = covariance_factor(process, "Q"), covariance_factor(sensor, "R")
     nw, m = W.shape[1] + V.shape[1], len(null)
 
+    X = _coordinates(varying, process, sensor)
+    LA, N1A = np.linalg.solve(X, L0 @ A @ X), N1 @ A @ X
+
     P, Z = cp.Variable((n, n), symmetric=True, name="P"), cp.Variable((nw, nw), symmetric=True, name="Z")
     Y = cp.Variable((n, m), name="Y")
     stable, covariance = atoms.h2(
-        L0 @ A,
-        np.hstack([L0 @ W, -K0 @ V]),
-        np.eye(n),
+        LA,
+        np.linalg.solve(X, np.hstack([L0 @ W, -K0 @ V])),
+        X,
         np.zeros((n, nw)),
         P,
         Z,
         varying.dt,
         Y=Y,
-        Cy=-N1 @ A,
+        Cy=-N1A,
         Dy=np.hstack([-N1 @ W, N2 @ V]),
         margin=margin,
     )
     constraints = {"(13) stable": stable, "(13) covariance": covariance}
 
     def gains(values: Values) -> dict[str, FloatArray]:
-        S = np.linalg.solve(values["P"], values["Y"])
+        S = X @ np.linalg.solve(values["P"], values["Y"])
         L, K = L0 + S @ N1, K0 + S @ N2
         driven = np.hstack([L @ W, -K @ V])
         return {"L": L, "K": K, "covariance": output_covariance(L @ A, driven, np.eye(n), np.zeros((n, nw)))}
 
-    data = {"E": E, "A": A, "C": C, "L0": L0, "K0": K0, "N1": N1, "N2": N2, "Q": process, "R": sensor, "W": W, "V": V}
+    data = {
+        "E": E,
+        "A": A,
+        "C": C,
+        "L0": L0,
+        "K0": K0,
+        "N1": N1,
+        "N2": N2,
+        "LA": LA,
+        "N1A": N1A,
+        "X": X,
+        "Q": process,
+        "R": sensor,
+        "W": W,
+        "V": V,
+    }
     return Conditions(
         "Moussa Ali, Zhang 2013, (10)-(13): steady Kalman gain as an H2 inequality",
         cp.Problem(cp.Minimize(cp.trace(Z)), list(constraints.values())),
@@ -182,3 +201,12 @@ def _covariance(given: Any, size: int, name: str) -> FloatArray:
     if matrix.shape != (size, size):
         raise SpecError(f"{name} is {matrix.shape}, but {(size, size)} is needed.", path=name)
     return matrix
+
+
+def _coordinates(varying: TimeVaryingDescriptorSystem, process: FloatArray, sensor: FloatArray) -> FloatArray:
+    """Return a state change ``(nx, nx)`` in which solvers do not stall: a square root of a Riccati solution."""
+    try:
+        values, vectors = np.linalg.eigh(steady_state_filter(varying, Q=process, R=sensor).P)
+    except (ObsynthError, np.linalg.LinAlgError):
+        return np.eye(varying.nx)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, CANCELLATION_TOLERANCE * values[-1])))

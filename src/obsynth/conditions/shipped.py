@@ -97,9 +97,10 @@ def _kalman(design: ObserverDesign) -> Conditions:
     found = steady_gain(plant, process, sensor, margin=0.0, held=held, design=_kept(design))
     data = found.data
     S = np.hstack([steady.L - data["L0"], steady.K - data["K0"]]) @ np.hstack([data["N1"], data["N2"]]).T
-    P = _gramian(steady.L @ data["A"])
-    driven = np.hstack([steady.L @ data["W"], -steady.K @ data["V"]])
-    return _put(found, P=P, Y=P @ S, Z=driven.T @ P @ driven)
+    X = data["X"]
+    P = X.T @ _gramian(steady.L @ data["A"]) @ X
+    driven = np.linalg.solve(X, np.hstack([steady.L @ data["W"], -steady.K @ data["V"]]))
+    return _put(found, P=P, Y=P @ np.linalg.solve(X, S), Z=driven.T @ P @ driven)
 
 
 def _gramian(loop: FloatArray) -> FloatArray:

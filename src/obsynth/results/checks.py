@@ -32,7 +32,7 @@ class Check:
     passed : bool
         The verdict.
     source : str
-        Where the claim comes from: paper and equation, or the audit's finding.
+        Where the claim comes from: paper and equation, or our own finding.
     kind : str
         ``proved`` (an inequality, rounding errors bounded), ``equality`` (a residual against a bound
         scaled by the data: never called proved), ``computed`` (a number found by a second route),
