@@ -67,6 +67,7 @@ _NAMES = {
     "methods.fault_figures": "FaultFigures",
     "methods.designing": "check design design_from_gains",
     "methods.detection_filter.public": "detection_filter DetectionFilter",
+    "methods.guaranteed_test.bank": "GuaranteedBank guaranteed_bank",
     "methods.guaranteed_test.result": "GuaranteedTest guaranteed_test",
     "methods.functions": (
         "adaptive_observer dae_adaptive_observer descriptor_kalman fault_estimation_filter functional_filter "

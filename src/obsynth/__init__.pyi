@@ -76,6 +76,8 @@ from obsynth.methods.functions import fault_estimation_filter as fault_estimatio
 from obsynth.methods.functions import functional_filter as functional_filter
 from obsynth.methods.functions import pd_observer as pd_observer
 from obsynth.methods.functions import ui_pi_observer as ui_pi_observer
+from obsynth.methods.guaranteed_test.bank import GuaranteedBank as GuaranteedBank
+from obsynth.methods.guaranteed_test.bank import guaranteed_bank as guaranteed_bank
 from obsynth.methods.guaranteed_test.result import GuaranteedTest as GuaranteedTest
 from obsynth.methods.guaranteed_test.result import guaranteed_test as guaranteed_test
 from obsynth.methods.pd_observer.public import apply_adaptation_gain as apply_adaptation_gain

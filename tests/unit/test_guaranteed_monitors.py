@@ -67,3 +67,39 @@ def test_bounds_of_a_design_are_not_changed_by_its_monitor() -> None:
         obsynth.monitor(drive(), spec().scenario, noise_bound=2.0)
     with pytest.raises(obsynth.SpecError, match="its own threshold"):
         obsynth.online_monitor(drive(), "cusum")
+
+
+@cache
+def tanks() -> obsynth.DescriptorSystem:
+    return obsynth.load_spec(ROOT / "designs/tanks/spec.yaml").plant
+
+
+OPTIONS = {"course": "constant", "samples": 12, "noise_bound": 3.0}
+
+
+def test_three_levels_isolate_three_faults() -> None:
+    bank = obsynth.guaranteed_bank(tanks(), **OPTIONS)
+    assert bank.isolates
+    assert bank.groups == (("leak 1",), ("leak 2",), ("clog 13",))
+    plant, rng = tanks(), np.random.default_rng(2)
+    # Leak 2 alone, of twice its threshold, with noise within its bounds and an input that moves.
+    size = 1.001 * bank.tests[1].surely_found
+    x, rows, inputs = np.zeros(3), [], []
+    for _ in range(20):
+        u = 1e-6 * rng.standard_normal(2)
+        rows.append(plant.C @ x + plant.Dw @ rng.uniform(-3.0, 3.0, 3))
+        inputs.append(u)
+        x = plant.A @ x + plant.B @ u + plant.Bf[:, 1] * size
+    found = bank.alarms(np.array(rows), np.array(inputs))
+    assert {name for name, alarms in found.items() if alarms[-1]} == {"leak 2"}
+
+
+def test_two_levels_tell_pairs_and_name_the_smallest_group() -> None:
+    two = tanks().replace(C=tanks().C[:2], D=None, Df=None, Dw=None, Bw=None, noise_names=None,
+                          output_names=["h1", "h2"], operating_point={}, units={})  # fmt: skip
+    bank = obsynth.guaranteed_bank(two, **{**OPTIONS, "noise_bound": {"h1": 0.003, "h2": 0.003}, "samples": 30})
+    assert set(bank.refused) == {"leak 1", "leak 2", "clog 13"}
+    assert all(np.isfinite(size) for size in bank.pairs.values())
+    assert all(len(group) == 2 for group in bank.groups)
+    assert "together give the same outputs" in bank.refused["leak 1"]
+    assert " or " in str(bank)
