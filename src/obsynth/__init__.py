@@ -116,19 +116,21 @@ _PACKAGES = ("conditions", "plotting")
 
 __all__ = sorted(_HOMES)
 
-provide({
-    "PD observer by its inequality": "obsynth.conditions.own_terms:pd_by_inequality",
-    "UI-PI observer by its inequality": "obsynth.conditions.own_terms:ui_pi_by_inequality",
-    "filter by its inequality": "obsynth.conditions.own_terms:filter_by_inequality",
-    "conditions of a design": "obsynth.conditions.shipped:conditions_of",
-    "checks as text": "obsynth.results.layout:report_text",
-    "design summary": "obsynth.report.summary:summary",
-    "rows of a log": "obsynth.data.alarm_proof:rows_of",
-    "picture of a guaranteed test": "obsynth.plotting.guaranteed:plot_least_thresholds",
-    "table of a log": "obsynth.data.log_tables:log_table",
-    "thresholds from a log": "obsynth.data.normal_rows:learn_thresholds",
-    "designs with model error": "obsynth.experiments.tolerant_designs:with_model_error",
-})  # fmt: skip
+provide(
+    {
+        "PD observer by its inequality": "obsynth.conditions.own_terms:pd_by_inequality",
+        "UI-PI observer by its inequality": "obsynth.conditions.own_terms:ui_pi_by_inequality",
+        "filter by its inequality": "obsynth.conditions.own_terms:filter_by_inequality",
+        "conditions of a design": "obsynth.conditions.shipped:conditions_of",
+        "checks as text": "obsynth.results.layout:report_text",
+        "design summary": "obsynth.report.summary:summary",
+        "rows of a log": "obsynth.data.alarm_proof:rows_of",
+        "picture of a guaranteed test": "obsynth.plotting.guaranteed:plot_least_thresholds",
+        "table of a log": "obsynth.data.log_tables:log_table",
+        "thresholds from a log": "obsynth.data.normal_rows:learn_thresholds",
+        "designs with model error": "obsynth.experiments.tolerant_designs:with_model_error",
+    }
+)
 
 
 def __getattr__(name: str) -> Any:

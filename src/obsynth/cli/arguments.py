@@ -51,8 +51,15 @@ def settings_of(arguments: Iterable[Argument | Group | Settings]) -> tuple[Argum
 
 def add_settings(parser: argparse.ArgumentParser, settings: Sequence[Argument]) -> None:
     """Let a parser take ``--set`` and know the defaults of settings; its help lists them at the end."""
-    parser.add_argument("--set", dest="settings", metavar="NAME=VALUE", type=setting, action="append", default=[],
-                        help="one of the settings below; may be repeated")  # fmt: skip
+    parser.add_argument(
+        "--set",
+        dest="settings",
+        metavar="NAME=VALUE",
+        type=setting,
+        action="append",
+        default=[],
+        help="one of the settings below; may be repeated",
+    )
     own = _settings_parser("", settings)
     parser.set_defaults(**vars(own.parse_args([])))
     lines = ["settings, each by --set NAME=VALUE (or --NAME VALUE):"]
@@ -148,45 +155,70 @@ QUIET = flag("--quiet", "print no progress")
 JOBS = option("--jobs", "N", "processes (default: 1)", type=int, default=1)
 CLUSTER = option("--cluster", "ADDRESS", "of the scheduler of a Dask cluster, instead of --jobs")
 MAP = option("--map", "SIGNAL=COLUMN", "column of a signal (or of time) where the names differ; may be repeated")
-SCALE = option("--scale", "SIGNAL=FACTOR", "the column's value times the factor is in the signal's unit; may be "
-               "repeated")  # fmt: skip
+SCALE = option(
+    "--scale", "SIGNAL=FACTOR", "the column's value times the factor is in the signal's unit; may be repeated"
+)
 TIME_COLUMN = option("--time-column", "COLUMN", "column of the time, in seconds or as dates (ISO 8601); default: time")
 #: How a log without faults is read.
 LOG_OPTIONS = (
-    option("--rows", "A:B", "rows of the log without faults, as Python counts (default: all)"), MAP, SCALE,
+    option("--rows", "A:B", "rows of the log without faults, as Python counts (default: all)"),
+    MAP,
+    SCALE,
     Settings((TIME_COLUMN,)),
-)  # fmt: skip
+)
 #: What a monitor is made of.
-MONITOR = Group("monitor", (
-    option("--monitor", "KIND", "watch the residual (or the parameters) by a threshold"),
-))  # fmt: skip
+MONITOR = Group("monitor", (option("--monitor", "KIND", "watch the residual (or the parameters) by a threshold"),))
 #: What its threshold is made of, where the scenario does not say it.
-MONITOR_SETTINGS = Settings((
-    option("--disturbance", "NAME=BOUND", "largest absolute value of a disturbance; may be repeated"),
-    option("--noise-bound", "N", "standard deviations that no noise exceeds", type=float),
-    option("--initial", "STATE=BOUND", "pointwise, discrete designs: bound of a state of the plant at the start (or "
-           "LOW:HIGH); may be repeated"),
-    option("--initial-error", "E", "bound on the norm of the error at the start", type=float),
-    option("--false-alarms", "P", "statistical kinds: probability of a false alarm in the whole run (default: "
-           "%(default)s)", type=float, default=FALSE_ALARMS),
-    option("--window", "N", "samples looked back (default: 20)", type=int, default=20),
-    option("--change", "X", "cusum: change to be found, in deviations of the residual, or in parameter units (default: "
-           "1)", type=float, default=1.0),
-))  # fmt: skip
+MONITOR_SETTINGS = Settings(
+    (
+        option("--disturbance", "NAME=BOUND", "largest absolute value of a disturbance; may be repeated"),
+        option("--noise-bound", "N", "standard deviations that no noise exceeds", type=float),
+        option(
+            "--initial",
+            "STATE=BOUND",
+            "pointwise, discrete designs: bound of a state of the plant at the start (or LOW:HIGH); may be repeated",
+        ),
+        option("--initial-error", "E", "bound on the norm of the error at the start", type=float),
+        option(
+            "--false-alarms",
+            "P",
+            "statistical kinds: probability of a false alarm in the whole run (default: %(default)s)",
+            type=float,
+            default=FALSE_ALARMS,
+        ),
+        option("--window", "N", "samples looked back (default: 20)", type=int, default=20),
+        option(
+            "--change",
+            "X",
+            "cusum: change to be found, in deviations of the residual, or in parameter units (default: 1)",
+            type=float,
+            default=1.0,
+        ),
+    )
+)
 #: How a log is read, and what is watched in it.
 DATA_OPTIONS = (
-    MAP, MONITOR,
+    MAP,
+    MONITOR,
     option("--normal", "FILE", "monitor 'learned': what the verb thresholds wrote (.json), or a log without faults"),
     MONITOR_SETTINGS,
-    Settings((
-        TIME_COLUMN,
-        SCALE,
-        option("--threshold", "COLUMN=LEVEL", "alarm when the absolute value of a column of the output passes a level; "
-               "may be repeated"),
-        option("--nominal", "NAME=VALUE", "monitor of a recursive design: nominal value of a parameter; may be "
-               "repeated"),
-        option("--sample-time", "SECONDS", "monitor of a continuous design: between the rows", type=float),
-        option("--gap", "SECONDS", "continuous designs: longer intervals are gaps", type=float),
-        option("--warm-up", "SECONDS", "how long to mark the start, and after gaps", type=float),
-    )),
-)  # fmt: skip
+    Settings(
+        (
+            TIME_COLUMN,
+            SCALE,
+            option(
+                "--threshold",
+                "COLUMN=LEVEL",
+                "alarm when the absolute value of a column of the output passes a level; may be repeated",
+            ),
+            option(
+                "--nominal",
+                "NAME=VALUE",
+                "monitor of a recursive design: nominal value of a parameter; may be repeated",
+            ),
+            option("--sample-time", "SECONDS", "monitor of a continuous design: between the rows", type=float),
+            option("--gap", "SECONDS", "continuous designs: longer intervals are gaps", type=float),
+            option("--warm-up", "SECONDS", "how long to mark the start, and after gaps", type=float),
+        )
+    ),
+)

@@ -71,13 +71,21 @@ def run_linearise(options: argparse.Namespace) -> int:
     if target is not None:
         write_atomically(target, plant_document(linear, options.system.name))
     told = linear_plant_text(linear) if found is None else f"{linear_plant_text(linear)}\n{found}"
-    answer(options, {
-        "system": options.system, "file": target, "operating_point": dict(linear.operating_point),
-        "validity": None if found is None else found.to_dict(),
-        **{name: getattr(linear, name) for name in ("E", "A", "B", "C", "Bf", "Df", "Bd")},
-        **{name: list(getattr(linear, name)) for name in (
-            "state_names", "input_names", "output_names", "fault_names", "disturbance_names")},
-    }, told)  # fmt: skip
+    answer(
+        options,
+        {
+            "system": options.system,
+            "file": target,
+            "operating_point": dict(linear.operating_point),
+            "validity": None if found is None else found.to_dict(),
+            **{name: getattr(linear, name) for name in ("E", "A", "B", "C", "Bf", "Df", "Bd")},
+            **{
+                name: list(getattr(linear, name))
+                for name in ("state_names", "input_names", "output_names", "fault_names", "disturbance_names")
+            },
+        },
+        told,
+    )
     return 0
 
 
@@ -99,8 +107,9 @@ def run_calibrate(options: argparse.Namespace) -> int:
         if digest is not None and digest != found.box.digest:
             raise SpecError(
                 f"The log {log} is not the one that the spec names: its digest is {found.box.digest}, and "
-                f"calibrate.digest {digest}.", path="calibrate.digest",
-            )  # fmt: skip
+                f"calibrate.digest {digest}.",
+                path="calibrate.digest",
+            )
     data = {"kind": "obsynth calibration", "system": options.system.name, **found.to_dict()}
     if target is not None:
         import json

@@ -38,11 +38,17 @@ def run_design(options: argparse.Namespace) -> int:
     from obsynth.report.summary import summary
 
     if options.json:
-        print_json({
-            "command": "design", "spec": str(spec.path), "file": str(file), "passed": design.report.passed,
-            "summary": summary(design, everything=True).as_dict(),
-            "gain_set": {"written_for": place_of(spec.path), **design_as_dict(design)},
-        }, is_plain=True)  # fmt: skip
+        print_json(
+            {
+                "command": "design",
+                "spec": str(spec.path),
+                "file": str(file),
+                "passed": design.report.passed,
+                "summary": summary(design, everything=True).as_dict(),
+                "gain_set": {"written_for": place_of(spec.path), **design_as_dict(design)},
+            },
+            is_plain=True,
+        )
         return 0
     _print_design(design, file, verbose=options.verbose)
     return 0
@@ -89,16 +95,21 @@ def designed(spec: Spec, report_stage: Any) -> ObserverDesign:
 
     recovery = None if spec.transformation is None else spec.transformation.recovery
     found = design(
-        spec.plant, spec.method, name=spec.name, recovery=recovery, progress=report_stage, scenario=spec.scenario,
+        spec.plant,
+        spec.method,
+        name=spec.name,
+        recovery=recovery,
+        progress=report_stage,
+        scenario=spec.scenario,
         **dict(spec.options),
-    )  # fmt: skip
+    )
     noted = () if spec.transformation is None else spec.transformation.notes
     return found.replace(notes=(*noted, *found.notes)) if noted else found
 
 
 def designed_or_loaded(
     spec: Spec, gains: Path | None, report_stage: Any, *, unverified: bool = False
-) -> ObserverDesign:  # fmt: skip
+) -> ObserverDesign:
     """Return the design that a spec asks for, or a saved one of the same plant, verified again."""
     if gains is None:
         return designed(spec, report_stage)
@@ -164,12 +175,19 @@ def run_check(options: argparse.Namespace) -> int:
             console.print()
         print_methods(methods, own=spec.method, console=console)
 
-    answer(options, {
-        "spec": spec.path, "method": spec.method, "passed": passed,
-        "transformation": done, "diagnosis": None if diagnosis is None else diagnosis.to_dict(),
-        "structure": {name.replace(" ", "_"): _structure_as_dict(found) for name, found in structures.items()},
-        "methods": {name: report.as_dict() for name, report in methods.items()},
-    }, told)  # fmt: skip
+    answer(
+        options,
+        {
+            "spec": spec.path,
+            "method": spec.method,
+            "passed": passed,
+            "transformation": done,
+            "diagnosis": None if diagnosis is None else diagnosis.to_dict(),
+            "structure": {name.replace(" ", "_"): _structure_as_dict(found) for name, found in structures.items()},
+            "methods": {name: report.as_dict() for name, report in methods.items()},
+        },
+        told,
+    )
     return 0 if passed else PreconditionError.exit_code
 
 
@@ -215,16 +233,26 @@ def run_verify(options: argparse.Namespace) -> int:
         from obsynth.results.layout import print_checks
 
         report = verify_alarm(options.gains)
-        answer(options, {"file": str(options.gains), "passed": report.passed, "report": report.as_dict()},
-               lambda: print_checks(report.checks, console=stdout_console()))  # fmt: skip
+        answer(
+            options,
+            {"file": str(options.gains), "passed": report.passed, "report": report.as_dict()},
+            lambda: print_checks(report.checks, console=stdout_console()),
+        )
     else:
         from obsynth.methods.verifying import verify
         from obsynth.results.gain_sets import load
 
         design = load(options.gains)
         report = verify(design, printed_digits=options.printed_digits)
-        answer(options, {
-            "file": str(options.gains), "name": design.name, "method": design.method, "passed": report.passed,
-            "report": report.as_dict(),
-        }, lambda: _print_design(design.replace(report=report), options.gains, verbose=options.verbose))  # fmt: skip
+        answer(
+            options,
+            {
+                "file": str(options.gains),
+                "name": design.name,
+                "method": design.method,
+                "passed": report.passed,
+                "report": report.as_dict(),
+            },
+            lambda: _print_design(design.replace(report=report), options.gains, verbose=options.verbose),
+        )
     return 0 if report.passed else VerificationError.exit_code

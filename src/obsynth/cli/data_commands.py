@@ -41,16 +41,31 @@ def run_run(options: argparse.Namespace) -> int:
     certificate = certificate_target(options)
     design, mark = gains_to_hand_on(options.gains, unverified=options.unverified)
     watched = monitor_of(design, options)
-    found = run_of(design, options, watched, out, recovered=_recovered(options.recovered), outliers=options.outliers,
-                   smooth=options.smooth, lag=options.lag, state=options.state,
-                   state_every=options.state_every)  # fmt: skip
+    found = run_of(
+        design,
+        options,
+        watched,
+        out,
+        recovered=_recovered(options.recovered),
+        outliers=options.outliers,
+        smooth=options.smooth,
+        lag=options.lag,
+        state=options.state,
+        state_every=options.state_every,
+    )
     proof = None if certificate is None else alarm_of_run(design, options, found, certificate)
     if options.json:
-        print_json({
-            "command": "run", **({} if proof is None else {"proof": proof}), "gains": str(options.gains),
-            "file": str(out), **found.as_dict(), **({"unverified": mark} if mark else {}),
-            "monitor": None if watched is None else {"kind": watched.kind, "statement": watched.statement},
-        })  # fmt: skip
+        print_json(
+            {
+                "command": "run",
+                **({} if proof is None else {"proof": proof}),
+                "gains": str(options.gains),
+                "file": str(out),
+                **found.as_dict(),
+                **({"unverified": mark} if mark else {}),
+                "monitor": None if watched is None else {"kind": watched.kind, "statement": watched.statement},
+            }
+        )
     elif not options.quiet:
         # The estimates themselves may be on stdout.
         stream = sys.stderr if out is sys.stdout else sys.stdout
@@ -72,10 +87,14 @@ def run_export(options: argparse.Namespace) -> int:
     for file, kind in exported_files(options.to).items():
         output_file(file, kind, options, option="--to")
     files = export(
-        design, options.to, sample_time=options.sample_time, fmi=options.fmi,
-        thresholds=numbers_of(options.threshold) or None, warm_up=options.warm_up,
+        design,
+        options.to,
+        sample_time=options.sample_time,
+        fmi=options.fmi,
+        thresholds=numbers_of(options.threshold) or None,
+        warm_up=options.warm_up,
         unverified=options.unverified,
-    )  # fmt: skip
+    )
     answer(options, {"gains": options.gains, "files": files, **({"unverified": mark} if mark else {})}, mark)
     return 0
 
@@ -89,10 +108,20 @@ def run_prove_alarm(options: argparse.Namespace) -> int:
     target = None if options.out is None else output_file(options.out, CERTIFICATE, options)
     found = proof_of(design, options, options.row, state_bounds=numbers_of(options.state_bound) or None)
     file = str(found.save(target)) if found.proved and target is not None else None
-    answer(options, {
-        "gains": options.gains, "proved": found.proved, "row": found.row, "window": found.window,
-        "margin": found.margin, "statement": found.statement, "origin": found.origin, "file": file,
-    }, found.statement + (f"\nCertificate: {file}" if file else ""))  # fmt: skip
+    answer(
+        options,
+        {
+            "gains": options.gains,
+            "proved": found.proved,
+            "row": found.row,
+            "window": found.window,
+            "margin": found.margin,
+            "statement": found.statement,
+            "origin": found.origin,
+            "file": file,
+        },
+        found.statement + (f"\nCertificate: {file}" if file else ""),
+    )
     return 0
 
 
@@ -118,9 +147,17 @@ def run_report(options: argparse.Namespace) -> int:
         watched = monitor_of(design, options, has_scenario=True)
         run = run_of(design, options, watched)
     file = html_report(
-        design, options.out, report=report, gains_file=options.gains.name, scenario=scenario, system_file=system,
-        run=run, data_file=options.data, statement="" if watched is None else watched.statement, rows=options.rows,
-    )  # fmt: skip
+        design,
+        options.out,
+        report=report,
+        gains_file=options.gains.name,
+        scenario=scenario,
+        system_file=system,
+        run=run,
+        data_file=options.data,
+        statement="" if watched is None else watched.statement,
+        rows=options.rows,
+    )
     answer(options, {"gains": options.gains, "file": file, "passed": report.passed})
     return 0 if report.passed else VerificationError.exit_code
 

@@ -38,19 +38,29 @@ def protect_inputs(options: argparse.Namespace) -> None:
 
 
 def run_of(
-    design: ObserverDesign, options: argparse.Namespace, watched: OnlineMonitor | None,
-    out: Path | TextIO | None = None, **more: Any,
-) -> DataRun:  # fmt: skip
+    design: ObserverDesign,
+    options: argparse.Namespace,
+    watched: OnlineMonitor | None,
+    out: Path | TextIO | None = None,
+    **more: Any,
+) -> DataRun:
     """Return a run of a design on the data of the command line, with its table where it is not written to ``out``."""
     from obsynth.data.run import run_on_data
 
     with rows_done(options.data, quiet=getattr(options, "quiet", True) or out is sys.stdout) as progress:
         found = run_on_data(
-            design, sys.stdin if options.data == STREAM else Path(options.data), out, columns=columns_of(options),
+            design,
+            sys.stdin if options.data == STREAM else Path(options.data),
+            out,
+            columns=columns_of(options),
             scales=numbers_of(options.scale),
-            thresholds=numbers_of(options.threshold), monitor=watched, gap=options.gap, warm_up=options.warm_up,
-            progress=progress, **more,
-        )  # fmt: skip
+            thresholds=numbers_of(options.threshold),
+            monitor=watched,
+            gap=options.gap,
+            warm_up=options.warm_up,
+            progress=progress,
+            **more,
+        )
     for text in found.warnings:
         print(f"Warning: {text}", file=sys.stderr)
     return found
@@ -93,11 +103,16 @@ def own_tolerances(design: ObserverDesign, kind: str | None) -> Uncertainty | No
 def monitor_settings(design: ObserverDesign, options: argparse.Namespace) -> dict[str, Any]:
     """Return what any monitor of a design is made of, by the names of the arguments of `obsynth.monitor`."""
     return {
-        "disturbance_bounds": numbers_of(options.disturbance), "noise_bound": options.noise_bound,
-        "initial_error": options.initial_error, "window": options.window, "false_alarms": options.false_alarms,
-        "change": options.change, "initial_set": ranges_of(options.initial) or None,
-        "constants": own_tolerances(design, options.monitor), "unverified": options.unverified,
-    }  # fmt: skip
+        "disturbance_bounds": numbers_of(options.disturbance),
+        "noise_bound": options.noise_bound,
+        "initial_error": options.initial_error,
+        "window": options.window,
+        "false_alarms": options.false_alarms,
+        "change": options.change,
+        "initial_set": ranges_of(options.initial) or None,
+        "constants": own_tolerances(design, options.monitor),
+        "unverified": options.unverified,
+    }
 
 
 def monitor_of(
@@ -105,8 +120,16 @@ def monitor_of(
 ) -> OnlineMonitor | None:
     """Return the monitor that is asked for."""
     if options.monitor is None:
-        of_monitors = (*(() if has_scenario else ("system",)), "noise_bound", "initial_error", "sample_time",
-                       "disturbance", "nominal", "initial", "normal")  # fmt: skip
+        of_monitors = (
+            *(() if has_scenario else ("system",)),
+            "noise_bound",
+            "initial_error",
+            "sample_time",
+            "disturbance",
+            "nominal",
+            "initial",
+            "normal",
+        )
         asked = [name for name in of_monitors if getattr(options, name)]
         if asked:
             flag = f"--{asked[0].replace('_', '-')}"
@@ -123,9 +146,14 @@ def monitor_of(
         require_same_signals(design, options.gains, spec)
         scenario = required_scenario(spec)
     return online_monitor(
-        design, options.monitor, scenario=scenario, nominal=numbers_of(options.nominal),
-        sample_time=options.sample_time, normal=options.normal, **monitor_settings(design, options),
-    )  # fmt: skip
+        design,
+        options.monitor,
+        scenario=scenario,
+        nominal=numbers_of(options.nominal),
+        sample_time=options.sample_time,
+        normal=options.normal,
+        **monitor_settings(design, options),
+    )
 
 
 def summary_of_run(found: DataRun, watched: OnlineMonitor | None) -> str:
@@ -236,8 +264,9 @@ def certificate_target(options: argparse.Namespace) -> Path | None:
     if options.monitor != "pointwise":
         raise SpecError("--prove is for alarms of --monitor pointwise.", path="--prove")
     if options.data == STREAM or options.state is not None:
-        raise SpecError("--prove reads the data again from their first row on: give --data a file, and no --state.",
-                        path="--prove")  # fmt: skip
+        raise SpecError(
+            "--prove reads the data again from their first row on: give --data a file, and no --state.", path="--prove"
+        )
     return output_file(options.prove, CERTIFICATE, options, option="--prove")
 
 
@@ -259,8 +288,15 @@ def proof_of(design: ObserverDesign, options: argparse.Namespace, row: int, **mo
     from obsynth.data.alarm_proof import prove_alarm
 
     return prove_alarm(
-        design, Path(options.data), row, window=options.window, columns=columns_of(options),
-        scales=numbers_of(options.scale), disturbance_bounds=numbers_of(options.disturbance),
-        noise_bound=options.noise_bound, initial_set=ranges_of(options.initial) or None, unverified=options.unverified,
+        design,
+        Path(options.data),
+        row,
+        window=options.window,
+        columns=columns_of(options),
+        scales=numbers_of(options.scale),
+        disturbance_bounds=numbers_of(options.disturbance),
+        noise_bound=options.noise_bound,
+        initial_set=ranges_of(options.initial) or None,
+        unverified=options.unverified,
         **more,
-    )  # fmt: skip
+    )

@@ -38,9 +38,7 @@ def _prepared(
     if options.gains is not None:
         protect(options.gains)
     target = None if options.out is None else spec_output(options.out, kind, spec, options, option="--out")
-    return spec, scenario, target, designed_or_loaded(
-        spec, options.gains, report_stage, unverified=options.unverified
-    )  # fmt: skip
+    return spec, scenario, target, designed_or_loaded(spec, options.gains, report_stage, unverified=options.unverified)
 
 
 def run_simulate(options: argparse.Namespace) -> int:
@@ -55,27 +53,35 @@ def run_simulate(options: argparse.Namespace) -> int:
     from obsynth.report.scenarios import simulation_report
 
     answer(
-        options, {"spec": spec.path, "file": written, **found.summary()},
+        options,
+        {"spec": spec.path, "file": written, **found.summary()},
         lambda: simulation_report(design.name, found, console=stdout_console(), units=design.plant.units, file=written),
-    )  # fmt: skip
+    )
     return 0
 
 
 def _run_tolerances(options: argparse.Namespace) -> int:
     """Run ``evaluate --tolerances``: spec in, a table and a picture out."""
     if options.plants is not None or options.monitor not in (None, "pointwise"):
-        raise SpecError("--tolerances compares two pointwise monitors on plants that it draws itself: leave out "
-                        "--plants and --monitor.", path="--tolerances")  # fmt: skip
+        raise SpecError(
+            "--tolerances compares two pointwise monitors on plants that it draws itself: leave out "
+            "--plants and --monitor.",
+            path="--tolerances",
+        )
     with progress(quiet=options.quiet) as report_stage:
         kind = None if options.out is None else picture_kind(options.out)
         spec, scenario, target, design = _prepared(options, report_stage, kind)
         from obsynth.experiments.tolerance_study import tolerance_study
 
         found = tolerance_study(
-            design, scenario, tolerances=[_tolerance(item) for item in options.tolerances.split(",")],
-            runs=options.runs, disturbance_bounds=numbers_of(options.disturbance) or None,
-            noise_bound=options.noise_bound, progress=report_stage,
-        )  # fmt: skip
+            design,
+            scenario,
+            tolerances=[_tolerance(item) for item in options.tolerances.split(",")],
+            runs=options.runs,
+            disturbance_bounds=numbers_of(options.disturbance) or None,
+            noise_bound=options.noise_bound,
+            progress=report_stage,
+        )
     if target is not None:
         from obsynth.plotting.trade_off import plot_tolerances
 
@@ -113,10 +119,15 @@ def run_evaluate(options: argparse.Namespace) -> int:
             watched = ParameterMonitor(options.monitor, false_alarms=options.false_alarms, change=options.change)
         with chosen_executor(options.jobs, None) as executor:
             found = evaluate(
-                design, scenario, runs=options.runs, monitor=watched, executor=executor,
-                progress=lambda done, total: report_stage(f"{done} of {total} runs"), confidence=options.confidence,
+                design,
+                scenario,
+                runs=options.runs,
+                monitor=watched,
+                executor=executor,
+                progress=lambda done, total: report_stage(f"{done} of {total} runs"),
+                confidence=options.confidence,
                 plants=options.plants,
-            )  # fmt: skip
+            )
     from obsynth.report.scenarios import described, evaluation_report, final_threshold
 
     told: dict[str, Any] | None = None
@@ -124,10 +135,12 @@ def run_evaluate(options: argparse.Namespace) -> int:
         kind, statement = described(watched)
         told = {"kind": kind, "statement": statement, "final_threshold": final_threshold(watched)}
     answer(
-        options, {"spec": spec.path, "monitor": told, **found.as_dict()},
-        lambda: evaluation_report(design.name, found, monitor=watched, console=stdout_console(),
-                                  units=design.plant.units),
-    )  # fmt: skip
+        options,
+        {"spec": spec.path, "monitor": told, **found.as_dict()},
+        lambda: evaluation_report(
+            design.name, found, monitor=watched, console=stdout_console(), units=design.plant.units
+        ),
+    )
     return 0
 
 
@@ -145,17 +158,28 @@ def run_compare(options: argparse.Namespace) -> int:
         plant, clock = _plant_and_clock(spec, options.sample_time)
         given = {} if spec.method == "auto" else {spec.method: spec.options}
         found = compare(
-            plant, scenario=spec.scenario, options=given, sample_time=clock, within=options.within,
-            tolerance=options.tolerance, runs=options.runs, data=options.data, columns=columns_of(options),
-            scales=numbers_of(options.scale), progress=report_stage,
-        )  # fmt: skip
+            plant,
+            scenario=spec.scenario,
+            options=given,
+            sample_time=clock,
+            within=options.within,
+            tolerance=options.tolerance,
+            runs=options.runs,
+            data=options.data,
+            columns=columns_of(options),
+            scales=numbers_of(options.scale),
+            progress=report_stage,
+        )
         if options.out is not None:
             report_stage(f"writing {options.out}")
             write_atomically(options.out, found.page())
     from obsynth.report.scenarios import comparison_report
 
-    answer(options, {"spec": spec.path, **found.to_dict()},
-           lambda: comparison_report(found, console=stdout_console(), file=options.out))  # fmt: skip
+    answer(
+        options,
+        {"spec": spec.path, **found.to_dict()},
+        lambda: comparison_report(found, console=stdout_console(), file=options.out),
+    )
     return 0 if found.recommended else PreconditionError.exit_code
 
 

@@ -39,8 +39,10 @@ def run_sweep(options: argparse.Namespace) -> int:
         claims = {name for result in found.results for name in result.claims}
         if options.claim is not None and options.claim not in claims:
             known = ", ".join(sorted(claims)) or "none"
-            print(f"Warning: no picture is written, as no design claims {options.claim!r}; there are: {known}.",
-                  file=sys.stderr)  # fmt: skip
+            print(
+                f"Warning: no picture is written, as no design claims {options.claim!r}; there are: {known}.",
+                file=sys.stderr,
+            )
             return None
         return found.plot(options.claim) if claims else None
 
@@ -64,8 +66,10 @@ def _require_claim(options: argparse.Namespace, parameters: dict[str, list[Any]]
     known = REGISTRY if any(method not in REGISTRY for method in methods) else methods
     claims = sorted({claim for method in known for claim in method_class(method).claims})
     if options.claim not in claims:
-        raise SpecError(f"No method of this sweep claims {options.claim!r}: give --claim one of {', '.join(claims)}.",
-                        path="--claim")  # fmt: skip
+        raise SpecError(
+            f"No method of this sweep claims {options.claim!r}: give --claim one of {', '.join(claims)}.",
+            path="--claim",
+        )
 
 
 def run_many(options: argparse.Namespace) -> int:
@@ -84,11 +88,16 @@ def run_many(options: argparse.Namespace) -> int:
         if path.is_file():
             input_file(path)  # what is read is never written, by force or not
     asked = {
-        "columns": dict(options.map) or None, "time_column": options.time_column, "outliers": options.outliers,
-        "scales": numbers_of(options.scale) or None, "thresholds": numbers_of(options.threshold) or None,
-        "gap": options.gap, "warm_up": options.warm_up, "recovered": options.recovered,
+        "columns": dict(options.map) or None,
+        "time_column": options.time_column,
+        "outliers": options.outliers,
+        "scales": numbers_of(options.scale) or None,
+        "thresholds": numbers_of(options.threshold) or None,
+        "gap": options.gap,
+        "warm_up": options.warm_up,
+        "recovered": options.recovered,
         "unverified": options.unverified or None,
-    }  # fmt: skip
+    }
 
     def work(executor: Executor | None, done: Callable[[int, int], None]) -> Any:
         stated = {name: value for name, value in asked.items() if value is not None}
@@ -96,18 +105,24 @@ def run_many(options: argparse.Namespace) -> int:
 
     table = FileKind("the table of many runs", rb"\Arun,status,")
     found, files = _carried_out(
-        options, folder, ("runs", table, "fleet.png"), work,
+        options,
+        folder,
+        ("runs", table, "fleet.png"),
+        work,
         lambda found: found.plot() if "run" in found.counts else None,
-    )  # fmt: skip
+    )
     if options.json or not options.quiet:
         _tell(options, found, files, "runs")
     return 0
 
 
 def _carried_out(
-    options: argparse.Namespace, folder: Path, named: tuple[str, FileKind, str],
-    work: Callable[[Executor | None, Callable[[int, int], None]], Any], draw: Callable[[Any], Any],
-) -> tuple[Any, tuple[Path, ...]]:  # fmt: skip
+    options: argparse.Namespace,
+    folder: Path,
+    named: tuple[str, FileKind, str],
+    work: Callable[[Executor | None, Callable[[int, int], None]], Any],
+    draw: Callable[[Any], Any],
+) -> tuple[Any, tuple[Path, ...]]:
     """Return what ``work`` comes to, and the files of its table and picture; nothing is left of a folder in vain."""
     what, kind, picture_name = named
     with made_folder(folder):

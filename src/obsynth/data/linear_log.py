@@ -240,9 +240,10 @@ class DataObserver(Engine):
         self.z, self.v, self.row, self.measured = np.array(after[last]), values[last], rows[last], values[last]
         self.fault = self._faults_in(rows[last])
         self.seen = (
-            rows[last][observer.state_rows] if self.partial is None
+            rows[last][observer.state_rows]
+            if self.partial is None
             else self.partial.state(states[last], values[last], self.fault)
-        )  # fmt: skip
+        )
         self.inputs.extend(v[: self.nu] for v in values[max(count - (self.inputs.maxlen or count), 0) : count])
         settled, phase, forgotten = self.settled_at, self.phase, self.forgotten_at
         nu, nx = self.nu, len(self.state_names)
@@ -345,10 +346,17 @@ class DataObserver(Engine):
 
     def _own_data(self) -> dict[str, Any]:
         return {
-            "z": self.z, "v": self.v, "row": self.row, "model": self.model, "fault": self.fault,
-            "inputs": np.array(list(self.inputs)).reshape(len(self.inputs), self.nu), "measured": self.measured,
-            "seen": self.seen, "forgotten_at": self.forgotten_at, "begun": self.begun,
-        }  # fmt: skip
+            "z": self.z,
+            "v": self.v,
+            "row": self.row,
+            "model": self.model,
+            "fault": self.fault,
+            "inputs": np.array(list(self.inputs)).reshape(len(self.inputs), self.nu),
+            "measured": self.measured,
+            "seen": self.seen,
+            "forgotten_at": self.forgotten_at,
+            "begun": self.begun,
+        }
 
     def _resume_own(self, data: dict[str, Any]) -> None:
         self.z, self.v, self.row, self.model = data["z"], data["v"], data["row"], data["model"]
@@ -364,8 +372,11 @@ def engine_of(
     """Return a running design, at its start; ``outliers`` takes the place of what the design says of them."""
     if isinstance(design.observer, LinearObserver):
         if outliers not in (None, "none"):
-            raise SpecError("outliers is for recursive and nonlinear designs, which know how far a sample may be from "
-                            "its prediction.", path="outliers")  # fmt: skip
+            raise SpecError(
+                "outliers is for recursive and nonlinear designs, which know how far a sample may be from "
+                "its prediction.",
+                path="outliers",
+            )
         return DataObserver(design, gap=gap, warm_up=warm_up)
     if gap is not None:
         raise SpecError(SAMPLED_GAP, path="gap")

@@ -13,11 +13,42 @@ from obsynth.numerics.arrays import FloatArray
 
 _KEYWORDS = frozenset(
     {
-        "auto", "break", "case", "char", "const", "continue", "default", "do", "double", "else", "enum", "extern",
-        "float", "for", "goto", "if", "inline", "int", "long", "register", "restrict", "return", "short", "signed",
-        "sizeof", "static", "struct", "switch", "typedef", "union", "unsigned", "void", "volatile", "while",
+        "auto",
+        "break",
+        "case",
+        "char",
+        "const",
+        "continue",
+        "default",
+        "do",
+        "double",
+        "else",
+        "enum",
+        "extern",
+        "float",
+        "for",
+        "goto",
+        "if",
+        "inline",
+        "int",
+        "long",
+        "register",
+        "restrict",
+        "return",
+        "short",
+        "signed",
+        "sizeof",
+        "static",
+        "struct",
+        "switch",
+        "typedef",
+        "union",
+        "unsigned",
+        "void",
+        "volatile",
+        "while",
     }
-)  # fmt: skip
+)
 
 
 def c_identifier(text: str) -> str:
@@ -74,13 +105,23 @@ def header_text(found: Realisation, prefix: str) -> str:
     before, after = found.operating_point
     lines = [
         comment(f"Observer {quoted(found.design.name)} by {quoted(found.design.method)}, written by obsynth."),
-        *([comment(found.note)] if found.note else []), *([comment(quoted(found.mark))] if found.mark else []),
-        f"#ifndef {guard}", f"#define {guard}", "",
-        comment("sha256 of the gain set"), f'#define {prefix.upper()}_SHA256 "{found.digest}"',
-        comment("seconds between samples"), f"#define {prefix.upper()}_DT {observer.dt!r}",
-        "", "typedef struct {", f"    double z[{max(observer.order, 1)}];", f"}} {prefix}_state;", "",
+        *([comment(found.note)] if found.note else []),
+        *([comment(quoted(found.mark))] if found.mark else []),
+        f"#ifndef {guard}",
+        f"#define {guard}",
+        "",
+        comment("sha256 of the gain set"),
+        f'#define {prefix.upper()}_SHA256 "{found.digest}"',
+        comment("seconds between samples"),
+        f"#define {prefix.upper()}_DT {observer.dt!r}",
+        "",
+        "typedef struct {",
+        f"    double z[{max(observer.order, 1)}];",
+        f"}} {prefix}_state;",
+        "",
         comment("Start where the design does." if found.start.any() else "Start at rest."),
-        f"void {prefix}_reset({prefix}_state *state);", "",
+        f"void {prefix}_reset({prefix}_state *state);",
+        "",
         comment("Take one sample of each signal, write the estimates at that sample, and advance."),
         comment("Signals are deviations from the operating point. Returns 0; or 1 if a sample is not finite:"),
         comment("the state and the estimates are left as they were then."),
@@ -89,8 +130,10 @@ def header_text(found: Realisation, prefix: str) -> str:
         *_signal_comments("states", observer.state_names, after, observer.state_delays),
         *_signal_comments("faults", observer.fault_names, after[len(observer.state_names) :], observer.fault_delays),
         *_signal_comments("residuals", observer.residual_names, None),
-        f"{_step_signature(found, prefix)};", "", "#endif",
-    ]  # fmt: skip
+        f"{_step_signature(found, prefix)};",
+        "",
+        "#endif",
+    ]
     return "\n".join(lines) + "\n"
 
 
@@ -106,24 +149,41 @@ def source_text(found: Realisation, prefix: str, header: str) -> str:
     }
     blocks["next"] = {"z": observer.Az, "u": observer.Bu, "y": observer.By}
     tables = [
-        line for target, parts in blocks.items() for signal, matrix in parts.items() if matrix.size
+        line
+        for target, parts in blocks.items()
+        for signal, matrix in parts.items()
+        if matrix.size
         for line in _tables(f"{target}_{signal}", matrix)
-    ]  # fmt: skip
+    ]
     large = any(_form(matrix) != PLAIN for parts in blocks.values() for matrix in parts.values())
-    body = ["int i;", *(["int j;"] if any(sizes.values()) else []),
-            f"double next[{sizes['z']}];" if sizes["z"] else "(void)state;"]  # fmt: skip
+    body = [
+        "int i;",
+        *(["int j;"] if any(sizes.values()) else []),
+        f"double next[{sizes['z']}];" if sizes["z"] else "(void)state;",
+    ]
     for signal in "uy":
         if sizes[signal]:
             body += _loop("i", sizes[signal], [f"if (!isfinite({signal}[i])) {{", "    return 1;", "}"])
     for target, parts in blocks.items():
         body += _product(target, parts)
     body += _loop("i", sizes["z"], ["state->z[i] = next[i];"]) if sizes["z"] else []
-    return "\n".join([
-        comment(f"sha256 of the gain set: {found.digest}"), *([comment(quoted(found.mark))] if found.mark else []),
-        f'#include "{included(header)}"', "", "#include <math.h>",
-        "", *([comment(ADVICE), ""] if large else []), *tables, *_reset(found, prefix),
-        *_function(_step_signature(found, prefix), [*body, "return 0;"]),
-    ]) + "\n"  # fmt: skip
+    return (
+        "\n".join(
+            [
+                comment(f"sha256 of the gain set: {found.digest}"),
+                *([comment(quoted(found.mark))] if found.mark else []),
+                f'#include "{included(header)}"',
+                "",
+                "#include <math.h>",
+                "",
+                *([comment(ADVICE), ""] if large else []),
+                *tables,
+                *_reset(found, prefix),
+                *_function(_step_signature(found, prefix), [*body, "return 0;"]),
+            ]
+        )
+        + "\n"
+    )
 
 
 def _reset(found: Realisation, prefix: str) -> list[str]:
@@ -158,8 +218,12 @@ def _product(target: str, parts: dict[str, FloatArray]) -> list[str]:
     if not rows:
         return []
     if all(_form(matrix) == PLAIN for matrix in parts.values()):
-        sums = [line for signal, matrix in parts.items() if matrix.size
-                for line in _row_sum("sum", f"{target}_{signal}", _vector(signal), matrix.shape[1])]  # fmt: skip
+        sums = [
+            line
+            for signal, matrix in parts.items()
+            if matrix.size
+            for line in _row_sum("sum", f"{target}_{signal}", _vector(signal), matrix.shape[1])
+        ]
         return _loop("i", rows, ["double sum = 0.0;", *sums, f"{target}[i] = sum;"])
     lines = [f"double sum[{rows}];", *_loop("i", rows, ["sum[i] = 0.0;"])]
     for signal, matrix in parts.items():

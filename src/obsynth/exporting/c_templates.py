@@ -30,8 +30,9 @@ def _template(name: str) -> str:
 def write_dae_c(design: ObserverDesign, target: Path, sample_time: float | None) -> tuple[Path, ...]:
     """Write source and header."""
     if target.suffix.lower() != ".c":
-        raise SpecError(f"{target}: the observer of a nonlinear plant is no matrices; it is exported as C (.c).",
-                        path=str(target))  # fmt: skip
+        raise SpecError(
+            f"{target}: the observer of a nonlinear plant is no matrices; it is exported as C (.c).", path=str(target)
+        )
     require_no_sample_time(design, sample_time)
     prefix, header = c_identifier(target.stem), target.with_suffix(".h")
     source, declarations, _ = dae_c_texts(design, prefix, header.name)
@@ -42,8 +43,9 @@ def require_no_sample_time(design: ObserverDesign, sample_time: float | None) ->
     """Raise `SpecError` where a sample time is given for an observer that is sampled."""
     if sample_time is not None:
         dt = design.nonlinear[1].dt
-        raise SpecError(f"The design is sampled already (dt = {dt:g} s): leave the sample time out.",
-                        path="sample_time")  # fmt: skip
+        raise SpecError(
+            f"The design is sampled already (dt = {dt:g} s): leave the sample time out.", path="sample_time"
+        )
 
 
 def dae_c_texts(design: ObserverDesign, prefix: str, header: str) -> tuple[str, str, str]:
@@ -51,19 +53,28 @@ def dae_c_texts(design: ObserverDesign, prefix: str, header: str) -> tuple[str, 
     _, observer = design.nonlinear
     digest = gain_set_digest(design)
     inner = f"{prefix}_observer" if observer.timing.is_plain else f"{prefix}_observer_memory"
-    source = "\n".join([
-        comment(f"sha256 of the gain set: {digest}"), f'#include "{included(header)}"', "",
-        f"#define observer {inner}", *([f"#define waiting {prefix}_observer"] if inner != f"{prefix}_observer" else []),
-        "", observer_code(observer.steps),
-        _step_text(prefix, design.nonlinear[0]),
-    ])  # fmt: skip
+    source = "\n".join(
+        [
+            comment(f"sha256 of the gain set: {digest}"),
+            f'#include "{included(header)}"',
+            "",
+            f"#define observer {inner}",
+            *([f"#define waiting {prefix}_observer"] if inner != f"{prefix}_observer" else []),
+            "",
+            observer_code(observer.steps),
+            _step_text(prefix, design.nonlinear[0]),
+        ]
+    )
     return source, "\n".join(_header(design, prefix, digest)) + "\n", digest
 
 
 def _step_text(prefix: str, model: DAEModel) -> str:
     """Return the two functions of the header; without inputs, C has no array for them."""
-    arguments, given, nothing = ("const double u[NU], ", "u", "") if model.nu else (
-        "", "nothing", "    static const double nothing[1] = {0.0};\n")  # fmt: skip
+    arguments, given, nothing = (
+        ("const double u[NU], ", "u", "")
+        if model.nu
+        else ("", "nothing", "    static const double nothing[1] = {0.0};\n")
+    )
     text = _template("dae_step.c").replace("PREFIX", prefix).replace("ARGUMENTS", arguments)
     return text.replace("NOTHING", nothing).replace("INPUT", given)
 
@@ -71,8 +82,13 @@ def _step_text(prefix: str, model: DAEModel) -> str:
 def _header(design: ObserverDesign, prefix: str, digest: str) -> Iterator[str]:
     model, observer = design.nonlinear
     guard, upper = f"{prefix.upper()}_H", prefix.upper()
-    sizes = {"states": model.nx, "state_deviations": model.nx, "parameters": model.nq,
-             "parameter_deviations": model.nq, "innovations": model.ny}  # fmt: skip
+    sizes = {
+        "states": model.nx,
+        "state_deviations": model.nx,
+        "parameters": model.nq,
+        "parameter_deviations": model.nq,
+        "innovations": model.ny,
+    }
     yield comment(f"Observer {quoted(design.name)} by {quoted(design.method)}, written by obsynth.")
     if mark := unverified_mark(design.report):
         yield comment(quoted(mark))
@@ -89,8 +105,12 @@ def _header(design: ObserverDesign, prefix: str, digest: str) -> Iterator[str]:
     yield comment("Take one sample: y at this sample, NaN where it is missing, and u during the step that ends at it.")
     yield comment("Returns 0; 1 if an input is not finite or an output infinite; 2 if the step has no solution:")
     yield comment("state and estimates are left as they were then.")
-    for array, names in (("u", model.input_names), ("y", model.output_names), ("states", model.state_names),
-                         ("parameters", model.parameter_names)):  # fmt: skip
+    for array, names in (
+        ("u", model.input_names),
+        ("y", model.output_names),
+        ("states", model.state_names),
+        ("parameters", model.parameter_names),
+    ):
         for i, name in enumerate(names):
             unit = model.units.get(name)
             yield comment(f"{array}[{i}]: {quoted(name)}" + (f", {quoted(unit)}" if unit else ""))
@@ -109,21 +129,27 @@ def threshold_header(bound: AdaptiveBound, prefix: str) -> str:
         comment("Thresholds over the tolerances of the plant: of the faults, then of the residuals."),
         "typedef struct {",
         *(f"    double {name}[{size}];" for name, size in zip(("psi", "ring", "eps", "largest"), sizes, strict=True)),
-        "    int at;", "    long k;", f"}} {prefix}_thresholds;", "",
-        f"void {prefix}_thresholds_reset({prefix}_thresholds *state);", "",
+        "    int at;",
+        "    long k;",
+        f"}} {prefix}_thresholds;",
+        "",
+        f"void {prefix}_thresholds_reset({prefix}_thresholds *state);",
+        "",
         comment("After each step of the observer: u, y, and its states, faults and residuals one after the other;"),
         comment(f"total gets {no} numbers."),
         f"void {prefix}_thresholds_step({prefix}_thresholds *state, const double *u, const double *y,",
-        "                               const double *rows, double *total);", "",
-    ]  # fmt: skip
+        "                               const double *rows, double *total);",
+        "",
+    ]
     return "\n".join(lines) + "\n"
 
 
 def threshold_source(bound: AdaptiveBound, prefix: str) -> str:
     """Return tables and functions, for the end of the source; `SpecError` for constants that vary."""
     if bound.varying:
-        raise SpecError("Thresholds are written as C for constants that stay the same (variation: constant).",
-                        path="monitor")  # fmt: skip
+        raise SpecError(
+            "Thresholds are written as C for constants that stay the same (variation: constant).", path="monitor"
+        )
     p, nz, rows, m, no = bound.counts
     structure = bound.structure
     n, out = structure.reading.shape
@@ -131,24 +157,51 @@ def threshold_source(bound: AdaptiveBound, prefix: str) -> str:
     ny = bound.rounding.shape[1] - 1 - nv
     theta, later = bound.start_later
     sizes = {
-        "P": p, "NZ": nz, "ROWS": rows, "M": m, "NO": no, "N": n, "NU": nv - n, "NY": ny, "NV": nv, "OUT": out,
-        "W": bound.width, "L": bound.length, "NR": bound.rounding.shape[1], "SINGLE": structure.single,
-        "OWN": len(structure.owner), "DRIVEN": len(bound.remainder_inputs), "START": len(bound.start),
-    }  # fmt: skip
+        "P": p,
+        "NZ": nz,
+        "ROWS": rows,
+        "M": m,
+        "NO": no,
+        "N": n,
+        "NU": nv - n,
+        "NY": ny,
+        "NV": nv,
+        "OUT": out,
+        "W": bound.width,
+        "L": bound.length,
+        "NR": bound.rounding.shape[1],
+        "SINGLE": structure.single,
+        "OWN": len(structure.owner),
+        "DRIVEN": len(bound.remainder_inputs),
+        "START": len(bound.start),
+    }
     tables = {
-        "Az": structure.Az, "reading": structure.reading, "drive": bound.drive.reshape(-1, nv), "shown": bound.shown,
-        "offsets": structure.offsets[None], "channels": structure.channel_rows, "kernels": bound.kernels,
-        "same": bound.same, "solved": bound.solved, "tail": bound.tail, "nominal": bound.nominal[None],
-        "rounding": bound.rounding, "start": bound.start, "later": later[None],
+        "Az": structure.Az,
+        "reading": structure.reading,
+        "drive": bound.drive.reshape(-1, nv),
+        "shown": bound.shown,
+        "offsets": structure.offsets[None],
+        "channels": structure.channel_rows,
+        "kernels": bound.kernels,
+        "same": bound.same,
+        "solved": bound.solved,
+        "tail": bound.tail,
+        "nominal": bound.nominal[None],
+        "rounding": bound.rounding,
+        "start": bound.start,
+        "later": later[None],
         "driven": np.array([bound.remainder_inputs], dtype=np.float64),
-    }  # fmt: skip
+    }
     text = _template("adaptive_threshold.c")
     enumerated = ", ".join(f"{name} = {value}" for name, value in sizes.items())
     lines = [
-        "", f"enum {{ {enumerated} }};",
-        f"static const double THETA = {theta!r};", f"static const double ROUNDED = {THRESHOLD_ROUNDING!r};", "",
+        "",
+        f"enum {{ {enumerated} }};",
+        f"static const double THETA = {theta!r};",
+        f"static const double ROUNDED = {THRESHOLD_ROUNDING!r};",
+        "",
         *(line for name, table in tables.items() for line in table_lines(f"thresholds_{name}", _filled(table))),
-    ]  # fmt: skip
+    ]
     return "\n".join(lines) + "\n" + text.replace("PREFIX", prefix)
 
 

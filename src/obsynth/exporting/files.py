@@ -115,8 +115,9 @@ def export(
         from obsynth.exporting.fmu.archive import write_fmu
 
         require_kind(design, ObserverDesign, "design", "an ObserverDesign, such as obsynth.load(path)")
-        return (write_fmu(design, target, version=fmi, sample_time=sample_time, thresholds=thresholds,
-                          warm_up=warm_up),)  # fmt: skip
+        return (
+            write_fmu(design, target, version=fmi, sample_time=sample_time, thresholds=thresholds, warm_up=warm_up),
+        )
     if thresholds or warm_up is not None:
         raise SpecError("Thresholds and warm-up are for an FMU (.fmu): other files hold no alarms.", path="thresholds")
     if isinstance(design, ObserverDesign) and isinstance(design.observer, DAEObserver):
@@ -155,15 +156,17 @@ def _bound_of(monitor: OnlineMonitor, found: Realisation) -> AdaptiveBound:
     if bound is None:
         raise SpecError("The monitor has no thresholds over tolerances: make it with constants.", path="monitor")
     if bound.first is not None:
-        raise SpecError("Thresholds of continuous designs are not written as C: sample the plant first.",
-                        path="monitor")  # fmt: skip
+        raise SpecError(
+            "Thresholds of continuous designs are not written as C: sample the plant first.", path="monitor"
+        )
     return bound
 
 
 def _write_c(found: Realisation, target: Path, bound: AdaptiveBound | None = None) -> tuple[Path, ...]:
     if found.observer.dt == 0.0:
-        raise SpecError("The observer is continuous in time: give the sample time, in seconds, for C.",
-                        path="sample_time")  # fmt: skip
+        raise SpecError(
+            "The observer is continuous in time: give the sample time, in seconds, for C.", path="sample_time"
+        )
     prefix = c_identifier(target.stem)
     header = target.with_suffix(".h")
     source, declared = source_text(found, prefix, header.name), header_text(found, prefix)

@@ -46,8 +46,9 @@ class Realisation:
             if design.observer.outliers != "none":
                 raise SpecError(
                     f"Design {design.name!r} uses the option 'outliers', which exported code does not know: design it "
-                    "without, or run it with obsynth run.", path="outliers",
-                )  # fmt: skip
+                    "without, or run it with obsynth run.",
+                    path="outliers",
+                )
             found = steady_observer(design.observer)
             if sample_time is not None:
                 raise SpecError("A recursive design is sampled already: leave the sample time out.", path="sample_time")
@@ -55,8 +56,9 @@ class Realisation:
         if isinstance(design.observer, DAEObserver):
             raise SpecError(
                 f"Design {design.name!r} is for a nonlinear plant: it has no constant gains to write. Run it with "
-                "obsynth run, or with observer.step.", path="observer",
-            )  # fmt: skip
+                "obsynth run, or with observer.step.",
+                path="observer",
+            )
         _, observer = design.linear
         if sample_time is not None:
             if observer.dt > 0.0:
@@ -98,11 +100,19 @@ class Realisation:
         observer = self.observer
         before, after = self.operating_point
         return {
-            "A": observer.Az, "B": np.hstack([observer.Bu, observer.By]), "C": observer.Cz,
-            "D": np.hstack([observer.Du, observer.Dy]), "x0": self.start.reshape(-1, 1), "Ts": observer.dt,
-            "input_point": before, "output_point": after,
+            "A": observer.Az,
+            "B": np.hstack([observer.Bu, observer.By]),
+            "C": observer.Cz,
+            "D": np.hstack([observer.Du, observer.Dy]),
+            "x0": self.start.reshape(-1, 1),
+            "Ts": observer.dt,
+            "input_point": before,
+            "output_point": after,
             "delays": np.array([*observer.state_delays, *observer.fault_delays], dtype=np.float64),
-            "input_names": list(self.inputs), "output_names": list(self.outputs),
-            "name": self.design.name, "method": self.design.method, "sha256": self.digest,
+            "input_names": list(self.inputs),
+            "output_names": list(self.outputs),
+            "name": self.design.name,
+            "method": self.design.method,
+            "sha256": self.digest,
             **({"unverified": self.mark} if self.mark else {}),
-        }  # fmt: skip
+        }

@@ -101,8 +101,16 @@ def plot_data(
         tidy(panel)
     mark = "" if design is None or not design.report.checks else unverified_mark(design.report)
     if panels and mark:
-        panels[0].annotate(mark, (0.0, 1.0), xycoords="figure fraction", xytext=(4, -4), textcoords="offset points",
-                           va="top", fontsize=8, color="tab:red")  # fmt: skip
+        panels[0].annotate(
+            mark,
+            (0.0, 1.0),
+            xycoords="figure fraction",
+            xytext=(4, -4),
+            textcoords="offset points",
+            va="top",
+            fontsize=8,
+            color="tab:red",
+        )
     if panels:
         panels[-1].set_xlabel("time" if run.stamps.is_dated else "time (s)")
         if run.stamps.is_dated:
@@ -212,8 +220,9 @@ class _Drawing:
         shown, others = order[: MOST - 1], order[MOST - 1 :]
         parts = [values[:, i] for i in shown] + ([values[:, others].sum(axis=1)] if len(others) else [])
         labels = [names[i].removeprefix("share ") for i in shown] + (["other constants"] if len(others) else [])
-        panel.stackplot(self.table["time"], parts, labels=labels, colors=LINE_COLOURS[: len(parts)], alpha=0.7,
-                        linewidth=0.0)  # fmt: skip
+        panel.stackplot(
+            self.table["time"], parts, labels=labels, colors=LINE_COLOURS[: len(parts)], alpha=0.7, linewidth=0.0
+        )
         panel.set_ylim(0.0, 100.0)
         panel.set_ylabel("share of the\nthreshold (%)")
 

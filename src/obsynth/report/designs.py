@@ -50,9 +50,14 @@ def tolerance_facts(design: ObserverDesign) -> list[tuple[str, str]]:
 
 #: Signals of any kind of plant, as they are called here.
 _SIGNALS = {
-    "states": "state_names", "known inputs": "input_names", "outputs": "output_names", "faults": "fault_names",
-    "disturbances": "disturbance_names", "noise": "noise_names", "parameters": "parameter_names",
-}  # fmt: skip
+    "states": "state_names",
+    "known inputs": "input_names",
+    "outputs": "output_names",
+    "faults": "fault_names",
+    "disturbances": "disturbance_names",
+    "noise": "noise_names",
+    "parameters": "parameter_names",
+}
 
 
 def plant_facts(plant: DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel) -> Iterator[tuple[str, str]]:
@@ -251,8 +256,9 @@ def design_warnings(
     missed = (
         f"A unit step of {name} reads {figures.at_horizon:.3g} after {found.seconds:.3g} s: the estimate does not "
         "reach it by then."
-        for name, figures in found.figures.items() if not figures.reaches and name not in told
-    )  # fmt: skip
+        for name, figures in found.figures.items()
+        if not figures.reaches and name not in told
+    )
     return (*_undetectable(*pair), *missed)
 
 

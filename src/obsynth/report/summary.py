@@ -81,8 +81,10 @@ class Summary:
         """Return the summary as a piece of HTML."""
         colour = "#1a7f37" if self.passed else "#b42318"
         parts = [f'<p style="color:{colour};font-weight:600">{escape(self.verdict)}</p>', "<table>"]
-        parts += [f'<tr><th style="text-align:left">{escape(label)}</th><td style="text-align:left">{escape(text)}</td>'
-                  "</tr>" for label, text in self.facts]  # fmt: skip
+        parts += [
+            f'<tr><th style="text-align:left">{escape(label)}</th><td style="text-align:left">{escape(text)}</td></tr>'
+            for label, text in self.facts
+        ]
         parts += ["</table>", *([html_table([self.headings, *self.rows])] if self.rows else [])]
         parts += [f"<p>{escape(self.more)}</p>"] if self.more else []
         parts += [f'<p style="color:#9a6700">Warning: {escape(text)}</p>' for text in self.warnings]
@@ -92,10 +94,13 @@ class Summary:
     def as_dict(self) -> dict[str, Any]:
         """Return the summary as plain data."""
         return {
-            "verdict": self.verdict, "passed": self.passed, "facts": dict(self.facts),
+            "verdict": self.verdict,
+            "passed": self.passed,
+            "facts": dict(self.facts),
             "estimates": [dict(zip(self.headings, row, strict=True)) for row in self.rows],
-            "warnings": list(self.warnings), "notes": list(self.notes),
-        }  # fmt: skip
+            "warnings": list(self.warnings),
+            "notes": list(self.notes),
+        }
 
 
 def summary(design: ObserverDesign, *, file: Path | None = None, everything: bool = False) -> Summary:
@@ -110,9 +115,16 @@ def summary(design: ObserverDesign, *, file: Path | None = None, everything: boo
     more = _counted([(count, what) for count, what in hidden if count > 0])
     verdict = f"{design.name}: {verdict_line(design.report.checks).plain}"
     return Summary(
-        verdict, design.report.passed, tuple(_facts(design, steps)), headings, tuple(rows[:shown]),
-        f"{more} with -v" if more else "", warnings, notes, "" if file is None else str(file),
-    )  # fmt: skip
+        verdict,
+        design.report.passed,
+        tuple(_facts(design, steps)),
+        headings,
+        tuple(rows[:shown]),
+        f"{more} with -v" if more else "",
+        warnings,
+        notes,
+        "" if file is None else str(file),
+    )
 
 
 def print_summary(found: Summary, *, console: Console) -> None:
@@ -154,8 +166,11 @@ def _promise(design: ObserverDesign) -> Iterator[tuple[str, str]]:
     claims = design.certificate.claims
     for name in (name for name in _PROMISES if name in claims and name in known):
         unit = f" {known[name].unit}" if known[name].unit else ""
-        label, meaning = ("promise", known[name].meaning) if design.report.passed else (
-            "claimed", f"{unproved(known[name].meaning)} (NOT proved: checks fail)")  # fmt: skip
+        label, meaning = (
+            ("promise", known[name].meaning)
+            if design.report.passed
+            else ("claimed", f"{unproved(known[name].meaning)} (NOT proved: checks fail)")
+        )
         yield label, f"{name} = {number(claims[name])}{unit}, {meaning}"
 
 
@@ -165,8 +180,7 @@ def _slowest(design: ObserverDesign) -> str:
         seconds = transient(design.linear[1])
         if not math.isfinite(seconds):
             return f"the start is never forgotten; observer of order {design.observer.order}"
-        return (f"{100.0 * FORGOTTEN:g} % settling time {number(seconds)} s; observer of order "
-                f"{design.observer.order}")  # fmt: skip
+        return f"{100.0 * FORGOTTEN:g} % settling time {number(seconds)} s; observer of order {design.observer.order}"
     factor = design.certificate.claims.get("contraction", math.nan)
     return f"errors shrink to {number(100.0 * factor)} % per step on average; observer of order {design.observer.order}"
 
@@ -212,8 +226,10 @@ def _warnings(design: ObserverDesign, gains: FaultGains | None, steps: Followed)
         for j, name in enumerate(plant.disturbance_names):
             leak = float(gains.leaks[i, j])
             if leak >= NEAR_ONE and units.get(fault) == units.get(name):
-                yield (f"{name} reaches the estimate of {fault} with a gain of up to {number(leak)}: it looks like the "
-                       "fault.")  # fmt: skip
+                yield (
+                    f"{name} reaches the estimate of {fault} with a gain of up to {number(leak)}: it looks like the "
+                    "fault."
+                )
         followed = float(gains.steady[i])
         if abs(followed - 1.0) > FOLLOWS:
             share = number(100.0 * followed, digits=3)

@@ -86,8 +86,12 @@ def headed_table(*headings: str) -> Table:
 def facts_table(rows: Iterable[Sequence[str]], *, headings: Sequence[str] = ()) -> Table:
     """Return a table of labels with one or more values each."""
     table = Table(
-        box=None, show_header=bool(headings), pad_edge=False, padding=(0, 2, 0, 0), header_style="dim",
-    )  # fmt: skip
+        box=None,
+        show_header=bool(headings),
+        pad_edge=False,
+        padding=(0, 2, 0, 0),
+        header_style="dim",
+    )
     listed = [tuple(row) for row in rows]
     for column in range(max((len(row) for row in listed), default=0)):
         heading = headings[column] if column < len(headings) else ""

@@ -40,9 +40,10 @@ def _rectangular(rows: Any, check_entries: ValidatorFunctionWrapHandler) -> Any:
     if ragged is None:
         return check_entries(rows)
     problem = PydanticCustomError(
-        "ragged_rows", "row {row} has {found} entries, but row {first} has {expected}",
+        "ragged_rows",
+        "row {row} has {found} entries, but row {first} has {expected}",
         {"row": ragged[0], "found": ragged[1], "first": listed[0][0], "expected": listed[0][1]},
-    )  # fmt: skip
+    )
     others: list[InitErrorDetails] = []
     try:
         check_entries(rows)
@@ -131,8 +132,10 @@ def _number_or_expression(value: Any) -> Any:
 
 VaryingRows = Annotated[
     list[Annotated[list[Annotated[Any, BeforeValidator(_number_or_expression)]], Field(min_length=1)]],
-    Field(min_length=1), WrapValidator(_rectangular), Tag(_ROWS),
-]  # fmt: skip
+    Field(min_length=1),
+    WrapValidator(_rectangular),
+    Tag(_ROWS),
+]
 
 
 def _same_shapes(stack: Any, check_entries: ValidatorFunctionWrapHandler) -> Any:
@@ -143,9 +146,10 @@ def _same_shapes(stack: Any, check_entries: ValidatorFunctionWrapHandler) -> Any
     if k is None:
         return checked
     raise PydanticCustomError(
-        "stack_shapes", "matrix {number} of the stack is {rows} by {columns}, but the first is {wanted}",
+        "stack_shapes",
+        "matrix {number} of the stack is {rows} by {columns}, but the first is {wanted}",
         {"number": k + 1, "rows": shapes[k][0], "columns": shapes[k][1], "wanted": "{} by {}".format(*shapes[0])},
-    )  # fmt: skip
+    )
 
 
 Stack = Annotated[list[Rows], Field(min_length=1), WrapValidator(_same_shapes), Tag(_STACK)]

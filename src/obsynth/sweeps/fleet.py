@@ -99,15 +99,29 @@ class Fleet(ResultTable):
         """Return the table as a header and rows: one column for each alarm and each largest value of any run."""
         alarms = all_of(run.alarms for run in self.runs)
         largest = all_of(run.largest for run in self.runs)
-        header = ["run", "status", "rows", "ok", *(f"alarm {n}, s" for n in alarms), *(f"largest {n}" for n in largest),
-                  "file", "message"]  # fmt: skip
+        header = [
+            "run",
+            "status",
+            "rows",
+            "ok",
+            *(f"alarm {n}, s" for n in alarms),
+            *(f"largest {n}" for n in largest),
+            "file",
+            "message",
+        ]
         body = [
             [
-                run.name, run.status, run.rows, run.statuses.get("ok", 0), *(run.alarms.get(n, "") for n in alarms),
-                *(run.largest.get(n, "") for n in largest), "" if run.file is None else run.file.name, run.message,
+                run.name,
+                run.status,
+                run.rows,
+                run.statuses.get("ok", 0),
+                *(run.alarms.get(n, "") for n in alarms),
+                *(run.largest.get(n, "") for n in largest),
+                "" if run.file is None else run.file.name,
+                run.message,
             ]
             for run in self.runs
-        ]  # fmt: skip
+        ]
         return header, body
 
     def plot(self) -> Figure:
@@ -187,17 +201,22 @@ def run_fleet(
     SpecError
         There is no gain set or no log, an option is unknown, or the folder cannot be used.
     """
-    known = ("columns", "time_column", "scales", "thresholds", "gap", "warm_up", "recovered", "outliers",
-             "unverified")  # fmt: skip
+    known = ("columns", "time_column", "scales", "thresholds", "gap", "warm_up", "recovered", "outliers", "unverified")
     wrong = sorted(set(options) - set(known))
     if wrong:
         raise SpecError(f"{', '.join(wrong)}: use some of {', '.join(known)}.", path=wrong[0])
     pairs = _pairs(_files(gains, (GAINS_ENDING,), "gains"), _files(data, LOG_ENDINGS, "data"), options)
     place = ResultFolder(folder, _KIND, _KEPT, letters=LONGEST_STEM)
-    return Fleet(carried_out(
-        pairs, _run, executor=executor, told=progress, known=lambda pair: _known(pair, place),
-        kept=lambda pair, outcome: _kept(pair, *outcome, place),
-    ))  # fmt: skip
+    return Fleet(
+        carried_out(
+            pairs,
+            _run,
+            executor=executor,
+            told=progress,
+            known=lambda pair: _known(pair, place),
+            kept=lambda pair, outcome: _kept(pair, *outcome, place),
+        )
+    )
 
 
 def _files(given: Any, endings: tuple[str, ...], what: str) -> list[Path]:
@@ -221,11 +240,16 @@ def _pairs(gains: Sequence[Path], logs: Sequence[Path], options: Mapping[str, An
     said = json.dumps(options, sort_keys=True, default=str)
     return [
         _Pair(
-            f"{names[gain]} on {log.stem}", gain, log, options,
+            f"{names[gain]} on {log.stem}",
+            gain,
+            log,
+            options,
             hashlib.sha256(f"{digests[gain]} {digests[log]} {said}".encode()).hexdigest(),
         )
-        for gain in gains for log in logs if own.get(log, names[gain]) == names[gain]
-    ]  # fmt: skip
+        for gain in gains
+        for log in logs
+        if own.get(log, names[gain]) == names[gain]
+    ]
 
 
 @lru_cache(maxsize=1)

@@ -160,17 +160,22 @@ def online_monitor(
         rule = _whitened(kind, model, bounds if scenario is None else None, window, change, false_alarms, dt)
         ending = ANY_LENGTH
     return OnlineMonitor(
-        kind, statement_of(kind, model, estimates=estimates) + ending + EXACT, rule,
-        residuals=len(design.linear[1].residual_names), fault_names=design.linear[1].fault_names,
+        kind,
+        statement_of(kind, model, estimates=estimates) + ending + EXACT,
+        rule,
+        residuals=len(design.linear[1].residual_names),
+        fault_names=design.linear[1].fault_names,
         fault_scales=model.fault_scales(),
-    )  # fmt: skip
+    )
 
 
 def _learned(design: ObserverDesign, normal: Any) -> OnlineMonitor:
     """Return the monitor of thresholds that were learned, or are to be."""
     if normal is None:
-        raise SpecError("learned needs rows without faults: give a log, or what obsynth thresholds wrote (normal, "
-                        "--normal).", path="normal")  # fmt: skip
+        raise SpecError(
+            "learned needs rows without faults: give a log, or what obsynth thresholds wrote (normal, --normal).",
+            path="normal",
+        )
     if isinstance(normal, (str, Path)) and Path(normal).suffix.lower() == ".json":
         normal = load_thresholds(normal)
     if not isinstance(normal, LearnedThresholds):
@@ -206,8 +211,9 @@ def _require_noise(model: ResidualModel, noise_bound: float | None) -> None:
         raise SpecError(
             "noise_bound says how many standard deviations the noise never exceeds, but no noise is stated that "
             "reaches what is watched, so there is nothing to multiply: state the noise of the sensors (sensor_noise of "
-            "the plant, or Bw and Dw), or leave noise_bound out where there is none.", path="noise_bound",
-        )  # fmt: skip
+            "the plant, or Bw and Dw), or leave noise_bound out where there is none.",
+            path="noise_bound",
+        )
 
 
 def _require_above_zero(limit: float) -> None:
@@ -220,9 +226,17 @@ def _require_above_zero(limit: float) -> None:
 
 
 def _norm_rule(
-    design: ObserverDesign, kind: str, model: ResidualModel, bounds: FloatArray, noise_bound: float | None,
-    start: float, gamma: float | None, window: int, dt: float, estimates: bool,
-) -> tuple[NormRule, float]:  # fmt: skip
+    design: ObserverDesign,
+    kind: str,
+    model: ResidualModel,
+    bounds: FloatArray,
+    noise_bound: float | None,
+    start: float,
+    gamma: float | None,
+    window: int,
+    dt: float,
+    estimates: bool,
+) -> tuple[NormRule, float]:
     """Return the rule of a bound on the norm of the residual, or of the fault estimates, and the bound in the end."""
     irregular = None
     if kind == "paper":
@@ -236,9 +250,14 @@ def _norm_rule(
     if kind != "paper" and model.continuous is not None and design.linear[0].nu:
         driven = model.continuous.between.input_response(model.continuous.observer)
     rule = NormRule(
-        table, limit, window=window if kind == "window" else 1, dt=dt, irregular=irregular,
-        watched=design.linear[1].fault_rows if estimates else None, driven=driven,
-    )  # fmt: skip
+        table,
+        limit,
+        window=window if kind == "window" else 1,
+        dt=dt,
+        irregular=irregular,
+        watched=design.linear[1].fault_rows if estimates else None,
+        driven=driven,
+    )
     return rule, limit
 
 
@@ -255,20 +274,34 @@ def _more_words(kind: str, model: ResidualModel, limit: float) -> str:
 
 
 def _adaptive(
-    design: ObserverDesign, scenario: Scenario | None, norm: NormRule, model: ResidualModel, bounds: FloatArray,
-    noise_bound: float | None, initial_error: float | None, initial_set: Mapping[str, Any] | None, dt: float,
-) -> OnlineMonitor:  # fmt: skip
+    design: ObserverDesign,
+    scenario: Scenario | None,
+    norm: NormRule,
+    model: ResidualModel,
+    bounds: FloatArray,
+    noise_bound: float | None,
+    initial_error: float | None,
+    initial_set: Mapping[str, Any] | None,
+    dt: float,
+) -> OnlineMonitor:
     """Return the monitor whose threshold holds for every plant within its tolerances."""
     first, later = adaptive_plan(
-        noisy_design(design, scenario), bounds, noise_bound or 0.0, initial_error=initial_error,
-        initial_set=initial_set, sample_time=dt,
-    )  # fmt: skip
+        noisy_design(design, scenario),
+        bounds,
+        noise_bound or 0.0,
+        initial_error=initial_error,
+        initial_set=initial_set,
+        sample_time=dt,
+    )
     start = _FROM_THE_FIRST if initial_set is not None else _FORGOTTEN if initial_error is None else _AFTER_A_GAP
     return OnlineMonitor(
-        "pointwise", adaptive_statement(first, design) + start, AdaptiveRule(first, later, norm),
-        residuals=len(design.linear[1].residual_names), fault_names=design.linear[1].fault_names,
+        "pointwise",
+        adaptive_statement(first, design) + start,
+        AdaptiveRule(first, later, norm),
+        residuals=len(design.linear[1].residual_names),
+        fault_names=design.linear[1].fault_names,
         fault_scales=model.fault_scales(),
-    )  # fmt: skip
+    )
 
 
 def _endless_model(
@@ -281,30 +314,48 @@ def _endless_model(
     asked = sample_time if sample_time is not None or scenario is None else scenario.sample_time
     dt = plant.dt if plant.is_discrete else asked
     if dt is None or not (is_finite_number(dt) and dt > 0.0):
-        raise SpecError("A continuous design needs the sample_time of its data, in seconds, for a threshold.",
-                        path="sample_time")  # fmt: skip
+        raise SpecError(
+            "A continuous design needs the sample_time of its data, in seconds, for a threshold.", path="sample_time"
+        )
     transition = observer.Az if plant.is_discrete else first_order_hold(observer.Az, observer.By, dt)[0]
     steps = samples_of(transition, window)
     expected = Scenario(horizon=dt, noise=1.0 if plant.nw else 0.0) if scenario is None else scenario
     expected = expected.replace(
-        horizon=(steps - 0.5) * dt, sample_time=None if plant.is_discrete else dt, inputs={}, faults={}, sensors={},
-        initial_state={}, observer_state=None, stabilise=False,
-    )  # fmt: skip
+        horizon=(steps - 0.5) * dt,
+        sample_time=None if plant.is_discrete else dt,
+        inputs={},
+        faults={},
+        sensors={},
+        initial_state={},
+        observer_state=None,
+        stabilise=False,
+    )
     return residual_model(design, expected, endless=True, estimates=estimates), dt
 
 
 def _whitened(
-    kind: str, model: ResidualModel, unknown: FloatArray | None, window: int, change: float, false_alarms: float,
+    kind: str,
+    model: ResidualModel,
+    unknown: FloatArray | None,
+    window: int,
+    change: float,
+    false_alarms: float,
     dt: float,
-) -> WhitenedRule:  # fmt: skip
+) -> WhitenedRule:
     reached = model.Bd.any(axis=0) | model.Dd.any(axis=0)
     if unknown is not None and reached.any():
         raise SpecError(
             f"{kind} needs to know what disturbances are to be expected: give a scenario (a spec with one), or use "
-            "pointwise with disturbance bounds.", path="disturbances",
-        )  # fmt: skip
+            "pointwise with disturbance bounds.",
+            path="disturbances",
+        )
     whitener, white = whitened(kind, model, window)
     return WhitenedRule(
-        whitener, steady_mean(model), window=window, change=None if kind == "chi-square" else change,
-        false_alarms=false_alarms, dt=dt, white=white,
-    )  # fmt: skip
+        whitener,
+        steady_mean(model),
+        window=window,
+        change=None if kind == "chi-square" else change,
+        false_alarms=false_alarms,
+        dt=dt,
+        white=white,
+    )

@@ -151,9 +151,20 @@ def monitor(
         threshold = threshold + _straight_lines(design, scenario, model, kind, window, rows)
     statement = statement_of(kind, model, estimates=estimates) + EXACT
     found = Monitor(
-        kind, statement, threshold, _floor(bench, scenario, rows), bench.drive.dt, window,
-        mean, whitener, float(change), model.fault_scales(), design.linear[1].fault_names, isolation_delay, estimates,
-    )  # fmt: skip
+        kind,
+        statement,
+        threshold,
+        _floor(bench, scenario, rows),
+        bench.drive.dt,
+        window,
+        mean,
+        whitener,
+        float(change),
+        model.fault_scales(),
+        design.linear[1].fault_names,
+        isolation_delay,
+        estimates,
+    )
     if not adaptive:
         return found
     from obsynth.experiments.monitors.adaptive_records_monitor import with_box
@@ -162,9 +173,14 @@ def monitor(
 
 
 def require_options(
-    noise_bound: float | None, initial_error: float | None, gamma: float | None, window: int, false_alarms: float,
-    change: float, isolation_delay: int,
-) -> None:  # fmt: skip
+    noise_bound: float | None,
+    initial_error: float | None,
+    gamma: float | None,
+    window: int,
+    false_alarms: float,
+    change: float,
+    isolation_delay: int,
+) -> None:
     """Raise `SpecError` where an option of a monitor is out of range."""
     for name, value in (("noise_bound", noise_bound), ("initial_error", initial_error), ("gamma", gamma)):
         if value is not None and not (is_finite_number(value) and value >= 0.0):
@@ -190,9 +206,15 @@ def bounds_of(design: ObserverDesign, model: ResidualModel, given: Mapping[str, 
 
 
 def _statistical(
-    kind: str, model: ResidualModel, degrees: int, start: float, window: int, false_alarms: float,
-    *, white: bool,
-) -> FloatArray:  # fmt: skip
+    kind: str,
+    model: ResidualModel,
+    degrees: int,
+    start: float,
+    window: int,
+    false_alarms: float,
+    *,
+    white: bool,
+) -> FloatArray:
     """Return thresholds by Bonferroni's inequality over all looks (chi-square), or Ville's over all white sums."""
     from scipy.special import chdtri
 
@@ -227,10 +249,12 @@ def _straight_lines(
     calm = scenario.replace(faults={}, sensors={}, disturbances={}, noise=0.0, sensor_noise={})
     bench = make_bench(design, calm)
     residuals = bench.run([scenario.seed]).rows[:, 0, rows]
-    sizes = np.array([
-        np.linalg.norm(residual - model.C @ power @ model.start)
-        for residual, power in zip(residuals, model.powers(), strict=True)
-    ])  # fmt: skip
+    sizes = np.array(
+        [
+            np.linalg.norm(residual - model.C @ power @ model.start)
+            for residual, power in zip(residuals, model.powers(), strict=True)
+        ]
+    )
     if kind == "pointwise":
         return sizes
     return np.array([np.linalg.norm(sizes[max(k - window + 1, 0) : k + 1]) for k in range(model.steps)])

@@ -78,17 +78,25 @@ def signals_of_linear(found: Realisation, thresholds: Mapping[str, float] | None
         for name, delay in zip(observer.state_names, observer.state_delays, strict=True)
     ]
     outputs += [
-        Output(f"fhat[{name}]", None if name in biases else name, units.get(name, ""),
-               _late(f"estimate of the fault {name}", delay), watched=True)
+        Output(
+            f"fhat[{name}]",
+            None if name in biases else name,
+            units.get(name, ""),
+            _late(f"estimate of the fault {name}", delay),
+            watched=True,
+        )
         for name, delay in zip(observer.fault_names, observer.fault_delays, strict=True)
-    ]  # fmt: skip
-    outputs += [Output(f"r[{name}]", None, units.get(name, ""), f"residual {name}", watched=True)
-                for name in observer.residual_names]  # fmt: skip
+    ]
+    outputs += [
+        Output(f"r[{name}]", None, units.get(name, ""), f"residual {name}", watched=True)
+        for name in observer.residual_names
+    ]
     signals = (*found.inputs, *observer.state_names, *observer.fault_names)
     points = {name: float(stated.get(name, 0.0)) for name in dict.fromkeys(signals)}
     inputs = _apart(observer.input_names, observer.output_names)
-    return Signals(inputs, found.inputs, tuple(outputs), points, _checked(thresholds, outputs), units, warm_up,
-                   observer.dt)  # fmt: skip
+    return Signals(
+        inputs, found.inputs, tuple(outputs), points, _checked(thresholds, outputs), units, warm_up, observer.dt
+    )
 
 
 def signals_of_dae(design: ObserverDesign, thresholds: Mapping[str, float] | None, warm_up: float) -> Signals:
@@ -99,13 +107,25 @@ def signals_of_dae(design: ObserverDesign, thresholds: Mapping[str, float] | Non
     outputs = []
     for kind, of, names in estimated:
         outputs += [Output(f"{kind}[{name}]", None, units.get(name, ""), f"estimate of {of}{name}") for name in names]
-        outputs += [Output(f"sd {kind}[{name}]", None, units.get(name, ""),
-                           f"standard deviation of the estimate of {name}") for name in names]  # fmt: skip
-    outputs += [Output(f"r[{name}]", None, units.get(name, ""), f"innovation of {name}", watched=True)
-                for name in model.output_names]  # fmt: skip
+        outputs += [
+            Output(f"sd {kind}[{name}]", None, units.get(name, ""), f"standard deviation of the estimate of {name}")
+            for name in names
+        ]
+    outputs += [
+        Output(f"r[{name}]", None, units.get(name, ""), f"innovation of {name}", watched=True)
+        for name in model.output_names
+    ]
     outputs.append(Output("nis", None, "", "square of the innovations in units of their covariance", watched=True))
-    return Signals(_apart(model.input_names, model.output_names), (*model.input_names, *model.output_names),
-                   tuple(outputs), {}, _checked(thresholds, outputs), units, warm_up, observer.dt)  # fmt: skip
+    return Signals(
+        _apart(model.input_names, model.output_names),
+        (*model.input_names, *model.output_names),
+        tuple(outputs),
+        {},
+        _checked(thresholds, outputs),
+        units,
+        warm_up,
+        observer.dt,
+    )
 
 
 def _late(text: str, delay: int) -> str:
@@ -115,8 +135,10 @@ def _late(text: str, delay: int) -> str:
 def _apart(known: Sequence[str], measured: Sequence[str]) -> tuple[str, ...]:
     """Return names of the FMU's inputs: those of the signals, told apart where an input is called as an output."""
     both = set(known) & set(measured)
-    return (*(f"u[{name}]" if name in both else name for name in known),
-            *(f"y[{name}]" if name in both else name for name in measured))  # fmt: skip
+    return (
+        *(f"u[{name}]" if name in both else name for name in known),
+        *(f"y[{name}]" if name in both else name for name in measured),
+    )
 
 
 def _checked(thresholds: Mapping[str, float] | None, outputs: Sequence[Output]) -> dict[str, float]:
@@ -172,11 +194,19 @@ def _variables(signals: Signals) -> Iterator[_Variable]:
     for output in signals.outputs:
         yield _Variable(output.name, "real", "output", "discrete", "calculated", None, output.unit, output.description)
     units = {output.name: output.unit for output in signals.outputs}
-    parameters = [(f"operating_point[{name}]", value, signals.units.get(name, ""),
-                   f"{name} where the linear model was taken") for name, value in signals.points.items()]  # fmt: skip
-    parameters += [(f"threshold[{name}]", level, units[name],
-                    f"alarm above this absolute value of {name} (its deviation); 0: none")
-                   for name, level in signals.thresholds.items()]  # fmt: skip
+    parameters = [
+        (f"operating_point[{name}]", value, signals.units.get(name, ""), f"{name} where the linear model was taken")
+        for name, value in signals.points.items()
+    ]
+    parameters += [
+        (
+            f"threshold[{name}]",
+            level,
+            units[name],
+            f"alarm above this absolute value of {name} (its deviation); 0: none",
+        )
+        for name, level in signals.thresholds.items()
+    ]
     parameters.append(("warm_up", signals.warm_up, "s", "no alarm in these seconds after the start"))
     for name, value, unit, told in parameters:
         yield _Variable(name, "real", "parameter", "tunable", "exact", value, unit, told)
@@ -203,23 +233,45 @@ class _Version(NamedTuple):
 
 _STEPS = {"canHandleVariableCommunicationStepSize": "false"}
 _VERSIONS = {
-    "2.0": _Version("guid", "Real", ("Outputs", "InitialUnknowns"), {
-        **_STEPS, "canNotUseMemoryManagementFunctions": "true", "canGetAndSetFMUstate": "true",
-        "canSerializeFMUstate": "true",
-    }),
-    "3.0": _Version("instantiationToken", "Float64", ("Output", "InitialUnknown"), {
-        **_STEPS, "fixedInternalStepSize": "", "canGetAndSetFMUState": "true", "canSerializeFMUState": "true",
-    }),
-}  # fmt: skip
+    "2.0": _Version(
+        "guid",
+        "Real",
+        ("Outputs", "InitialUnknowns"),
+        {
+            **_STEPS,
+            "canNotUseMemoryManagementFunctions": "true",
+            "canGetAndSetFMUstate": "true",
+            "canSerializeFMUstate": "true",
+        },
+    ),
+    "3.0": _Version(
+        "instantiationToken",
+        "Float64",
+        ("Output", "InitialUnknown"),
+        {
+            **_STEPS,
+            "fixedInternalStepSize": "",
+            "canGetAndSetFMUState": "true",
+            "canSerializeFMUState": "true",
+        },
+    ),
+}
 
 
 def model_description(model: Model, version: str, sources: list[str]) -> bytes:
     """Return ``modelDescription.xml`` of a version of FMI."""
     spelled, step = _VERSIONS[version], repr(model.signals.dt)
-    root = Element("fmiModelDescription", {
-        "fmiVersion": version, "modelName": model.name, spelled.token: model.token, "description": model.description,
-        "generationTool": "obsynth", "variableNamingConvention": "flat",
-    })  # fmt: skip
+    root = Element(
+        "fmiModelDescription",
+        {
+            "fmiVersion": version,
+            "modelName": model.name,
+            spelled.token: model.token,
+            "description": model.description,
+            "generationTool": "obsynth",
+            "variableNamingConvention": "flat",
+        },
+    )
     abilities = {name: value or step for name, value in spelled.abilities.items()}
     simulation = SubElement(root, "CoSimulation", {"modelIdentifier": model.identifier, **abilities})
     if version == "2.0":
@@ -233,10 +285,13 @@ def model_description(model: Model, version: str, sources: list[str]) -> bytes:
     for reference, variable in enumerate(variables):
         kind = spelled.real if variable.kind == "real" else "Boolean"
         attributes = {
-            "name": variable.name, "valueReference": str(reference), "causality": variable.causality,
-            "variability": variable.variability, "description": variable.description,
+            "name": variable.name,
+            "valueReference": str(reference),
+            "causality": variable.causality,
+            "variability": variable.variability,
+            "description": variable.description,
             **({"initial": variable.initial} if variable.initial else {}),
-        }  # fmt: skip
+        }
         if version == "2.0":
             SubElement(SubElement(listed, "ScalarVariable", attributes), kind, _value(variable))
         else:
@@ -334,8 +389,9 @@ def _contents(
         return signals_of_dae(design, thresholds, finite_warm_up(checked_warm_up(warm_up, 0.0))), (text, header), digest
     found = Realisation.of(design, sample_time)
     if found.observer.dt == 0.0:
-        raise SpecError("The observer is continuous in time: give the sample time, in seconds, for an FMU.",
-                        path="sample_time")  # fmt: skip
+        raise SpecError(
+            "The observer is continuous in time: give the sample time, in seconds, for an FMU.", path="sample_time"
+        )
     signals = signals_of_linear(found, thresholds, finite_warm_up(checked_warm_up(warm_up, transient(found.observer))))
     return signals, (source_text(found, _PREFIX, f"{_PREFIX}.h"), header_text(found, _PREFIX)), found.digest
 
@@ -346,21 +402,46 @@ def _layout(design: ObserverDesign, model: Model) -> str:
     names = [output.name for output in signals.outputs]
     points = [signals.point_index(signal if signals.points else None) for signal in signals.input_signals]
     shown = [signals.point_index(output.signal) for output in signals.outputs]
-    sizes = {"N_IN": len(signals.inputs), "N_OUT": len(names), "N_POINT": len(signals.points),
-             "N_WATCHED": len(signals.watched)}  # fmt: skip
+    sizes = {
+        "N_IN": len(signals.inputs),
+        "N_OUT": len(names),
+        "N_POINT": len(signals.points),
+        "N_WATCHED": len(signals.watched),
+    }
     body = _taking_dae(design) if isinstance(design.observer, DAEObserver) else _taking_linear(design, signals)
-    return "\n".join([
-        comment("Sizes and start values of this observer, written by obsynth."), "#ifndef OBSYNTH_FMU_LAYOUT_H",
-        "#define OBSYNTH_FMU_LAYOUT_H", "", f'#include "{_PREFIX}.h"', "", f'#define TOKEN "{model.token}"',
-        f"#define DT {signals.dt!r}", *(f"#define {name} {size}" for name, size in sizes.items()), "",
-        f"typedef {_PREFIX}_state observer_memory;", "",
-        _table("double", "start_values", [repr(value) for value in start_values(signals)]),
-        _table("int", "point_of_in", points), _table("int", "point_of_out", shown),
-        _table("int", "watched", [names.index(name) for name in signals.watched]), "",
-        "static void observer_begin(observer_memory *memory)", "{", f"    {_PREFIX}_reset(memory);", "}", "",
-        "static int observer_take(observer_memory *memory, const double *in, double *out)", "{", *body, "}", "",
-        "#endif", "",
-    ])  # fmt: skip
+    return "\n".join(
+        [
+            comment("Sizes and start values of this observer, written by obsynth."),
+            "#ifndef OBSYNTH_FMU_LAYOUT_H",
+            "#define OBSYNTH_FMU_LAYOUT_H",
+            "",
+            f'#include "{_PREFIX}.h"',
+            "",
+            f'#define TOKEN "{model.token}"',
+            f"#define DT {signals.dt!r}",
+            *(f"#define {name} {size}" for name, size in sizes.items()),
+            "",
+            f"typedef {_PREFIX}_state observer_memory;",
+            "",
+            _table("double", "start_values", [repr(value) for value in start_values(signals)]),
+            _table("int", "point_of_in", points),
+            _table("int", "point_of_out", shown),
+            _table("int", "watched", [names.index(name) for name in signals.watched]),
+            "",
+            "static void observer_begin(observer_memory *memory)",
+            "{",
+            f"    {_PREFIX}_reset(memory);",
+            "}",
+            "",
+            "static int observer_take(observer_memory *memory, const double *in, double *out)",
+            "{",
+            *body,
+            "}",
+            "",
+            "#endif",
+            "",
+        ]
+    )
 
 
 def _table(kind: str, name: str, values: list[object] | list[int] | list[str]) -> str:
@@ -382,12 +463,21 @@ def _taking_linear(design: ObserverDesign, signals: Signals) -> list[str]:
 
 def _taking_dae(design: ObserverDesign) -> list[str]:
     model, _ = design.nonlinear
-    parts = (("states", model.nx), ("state_deviations", model.nx), ("parameters", model.nq),
-             ("parameter_deviations", model.nq), ("innovations", model.ny))  # fmt: skip
+    parts = (
+        ("states", model.nx),
+        ("state_deviations", model.nx),
+        ("parameters", model.nq),
+        ("parameter_deviations", model.nq),
+        ("innovations", model.ny),
+    )
     lines = [f"    {_PREFIX}_estimates said;", "    int i;"]
     inputs = "in, " if model.nu else ""
-    lines += [f"    int failed = {_PREFIX}_step(memory, {inputs}in + {model.nu}, &said);",
-              "    if (failed) {", "        return failed;", "    }"]  # fmt: skip
+    lines += [
+        f"    int failed = {_PREFIX}_step(memory, {inputs}in + {model.nu}, &said);",
+        "    if (failed) {",
+        "        return failed;",
+        "    }",
+    ]
     place = 0
     for name, size in parts:
         if size:
@@ -420,9 +510,20 @@ def _binary(sources: Mapping[str, str], compiled: list[str]) -> bytes | None:
             (folder / file).write_text(text, encoding="utf-8", newline="\n")
         library = folder / "library"
         done = subprocess.run(
-            [*command, *FLAGS, "-fvisibility=hidden", *(str(folder / file) for file in compiled), "-o", str(library),
-             "-lm"], capture_output=True, encoding="utf-8", errors="replace", check=False,
-        )  # fmt: skip
+            [
+                *command,
+                *FLAGS,
+                "-fvisibility=hidden",
+                *(str(folder / file) for file in compiled),
+                "-o",
+                str(library),
+                "-lm",
+            ],
+            capture_output=True,
+            encoding="utf-8",
+            errors="replace",
+            check=False,
+        )
         if done.returncode != 0:
             raise SpecError(f"The C compiler {command[0]!r} fails: {done.stderr.strip()[:500]}", path="fmu")
         return library.read_bytes()

@@ -28,19 +28,42 @@ def conditions(plant: DescriptorSystem) -> tuple[Condition, ...]:
     """Return the existence conditions of a plant."""
     first = (
         Condition(
-            "continuous time", "dt = 0", plant.dt == 0.0, plant.dt, 0.0, _SOURCE,
+            "continuous time",
+            "dt = 0",
+            plant.dt == 0.0,
+            plant.dt,
+            0.0,
+            _SOURCE,
             "continuous" if plant.dt == 0.0 else "sampled: give a continuous plant, or see functional_filter.",
         ),
-        Condition("faults", "a fault to show", plant.nf > 0, float(plant.nf), 1.0, _SOURCE,
-                  f"{plant.nf} faults" if plant.nf else "none: name one by Bf or Df."),
-    )  # fmt: skip
+        Condition(
+            "faults",
+            "a fault to show",
+            plant.nf > 0,
+            float(plant.nf),
+            1.0,
+            _SOURCE,
+            f"{plant.nf} faults" if plant.nf else "none: name one by Bf or Df.",
+        ),
+    )
     if not all(condition.holds for condition in first):
         return first
     try:
         smooth = eliminate_algebraic_states(plant).plant
     except PreconditionError as error:
-        return (*first, Condition(error.condition, "algebraic states that can be eliminated", False, np.nan, np.nan,
-                                  _SOURCE, str(error), signals=error.signals))  # fmt: skip
+        return (
+            *first,
+            Condition(
+                error.condition,
+                "algebraic states that can be eliminated",
+                False,
+                np.nan,
+                np.nan,
+                _SOURCE,
+                str(error),
+                signals=error.signals,
+            ),
+        )
     _, direct = unknown_inputs(smooth)
     reach = decide_rank(direct, expected=smooth.ny)
     remedy = (
@@ -48,17 +71,27 @@ def conditions(plant: DescriptorSystem) -> tuple[Condition, ...]:
         "of them at high frequencies. Ask functional_filter for residuals, or state the noise of all sensors."
     )
     return (
-        *first, rank_condition("rank [Dd, Dw]", reach, remedy, source=_SOURCE, signals=smooth.output_names),
-        _detectable(smooth), *(_no_zero_on_the_axis(plant) if reach.full else ()),
-    )  # fmt: skip
+        *first,
+        rank_condition("rank [Dd, Dw]", reach, remedy, source=_SOURCE, signals=smooth.output_names),
+        _detectable(smooth),
+        *(_no_zero_on_the_axis(plant) if reach.full else ()),
+    )
 
 
 def _detectable(plant: DescriptorSystem) -> Condition:
     lost = hidden_modes(plant).undetectable
     detail = f"no output shows s = {complex(lost[0]):.4g}: measure more." if lost else "every mode shows, or dies out"
     mode = complex(lost[0]) if lost else None
-    return Condition("detectable", "modes that show in no output die out", not lost, float(len(lost)), 0.0, _SOURCE,
-                     detail, mode=mode)  # fmt: skip
+    return Condition(
+        "detectable",
+        "modes that show in no output die out",
+        not lost,
+        float(len(lost)),
+        0.0,
+        _SOURCE,
+        detail,
+        mode=mode,
+    )
 
 
 def _no_zero_on_the_axis(plant: DescriptorSystem) -> tuple[Condition, ...]:
@@ -71,9 +104,23 @@ def _no_zero_on_the_axis(plant: DescriptorSystem) -> tuple[Condition, ...]:
     e[: plant.nx, : plant.nx] = plant.E
     zeros = ExactPencil.written(e, a).zeros(discrete=False).roots
     found = [complex(root.value) for root in zeros if root.side == "boundary"]
-    detail = "none, exactly" if not found else (
-        f"s = {found[0]:.4g}: the unknown inputs do not reach some residual there, and the filter that makes them all "
-        "alike would never forget. State noise of the states (Bw)."
-    )  # fmt: skip
-    return (Condition("zeros of the unknown inputs", "none on the imaginary axis", not found, float(len(found)), 0.0,
-                      _SOURCE, detail, mode=found[0] if found else None),)  # fmt: skip
+    detail = (
+        "none, exactly"
+        if not found
+        else (
+            f"s = {found[0]:.4g}: the unknown inputs do not reach some residual there, and the filter that makes them "
+            "all alike would never forget. State noise of the states (Bw)."
+        )
+    )
+    return (
+        Condition(
+            "zeros of the unknown inputs",
+            "none on the imaginary axis",
+            not found,
+            float(len(found)),
+            0.0,
+            _SOURCE,
+            detail,
+            mode=found[0] if found else None,
+        ),
+    )

@@ -60,8 +60,9 @@ class Transfer:
         return Transfer(
             Ball(a.midpoint * turned, a.radius * turned),
             Ball(self.B.midpoint / scale[:, None], self.B.radius / scale[:, None]),
-            Ball(self.C.midpoint * scale, self.C.radius * scale), self.D,
-        )  # fmt: skip
+            Ball(self.C.midpoint * scale, self.C.radius * scale),
+            self.D,
+        )
 
 
 def _equal_shares(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
@@ -114,11 +115,13 @@ def sensitivity_is_proved(transfer: Transfer, level: float, low: float, high: fl
 def _pencil(work: Transfer, level: float) -> Ball:
     a, n, m = work.dynamics, work.order, work.B.shape[1]
     corner = work.D.T @ work.D - Ball.exact(level**2 * np.eye(m))
-    return Ball.blocks([
-        [a, Ball.exact(np.zeros((n, n))), work.B],
-        [-(work.C.T @ work.C), -a.T, -(work.C.T @ work.D)],
-        [work.D.T @ work.C, work.B.T, corner],
-    ])  # fmt: skip
+    return Ball.blocks(
+        [
+            [a, Ball.exact(np.zeros((n, n))), work.B],
+            [-(work.C.T @ work.C), -a.T, -(work.C.T @ work.D)],
+            [work.D.T @ work.C, work.B.T, corner],
+        ]
+    )
 
 
 def _is_never_singular(pencil: Ball, n: int, low: float, high: float) -> bool:

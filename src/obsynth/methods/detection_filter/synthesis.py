@@ -41,11 +41,21 @@ def synthesise(plant: DescriptorSystem, asked: DetectionFilterMethod, *, progres
     progress("choosing the gains")
     gain, weight = _gains(smooth)
     observer = LinearObserver(
-        Az=smooth.A - gain @ smooth.C, Bu=smooth.B - gain @ smooth.D, By=gain, Cz=-weight @ smooth.C,
-        Du=-weight @ smooth.D, Dy=weight, dt=0.0, input_names=smooth.input_names, output_names=smooth.output_names,
-        state_names=(), fault_names=(), residual_names=tuple(f"r{i + 1}" for i in range(smooth.ny)), state_delays=(),
+        Az=smooth.A - gain @ smooth.C,
+        Bu=smooth.B - gain @ smooth.D,
+        By=gain,
+        Cz=-weight @ smooth.C,
+        Du=-weight @ smooth.D,
+        Dy=weight,
+        dt=0.0,
+        input_names=smooth.input_names,
+        output_names=smooth.output_names,
+        state_names=(),
+        fault_names=(),
+        residual_names=tuple(f"r{i + 1}" for i in range(smooth.ny)),
+        state_delays=(),
         fault_delays=(),
-    )  # fmt: skip
+    )
     felt = error_transfer(smooth, observer, *unknown_inputs(smooth))
     witness = _gain_witness(felt, 1.0 + MARGIN)
     if witness is None or not gain_is_proved(felt, 1.0 + MARGIN, witness):
@@ -57,14 +67,20 @@ def synthesise(plant: DescriptorSystem, asked: DetectionFilterMethod, *, progres
     low, high = (float(value) for value in asked.band)
     least, where = _sensitivity(smooth, observer, low, high)
     claims = {
-        "disturbance_gain": 1.0 + MARGIN, "fault_sensitivity": _provable(smooth, observer, least, low, high),
-        "band_from": low, "band_to": high, "frequency": where,
-    }  # fmt: skip
+        "disturbance_gain": 1.0 + MARGIN,
+        "fault_sensitivity": _provable(smooth, observer, least, low, high),
+        "band_from": low,
+        "band_to": high,
+        "frequency": where,
+    }
     return Synthesis(
-        asked.as_plain(), {"L": gain, "V": weight}, observer, Certificate({"P": witness}, claims),
+        asked.as_plain(),
+        {"L": gain, "V": weight},
+        observer,
+        Certificate({"P": witness}, claims),
         notes=_notes(smooth, observer, claims),
         transformation=found if found.description else None,
-    )  # fmt: skip
+    )
 
 
 def _gain_witness(transfer: Transfer, bound: float) -> FloatArray | None:

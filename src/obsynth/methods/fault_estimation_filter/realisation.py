@@ -176,8 +176,9 @@ def _checked(indexes: Sequence[int] | None, work: DescriptorSystem) -> tuple[int
     if len(listed) != work.nf or not whole or not all(1 <= index <= work.nx for index in listed):
         raise SpecError(
             f"indexes is {indexes!r}: give one whole number from 1 to {work.nx} for each of "
-            f"{', '.join(map(repr, work.fault_names))}.", path="indexes",
-        )  # fmt: skip
+            f"{', '.join(map(repr, work.fault_names))}.",
+            path="indexes",
+        )
     return tuple(int(index) for index in listed)
 
 
@@ -193,12 +194,11 @@ def _detectability(work: DescriptorSystem, t: FloatArray, indexes: tuple[int, ..
     lengths = np.linalg.norm(upsilon, axis=0)
     if not lengths.all():
         hidden = work.fault_names[int(np.argmin(lengths))]
-        raise SpecError(f"With this T and these indexes the fault {hidden!r} does not reach the outputs.",
-                        path="indexes")  # fmt: skip
+        raise SpecError(
+            f"With this T and these indexes the fault {hidden!r} does not reach the outputs.", path="indexes"
+        )
     unit = upsilon / lengths
-    return FaultDetectability(
-        indexes, psi, upsilon, decide_rank(unit, expected=work.nf), float(np.linalg.cond(unit))
-    )  # fmt: skip
+    return FaultDetectability(indexes, psi, upsilon, decide_rank(unit, expected=work.nf), float(np.linalg.cond(unit)))
 
 
 def _lost_indexes(plant: DescriptorSystem, found: FaultDetectability) -> tuple[str, ...]:

@@ -34,9 +34,13 @@ def checks(design: ObserverDesign, read: Callable[[Mapping[str, Any]], Asked]) -
     except (ObsynthError, TypeError, ValueError, AttributeError, OverflowError) as error:
         window, reason = None, str(error)
     yield upper_bound_check(
-        "question", "the options ask a question about this plant", float(window is None), 0.0, source="options",
+        "question",
+        "the options ask a question about this plant",
+        float(window is None),
+        0.0,
+        source="options",
         detail=reason,
-    )  # fmt: skip
+    )
     if window is None:
         return
     shipped = design.certificate.matrices
@@ -49,9 +53,13 @@ def checks(design: ObserverDesign, read: Callable[[Mapping[str, Any]], Asked]) -
         sizes |= {"witness": len(window.bar), "witness_radius": len(window.bar)}
     wrong = [name for name, size in sizes.items() if not _fits(shipped.get(name), size, signed="radius" not in name)]
     yield upper_bound_check(
-        "certificate", "multipliers and witness fit the window of the options", float(len(wrong)), 0.0,
-        source="certificate", detail=f"wrong: {', '.join(wrong)}" if wrong else "",
-    )  # fmt: skip
+        "certificate",
+        "multipliers and witness fit the window of the options",
+        float(len(wrong)),
+        0.0,
+        source="certificate",
+        detail=f"wrong: {', '.join(wrong)}" if wrong else "",
+    )
     if wrong:
         return
     test = Repaired(_flat(shipped["multipliers"]), _flat(shipped["multiplier_radius"]))
@@ -60,9 +68,12 @@ def checks(design: ObserverDesign, read: Callable[[Mapping[str, Any]], Asked]) -
     delay = delay_in_samples(window, window.weights(test.values)[2]) * window.plant.dt
     claimed = float(design.certificate.claims.get("delay", np.nan))
     yield upper_bound_check(
-        "delay", "a fault of the size that is surely found alarms after so many seconds at the latest", delay, claimed,
+        "delay",
+        "a fault of the size that is surely found alarms after so many seconds at the latest",
+        delay,
+        claimed,
         source=SOURCE,
-    )  # fmt: skip
+    )
 
 
 def _flat(matrix: FloatArray) -> FloatArray:
@@ -89,33 +100,55 @@ def _of_the_test(design: ObserverDesign, window: Window, test: Repaired) -> Iter
     zero = threshold == 0.0
     exact = repaired_multipliers(window, test.values, refine=False, exact_zero=zero, among=test.radius)
     yield upper_bound_check(
-        "multipliers", "exact multipliers that see the fault with weight one and nothing free lie within the shipped "
-        "distance of the shipped ones", _excess(exact, test.radius), 1.0,
-        source=SOURCE, kind="proved", detail="the largest distance as a multiple of the shipped one; one where below",
-    )  # fmt: skip
+        "multipliers",
+        "exact multipliers that see the fault with weight one and nothing free lie within the shipped "
+        "distance of the shipped ones",
+        _excess(exact, test.radius),
+        1.0,
+        source=SOURCE,
+        kind="proved",
+        detail="the largest distance as a multiple of the shipped one; one where below",
+    )
     yield upper_bound_check(
-        "threshold", "without the fault the residual never passes this",
-        proved_threshold(window, test, exact_zero=zero), threshold, source=SOURCE, kind="proved",
+        "threshold",
+        "without the fault the residual never passes this",
+        proved_threshold(window, test, exact_zero=zero),
+        threshold,
+        source=SOURCE,
+        kind="proved",
         detail="sum of all bounds times what the exact multipliers see of each",
-    )  # fmt: skip
+    )
     found = float(claims.get("surely_found", np.nan))
     yield lower_bound_check(
-        "surely found", "twice the threshold", found, 2.0 * threshold, source=SOURCE, kind="proved",
-    )  # fmt: skip
+        "surely found",
+        "twice the threshold",
+        found,
+        2.0 * threshold,
+        source=SOURCE,
+        kind="proved",
+    )
     on_y, on_u, delay = window.weights(test.values)
     implied = observer_of(window, on_y, on_u, delay)
     rounding = rounding_of(window, test.values, test.radius)
     yield upper_bound_check(
-        "weights", "what runs are the weights that the multipliers say",
-        _misfit(observer, implied, window, test.values), 1.0, source="shipped realisation", kind="equality",
+        "weights",
+        "what runs are the weights that the multipliers say",
+        _misfit(observer, implied, window, test.values),
+        1.0,
+        source="shipped realisation",
+        kind="equality",
         detail="largest difference, in roundings of the sums that the weights are; a wrong shape or name is infinite",
-    )  # fmt: skip
+    )
     shipped = _flat(design.certificate.matrices["rounding"])
     share = float(np.max(rounding / np.maximum(shipped, np.finfo(float).tiny), initial=0.0))
     yield upper_bound_check(
-        "rounding", "what the running test may err for known signals of size one is at most what is shipped", share,
-        1.0 + SAME, source=SOURCE, kind="computed",
-    )  # fmt: skip
+        "rounding",
+        "what the running test may err for known signals of size one is at most what is shipped",
+        share,
+        1.0 + SAME,
+        source=SOURCE,
+        kind="computed",
+    )
 
 
 #: Sums in another order differ by less than this share.
@@ -157,19 +190,32 @@ def _of_the_least(design: ObserverDesign, window: Window) -> Iterator[Check]:
         witness = Repaired(_flat(shipped["witness"]), _flat(shipped["witness_radius"]))
         exact = repaired_point(window, witness.values, refine=False, among=witness.radius)
         yield upper_bound_check(
-            "witness", "a course of the fault that satisfies every equation exactly lies within the shipped distance "
-            "of the shipped one", _excess(exact, witness.radius), 1.0,
-            source=SOURCE, kind="proved",
-        )  # fmt: skip
+            "witness",
+            "a course of the fault that satisfies every equation exactly lies within the shipped distance "
+            "of the shipped one",
+            _excess(exact, witness.radius),
+            1.0,
+            source=SOURCE,
+            kind="proved",
+        )
         found = proved_least(window, witness)
     yield lower_bound_check(
-        "least", "no function of these samples has a threshold below this: a fault of twice this size, and none, give "
-        "the same samples within all bounds", found, float(least), source=SOURCE, kind="proved",
-    )  # fmt: skip
-    yield upper_bound_check(
-        "order", "the least threshold is not above the shipped one", float(least), threshold, source=SOURCE,
+        "least",
+        "no function of these samples has a threshold below this: a fault of twice this size, and none, give "
+        "the same samples within all bounds",
+        found,
+        float(least),
+        source=SOURCE,
         kind="proved",
-    )  # fmt: skip
+    )
+    yield upper_bound_check(
+        "order",
+        "the least threshold is not above the shipped one",
+        float(least),
+        threshold,
+        source=SOURCE,
+        kind="proved",
+    )
     if threshold > 0.0:
         yield information(
             "gap", "threshold over least, less one", threshold / least - 1.0 if least > 0.0 else np.inf, source=SOURCE

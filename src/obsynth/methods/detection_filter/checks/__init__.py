@@ -29,9 +29,12 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
     yield from plant_information(plant)
     fitting = _fits(design)
     yield upper_bound_check(
-        "fits the plant", "observer, claims, options and plant have matching signals, shapes and bands",
-        float(not fitting), 0.0, source="shipped realisation",
-    )  # fmt: skip
+        "fits the plant",
+        "observer, claims, options and plant have matching signals, shapes and bands",
+        float(not fitting),
+        0.0,
+        source="shipped realisation",
+    )
     if not fitting:
         return
     yield from condition_rows(conditions(plant))
@@ -92,13 +95,27 @@ def _norm_rows(design: ObserverDesign) -> Iterator[Check]:
 
     by_itself = gain_is_proved(felt, gain, witness), shows(sensitivity)
     yield Check(
-        "disturbance gain", "the error dies out, and the H-infinity norm from unknown inputs and noise to the "
-        "residuals is at most the claimed one", gain, gain, 0.0, by_itself[0], _SOURCE, "proved",
-    )  # fmt: skip
+        "disturbance gain",
+        "the error dies out, and the H-infinity norm from unknown inputs and noise to the "
+        "residuals is at most the claimed one",
+        gain,
+        gain,
+        0.0,
+        by_itself[0],
+        _SOURCE,
+        "proved",
+    )
     yield Check(
-        "fault sensitivity", "the least singular value from the faults to the residuals is at least the claimed one "
-        f"from {band[0]:g} to {band[1]:g} rad/s", sensitivity, sensitivity, 0.0, by_itself[1], _SOURCE, "proved",
-    )  # fmt: skip
+        "fault sensitivity",
+        "the least singular value from the faults to the residuals is at least the claimed one "
+        f"from {band[0]:g} to {band[1]:g} rad/s",
+        sensitivity,
+        sensitivity,
+        0.0,
+        by_itself[1],
+        _SOURCE,
+        "proved",
+    )
     if not all(by_itself):
         return
     what = "both norms hold for the plant together with the filter as it is stored, rounding included"

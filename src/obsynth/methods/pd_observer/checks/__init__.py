@@ -31,11 +31,13 @@ _IDENTITIES = {
     "dynamics": ("unbiased: dynamics", "Az + By C = A, with the faults as states", "Filasova et al., eq. (29)"),
     "inputs": ("unbiased: inputs", "Bu + By D = B", "Filasova et al., eq. (4)"),
     "state estimate": (
-        "unbiased: estimates", "the estimates equal states and faults when the error is zero",
-        "Filasova et al., eqs. (22), (23)"),
+        "unbiased: estimates",
+        "the estimates equal states and faults when the error is zero",
+        "Filasova et al., eqs. (22), (23)",
+    ),
     "residual": ("unbiased: residual", "the residual is zero when the error is", "ours: y - D u - C xhat - Df fhat"),
     "input feedthrough": ("unbiased: feedthrough", "no estimate sees the input directly (Du + Dy D = 0)", "ours"),
-}  # fmt: skip
+}
 
 
 def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
@@ -45,9 +47,12 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
     yield from condition_rows(pd_observer_conditions(plant))
     fitting = _fits(plant, observer) and fitting_claims(design)
     yield upper_bound_check(
-        "fits the plant", "observer, gains, certificate and plant have matching signals and shapes",
-        0.0 if fitting else 1.0, 0.0, source="shipped realisation",
-    )  # fmt: skip
+        "fits the plant",
+        "observer, gains, certificate and plant have matching signals and shapes",
+        0.0 if fitting else 1.0,
+        0.0,
+        source="shipped realisation",
+    )
     if not fitting:
         return
     tolerance = relative_tolerance(printed_digits, plant.nx + plant.nf + plant.ny)
@@ -93,18 +98,25 @@ def _gains_row(design: ObserverDesign, augmented: DescriptorSystem, tolerance: f
     found = [
         residual(estimate @ gain_l, -direct, factors=((estimate, gain_l),), units=units),
         residual(
-            gain_j, observer.Az @ gain_l, -observer.By,
+            gain_j,
+            observer.Az @ gain_l,
+            -observer.By,
             factors=(
-                (observer.Az, gain_l), (augmented.A, gain_l), (observer.By, augmented.C, gain_l),
+                (observer.Az, gain_l),
+                (augmented.A, gain_l),
+                (observer.By, augmented.C, gain_l),
                 (gain_j, augmented.C, gain_l),
             ),
             units=units,
         ),
-    ]  # fmt: skip
+    ]
     return equality(
-        "gains", "the realisation is that of the listed J, L, M, N (and G)", worst(found),
-        "Filasova et al., eqs. (4)-(6), (31)", bound=tolerance,
-    )  # fmt: skip
+        "gains",
+        "the realisation is that of the listed J, L, M, N (and G)",
+        worst(found),
+        "Filasova et al., eqs. (4)-(6), (31)",
+        bound=tolerance,
+    )
 
 
 def _spectra(design: ObserverDesign, errors: PdErrorSystem) -> Iterator[Check]:
@@ -113,29 +125,40 @@ def _spectra(design: ObserverDesign, errors: PdErrorSystem) -> Iterator[Check]:
     singular_values = np.linalg.svd(_balanced(errors.estimate), compute_uv=False)
     largest, smallest = float(singular_values[0]), float(singular_values[-1])
     yield lower_bound_check(
-        "det(I + L C)", "I + L C is nonsingular, so that the observer exists without derivatives",
-        smallest / largest if largest > 0.0 else 0.0, RANK_TOLERANCE, source="Filasova et al., Remark 1",
+        "det(I + L C)",
+        "I + L C is nonsingular, so that the observer exists without derivatives",
+        smallest / largest if largest > 0.0 else 0.0,
+        RANK_TOLERANCE,
+        source="Filasova et al., Remark 1",
         detail=f"inverse of its condition number; the determinant is {1.0 / np.linalg.det(errors.estimate):.6g}",
-    )  # fmt: skip
+    )
     abscissa = spectral_abscissa(errors.Az)
     yield _negative(
-        "error system", "every eigenvalue of the error system has a negative real part", abscissa,
+        "error system",
+        "every eigenvalue of the error system has a negative real part",
+        abscissa,
         source="Filasova et al., eq. (33)",
         detail=f"eigenvalues {spectrum_text(errors.Az)}; computed, their proof is the row 'LMI'",
-    )  # fmt: skip
+    )
     decay = claims["decay"]
     if decay > 0.0:
         yield upper_bound_check(
-            "decay rate", "errors die out at the claimed rate (largest real part of an eigenvalue, 1/s)", abscissa,
-            -decay, source="ours: the theorem for A + alpha I",
-        )  # fmt: skip
+            "decay rate",
+            "errors die out at the claimed rate (largest real part of an eigenvalue, 1/s)",
+            abscissa,
+            -decay,
+            source="ours: the theorem for A + alpha I",
+        )
     if "disk_radius" in claims:
         centre, radius = claims["disk_centre"], claims["disk_radius"]
         distance = float(np.max(np.abs(np.linalg.eigvals(errors.Az) + centre)))
         yield upper_bound_check(
-            "disk", f"every eigenvalue of the error system lies within {radius:.6g} of {-centre:.6g}", distance, radius,
+            "disk",
+            f"every eigenvalue of the error system lies within {radius:.6g} of {-centre:.6g}",
+            distance,
+            radius,
             source="ours",
-        )  # fmt: skip
+        )
     yield from _parts(plant, errors)
 
 
@@ -149,15 +172,19 @@ def _parts(plant: DescriptorSystem, errors: PdErrorSystem) -> Iterator[Check]:
     proportional = plant.A - errors.J[:nx] @ plant.C
     together = solved(np.eye(nx) + errors.L[:nx] @ plant.C, proportional)
     yield information(
-        "state part", "spectral abscissa of (I + L C)^-1 (A - J C), 1/s",
-        spectral_abscissa(together), source="Filasova et al., eq. (28)",
+        "state part",
+        "spectral abscissa of (I + L C)^-1 (A - J C), 1/s",
+        spectral_abscissa(together),
+        source="Filasova et al., eq. (28)",
         detail=f"eigenvalues {spectrum_text(together)}",
-    )  # fmt: skip
+    )
     yield information(
-        "P part alone", "spectral abscissa of A - J C, 1/s: neither theorem promises that it is negative",
-        spectral_abscissa(proportional), source="Filasova et al., eq. (27)",
+        "P part alone",
+        "spectral abscissa of A - J C, 1/s: neither theorem promises that it is negative",
+        spectral_abscissa(proportional),
+        source="Filasova et al., eq. (27)",
         detail=f"eigenvalues {spectrum_text(proportional)}",
-    )  # fmt: skip
+    )
 
 
 def spectrum_text(matrix: FloatArray, most: int = 8) -> str:
@@ -177,10 +204,12 @@ def _pencil_row(design: ObserverDesign, augmented: DescriptorSystem) -> Check:
     impulse_free = rounding_rank(_balanced(shown)) == augmented.nx
     abscissa = spectral_abscissa(_balanced(solved(shown, moved))) if impulse_free else float("nan")
     return _negative(
-        "descriptor pair", "(E*, A*) of the listed gains is admissible: regular, impulse-free, stable", abscissa,
+        "descriptor pair",
+        "(E*, A*) of the listed gains is admissible: regular, impulse-free, stable",
+        abscissa,
         source="Filasova et al., eqs. (38), (39), Definition 1",
         detail=f"{augmented.nx} finite modes of {2 * augmented.nx}" if impulse_free else "I + L C is singular",
-    )  # fmt: skip
+    )
 
 
 #: Norms of ``[J L]`` above this many times the norm of A are out of proportion to the plant, and worth a warning.
@@ -193,31 +222,45 @@ def norm_rows(design: ObserverDesign, errors: PdErrorSystem) -> Iterator[Check]:
     noisy = with_sensor_noise(plant)
     unit = "" if plant.nw else "unit noise on every output, as the plant states none"
     yield _norm_row(
-        "fault rate in the fault estimate", "H-infinity norm from f' to the fault error, seconds",
-        errors.fault_norm(errors.rate), claims.get("fault_rate_gain"),
-    )  # fmt: skip
+        "fault rate in the fault estimate",
+        "H-infinity norm from f' to the fault error, seconds",
+        errors.fault_norm(errors.rate),
+        claims.get("fault_rate_gain"),
+    )
     yield _norm_row(
         "noise and its derivative in the fault estimate",
         "H-infinity norm from noise and its derivative, as free inputs, to the fault error",
-        errors.separate_noise_norm(noisy.Bw, noisy.Dw), claims.get("noise_gain"), unit,
-    )  # fmt: skip
+        errors.separate_noise_norm(noisy.Bw, noisy.Dw),
+        claims.get("noise_gain"),
+        unit,
+    )
     yield _norm_row(
-        "noise in the fault estimate", "H-infinity norm from the noise to the fault error",
-        errors.fault_norm(errors.noise), None, unit,
-    )  # fmt: skip
+        "noise in the fault estimate",
+        "H-infinity norm from the noise to the fault error",
+        errors.fault_norm(errors.noise),
+        None,
+        unit,
+    )
     yield information(
-        "fast noise in the fault estimate", "gain from the noise to the fault error at high frequencies",
-        _size(errors.noise[1][plant.nx :]), source="recomputed", detail=unit,
-    )  # fmt: skip
+        "fast noise in the fault estimate",
+        "gain from the noise to the fault error at high frequencies",
+        _size(errors.noise[1][plant.nx :]),
+        source="recomputed",
+        detail=unit,
+    )
     if plant.nd:
         yield _norm_row(
-            "disturbance in the fault estimate", "H-infinity norm from d to the fault error: d is not decoupled",
-            errors.fault_norm(errors.disturbance), None,
-        )  # fmt: skip
+            "disturbance in the fault estimate",
+            "H-infinity norm from d to the fault error: d is not decoupled",
+            errors.fault_norm(errors.disturbance),
+            None,
+        )
         yield _norm_row(
-            "disturbance in the state estimate", "H-infinity norm from d to the state error",
-            errors.state_norm(errors.disturbance), None,
-        )  # fmt: skip
+            "disturbance in the state estimate",
+            "H-infinity norm from d to the state error",
+            errors.state_norm(errors.disturbance),
+            None,
+        )
     yield from _gain_rows(design, errors)
 
 
@@ -234,9 +277,12 @@ def _gain_rows(design: ObserverDesign, errors: PdErrorSystem) -> Iterator[Check]
     gain = _size(np.hstack([errors.J, errors.L]))
     if "gain_bound" in claims:
         yield upper_bound_check(
-            "gain bound", "norm of [J L], with the rows of M and N: at most as claimed", gain, claims["gain_bound"],
+            "gain bound",
+            "norm of [J L], with the rows of M and N: at most as claimed",
+            gain,
+            claims["gain_bound"],
             source="ours",
-        )  # fmt: skip
+        )
     large = not gain <= LARGE_GAIN * max(_size(design.linear[0].A), 1.0)
     warning = (
         "WARNING: out of proportion to the plant: any error of the model or the sensors is multiplied by it. Ask for a "
