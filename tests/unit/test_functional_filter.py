@@ -258,3 +258,41 @@ def test_some_of_the_faults_are_judged_against_those() -> None:
     found = obsynth.functional_filter(plant, faults=["b"])
     scenario = obsynth.Scenario(horizon=20.0, faults={"b": obsynth.Step(size=1.0, start=2.0)}, noise=0.0)
     assert abs(obsynth.simulate(found, scenario).fault_errors[-1, 0]) < 1e-3
+
+
+#: Small integer plants whose filters had rows of nothing but rounding, which met their identities to all of themselves.
+ROUNDING_ROWS = {
+    "one unstable state": {
+        "E": [[1]], "A": [[3]], "C": [[3], [0], [0], [0]], "Bf": [[0]], "Df": [[1], [0], [0], [0]],
+        "Bd": [[0]], "Dd": [[0], [0], [-3], [-3]], "dt": 1.0,
+    },
+    "an output that is a biased zero": {
+        "E": [[1]], "A": [[0]], "C": [[-1], [0], [0], [0]], "Bf": [[0]], "Df": [[3], [0], [0], [0]],
+        "Bd": [[1]], "Dd": [[0], [-3], [0], [1]], "dt": 1.0,
+    },
+    "gains of rounding": {
+        "E": [[-1]], "A": [[-2]], "C": [[-3], [0], [0], [1]], "Bf": [[0, -1]], "Df": [[3, 0], [0, 2], [1, 0], [0, 0]],
+        "Bd": [[-2]], "Dd": [[0]] * 4, "dt": 0.0,
+    },
+    "a sensor without a state": {
+        "E": [[1, 0], [0, 1]], "A": [[-2, -1], [2, 0]], "C": [[0, 0], [0, 2], [0, 3], [0, 0]], "Bf": [[-2, 0], [0, 0]],
+        "Df": [[0, 2], [0, 0], [0, 0], [0, 0]], "dt": 1.0,
+    },
+    "a zero output": {
+        "E": [[0, 1, 0, -1], [-1, 1, 0, -1], [1, 0, 1, 0], [0, 0, 0, 1]],
+        "A": [[0, -1, 0, 1], [1, -2, 0, 1], [-1, 1, -1, 1], [0, 0, 0, -1]],
+        "C": [[0, 0, 0, 0], [0, -1, 0, 0], [0, -1, 1, 0], [0, 1, 0, -2]], "Bf": [[-2, -2], [-4, 0], [4, -4], [2, 1]],
+    },
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ROUNDING_ROWS)
+def test_rows_of_rounding_are_zero_and_lose_no_filter(name: str) -> None:
+    entries = {
+        key: value if key == "dt" else np.array(value, dtype=float) for key, value in ROUNDING_ROWS[name].items()
+    }
+    design = obsynth.functional_filter(obsynth.DescriptorSystem(**entries))
+    assert design.report.passed
+    # Every row of an output is a number or zero, not what rounding left of one.
+    rows = np.abs(np.hstack([design.observer.Cz, design.observer.Dy]))
+    assert not np.any((rows > 0.0) & (rows < 1e-13 * np.max(rows)))

@@ -85,6 +85,12 @@ def rounding_rank(matrix: FloatArray) -> int:
     return int(np.linalg.matrix_rank(matrix))
 
 
+def product_but_rounding(matrix: FloatArray, other: FloatArray) -> FloatArray:
+    """Return a product; where its terms cancel down to their rounding, there is nothing."""
+    found = matrix @ other
+    return np.where(np.abs(found) > CANCELLATION_TOLERANCE * (np.abs(matrix) @ np.abs(other)), found, 0.0)
+
+
 @dataclass(frozen=True, eq=False)
 class RankDecision:
     """A numerical rank with the evidence: all singular values, largest first, as decided upon (rows, columns scaled).

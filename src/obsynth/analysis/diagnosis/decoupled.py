@@ -12,7 +12,7 @@ from obsynth.analysis.transformations.recovery import Transformation, linear_pla
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import ComplexArray, FloatArray, read_only
 from obsynth.numerics.libraries import on_one_thread_if_small
-from obsynth.numerics.ranks import CLEAR_GAP, RankDecision
+from obsynth.numerics.ranks import CLEAR_GAP, RankDecision, product_but_rounding
 from obsynth.plants.descriptor import DescriptorSystem
 
 #: Entries of unit rows below this are rounding of the orthogonal transformations that made them.
@@ -194,15 +194,15 @@ def decoupled(plant: DescriptorSystem, removed: Sequence[int], kept: Sequence[in
     sizes = np.linalg.norm(units.rows[:, None] * signals, axis=0)
     k = found.order
     parts = {
-        "u": rows @ signals[:, : plant.nu],
-        "y": rows @ signals[:, plant.nu :],
-        "f": rows @ faults,
-        "w": rows @ np.vstack([plant.Bw, plant.Dw]),
+        "u": product_but_rounding(rows, signals[:, : plant.nu]),
+        "y": product_but_rounding(rows, signals[:, plant.nu :]),
+        "f": product_but_rounding(rows, faults),
+        "w": product_but_rounding(rows, np.vstack([plant.Bw, plant.Dw])),
     }
     return DecoupledPlant(
-        E=read_only(found.E / units.time),
-        A=read_only(found.A),
-        C=read_only(found.C),
+        E=read_only(_told(found.E) / units.time),
+        A=read_only(_told(found.A)),
+        C=read_only(_told(found.C)),
         Bu=read_only(parts["u"][:k]),
         By=read_only(parts["y"][:k]),
         F=read_only(parts["f"][:k]),
@@ -222,6 +222,12 @@ def decoupled(plant: DescriptorSystem, removed: Sequence[int], kept: Sequence[in
         time=units.time,
         decisions=found.decisions,
     )
+
+
+def _told(matrix: FloatArray) -> FloatArray:
+    """Return a matrix of the balanced plant, in which entries are near one, without what is only rounding."""
+    size = ROUNDING * max(1.0, float(np.max(np.abs(matrix), initial=0.0)))
+    return np.where(np.abs(matrix) > size, matrix, 0.0)
 
 
 def unknowns_pencil(plant: DescriptorSystem, removed: Sequence[int]) -> tuple[FloatArray, FloatArray]:

@@ -13,7 +13,7 @@ eps = z - T E x obeys ``eps+ = Az eps + (By Df - T Bf) f``, ``estimates = Cz eps
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -38,7 +38,7 @@ from obsynth.methods.placement.eigenstructure import checked_poles, place
 from obsynth.methods.refusals import require_all_told
 from obsynth.methods.riccati import lyapunov_factor
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, rounding_rank
+from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, product_but_rounding, rounding_rank
 from obsynth.numerics.scaling import balanced_matrix
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
@@ -80,12 +80,11 @@ class Rows:
 
     def times(self, matrix: FloatArray) -> Rows:
         """Return combinations of the rows; where only rounding is left, there is nothing."""
-        return Rows(matrix @ self.C, _combined(matrix, self.D), _combined(matrix, self.T0))
-
-
-def _combined(matrix: FloatArray, rows: FloatArray) -> FloatArray:
-    found = matrix @ rows
-    return np.where(np.abs(found) > CANCELLATION_TOLERANCE * (np.abs(matrix) @ np.abs(rows)), found, 0.0)
+        return Rows(
+            product_but_rounding(matrix, self.C),
+            product_but_rounding(matrix, self.D),
+            product_but_rounding(matrix, self.T0),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +100,11 @@ class FilterPart:
 
 def filter_part(model: FilterModel, gain: KalmanGain, shown: FloatArray, *, delay: int, mean: int) -> FilterPart:
     """Return the filter of a gain, with a delay in samples; ``shown (rows, p)``: innovations shipped as residuals."""
-    dynamics = Dynamics(model.A - gain.K @ model.C, model.B + gain.K @ model.L, model.T + gain.K @ model.T0)
+    sizes = np.sqrt(np.maximum(np.diag(gain.innovation), 0.0))
+    gain = replace(gain, K=_told(gain.K, sizes), lag=tuple(_told(part, sizes) for part in gain.lag))
+    shown = _told(shown, sizes)
+    parts = (model.A, -model.C), (model.B, model.L), (model.T, model.T0)
+    dynamics = Dynamics(*(_sum_but_rounding(own, gain.K, fed_back) for own, fed_back in parts))
     innovation = Rows(-model.C, model.L, model.T0)
     count, nx = len(model.estimate), model.T.shape[1]
     row = Rows(model.estimate, np.zeros((count, model.L.shape[1])), np.zeros((count, nx)))
@@ -121,6 +124,22 @@ def filter_part(model: FilterModel, gain: KalmanGain, shown: FloatArray, *, dela
         total = total.plus(row)
     estimates = total.times(np.eye(count) / mean) if mean > 1 else total
     return FilterPart(dynamics, estimates, innovation.times(shown), model.faults, delay + (mean - 1) // 2)
+
+
+def _told(gain: FloatArray, sizes: FloatArray) -> FloatArray:
+    """Return a gain ``(rows, p)`` of innovations of some sizes without what only rounding put into its rows.
+
+    A gain may be any number: of zero the identities of the filter hold exactly, of rounding they hold to all of it.
+    """
+    share = np.abs(gain) * np.where(sizes > 0.0, sizes, 1.0)
+    return np.where(share > CANCELLATION_TOLERANCE * np.max(share, axis=1, initial=0.0, keepdims=True), gain, 0.0)
+
+
+def _sum_but_rounding(own: FloatArray, gain: FloatArray, fed_back: FloatArray) -> FloatArray:
+    """Return ``own + gain @ fed_back``; where the terms cancel down to their rounding, there is nothing."""
+    found = own + gain @ fed_back
+    terms = np.abs(own) + np.abs(gain) @ np.abs(fed_back)
+    return np.where(np.abs(found) > CANCELLATION_TOLERANCE * terms, found, 0.0)
 
 
 def _plain_coordinates(a: FloatArray) -> FloatArray | None:
