@@ -196,7 +196,7 @@ def _summed(power: FloatArray, factor: FloatArray) -> FloatArray | None:
         later = factor @ power
         if not np.all(np.isfinite(later)):
             return None
-        factor = np.linalg.qr(np.vstack([factor, later]), mode="r")
+        factor = np.asarray(np.linalg.qr(np.vstack([factor, later]), mode="r"))
         if np.all(np.linalg.norm(later, axis=0) <= SETTLED * np.linalg.norm(factor, axis=0)):
             return np.asarray(factor / (np.max(np.abs(factor), initial=0.0) or 1.0))
         power = power @ power

@@ -135,13 +135,13 @@ def _row(check: Check) -> str:
     detail = f"<div>{escape(check.detail)}</div>" if check.detail else ""
     kind = "" if word == "info" or worth(check) != check.status else check.kind
     parts = dict.fromkeys([*([kind] if kind else []), f"({worth(check)})"])
-    kind = f'<span class="kind">{escape(" ".join(parts))}</span>'
+    marked = f'<span class="kind">{escape(" ".join(parts))}</span>'
     numbers = "".join(
         f'<td class="number{" none" if number(value) == "-" else ""}" data-label="{label}">{number(value)}</td>'
         for label, value in (("value", check.value), ("bound", check.bound), ("margin", check.margin))
     )
     return (
-        f'<tr><td class="word {word.lower()}" data-label="verdict">{word}{kind}</td>'
+        f'<tr><td class="word {word.lower()}" data-label="verdict">{word}{marked}</td>'
         f'<td><strong>{escape(check.name)}</strong><div class="claim">{escape(check.claim)}</div>{detail}</td>'
         f'{numbers}<td class="source">{escape(check.source)}</td></tr>'
     )
