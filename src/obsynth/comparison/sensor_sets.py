@@ -12,6 +12,7 @@ import numpy as np
 from annotated_types import Ge
 
 from obsynth.analysis.diagnosis.decoupled import fault_numbers
+from obsynth.analysis.diagnosis.exact import Questions
 from obsynth.analysis.diagnosis.explanations import Sensor, state_sensors
 from obsynth.analysis.diagnosis.sensor_search import GOALS, SensorSearch, Task, reached
 from obsynth.analysis.transformations.recovery import Transformation, linear_plant
@@ -217,7 +218,8 @@ def sensor_sets(
             found, exact = ([], exact) if one is None else ([one], False)
     report_stage("designing for each set")
     ranked = _ranked(search, found, costs, noise is not None and goal.startswith("estimate"))
-    had = [task for task in wanted if reached(plant, task)]
+    asked = Questions(plant, exactly=False)
+    had = [task for task in wanted if reached(asked, task)]
     failing = {name: _lost_without(plant, had, i) for i, name in enumerate(plant.output_names)} if had else {}
     kept = tuple(name for name, faults in failing.items() if len(had) == len(wanted) and not faults)
     out_of_reach = []
@@ -307,4 +309,5 @@ def _lost_without(plant: DescriptorSystem, had: Sequence[Task], output: int) -> 
         units={},
         operating_point={},
     )
-    return tuple(dict.fromkeys(plant.fault_names[task.fault] for task in had if not reached(fewer, task)))
+    asked = Questions(fewer, exactly=False)
+    return tuple(dict.fromkeys(plant.fault_names[task.fault] for task in had if not reached(asked, task)))

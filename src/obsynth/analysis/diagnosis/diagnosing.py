@@ -3,13 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from obsynth.analysis.diagnosis.exact import Questions, decided_exactly
-from obsynth.analysis.diagnosis.explanations import hidden_motion, least_additions, listed, state_sensors
+from obsynth.analysis.diagnosis.explanations import (
+    MOST_FOR_ONE,
+    Sensor,
+    hidden_motion,
+    least_additions,
+    listed,
+    state_sensors,
+)
 from obsynth.analysis.diagnosis.fault_columns import Question, dc_point, others
+from obsynth.analysis.diagnosis.sensor_search import SensorResponses
 from obsynth.analysis.diagnosis.verdicts import (
     MOST_FAULTS,
     MOST_FAULTS_OF_WHOLE_BANK,
@@ -99,11 +110,11 @@ def diagnose(
     report_stage = progress or (lambda _: None)
     exactly = decided_exactly(plant)
     report_stage("asking what shows each fault")
-    asked = Questions(plant, exactly)
+    asked, candidates = Questions(plant, exactly), _Candidates(plant) if suggest else None
     shown = [asked.of((), i) for i in range(plant.nf)]
     free = [asked.of(others(plant, i), i) for i in range(plant.nf)]
     faults = tuple(
-        _verdict(plant, own, alone, frequencies, model_points(model, i), suggest=suggest)
+        _verdict(plant, own, alone, frequencies, model_points(model, i), candidates)
         for i, (own, alone) in enumerate(zip(shown, free, strict=True))
     )
     report_stage("telling faults from each other")
@@ -137,8 +148,7 @@ def _verdict(
     free: Question,
     frequencies: Sequence[float],
     modes: Sequence[complex],
-    *,
-    suggest: bool,
+    candidates: _Candidates | None,
 ) -> FaultDiagnosis:
     points = [complex(np.exp(1j * w * plant.dt)) if plant.dt > 0.0 else 1j * w for w in frequencies]
     return FaultDiagnosis(
@@ -154,13 +164,13 @@ def _verdict(
         filter_order=free.order,
         zeros=free.zeros,
         blocking=free.blocking,
-        sentences=tuple(_sentences(plant, shown, free, suggest=suggest)),
+        sentences=tuple(_sentences(plant, shown, free, candidates)),
         exact=shown.exactly,
         gap=min(shown.gap, free.gap),
     )
 
 
-def _sentences(plant: DescriptorSystem, shown: Question, free: Question, *, suggest: bool) -> list[str]:
+def _sentences(plant: DescriptorSystem, shown: Question, free: Question, candidates: _Candidates | None) -> list[str]:
     """Return what hides a fault, at which point, and what would help."""
     name, rest = plant.fault_names[shown.number], dc_point(plant.dt)
     letter = "z" if plant.dt > 0.0 else "s"
@@ -189,30 +199,58 @@ def _sentences(plant: DescriptorSystem, shown: Question, free: Question, *, sugg
         more = "s" if free.derivatives > 1 else ""
         needed = f"sample{more} of delay" if plant.dt > 0.0 else f"derivative{more} of the outputs"
         texts.append(f"{name}: needs {free.derivatives} {needed}{'; as a step, none' if step else ''}.")
-    if suggest and not (step and free.estimable):
-        texts += _suggestion(plant, name, shown, step=step)
+    if candidates is not None and not (step and free.estimable):
+        texts += _suggestion(candidates, name, shown, step=step)
     return texts
 
 
-def _suggestion(plant: DescriptorSystem, name: str, shown: Question, *, step: bool) -> list[str]:
-    """Return which states to measure, computed; and those that would only show the fault."""
-    sensors, fault = state_sensors(plant), shown.number
+@dataclass(frozen=True, eq=False)
+class _Candidates:
+    """States that could be measured, and what they show at generic points: of most sets that is enough to refuse."""
 
+    plant: DescriptorSystem
+
+    @cached_property
+    def sensors(self) -> tuple[Sensor, ...]:
+        return state_sensors(self.plant)
+
+    @cached_property
+    def responses(self) -> SensorResponses | None:
+        return SensorResponses.of(self.plant, self.sensors)
+
+    def additions(
+        self, fault: int, beside: Sequence[int], reached: Callable[[DescriptorSystem], bool]
+    ) -> tuple[tuple[str, ...], ...]:
+        """Return the least sets that reach something for which a fault has to show, free of those ``beside``."""
+
+        def promising(sets: NDArray[np.int64]) -> NDArray[np.bool_]:
+            return np.ones(len(sets), bool) if responses is None else responses.shows(sets, fault, beside) > 0.0
+
+        if self.plant.nx > MOST_FOR_ONE:
+            return ()
+        responses = self.responses
+        return least_additions(self.plant, self.sensors, reached, promising=promising)
+
+
+def _suggestion(candidates: _Candidates, name: str, shown: Question, *, step: bool) -> list[str]:
+    """Return which states to measure, computed; and those that would only show the fault."""
+    plant, fault = candidates.plant, shown.number
+    rest = others(plant, fault)
     answered: dict[tuple[str, ...], Question] = {}
 
     def free(changed: DescriptorSystem) -> Question:
         added = changed.output_names[plant.ny :]
-        return answered.setdefault(added, Question(changed, others(changed, fault), fault))
+        return answered.setdefault(added, Question(changed, rest, fault))
 
-    full = least_additions(plant, sensors, lambda changed: free(changed).estimable)
-    constant = () if step else least_additions(plant, sensors, lambda changed: free(changed).shows_at_rest)
+    full = candidates.additions(fault, rest, lambda changed: free(changed).estimable)
+    constant = () if step else candidates.additions(fault, rest, lambda changed: free(changed).shows_at_rest)
     texts = []
     if full:
         texts.append(f"{name}: Add one of: {listed(full)}.")
     elif constant:
         texts.append(f"{name}: Add one of: {listed(constant)} (then it can be estimated as a step).")
     if not shown.visible:
-        showing = least_additions(plant, sensors, lambda changed: Question(changed, (), fault).visible)
+        showing = candidates.additions(fault, (), lambda changed: Question(changed, (), fault).visible)
         more = [names for names in showing if names not in (*full, *constant)]
         if more:
             texts.append(f"{name}: {listed(more)} would show it, but not its size.")

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from obsynth.analysis.diagnosis.decoupled import unknowns_pencil
 from obsynth.analysis.diagnosis.fault_columns import dc_point
@@ -74,12 +75,19 @@ def least_additions(
     reached: Callable[[DescriptorSystem], bool],
     *,
     most: tuple[int, int] = (MOST_FOR_ONE, MOST_FOR_PAIRS),
+    promising: Callable[[NDArray[np.int64]], NDArray[np.bool_]] | None = None,
 ) -> tuple[tuple[str, ...], ...]:
-    """Return all single sensors that do it, or else all pairs; none for plants of more states than ``most``."""
+    """Return all single sensors that do it, or else all pairs; none for plants of more states than ``most``.
+
+    ``promising`` says of sets ``(N, size)`` of places which ones are to be asked about at all.
+    """
     if plant.nx > most[0]:
         return ()
     for size in (1, 2) if plant.nx <= most[1] else (1,):
-        helping = [chosen for chosen in combinations(sensors, size) if reached(with_sensors(plant, chosen))]
+        sets = np.array(list(combinations(range(len(sensors)), size)), dtype=np.int64).reshape(-1, size)
+        asked = sets if promising is None else sets[promising(sets)]
+        sensor_sets = [[sensors[i] for i in chosen] for chosen in asked.tolist()]
+        helping = [chosen for chosen in sensor_sets if reached(with_sensors(plant, chosen))]
         if helping:
             return tuple(tuple(sensor.name for sensor in chosen) for chosen in helping)
     return ()

@@ -9,14 +9,16 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import combinations
 from math import comb
 
 import numpy as np
 from numpy.typing import NDArray
 
+from obsynth.analysis.diagnosis.exact import Questions
 from obsynth.analysis.diagnosis.explanations import Sensor, with_sensors
-from obsynth.analysis.diagnosis.fault_columns import Question, others
+from obsynth.analysis.diagnosis.fault_columns import others
 from obsynth.analysis.diagnosis.reduction import PencilUnits
 from obsynth.numerics.arrays import SMALLEST, ComplexArray
 from obsynth.numerics.ranks import RANK_TOLERANCE
@@ -114,6 +116,11 @@ class SensorSearch:
     may_fail: bool  # an added sensor brings a fault of its own, to be told as well
     copies: int  # how often a sensor may be taken
 
+    @cached_property
+    def responses(self) -> SensorResponses | None:
+        """What outputs and candidates show of unknown inputs and faults at generic points."""
+        return SensorResponses.of(self.plant, self.sensors)
+
     def tasks(self, plant: DescriptorSystem, faults: Sequence[int]) -> list[Task]:
         """Return everything that the goal asks of a plant."""
         if self.goal == "detect":
@@ -125,7 +132,7 @@ class SensorSearch:
 
     def reachable(self) -> list[Task]:
         """Return the tasks that all candidates together reach: no set can do more."""
-        whole = with_sensors(self.plant, self.sensors)
+        whole = Questions(with_sensors(self.plant, self.sensors), exactly=False)
         return [task for task in self.tasks(self.plant, self.faults) if reached(whole, task)]
 
     def equipped(self, chosen: Sequence[int]) -> DescriptorSystem:
@@ -149,17 +156,18 @@ class SensorSearch:
     def feasible(self, chosen: Sequence[int], wanted: Sequence[Task]) -> bool:
         """Whether a set reaches all that is wanted (and all about its own faults)."""
         plant = self.equipped(chosen)
-        if not all(reached(plant, task) for task in wanted):
+        asked = Questions(plant, exactly=False)
+        if not all(reached(asked, task) for task in wanted):
             return False
         if not self.may_fail:
             return True
         known = self.plant.nf
         more = self.tasks(plant, [*self.faults, *range(known, plant.nf)])
-        return all(reached(plant, task) for task in more if max(task.fault, *task.beside, -1) >= known)
+        return all(reached(asked, task) for task in more if max(task.fault, *task.beside, -1) >= known)
 
     def minimal_sets(self, wanted: Sequence[Task], largest: int, most: int) -> tuple[list[tuple[int, ...]], bool]:
         """Return inclusion-minimal sets by size, and whether these are all of them up to the largest size."""
-        responses = None if self.may_fail else SensorResponses.of(self.plant, self.sensors)
+        responses = None if self.may_fail else self.responses
         found: list[tuple[int, ...]] = []
         count = len(self.sensors)
         for size in range(largest + 1):
@@ -205,18 +213,18 @@ class SensorSearch:
         return tuple(sorted(chosen))
 
     def _score(self, chosen: Sequence[int], wanted: Sequence[Task]) -> float:
-        responses = SensorResponses.of(self.plant, self.sensors)
+        responses = self.responses
         if responses is None:
-            plant = self.equipped(chosen)
-            return float(sum(reached(plant, task) for task in wanted))
+            asked = Questions(self.equipped(chosen), exactly=False)
+            return float(sum(reached(asked, task) for task in wanted))
         table = np.array([chosen], dtype=np.int64)
         shown = [float(responses.shows(table, task.fault, task.beside)[0]) for task in wanted]
         return sum(value > 0.0 for value in shown) + min([value for value in shown if value > 0.0], default=0.0) / 2.0
 
 
-def reached(plant: DescriptorSystem, task: Task) -> bool:
-    """Whether a plant reaches a task, decided by taking out what must not show."""
-    asked = Question(plant, task.beside, task.fault)
+def reached(questions: Questions, task: Task) -> bool:
+    """Whether a plant reaches a task, decided by taking out what must not show: once for all faults that stay."""
+    asked = questions.of(task.beside, task.fault)
     if task.goal == "estimate":
         return asked.estimable
     return asked.shows_at_rest if task.goal == "estimate-step" else asked.visible
