@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +16,7 @@ import obsynth
 from obsynth import DAEModel, PreconditionError, SpecError, linearise
 from obsynth.plants.dae.functions import local_equations
 from obsynth.plants.uncertainty import matrices_of
+from obsynth.results.calibration_files import calibration_text
 from obsynth.spec import load_spec
 
 POINT = {"leak": 0.03, "h1": 0.7, "h3": 0.65}
@@ -152,7 +152,7 @@ def test_a_spec_with_tolerances_of_a_nonlinear_plant_watches_logs_of_it(tmp_path
 def test_a_calibration_file_gives_the_box(tmp_path: Path) -> None:
     found = {"kind": "obsynth calibration", "level": 0.95, "log": {"digest": "cd" * 32}, "constants": {
         "a2": {"nominal": 0.0201, "range": [0.0195, 0.0211], "open": [], "unit": "V^0.5/s"}}}  # fmt: skip
-    (tmp_path / "cal.json").write_text(json.dumps(found), encoding="utf-8")
+    (tmp_path / "cal.json").write_text(calibration_text(found), encoding="utf-8")
     (tmp_path / "spec.yaml").write_text(
         SPEC.replace("  states:", "  box: {file: cal.json}\n  states:", 1), encoding="utf-8"
     )
@@ -161,7 +161,7 @@ def test_a_calibration_file_gives_the_box(tmp_path: Path) -> None:
     assert box.sentence == ("a constant outside its 95 % box of the log cdcdcdcdcdcd, or outside its stated tolerance "
                             "(a1, b1)")  # fmt: skip
     found["constants"]["a2"]["open"] = ["high"]
-    (tmp_path / "cal.json").write_text(json.dumps(found), encoding="utf-8")
+    (tmp_path / "cal.json").write_text(calibration_text(found), encoding="utf-8")
     with pytest.raises(SpecError, match="open high side"):
         load_spec(tmp_path / "spec.yaml")
 

@@ -92,6 +92,8 @@ def run_linearise(options: argparse.Namespace) -> int:
 def run_calibrate(options: argparse.Namespace) -> int:
     """Run ``calibrate``: spec and log in, constants with their box and a verdict out."""
     from obsynth.calibration.calibrating import calibrate
+    from obsynth.results.calibration_files import KIND, calibration_text
+    from obsynth.results.gain_sets import plain
     from obsynth.spec.loader import load_plant
 
     with progress(quiet=options.quiet) as report_stage:
@@ -107,16 +109,12 @@ def run_calibrate(options: argparse.Namespace) -> int:
         if digest is not None and digest != found.box.digest:
             raise SpecError(
                 f"The log {log} is not the one that the spec names: its digest is {found.box.digest}, and "
-                f"calibrate.digest {digest}.",
-                path="calibrate.digest",
-            )
-    data = {"kind": "obsynth calibration", "system": options.system.name, **found.to_dict()}
+                f"calibrate.digest {digest}.", path="calibrate.digest",
+            )  # fmt: skip
+    told = {name: value for name, value in asked.items() if name not in ("log", "digest")}
+    data = {"kind": KIND, "system": options.system.name, **found.to_dict()}
     if target is not None:
-        import json
-
-        from obsynth.results.gain_sets import plain
-
-        write_atomically(target, json.dumps(plain(data), indent=1, allow_nan=False) + "\n")
+        write_atomically(target, calibration_text({**data, "asked": plain(told)}))
     answer(options, {"file": target, **data}, f"{found}\n  digest of the log: {found.box.digest}")
     return 0
 

@@ -17,6 +17,7 @@ from obsynth.files.outputs import write_atomically
 if TYPE_CHECKING:
     from obsynth.analysis.structure import Structure
     from obsynth.files.outputs import FileKind
+    from obsynth.results.checks import VerificationReport
     from obsynth.results.design import ObserverDesign
     from obsynth.spec import Spec
 
@@ -213,46 +214,101 @@ def _structure_as_dict(structure: Structure) -> dict[str, Any]:
     return facts
 
 
-def _is_alarm(path: Path) -> bool:
-    """Whether a file begins like the certificate of an alarm."""
+def _kind_of(path: Path) -> str:
+    """Return what kind of certificate a file begins like: ``alarm``, ``calibration``, or else a gain set."""
     from obsynth.experiments.alarm_proof import CERTIFICATE
+    from obsynth.results.calibration_files import KIND
 
     if not path.is_file():  # who reads it says so
-        return False
+        return "gain set"
     try:
         with path.open("rb") as stream:
-            return CERTIFICATE.mark in stream.read(200)
+            start = stream.read(200)
     except OSError:
-        return False
+        return "gain set"
+    return "alarm" if CERTIFICATE.mark in start else "calibration" if KIND.encode() in start else "gain set"
 
 
 def run_verify(options: argparse.Namespace) -> int:
-    """Run ``verify``: recheck a saved gain set, or the certificate of an alarm, without a solver."""
-    if _is_alarm(options.gains):
-        from obsynth.experiments.alarm_proof import verify_alarm
-        from obsynth.results.layout import print_checks
+    """Run ``verify``: recheck any certificate, without a solver, to the end of what it rests on."""
+    kind = _kind_of(options.gains)
+    _require_fitting(options, kind)
+    if kind == "gain set":
+        return _verify_gain_set(options)
+    from obsynth.results.layout import print_checks
 
-        report = verify_alarm(options.gains)
-        answer(
-            options,
-            {"file": str(options.gains), "passed": report.passed, "report": report.as_dict()},
-            lambda: print_checks(report.checks, console=stdout_console()),
-        )
+    if kind == "alarm":
+        from obsynth.experiments.alarm_proof import design_of_alarm, verify_alarm
+
+        report = verify_alarm(options.gains, data=options.data)
+        if options.calibration is not None and report.passed:
+            report = _with_calibration(report, design_of_alarm(options.gains), options.calibration)
     else:
-        from obsynth.methods.verifying import verify
-        from obsynth.results.gain_sets import load
+        from obsynth.results.calibration_files import verify_calibration
 
-        design = load(options.gains)
-        report = verify(design, printed_digits=options.printed_digits)
-        answer(
-            options,
-            {
-                "file": str(options.gains),
-                "name": design.name,
-                "method": design.method,
-                "passed": report.passed,
-                "report": report.as_dict(),
-            },
-            lambda: _print_design(design.replace(report=report), options.gains, verbose=options.verbose),
-        )
+        report = verify_calibration(options.gains, None if options.data is None else _calibrated_again(options))
+    answer(
+        options,
+        {"file": str(options.gains), "kind": kind, "passed": report.passed, "report": report.as_dict()},
+        lambda: print_checks(report.checks, console=stdout_console()),
+    )
+    return 0 if report.passed else VerificationError.exit_code
+
+
+def _require_fitting(options: argparse.Namespace, kind: str) -> None:
+    """Refuse options that do nothing for a kind of certificate."""
+    meant = {"data": ("alarm", "calibration"), "calibration": ("gain set", "alarm"), "system": ("calibration",),
+             "printed_digits": ("gain set",)}  # fmt: skip
+    for name, kinds in meant.items():
+        if getattr(options, name) is not None and kind not in kinds:
+            option = f"--{name.replace('_', '-')}"
+            raise SpecError(f"{options.gains} is a certificate of the kind {kind!r}: {option} is for "
+                            f"{' and '.join(kinds)}.", path=option)  # fmt: skip
+    if kind == "calibration" and (options.data is None) != (options.system is None):
+        raise SpecError("A calibration is done again from plant and log: give both --system and --data.",
+                        path="--system")  # fmt: skip
+
+
+def _calibrated_again(options: argparse.Namespace) -> dict[str, Any]:
+    """Return what the same calibration of the given plant and log comes to."""
+    from obsynth.calibration.calibrating import calibrate
+    from obsynth.files.inputs import read_json
+    from obsynth.results.gain_sets import restored
+    from obsynth.spec.loader import load_plant
+
+    plant, _ = load_plant(options.system)
+    asked = read_json(options.gains).get("asked")
+    if not isinstance(asked, dict):
+        raise SpecError(f"{options.gains} does not say what was asked: calibrate again.", path=str(options.gains))
+    return calibrate(plant, options.data, **restored(asked)).to_dict()
+
+
+def _with_calibration(report: VerificationReport, design: ObserverDesign, path: Path) -> VerificationReport:
+    """Return a report with the row that the box of a design is that of a calibration file."""
+    from obsynth.plants.descriptor import DescriptorSystem
+    from obsynth.results.calibration_files import box_row
+    from obsynth.results.checks import VerificationReport
+
+    uncertain = design.plant.uncertainty if isinstance(design.plant, DescriptorSystem) else None
+    if uncertain is None:
+        raise SpecError(f"{design.name!r} has no tolerances, which a calibration could give.", path="--calibration")
+    return VerificationReport.of((*report.checks, box_row(uncertain.box, path)))
+
+
+def _verify_gain_set(options: argparse.Namespace) -> int:
+    from obsynth.methods.verifying import verify
+    from obsynth.results.gain_sets import load
+
+    design = load(options.gains)
+    report = verify(design, printed_digits=options.printed_digits)
+    if options.calibration is not None:
+        report = _with_calibration(report, design, options.calibration)
+    answer(
+        options,
+        {
+            "file": str(options.gains), "name": design.name, "method": design.method, "passed": report.passed,
+            "report": report.as_dict(),
+        },
+        lambda: _print_design(design.replace(report=report), options.gains, verbose=options.verbose),
+    )  # fmt: skip
     return 0 if report.passed else VerificationError.exit_code

@@ -139,9 +139,12 @@ VERBS = {
     ),
     "verify": Verb(
         "commands:run_verify",
-        "Verify a saved gain set again, from the plant and the shipped realisation alone.",
+        "Verify a saved gain set, an alarm's certificate or a calibration again, to the end of what it rests on.",
         (
-            option("gains", "FILE", "a gain set that design wrote, or an alarm's certificate", type=Path),
+            option("gains", "FILE", "a gain set, an alarm's certificate, or what calibrate wrote", type=Path),
+            option("--data", "FILE", "the log that an alarm or a calibration names", type=Path),
+            option("--calibration", "FILE", "the calibration that the box of a gain set or an alarm names", type=Path),
+            option("--system", "FILE", "with --data: the spec of a calibration, which is then done again", type=Path),
             option(
                 "--printed-digits", "N", "judge the gains as numbers that were printed with N decimals", type=digits
             ),

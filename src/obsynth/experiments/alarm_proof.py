@@ -334,6 +334,12 @@ def verify_alarm(path: str | Path, *, data: str | Path | None = None) -> Verific
     return VerificationReport.of(checks)
 
 
+def design_of_alarm(path: str | Path) -> ObserverDesign:
+    """Return the design inside a certificate of an alarm."""
+    inside = read_json(Path(path))["certificate"]["gain_set"]
+    return loaded(json.dumps(inside).encode(), "the certificate's gain set")
+
+
 #: Its sentence did not tell bounds, start, constants and log.
 OLD_VERSION = 1
 

@@ -109,6 +109,8 @@ class ConstantsBox:
         For ``calibrated``: sha256 of the log.
     calibrated : tuple of str, optional
         For ``calibrated``: the constants that the log has bounded, where the ranges of others are stated; all if empty.
+    calibration : str, optional
+        For ``calibrated``: sha256 of the calibration file that gives the box.
     """
 
     constants: Mapping[str, Constant]
@@ -117,6 +119,7 @@ class ConstantsBox:
     level: float | None = None
     digest: str = ""
     calibrated: tuple[str, ...] = ()
+    calibration: str = ""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "constants", MappingProxyType(dict(self.constants)))
@@ -130,7 +133,7 @@ class ConstantsBox:
             raise SpecError(
                 f"level is {self.level!r}: a calibrated box needs its probability, between 0 and 1.", path="level"
             )
-        if not calibrated and (self.level is not None or self.digest or self.calibrated):
+        if not calibrated and (self.level is not None or self.digest or self.calibrated or self.calibration):
             raise SpecError("level and digest are for a calibrated box (source: calibrated).", path="level")
 
     @property
@@ -216,7 +219,9 @@ class ConstantsBox:
         """Return plain data, as `constants_box` reads it."""
         plain = {name: getattr(self, name) for name in ("variation", "source", "level", "digest")}
         constants = {name: item.as_dict() for name, item in self.constants.items()}
-        return {"constants": constants, **plain, **({"calibrated": list(self.calibrated)} if self.calibrated else {})}
+        more = {"calibrated": list(self.calibrated)} if self.calibrated else {}
+        return {"constants": constants, **plain, **more,
+                **({"calibration": self.calibration} if self.calibration else {})}  # fmt: skip
 
 
 def tolerance_share(value: Any, path: str) -> float:
@@ -295,6 +300,7 @@ def constants_box(
     level: float | None = None,
     digest: str | None = None,
     calibrated: Sequence[str] | None = None,
+    calibration: str | None = None,
 ) -> ConstantsBox:
     """Return a box from a mapping by name; nominal values that are left out are those of ``known``."""
     if isinstance(given, ConstantsBox):
@@ -307,5 +313,6 @@ def constants_box(
         if not isinstance(name, str) or not name:
             raise SpecError(f"{name!r} is no name of a constant.", path="constants")
         found[name] = constant_of(name, value, nominal=before[name].nominal if name in before else None)
-    more = {"variation": variation, "source": source, "level": level, "digest": digest, "calibrated": calibrated}
+    more = {"variation": variation, "source": source, "level": level, "digest": digest, "calibrated": calibrated,
+            "calibration": calibration}  # fmt: skip
     return ConstantsBox(found, **{key: value for key, value in more.items() if value is not None})  # type: ignore[arg-type]

@@ -205,7 +205,8 @@ def _kept_source(box: ConstantsBox, constants: Any, stated: Mapping[str, Any]) -
     if box.source != "calibrated":
         return {"source": box.source}
     left = tuple(name for name in box.calibrated or box.constants if name not in (constants or {}))
-    return {"source": "calibrated", "level": box.level, "digest": box.digest, "calibrated": left} if left else {}
+    return {"source": "calibrated", "level": box.level, "digest": box.digest, "calibrated": left,
+            "calibration": box.calibration} if left else {}  # fmt: skip
 
 
 def _boxed(
@@ -227,6 +228,7 @@ def _boxed(
             "level": constants.level,
             "digest": constants.digest,
             "calibrated": logged,
+            "calibration": constants.calibration or None,
         }
         options = own | {key: value for key, value in options.items() if value is not None}
         constants = constants.constants

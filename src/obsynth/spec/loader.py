@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.files.inputs import input_file, read_json
+from obsynth.files.inputs import input_file
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.numerics.libraries import one_thread_if_small
 from obsynth.numerics.sparse import as_sparse_matrix, is_sparse
@@ -34,6 +34,7 @@ from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.plants.uncertain_system import with_expressions
 from obsynth.plants.uncertainty import UNCERTAIN_MATRICES, Entry
 from obsynth.plants.validation import index_of
+from obsynth.results.calibration_files import read_calibration
 from obsynth.simulation.profiles import KINDS, Profile
 from obsynth.simulation.scenario import Scenario
 from obsynth.simulation.signals import check_parameters
@@ -468,12 +469,11 @@ def boxed_constants(section: PlantSection | DAESection, folder: Path) -> tuple[d
         return constants, box
     if box:
         raise SpecError("box has a file, which says where it comes from: remove source, level and digest.", path="box")
-    found = read_json(folder / file, where="box.file")
-    if not isinstance(found, dict) or found.get("kind") != "obsynth calibration":
-        raise SpecError(f"{file} is no calibration: write one by obsynth calibrate --out {file}.", path="box.file")
+    found = read_calibration(folder / file, where="box.file")
     try:
         calibrated = {name: _calibrated(name, item) for name, item in found["constants"].items()}
-        options = {"source": "calibrated", "level": found["level"], "digest": found["log"]["digest"]}
+        options = {"source": "calibrated", "level": found["level"], "digest": found["log"]["digest"],
+                   "calibration": found["sha256"]}  # fmt: skip
     except (KeyError, TypeError, AttributeError) as error:
         raise SpecError(f"{file} is damaged: it has no {error}.", path="box.file") from error
     for name in calibrated:

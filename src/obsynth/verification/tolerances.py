@@ -50,6 +50,12 @@ def tolerance_rows(design: ObserverDesign) -> Iterator[Check]:
     )
     if wrong:
         return
+    if uncertain.box.source == "calibrated":
+        yield information(
+            "calibration", f"the box is the {uncertain.box.origin}, of the calibration file "
+            f"{uncertain.box.calibration[:12] or 'that is not named'}: assumed, unless it is given (--calibration)",
+            np.nan, source="the plant", status="assumed",
+        )  # fmt: skip
     try:
         missed = _family_difference(plant, uncertain)
         detail = ""

@@ -1,0 +1,140 @@
+"""Calibration files: constants with ranges, the log's digest, and a digest of all that the file says."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from obsynth.errors import SpecError
+from obsynth.files.inputs import read_json
+from obsynth.numerics.arguments import is_finite_number
+from obsynth.results.checks import Check, VerificationReport, information, upper_bound_check
+from obsynth.results.gain_set_writing import digest_of, plain
+
+KIND = "obsynth calibration"
+SCHEMA_VERSION = 1
+_SOURCE = "the calibration file"
+
+
+def calibration_text(data: Mapping[str, Any]) -> str:
+    """Return what a calibration file holds: the data and their digest."""
+    body = plain({"kind": KIND, "schema_version": SCHEMA_VERSION, **data})
+    return json.dumps({"kind": KIND, "sha256": digest_of(body), **body}, indent=1, allow_nan=False) + "\n"
+
+
+def read_calibration(path: Path, *, where: str = "") -> dict[str, Any]:
+    """Return the content of a calibration file whose digest is right; raise `SpecError` for any other."""
+    found = read_json(path, where=where) if where else read_json(path)
+    name = path.name
+    if not isinstance(found, dict) or found.get("kind") != KIND:
+        raise SpecError(f"{name} is no calibration: write one by obsynth calibrate --out {name}.", path=where or name)
+    if "sha256" not in found:
+        raise SpecError(f"{name} holds no digest of itself, as files of older versions: calibrate again (obsynth "
+                        f"calibrate --out {name}).", path=where or name)  # fmt: skip
+    if not _intact(found):
+        raise SpecError(f"{name} was changed after it was written: its digest does not match.", path=where or name)
+    return found
+
+
+def _intact(found: Mapping[str, Any]) -> bool:
+    return bool(found.get("sha256") == digest_of({key: value for key, value in found.items() if key != "sha256"}))
+
+
+def verify_calibration(path: str | Path, again: Mapping[str, Any] | None = None) -> VerificationReport:
+    """Check a calibration file, against the same calibration done ``again`` where plant and log are given.
+
+    Parameters
+    ----------
+    path : str or Path
+        What ``obsynth calibrate --out`` wrote.
+    again : mapping, optional
+        `Calibration.to_dict` of the same plant and log.
+
+    Returns
+    -------
+    VerificationReport
+        Without ``again`` the ranges are assumed to be what the log says.
+
+    Raises
+    ------
+    SpecError
+        The file is no calibration.
+    """
+    found = read_json(Path(path))
+    if not isinstance(found, dict) or found.get("kind") != KIND:
+        raise SpecError(f"{path} is no calibration.", path=str(path))
+    rows = [_row("digest", "the file is as it was written", [] if _intact(found) else ["sha256"])]
+    rows.append(_row("box", "ranges are finite, hold their nominal values, and the level is a probability",
+                     _misfits(found)))  # fmt: skip
+    log = found.get("log") if isinstance(found.get("log"), dict) else {}
+    cited = str(log.get("digest", "")) if isinstance(log, dict) else ""
+    if again is None:
+        rows.append(information(
+            "log", f"the ranges are what the log says whose digest is {cited}: assumed, as plant and log were not "
+            "given (--system, --data)", float("nan"), source=_SOURCE, status="assumed",
+        ))  # fmt: skip
+    else:
+        rows.append(_row("log", "the log that is given has the digest that the file cites",
+                         [] if again["log"]["digest"] == cited else ["digest"]))  # fmt: skip
+        rows.append(_row("ranges", "the same calibration gives the same constants, ranges and level",
+                         _differences(found, again)))  # fmt: skip
+    return VerificationReport.of(rows)
+
+
+#: Ranges found again on another machine may differ by this share of their width.
+SAME_WIDTH = 1e-2
+
+
+def _differences(found: Mapping[str, Any], again: Mapping[str, Any]) -> list[str]:
+    """Return what differs from the same calibration done again."""
+    one, two = found.get("constants"), again["constants"]
+    if not isinstance(one, dict) or one.keys() != two.keys():
+        return ["names"]
+    wrong = [] if found.get("level") == again["level"] else ["level"]
+    for name, item in two.items():
+        low, high = item["range"]
+        slack = SAME_WIDTH * (high - low)
+        ends = [*one[name]["range"], one[name]["nominal"]]
+        if (
+            list(one[name]["open"]) != list(item["open"])
+            or one[name].get("unit") != item["unit"]
+            or any(abs(a - b) > slack for a, b in zip(ends, (low, high, item["nominal"]), strict=True))
+        ):
+            wrong.append(name)
+    return wrong
+
+
+def _misfits(found: Mapping[str, Any]) -> list[str]:
+    level = found.get("level")
+    wrong = [] if is_finite_number(level) and 0.0 < float(level or 0.0) < 1.0 else ["level"]
+    constants = found.get("constants")
+    if not isinstance(constants, dict):
+        return [*wrong, "constants"]
+    for name, item in constants.items():
+        ends = item.get("range") if isinstance(item, dict) else None
+        fits = isinstance(ends, list) and len(ends) == 2 and all(map(is_finite_number, [*ends, item.get("nominal")]))
+        if not fits or not ends[0] <= item["nominal"] <= ends[1]:
+            wrong.append(str(name))
+    return wrong
+
+
+def _row(name: str, claim: str, wrong: list[str]) -> Check:
+    detail = f"wrong: {', '.join(wrong)}" if wrong else ""
+    return upper_bound_check(name, claim, float(len(wrong)), 0.0, source=_SOURCE, detail=detail)
+
+
+def box_row(box: Any, path: Path) -> Check:
+    """Return the row that a calibrated box is that of a calibration file."""
+    found = read_calibration(path)
+    constants = found["constants"]
+    wrong = [] if box.calibration == found["sha256"] else ["digest of the calibration"]
+    wrong += [] if box.digest == found["log"]["digest"] and box.level == found["level"] else ["log or level"]
+    for name in box.calibrated or box.constants:
+        item, stated = box.constants.get(name), constants.get(name)
+        if item is None or stated is None or [item.low, item.high, item.nominal] != [*stated["range"],
+                                                                                     stated["nominal"]]:  # fmt: skip
+            wrong.append(name)
+    return upper_bound_check("calibration", f"the box is that of {path.name}", float(len(wrong)), 0.0, source=_SOURCE,
+                             detail=f"wrong: {', '.join(wrong)}" if wrong else "")  # fmt: skip

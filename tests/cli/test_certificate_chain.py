@@ -1,0 +1,119 @@
+"""Calibration file -> box -> plant with tolerances -> gain set -> alarm: each link is named by digest and compared."""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+import obsynth
+from obsynth.cli.main import main
+from obsynth.results.calibration_files import calibration_text, read_calibration, verify_calibration
+from obsynth.results.gain_sets import digest_of
+
+DESIGNS = Path(__file__).parents[2] / "designs"
+SPEC, LOG = DESIGNS / "threetank" / "spec.yaml", DESIGNS / "threetank" / "log.csv"
+
+
+def stated() -> dict[str, object]:
+    """A calibration of the stiffness of the drive, as the verb writes it."""
+    constants = {"k": {"nominal": 20.0, "range": [19.0, 21.0], "open": [], "unit": "N m/rad"}}
+    return {"level": 0.95, "log": {"digest": "cd" * 32}, "constants": constants}
+
+
+def drive_spec(folder: Path) -> Path:
+    """The drive of the examples, whose stiffness has the range of a calibration file."""
+    plant = (DESIGNS / "drive" / "plant.yaml").read_text()
+    line = "k: {nominal: 20.0, tolerance: 5 %, unit: N m/rad}"
+    assert line in plant
+    plant = plant.replace(line, "k: {nominal: 20.0}")
+    plant = plant.replace("variation: constant", "variation: constant\nbox: {file: box.json}")
+    (folder / "plant.yaml").write_text(plant)
+    (folder / "box.json").write_text(calibration_text(stated()))
+    spec = "schema_version: 1\nname: drive\nplant: {file: plant.yaml}\nmethod: {id: fault-estimation-filter}\n"
+    (folder / "spec.yaml").write_text(spec)
+    return folder / "spec.yaml"
+
+
+@cache
+def gain_set() -> str:
+    import tempfile
+
+    with tempfile.TemporaryDirectory() as name:
+        spec = drive_spec(Path(name))
+        assert main(["design", "--system", str(spec), "--output", f"{name}/g.json", "--quiet", "--json"]) == 0
+        return (Path(name) / "g.json").read_text()
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "box.json").write_text(calibration_text(stated()))
+    (tmp_path / "gains.json").write_text(gain_set())
+    return tmp_path
+
+
+def test_a_gain_set_names_its_calibration(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["verify", "gains.json", "-v"]) == 0
+    assert "assumed" in capsys.readouterr().out
+    assert main(["verify", "gains.json", "--calibration", "box.json"]) == 0
+    wider = stated()
+    wider["constants"]["k"]["range"] = [18.0, 22.0]
+    (folder / "box.json").write_text(calibration_text(wider))
+    capsys.readouterr()
+    assert main(["verify", "gains.json", "--calibration", "box.json", "--json"]) == 6
+    told = json.loads(capsys.readouterr().out)
+    failing = [row["detail"] for row in told["report"]["checks"] if not row["passed"]]
+    assert failing == ["wrong: digest of the calibration, k"]
+
+
+@pytest.mark.parametrize("change", ["range", "level", "digest", "nominal", "unit"])
+def test_an_edited_calibration_is_refused(folder: Path, change: str) -> None:
+    content = json.loads((folder / "box.json").read_text())
+    item = content["constants"]["k"]
+    if change == "range":
+        item["range"] = [19.99, 20.01]
+    elif change == "level":
+        content["level"] = 0.9999
+    elif change == "digest":
+        content["log"]["digest"] = "ab" * 32
+    else:
+        item[change] = 20.1 if change == "nominal" else "N"
+    (folder / "box.json").write_text(json.dumps(content))
+    with pytest.raises(obsynth.SpecError, match="changed after it was written"):
+        read_calibration(folder / "box.json")
+    assert main(["verify", "box.json"]) == 6
+
+
+def test_a_calibration_without_a_digest_is_asked_for_again(folder: Path) -> None:
+    content = json.loads((folder / "box.json").read_text())
+    del content["sha256"]
+    (folder / "box.json").write_text(json.dumps(content))
+    with pytest.raises(obsynth.SpecError, match="calibrate again"):
+        read_calibration(folder / "box.json")
+
+
+def test_a_calibration_is_done_again_from_plant_and_log(folder: Path) -> None:
+    words = ["--system", str(SPEC), "--data", str(LOG)]
+    asked = ["--rows", "0:56", "--unknown", "a1=0.005:0.08", "--quiet"]
+    assert main(["calibrate", *words, *asked, "--out", "tank.json"]) == 0
+    assert main(["verify", "tank.json"]) == 0
+    assert main(["verify", "tank.json", *words]) == 0
+    assert main(["verify", "tank.json", "--data", str(LOG)]) == 2
+    content = json.loads((folder / "tank.json").read_text())
+    item = content["constants"]["a1"]
+    middle = item["nominal"]
+    item["range"] = [middle + 0.01 * (end - middle) for end in item["range"]]
+    del content["sha256"]
+    (folder / "tank.json").write_text(json.dumps({"kind": content["kind"], "sha256": digest_of(content), **content}))
+    # With a digest made anew it is the log that tells.
+    assert verify_calibration("tank.json").passed
+    assert main(["verify", "tank.json", *words]) == 6
+
+
+def test_options_that_do_nothing_are_refused(folder: Path) -> None:
+    assert main(["verify", "gains.json", "--data", "box.json"]) == 2
+    assert main(["verify", "box.json", "--calibration", "box.json"]) == 2
+    assert main(["verify", "box.json", "--printed-digits", "3"]) == 2
