@@ -123,3 +123,55 @@ def test_validity_along_the_log_is_that_of_the_reference():
 
 def test_the_bounds_of_the_calibration_hold_what_the_design_uses():
     assert all(BOUNDS[name][0] < value < BOUNDS[name][1] for name, value in CALIBRATED.items())
+
+
+def emptying_tank(samples: int, *, correlation: float = 0.0, c: float = 0.1, seed: int = 3) -> dict[str, np.ndarray]:
+    """A log of a tank, backward Euler as the design takes it; sensor noise of deviation 0.01, first-order coloured."""
+    rng = np.random.default_rng(seed)
+    inflow = np.repeat(0.1 + 0.05 * rng.random(samples // 20 + 1), 20)[:samples]
+    level, gauge, noise = 1.0, np.zeros(samples), 0.0
+    for k in range(samples):
+        if k:
+            # level + c sqrt(level) = last + inflow: a quadratic in the root.
+            held = level + inflow[k]
+            level = ((-c + np.sqrt(c * c + 4.0 * held)) / 2.0) ** 2
+        noise = correlation * noise + np.sqrt(1.0 - correlation**2) * 0.01 * rng.normal()
+        gauge[k] = level + noise
+    return {"time": np.arange(float(samples)), "inflow": inflow, "gauge": gauge}
+
+
+@pytest.fixture(scope="module")
+def tank_design():
+    model = obsynth.DAEModel(
+        {"balance": "der(level) = inflow - c * sqrt(level) * (1 - clog)"},
+        {"gauge": "level"},
+        states={"level": 1.0},
+        inputs={"inflow": 0.1},
+        parameters={"clog": 0.0},
+        constants={"c": 0.1},
+    )
+    return dae_adaptive_observer(
+        model, dt=1.0, Q={"balance": 1e-8}, R={"gauge": 1e-4}, initial_covariance=[[1e-4]],
+        initial_parameter_covariance=[[1e-6]],
+    )  # fmt: skip
+
+
+def test_white_noise_of_the_stated_size_agrees(tank_design):
+    assert validate(tank_design, emptying_tank(400)).passed
+
+
+def test_coloured_noise_is_called_so_and_no_variance_is_blamed(tank_design):
+    found = validate(tank_design, emptying_tank(400, correlation=0.9))
+    assert not found.passed
+    assert found.ratios == {}
+    text = " ".join(found.verdict)
+    assert "coloured noise or a model error" in text
+    assert "noise of gauge that is correlated over about" in text
+    assert "times too" not in text
+
+
+def test_a_wrong_constant_is_named_with_the_value_that_explains_the_log(tank_design):
+    found = validate(tank_design, emptying_tank(400, c=0.13))
+    assert not found.passed
+    explained = next(sentence for sentence in found.verdict if "explains it best" in sentence or "constant" in sentence)
+    assert "c" in explained

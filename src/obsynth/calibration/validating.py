@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from obsynth.calibration.diagnostics import (
     whiteness,
     wrong_samples,
 )
+from obsynth.calibration.explanations import Explanation, explanations, whitened
 from obsynth.calibration.logs import Log, LogData, quantum, read_log
 from obsynth.calibration.maximum import Objective, greatest_likelihood
 from obsynth.calibration.plants import NonlinearPlant
@@ -107,12 +109,16 @@ def _recorded(
 
 #: Nats that a variance of the design must cost, the others being free, before its ratio is told.
 CLEAR_NATS = 3.0
+#: Where something else explains coloured innovations, variances are told if they explain this many times as many nats:
+#: process noise and coloured sensor noise are hardly told apart on one log.
+CLEARLY_MORE = 1.25
 #: Ratios nearer to one than this factor are not told: nobody knows a variance better.
 TOLD_FACTOR = 1.5
 
 
-def noise_ratios(observer: DAEObserver, log: Log) -> Mapping[str, float]:
-    """Return likeliest over designed variance for each that the log contradicts, parameters at their start."""
+def noise_ratios(observer: DAEObserver, log: Log) -> tuple[Mapping[str, float], float]:
+    """Return likeliest over designed variance for each that the log contradicts, parameters at their start; and the
+    nats that the likeliest ones gain."""
     model = observer.model
     held = model.replace(parameters=dict(zip(model.parameter_names, observer.initial_parameters, strict=True)))
     designed_Q, designed_R = np.diag(observer.Q), np.diag(observer.R)
@@ -150,7 +156,7 @@ def noise_ratios(observer: DAEObserver, log: Log) -> Mapping[str, float]:
         best = greatest_likelihood(objective, [fit], lambda text: None)
     except PreconditionError:
         # Without a likelihood nothing can be told of its variances.
-        return {}
+        return {}, 0.0
     found = {}
     for i, (name, variance) in enumerate(zip(names, designed, strict=True)):
         ratio = float(np.exp(best.z[i]) / variance)
@@ -158,7 +164,7 @@ def noise_ratios(observer: DAEObserver, log: Log) -> Mapping[str, float]:
         z[i] = np.log(variance)
         if max(ratio, 1.0 / ratio) > TOLD_FACTOR and objective(z)[0] - best.value > CLEAR_NATS:
             found[name] = ratio
-    return found
+    return found, objective(np.log(designed))[0] - best.value
 
 
 #: A mean of innovations, or a parameter's deviation from its start, beyond so many standard deviations is told.
@@ -225,12 +231,22 @@ def validate(
     record = recorded_innovations(design, found)
     sensors = _sensors(record, plant.output_names)
     whole = consistency(record.squares, record.degrees)
-    place = change_of_mean(record.standardised)
+    coloured = not _white(sensors)
+    place = change_of_mean(whitened(record.standardised) if coloured else record.standardised)
     change = None if place is None else found.rows[0] + place
-    ratios = noise_ratios(design.observer, found) if isinstance(design.observer, DAEObserver) else {}
-    verdict = [*found.notes, *_sentences(sensors, ratios, change, record, design)]
+    ratios, gain = noise_ratios(design.observer, found) if isinstance(design.observer, DAEObserver) else ({}, 0.0)
+    others = _explanations(design, found, record) if coloured else ()
+    if coloured and ratios and isinstance(design.observer, DAEObserver):
+        # Wrong variances colour the innovations too: with the likeliest ones they are white, and nothing explains more.
+        likeliest = recorded_innovations(design.replace(observer=_with_variances(design.observer, ratios)), found)
+        rival = CLEARLY_MORE * others[0].gain if others else 0.0
+        coloured = not _white(_sensors(likeliest, plant.output_names)) or rival > gain
+        ratios = {} if coloured else ratios
+    verdict = [*found.notes, *_sentences(sensors, ratios, change, record, design, coloured=coloured)]
+    if coloured:
+        verdict.append(_explained(others))
     passed = not verdict[len(found.notes) :] and whole.holds
-    if not passed and not whole.holds and not ratios:
+    if not passed and not whole.holds and not ratios and not coloured:
         far = "small" if whole.value > whole.high else "large"
         verdict.append(
             f"Q and R are too {far} together: the innovations are {np.sqrt(whole.value):.2g} times what is expected."
@@ -281,6 +297,8 @@ def _sentences(
     change: int | None,
     record: RecordedInnovations,
     design: ObserverDesign,
+    *,
+    coloured: bool,
 ) -> list[str]:
     found = []
     for name, ratio in ratios.items():
@@ -296,17 +314,61 @@ def _sentences(
         if sensor.whiteness.probability < SIGNIFICANT:
             found.append(
                 f"The innovations of {name} are not white (p = {sensor.whiteness.probability:.2g}, first "
-                f"autocorrelation {sensor.whiteness.first:+.2f}): Q against R is wrong, or something that "
-                f"moves {name} is not in the model."
+                f"autocorrelation {sensor.whiteness.first:+.2f}): "
+                + ("coloured noise or a model error." if coloured else "Q against R is wrong.")
             )
     if change is not None:
-        found.append(f"The mean of the innovations changes at row {change}: these rows are not free of faults.")
+        found.append(
+            f"The mean of the innovations changes at row {change}: these rows are not free of faults"
+            + (", or something that is not in the model changes there." if coloured else ".")
+        )
     for name, deviation in _far(record.estimates, design).items():
         found.append(
             f"The estimate of {name} ends {deviation:.1f} deviations from its nominal value: a constant is "
-            "wrong, or the rows are not free of faults."
+            f"wrong, {'coloured noise moves it, ' if coloured else ''}or the rows are not free of faults."
         )
     return found
+
+
+def _white(sensors: Mapping[str, SensorValidation]) -> bool:
+    return all(sensor.whiteness.probability >= SIGNIFICANT for sensor in sensors.values())
+
+
+def _with_variances(observer: DAEObserver, ratios: Mapping[str, float]) -> DAEObserver:
+    """Return the observer with the likeliest variances on a log, where these are told."""
+    q = [ratios.get(name, 1.0) for name in observer.model.equation_names]
+    r = [ratios.get(name, 1.0) for name in observer.model.output_names]
+    return replace(observer, Q=np.diag(np.diag(observer.Q) * q), R=np.diag(np.diag(observer.R) * r))
+
+
+def _explanations(design: ObserverDesign, log: Log, record: RecordedInnovations) -> tuple[Explanation, ...]:
+    """Return what explains innovations that are not white, other than the variances."""
+    observer, constants = design.observer, dict[str, float]()
+    if isinstance(observer, DAEObserver):
+        constants = {name: float(value) for name, value in observer.model.constants.items()}
+
+    def with_constant(name: str, value: float) -> FloatArray:
+        nonlinear: Any = observer  # no other observer has constants
+        model = nonlinear.model.replace(constants={**nonlinear.model.constants, name: value})
+        found = recorded_innovations(design.replace(observer=replace(nonlinear, model=model)), log)
+        return np.asarray(found.innovations / record.deviations)
+
+    return explanations(
+        record.standardised,
+        log.u,
+        design.plant.output_names,
+        design.plant.input_names,
+        dt=log.dt,
+        constants=constants,
+        with_constant=with_constant,
+    )
+
+
+def _explained(told: Sequence[Explanation]) -> str:
+    if not told:
+        return "No single offset, correlated noise, delay of an input or constant explains that: look at the residuals."
+    listed = "; ".join(f"{item.text} ({item.gain:.3g} nats)" for item in told)
+    return f"What explains it best, by likelihood: {listed}. The factors of Q and R say nothing until then."
 
 
 def _far(estimates: Mapping[str, FloatArray], design: ObserverDesign) -> dict[str, float]:

@@ -1,0 +1,102 @@
+"""What explains innovations that are not white: an offset, correlated noise, a delay of an input, or one constant.
+
+Each candidate is one regression of the innovations, in their own deviations.  Its gain in nats is that of the Gaussian
+likelihood less half a logarithm of the number of rows for each coefficient (Schwarz 1978), so that candidates with
+different numbers of coefficients compare.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from obsynth.numerics.arrays import FloatArray
+
+#: Gains below this are no explanation: three nats are one in twenty.
+LEAST_GAIN = 3.0
+#: Explanations that are told, and constants that are tried: each costs a run over the log.
+MOST_TOLD, MOST_CONSTANTS = 3, 12
+#: Relative change of a constant by which its effect on the innovations is found: small beside any error worth telling.
+CONSTANT_STEP = 1e-3
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """What may be wrong, and the nats that it gains on this log."""
+
+    text: str
+    gain: float
+
+
+def explanations(
+    innovations: FloatArray,
+    inputs: FloatArray,
+    output_names: Sequence[str],
+    input_names: Sequence[str],
+    *,
+    dt: float,
+    constants: Mapping[str, float],
+    with_constant: Callable[[str, float], FloatArray],
+) -> tuple[Explanation, ...]:
+    """Return what explains innovations ``(n, ny)`` best, the largest gain first.
+
+    ``with_constant(name, value)``: the innovations, in the same deviations, with another value of a constant.
+    """
+    found = [*_of_sensors(innovations, output_names, dt)]
+    for i, name in enumerate(input_names):
+        moves = np.diff(inputs[:, i])
+        for move, word in ((np.append(np.nan, moves), "later"), (np.append(moves, np.nan), "earlier")):
+            gain, _ = _together(innovations, move[:, None, None] * np.eye(innovations.shape[1]))
+            found.append(Explanation(f"an input {name} that acts {word} than the design takes it", gain))
+    for name, value in list(constants.items())[:MOST_CONSTANTS]:
+        step = CONSTANT_STEP * (abs(value) or 1.0)
+        effect = (with_constant(name, value + step) - innovations) / step
+        gain, coefficient = _together(innovations, effect[:, :, None])
+        nearer = value - float(coefficient[0]) if len(coefficient) else value
+        found.append(Explanation(f"a constant {name} near {nearer:.3g} instead of {value:.3g}", gain))
+    kept = sorted((item for item in found if item.gain >= LEAST_GAIN), key=lambda item: -item.gain)
+    return tuple(kept[:MOST_TOLD])
+
+
+def _of_sensors(innovations: FloatArray, names: Sequence[str], dt: float) -> list[Explanation]:
+    found = []
+    for j, name in enumerate(names):
+        column = innovations[:, j : j + 1]
+        gain, _ = _together(column, np.ones((len(column), 1, 1)))
+        found.append(Explanation(f"an offset of the sensor {name}", gain))
+        before = np.vstack([[[np.nan]], column[:-1]])
+        gain, coefficient = _together(column, before[:, :, None])
+        first = float(coefficient[0]) if len(coefficient) else 0.0
+        if first > 0.0:
+            lasting = f" over about {-dt / np.log(min(first, 1.0 - 1.0 / len(column))):.2g} s"
+            found.append(Explanation(f"noise of {name} that is correlated{lasting}", gain))
+    return found
+
+
+def _together(innovations: FloatArray, regressors: FloatArray) -> tuple[float, FloatArray]:
+    """Return the gain in nats of regressors ``(n, ny, p)``, and their coefficients; none where they do not move."""
+    count = regressors.shape[2]
+    y, x = innovations.ravel(), regressors.reshape(-1, count)
+    seen = np.isfinite(y) & np.isfinite(x).all(axis=1)
+    y, x = y[seen], x[seen]
+    if len(y) <= count + 1 or not np.any(x):
+        return -np.inf, np.zeros(0)
+    coefficients: FloatArray = np.asarray(np.linalg.lstsq(x, y, rcond=None)[0], dtype=np.float64)
+    left, whole = float(np.sum((y - x @ coefficients) ** 2)), float(y @ y)
+    if not left > 0.0:
+        return np.inf, coefficients
+    return 0.5 * len(y) * float(np.log(whole / left)) - 0.5 * count * float(np.log(len(y))), coefficients
+
+
+def whitened(innovations: FloatArray) -> FloatArray:
+    """Return innovations ``(n, ny)`` less what each column keeps of its sample before: a change of mean stays one."""
+    found = np.array(innovations)
+    for j in range(innovations.shape[1]):
+        before = np.append(np.nan, innovations[:-1, j])
+        both = np.isfinite(before) & np.isfinite(innovations[:, j])
+        power = float(before[both] @ before[both])
+        first = float(before[both] @ innovations[both, j]) / power if power else 0.0
+        found[both, j] -= first * before[both]
+    return found
