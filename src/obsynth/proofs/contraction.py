@@ -147,8 +147,10 @@ def _tried(ball: Ball, rate: float, *, discrete: bool) -> Contraction | None:
 
 def _proved(ball: Ball, factor: FloatArray, rate: float, *, discrete: bool) -> Contraction | None:
     """Return the contraction in the norm of a triangular factor, where it is one."""
+    if not np.all(np.isfinite(factor)) or np.any(np.diag(factor) == 0.0):
+        return None
     inverse = np.triu(np.linalg.inv(factor))
-    if not np.all(np.isfinite(inverse)) or np.any(np.diag(inverse) == 0.0) or np.any(np.diag(factor) == 0.0):
+    if not np.all(np.isfinite(inverse)) or np.any(np.diag(inverse) == 0.0):
         return None
     n = len(factor)
 
