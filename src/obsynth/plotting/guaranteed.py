@@ -63,6 +63,9 @@ def plot_least_thresholds(design: ObserverDesign, *, axes: Axes | None = None) -
         panel.set_ylim(bottom=0.7 * float(sizes.min()))
     else:
         panel.set_ylim(bottom=0.0)
+    if seconds.size > 1 and seconds[0] > 0.0:
+        # What a few more samples bring is of interest where they are few.
+        panel.set_xscale("log")
     after = "from the step to the last sample" if before else "from the first to the last sample"
     panel.set_xlabel(f"{after} (s)")
     panel.set_ylabel(f"{found.fault}{f' ({unit})' if unit else ''}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -198,6 +199,21 @@ class LinearObserver:
         after, row = self.advance(state, outputs, inputs)
         return after, split_rows(self, row[None, :])
 
+    @cached_property
+    def _is_delay_line(self) -> bool:
+        """Whether its rows are weighted sums of its last samples, kept in one register each."""
+        order = self.order
+        return order > 1 and not self.Cz[:, 1:].any() and np.array_equal(self.Az, np.eye(order, k=1))
+
+    def _weighted(self, y: FloatArray, u: FloatArray, start: FloatArray) -> FloatArray:
+        """Return the rows of a record ``(steps, rows)`` of such an observer, sample by sample of the window."""
+        taken = np.zeros(len(y))
+        count = min(len(y), self.order)
+        taken[:count] = start[:count]
+        for age, (on_u, on_y) in enumerate(zip(self.Bu, self.By, strict=True), start=1):
+            taken[age:] += u[:-age] @ on_u + y[:-age] @ on_y
+        return np.asarray(np.outer(taken, self.Cz[:, 0]) + u @ self.Du.T + y @ self.Dy.T)
+
     def run(self, y: ArrayLike, u: ArrayLike | None = None, *, initial_state: ArrayLike | None = None) -> Estimates:
         """Run over a whole record of a discrete-time observer.
 
@@ -222,6 +238,8 @@ class LinearObserver:
         """
         outputs, inputs = whole_record(y, u, len(self.output_names), len(self.input_names), complete=True)
         state = self.init(initial_state)
+        if self._is_delay_line:
+            return split_rows(self, self._weighted(outputs, inputs, state.z))
         rows = np.empty((len(outputs), self.Cz.shape[0]))
         for k in range(len(outputs)):
             state, rows[k] = self.advance(state, outputs[k], inputs[k])
