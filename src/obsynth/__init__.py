@@ -1,9 +1,9 @@
 """obsynth: designs, proves and runs observers and fault-estimation filters for descriptor systems.
 
 Plants
-    DescriptorSystem, TimeVaryingDescriptorSystem, DAEModel; from other tools: from_andes, from_control, from_fmu,
-    from_matlab, from_modelica, from_pandas, from_scipy, from_sympy; from a spec: load_spec; changed by discretise,
-    eliminate_algebraic_states.
+    DescriptorSystem, TimeVaryingDescriptorSystem, DAEModel; from other tools: from_andes, from_casadi, from_control,
+    from_fmu, from_matlab, from_modelica, from_pandas, from_scipy, from_sympy; from a spec: load_spec; changed by
+    discretise, eliminate_algebraic_states.
 What is possible
     check, analyse_structure, diagnose, identifiability.
 Designs
@@ -61,6 +61,7 @@ _NAMES = {
     "experiments.simulation": "simulate Simulation",
     "exporting.files": "export",
     "importing.andes": "from_andes",
+    "importing.casadi_models": "from_casadi",
     "importing.fmu": "from_fmu",
     "importing.model_files": "from_matlab from_modelica",
     "importing.python_objects": "from_control from_pandas from_scipy from_sympy",

@@ -56,6 +56,7 @@ from obsynth.experiments.tolerance_study import ToleranceStudy as ToleranceStudy
 from obsynth.experiments.tolerance_study import tolerance_study as tolerance_study
 from obsynth.exporting.files import export as export
 from obsynth.importing.andes import from_andes as from_andes
+from obsynth.importing.casadi_models import from_casadi as from_casadi
 from obsynth.importing.fmu import from_fmu as from_fmu
 from obsynth.importing.model_files import from_matlab as from_matlab
 from obsynth.importing.model_files import from_modelica as from_modelica

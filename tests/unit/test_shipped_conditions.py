@@ -139,3 +139,14 @@ def test_state_spaces_of_scipy_and_control_are_the_observer(name):
     for letter in "ABCD":
         np.testing.assert_array_equal(getattr(ours, letter), getattr(theirs, letter))
     assert (ours.dt or 0.0) == theirs.dt == design.observer.dt
+
+
+def test_a_mat_file_has_the_gains_under_the_letters_of_the_paper(tmp_path):
+    from scipy.io import loadmat
+
+    design = made("wang, riccati")
+    obsynth.export(design, tmp_path / "filter.mat")
+    found = loadmat(tmp_path / "filter.mat", simplify_cells=True)
+    for letter in "TNLW":
+        np.testing.assert_array_equal(found["gains"][letter], design.gains[letter])
+    np.testing.assert_array_equal(found["certificate"]["P_factor"], design.certificate.matrices["P_factor"])

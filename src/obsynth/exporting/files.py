@@ -59,7 +59,8 @@ def export(
         Its suffix says what is written.  ``.mat`` and ``.npz``: ``A (nz, nz)``, ``B (nz, nu + ny)``, ``C``, ``D``,
         ``x0 (nz, 1)`` and ``Ts`` (seconds, 0 for continuous time) of the system from ``[u; y]`` to
         ``[xhat; fhat; r]``, as a State-Space block takes them, with ``input_names``, ``output_names``, ``delays``
-        (samples, of states and faults), ``input_point``, ``output_point``, ``name``, ``method`` and ``sha256``.
+        (samples, of states and faults), ``input_point``, ``output_point``, ``name``, ``method`` and ``sha256``; a
+        ``.mat`` has the structures ``gains``, by the letters of the method's paper, and ``certificate`` besides.
         ``.c``: a source file and the header beside it, with functions ``<stem>_reset`` and ``<stem>_step``; the only
         one besides ``.fmu`` for an observer of a nonlinear DAE, which holds the implicit step with its homotopy.
         ``.fmu``: a functional mock-up unit for co-simulation with that C inside, and a binary for this machine where
@@ -138,7 +139,12 @@ def export(
         named = {
             key: np.array(value, dtype=object) if isinstance(value, list) else value for key, value in arrays.items()
         }
-        savemat(buffer, named, oned_as="column")
+        # Gains by the letters of the method's paper, and the matrices of the certificate, as structures.
+        for key, matrices in (("gains", design.gains), ("certificate", design.certificate.matrices)):
+            fields = {name: matrix for name, matrix in matrices.items() if name.isidentifier()}
+            if fields:
+                named[key] = fields
+        savemat(buffer, named, oned_as="column", long_field_names=True)
     return (write_atomically(target, buffer.getvalue()),)
 
 
