@@ -103,3 +103,22 @@ def test_two_levels_tell_pairs_and_name_the_smallest_group() -> None:
     assert all(len(group) == 2 for group in bank.groups)
     assert "together give the same outputs" in bank.refused["leak 1"]
     assert " or " in str(bank)
+
+
+def test_the_least_interval_of_a_window_holds_the_fault_and_finds_what_no_fixed_test_does() -> None:
+    options = {"course": "constant", "samples": 8, "disturbance_bounds": {"load torque": 1.0}, "noise_bound": 3}
+    test = obsynth.guaranteed_test(spec().plant, **options)
+    plant, rng, fault = test.linear[0], np.random.default_rng(11), test.threshold
+    bound = 3.0 * np.diag(plant.Dw)
+    x, rows = rng.standard_normal(plant.nx), []
+    for _ in range(14):
+        rows.append(plant.C @ x + bound * rng.uniform(-1.0, 1.0, 2))
+        x = plant.A @ x + plant.Bd[:, 0] * rng.uniform(-1.0, 1.0) + plant.Bf[:, 0] * fault
+    y, u = np.array(rows), np.zeros((14, 1))
+    low, high = test.exact_interval(y, u)
+    assert np.isnan(low[:7]).all()
+    assert np.all((low[7:] <= fault) & (fault <= high[7:]))
+    fixed = test.interval(test.observer.run(y, u))
+    assert np.all(high[7:] - low[7:] < 0.8 * (fixed[1] - fixed[0])[7:])
+    # The fixed test is silent on some row on which zero is outside of the least interval.
+    assert np.any((low[7:] > 0.0) & (fixed[0][7:] <= 0.0))

@@ -56,7 +56,7 @@ def largest_hidden_fault(window: Window, right: FloatArray | None = None, *, sig
     multipliers = np.ldexp(-sign * np.asarray(found.eqlin.marginals), rows)
     scale = float(window.matrix[:, [0]].toarray().ravel() @ multipliers)
     point = np.ldexp(np.asarray(found.x), columns)
-    if right is None and abs(scale) > 0.0:
+    if abs(scale) > 0.0:
         multipliers = multipliers / scale
     return Optimum(float(point[0]), multipliers, point)
 

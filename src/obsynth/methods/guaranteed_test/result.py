@@ -157,6 +157,39 @@ class GuaranteedTest(ObserverDesign):
         row = np.nan_to_num(self.residual(estimates))
         return np.maximum.accumulate(np.abs(row) > self.threshold)
 
+    def exact_interval(self, y: FloatArray, u: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
+        """Return the ends of the least interval in which the fault lies at each row, ``(steps,)`` each.
+
+        Two linear programmes a row, some milliseconds each: no interval that is sure to hold the fault is smaller for
+        these very samples, but for rounding.  Each end is one that is proved, or that of the fixed test; where the
+        lower one is above the upper one, no course within the bounds explains the window.
+
+        Parameters
+        ----------
+        y, u : FloatArray
+            Outputs ``(steps, ny)`` and known inputs ``(steps, nu)``, from the start of a record without gaps.
+
+        Returns
+        -------
+        low, high : FloatArray
+            NaN before the window is full.
+        """
+        from obsynth.methods.guaranteed_test.exact import least_interval
+
+        plant, observer = self.linear
+        inputs = np.zeros((len(y), plant.nu)) if u is None else np.asarray(u, dtype=np.float64)
+        outputs = np.asarray(y, dtype=np.float64)
+        low, high = (np.array(end) for end in self.interval(observer.run(outputs, inputs)))
+        slack = self.slack(outputs, inputs)
+        low, high = low - slack, high + slack
+        window = window_as_designed(plant, GuaranteedTestMethod.of(self.options))
+        length = observer.order + 1
+        for k in range(observer.order, len(outputs)):
+            rows = slice(k + 1 - length, k + 1)
+            found = least_interval(window, length - self.samples, outputs[rows], inputs[rows])
+            low[k], high[k] = max(low[k], found[0]), min(high[k], found[1])
+        return low, high
+
     def plot(self, axes: Axes | None = None) -> Axes:
         """Plot the least threshold against the samples of the window.
 

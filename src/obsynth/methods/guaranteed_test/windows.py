@@ -90,6 +90,7 @@ class Window:
     """The stacked equations of a question; column 0 is theta."""
 
     plant: DescriptorSystem
+    bounds: Bounds
     question: Question
     rows: int
     equations: int  # number of k for which there are equations
@@ -219,7 +220,15 @@ def window_of(plant: DescriptorSystem, bounds: Bounds, question: Question) -> Wi
             both(k, state, output, column)
     whole = [np.concatenate(parts) for parts in zip(*builder.parts, strict=True)]
     return Window(
-        plant, question, rows, equations, tuple(builder.labels), np.array(builder.bar), np.array(builder.group), *whole
+        plant,
+        bounds,
+        question,
+        rows,
+        equations,
+        tuple(builder.labels),
+        np.array(builder.bar),
+        np.array(builder.group),
+        *whole,
     )
 
 
