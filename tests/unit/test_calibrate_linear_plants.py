@@ -124,9 +124,10 @@ def test_stacks_and_functions_are_as_good_as_expressions():
 
 
 def test_a_discrete_plant_says_which_direction_a_log_leaves_open():
+    most = 3.3  # no whole number of its own width
     plant = uncertain_system(
         {"E": None, "A": [["a"]], "B": [["b"]], "C": [["c"]], "D": [[0.2]], "dt": 0.5},
-        {"a": (0.5, 0.99), "b": (0.1, 4.0), "c": (0.1, 4.0)},
+        {"a": (0.5, 0.99), "b": (0.1, most), "c": (0.1, most)},
     )
     rng, u = np.random.default_rng(0), held_inputs(150, 2)
     x, y = 0.0, np.zeros(150)
@@ -134,14 +135,17 @@ def test_a_discrete_plant_says_which_direction_a_log_leaves_open():
         y[k] = 0.5 * x + 0.2 * u[k] + 0.01 * rng.standard_normal()
         x = 0.9 * x + 1.5 * u[k] + 0.01 * rng.standard_normal()
     log = {"time": 0.5 * np.arange(150), "u1": u, "y1": y}
-    found = calibrate(plant, log, {"a": (0.5, 0.99), "b": (0.1, 4.0), "c": (0.1, 4.0)}, **QUICK)
+    found = calibrate(plant, log, {"a": (0.5, 0.99), "b": (0.1, most), "c": (0.1, most)}, **QUICK)
     assert [set(direction) for direction in found.undetermined] == [{"b", "c"}]
     assert found.box.low["a"] < 0.9 < found.box.high["a"]
-    # c = 4 is the bound, and b c = 0.75 is known: the box follows that curve over a factor of twenty.
+    # c = 3.3 is the bound, and b c = 0.75 is known: the box follows that curve over a factor of fourteen.
+    # An open side is the bound as it was given, to the last digit.
+    assert found.box.high["b"] == found.box.high["c"] == most
+    assert found.box.holds({"a": found.nominal["a"], "b": most, "c": most})
     assert ("b", "high") in found.box.open_sides
     assert ("c", "high") in found.box.open_sides
-    assert found.box.low["b"] == pytest.approx(0.75 / 4.0, rel=0.1)
-    assert found.box.low["c"] == pytest.approx(0.75 / 4.0, rel=0.1)
+    assert found.box.low["b"] == pytest.approx(0.75 / most, rel=0.1)
+    assert found.box.low["c"] == pytest.approx(0.75 / most, rel=0.1)
 
 
 def test_a_constant_sensor_fault_is_found_and_unknown_inputs_are_told():

@@ -106,12 +106,19 @@ class Side:
 
 def profile_box(objective: Objective, maximum: Maximum, root: float, said: Information) -> list[tuple[Side, Side]]:
     """Return both ends of each constant's box, in its own units."""
-    found, names = [], objective.problem.unknown
-    for i, width in enumerate(objective.problem.widths):
+    found, problem = [], objective.problem
+    names = problem.unknown
+    for i, width in enumerate(problem.widths):
         weak = objective.bent or any(names[i] in direction for direction in said.undetermined)
         side = _side_along_valley if weak else _side
         sides = [side(objective, maximum, i, sign, root) for sign in (-1.0, 1.0)]
-        found.append((Side(sides[0].value * width, sides[0].is_open), Side(sides[1].value * width, sides[1].is_open)))
+        # An open side is the bound that was given, not what a division and a product leave of it.
+        given = (float(problem.low[i]), float(problem.high[i]))
+        low, high = (
+            Side(bound if item.is_open else item.value * width, item.is_open)
+            for item, bound in zip(sides, given, strict=True)
+        )
+        found.append((low, high))
     return found
 
 
