@@ -100,7 +100,7 @@ def _said(
     scales: Mapping[str, float] | None,
     gap: float | None,
     warm_up: float | None,
-) -> tuple[NDArray[np.int_], FloatArray, FloatArray]:
+) -> tuple[NDArray[np.int64], FloatArray, FloatArray]:
     """Return numbers from 0 and times ``(n,)`` of rows, and what is watched ``(n, m)``: NaN where nothing is decided,
     or rows are missing."""
     engine = engine_of(design, gap=gap, warm_up=warm_up)

@@ -122,7 +122,7 @@ def _apart(values: FloatArray) -> FloatArray:
     return np.hstack([runs, np.full((len(runs), HOLD + 1), -np.inf)]).ravel()
 
 
-def _begins(places: NDArray[np.int_]) -> NDArray[np.int_]:
+def _begins(places: NDArray[np.int64]) -> NDArray[np.int64]:
     return places[np.diff(places, prepend=-np.inf) > HOLD]
 
 
