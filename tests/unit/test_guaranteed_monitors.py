@@ -122,3 +122,23 @@ def test_the_least_interval_of_a_window_holds_the_fault_and_finds_what_no_fixed_
     assert np.all(high[7:] - low[7:] < 0.8 * (fixed[1] - fixed[0])[7:])
     # The fixed test is silent on some row on which zero is outside of the least interval.
     assert np.any((low[7:] > 0.0) & (fixed[0][7:] <= 0.0))
+
+
+def test_the_cheapest_sensors_for_a_threshold() -> None:
+    plant = obsynth.DescriptorSystem(
+        None, [[1.0, 1.0], [0.0, 1.0]], C=[[1.0, 0.0]], Bd=[[0.0], [1.0]], Bf=[[0.0], [1.0]], dt=1.0,
+        state_names=["position", "speed"], output_names=["gauge"], sensor_noise={"gauge": 0.5},
+    )  # fmt: skip
+    test = {"course": "constant", "samples": 5, "disturbance_bounds": 0.25, "noise_bound": 1.0}
+    asked = {"goal": "threshold", "fault": "f1", "noise": 0.05, "candidates": ["speed", "position"], "test": test}
+    # The gauge alone has W + 16 V / 16 = 0.75; a speed with V = 0.05 has W + 2 V / 4 = 0.275.
+    found = obsynth.sensor_sets(plant, below=0.3, **asked)
+    assert found.sets[0].sensors == ("speed",)
+    assert found.sets[0].threshold is not None
+    assert found.sets[0].threshold <= 0.275 + 1e-9
+    assert obsynth.sensor_sets(plant, below=0.76, **asked).sets[0].sensors == ()
+    assert "samples" in str(found)
+    with pytest.raises(obsynth.PreconditionError, match=r"the least is 0\.2"):
+        obsynth.sensor_sets(plant, below=0.25, **asked)
+    with pytest.raises(obsynth.SpecError, match="needs fault"):
+        obsynth.sensor_sets(plant, goal="threshold", noise=0.05)

@@ -16,6 +16,7 @@ from obsynth.analysis.diagnosis.exact import Questions
 from obsynth.analysis.diagnosis.explanations import Sensor, state_sensors
 from obsynth.analysis.diagnosis.sensor_search import GOALS, SensorSearch, Task, reached
 from obsynth.analysis.transformations.recovery import Transformation, linear_plant
+from obsynth.comparison.threshold_sensors import ThresholdQuestion
 from obsynth.errors import ObsynthError, PreconditionError, SpecError
 from obsynth.files.tables import html_table, text_table
 from obsynth.methods.functions import functional_filter
@@ -40,11 +41,16 @@ class SensorSet:
     deviation : float or None
         Largest standard deviation of the error of an estimate after design, over the faults asked for; ``None`` where
         noise is not stated, or nothing is estimated.
+    threshold, samples, sample_time : float, int, float, optional
+        Of goal ``threshold``: the proved threshold of the test with the shortest delay, on so many samples.
     """
 
     sensors: tuple[str, ...]
     cost: float
     deviation: float | None
+    threshold: float | None = None
+    samples: int | None = None
+    sample_time: float | None = None
 
 
 @dataclass(frozen=True)
@@ -85,6 +91,12 @@ class SensorSets:
 
     def rows(self) -> tuple[tuple[str, ...], ...]:
         """Return the table as texts: the header, then one row per set."""
+        if any(found.threshold is not None for found in self.sets):
+            tested = [("add", "cost", "threshold", "samples", "sample time (s)")]
+            for found in self.sets:
+                numbers = (f"{found.cost:g}", f"{found.threshold:.4g}", f"{found.samples}", f"{found.sample_time:g}")
+                tested.append((", ".join(found.sensors) or "nothing", *numbers))
+            return tuple(tested)
         rows = [("add", "cost", "deviation after design")]
         for found in self.sets:
             deviation = "-" if found.deviation is None else f"{found.deviation:.3g}"
@@ -131,6 +143,10 @@ def sensor_sets(
     copies: int = 1,
     may_fail: bool = False,
     most: int = MOST,
+    fault: str | None = None,
+    below: float | None = None,
+    sample_time: float | Sequence[float] | None = None,
+    test: Mapping[str, Any] | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> SensorSets:
     """Find least sets of sensors to add for detecting, isolating or estimating faults.
@@ -142,9 +158,10 @@ def sensor_sets(
     ----------
     plant : DescriptorSystem or Transformation
         Either time; its outputs are there already.
-    goal : {"detect", "isolate", "estimate-step", "estimate"}, optional
+    goal : {"detect", "isolate", "estimate-step", "estimate", "threshold"}, optional
         What every fault asked for must be: shown free of the unknown inputs; told from each other fault as well;
-        estimated as a step, or whatever its course, free of all others.
+        estimated as a step, or whatever its course, free of all others.  ``threshold``: the least threshold of
+        ``fault`` without false alarms is at most ``below``, by `guaranteed_test`.
     faults : sequence of str, optional
         All by default.
     candidates : sequence of str or mapping, optional
@@ -162,6 +179,12 @@ def sensor_sets(
         Every added sensor may fail: its fault must be told as well.
     most : int, optional
         Sets returned at most.
+    fault, below : str, float, optional
+        Of goal ``threshold``: which fault, and what its threshold must be, half of the size that surely alarms.
+    sample_time : float or sequence of float, optional, seconds
+        Of goal ``threshold`` and a continuous plant: sample times to try.
+    test : mapping, optional
+        Of goal ``threshold``: other options of `guaranteed_test`; ``noise_bound`` is in deviations, of candidates too.
     progress : callable, optional
         Called with a text at the start of each stage.
 
@@ -185,8 +208,11 @@ def sensor_sets(
     plant = linear_plant(plant)
     report_stage = progress or (lambda _: None)
     chosen = tuple(range(plant.nf)) if faults is None else tuple(fault_numbers(plant, faults, "faults"))
+    if goal == "threshold":
+        sensors = _candidates(plant, candidates, noise)
+        return _by_threshold(plant, sensors, fault, below, sample_time, test or {}, cost or {}, largest, most)
     if goal not in GOALS:
-        raise SpecError(f"goal is {goal!r}: use one of {', '.join(GOALS)}.", path="goal")
+        raise SpecError(f"goal is {goal!r}: use one of {', '.join((*GOALS, 'threshold'))}.", path="goal")
     if not chosen:
         raise SpecError("The plant has no faults to place sensors for.", path="faults")
     for name, count in (("copies", copies), ("most", most), ("largest", largest)):
@@ -228,6 +254,48 @@ def sensor_sets(
         said = f" (from {others})." if others else "."
         out_of_reach.append(f"{plant.fault_names[task.fault]}: out of reach of all candidates{said}")
     return SensorSets(goal, ranked, exact, tuple(out_of_reach), kept, failing, tuple(notes))
+
+
+def _by_threshold(
+    plant: DescriptorSystem,
+    sensors: tuple[Sensor, ...],
+    fault: str | None,
+    below: float | None,
+    sample_time: Any,
+    test: Mapping[str, Any],
+    cost: Mapping[str, float],
+    largest: int | None,
+    most: int,
+) -> SensorSets:
+    """Return the cheapest sets with which the least threshold of a fault is at most ``below``."""
+    if fault is None or not (is_finite_number(below) and float(below or 0.0) > 0.0):
+        raise SpecError("goal threshold needs fault, and below, a positive number in its unit.", path="below")
+    fault_numbers(plant, [fault], "fault")
+    if any(sensor.deviation is None for sensor in sensors):
+        raise SpecError("goal threshold needs the noise of each candidate (noise).", path="noise")
+    times = [] if sample_time is None else list(np.atleast_1d(np.asarray(sample_time, dtype=np.float64)))
+    if bool(times) == plant.is_discrete:
+        raise SpecError("sample_time is for continuous plants, which need one.", path="sample_time")
+    _require_positive(cost, sensors, "cost", whole=False)
+    costs = [float(cost.get(sensor.name, 1.0)) for sensor in sensors]
+    size = float(below or 0.0)
+    question = ThresholdQuestion(plant, fault, size, sensors, costs, tuple(map(float, times)), test)
+    everything = tuple(range(len(sensors)))
+    if question.best(everything) is None:
+        raise PreconditionError(
+            f"Not even all {len(sensors)} candidates together let a threshold of {size:g} be had: the least is "
+            f"{question.least(everything):.4g}. Give other candidates, sample times, or a larger size.",
+            condition="sensors",
+            signals=(fault,),
+        )
+    found = question.minimal_sets(largest, most)
+    rows = tuple(
+        SensorSet(tuple(sensors[i].name for i in chosen), sum(costs[i] for i in chosen), None, made.threshold,
+                  made.samples, made.plant.dt)
+        for chosen, made in found
+    )  # fmt: skip
+    note = "Cheapest first; of each set the test with the shortest delay. More sensors never raise a least threshold."
+    return SensorSets(f"find {fault} by a threshold of {size:g}", rows, len(found) < most, (), (), {}, (note,))
 
 
 def _candidates(
