@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from obsynth.methods.fault_estimation_filter.gamma_iteration import GammaIteration
+from obsynth.methods.fault_estimation_filter.central_filter import GammaIteration
 from obsynth.methods.fault_estimation_filter.injection_problem import Injection
 
 TOLERANCE = 1e-7

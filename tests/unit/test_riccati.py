@@ -6,8 +6,12 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_continuous_are, solve_discrete_are
 
-from obsynth.methods.fault_estimation_filter.central_equation import CentralEquation, central_injection
-from obsynth.methods.fault_estimation_filter.central_filter import central_filter_at, search_central_filter
+from obsynth.methods.fault_estimation_filter.central_filter import (
+    CentralEquation,
+    central_filter_at,
+    central_injection,
+    search_central_filter,
+)
 from obsynth.methods.fault_estimation_filter.injection_problem import GainProblem, Injection
 from obsynth.methods.riccati import bounded_real_matrix
 from obsynth.numerics.doubling import (

@@ -1,20 +1,318 @@
 """Central H-infinity filters: the least gain of a `GainProblem`, and filters that weigh noise at a given gain.
 
 See `central_equation` for the equation behind them.  The true gain of the true problem decides.
+
+The least level of a central H-infinity equation: where the margin of its solutions vanishes.
+
+With u the squared level and m(u) u the margin, which grows at least as fast as u, ``u (1 - m)`` is a lower bound, and a
+parabola through the last levels reached leads to the least in a few steps.
+
+The Riccati equation of central H-infinity filters: gains of a `GainProblem` for each level g.
+
+With ``h = [C; Z]``, ``k = [D; Zd]``, ``Y = A Y A' - (A Y h' + B k') (k k' - diag(0, g^2 I) + h Y h')^-1 (.)' + B B'``
+has a stabilising solution with the right signs exactly when a filter of gain below g exists, and gives one. A little
+artificial noise makes it regular; it can only raise the gain, and the true gain of the true problem decides.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from obsynth.methods.fault_estimation_filter.central_equation import CentralEquation, central_injection
-from obsynth.methods.fault_estimation_filter.gamma_iteration import NEXT_TO, GammaIteration
 from obsynth.methods.fault_estimation_filter.injection_problem import GainProblem, Injection
-from obsynth.numerics.arrays import SMALLEST
+from obsynth.numerics.arrays import SMALLEST, FloatArray
+from obsynth.numerics.doubling import MOST_JUMPS, doubled_riccati_solution, is_positive
 from obsynth.numerics.norms import spectral_radius
+
+
+@dataclass(frozen=True, eq=False)
+class CentralEquation:
+    """The equation of a problem with measurements for every level, in as few states as it takes; no limit on V.
+
+    Where the disturbance is in no measurement, only the error on null C is left: with an orthonormal basis N of it, M
+    one of its complement and ``F = A N`` (``lift``), ``Y = F K F' + B B'``, ``K = S - S N'Z' (Z N S N'Z' - g^2 I)^-1 Z
+    N S``, where S solves the equation with ``N'F``, ``[M'F; ZN]``, ``N'BB'N``, ``diag(M'BB'M, -g^2 I)`` and ``[N'BB'M,
+    0]``.
+    """
+
+    problem: GainProblem
+    a: FloatArray
+    h: FloatArray
+    process: FloatArray
+    weight: FloatArray
+    cross: FloatArray
+    full_process: FloatArray
+    full_weight: FloatArray
+    full_cross: FloatArray
+    lift: FloatArray | None
+    outputs: FloatArray
+    last: FloatArray
+
+    @classmethod
+    def of(cls, problem: GainProblem, *, noise: float) -> CentralEquation:
+        """Return the equation with artificial noise, relative to the disturbance."""
+        n, m, q = problem.order, problem.measured, problem.Z.shape[0]
+        size = float(np.linalg.norm(problem.B, 2)) if problem.B.size else 0.0
+        h, k = np.vstack([problem.C, problem.Z]), np.vstack([problem.D, problem.Zd])
+        last = np.diag([0.0] * m + [1.0] * q)
+        process = problem.B @ problem.B.T + (noise * size) ** 2 * np.eye(n)
+        if np.any(k) or not 0 < m < n or size == 0.0:
+            seen = max(float(np.linalg.norm(part, 2)) if part.size else 0.0 for part in (problem.D, problem.C * size))
+            weight = k @ k.T + np.diag([(noise * seen) ** 2] * m + [0.0] * q)
+            cross = problem.B @ k.T
+            return cls(problem, problem.A, h, process, weight, cross, process, weight, cross, None, h, last)
+        basis = np.linalg.qr(problem.C.T, mode="complete")[0]
+        hidden, known = basis[:, m:], basis[:, :m]
+        lift = problem.A @ hidden
+        moved = process @ basis
+        weight = np.zeros((m + q, m + q))
+        weight[:m, :m] = known.T @ moved[:, :m]
+        return cls(
+            problem,
+            hidden.T @ lift,
+            np.vstack([known.T @ lift, problem.Z @ hidden]),
+            hidden.T @ moved[:, m:],
+            weight,
+            np.hstack([hidden.T @ moved[:, :m], np.zeros((n - m, q))]),
+            process,
+            np.zeros((m + q, m + q)),
+            np.zeros((n, m + q)),
+            lift,
+            h,
+            last,
+        )
+
+    def filter_at(self, level: float) -> Injection | None:
+        """Return the gains of the central filter at ``level``, or ``None`` when the equation gives none."""
+        return self.filter_and_margin(level)[0]
+
+    def filter_and_margin(self, level: float) -> tuple[Injection | None, float]:
+        """Return the gains of the central filter at ``level``, or ``None``, and how far the level is from the least.
+
+        The least eigenvalue of what must be negative, relative to ``-g^2 I``: twice the relative distance, or more.
+        """
+        try:
+            y = self.solution(level)
+            if y is None:
+                return None, 0.0
+            found, left = self._gains(*self._sums(y, level))
+        except np.linalg.LinAlgError:
+            return None, 0.0
+        if found is None or not (np.all(np.isfinite(found.R)) and np.all(np.isfinite(found.V))):
+            return None, 0.0
+        return found, float(np.linalg.eigvalsh(left)[0]) / level**2
+
+    def solution(self, level: float) -> FloatArray | None:
+        """Return Y ``(n, n)`` at ``level``, or ``None``; its signs are not looked at."""
+        lowered = self.weight - level**2 * self.last
+        s = doubled_riccati_solution(
+            self.a,
+            self.h,
+            self.process,
+            lowered,
+            self.cross,
+            possible=lambda y: self._is_possible(y, level),
+            most_jumps=MOST_JUMPS,
+        )
+        return None if s is None else self._in_all_states(s, level)
+
+    def _sums(self, y: FloatArray, level: float) -> tuple[FloatArray, FloatArray]:
+        """Return ``k k' - diag(0, g^2 I) + h Y h'`` and ``A Y h' + B k'`` in all states."""
+        seen = y @ self.outputs.T
+        total = self.full_weight + self.outputs @ seen - level**2 * self.last
+        return total, self.problem.A @ seen + self.full_cross
+
+    def _in_all_states(self, s: FloatArray, level: float) -> FloatArray:
+        if self.lift is None:
+            return s
+        shown = self.h[self.problem.measured :]
+        through = s @ shown.T
+        k = s - through @ np.linalg.solve(shown @ through - level**2 * np.eye(len(shown)), through.T)
+        return np.asarray(self.lift @ k @ self.lift.T + self.full_process)
+
+    def _is_possible(self, y: FloatArray, level: float) -> bool:
+        """Whether what xi shows over finitely many steps is still below the level, with the current measurement."""
+        m = self.problem.measured
+        if self.problem.weight_is_free and self.lift is None:
+            total = self.weight + self.h @ y @ self.h.T
+            left = total[m:, :m] @ np.linalg.solve(total[:m, :m], total[:m, m:]) - total[m:, m:]
+        else:
+            shown = self.h[m:]
+            left = -self.weight[m:, m:] - shown.dot(y).dot(shown.T)
+        left.reshape(-1)[:: len(left) + 1] += level**2
+        return is_positive(0.5 * (left + left.T))
+
+    def _gains(self, total: FloatArray, through: FloatArray) -> tuple[Injection | None, FloatArray]:
+        """Return the gains when the signs are right: m positive, q negative, and what must be positive of the q."""
+        n, m, q = self.problem.order, self.problem.measured, self.problem.Z.shape[0]
+        if self.problem.weight_is_free:
+            # The estimate may use the measurement of the same sample.
+            solved = np.linalg.solve(total[:m, :m], np.vstack([through[:, :m], total[m:, :m]]).T).T
+            left = solved[n:] @ total[:m, m:] - total[m:, m:]
+            left = 0.5 * (left + left.T)
+            found = Injection(np.asarray(solved[:n]), np.asarray(-solved[n:]))
+            return (found if is_positive(total[:m, :m]) and is_positive(left) else None), left
+        left = -0.5 * (total[m:, m:] + total[m:, m:].T)
+        change = np.linalg.solve(total[m:, m:], total[m:, :m])
+        reduced = total[:m, :m] - total[:m, m:] @ change
+        if not (is_positive(left) and is_positive(0.5 * (reduced + reduced.T))):
+            return None, left
+        gain = np.linalg.solve(reduced.T, (through[:, :m] - through[:, m:] @ change).T).T
+        return Injection(np.asarray(gain), np.zeros((q, m))), left
+
+
+def central_injection(problem: GainProblem, level: float, *, noise: float) -> Injection | None:
+    """Return the gains of the central filter at ``level``, or ``None`` when the equation gives none."""
+    return CentralEquation.of(problem, noise=noise).filter_at(level)
+
+
+MOST_LEVELS = 60
+#: Relative distance to the best gain from which a first level that fails ends the descent.
+NEXT_TO = 1e-3
+#: Shares of the distance to where the margin should vanish, told by one level or by two, by which the next stays above
+#: that; with three levels, a share of the distance between the last two estimates.
+SAFETY = {1: 0.01, 2: 0.1, 3: 0.2}
+#: A margin below this belongs to a level next to the least.
+SMALL_MARGIN = 1e-5
+#: Growth of that share with each level that fails.
+CAUTION = 10.0
+#: Levels that may fail in a narrow bracket where rounding is to be expected.
+MOST_FAILURES = 3
+#: A filter whose true gain is above its level by this relative amount shows that the equation was not solved.
+NORM_EXCESS = 2e-3
+#: Steps away from a broken promise, each longer than the one before, and halvings (of their logarithm) back.
+RETREAT = 10.0
+HALVINGS = 2
+
+
+@dataclass(frozen=True, eq=False)
+class Reached:
+    """A level at which the equation has a solution of the right signs, and its margin and central filter."""
+
+    level: float
+    margin: float
+    injection: Injection
+
+
+@dataclass(eq=False)
+class GammaIteration:
+    """The way down from ``high`` to the least level; low and high are the bracket, tolerance its relative width.
+
+    ``settled``: the margin tells that nothing is below; ``wary``: rounding is expected, the first filter is judged and
+    a few failures in a narrow bracket end it; ``judged``: a level counts only when its filter keeps its promise.
+    """
+
+    equation: CentralEquation
+    low: float
+    high: float
+    tolerance: float
+    reached: list[Reached] = field(default_factory=list)
+    settled: bool = False
+    wary: bool = False
+    judged: bool = False
+
+    def run(self, first: float) -> None:
+        """Go down from ``first``; where that is not reached and close to ``high``, nothing below is looked for."""
+        level, caution, failures = first * (1.0 + self.tolerance), 1.0, 0
+        for _ in range(MOST_LEVELS):
+            if level >= self.high * (1.0 - 0.5 * self.tolerance):
+                return
+            found, margin = self.equation.filter_and_margin(level)
+            if found is not None and self._is_credible(level, margin, found):
+                self.reached.append(Reached(level, margin, found))
+                self.high, caution = level, 1.0
+                if margin <= 4.0 * self.tolerance:
+                    self.settled = True
+                    return
+            elif not self.reached and level >= self.high * (1.0 - NEXT_TO):
+                return
+            else:
+                self.low, caution, failures = level, caution * CAUTION, failures + 1
+                if self.wary and failures >= MOST_FAILURES and self.high - self.low <= NEXT_TO * self.high:
+                    return
+            level = self._next_level(caution)
+
+    def _is_credible(self, level: float, margin: float, found: Injection) -> bool:
+        """Whether the margin has shrunk with the level, without which the solution is not the one looked for."""
+        if self.reached and margin * level**2 >= self.reached[-1].margin * self.reached[-1].level ** 2:
+            return False
+        believed = not self.judged and (not self.wary or bool(self.reached))
+        return believed or self._gain_as_promised(found, level) is not None
+
+    def _next_level(self, caution: float) -> float:
+        """Return the level to try: a little above where the margin should vanish."""
+        middle = 0.5 * (self.low + self.high)
+        points = [(item.level**2, item.margin * item.level**2) for item in self.reached[-3:]][::-1]
+        if not points or (caution > 1.0 and len(points) < len(SAFETY)):
+            return middle
+        u, m = points[0]
+        zeros = [max(u - m, self.low**2)]
+        if len(points) > 1:
+            zeros.append(max(zeros[0], _vanishing(points[:2])))
+        if len(points) > 2 and zeros[0] <= (parabola := _vanishing(points)) <= 0.5 * (zeros[1] + u):
+            zeros.append(parabola)
+        zero = zeros[-1]
+        distance = abs(zero - zeros[1]) if len(zeros) > 2 else u - zero
+        step = max(SAFETY[len(zeros)] * distance, 2.0 * self.tolerance * zero)
+        level = math.sqrt(zero + caution * step)
+        if caution == 1.0 and level >= self.high * (1.0 - 0.5 * self.tolerance):
+            self.settled = self.reached[-1].margin <= SMALL_MARGIN
+            return self.high
+        return level if self.low < level < self.high * (1.0 - 0.5 * self.tolerance) else middle
+
+    def best(self) -> tuple[Injection, float] | None:
+        """Return the filter of the lowest level that keeps its promise, and its true gain; ``None`` if there is none.
+
+        Rounding may break the promise of the equation next to its least level, where the margin vanishes.
+        """
+        if not self.reached:
+            return None
+        last = self.reached[-1]
+        gain = self.equation.problem.achieved_gain(last.injection)
+        if gain <= last.level * (1.0 + NORM_EXCESS):
+            return last.injection, gain
+        least, step, found = last.level, RETREAT * self.tolerance, None
+        while found is None and step <= NEXT_TO and least * (1.0 + step) < self.reached[0].level:
+            found, step = self._kept(least * (1.0 + step)), RETREAT * step
+        if found is None:
+            return None
+        step, ratio = step / RETREAT, RETREAT
+        for _ in range(HALVINGS):
+            ratio = math.sqrt(ratio)
+            lower = self._kept(least * (1.0 + step / ratio))
+            found, step = (found, step) if lower is None else (lower, step / ratio)
+        return found
+
+    def judged_again(self, high: float) -> GammaIteration:
+        """Return a descent in which each filter is judged by itself, down to the lowest level that was in vain."""
+        top, last = self.reached[0].level, self.reached[-1].level
+        in_vain = self._gain_as_promised(self.reached[0].injection, top) is None
+        again = GammaIteration(self.equation, top if in_vain else last, high, self.tolerance, judged=True)
+        again.run(0.5 * (top + high) if in_vain else top)
+        return again
+
+    def _kept(self, level: float) -> tuple[Injection, float] | None:
+        """Return the filter of a level and its true gain where that is as low as promised."""
+        found = self.equation.filter_at(level)
+        gain = None if found is None else self._gain_as_promised(found, level)
+        return None if found is None or gain is None else (found, gain)
+
+    def _gain_as_promised(self, found: Injection, level: float) -> float | None:
+        gain = self.equation.problem.achieved_gain(found)
+        return gain if gain <= level * (1.0 + self.tolerance) else None
+
+
+def _vanishing(points: list[tuple[float, float]]) -> float:
+    """Return where u is for a margin of zero, by the polynomial in the margin through points (u, margin)."""
+    total = 0.0
+    for i, (u, margin) in enumerate(points):
+        others = [m for j, (_, m) in enumerate(points) if j != i]
+        total += u * math.prod(m / (m - margin) for m in others)
+    return total
+
 
 #: Artificial noise relative to the disturbance, in turn: the first is bisected, and each of the others only where it
 #: reaches a level below.
