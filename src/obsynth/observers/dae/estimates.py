@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -102,17 +103,19 @@ class DAERow:
         """Number of outputs that are there, of one sample."""
         return int(self.seen.sum())
 
-    @property
+    @cached_property
     def several(self) -> DAERow:
         """The same with a leading axis of samples."""
         if self.memory.ndim == 2:
             return self
         return DAERow(self.graph, self.k, self.memory[None], self.said[None], self.seen[None], self.moved)
 
-    @property
+    @cached_property
     def conditions(self) -> FloatArray:
         """Condition number of the equilibrated matrix of (7) at each sample; one at k = 0, where no step was taken."""
         rows = self.several
+        if rows is not self:
+            return rows.conditions
         matrices, found = rows.part("scaled"), np.ones(len(rows.memory))
         stepped = np.arange(self.k, self.k + len(matrices)) > 0
         values = np.linalg.svd(matrices[stepped], compute_uv=False)
@@ -148,7 +151,8 @@ class GatheredRows:
 
     def estimates(self, informations: FloatArray | None = None) -> Estimates:
         """Return what was gathered (``informations (any, nq, nq)``)."""
-        whole = {name: np.concatenate([part[name] for part in self.parts]) for name in self.parts[0]}
+        first, *more = self.parts
+        whole = {name: np.concatenate([part[name] for part in self.parts]) for name in first} if more else dict(first)
         seen = whole["informations"]
         levels = _excitation(self.observer, seen if informations is None else informations)
         whole["excitation"] = levels[len(levels) - len(whole["nis"]) :]

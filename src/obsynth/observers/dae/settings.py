@@ -162,7 +162,7 @@ class Layout:
         rows, columns = self.shapes[name]
         if columns == 1 and name not in MATRICES:
             return flat
-        return np.swapaxes(flat.reshape(*flat.shape[:-1], columns, rows), -1, -2)
+        return flat.reshape(*flat.shape[:-1], columns, rows).swapaxes(-1, -2)
 
     def packed(self, arrays: Mapping[str, FloatArray]) -> FloatArray:
         """Return the vector of named arrays."""
