@@ -299,7 +299,7 @@ class TestEndings:
         assert main(["design", "--system", "nowhere.yaml", "--quiet"]) == 2
         printed = capsys.readouterr()
         assert printed.out == ""
-        assert printed.err == "Malformed input: nowhere.yaml does not exist.\n"
+        assert printed.err == "Error: nowhere.yaml does not exist.\n"
 
 
 class TestRealProcesses:

@@ -96,7 +96,7 @@ class TestInputsAreNeverOutputs:
             before = contents()
             assert main([*words, target, "--force"]) == 2
             told = capsys.readouterr().err
-            assert told.startswith("Malformed input: ")
+            assert told.startswith("Error: ")
             assert target in told
             assert contents() == before
 
@@ -111,7 +111,7 @@ class TestInputsAreNeverOutputs:
             [*RUN, "new.csv", "--state", "g.json"], [*RUN, "new.csv", "--state", "log.csv"], [*EXPORT, "gains.c"],
         ):  # fmt: skip
             assert main([*words, "--force"]) == 2, words
-            assert capsys.readouterr().err.startswith("Malformed input: ")
+            assert capsys.readouterr().err.startswith("Error: ")
             assert contents() == before
 
     def test_the_log_on_standard_input(self, monkeypatch, capsys):
@@ -165,7 +165,7 @@ class TestStandardStreams:
     def test_a_full_output(self):
         done = command("verify", "g.json", shell="> /dev/full")
         assert done.returncode == 2
-        assert done.stderr == "Malformed input: Standard output cannot be written: No space left on device.\n"
+        assert done.stderr == "Error: Standard output cannot be written: No space left on device.\n"
 
     def test_a_closed_output(self):
         done = command("verify", "g.json", shell=">&-")
@@ -233,7 +233,7 @@ class TestNumbers:
         Path("g.json").write_text(with_digest(document, "design"), "utf-8")
         assert main(["verify", "g.json"]) in (2, 6)
         told = capsys.readouterr()
-        assert told.err.startswith("Malformed input: g.json") or "NOT verified" in told.out or "fail" in told.out
+        assert told.err.startswith("Error: g.json") or "NOT verified" in told.out or "fail" in told.out
         assert main(["run", "--gains", "g.json", "--data", "log.csv", "--out", "o.csv", "--quiet"]) in (0, 2)
 
     @pytest.mark.parametrize("value", [10**400, float("nan"), "1", [], True, {"shape": [1], "data": [None]}])
@@ -247,7 +247,7 @@ class TestNumbers:
             Path("state.json").write_text(with_digest(document, "run"), "utf-8")
             before = contents()
             assert main([*RUN, "o.csv", "--state", "state.json"]) == 2, name
-            assert capsys.readouterr().err.startswith("Malformed input: state.json")
+            assert capsys.readouterr().err.startswith("Error: state.json")
             assert contents() == before
 
     @pytest.mark.parametrize("last", ["1e308", "-1e308", "1e400", "1e16"])
@@ -322,7 +322,7 @@ class TestNames:
     def test_control_characters_are_refused(self, name, capsys):
         Path("plant.yaml").write_text(PLANT.replace("${fault}", name), "utf-8")
         assert main(["check", "--system", "spec.yaml"]) == 2
-        assert capsys.readouterr().err.startswith("Malformed input: ")
+        assert capsys.readouterr().err.startswith("Error: ")
 
 
 def test_a_long_sum_is_no_deep_one(capsys):
@@ -360,7 +360,7 @@ class TestFoldersOfResults:
     def test_a_refused_sweep_leaves_no_folder(self, words, capsys):
         before = contents()
         assert main(["sweep", *words, "--out", "new/folder", "--quiet"]) == 2
-        assert capsys.readouterr().err.startswith("Malformed input: ")
+        assert capsys.readouterr().err.startswith("Error: ")
         assert not Path("new").exists()
         assert contents() == before
 

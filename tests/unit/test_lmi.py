@@ -33,7 +33,7 @@ def solver_that_raises(monkeypatch: pytest.MonkeyPatch, error: BaseException) ->
 def test_a_run_has_a_record() -> None:
     record = least_trace()
     assert record["status"] == "optimal"
-    assert {"what", "solver", "version", "settings", "iterations", "seconds"} <= set(record)
+    assert {"what", "solver", "version", "settings", "iterations"} <= set(record)
 
 
 @pytest.mark.parametrize(
@@ -48,7 +48,8 @@ def test_a_crash_is_contained(monkeypatch: pytest.MonkeyPatch, error: BaseExcept
     record = caught.value.record
     assert (record["solver"], record["status"]) == ("CLARABEL", "crashed")
     assert record["reason"] == (f"{type(error).__name__}: {error}" if str(error) else type(error).__name__)
-    assert record["seconds"] >= 0.0
+    # Nothing that is different when the same is done again.
+    assert "seconds" not in record
     assert caught.value.__cause__ is error
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import textwrap
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -134,6 +135,30 @@ def digits(text: str) -> int:
     return count
 
 
+def probability(text: str) -> float:
+    """Return a number between 0 and 1."""
+    value = float(text)
+    if not 0.0 < value < 1.0:
+        raise argparse.ArgumentTypeError(f"{text} is no probability between 0 and 1")
+    return value
+
+
+def positive(text: str) -> float:
+    """Return a positive finite number."""
+    value = float(text)
+    if not 0.0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"{text} is no positive number")
+    return value
+
+
+def count(text: str) -> int:
+    """Return a whole number of one or more."""
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"{text} is less than 1")
+    return value
+
+
 def columns_of(options: argparse.Namespace) -> dict[str, str]:
     """Return the columns of signals, and of the time, that the command line names."""
     named = dict(options.map)
@@ -152,7 +177,7 @@ UNVERIFIED = flag("--unverified", "hand on what fails its verification all the s
 JSON = flag("--json", "print JSON on stdout, for programs; errors too")
 FORCE = flag("--force", "replace an existing file whatever it is; never an input")
 QUIET = flag("--quiet", "print no progress")
-JOBS = option("--jobs", "N", "processes (default: 1)", type=int, default=1)
+JOBS = option("--jobs", "N", "processes (default: 1)", type=count, default=1)
 CLUSTER = option("--cluster", "ADDRESS", "of the scheduler of a Dask cluster, instead of --jobs")
 MAP = option("--map", "SIGNAL=COLUMN", "column of a signal (or of time) where the names differ; may be repeated")
 SCALE = option(
@@ -183,15 +208,15 @@ MONITOR_SETTINGS = Settings(
             "--false-alarms",
             "P",
             "statistical kinds: probability of a false alarm in the whole run (default: %(default)s)",
-            type=float,
+            type=probability,
             default=FALSE_ALARMS,
         ),
-        option("--window", "N", "samples looked back (default: 20)", type=int, default=20),
+        option("--window", "N", "samples looked back (default: 20)", type=count, default=20),
         option(
             "--change",
             "X",
             "cusum: change to be found, in deviations of the residual, or in parameter units (default: 1)",
-            type=float,
+            type=positive,
             default=1.0,
         ),
     )

@@ -35,6 +35,12 @@ def run_run(options: argparse.Namespace) -> int:
         from obsynth.cli.sweep import run_many
 
         return run_many(options)
+    for name, given in (("--jobs", options.jobs != 1), ("--cluster", options.cluster is not None)):
+        if given:
+            raise SpecError(
+                f"{name} spreads the gain sets of a folder: {options.gains} is one gain set. Leave {name} out.",
+                path=name,
+            )
     if options.json and options.out == STREAM:
         raise SpecError("--json and the estimates cannot both go to stdout: give --out a file.", path="--json")
     out = _target(options)

@@ -605,7 +605,7 @@ def unwritable_output(error: OSError) -> int:
         return BROKEN_PIPE
     place = error.filename or "Standard output"
     with suppress(OSError):
-        print(f"Malformed input: {place} cannot be written: {error.strerror or error}.", file=sys.stderr)
+        print(f"Error: {place} cannot be written: {error.strerror or error}.", file=sys.stderr)
     return SpecError.exit_code
 
 

@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 
 
 _TITLES = {
-    "SpecError": "Malformed input",
     "PreconditionError": "Precondition fails",
     "InfeasibleError": "Infeasible",
     "SolverError": "The solver gave up",

@@ -12,7 +12,7 @@ import numpy as np
 
 from obsynth.data.log_estimator import Engine
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import is_finite_number
+from obsynth.numerics.arguments import is_finite_number, number_in_text
 from obsynth.numerics.arrays import FloatArray, read_only
 
 #: What a missing sample may look like in a log.
@@ -38,7 +38,7 @@ class Stamps:
             return math.nan
         if self.is_dated is not True:
             try:
-                seconds = float(cell.replace(",", ".") if comma else cell)
+                seconds = number_in_text(cell.replace(",", ".") if comma else cell)
             except ValueError:
                 seconds = None
             if seconds is not None:

@@ -15,6 +15,7 @@ import numpy as np
 from obsynth.data.signals import MISSING, Signals, Stamps
 from obsynth.errors import SpecError
 from obsynth.files.tables import unquoted
+from obsynth.numerics.arguments import number_in_text
 from obsynth.numerics.arrays import FloatArray
 
 #: What may separate columns, the first one that fits.
@@ -42,7 +43,7 @@ class Dialect:
         if cell.lower() in MISSING:
             return float("nan")
         try:
-            return float(cell.replace(",", ".") if self.comma and "." not in cell else cell)
+            return number_in_text(cell.replace(",", ".") if self.comma and "." not in cell else cell)
         except ValueError:
             advice = ""
             if "," in cell:

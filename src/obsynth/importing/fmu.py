@@ -5,6 +5,7 @@ One instance of an FMU for model exchange, of either version of FMI, with the sa
 
 from __future__ import annotations
 
+import os
 import shutil
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -217,7 +218,8 @@ def _instance(path: Path) -> Iterator[Instance]:
     fmpy = imported("fmpy", extra="fmu")
     _require_readable(fmpy, path)
     description = _read(lambda: fmpy.read_model_description(str(path)), path)
-    folder = _read(lambda: fmpy.extract(str(path)), path)
+    # A library that cannot be loaded leaves the process in the folder of the FMU, which is then deleted.
+    before, folder = os.getcwd(), _read(lambda: fmpy.extract(str(path)), path)
     try:
         instance = _read(lambda: Instance(description, folder), path)
         try:
@@ -225,19 +227,17 @@ def _instance(path: Path) -> Iterator[Instance]:
         finally:
             instance.end()
     finally:
+        os.chdir(before)
         shutil.rmtree(folder, ignore_errors=True)
 
 
 def _read(make: Callable[[], Any], path: Path) -> Any:
     """Return what fmpy makes of a file; whatever it says of a damaged one becomes one error."""
-    from fmpy.fmi1 import FMICallException
-    from fmpy.model_description import ValidationError
-
-    # lxml's errors are syntax errors.
-    damaged = (OSError, ValueError, KeyError, SyntaxError, zipfile.BadZipFile, ValidationError, FMICallException)
     try:
         return make()
-    except damaged as error:
+    except MemoryError:
+        raise
+    except Exception as error:  # fmpy raises bare ones, for a library that cannot be loaded and for an unsafe path
         raise SpecError(f"{path} cannot be used as an FMU: {error}", path=str(path)) from error
 
 
@@ -266,7 +266,7 @@ def _require_readable(fmpy: Any, path: Path) -> None:
         raise SpecError(
             f"{path} provides no directional derivatives: switch them on in the tool that exports it.", path=str(path)
         )
-    platforms = fmpy.supported_platforms(str(path))
+    platforms = _read(lambda: fmpy.supported_platforms(str(path)), path)
     if fmpy.platform not in platforms and fmpy.platform_tuple not in platforms:
         raise SpecError(
             f"{path} has no binary for this machine ({fmpy.platform_tuple}); it has {', '.join(platforms) or 'none'}.",

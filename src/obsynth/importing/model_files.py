@@ -14,6 +14,7 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.files.inputs import read_text
 from obsynth.importing.roles import plant_of
+from obsynth.numerics.arguments import number_in_text
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.descriptor import DescriptorSystem
 
@@ -238,6 +239,6 @@ def _numbers(body: str, count: int, name: str, source: Path) -> list[float]:
 
 def _number(text: str, name: str, source: Path) -> float:
     try:
-        return float(text)
+        return number_in_text(text)
     except ValueError:
         raise SpecError(f"{source}: {name} holds {text.strip()!r}, which is no number.", path=name) from None

@@ -71,6 +71,13 @@ def chosen(value: Any, name: str, choices: tuple[str, ...]) -> str:
     return value
 
 
+def number_in_text(text: str) -> float:
+    """Return the number that a text holds; raise `ValueError` where it holds none, as ``1_000`` of Python is none."""
+    if "_" in text:
+        raise ValueError(f"{text!r} is no number")
+    return float(text)
+
+
 def is_number(value: Any) -> bool:
     """Whether ``value`` is a single real number, of Python or numpy."""
     return isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)

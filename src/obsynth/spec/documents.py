@@ -22,8 +22,13 @@ if TYPE_CHECKING:
     Model = TypeVar("Model", bound=BaseModel)
 
 
+#: Values that the aliases of a document may repeat it to.
+MOST_VALUES = 1_000_000
+
+
 def read_yaml(path: Path, *, where: str | None = None) -> dict[str, Any]:
-    """Return the mapping in a YAML 1.2 document; duplicate keys, tags and anchors used twice are refused."""
+    """Return the mapping in a YAML 1.2 document; duplicate keys, tags, anchors set twice, and aliases that
+    stand for more than a document can hold, are refused."""
     from ruamel.yaml import YAML
     from ruamel.yaml.error import YAMLError, YAMLWarning
 
@@ -35,12 +40,19 @@ def read_yaml(path: Path, *, where: str | None = None) -> dict[str, Any]:
         with warnings.catch_warnings():
             warnings.simplefilter("error", YAMLWarning)
             document = YAML(typ="safe", pure=True).load(text)
+        count = _values_in(document, {})
     except (YAMLError, YAMLWarning) as error:
         raise SpecError(f"{path} is no valid YAML: {_one_line(error)}", path=place) from error
     except RecursionError as error:
         raise SpecError(f"{path} is no valid spec: it is nested too deeply.", path=place) from error
     except (ValueError, TypeError, OverflowError, AttributeError) as error:
         raise SpecError(f"{path} has a value that YAML cannot read: {error}.", path=place) from error
+    if count > max(len(text), MOST_VALUES):
+        raise SpecError(
+            f"{path} stands for {count:.3g} values: its aliases (*name) repeat what they name too often. Put such "
+            "matrices into files beside it.",
+            path=place,
+        )
     if document is None:
         raise SpecError(f"{path} is empty.", path=place)
     if not isinstance(document, dict):
@@ -48,6 +60,17 @@ def read_yaml(path: Path, *, where: str | None = None) -> dict[str, Any]:
             f"{path} holds {described(document)}: the top level must be a mapping (key: value).", path=place
         )
     return document
+
+
+def _values_in(value: Any, known: dict[int, float]) -> float:
+    """Return how many values a document stands for, each as often as an alias repeats it; infinite in a circle."""
+    if not isinstance(value, (dict, list)):
+        return 1.0
+    if id(value) not in known:
+        known[id(value)] = float("inf")
+        parts = value.values() if isinstance(value, dict) else value
+        known[id(value)] = 1.0 + sum(_values_in(part, known) for part in parts)
+    return known[id(value)]
 
 
 def read_names(path: Path, *, where: str) -> list[str]:

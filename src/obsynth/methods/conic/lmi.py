@@ -6,7 +6,6 @@ A solver may end in a panic that is no ``Exception``: whatever it does becomes a
 
 from __future__ import annotations
 
-import time
 import warnings
 from collections.abc import Mapping, Sequence
 from functools import cache
@@ -168,7 +167,6 @@ def _solved(problem: cvxpy.Problem, what: str, solver: str) -> dict[str, Any]:
     """Solve a problem by one solver and return the record."""
     settings = {**SOLVER_SETTINGS.get(solver, {}), **getattr(solver, "options", {})}
     record: dict[str, Any] = {"what": what, "solver": str(solver), "version": _version(solver), "settings": settings}
-    began = time.perf_counter()
     try:
         with warnings.catch_warnings():
             # "Solution may be inaccurate": every solution is verified, so the warning tells nobody anything.
@@ -184,11 +182,10 @@ def _solved(problem: cvxpy.Problem, what: str, solver: str) -> dict[str, Any]:
         raise
     except BaseException as error:  # Rust panics, and memory that ran out inside the solver
         reason = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
-        record |= {"status": "crashed", "reason": reason, "seconds": time.perf_counter() - began}
+        record |= {"status": "crashed", "reason": reason}
         raise SolverError(
             f"{solver} failed while solving for {what} ({reason}): the result is inconclusive.", record=record
         ) from error
-    record["seconds"] = time.perf_counter() - began
     if record["status"] not in USABLE_STATUSES:
         raise SolverError(
             f"{solver} ended with status {record['status']!r} while solving for {what}: the result is inconclusive.",

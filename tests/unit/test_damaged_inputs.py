@@ -1,0 +1,85 @@
+"""Documents that grow when they are read, FMUs that cannot be loaded, and numbers that Python alone takes for some."""
+
+from __future__ import annotations
+
+import os
+import zipfile
+from pathlib import Path
+
+import pytest
+
+import obsynth
+from obsynth.cli.main import main
+from obsynth.data.text_logs import Dialect
+from obsynth.spec.documents import read_yaml
+
+FMU = """<?xml version="1.0"?><fmiModelDescription fmiVersion="2.0" modelName="m" guid="{x}"><ModelExchange
+modelIdentifier="m" providesDirectionalDerivative="true"/><ModelVariables><ScalarVariable name="x" valueReference="1"
+causality="local" variability="continuous"><Real/></ScalarVariable><ScalarVariable name="der(x)" valueReference="2"
+causality="local" variability="continuous"><Real derivative="1"/></ScalarVariable></ModelVariables><ModelStructure>
+<Derivatives><Unknown index="2"/></Derivatives></ModelStructure></fmiModelDescription>"""
+
+
+def stack(count: int) -> str:
+    row = "[" + ",".join(["0"] * count) + "]"
+    rows = f"    - &m\n      - &r {row}\n" + "      - *r\n" * (count - 1)
+    matrices = "    - *m\n" * (count - 1)
+    return f"A:\n{rows}{matrices}"
+
+
+def test_aliases_that_multiply_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "stack.yaml"
+    path.write_text(stack(20))
+    assert len(read_yaml(path)["A"]) == 20
+    path.write_text(stack(120))
+    with pytest.raises(obsynth.SpecError, match=r"stands for 1\.7\de\+06 values: its aliases"):
+        read_yaml(path)
+    path.write_text("a: &a [*a]\n")
+    with pytest.raises(obsynth.SpecError):
+        read_yaml(path)
+
+
+@pytest.mark.parametrize("entry", ["binaries/linux64/m.so", "../outside.txt"])
+def test_damaged_fmus_end_in_one_error_and_leave_the_process_where_it_was(
+    entry: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("fmpy")
+    monkeypatch.chdir(tmp_path)
+    with zipfile.ZipFile("m.fmu", "w") as archive:
+        archive.writestr("modelDescription.xml", FMU)
+        archive.writestr("binaries/linux64/m.so", b"not a library")
+        if entry.startswith(".."):
+            archive.writestr(entry, b"x")
+    with pytest.raises(obsynth.SpecError, match=r"m\.fmu"):
+        obsynth.from_fmu("m.fmu")
+    assert Path(os.getcwd()) == tmp_path
+    assert not (tmp_path.parent / "outside.txt").exists()
+
+
+@pytest.mark.parametrize("text", ["1_000", "1_0.5", "1e1_0"])
+def test_underscores_are_no_part_of_a_number(text: str) -> None:
+    with pytest.raises(obsynth.SpecError, match="Row 7"):
+        Dialect(",").number(text, 7, "y1")
+
+
+@pytest.mark.parametrize(
+    ("wrong", "told"),
+    [
+        (["--set", "change=nan"], "nan is no positive number"),
+        (["--set", "false-alarms=2"], "2 is no probability"),
+        (["--set", "window=0"], "0 is less than 1"),
+        (["--jobs", "-1"], "-1 is less than 1"),
+    ],
+)
+def test_options_out_of_their_range_are_refused_where_they_do_nothing_as_well(
+    wrong: list[str], told: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main(["run", "--gains", "g.json", "--data", "log.csv", *wrong])
+    assert told in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("wrong", [["--jobs", "2"], ["--cluster", "tcp://nowhere:1"]])
+def test_options_of_folders_are_refused_for_one_gain_set(wrong: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["run", "--gains", "g.json", "--data", "log.csv", *wrong]) == 2
+    assert f"{wrong[0]} spreads the gain sets of a folder" in capsys.readouterr().err
