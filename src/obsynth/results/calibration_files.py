@@ -93,17 +93,19 @@ def _differences(found: Mapping[str, Any], again: Mapping[str, Any]) -> list[str
     if not isinstance(one, dict) or one.keys() != two.keys():
         return ["names"]
     wrong = [] if found.get("level") == again["level"] else ["level"]
-    for name, item in two.items():
-        low, high = item["range"]
-        slack = SAME_WIDTH * (high - low)
-        ends = [*one[name]["range"], one[name]["nominal"]]
-        if (
-            list(one[name]["open"]) != list(item["open"])
-            or one[name].get("unit") != item["unit"]
-            or any(abs(a - b) > slack for a, b in zip(ends, (low, high, item["nominal"]), strict=True))
-        ):
-            wrong.append(name)
-    return wrong
+    return wrong + [name for name, item in two.items() if not _same_range(one[name], item)]
+
+
+def _same_range(one: Any, item: Mapping[str, Any]) -> bool:
+    """Whether a constant of a file is that of the calibration done again; what is malformed is not."""
+    if not isinstance(one, dict) or any(one.get(key) != item[key] for key in ("open", "unit")):
+        return False
+    (low, high), ends = item["range"], one.get("range")
+    if not isinstance(ends, list) or len(ends) != 2 or not all(map(is_finite_number, [*ends, one.get("nominal")])):
+        return False
+    slack = SAME_WIDTH * (high - low)
+    pairs = zip([*ends, one["nominal"]], (low, high, item["nominal"]), strict=True)
+    return all(abs(a - b) <= slack for a, b in pairs)
 
 
 def _misfits(found: Mapping[str, Any]) -> list[str]:
