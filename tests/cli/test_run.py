@@ -123,10 +123,10 @@ BAD_LOGS = {
     "a decimal comma": ([HEADER, ROWS[0], '1,0,0,"1,5",0,0'], "Row 2, column 'x2': '1,5' is no number"),
     "too many cells": ([HEADER, ROWS[0], ROWS[1] + ",7"], "log.csv cannot be read"),
     "too many cells in each row": ([HEADER, *(row + ",7" for row in ROWS)], "log.csv cannot be read"),
-    "a time twice": ([HEADER, ROWS[0], ROWS[1], ROWS[1]], "Row 3 repeats the time 1 s"),
-    "a time that falls": ([HEADER, ROWS[0], ROWS[2].replace("2", "1", 1), ROWS[0]], "Row 3: the time falls"),
+    "a time that stays": ([HEADER, ROWS[0], *[ROWS[1]] * 12], "Row 13 repeats the time 1 s"),
+    "times that fall": ([HEADER, ROWS[0], ROWS[1], *[ROWS[0]] * 11], "Row 13: the time falls"),
     "no time in a row": ([HEADER, ROWS[0], ",0,0,0,0,0"], "Row 2 has no time"),
-    "irregular times": ([HEADER, ROWS[0], ROWS[1], "2.3,0,0,0,0,0"], "Row 3 comes 1.3 s after"),
+    "irregular times": ([HEADER, ROWS[0], ROWS[1], "2.48,0,0,0,0,0"], "Row 3 comes 1.48 s after"),
     "another dt": ([HEADER, "0,0,0,0,0,0", "0.5,0,0,0,0,0"], "Row 2 comes 0.5 s after"),
     "twice the dt": ([HEADER, "0,0,0,0,0,0", "2,0,0,0,0,0"], "the sampling time does not fit"),
     "no rows": ([HEADER], "no rows"),
@@ -211,9 +211,11 @@ def test_recursive_and_nonlinear_designs_run_as_well(capsys, monkeypatch):
             answers += capsys.readouterr().out.splitlines()[1:]
         assert answers == whole[1:]
         Path("state.json").unlink()
-        log(*rows[:3], rows[2], header=f"time,{columns}")
-        assert run(Path("recursive.json"), out="other.csv") == 2
-        assert "Row 4 repeats the time" in capsys.readouterr().err
+        log(*rows[:3], rows[2], *rows[3:], header=f"time,{columns}")
+        assert run(Path("recursive.json"), out="repeated.csv") == 0
+        assert "1 repeated stamp" in capsys.readouterr().out
+        answers = Path("repeated.csv").read_text().splitlines()
+        assert [*answers[:4], *answers[5:]] == whole
         assert run(Path("recursive.json"), "--gap", "3", out="other.csv") == 2
         assert "gap is for continuous-time designs" in capsys.readouterr().err
         assert not Path("other.csv").exists()
@@ -227,7 +229,7 @@ def test_a_stream_that_breaks_off_saves_the_state_of_the_rows_that_were_answered
     assert run(gains, "--quiet") == 0
     whole = Path("estimates.csv").read_text().splitlines()
     answers = []
-    for rows, code in ((["high,0,0,0,0,0"], 2), ([*ROWS[:4], ROWS[3]], 2), (ROWS[4:], 0)):
+    for rows, code in ((["high,0,0,0,0,0"], 2), ([*ROWS[:4], "high,0,0,0,0,0"], 2), (ROWS[4:], 0)):
         monkeypatch.setattr("sys.stdin", io.StringIO("\n".join([HEADER, *rows])))
         assert run(gains, "--quiet", "--state", "state.json", data="-", out="-") == code
         answers += capsys.readouterr().out.splitlines()[1:]

@@ -406,17 +406,17 @@ class TestState:
         state = tmp_path / "state.json"
         run_on_data(continuous, random_log(continuous, [0.0, 0.1]), state=state)
         before = state.read_text()
-        with pytest.raises(SpecError, match="Row 1 repeats the time"):
-            run_on_data(continuous, random_log(continuous, [0.1, 0.2]), state=state)
+        with pytest.raises(SpecError, match="Row 1 has no time"):
+            run_on_data(continuous, random_log(continuous, [np.nan, 0.2]), state=state)
         assert state.read_text() == before
 
 
 @pytest.mark.parametrize(
     ("times", "message"),
     [
-        ([0.0, 1.0, 1.0], "Row 3 repeats the time 1 s"),
-        ([0.0, 1.0, 0.5], "Row 3: the time falls from 1 to 0.5 s"),
-        ([0.0, 1.0, 2.3], r"Row 3 comes 1\.3 s after the row before, but the design has dt = 1 s"),
+        ([0.0, *[1.0] * 12], "Row 13 repeats the time 1 s"),
+        ([0.0, 1.0, *[0.5] * 12], "Row 13: the time falls from 1 to 0.5 s"),
+        ([0.0, 1.0, 2.48], r"Row 3 comes 1\.48 s after the row before, but the design has dt = 1 s"),
         ([0.0, 2.0, 4.0], "Row 2: the data begin with an interval of 2 s"),
         ([0.0, 0.5, 1.0], "Row 2 comes 0.5 s"),
         ([0.0, np.nan, 2.0], "Row 2 has no time"),

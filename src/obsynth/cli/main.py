@@ -87,6 +87,10 @@ Each row of estimates has a status:
   gap         a sample is missing: fault estimates are held, the plant model stands in, no alarms
   partial     recursive and nonlinear designs: some outputs are missing, the others are used
   recovering  after a gap, like warm-up
+  repeated stamp, out of order
+              a stamp that does not rise: the row is left out (more than 10 in a row are an error)
+Of sampled designs, stamps may be off their sample by a fifth of the sampling time and more (.45 at once, .25 on
+average); of longer intervals, each whole number of samples is so many rows less one that are missing.
 An estimate that lags has a column 'time of ...', the time of which it is the estimate.
 
 --monitor KIND adds columns 'statistic', 'threshold' and 'alarm', with the fault that stands out. The thresholds hold

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from obsynth.data.log_estimator import GAP, PARTIAL, RECOVERING, WARM_UP
+from obsynth.data.log_estimator import GAP, OUT_OF_ORDER, PARTIAL, RECOVERING, REPEATED, WARM_UP
 from obsynth.observers.estimates import BAND_WIDTH
 
 #: An alarm ends when so many rows in a row were below the threshold.
@@ -20,6 +20,8 @@ REASONS = {
     WARM_UP: "the start is not forgotten yet (--warm-up)",
     RECOVERING: "a gap before them is not forgotten yet (--warm-up)",
     GAP: "samples are missing",
+    REPEATED: "their stamps are those of the rows before",
+    OUT_OF_ORDER: "their stamps are earlier than those of the rows before",
     NO_DECISION: "the monitor decides nothing there, as it waits for its window, its start, or the end of a gap",
 }
 

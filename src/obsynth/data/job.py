@@ -13,7 +13,7 @@ import numpy as np
 
 from obsynth.analysis.transformations.recovery import StateRecovery
 from obsynth.data.alarm_events import NO_DECISION, AlarmLog
-from obsynth.data.log_estimator import DECIDING, Engine, Entry, LagBuffer, Row
+from obsynth.data.log_estimator import DECIDING, STALE, Engine, Entry, LagBuffer, Row
 from obsynth.data.recovered import LATE, RecoveredStates
 from obsynth.data.signals import TIME, Signals
 from obsynth.errors import SpecError
@@ -147,17 +147,34 @@ class Job:
         entries: list[Entry] = []
         scaled = self.signals.deviations(chunk)
         if self.later is None:
-            times = chunk[:, 0].tolist()
-            rows = self.engine.steps(times, scaled, self.rows + 1)
-            self.rows += len(rows)
-            self.first.take_rows(times, scaled)
-            return self._shown([Entry(*parts) for parts in zip(times, scaled, rows, strict=True)])
+            return self._shown(self._in_order(chunk[:, 0].tolist(), scaled))
         for time, deviations in zip(chunk[:, 0].tolist(), scaled, strict=True):
             entry = Entry(time, deviations, self.engine.step(time, deviations, self.rows + 1))
             self.rows += 1
             self.first.take(time, deviations)
             entries.extend(ready for ready, *_ in self.later.take(entry))
         return self._shown(entries)
+
+    def _in_order(self, times: list[float], scaled: FloatArray) -> list[Entry]:
+        """Return the entries of rows, of which those whose stamps do not rise are left out by the observer."""
+        found: list[Entry] = []
+        nothing, done = np.full(len(self.engine.columns), np.nan), 0
+        while done < len(times):
+            # Rows that rise are taken in one piece, beginning with the first that does.
+            status = self.engine.clock.stale(times[done])
+            if status:
+                found.append(Entry(times[done], scaled[done], Row(status, nothing)))
+                self.rows, done = self.rows + 1, done + 1
+                continue
+            end = done + 1
+            while end < len(times) and times[end] > times[end - 1]:
+                end += 1
+            rows = self.engine.steps(times[done:end], scaled[done:end], self.rows + 1)
+            self.rows += len(rows)
+            self.first.take_rows(times[done:end], scaled[done:end])
+            found += [Entry(*parts) for parts in zip(times[done:end], scaled[done:end], rows, strict=True)]
+            done = end
+        return found
 
     def finish(self) -> list[list[Any]]:
         """Return the rows of output that waited for what does not come any more."""
@@ -166,12 +183,9 @@ class Job:
     def _shown(self, entries: Sequence[Entry]) -> list[list[Any]]:
         if not entries:
             return []
-        nu, estimates = len(self.engine.input_names), [entry.row.values for entry in entries]
+        estimates = [entry.row.values for entry in entries]
         if self.recovered is not None:
-            estimates = [
-                np.concatenate([entry.row.values, self.recovered.take(entry.row, entry.deviations[:nu])])
-                for entry in entries
-            ]
+            estimates = [np.concatenate([entry.row.values, self._recovered_in(entry)]) for entry in entries]
         self.statuses.update(entry.row.status for entry in entries)
         shown: list[list[float]] = (np.array(estimates) + self._point).tolist()
         rows: list[list[Any]] = [
@@ -184,8 +198,16 @@ class Job:
                 cells.extend(self._decided(time, row, values, number, cells))
         return rows
 
+    def _recovered_in(self, entry: Entry) -> FloatArray:
+        if self.recovered is None or entry.row.status in STALE:
+            return np.full(0 if self.recovered is None else len(self.recovered.columns), np.nan)
+        return self.recovered.take(entry.row, entry.deviations[: len(self.engine.input_names)])
+
     def _decided(self, time: float, row: Row, values: FloatArray, number: int, said: Sequence[Any]) -> list[Any]:
         """Return statistic and threshold, if there is a monitor, and what alarms there are; ``said``: cells so far."""
+        if row.status in STALE:
+            self.events.silent[row.status] += 1
+            return [*([math.nan] * (0 if self.monitor is None else len(self.monitor.columns) + 2)), ""]
         deciding = row.status in DECIDING
         above = [(name, abs(float(values[i])) / level) for name, i, level in self._levels if deciding]
         names = [name for name, evidence in above if evidence > 1.0]

@@ -16,12 +16,24 @@ from obsynth.plants.descriptor import DescriptorSystem
 
 #: What a row of estimates is.
 OK, WARM_UP, PARTIAL, GAP, RECOVERING = "ok", "warm-up", "partial", "gap", "recovering"
+#: Rows whose stamps do not rise: they are left out, and say nothing.
+REPEATED, OUT_OF_ORDER = "repeated stamp", "out of order"
+STALE = (REPEATED, OUT_OF_ORDER)
 #: Rows in which a decision may be taken.
 DECIDING = (OK, PARTIAL)
 #: Gaps longer than this many samples are not bridged: the observer starts again.
 LONGEST_BRIDGE = 10_000
-#: A sampled design accepts intervals that differ from a multiple of dt by this share of dt.
-FITTING_SHARE = 0.01
+#: A sampled design takes a stamp as the sample that it is nearest to: it is off by up to this share of dt.
+FITTING_SHARE = 0.45
+#: Continuous designs: a gap of so little more than a number of intervals has no further row in it.
+COUNTING_SHARE = 0.01
+#: What remains of a deviation from the samples in the next one: a clock that is a little fast is followed.
+FOLLOWING_SHARE = 0.9
+#: Stamps that are this far from the samples on average are of another sampling time; the average takes this share of
+#: each new row, and begins with nothing.
+OTHER_SHARE, AVERAGED_SHARE = 0.25, 0.05
+#: So many rows in a row whose stamps do not rise are no slip of a clock.
+MOST_STALE = 10
 #: One that differs by this share of dt is one of dt for certain.
 SURE_SHARE = 0.009
 #: Without another word, an interval is a gap when it is longer than this many times the longest one before.
@@ -65,8 +77,10 @@ class Clock:
 
     def __init__(self, dt: float, gap: float | None) -> None:
         self.dt, self.gap = dt, gap
+        # Sampled designs: the time of the last sample, near which its stamp lies.
         self.last: float | None = None
         self.longest = 0.0
+        self.stamp, self.away, self.left_out = -math.inf, 0.0, 0
 
     def advance(self, time: float, row: int) -> tuple[float, int]:
         """Take the stamp of the next row."""
@@ -74,7 +88,7 @@ class Clock:
             raise SpecError(f"Row {row} has no time: each row needs a finite number of seconds.", path=f"row {row}")
         last = self.last
         if last is None:
-            self.last = time
+            self.last = self.stamp = time
             return 0.0, 0
         if time == last:
             raise SpecError(f"Row {row} repeats the time {time:.17g} s of the row before.", path=f"row {row}")
@@ -83,9 +97,26 @@ class Clock:
         step = interval(last, time)
         missing = self._sampled(step, row) if self.dt > 0.0 else self._continuous(step, row)
         self.last = time
+        if self.dt > 0.0:
+            away = step - (missing + 1) * self.dt
+            # Regular stamps are taken as they are, and not as they are summed up.
+            self.last = time if abs(away) <= SURE_SHARE * self.dt else time - FOLLOWING_SHARE * away
+        self.stamp, self.left_out = time, 0
         if not missing:
             self.longest = max(self.longest, step)
         return step, missing
+
+    def stale(self, time: float) -> str:
+        """Return the status of a row whose stamp does not rise, which is left out; empty for others."""
+        last = self.last
+        if last is None or not math.isfinite(time) or self.left_out >= MOST_STALE:
+            return ""
+        # Of a sampled design the last sample may be told a little later than its stamp.
+        before = max(self.stamp, last - FITTING_SHARE * self.dt) if self.dt > 0.0 else last
+        if time > before and time != last:
+            return ""
+        self.left_out += 1
+        return REPEATED if time in (self.stamp, last) else OUT_OF_ORDER
 
     def regular(self, times: Sequence[float]) -> list[float]:
         """Return the intervals to the first of these stamps that certainly follow each other without a gap; nothing is
@@ -109,13 +140,16 @@ class Clock:
     def take(self, times: Sequence[float], steps: Sequence[float]) -> None:
         """Take stamps that `regular` found to follow each other, with their intervals."""
         self.last, self.longest = times[-1], max(self.longest, *steps)
+        self.stamp, self.left_out, self.away = times[-1], 0, 0.0
 
     def _sampled(self, step: float, row: int) -> int:
         count = _counted(step / self.dt, step, row)
-        if count < 1 or abs(step - count * self.dt) > FITTING_SHARE * self.dt:
+        away = abs(step - count * self.dt) / self.dt
+        average = (1.0 - AVERAGED_SHARE) * self.away + AVERAGED_SHARE * away
+        if count < 1 or away > FITTING_SHARE or average > OTHER_SHARE:
             raise SpecError(
                 f"Row {row} comes {step:.10g} s after the row before, but the design has dt = {self.dt:.10g} s: "
-                "irregular time stamps need a continuous-time design.",
+                "stamps may be a fifth of it off; irregular time stamps need a continuous-time design.",
                 path=f"row {row}",
             )
         if count > 1 and self.longest == 0.0:
@@ -124,6 +158,7 @@ class Clock:
                 f"{self.dt:.10g} s: the sampling time does not fit.",
                 path=f"row {row}",
             )
+        self.away = average
         return count - 1
 
     def _continuous(self, step: float, row: int) -> int:
@@ -132,7 +167,7 @@ class Clock:
             return 0
         unit = typical if self.longest else min(step, self.gap or step)
         _counted(step / unit, step, row)
-        return max(math.ceil(step / unit * (1.0 - FITTING_SHARE)) - 1, 1)
+        return max(math.ceil(step / unit * (1.0 - COUNTING_SHARE)) - 1, 1)
 
 
 def _counted(samples: float, step: float, row: int) -> int:

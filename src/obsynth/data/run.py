@@ -42,7 +42,8 @@ class DataRun:
     rows : int
         Rows of data.
     statuses : mapping of str to int
-        How many rows were ``ok``, ``warm-up``, ``partial``, ``gap`` and ``recovering``.
+        How many rows were ``ok``, ``warm-up``, ``partial``, ``gap``, ``recovering``, ``repeated stamp`` and
+        ``out of order``.
     alarms : mapping of str to float
         Time in seconds at which each column, or the monitor, first passed its threshold.
     isolated : str
