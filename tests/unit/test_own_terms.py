@@ -141,6 +141,7 @@ BAD = {
     "not for matrices": (lambda: a_pd(solver="HIGHS"), "no solver 'HIGHS' .*installed are: CLARABEL"),
     "solver 3": (lambda: a_ui_pi(solver=3), "solver is 3: give the name"),
     "settings": (lambda: a_pd(solver_options=[1]), "give the solver's settings by name"),
+    "unknown setting": (lambda: a_pd(solver_options={"leak": True}), "CLARABEL has no setting 'leak'"),
     "settings of none": (lambda: a_filter(solver_options={"eps": 1}), "not for 'auto'"),
     "no inequality": (
         lambda: a_filter(engine="riccati", constraints=lambda v: []), "engine 'riccati' solves no inequality that",

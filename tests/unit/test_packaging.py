@@ -50,8 +50,9 @@ def test_the_readme_is_short():
 
 def test_dir_is_the_public_names_only():
     shown = set(dir(obsynth))
-    assert shown == {*obsynth.__all__, "plotting", "__version__"}
+    assert shown == {*obsynth.__all__, "conditions", "plotting", "__version__"}
     assert obsynth.plotting.plot_data is not None
+    assert obsynth.conditions.wang2015 is not None
     assert obsynth.check is not None
     # Every name of the grouped list in the docstring exists.
     named = [word.strip(" .,;:") for word in (obsynth.__doc__ or "").split()]

@@ -64,7 +64,18 @@ def chosen_solver(name: str, options: Mapping[str, Any] | None, *, ours: tuple[s
         )
     if options and name in ours:
         raise SpecError(f"solver_options are for a solver of cvxpy, not for {name!r}.", path="method.options.solver")
+    if options and name == "CLARABEL":
+        import clarabel
+
+        known = {key for key in dir(clarabel.DefaultSettings()) if not key.startswith("_")} | _SETTINGS_OF_CVXPY
+        unknown = sorted(set(options) - known)
+        if unknown:
+            raise SpecError(f"{name} has no setting {unknown[0]!r}.", path="method.options.solver_options")
     return ChosenSolver(name, options)
+
+
+#: What cvxpy itself takes beside a solver's own settings.
+_SETTINGS_OF_CVXPY = {"canon_backend", "ignore_dpp", "use_quad_obj", "verbose", "warm_start"}
 
 
 def symmetric_variable(size: int) -> Any:
