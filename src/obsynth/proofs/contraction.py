@@ -28,6 +28,8 @@ RATES = (0.5, 0.2, 0.8, 0.95)
 OPERATIONS = 1e3
 #: Up to so many states Lyapunov equations are solved by sums first; doublings of these, and when they have settled.
 MANY_STATES, MOST_DOUBLINGS, SETTLED = 100, 80, 1e-17
+#: Beside sums up to so large rounding hides no identity matrix: 1e-16 of them is 1e-7 of it.
+MOST_GROWTH = 1e9
 #: The same where the rate itself is what is asked for.
 TIGHT_RATES = (0.01, 0.1)
 
@@ -172,13 +174,16 @@ def _proved(ball: Ball, factor: FloatArray, rate: float, *, discrete: bool) -> C
 
 def _summed_factor(a: FloatArray, rate: float, *, discrete: bool) -> FloatArray | None:
     """Return an upper triangular Q with ``Q'Q`` near the sum of ``(A / rate)^k' W (A / rate)^k``, in doubled steps; in
-    continuous time of the Cayley transform's.  W is the sum with W = I: beside it this one is at most as large as the
-    slowest mode is slow, however far the states are from each other."""
+    continuous time of the Cayley transform's.
+
+    W is I, or where I is lost beside such a sum, that sum with W = I: beside it this one is at most as large as the
+    slowest mode is slow, however far the states are from each other.
+    """
     one = np.eye(len(a))
     with np.errstate(all="ignore"):
         balanced, scale = balanced_matrix(a)
         if discrete:
-            power, start = balanced / rate if rate > 0.0 else np.full_like(balanced, np.nan), one
+            power, start, size = balanced / rate if rate > 0.0 else np.full_like(balanced, np.nan), one, 1.0
         else:
             shifted = balanced + rate * one
             size = float(np.linalg.norm(shifted, 2)) or 1.0
@@ -187,9 +192,10 @@ def _summed_factor(a: FloatArray, rate: float, *, discrete: bool) -> FloatArray 
             except np.linalg.LinAlgError:
                 return None
             power, start = inverse @ (size * one + shifted), np.sqrt(2.0 * size) * inverse
-        first = _summed(power, start)
-        second = None if first is None else _summed(power, first @ start)
-        return None if second is None else np.asarray(np.triu(np.linalg.qr(second / scale[None, :], mode="r")))
+        found = _summed(power, start)
+        if found is not None and size * float(np.max(np.sum(found**2, axis=0))) > MOST_GROWTH:
+            found = _summed(power, found / np.max(np.abs(found)) @ start)
+        return None if found is None else np.asarray(np.triu(np.linalg.qr(found / scale[None, :], mode="r")))
 
 
 def _summed(power: FloatArray, factor: FloatArray) -> FloatArray | None:
@@ -200,7 +206,7 @@ def _summed(power: FloatArray, factor: FloatArray) -> FloatArray | None:
             return None
         factor = np.asarray(np.linalg.qr(np.vstack([factor, later]), mode="r"))
         if np.all(np.linalg.norm(later, axis=0) <= SETTLED * np.linalg.norm(factor, axis=0)):
-            return np.asarray(factor / (np.max(np.abs(factor), initial=0.0) or 1.0))
+            return np.asarray(factor)
         power = power @ power
     return None
 
