@@ -11,6 +11,7 @@ from obsynth.analysis.time_varying import WARN_CONDITION, HorizonRanks, horizon_
 from obsynth.analysis.zeros import leading_names
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.methods.method import Synthesis
+from obsynth.methods.recursive.conditions import detectability_condition
 from obsynth.methods.recursive.steady_filter import reached_condition
 from obsynth.numerics.ranks import covariance_factor
 from obsynth.observers.recursive.gain_schedule_summary import (
@@ -52,7 +53,7 @@ def recursive_synthesis(plant: TimeVaryingDescriptorSystem, options: Mapping[str
     observer = observer_from_options(plant, options)
     ranks = horizon_ranks(plant, early=observer.early_constraints)
     facts = gain_schedule_summary(observer)
-    _require_contraction(observer, facts)
+    _require_contraction(observer, facts, options)
     claims = {
         "condition": ranks.condition,
         "condition_k": float(ranks.condition_k),
@@ -75,7 +76,15 @@ def recursive_synthesis(plant: TimeVaryingDescriptorSystem, options: Mapping[str
     )
 
 
-def _require_contraction(observer: RecursiveObserver, facts: GainScheduleSummary) -> None:
+def _has_steady_state(observer: RecursiveObserver) -> bool:
+    """Whether a time-invariant plant is detectable, and Q reaches its modes: then the recursion forgets its start."""
+    if not (observer.plant.is_time_invariant and observer.Q.is_constant and observer.R.is_constant):
+        return False
+    roots = covariance_factor(observer.Q.at(0), "Q"), covariance_factor(observer.R.at(0), "R")
+    return detectability_condition(observer.plant).holds and reached_condition(observer.plant, *roots).holds
+
+
+def _require_contraction(observer: RecursiveObserver, facts: GainScheduleSummary, options: Mapping[str, Any]) -> None:
     """Raise `PreconditionError` where errors do not die out along the horizon."""
     if facts.steps < STEPS_TO_CONTRACT or facts.contraction < 1.0:
         return
@@ -85,6 +94,17 @@ def _require_contraction(observer: RecursiveObserver, facts: GainScheduleSummary
         if facts.contraction < float("inf")
         else "grows without bound"
     )
+    if _has_steady_state(observer):
+        identity = [name for name in ("Q", "R") if options[name] is None]
+        given = f" {' and '.join(identity)} taken as the identity weigh this plant in its units." if identity else ""
+        raise PreconditionError(
+            "Unclear: the horizon does not tell whether errors die out fast enough. The outputs show every "
+            f"state, and with these Q and R the errors die out in the end; but over {facts.steps} steps the product of "
+            f"L_k A_k {kept}, in {', '.join(map(repr, names))}.{given} State Q and R in the units of equations and "
+            "outputs, or take units in which entries are near one.",
+            condition="contraction",
+            signals=names,
+        )
     raise PreconditionError(
         f"Errors do not die out: over {facts.steps} steps the product of L_k A_k {kept}, in "
         f"{', '.join(map(repr, names))}. Either the outputs do not show these "
