@@ -122,10 +122,16 @@ def is_computed(value: float) -> bool:
     return not _is_short(value) and _count(_decimal(value)[0]) > LOSSLESS_DIGITS
 
 
-def computed_entries(matrix: FloatArray) -> int:
-    """Return how many entries of a matrix were computed."""
-    long = np.ldexp(np.frexp(matrix)[0], SHORT_BITS)
-    return sum(is_computed(value) for value in matrix[long != np.rint(long)].tolist())
+def holds_computed(matrix: FloatArray) -> bool:
+    """Whether an entry of a matrix was computed."""
+    return any(map(is_computed, _long_entries(matrix)))
+
+
+def _long_entries(matrix: FloatArray) -> list[float]:
+    """Return the entries that are no short multiple of a power of two: all others are as they were written."""
+    parts = np.ldexp(np.frexp(matrix)[0], SHORT_BITS)
+    found: list[float] = matrix[parts != np.rint(parts)].tolist()
+    return found
 
 
 def written_matrix(matrix: FloatArray) -> fmpq_mat:

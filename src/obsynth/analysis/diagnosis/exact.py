@@ -23,7 +23,7 @@ from obsynth.proofs.exact_arithmetic import (
     Root,
     RootLocation,
     blocks,
-    computed_entries,
+    holds_computed,
     identity,
     locate_roots,
     null_basis,
@@ -44,7 +44,7 @@ MOST_REDUCED = 24
 def decided_exactly(plant: DescriptorSystem) -> bool:
     """Whether a plant is small enough, and made of numbers as they were written."""
     matrices = (plant.E, plant.A, plant.C, plant.Bd, plant.Dd, plant.Bf, plant.Df)
-    return plant.nx + plant.nd + plant.nf <= MOST_UNKNOWNS and not any(map(computed_entries, matrices))
+    return plant.nx + plant.nd + plant.nf <= MOST_UNKNOWNS and not any(map(holds_computed, matrices))
 
 
 def question(plant: DescriptorSystem, removed: Sequence[int], number: int, exactly: bool | None = None) -> Question:

@@ -243,7 +243,7 @@ class _Content:
 @lru_cache(maxsize=8)
 def _numbers_of(content: _Content, uncleaned: bool) -> PlantNumbers | None:
     plant = content.plant
-    from obsynth.proofs.exact_arithmetic import computed_entries, rational_matrix, written_matrix
+    from obsynth.proofs.exact_arithmetic import holds_computed, rational_matrix, written_matrix
 
     origin = origin_of(plant)
     if origin is not None:
@@ -256,7 +256,7 @@ def _numbers_of(content: _Content, uncleaned: bool) -> PlantNumbers | None:
             return written if states <= (COMPUTED_STATES if origin.computed else EXACT_STATES) else None
         sampled = sampled_numbers(exact, origin.sample_time) if states <= SAMPLED_STATES else None
         return None if sampled is None else replace(sampled, computed=origin.computed)
-    computed = any(computed_entries(getattr(plant, name)) for name in DECISIVE)
+    computed = any(holds_computed(getattr(plant, name)) for name in DECISIVE)
     if computed and plant.nx > COMPUTED_STATES:
         return None
     matrices = {name: written_matrix(getattr(plant, name)) for name in DECISIVE}

@@ -26,7 +26,7 @@ from obsynth.numerics.sparse import is_sparse
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.origin import note_source, with_origin
 from obsynth.plants.uncertainty import ELIMINATED
-from obsynth.proofs.exact_arithmetic import computed_entries
+from obsynth.proofs.exact_arithmetic import holds_computed
 
 #: Arrays of plants from this size on, with at most this share of entries that are not zero, are treated as sparse.
 MANY_VARIABLES = 500
@@ -148,7 +148,7 @@ def eliminated_exactly(plant: DescriptorSystem, basis: FloatArray | None = None)
     """Return the elimination in rational arithmetic, rounded once; ``None`` where it must be left to floating point.
     ``basis (nx, count)`` are the dynamic states to take, where they are combinations of those given."""
     exact = exact_elimination(plant)
-    if exact is not None and computed_entries(plant.E) and _dynamic_count(plant) != len(exact.pivots):
+    if exact is not None and holds_computed(plant.E) and _dynamic_count(plant) != len(exact.pivots):
         return None
     if exact is None:
         return None

@@ -62,11 +62,11 @@ class ExactElimination:
 
 def exact_elimination(plant: DescriptorSystem) -> ExactElimination | None:
     """Return the elimination; ``None`` for too many states, or where no state can be eliminated so."""
-    from obsynth.proofs.exact_arithmetic import computed_entries
+    from obsynth.proofs.exact_arithmetic import holds_computed
 
     if plant.nx > MOST_STATES or origin_of(plant) is not None:
         return None
-    computed = any(computed_entries(getattr(plant, name)) for name in ("E", "A", "C", *_SIGNALS, *_DIRECT))
+    computed = any(holds_computed(getattr(plant, name)) for name in ("E", "A", "C", *_SIGNALS, *_DIRECT))
     found = _eliminated(plant, clean=computed)
     if found is None or not computed:
         return found
@@ -249,13 +249,13 @@ def _split(matrix: fmpq_mat, widths: list[int]) -> list[fmpq_mat]:
 
 def sampled_origin(smooth: DescriptorSystem, sample_time: float) -> PlantOrigin:
     """Return what a plant that is sampled from one with ``E = I`` remembers."""
-    from obsynth.proofs.exact_arithmetic import computed_entries, written_fraction, written_rows
+    from obsynth.proofs.exact_arithmetic import holds_computed, written_fraction, written_rows
 
     origin = origin_of(smooth)
     exact: Mapping[str, tuple[tuple[Fraction, ...], ...]] = (
         origin.exact if origin is not None else {name: written_rows(getattr(smooth, name)) for name in DECISIVE}
     )
-    computed = origin.computed if origin else any(computed_entries(getattr(smooth, name)) for name in DECISIVE)
+    computed = origin.computed if origin else any(holds_computed(getattr(smooth, name)) for name in DECISIVE)
     sizes = None if origin is None or origin.sizes is None else _sampled_sizes(smooth, origin.sizes, sample_time)
     uncleaned = None if origin is None else origin.uncleaned
     return PlantOrigin(exact, written_fraction(sample_time), computed, sizes, uncleaned=uncleaned)

@@ -32,7 +32,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.pencils import pencil_structure
 from obsynth.numerics.ranks import decide_rank, equilibrate
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.proofs.exact_arithmetic import computed_entries
+from obsynth.proofs.exact_arithmetic import holds_computed
 
 #: At most this many signals are named in a failed condition.
 MOST_NAMES = 4
@@ -116,7 +116,7 @@ def _all_conditions(plant: DescriptorSystem) -> Iterator[Condition]:
 def _form(plant: DescriptorSystem) -> tuple[int, int, int]:
     """Return normal rank, index (0 for a plant that is not regular) and the number of dynamic states."""
     numbers = numbers_of(plant)
-    if not isinstance(numbers, WrittenNumbers) or computed_entries(plant.E):
+    if not isinstance(numbers, WrittenNumbers) or holds_computed(plant.E):
         pencil = pencil_structure(plant.E, plant.A)
         return pencil.normal_rank, pencil.index or 0, len(pencil.finite_eigenvalues)
     index = numbers.index
