@@ -122,7 +122,8 @@ def _changed(
     if found is None:
         return None
     a, c, faults, t = found
-    shares = [_scalar(Fraction(float(share))) for share in direction]
+    # Of shares that rounding has made alike another one may be the first of the largest, with the other sign.
+    shares = [_scalar(Fraction(float(share)) / Fraction(float(direction[chosen]))) for share in direction]
     parts = [c * _moved(a, faults, fault, index) * shares[fault] for fault, index in enumerate(indexes)]
     rest, maps, through = sum(parts[1:], start=parts[0]), list["fmpq_mat"](), t
     for _ in range(int(indexes[chosen] or 1)):
