@@ -291,7 +291,7 @@ def _by_threshold(
     found = question.minimal_sets(largest, most)
     rows = tuple(
         SensorSet(tuple(sensors[i].name for i in chosen), sum(costs[i] for i in chosen), None, made.threshold,
-                  made.samples, made.plant.dt)
+                  made.samples, made.linear[0].dt)
         for chosen, made in found
     )  # fmt: skip
     note = "Cheapest first; of each set the test with the shortest delay. More sensors never raise a least threshold."

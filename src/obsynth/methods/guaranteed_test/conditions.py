@@ -17,8 +17,8 @@ SOURCE = "duality of linear programmes"
 TOLD = 1e-6
 
 
-def conditions(plant: DescriptorSystem, asked: Asked) -> tuple[Condition, ...]:
-    """Return the conditions in order; the first that fails ends the list."""
+def conditions(plant: DescriptorSystem, asked: Asked, *, with_windows: bool = True) -> tuple[Condition, ...]:
+    """Return the conditions in order; ``with_windows``: also whether a window tells the fault, if the others hold."""
     discrete = Condition(
         "discrete time",
         "dt > 0",
@@ -50,7 +50,7 @@ def conditions(plant: DescriptorSystem, asked: Asked) -> tuple[Condition, ...]:
         " ".join(lacking),
     )
     first = (discrete, fault, stated)
-    if not all(condition.holds for condition in first):
+    if not all(condition.holds for condition in first) or not with_windows:
         return first
     return (*first, told(problem_of(plant, asked), asked)[0])
 
@@ -62,9 +62,14 @@ def told(problem: Problem, asked: Asked) -> tuple[Condition, int]:
         lags = list(range(problem.plant.nx + 2))
     window = None
     for lag in lags:
-        window = problem.window(_samples(problem, asked, lag), lag=lag)
-        if _has_test(window):
-            return _condition(problem, window, True, ""), lag
+        most = _samples(problem, asked, lag)
+        least = max(problem.before, lag) + 2
+        # A test on fewer samples is one on more: short windows are decided in no time.
+        doubled = [least * 2**k for k in range(most.bit_length())]
+        for samples in (*(tried for tried in doubled if tried < most), most):
+            window = problem.window(samples, lag=lag)
+            if _has_test(window):
+                return _condition(problem, window, True, ""), lag
     assert window is not None
     return _condition(problem, window, False, _why(problem, asked, window)), lags[-1]
 

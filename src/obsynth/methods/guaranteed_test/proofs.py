@@ -119,17 +119,19 @@ class _Square:
             return None
         rows = -np.frexp(largest)[1].astype(np.int64)
         scaled = np.ldexp(scaled, rows[:, None])
-        triangle, order = qr(scaled, mode="r", pivoting=True)
         count = len(matrix)
-        diagonal = np.abs(np.diag(triangle))
-        if count and not diagonal[count - 1] > DEPENDENT * diagonal[0]:
-            return None
-        chosen = np.sort(order[:count])
+        chosen = np.flatnonzero(weight > 0.0)
+        if chosen.size != count:
+            triangle, order = qr(scaled, mode="r", pivoting=True)
+            diagonal = np.abs(np.diag(triangle))
+            if count and not diagonal[count - 1] > DEPENDENT * diagonal[0]:
+                return None
+            chosen = np.sort(order[:count])
         columns = units[chosen]
-        part = np.ldexp(matrix[:, chosen], columns)
-        rows = -np.frexp(np.abs(part).max(axis=1, initial=0.0))[1].astype(np.int64)
+        picked = np.ldexp(matrix[:, chosen], columns)
+        rows = -np.frexp(np.abs(picked).max(axis=1, initial=0.0))[1].astype(np.int64)
         spread = np.ldexp(np.ldexp(radius[:, chosen], columns), rows[:, None])
-        part = Ball(np.ldexp(part, rows[:, None]), spread)
+        part = Ball(np.ldexp(picked, rows[:, None]), spread)
         try:
             inverse = np.asarray(np.linalg.inv(part.midpoint), dtype=np.float64)
         except np.linalg.LinAlgError:

@@ -45,28 +45,31 @@ TRADE_OFF = "trade_off"
 def synthesise(plant: DescriptorSystem, asked: Asked, *, progress: Callable[[str], None]) -> Synthesis:
     """Return weights, observer and certificate."""
     problem = problem_of(plant, asked)
-    require_all(conditions(plant, asked))
-    _, lag = told(problem, asked)
+    require_all(conditions(plant, asked, with_windows=False))
+    condition, lag = told(problem, asked)
+    condition.require()
     problem = replace(problem, question=replace(problem.question, lag=lag))
     progress("looking for the least number of samples")
-    samples, table = chosen_samples(problem, asked)
+    samples, table, found = chosen_samples(problem, asked)
     progress(f"proving the threshold on {samples} samples")
     window = problem.window(samples)
-    shipped = proved_test(window, largest_hidden_fault(window))
+    shipped = proved_test(window, found)
     return _synthesis(problem, asked, window, shipped, table)
 
 
-def chosen_samples(problem: Problem, asked: Asked) -> tuple[int, FloatArray]:
-    """Return the number of samples, and the table of those tried with their thresholds ``(tried, 2)``."""
+def chosen_samples(problem: Problem, asked: Asked) -> tuple[int, FloatArray, Optimum]:
+    """Return the number of samples, the table of those tried with their thresholds ``(tried, 2)``, and the optimum."""
     given = asked.before + asked.after if asked.after is not None else asked.samples
     tried = problem.ladder() if given == "auto" else (int(given),)
-    table = np.array([[rung, largest_hidden_fault(problem.window(rung)).size] for rung in tried])
+    found = [largest_hidden_fault(problem.window(rung)) for rung in tried]
+    table = np.array([[rung, optimum.size] for rung, optimum in zip(tried, found, strict=True)])
     if not np.isfinite(table[-1, 1]):
         raise SolverError(
             f"HiGHS finds no test on {tried[-1]} samples, but there is one: nothing is known. Other units may help."
         )
     good = table[:, 1] <= (1.0 + WITHIN) * table[-1, 1]
-    return int(table[np.flatnonzero(good)[0], 0]), table
+    place = int(np.flatnonzero(good)[0])
+    return int(table[place, 0]), table, found[place]
 
 
 class Shipped:
