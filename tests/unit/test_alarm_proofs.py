@@ -174,3 +174,24 @@ def test_the_sentence_tells_bounds_start_constants_and_log(tmp_path) -> None:
     (tmp_path / "old.json").write_text(json.dumps(content))
     with pytest.raises(obsynth.SpecError, match="prove the alarm again"):
         obsynth.verify_alarm(tmp_path / "old.json")
+
+
+def test_digest_row_and_margin_are_judged_by_themselves(design, tmp_path) -> None:
+    """A smaller margin and another row are harmless or wrong in themselves; the digest tells the first."""
+    u, y = record(design, 1, fault=0.2)
+    found = proved_alarm(design, u[:34], y[:34], **options(design))
+    text = found.save(tmp_path / "alarm.json").read_text()
+    content = json.loads(text)
+    content["certificate"]["margin"] *= 0.5
+    (tmp_path / "bad.json").write_text(json.dumps(content))
+    assert {check.name for check in obsynth.verify_alarm(tmp_path / "bad.json").failures} == {"digest"}
+    assert obsynth.verify_alarm(resigned(content, tmp_path / "bad.json")).passed
+    cases = (("row", 33, {"rows"}), ("margin", 0.0, {"margin"}), ("origin", "stated", {"statement"}))
+    for key, value, failing in cases:
+        content = json.loads(text)
+        content["certificate"][key] = value
+        report = obsynth.verify_alarm(resigned(content, tmp_path / "bad.json"))
+        assert {check.name for check in report.failures} == failing
+    content = json.loads(text)
+    content["certificate"]["below"]["data"] = [0.0] * len(content["certificate"]["below"]["data"])
+    assert "proof" in {check.name for check in obsynth.verify_alarm(resigned(content, tmp_path / "bad.json")).failures}
