@@ -173,16 +173,19 @@ def delay(text: str) -> int | str:
 SYSTEM = option("--system", "FILE", "the spec (YAML)", type=Path, required=True)
 GAINS = option("--gains", "FILE", "a gain set (JSON) that design wrote", type=Path, required=True)
 SPEC_GAINS = option("--gains", "FILE", "a gain set for the spec's plant: nothing is designed", type=Path)
-UNVERIFIED = flag("--unverified", "hand on what fails its verification all the same; whatever is written says so")
+UNVERIFIED = Settings(
+    (flag("--unverified", "hand on what fails its verification all the same; whatever is written says so"),)
+)
 JSON = flag("--json", "print JSON on stdout, for programs; errors too")
 FORCE = flag("--force", "replace an existing file whatever it is; never an input")
 QUIET = flag("--quiet", "print no progress")
 JOBS = option("--jobs", "N", "processes (default: 1)", type=count, default=1)
 CLUSTER = option("--cluster", "ADDRESS", "of the scheduler of a Dask cluster, instead of --jobs")
 MAP = option("--map", "SIGNAL=COLUMN", "column of a signal (or of time) where the names differ; may be repeated")
-SCALE = option(
+_SCALE = option(
     "--scale", "SIGNAL=FACTOR", "the column's value times the factor is in the signal's unit; may be repeated"
 )
+SCALE = Settings((_SCALE,))
 TIME_COLUMN = option("--time-column", "COLUMN", "column of the time, in seconds or as dates (ISO 8601); default: time")
 #: How a log without faults is read.
 LOG_OPTIONS = (
@@ -225,12 +228,16 @@ MONITOR_SETTINGS = Settings(
 DATA_OPTIONS = (
     MAP,
     MONITOR,
-    option("--normal", "FILE", "monitor 'learned': what the verb thresholds wrote (.json), or a log without faults"),
     MONITOR_SETTINGS,
     Settings(
         (
             TIME_COLUMN,
-            SCALE,
+            option(
+                "--normal",
+                "FILE",
+                "monitor 'learned': what the verb thresholds wrote (.json), or a log without faults",
+            ),
+            _SCALE,
             option(
                 "--threshold",
                 "COLUMN=LEVEL",

@@ -149,8 +149,8 @@ class DataObserver(Engine):
         self.row = np.full(len(self.observer.Cz), np.nan)
         self.model: FloatArray | None = None
         # What is known of the plant's states at the last measured row, from which the model starts.
-        known = len(self.observer.state_names) if self.partial is None else self.plant.nx
-        self.seen = np.full(known, np.nan)
+        width = len(self.observer.state_names) if self.partial is None else self.plant.nx
+        self.seen = np.full(width, np.nan)
         # Since when nothing is left of a gap: bounds that are never passed hold from there on.
         self.forgotten_at, self.begun = -math.inf, False
         self.transient = transient(self.observer)
