@@ -106,3 +106,28 @@ def test_bank_above_six_faults_is_whole_when_asked_and_says_so_otherwise() -> No
 def test_whole_bank_has_a_limit() -> None:
     with pytest.raises(obsynth.SpecError, match="13 faults: the whole bank"):
         obsynth.diagnose(mixed_biases(13), suggest=False, whole_bank=True)
+
+
+@pytest.mark.parametrize("exactly", [True, False])
+def test_derivatives_of_exact_constraints_cost_no_order(exactly: bool) -> None:
+    # 0 = x1 and its derivatives: y = x2 = -f; y = x3 = -f after two of them; and y = x2 = -f' of 0 = x1 + f.
+    plants = [
+        obsynth.DescriptorSystem([[1, 0], [0, 0]], [[0, 1], [1, 0]], None, [[0, 1]], Bf=[[1], [0]]),
+        obsynth.DescriptorSystem(
+            np.diag([1.0, 1.0, 0.0]), [[0, 1, 0], [0, 0, 1], [1, 0, 0]], None, [[0, 0, 1]], Bf=[[0], [1], [0]]
+        ),
+        obsynth.DescriptorSystem([[1, 0], [0, 0]], [[0, 1], [1, 0]], None, [[0, 1]], Bf=[[0], [1]]),
+    ]
+    for plant in plants:
+        assert least_order(plant, (), 0) == 0
+        assert question(plant, (), 0, exactly).residual_order == 0
+
+
+def test_a_residual_that_sees_two_faults_has_the_larger_of_their_orders() -> None:
+    # y1 = a at once, y2 = x2 behind two states shows b: order 2.
+    plant = obsynth.DescriptorSystem(
+        None, [[0, 0], [1, 0]], None, [[0, 0], [0, 1]], Bf=[[0, 1], [0, 0]], Df=[[1, 0], [0, 0]],
+        fault_names=["a", "b"],
+    )  # fmt: skip
+    orders = {one.sees: one.order for one in obsynth.diagnose(plant, suggest=False).bank}
+    assert orders == {("a",): 0, ("b",): 2, ("a", "b"): 2}
