@@ -338,3 +338,24 @@ def test_rows_are_left_out_across_a_saved_state(tmp_path: Path) -> None:
     parts = [obsynth.run_on_data(designed("ui-pi-observer"), part, state=state).table
              for part in (data.iloc[:61], data.iloc[61:])]  # fmt: skip
     pd.testing.assert_frame_equal(whole, pd.concat(parts, ignore_index=True))
+
+
+@pytest.mark.parametrize("method", METHODS[1:])
+def test_one_blank_cell_does_not_blind_for_a_warm_up(method: str) -> None:
+    rng, blanks = np.random.default_rng(6), range(90, 240, 15)
+    data = log(fault=0.5, rows=260)
+    data[["a", "b"]] += 0.01 * rng.standard_normal((260, 2))
+    clean = obsynth.run_on_data(designed(method), data).table
+    for row in blanks:
+        data.loc[row, "b"] = np.nan
+    table = obsynth.run_on_data(designed(method), data).table
+    assert table is not None
+    assert clean is not None
+    counts = table["status"].value_counts()
+    assert counts["gap"] == len(blanks)
+    assert counts.get("recovering", 0) <= 10 * len(blanks)
+    well = table["status"] == "ok"
+    away = (table["fhat[f]"] - clean["fhat[f]"])[well]
+    # What is left of a gap stays below half of what the estimate changes by from row to row; gaps may add up.
+    usual = np.sqrt(np.mean(np.diff(clean["fhat[f]"][60:]) ** 2))
+    assert np.sqrt(np.mean(away**2)) <= usual

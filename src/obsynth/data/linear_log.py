@@ -25,6 +25,9 @@ from obsynth.results.design import ObserverDesign
 KEPT_INTERVALS = 64
 #: Rows that are taken in one piece at most.
 PIECE = 4096
+#: A gap is over when what it can have left in fault estimates and residuals is below this share of their usual changes
+#: from row to row, which so many rows must have shown.
+LEFT_SHARE, LEAST_SHOWN = 0.5, 20
 SAMPLED_GAP = "gap is for continuous-time designs: a sampled one knows which rows are missing."
 _Part = TypeVar("_Part")
 
@@ -153,6 +156,11 @@ class DataObserver(Engine):
         self.seen = np.full(width, np.nan)
         # Since when nothing is left of a gap: bounds that are never passed hold from there on.
         self.forgotten_at, self.begun = -math.inf, False
+        # Squares of changes of fault estimates and residuals from row to row, summed up, and how many there are.
+        self.shown = slice(len(self.observer.state_names), None)
+        self.changes, self.counted = np.zeros(len(self.observer.Cz[self.shown])), 0
+        # What a unit error of each output that the model told has left in z; NaN where inputs were missing, too.
+        self.left = np.zeros((self.observer.order, len(self.output_names)))
         self.transient = transient(self.observer)
         # Of every fault of the plant; those of which nothing is estimated are held to be absent.
         self.fault = np.zeros(self.plant.nf)
@@ -164,6 +172,9 @@ class DataObserver(Engine):
         """Take one row of data."""
         seconds, missing = self.clock.advance(time, row)
         good = bool(np.isfinite(values).all())
+        previous = self.row if self.model is None and self.z is not None else None
+        if not np.isfinite(values[: self.nu]).all() or (missing and self.nu):
+            self.left = np.full_like(self.left, np.nan)
         u = values[: self.nu]
         u = np.where(np.isfinite(u), u, self.v[: self.nu])
         # A number that overflows in what follows is a bad sample like any other: the state is looked at below.
@@ -181,9 +192,11 @@ class DataObserver(Engine):
                 self.inputs.clear()
                 seconds = 0.0
             if good:
+                recovered = self.warm_up if self.model is None else self._recovering(seconds, values)
                 found = self._measured(seconds, values)
                 if self.model is not None:
-                    self.model, self.settled_at, self.phase = None, time + self.warm_up, RECOVERING
+                    self.model, self.settled_at, self.phase = None, time + recovered, RECOVERING
+                    self.left = np.zeros_like(self.left)
                     self.forgotten_at = time + max(self.warm_up, self.transient)
                 status = OK if time >= self.settled_at else self.phase
             else:
@@ -194,6 +207,8 @@ class DataObserver(Engine):
             self._restart()
             return Row(GAP, self._held(), missing)
         self.fault = self._faults_in(found)
+        if previous is not None and status == OK and not missing:
+            self._count((found - previous)[None])
         sample = LinearSample(found, values[: self.nu], values[self.nu :], len(self.state_names))
         return Row(status, found, missing, sample, time >= self.forgotten_at)
 
@@ -238,6 +253,8 @@ class DataObserver(Engine):
                 return []
         last = count - 1
         self.clock.take(times[:count], steps[:count])
+        settled = np.array(times[:count]) >= self.settled_at
+        self._count(np.diff(np.vstack([self.row, rows[:count]]), axis=0)[settled])
         self.z, self.v, self.row, self.measured = np.array(after[last]), values[last], rows[last], values[last]
         self.fault = self._faults_in(rows[last])
         self.seen = (
@@ -269,6 +286,38 @@ class DataObserver(Engine):
         faults = np.zeros(len(self.fault))
         faults[self.told_faults] = row[self.observer.fault_rows]
         return faults
+
+    def _count(self, changes: FloatArray) -> None:
+        """Sum up changes ``(n, rows)``, one after the other, so that results do not depend on pieces."""
+        squares = np.nan_to_num(changes[:, self.shown] ** 2, nan=0.0, posinf=0.0)
+        self.changes = np.cumsum(np.vstack([self.changes, squares]), axis=0)[-1]
+        self.counted += len(changes)
+
+    def _recovering(self, seconds: float, v: FloatArray) -> float:
+        """Return the seconds after a gap in which nothing may be decided; the model stands at this row already.
+
+        The outputs of the model missed those of the plant by no more during the gap than they do now, as errors of a
+        model grow: what that can have left in fault estimates and residuals is followed until it is usual.
+        """
+        gap_model, nu = _running(self.gap_model), self.nu
+        missed = np.abs(v[nu:] - gap_model.outputs(_running(self.model), v[:nu], self.fault))
+        if self.counted < LEAST_SHOWN or not np.isfinite(self.left).all():
+            return self.warm_up
+        step = self.observer.dt or self.clock.longest
+        if not step > 0.0:
+            return self.warm_up
+        a, left = self.observer.Az, self.left
+        if self.observer.dt == 0.0:
+            transition, constant, _ = self._hold(seconds or step)
+            a, left = self._hold(step)[0], transition @ left + constant[:, nu:]
+        usual = LEFT_SHARE * np.sqrt(self.changes / self.counted)
+        rows, waited = self.observer.Cz[self.shown], 0.0
+        # The first row after a gap always counts as recovering.
+        while waited < self.warm_up:
+            left, waited = a @ left, waited + step
+            if np.all(np.abs(rows @ left) @ missed <= usual):
+                break
+        return min(waited, self.warm_up)
 
     def _lost(self, seconds: float, v: FloatArray) -> bool:
         """Whether the model, after a gap, misses the outputs by more than their whole size before and after it."""
@@ -321,6 +370,10 @@ class DataObserver(Engine):
         v = np.concatenate([u, self.gap_model.outputs(self.model, u, self.fault)])
         if self.observer.dt == 0.0:
             self._flow(seconds, v)
+            transition, constant, _ = self._hold(seconds)
+            self.left = transition @ self.left + constant[:, self.nu :]
+        else:
+            self.left = self.observer.Az @ self.left + self.observer.By
         row = np.asarray(self.observer.Cz @ self.z + self.d @ v)
         self._taken(v)
         row[self.observer.fault_rows] = self.fault[self.told_faults]
@@ -357,12 +410,16 @@ class DataObserver(Engine):
             "seen": self.seen,
             "forgotten_at": self.forgotten_at,
             "begun": self.begun,
+            "changes": self.changes,
+            "counted": self.counted,
+            "left": self.left,
         }
 
     def _resume_own(self, data: dict[str, Any]) -> None:
         self.z, self.v, self.row, self.model = data["z"], data["v"], data["row"], data["model"]
         self.fault, self.measured = data["fault"], data["measured"]
         self.seen, self.forgotten_at, self.begun = data["seen"], data["forgotten_at"], data["begun"]
+        self.changes, self.counted, self.left = data["changes"], data["counted"], data["left"]
         self.inputs.clear()
         self.inputs.extend(data["inputs"])
 
