@@ -253,8 +253,8 @@ class DataObserver(Engine):
                 return []
         last = count - 1
         self.clock.take(times[:count], steps[:count])
-        settled = np.array(times[:count]) >= self.settled_at
-        self._count(np.diff(np.vstack([self.row, rows[:count]]), axis=0)[settled])
+        deciding = np.array(times[:count]) >= self.settled_at
+        self._count(np.diff(np.vstack([self.row, rows[:count]]), axis=0)[deciding])
         self.z, self.v, self.row, self.measured = np.array(after[last]), values[last], rows[last], values[last]
         self.fault = self._faults_in(rows[last])
         self.seen = (

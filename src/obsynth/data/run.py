@@ -164,7 +164,7 @@ def run_on_data(
     gap : float, optional, seconds
         Continuous-time designs: longer intervals are gaps; by default those ten times the longest one before.
     warm_up : float, optional, seconds
-        Marked after the start, and after gaps at most; by default until the slowest mode has shrunk to 2 %, and none for
+        After the start, and after gaps at most; by default until the slowest mode has shrunk to 2 %, and none for
         recursive and nonlinear designs, whose deviations hold from the start.
     outliers : {"gate", "huber", "none"}, optional
         Recursive and nonlinear designs: what is done with a sample that its prediction excludes; by default what the
