@@ -116,8 +116,9 @@ def _misfits(found: Mapping[str, Any]) -> list[str]:
         return [*wrong, "constants"]
     for name, item in constants.items():
         ends = item.get("range") if isinstance(item, dict) else None
-        fits = isinstance(ends, list) and len(ends) == 2 and all(map(is_finite_number, [*ends, item.get("nominal")]))
-        if not fits or not ends[0] <= item["nominal"] <= ends[1]:
+        nominal = item.get("nominal") if isinstance(item, dict) else None
+        fits = isinstance(ends, list) and len(ends) == 2 and all(map(is_finite_number, [*ends, nominal]))
+        if not (fits and isinstance(ends, list) and float(ends[0]) <= float(nominal or 0.0) <= float(ends[1])):
             wrong.append(str(name))
     return wrong
 
