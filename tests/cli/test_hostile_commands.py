@@ -250,7 +250,12 @@ class TestNumbers:
             assert capsys.readouterr().err.startswith("Error: state.json")
             assert contents() == before
 
-    @pytest.mark.parametrize("last", ["1e308", "-1e308", "1e400", "1e16"])
+    def test_a_stamp_that_falls_is_a_row_that_is_left_out_and_told(self):
+        Path("log.csv").write_text(log([*range(8), "-1e308"]), "utf-8")
+        assert main([*RUN, "o.csv"]) == 0
+        assert Path("o.csv").read_text("utf-8").splitlines()[-1].startswith("-1e+308,out of order,")
+
+    @pytest.mark.parametrize("last", ["1e308", "1e400", "1e16"])
     def test_in_a_cell_of_time(self, last, capsys):
         Path("log.csv").write_text(log([*range(8), last]), "utf-8")
         assert main([*RUN, "o.csv"]) == 2
@@ -352,16 +357,25 @@ class TestFoldersOfResults:
         "words",
         [
             ["--system", "missing.yaml"], ["--system", "spec.yaml", "--set", "gamma"],
-            ["--system", "spec.yaml", "--set", "gamma=[]"], ["--system", "spec.yaml", "--jobs", "0"],
+            ["--system", "spec.yaml", "--set", "gamma=[]"],
             ["--system", "spec.yaml", "--set", "gamma=[2]", "--set", "gamma=[3]"],
         ],
-        ids=["no spec", "no list", "no values", "no process", "twice"],
+        ids=["no spec", "no list", "no values", "twice"],
     )  # fmt: skip
     def test_a_refused_sweep_leaves_no_folder(self, words, capsys):
         before = contents()
         assert main(["sweep", *words, "--out", "new/folder", "--quiet"]) == 2
         assert capsys.readouterr().err.startswith("Error: ")
         assert not Path("new").exists()
+        assert contents() == before
+
+    @pytest.mark.parametrize("jobs", ["0", "-1", "2.5", "many"])
+    def test_no_process_is_a_word_that_the_command_line_refuses(self, jobs, capsys):
+        before = contents()
+        with pytest.raises(SystemExit) as ended:
+            main(["sweep", "--system", "spec.yaml", "--jobs", jobs, "--out", "new/folder", "--quiet"])
+        assert ended.value.code == 2
+        assert "argument --jobs" in capsys.readouterr().err
         assert contents() == before
 
     def test_a_table_that_is_the_spec(self, capsys):
