@@ -89,8 +89,11 @@ def _gain_witness(transfer: Transfer, bound: float) -> FloatArray | None:
     a, b, c, d = (part.midpoint for part in parts)
     if not len(a):
         return a
-    slack = STRICTNESS * max(float(np.linalg.norm(b @ b.T, 2)), np.finfo(np.float64).tiny)
     gap = bound**2 * np.eye(len(c)) - d @ d.T
+    # Where nothing drives the errors, the strictness is relative to what the bound leaves room for.
+    room = float(np.linalg.norm(a, 2)) ** 2 * float(np.linalg.eigvalsh(gap)[0])
+    room /= max(float(np.linalg.norm(c, 2)) ** 2, np.finfo(np.float64).tiny)
+    slack = STRICTNESS * max(float(np.linalg.norm(b @ b.T, 2)), room, np.finfo(np.float64).tiny)
     found = continuous_solution(a, c, b @ b.T + slack * np.eye(len(a)), -gap, b @ d.T)
     return None if found is None or not np.all(np.isfinite(found)) else np.asarray(0.5 * (found + found.T))
 
