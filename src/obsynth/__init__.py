@@ -134,7 +134,28 @@ provide(
 )
 
 
+#: Functions that `design_from_gains` has replaced, by method.
+_FROM_GAINS = {
+    "fault_estimation_filter_from_gains": "fault-estimation-filter",
+    "pd_observer_from_gains": "pd-observer",
+    "ui_pi_observer_from_gains": "ui-pi-observer",
+}
+
+
+def _replaced(name: str) -> Any:
+    """Return a function of old with a warning that names the new one."""
+    from warnings import warn
+
+    method = _FROM_GAINS[name]
+    warn(f"{name} is now design_from_gains(plant, {method!r}, ...).", DeprecationWarning, stacklevel=3)
+    from obsynth.methods.designing import design_from_gains
+
+    return lambda plant, **gains: design_from_gains(plant, method, **gains)
+
+
 def __getattr__(name: str) -> Any:
+    if name in _FROM_GAINS:
+        return _replaced(name)
     if name in _HOMES:
         return getattr(import_module(_HOMES[name]), name)
     if name in _PACKAGES:

@@ -68,15 +68,27 @@ def test_processes_do_not_change_the_numbers(gains, capsys):
     [
         (["--runs", "0"], "runs is 0"),
         (["--confidence", "1"], "confidence is 1"),
-        (["--jobs", "0"], "--jobs is 0"),
         (["--monitor", "nonsense"], "use one of"),
         (["--monitor", "pointwise", "--disturbance", "v=1"], "no signal named 'v'"),
         (["--monitor", "pointwise", "--disturbance", "w=one"], "'one' is no number"),
-        (["--monitor", "cusum", "--false-alarms", "2"], "probability between 0 and 1"),
     ],
 )
 def test_bad_options_are_refused(gains, capsys, more, message):
     assert evaluated(gains, *more) == 2
+    assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (["--jobs", "0"], "argument --jobs: 0 is less than 1"),
+        (["--monitor", "cusum", "--false-alarms", "2"], "argument --false-alarms"),
+    ],
+)
+def test_numbers_out_of_range_are_refused_by_the_command_line(gains, capsys, more, message):
+    with pytest.raises(SystemExit) as ended:
+        evaluated(gains, *more)
+    assert ended.value.code == 2
     assert message in capsys.readouterr().err
 
 

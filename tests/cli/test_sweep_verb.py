@@ -45,7 +45,6 @@ def test_folder_table_and_picture(spec, tmp_path, capsys):
     [
         (["--set", "gamma=0.5"], "--set"),
         (["--set", "gamma=[0.5"], "--set"),
-        (["--jobs", "0"], "--jobs"),
     ],
 )
 def test_bad_arguments(spec, tmp_path, capsys, extra, path):

@@ -133,3 +133,14 @@ def test_all_names_resolve_and_are_listed():
     assert set(obsynth.__all__) <= set(dir(obsynth))
     with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
         _ = obsynth.nonsense
+
+
+def test_functions_of_old_say_what_has_replaced_them():
+    plant = obsynth.DescriptorSystem(None, [[0.5]], C=[[1.0]], Bf=[[1.0]], dt=1.0)
+    gains = {letter: obsynth.fault_estimation_filter(plant).gains[letter] for letter in "TNLW"}
+    with pytest.warns(DeprecationWarning, match=r"design_from_gains\(plant, 'fault-estimation-filter'"):
+        old = obsynth.fault_estimation_filter_from_gains
+    new = obsynth.design_from_gains(plant, "fault-estimation-filter", **gains)
+    assert old(plant, **gains).observer.as_dict().keys() == new.observer.as_dict().keys()
+    assert old(plant, **gains).report.passed == new.report.passed
+    assert "fault_estimation_filter_from_gains" not in obsynth.__all__

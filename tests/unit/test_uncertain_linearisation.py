@@ -136,8 +136,9 @@ def test_a_spec_with_tolerances_of_a_nonlinear_plant_watches_logs_of_it(tmp_path
     design = obsynth.load(design.save(tmp_path / "g.json"))
     found = obsynth.robustness(design)
     assert "not covered" in dict(found.facts())["linear model"]
-    monitor = obsynth.online_monitor(design, constants=design.plant, noise_bound=3.0,
-                                     initial_set=dict.fromkeys(("h1", "h2", "h3"), 1e-6))  # fmt: skip
+    monitor = obsynth.online_monitor(
+        design, constants=design.plant, initial_set=dict.fromkeys(("h1", "h2", "h3"), 1e-6)
+    )
     assert "not linear in the plant is not covered" in monitor.statement
     rows = tank_rows(design.plant.operating_point, 0.0163 * 1.02, 0.035 * 0.98)
     table = obsynth.run_on_data(design, rows, monitor=monitor).table
@@ -145,7 +146,7 @@ def test_a_spec_with_tolerances_of_a_nonlinear_plant_watches_logs_of_it(tmp_path
     assert (settled["alarm"] == "").all()
     # A tolerance that is not known would be taken for a fault.
     smaller = obsynth.uncertain_system(design.plant, {"a1": "0.1 %", "b1": "0.1 %"})
-    exact = obsynth.online_monitor(design, constants=smaller, noise_bound=3.0)
+    exact = obsynth.online_monitor(design, constants=smaller)
     assert (obsynth.run_on_data(design, rows, monitor=exact).table.iloc[10:]["alarm"] != "").any()
 
 

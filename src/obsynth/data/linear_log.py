@@ -289,7 +289,8 @@ class DataObserver(Engine):
 
     def _count(self, changes: FloatArray) -> None:
         """Sum up changes ``(n, rows)``, one after the other, so that results do not depend on pieces."""
-        squares = np.nan_to_num(changes[:, self.shown] ** 2, nan=0.0, posinf=0.0)
+        with np.errstate(over="ignore"):
+            squares = np.nan_to_num(changes[:, self.shown] ** 2, nan=0.0, posinf=0.0)
         self.changes = np.cumsum(np.vstack([self.changes, squares]), axis=0)[-1]
         self.counted += len(changes)
 
