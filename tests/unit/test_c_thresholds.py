@@ -25,7 +25,7 @@ def test_c_gives_the_thresholds_of_python(tmp_path: Path, make) -> None:
     plant = make()
     design = obsynth.fault_estimation_filter(plant)
     monitor = obsynth.online_monitor(
-        design, constants=plant.uncertainty, noise_bound=1.0, initial_error=0.3,
+        design, constants=plant.uncertainty, noise_bound=1.0 if plant.nw else None, initial_error=0.3,
         disturbance_bounds={plant.disturbance_names[0]: 0.1},
     )  # fmt: skip
     source, _ = obsynth.export(design, tmp_path / "filter.c", monitor=monitor)

@@ -145,6 +145,7 @@ def run_check(options: argparse.Namespace) -> int:
     from obsynth.methods.registry import AUTO
     from obsynth.numerics.libraries import failure_of
     from obsynth.plants.descriptor import DescriptorSystem
+    from obsynth.report.plants import is_unclear
 
     # A pencil, its eigenvalues and its index are those of one matrix pair: a plant that changes with k has none.
     structures, diagnosis, not_known = {}, None, ""
@@ -189,7 +190,9 @@ def run_check(options: argparse.Namespace) -> int:
         },
         told,
     )
-    return 0 if passed else PreconditionError.exit_code
+    # What double precision cannot decide is no impossibility: nothing is known.
+    undecided = any(is_unclear(report.failures) for report in own)
+    return 0 if passed else SolverError.exit_code if undecided else PreconditionError.exit_code
 
 
 def _ask(spec: Spec) -> None:

@@ -50,7 +50,16 @@ def _existence_line(method: str, report: VerificationReport) -> Text:
     if report.passed:
         return Text(f"{method}: all conditions hold, so a design exists.", style="green")
     failed = ", ".join(check.name for check in report.failures) or "no condition was checked"
-    return Text(f"{method}: IMPOSSIBLE for this plant: {failed}.", style="bold red")
+    return Text(f"{method}: {_verdict(report.failures)} for this plant: {failed}.", style="bold red")
+
+
+def is_unclear(failed: Sequence[Check]) -> bool:
+    """Whether all conditions that do not hold are undecided."""
+    return bool(failed) and all(check.detail.startswith("Unclear") for check in failed)
+
+
+def _verdict(failed: Sequence[Check]) -> str:
+    return "UNCLEAR" if is_unclear(failed) else "IMPOSSIBLE"
 
 
 def structure_facts(structure: Structure) -> dict[str, str]:
@@ -144,7 +153,7 @@ def method_lines(methods: Mapping[str, VerificationReport], *, own: str = "") ->
             reason = next(check.detail for check in failed if check.name == _OF_THIS_KIND)
             yield method, f"not for this plant{asked}: {reason}".rstrip("."), "yellow"
         else:
-            yield method, f"IMPOSSIBLE for this plant{asked}: {_reason(failed)}", "bold red"
+            yield method, f"{_verdict(failed)} for this plant{asked}: {_reason(failed)}", "bold red"
     if others:
         yield "other plants", f"{', '.join(others)}: for another kind of plant", "dim"
 
