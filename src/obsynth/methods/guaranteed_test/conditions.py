@@ -60,7 +60,6 @@ def told(problem: Problem, asked: Asked) -> tuple[Condition, int]:
     lags = [problem.question.lag]
     if problem.question.course == "any" and asked.lag is None:
         lags = list(range(problem.plant.nx + 2))
-    window = None
     for lag in lags:
         most = _samples(problem, asked, lag)
         least = max(problem.before, lag) + 2
@@ -70,7 +69,6 @@ def told(problem: Problem, asked: Asked) -> tuple[Condition, int]:
             window = problem.window(samples, lag=lag)
             if _has_test(window):
                 return _condition(problem, window, True, ""), lag
-    assert window is not None
     return _condition(problem, window, False, _why(problem, asked, window)), lags[-1]
 
 
