@@ -66,9 +66,7 @@ def _of_sensors(innovations: FloatArray, names: Sequence[str], dt: float) -> lis
         column = innovations[:, j : j + 1]
         gain, _ = _together(column, np.ones((len(column), 1, 1)))
         found.append(Explanation(f"an offset of the sensor {name}", gain))
-        before = np.vstack([[[np.nan]], column[:-1]])
-        gain, coefficient = _together(column, before[:, :, None])
-        first = float(coefficient[0]) if len(coefficient) else 0.0
+        gain, first, _ = _on_its_past(column)
         if first > 0.0:
             lasting = f" over about {-dt / np.log(min(first, 1.0 - 1.0 / len(column))):.2g} s"
             found.append(Explanation(f"noise of {name} that is correlated{lasting}", gain))
@@ -94,9 +92,13 @@ def whitened(innovations: FloatArray) -> FloatArray:
     """Return innovations ``(n, ny)`` less what each column keeps of its sample before: a change of mean stays one."""
     found = np.array(innovations)
     for j in range(innovations.shape[1]):
-        before = np.append(np.nan, innovations[:-1, j])
-        both = np.isfinite(before) & np.isfinite(innovations[:, j])
-        power = float(before[both] @ before[both])
-        first = float(before[both] @ innovations[both, j]) / power if power else 0.0
-        found[both, j] -= first * before[both]
+        _, first, before = _on_its_past(innovations[:, j : j + 1])
+        found[:, j] -= np.where(np.isfinite(before), first * before, 0.0)
     return found
+
+
+def _on_its_past(column: FloatArray) -> tuple[float, float, FloatArray]:
+    """Return the gain in nats of a column's ``(n, 1)`` own sample before, its coefficient, and that sample ``(n,)``."""
+    before = np.append(np.nan, column[:-1, 0])
+    gain, coefficient = _together(column, before[:, None, None])
+    return gain, float(coefficient[0]) if len(coefficient) else 0.0, before
