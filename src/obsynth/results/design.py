@@ -212,16 +212,10 @@ class ObserverDesign:
         PreconditionError, SolverError
             A recursive design has no stable steady state.
         """
-        import numpy as np
         from scipy.signal import StateSpace
 
         observer = self._constant_observer()
-        matrices = (
-            observer.Az,
-            np.hstack([observer.Bu, observer.By]),
-            observer.Cz,
-            np.hstack([observer.Du, observer.Dy]),
-        )
+        matrices = _from_inputs_and_outputs(observer)
         return StateSpace(*matrices, dt=observer.dt) if observer.dt > 0.0 else StateSpace(*matrices)
 
     def _constant_observer(self) -> LinearObserver:
@@ -246,17 +240,25 @@ class ObserverDesign:
             A recursive design has no stable steady state.
         """
         import control
-        import numpy as np
 
         observer = self._constant_observer()
         return control.ss(
-            observer.Az,
-            np.hstack([observer.Bu, observer.By]),
-            observer.Cz,
-            np.hstack([observer.Du, observer.Dy]),
+            *_from_inputs_and_outputs(observer),
             observer.dt,
             inputs=[*observer.input_names, *observer.output_names],
             outputs=list(observer.row_names),
             states=[f"z[{i + 1}]" for i in range(observer.order)],
             name=self.name,
         )
+
+
+def _from_inputs_and_outputs(observer: LinearObserver) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return A, B, C and D from ``[u; y]`` to the rows of the observer."""
+    import numpy as np
+
+    return (
+        observer.Az,
+        np.hstack([observer.Bu, observer.By]),
+        observer.Cz,
+        np.hstack([observer.Du, observer.Dy]),
+    )
