@@ -19,7 +19,7 @@ import obsynth
 
 FAULTS = 2
 #: Above these sizes an engine is left out: the whole inequality takes a gigabyte at 48, the smaller one minutes at 64.
-MOST_STATES = {"lmi": 48, "reduced-lmi": 48, "riccati": 10_000}
+MOST_STATES = {"lmi": 48, "riccati": 10_000}
 
 
 def random_plant(states: int, seed: int = 0) -> obsynth.DescriptorSystem:

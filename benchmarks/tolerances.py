@@ -72,7 +72,7 @@ def sampled(name: str, design: Any, disturbance: float, start: float) -> tuple[s
     def stepped() -> None:
         state = AdaptiveState.of(plan.bound)
         for k in range(SAMPLES):
-            adaptive_step(plan.bound, state, rows[k], u[k], y[k])
+            state, _ = adaptive_step(plan.bound, state, rows[k], u[k], y[k])
 
     each = seconds(stepped)
     return (name, str(plant.nx), str(len(plan.names)), str(plan.bound.length), f"{1e6 * record / SAMPLES:.0f}",

@@ -48,19 +48,22 @@ def write_sources(folder: Path) -> None:
     shutil.copy(folder.parent / "CHANGELOG.md", target / "changelog.md")
 
 
-def _section(name: str) -> str:
-    module = getattr(getattr(obsynth, name), "__module__", "") or ""
+def _section(item: object) -> str:
+    module = getattr(item, "__module__", "") or ""
     return next((title for prefix, title in SECTIONS if module.startswith(prefix)), "Other")
 
 
 def _reference() -> str:
     import obsynth.conditions
     import obsynth.plotting
+    import obsynth.types
 
     found: dict[str, list[str]] = {}
     # A second name of the same thing has no page of its own.
     for name in (name for name in obsynth.__all__ if getattr(getattr(obsynth, name), "__name__", name) == name):
-        found.setdefault(_section(name), []).append(f"obsynth.{name}")
+        found.setdefault(_section(getattr(obsynth, name)), []).append(f"obsynth.{name}")
+    for name in obsynth.types.__all__:
+        found.setdefault(_section(getattr(obsynth.types, name)), []).append(f"obsynth.types.{name}")
     found["Conditions"] = [f"obsynth.conditions.{name}" for name in obsynth.conditions.__all__]
     found["Pictures"] = [f"obsynth.plotting.{name}" for name in obsynth.plotting.__all__]
     lines = ["API reference", "=============", "", "Every public name, from its docstring.", ""]

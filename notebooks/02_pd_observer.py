@@ -190,7 +190,15 @@ for alpha in (0.0, 1.0, 2.0, 5.0):
 # fastest mode, 0.115 s here. Speed is better asked for as a decay rate.
 
 # %%
-panels = obsynth.plotting.plot_delta_scan(obsynth.pd_delta_scan(plant, np.logspace(-3, 1, 7)))
+deltas = np.logspace(-3, 1, 7)
+scan = obsynth.sweep(plant, {"delta": deltas.tolist(), "decay": [0.0]}, method="pd-observer")
+_, panel = plt.subplots(figsize=(7.0, 3.0))
+panel.loglog(deltas, -scan.values("error system"), "-o", color="black", label="decay (1/s)")
+panel.loglog(deltas, scan.values("gain"), "--s", color="tab:red", label="norm of the gains")
+panel.loglog(deltas, scan.values("noise in the fault estimate"), ":^", color="tab:blue", label="noise to fault")
+panel.set_xlabel("delta (s)")
+panel.legend(frameon=False)
+plt.show()
 
 # %% [markdown]
 # ## 7. The paper's scenario, and what G does

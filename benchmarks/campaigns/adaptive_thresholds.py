@@ -25,7 +25,7 @@ from scipy.linalg import expm
 import obsynth
 from obsynth.experiments.alarm_proof import proved_alarm, verify_alarm
 from obsynth.experiments.monitors.adaptive_monitor import adaptive_plan
-from obsynth.experiments.monitors.adaptive_rule import record_columns
+from obsynth.experiments.monitors.adaptive_record import record_columns
 from obsynth.spec import load_spec
 
 NAMES = ("wang2015", "smib", "drive")

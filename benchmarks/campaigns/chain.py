@@ -1,12 +1,13 @@
 """Certificates with one entry changed anywhere, digests made anew: none that is false may verify.
 
-A case takes a gain set with tolerances, the certificate of an alarm, or a calibration file, of a plant of one or two
-states drawn with its seed, changes one number, text or list anywhere in it (by a few per cent, a sign, a power of ten,
-or to another kind of value), and makes every digest anew, that of a gain set inside an alarm too; for alarms the
-sentence is made anew as well in every second case.  Judged are those that verify: of a gain set, the gain of plant and
-stored observer together at 400 frequencies against its claim, and the tolerances' entries at nominal values against
-plant and plant as written; of an alarm, whether the linear programme of what it then says still has no solution,
-solved again by HiGHS; of a calibration, whether constants, ranges and level are those of the same calibration.
+A case takes a gain set with tolerances, the certificate of an alarm, of a robustness analysis or of a comparison, or
+a calibration file, of a plant of one or two states drawn with its seed, changes one number, text or list anywhere in
+it (by a few per cent, a sign, a power of ten, or to another kind of value), and makes every digest anew, those of
+gain sets inside too; for alarms the sentence is made anew as well in every second case. Judged are those that verify:
+of a gain set, the gain of plant and stored observer together at 400 frequencies against its claim, and the
+tolerances' entries at nominal values against plant and plant as written; of an alarm, whether the linear programme of
+what it then says still has no solution, solved again by HiGHS; of a calibration, whether constants, ranges and level
+are those of the same calibration; of robustness and comparison, whether every figure is that of the true certificate.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from __future__ import annotations
 import json
 import tempfile
 import warnings
+from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -27,10 +29,10 @@ from obsynth.results.calibration_files import calibration_text, verify_calibrati
 from obsynth.results.gain_sets import design_as_dict, digest_of, loaded, restored
 
 CASES = 3000
-LIMIT = 60.0
+LIMIT = 120.0
 #: Different plants: what is changed in them goes by the seed.
 PLANTS = 12
-KINDS = ("gain set", "alarm", "calibration")
+KINDS = ("gain set", "alarm", "calibration", "robustness", "comparison")
 #: A gain may exceed its claim by rounding.
 ROUNDING = 1e-6
 
@@ -102,12 +104,80 @@ def put(document: Any, path: tuple[Any, ...], value: Any) -> None:
     document[path[-1]] = value
 
 
+@lru_cache(maxsize=2 * PLANTS)
+def result(number: int, kind: str) -> dict[str, Any]:
+    """Return the certificate of the robustness, or of a comparison, of a plant."""
+    inside = {"kind": "obsynth gain set", "schema_version": 2, **_sealed(made(number)[0]["design"])}
+    design = loaded(json.dumps(inside).encode())
+    plant, _ = design.linear
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "c.json"
+        if kind == "robustness":
+            obsynth.robustness(design).save(file)
+        else:
+            scenario = obsynth.Scenario(
+                horizon=20.0 * plant.dt, faults={plant.fault_names[0]: obsynth.Step(size=1.0, start=5.0 * plant.dt)},
+                disturbances={name: obsynth.Step(size=0.1) for name in plant.disturbance_names},
+            )  # fmt: skip
+            obsynth.compare(plant, scenario=scenario, methods=["fault-estimation-filter"], runs=2).save(file)
+        return dict(json.loads(file.read_text()))
+
+
+def _sealed(body: dict[str, Any]) -> dict[str, Any]:
+    return {"sha256": digest_of(body), "design": body}
+
+
+def _result(kind: str) -> Callable[[np.random.Generator, Path], Outcome]:
+    def judged(rng: np.random.Generator, file: Path) -> Outcome:
+        true = result(int(rng.integers(PLANTS)), kind)
+        body = _altered(true["certificate"], rng)
+        try:
+            for inside in body["gain_sets"].values():
+                inside["sha256"] = digest_of(inside["design"])
+        except (KeyError, TypeError, AttributeError):
+            return Outcome(kind, "refused (no gain set)")
+        file.write_text(json.dumps({**true, "sha256": digest_of(body), "certificate": body}))
+        try:
+            passed = obsynth.verify_certificate(file).passed
+        except obsynth.ObsynthError as error:
+            return Outcome(kind, f"refused ({type(error).__name__})")
+        if not passed:
+            return Outcome(kind, "fails")
+        wrong = _other_figures(body["result"], true["certificate"]["result"])
+        return Outcome(kind, "verifies", f"another figure verifies: {wrong}" if wrong else "")
+
+    return judged
+
+
+def _other_figures(found: Any, true: Any) -> str:
+    """Return the first place at which figures are not those of the true certificate, to 1e-5 of the largest."""
+    ours, theirs = leaves(found), leaves(true)
+    if ours != theirs:
+        return "places"
+    for place in ours:
+        one, other = found, true
+        for key in place:
+            one, other = one[key], other[key]
+        if isinstance(one, bool) or not isinstance(one, (int, float)) or not isinstance(other, (int, float)):
+            if one != other:
+                return str(place)
+        elif abs(one - other) > 1e-5 * abs(other) + 1e-9:
+            return str(place)
+    return ""
+
+
 def case(seed: int) -> Outcome:
     """Run one case."""
     rng, kind = np.random.default_rng([seed, 31]), KINDS[seed % len(KINDS)]
     with warnings.catch_warnings(), tempfile.TemporaryDirectory() as folder:
         warnings.simplefilter("ignore")
-        return {"gain set": _gain_set, "alarm": _alarm, "calibration": _calibration}[kind](rng, Path(folder) / "c.json")
+        return {
+            "gain set": _gain_set,
+            "alarm": _alarm,
+            "calibration": _calibration,
+            "robustness": _result("robustness"),
+            "comparison": _result("comparison"),
+        }[kind](rng, Path(folder) / "c.json")
 
 
 def _altered(document: dict[str, Any], rng: np.random.Generator) -> dict[str, Any]:

@@ -15,8 +15,8 @@ import numpy as np
 from benchmarks.campaigns.frame import Outcome
 
 import obsynth
+from obsynth.methods.fault_estimation_filter.central_filter import search_least_gain
 from obsynth.methods.fault_estimation_filter.conditions import examine_fault_filter
-from obsynth.methods.fault_estimation_filter.inequality_search import search_least_gain
 from obsynth.methods.fault_estimation_filter.synthesis import _gains, centred, gain_problem
 
 CASES = 50
@@ -32,7 +32,7 @@ def case(seed: int) -> Outcome:
     if not all(condition.holds for condition in held) or prepared is None:
         return Outcome("random", "no filter exists")
     problem, parts = centred(*_order(gain_problem(prepared, free_weight=False), prepared))
-    least = search_least_gain(problem, solver="auto")
+    least = search_least_gain(problem)
     size = max(least.gain, 1.0)
     gains = _gains(prepared, parts, least.injection)
     level = least.gain + SAME * size

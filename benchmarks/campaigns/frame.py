@@ -30,11 +30,13 @@ LISTED = 20
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a case: the row and the column of the table it counts in; ``wrong`` says what must not be."""
+    """What became of a case: the row and the column of the table it counts in; ``wrong`` says what must not be, and
+    ``value`` is what the table says the mean of."""
 
     group: str
     result: str
     wrong: str = ""
+    value: float | None = None
 
 
 class TooLongError(BaseException):
@@ -114,6 +116,10 @@ def written_table(campaign: ModuleType, outcomes: Mapping[int, Outcome]) -> str:
                      str(sum(outcome.group == group for outcome in wrong.values()))])  # fmt: skip
     sums = [sum(counts[group, result] for group in groups) for result in results]
     rows.append(["all", *map(str, sums), str(len(outcomes)), str(len(wrong))])
+    if any(outcome.value is not None for outcome in outcomes.values()):
+        for row, group in zip(rows, ["", *groups, ""], strict=True):
+            values = [o.value for o in outcomes.values() if o.group == group and o.value is not None]
+            row.append("mean" if row is rows[0] else f"{sum(values) / len(values):.2f}" if values else "")
     lines = [f"# Campaign `{name}`", "", (campaign.__doc__ or "").strip(), "",
              f"`python -m benchmarks.campaigns {name}`, seeds {min(outcomes)} to {max(outcomes)}.", ""]  # fmt: skip
     for number, row in enumerate(rows):

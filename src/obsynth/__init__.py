@@ -3,7 +3,7 @@
 Plants
     DescriptorSystem, TimeVaryingDescriptorSystem, DAEModel; from other tools: from_andes, from_casadi, from_control,
     from_fmu, from_matlab, from_modelica, from_pandas, from_scipy, from_sympy; from a spec: load_spec; changed by
-    discretise, eliminate_algebraic_states.
+    discretise, eliminate_algebraic_states, with_noise.
 What is possible
     check, analyse_structure, diagnose, identifiability.
 Designs
@@ -15,6 +15,8 @@ In simulation
     Scenario, simulate, monitor, evaluate, decide; plotting.
 What is wrong
     SpecError, PreconditionError, InfeasibleError, SolverError, VerificationError, all of them ObsynthError.
+Types
+    Of what functions return, for annotations: ``obsynth.types``.
 """
 
 from __future__ import annotations
@@ -28,108 +30,94 @@ from obsynth.version import __version__ as __version__
 #: What is public, by the module that holds it.  Imported when it is first used, so that ``import obsynth`` stays fast;
 #: ``__init__.pyi`` tells the types.
 _NAMES = {
-    "analysis.diagnosis.decoupled": "decouple DecoupledPlant",
+    "analysis.diagnosis.decoupled": "decouple",
     "analysis.diagnosis.diagnosing": "diagnose",
-    "analysis.diagnosis.verdicts": "Diagnosis FaultDiagnosis StructuredResidual",
-    "analysis.dae_structure": "Identifiability identifiability",
+    "analysis.dae_structure": "identifiability",
     "analysis.structure": "analyse_structure",
     "analysis.transformations.elimination": "eliminate_algebraic_states",
     "analysis.transformations.linearisation": "linearise",
+    "analysis.transformations.noise": "with_noise",
     "analysis.transformations.sampling": "discretise",
     "calibration.calibrating": "calibrate",
-    "calibration.diagnostics": "Validation",
-    "calibration.result": "CalibratedBox Calibration",
     "calibration.validating": "validate",
-    "calibration.validity": "Validity validity",
+    "calibration.validity": "validity",
     "comparison.comparing": "compare",
-    "comparison.result": "ComparedMethod Comparison FaultComparison",
-    "comparison.sensor_sets": "sensor_sets SensorSet SensorSets",
-    "data.alarm_events": "AlarmEvent",
+    "comparison.result": "Comparison",
+    "comparison.sensor_sets": "sensor_sets",
     "data.alarm_proof": "prove_alarm",
     "data.normal_rows": "learn_thresholds",
-    "data.run": "DataRun run_on_data",
+    "data.run": "run_on_data",
     "data.smoothing": "smooth",
     "errors": "InfeasibleError ObsynthError PreconditionError SolverError SpecError VerificationError",
-    "experiments.alarm_proof": "AlarmProof verify_alarm",
-    "experiments.monitors.learned": "LearnedThresholds load_thresholds",
-    "experiments.monitors.monitor": "Detection Monitor",
-    "experiments.monitors.online": "OnlineMonitor",
+    "experiments.alarm_proof": "verify_alarm",
+    "experiments.certificates": "verify_certificate",
+    "experiments.monitors.learned": "load_thresholds",
     "experiments.monitors.online_monitor": "online_monitor",
     "experiments.monitors.residual_monitor": "monitor",
-    "experiments.monte_carlo": "evaluate Evaluation Interval",
-    "experiments.tolerance_study": "tolerance_study ToleranceStudy",
-    "experiments.simulation": "simulate Simulation",
+    "experiments.monte_carlo": "evaluate",
+    "experiments.tolerance_study": "tolerance_study",
+    "experiments.simulation": "simulate",
     "exporting.files": "export",
     "importing.andes": "from_andes",
     "importing.casadi_models": "from_casadi",
     "importing.fmu": "from_fmu",
     "importing.model_files": "from_matlab from_modelica",
     "importing.python_objects": "from_control from_pandas from_scipy from_sympy",
-    "methods.fault_figures": "FaultFigures",
     "methods.designing": "check design design_from_gains",
-    "methods.detection_filter.public": "detection_filter DetectionFilter",
-    "methods.guaranteed_test.bank": "GuaranteedBank guaranteed_bank",
+    "methods.detection_filter.public": "detection_filter",
     "methods.guaranteed_test.result": "GuaranteedTest guaranteed_test",
     "methods.functions": (
-        "adaptive_observer dae_adaptive_observer descriptor_kalman fault_estimation_filter functional_filter "
-        "pd_observer ui_pi_observer"
+        "adaptive_observer dae_adaptive_observer descriptor_kalman "
+        "fault_estimation_filter functional_filter pd_observer ui_pi_observer"
     ),
-    "methods.pd_observer.public": "apply_adaptation_gain pd_delta_scan",
-    "methods.recursive.steady_filter": "steady_state_filter SteadyState",
+    "methods.pd_observer.public": "apply_adaptation_gain",
+    "methods.recursive.steady_filter": "steady_state_filter",
     "methods.ui_pi_observer.checks.fault_response": "fault_response",
     "methods.verifying": "verify",
-    "observers.alarms": "Alarm Decision",
     "observers.batches": "run_batch",
     "observers.dae.observer": "DAEObserver",
     "observers.decisions": "decide ParameterMonitor",
-    "observers.estimates": "Estimates",
     "observers.linear.observer": "LinearObserver",
     "observers.linear.derived": "sample_observer",
     "observers.recursive.observer": "RecursiveObserver",
     "observers.recursive.settings": "Adaptation",
-    "observers.running": "RunningObserver",
-    "plants.constants": "Constant ConstantsBox",
     "plants.dae.model": "DAEModel",
     "plants.descriptor": "DescriptorSystem",
     "plants.fault_models": "fault_model FaultModel",
     "plants.time_varying": "TimeVaryingDescriptorSystem",
     "plants.uncertain_system": "uncertain_system",
-    "plants.uncertainty": "Uncertainty",
     "report.page": "html_report",
-    "results.checks": "Check VerificationReport",
-    "results.delta_scan": "DeltaScan",
+    "results.checks": "VerificationReport",
     "results.design": "Certificate ObserverDesign",
     "results.gain_sets": "load",
     "simulation.dae": "simulate_dae",
     "simulation.linear": "simulate_time_varying",
     "simulation.profiles": "Drift Gaussian Intermittent LostEffectiveness Ramp Sine Step Stuck Uniform",
     "simulation.scenario": "Scenario",
-    "simulation.signals": "Trajectory",
     "spec.loader": "load_spec Spec",
-    "sweeps.fleet": "Fleet FleetRun run_fleet",
-    "sweeps.sweep": "Sweep sweep SweepResult",
-    "tolerances.result": "Robustness",
+    "sweeps.fleet": "run_fleet",
+    "sweeps.sweep": "sweep",
     "tolerances.robustness": "robustness",
 }
 _HOMES = {name: f"obsynth.{module}" for module, names in _NAMES.items() for name in names.split()}
-#: Packages whose names are used through them, such as ``obsynth.plotting.plot_data``.
-_PACKAGES = ("conditions", "plotting")
+#: Modules whose names are used through them, such as ``obsynth.plotting.plot_data``.
+_PACKAGES = ("conditions", "plotting", "types")
 
 __all__ = sorted(_HOMES)
 
 provide(
     {
-        "PD observer by its inequality": "obsynth.conditions.own_terms:pd_by_inequality",
-        "UI-PI observer by its inequality": "obsynth.conditions.own_terms:ui_pi_by_inequality",
-        "filter by its inequality": "obsynth.conditions.own_terms:filter_by_inequality",
         "conditions of a design": "obsynth.conditions.shipped:conditions_of",
         "checks as text": "obsynth.results.layout:report_text",
         "design summary": "obsynth.report.summary:summary",
+        "comparison again": "obsynth.comparison.comparing:compared_again",
+        "running design": "obsynth.data.linear_log:engine_of",
         "rows of a log": "obsynth.data.alarm_proof:rows_of",
         "picture of a guaranteed test": "obsynth.plotting.guaranteed:plot_least_thresholds",
         "table of a log": "obsynth.data.log_tables:log_table",
         "thresholds from a log": "obsynth.data.normal_rows:learn_thresholds",
-        "designs with model error": "obsynth.experiments.tolerant_designs:with_model_error",
+        "guaranteed tests over tolerances": "obsynth.experiments.tolerant_tests:synthesise_over_tolerances",
+        "thresholds over tolerances": "obsynth.experiments.tolerant_tests:thresholds_over_tolerances",
     }
 )
 
@@ -160,6 +148,11 @@ def __getattr__(name: str) -> Any:
         return getattr(import_module(_HOMES[name]), name)
     if name in _PACKAGES:
         return import_module(f"obsynth.{name}")
+    if name[:1].isupper() and name in (types := import_module("obsynth.types")).__all__:
+        from warnings import warn
+
+        warn(f"obsynth.{name} is now obsynth.types.{name}.", DeprecationWarning, stacklevel=2)
+        return getattr(types, name)
     raise AttributeError(f"module 'obsynth' has no attribute {name!r}")
 
 

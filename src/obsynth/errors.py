@@ -95,6 +95,8 @@ class PreconditionError(ObsynthError):
         Names of the faults, states or outputs involved.
     add : sequence of sequence of str, optional
         Sets of states, the measurement of any one of which would make the design possible.
+    unclear : bool, optional
+        Whether double precision cannot decide the condition.
     """
 
     exit_code = 3
@@ -108,7 +110,9 @@ class PreconditionError(ObsynthError):
         mode: complex | None = None,
         signals: Sequence[str] = (),
         add: Sequence[Sequence[str]] = (),
+        unclear: bool = False,
     ) -> None:
+        self.unclear = unclear
         self.add = tuple(tuple(names) for names in add)
         self.condition = self.code = condition
         self.mode = None if mode is None else complex(mode)

@@ -56,7 +56,7 @@ def run(document: dict[str, Any], folder: Path, capsys: pytest.CaptureFixture[st
 def test_the_good_one_is_designed_saved_and_verified(tmp_path, capsys) -> None:
     code, text = run(GOOD, tmp_path, capsys)
     assert code == 0
-    assert "std after the nominal run" in text
+    assert "deviation after the nominal run" in text
     assert main(["verify", str(tmp_path / "gains.json")]) == 0
     assert main(["check", "--system", str(tmp_path / "spec.yaml")]) == 0
 

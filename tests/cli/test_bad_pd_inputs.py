@@ -48,8 +48,7 @@ CASES: dict[str, tuple[dict[str, Any] | None, dict[str, Any], int, tuple[str, ..
     "range and disk": (None, {"adaptation_range": [1.0, 2.0], "disk": [5.0, 4.5]}, 2, ("cannot be combined", "disk")),
     "singular G": (None, {"adaptation_gain": [[1, 1], [1, 1]]}, 2, ("adaptation_gain", "nonsingular")),
     "G of the wrong shape": (None, {"adaptation_gain": [[1, 0, 0]]}, 2, ("adaptation_gain", "1 by 3")),
-    "empty scan": (None, {"delta_scan": []}, 2, ("method.options.delta_scan",)),
-    "scan with a zero": (None, {"delta_scan": [0.1, 0.0]}, 2, ("method.options.delta_scan",)),
+    "scan of old": (None, {"delta_scan": [0.1]}, 2, ("method.options.delta_scan", "a scan is a sweep")),
     "unknown option": (None, {"detla": 0.1}, 2, ("method.options.detla", "delta")),
     "unknown solver": (None, {"solver": "MOSEK"}, 2, ("method.options.solver",)),
     # Existence conditions: 3.
@@ -133,16 +132,3 @@ def test_gains_that_explode_are_a_warning_in_the_report(
     assert gain["value"] > 1e3
     assert gain["kind"] == "information"
     assert "WARNING" in gain["detail"]
-
-
-def test_the_scan_is_in_the_report_and_in_the_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    path = written(tmp_path, HIDDEN_PAIR, {"theorem": 2, "decay": 0.0, "delta_scan": [0.1, 10.0]})
-    assert main(["design", "--system", str(path), "--quiet", "-v"]) == 0
-    assert "Other values of delta" in capsys.readouterr().out
-    scan = json.loads((tmp_path / "case.gains.json").read_text())["design"]["solver"]["delta_scan"]
-    assert scan["delta"] == [0.1, 10.0]
-    assert scan["failures"][0] == ""
-    assert "Theorem 2 has no solution" in scan["failures"][1]

@@ -10,7 +10,8 @@ import pytest
 
 import obsynth
 from obsynth.cli.main import main
-from obsynth.results.calibration_files import calibration_text, read_calibration, verify_calibration
+from obsynth.plants.constants import constants_box
+from obsynth.results.calibration_files import box_row, calibration_text, read_calibration, verify_calibration
 from obsynth.results.gain_sets import digest_of
 
 DESIGNS = Path(__file__).parents[2] / "designs"
@@ -111,6 +112,48 @@ def test_a_calibration_is_done_again_from_plant_and_log(folder: Path) -> None:
     # With a digest made anew it is the log that tells.
     assert verify_calibration("tank.json").passed
     assert main(["verify", "tank.json", *words]) == 6
+
+
+def test_each_entry_of_a_calibration_is_compared_with_the_same_done_again(folder: Path) -> None:
+    """A row fails by its name where log, unit, open sides, nominal value, range or level are others."""
+    again = stated()
+    assert verify_calibration("box.json", again).passed
+    changes = {
+        "unit": ("ranges", lambda data: data["constants"]["k"].update(unit="N")),
+        "open": ("ranges", lambda data: data["constants"]["k"].update(open=["low"])),
+        "nominal": ("ranges", lambda data: data["constants"]["k"].update(nominal=20.05)),
+        "low": ("ranges", lambda data: data["constants"]["k"].update(range=[19.05, 21.0])),
+        "high": ("ranges", lambda data: data["constants"]["k"].update(range=[19.0, 21.05])),
+        "level": ("ranges", lambda data: data.update(level=0.9)),
+        "name": ("ranges", lambda data: data["constants"].update(c=data["constants"]["k"])),
+        "log": ("log", lambda data: data["log"].update(digest="ab" * 32)),
+    }
+    for name, (row, change) in changes.items():
+        other = stated()
+        change(other)
+        assert {check.name for check in verify_calibration("box.json", other).failures} == {row}, name
+    near = stated()
+    near["constants"]["k"]["range"] = [19.001, 21.001]
+    assert verify_calibration("box.json", near).passed
+
+
+@pytest.mark.parametrize("change", ["digest", "level", "log", "low", "high", "nominal"])
+def test_each_entry_of_a_box_is_compared_with_its_calibration(folder: Path, change: str) -> None:
+    text = calibration_text(stated())
+    digest = json.loads(text)["sha256"]
+    ends = {"low": 19.0, "high": 21.0, "nominal": 20.0}
+    if change in ends:
+        ends[change] += 0.25
+    constant = {"nominal": ends["nominal"], "range": [ends["low"], ends["high"]]}
+    asked = {
+        "calibration": "ab" * 32 if change == "digest" else digest,
+        "digest": "ab" * 32 if change == "log" else "cd" * 32,
+        "level": 0.9 if change == "level" else 0.95,
+    }
+    good = {"calibration": digest, "digest": "cd" * 32, "level": 0.95}
+    true = constants_box({"k": {"nominal": 20.0, "range": [19.0, 21.0]}}, source="calibrated", **good)
+    assert box_row(true, folder / "box.json").passed
+    assert not box_row(constants_box({"k": constant}, source="calibrated", **asked), folder / "box.json").passed
 
 
 def test_options_that_do_nothing_are_refused(folder: Path) -> None:

@@ -32,7 +32,7 @@ def places(tmp_path: Path) -> tuple[Path, Path]:
     return gains, logs
 
 
-def told(fleet: obsynth.Fleet) -> list[tuple[object, ...]]:
+def told(fleet: obsynth.types.Fleet) -> list[tuple[object, ...]]:
     return [
         (run.name, run.status, run.rows, dict(run.alarms), dict(run.largest), run.file and run.file.read_bytes())
         for run in fleet.runs

@@ -115,11 +115,23 @@ def test_what_is_missing_is_a_gap(gains, capsys, blank):
     assert capsys.readouterr().out == "8 rows: 5 warm-up, 1 ok, 1 gap, 1 recovering.\n"
 
 
+@pytest.mark.parametrize("word", ["BAD", "No Data", "#DIV/0!", "-"])
+def test_a_word_among_numbers_is_a_missing_sample(gains, capsys, word):
+    rows = list(ROWS)
+    rows[6] = f"6,0.1,0,{word},1,1"
+    log(*rows)
+    assert run(gains) == 0
+    told = capsys.readouterr()
+    assert told.out == "8 rows: 5 warm-up, 1 ok, 1 gap, 1 recovering.\n"
+    assert f"1 cell(s) of 'x2' hold no number and count as missing, first {word!r} in row 7" in told.err
+
+
 BAD_LOGS = {
     "a missing column": (["time,u1,u2,x2,x3", "0,0,0,0,0"], "no column 'x4'"),
     "a missing time": (["u1,u2,x2,x3,x4", "0,0,0,0,0"], "no column 'time'"),
     "a repeated column": (["time,u1,u2,x2,x3,x4,x4", "0,0,0,0,0,0,0"], "more than one column 'x4'"),
-    "a word": ([HEADER, ROWS[0], "1,0,0,high,0,0"], "Row 2, column 'x2': 'high' is no number"),
+    "a word before any number": ([HEADER, "0,0,0,high,0,0"], "Row 1, column 'x2': 'high' is no number"),
+    "a number with its unit": ([HEADER, ROWS[0], "1,0,0,5 m,0,0"], "Row 2, column 'x2': '5 m' is no number"),
     "a decimal comma": ([HEADER, ROWS[0], '1,0,0,"1,5",0,0'], "Row 2, column 'x2': '1,5' is no number"),
     "too many cells": ([HEADER, ROWS[0], ROWS[1] + ",7"], "log.csv cannot be read"),
     "too many cells in each row": ([HEADER, *(row + ",7" for row in ROWS)], "log.csv cannot be read"),

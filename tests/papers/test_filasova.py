@@ -112,19 +112,17 @@ class TestOurDesign:
     def test_delta_scan(self, theorem: int) -> None:
         """The audit's table, and no trap: gains stay below 10 from 1e-3 to 1, where plain feasibility gave 1e9."""
         rows = SHIPPED["delta_scan"]
-        scan = obsynth.pd_delta_scan(PLANT, [row[0] for row in rows], theorem=theorem)
+        deltas = np.array([row[0] for row in rows])
+        varied = {"delta": deltas.tolist(), "theorem": [theorem], "decay": [0.0]}
+        scan = obsynth.sweep(PLANT, varied, method="pd-observer")
+        gain = scan.values("gain")
         expected = np.array([row[theorem] for row in rows])
-        np.testing.assert_allclose(-scan.decay, expected[:, 0], rtol=0.02)
-        np.testing.assert_allclose(scan.proportional_abscissa, expected[:, 3], rtol=0.02, atol=0.006)
-        assert np.all(scan.gain >= np.maximum(expected[:, 1], expected[:, 2]) - 0.05)
-        assert np.all(scan.gain <= np.hypot(expected[:, 1], expected[:, 2]) + 0.05)
-        assert np.max(scan.gain[scan.delta <= 1.0]) < 10.0
-        assert set(scan.failures) == {""}
-
-    def test_the_spec_carries_the_scan(self, design: obsynth.ObserverDesign) -> None:
-        scan = obsynth.DeltaScan.from_dict(design.solver["delta_scan"])
-        np.testing.assert_array_equal(scan.delta, SPEC.options["delta_scan"])
-        assert scan.decay[2] == pytest.approx(-SHIPPED["abscissa"], abs=1e-3)
+        np.testing.assert_allclose(scan.values("error system"), expected[:, 0], rtol=0.02)
+        np.testing.assert_allclose(scan.values("P part alone"), expected[:, 3], rtol=0.02, atol=0.006)
+        assert np.all(gain >= np.maximum(expected[:, 1], expected[:, 2]) - 0.05)
+        assert np.all(gain <= np.hypot(expected[:, 1], expected[:, 2]) + 0.05)
+        assert np.max(gain[deltas <= 1.0]) < 10.0
+        assert scan.counts == {"designed": len(rows)}
 
     @pytest.mark.parametrize("row", SHIPPED["decay"], ids=lambda row: f"alpha={row[0]}")
     def test_decay(self, row: list[float]) -> None:

@@ -15,9 +15,9 @@ import pytest
 import obsynth
 from obsynth.analysis.zeros import fault_zeros
 from obsynth.errors import InfeasibleError
-from obsynth.methods.fault_estimation_filter import inequality_search, inequality_solutions
+from obsynth.methods.fault_estimation_filter.central_filter import search_least_gain
 from obsynth.methods.fault_estimation_filter.prepared_plant import prepare, restricted_equivalent_from
-from obsynth.methods.fault_estimation_filter.synthesis import gain_problem
+from obsynth.methods.fault_estimation_filter.synthesis import PrintedInequality, gain_problem
 from obsynth.numerics.norms import hinf_norm, spectral_radius
 from obsynth.simulation import simulate_plant
 from obsynth.spec import load_spec
@@ -210,9 +210,12 @@ def test_the_printed_minimum_is_a_point_of_a_grid(plant, expected) -> None:
 def test_the_second_stage_at_five_percent(plant, expected) -> None:
     """In the paper's coordinates, at the full 5 %: the audit's numbers."""
     truth = expected["truth"]
-    problem, _ = gain_problem(prepare(plant, S), free_weight=False)
+    prepared = prepare(plant, S)
+    problem, parts = gain_problem(prepared, free_weight=False)
     level = 1.05 * truth["gamma_min"]["value"]
-    found = inequality_solutions.small_gains(problem, level, solver="CLARABEL").injection
+    printed = PrintedInequality(plant, prepared, parts, False, "CLARABEL")
+    found = printed.small_gains(problem, level, [])
+    assert found is not None
     a, b, c, d = problem.closed_loop(found)
     stage = truth["second_stage"]
     assert np.linalg.norm(found.R) == pytest.approx(stage["norm_R"], abs=5.1e-4)
@@ -251,7 +254,7 @@ def test_a_free_residual_weight_lowers_gamma_to_one() -> None:
 def test_the_sign_printed_in_48_is_unstable() -> None:
     """TA - LC is A1 - R C1 by (60), and A1 + R C1 by (48) as printed."""
     problem, _ = gain_problem(prepare(PLANT, S), free_weight=False)
-    gain = inequality_search.search_least_gain(problem, solver="CLARABEL").injection.R
+    gain = search_least_gain(problem).injection.R
     printed_sign = spectral_radius(problem.A + gain @ problem.C)
     assert printed_sign == pytest.approx(EXPECTED["truth"]["as_printed"]["spectral_radius_with_sign_of_48"], abs=5e-3)
     assert spectral_radius(problem.A - gain @ problem.C) < 0.4

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import obsynth
+from obsynth.methods.fault_estimation_filter.central_filter import search_least_gain
 from obsynth.methods.fault_estimation_filter.gamma_lower_bound import _checked_bound, _DualProblem, proved_lower_bound
-from obsynth.methods.fault_estimation_filter.inequality_search import search_least_gain
 from obsynth.methods.fault_estimation_filter.least_gain_proof import ALONE, LAST, PAIRS, InvisiblePairs
 from obsynth.methods.fault_estimation_filter.prepared_plant import prepare
 from obsynth.methods.fault_estimation_filter.synthesis import gain_problem
@@ -39,7 +39,7 @@ def test_the_proved_lower_bound_is_close_to_the_least_gain_found(units, gap):
     weak = []
     for seed in range(8):
         problem, _ = gain_problem(prepare(random_plant(seed, units)), free_weight=False)
-        least = search_least_gain(problem, solver="CLARABEL", polish=False)
+        least = search_least_gain(problem)
         bound = proved_lower_bound(problem, solver="CLARABEL", best=least.injection)
         assert bound <= least.gain * (1.0 + 1e-9)
         if bound < (1.0 - gap) * least.gain:
@@ -49,7 +49,7 @@ def test_the_proved_lower_bound_is_close_to_the_least_gain_found(units, gap):
 
 def test_a_bound_is_not_improved_once_it_is_enough():
     problem, _ = gain_problem(prepare(random_plant(1, 1.0)), free_weight=False)
-    least = search_least_gain(problem, solver="CLARABEL", polish=False)
+    least = search_least_gain(problem)
     assert 0.5 * least.gain < proved_lower_bound(problem, solver="CLARABEL", enough=0.5 * least.gain) <= least.gain
 
 

@@ -11,7 +11,7 @@ from pd_plants import build, random_recipe
 
 import obsynth
 
-ENGINES = ("lmi", "reduced-lmi", "riccati")
+ENGINES = ("lmi", "riccati")
 FAMILIES: Mapping[str, dict[str, Any]] = {
     "random": {},
     "one output": {"ny": 1},

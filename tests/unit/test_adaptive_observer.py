@@ -7,6 +7,7 @@ import pytest
 from paper_filter import PaperState, paper_step
 from time_varying_plants import maximum_likelihood, observer_for, printed, record, textbook, varying
 
+import obsynth
 from obsynth import PreconditionError, SpecError, run_batch, simulate_time_varying
 from obsynth.analysis.time_varying import horizon_ranks
 from obsynth.methods.recursive.conditions import residual_condition
@@ -330,3 +331,22 @@ def test_the_random_walk_has_no_regressors_to_report_an_excitation_of() -> None:
     plant = varying()
     found = observer_for(plant, adapt={"form": "random-walk", "walk": 1e-3 * np.eye(plant.nq)}).run(*record(plant, 9))
     assert np.isnan(found.excitation).all()
+
+
+def test_units_do_not_decide_whether_there_is_an_observer() -> None:
+    """Without a stated noise, the identity in given units may keep errors for as long as anybody looks."""
+    sizes, shown = np.array([1e0, 1e-3, 1e-5, 1e3]), np.array([5e2, 1e7])
+    e = np.diag([0.001, 0.1, 0.01, 1.0])
+    a = [[0.00025, -0.5, -25.0, 2.5e-07], [0, -0.05, -2.5, -2.5e-08], [0, 0, 0.0075, 2.5e-11], [0, 0, 0, -1.0]]
+    c, faults = (
+        np.array([[-0.002, -2.0, -100.0, 2e-06], [-1e-07, 0.0002, 0.02, 2e-10]]),
+        [[1e-5], [2e-6], [-1e-9], [0.0]],
+    )
+    given = obsynth.DescriptorSystem(e, a, C=c, Bf=faults, dt=0.5)
+    natural = obsynth.DescriptorSystem(e * sizes, a * sizes, C=shown[:, None] * c * sizes, Bf=faults, dt=0.5)
+    design = obsynth.adaptive_observer(given)
+    assert design.report.passed
+    assert any("in units in which the plant is near one" in note for note in design.notes)
+    assert not any("in units in which" in note for note in obsynth.adaptive_observer(natural).notes)
+    kept = obsynth.adaptive_observer(given, Q=design.options["Q"], R=design.options["R"]).options
+    np.testing.assert_array_equal(kept["Q"], design.options["Q"])

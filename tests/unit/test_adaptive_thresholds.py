@@ -16,8 +16,9 @@ import obsynth
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.experiments.benches import make_bench
 from obsynth.experiments.monitors.adaptive_monitor import adaptive_plan
-from obsynth.experiments.monitors.adaptive_record import thresholds_of_records
-from obsynth.experiments.monitors.adaptive_rule import AdaptiveState, adaptive_step, record_columns
+from obsynth.experiments.monitors.adaptive_record import record_columns, thresholds_of_records
+from obsynth.experiments.monitors.adaptive_rule import AdaptiveState, adaptive_step
+from obsynth.observers.running import state_as_data, state_from_data
 from obsynth.tolerances.exact_plant import drawn_points, plant_at
 
 START = 0.2
@@ -125,11 +126,11 @@ def test_a_sample_at_a_time_is_the_record(variation) -> None:
     record = thresholds_of_records(bound, estimates, u, y)
     state = AdaptiveState.of(bound)
     for k in range(300):
-        found = adaptive_step(bound, state, estimates[0, k], u[0, k], y[0, k])
+        state, found = adaptive_step(bound, state, estimates[0, k], u[0, k], y[0, k])
         assert found.total == pytest.approx(record.total[0, k], rel=1e-12)
         assert found.first == pytest.approx(record.first[0, k], rel=1e-9, abs=1e-15)
         if k == 150:
-            state = AdaptiveState.from_dict(state.as_dict())
+            state = state_from_data(AdaptiveState.of(bound), state_as_data(state))
 
 
 def log_of(design: Any, rows: int = 120) -> pd.DataFrame:
@@ -239,8 +240,8 @@ def test_what_an_evaluation_counts_does_not_depend_on_what_is_left_out(design, s
     for q in drawn_points(len(box.names), 6, 3):
         bench = make_bench(design.replace(plant=plant_at(plant, box.values(q))), scenario)
         runs = bench.run(range(20))
-        some = watched.passed_in(runs, design.observer.residual_rows, onset=onset)
-        whole = watched.passed_in(runs, design.observer.residual_rows)
+        some = watched.passed_in(runs, onset=onset)
+        whole = watched.passed_in(runs)
         assert np.array_equal(some[:onset].any(axis=0), whole[:onset].any(axis=0))
         assert np.array_equal(some[onset:].any(axis=0), whole[onset:].any(axis=0))
         assert np.array_equal(np.argmax(some[onset:], axis=0), np.argmax(whole[onset:], axis=0))

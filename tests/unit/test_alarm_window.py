@@ -10,7 +10,7 @@ import pytest
 
 import obsynth
 from obsynth.analysis.transformations.uncertain_plant import affine_plant
-from obsynth.experiments.alarm_window import Window, WindowData, window_programme
+from obsynth.experiments.alarm_window import Rows, Window, WindowData, window_programme
 
 STEPS = 5
 BOUNDS = np.array([0.3, 0.2, 0.1])  # the disturbance, process noise, sensor noise
@@ -126,3 +126,38 @@ def test_the_proved_least_is_never_above_the_solvers() -> None:
         )
         assert float(some) <= least * (1.0 + 1e-9)
     assert float(programme.proved_least(0.0 * equal, -below)) <= least
+
+
+def test_a_multiplier_of_the_wrong_sign_proves_nothing() -> None:
+    """Of ``x <= 10`` with ``|x| <= 1`` nothing follows, whatever number a certificate holds for it."""
+    scales = np.ones(2)
+    equal, below = Rows(scales), Rows(scales)
+    below.add({0: 1.0}, 10.0)
+    programme = Window(equal, below, np.array([-1.0, 0.0]), np.array([1.0, 1e3]))
+    assert programme.proved_least(np.zeros(0), np.array([5.0])) <= 0
+    assert programme.proved_least(np.zeros(0), np.array([-5.0])) <= 0
+
+
+def least_share(given: dict[str, Any], y: list[float]) -> float:
+    """The proved least share for one sample of an exact plant with every state between -1 and 1."""
+    from obsynth.experiments.alarm_proof import solved
+
+    family = affine_plant(obsynth.DescriptorSystem(**given, dt=1.0))
+    n = len(given["A"])
+    data = WindowData(np.zeros((1, 0)), np.array([y]), -np.ones((1, n)), np.ones((1, n)))
+    programme = window_programme(family, np.zeros(0), data)
+    return float(programme.proved_least(*solved(programme)))
+
+
+def test_the_least_share_worked_by_hand() -> None:
+    """A row in units of 4: x <= 3 + 4 t from the output, x <= 1 + 4 t from the bounds, so t = 1/4; and the other way.
+
+    The equation 0 = x1 - x2 of the last sample counts too: outputs of 0.5 and -0.5 need 0.5 - 4 t = 4 t - 0.5.
+    """
+    single = {"E": None, "A": [[0.5]], "C": [[1.0]]}
+    assert least_share(single, [3.0]) == pytest.approx(0.25, rel=1e-9)
+    assert least_share(single, [-3.0]) == pytest.approx(0.25, rel=1e-9)
+    assert least_share(single, [0.9]) == pytest.approx(0.0, abs=1e-12)
+    equation = {"E": np.diag([1.0, 0.0]), "A": [[0.5, 0.0], [1.0, -1.0]], "C": np.eye(2)}
+    assert least_share(equation, [0.5, -0.5]) == pytest.approx(0.125, rel=1e-9)
+    assert least_share(equation, [0.5, 0.5]) == pytest.approx(0.0, abs=1e-12)

@@ -184,7 +184,7 @@ class TestExponentialsOfManyStates:
 
     @pytest.mark.parametrize("time", [0.05, 3.0])
     def test_balls_hold_what_more_digits_and_identities_say(self, time, monkeypatch):
-        n, rng = products.MANY_STATES + 1, np.random.default_rng(7)
+        n, rng = products.MOST_STATES_FOR_BALLS + 1, np.random.default_rng(7)
         units = 10.0 ** rng.uniform(-3, 3, n)
         a = units[:, None] * (rng.normal(size=(n, n)) / np.sqrt(n) - 1.5 * np.eye(n)) / units
         b = Ball.exact(units[:, None] * rng.normal(size=(n, 2)))
@@ -193,13 +193,13 @@ class TestExponentialsOfManyStates:
         inner, moved = Ball.exact(a) @ energy, found @ b
         left = inner + inner.T - moved @ moved.T + b @ b.T
         assert np.all(np.abs(left.midpoint) <= left.radius)
-        monkeypatch.setattr(products, "MANY_STATES", n)
+        monkeypatch.setattr(products, "MOST_STATES_FOR_BALLS", n)
         sharp = products.exponential(a, time)
         assert np.all(np.abs(found.midpoint - sharp.midpoint) <= found.radius + sharp.radius)
         assert np.max(sharp.radius) < np.max(found.radius) <= 1e-7 * np.max(np.abs(found.midpoint))
 
     def test_what_double_precision_does_not_tell_is_left_to_more_digits(self, monkeypatch):
-        a = np.random.default_rng(8).normal(size=(products.MANY_STATES + 1,) * 2) / 8.0
+        a = np.random.default_rng(8).normal(size=(products.MOST_STATES_FOR_BALLS + 1,) * 2) / 8.0
         fast = products.exponential(a, 1.0)
         monkeypatch.setattr(products, "LARGEST_SHARE", 1e-15)
         assert np.max(products.exponential(a, 1.0).radius) < 0.01 * np.max(fast.radius)

@@ -141,3 +141,12 @@ def test_the_gates_table_in_the_readme_is_of_its_cases():
     )
     (rows,) = tables(text)
     assert [line[0] for line in rows[1:]] == list(bounds)
+
+
+def test_the_benchmark_of_guaranteed_tests_runs():
+    rows = small_table("guaranteed_tests")
+    assert [row[:3] for row in rows] == [["4", "3", "14"], ["4", "10", "56"]]
+    for *_, verify, _, _, exact, gap in rows:
+        assert verify != "fails"
+        assert float(exact) > 0.0
+        assert 0.0 <= float(gap) < 1e-6

@@ -189,10 +189,10 @@ def test_no_switching_load_passes_the_threshold_and_some_come_near(dt: float, di
     found = worst_residual(design, dt, 20.0)
     assert found <= threshold[-1] <= 1.5 * found
     online = obsynth.online_monitor(design, disturbance_bounds={"load": 1.0}, sample_time=dt)
-    assert online._rule._limit >= threshold[-1] * (1.0 - 1e-9)
+    assert online.rule.limit >= threshold[-1] * (1.0 - 1e-9)
     assert "between samples" in online.statement
     assert "exact model" in online.statement
-    assert online._rule._other.limit >= found
+    assert online.rule.irregular.limit >= found
 
 
 @pytest.mark.parametrize("dt", [0.05, 0.4])
@@ -209,7 +209,7 @@ def test_two_loads_at_once_pass_no_threshold_at_any_sample(dt: float):
         assert worst_residual(design, dt, k * dt) <= threshold[k - 1]
     online = obsynth.online_monitor(design, disturbance_bounds={"load": 1.0, "wind": 1.0}, sample_time=dt)
     reached = worst_residual(design, dt, 10.0)
-    assert reached <= min(online._rule._limit, online._rule._other.limit)
+    assert reached <= min(online.rule.limit, online.rule.irregular.limit)
 
 
 def test_two_noises_of_the_plant_add_up_in_tables_and_for_ever():
@@ -235,7 +235,7 @@ def test_two_noises_of_the_plant_add_up_in_tables_and_for_ever():
     assert np.all(threshold >= sums * (1.0 - 1e-12))
     assert np.all(threshold <= sums * 1.01 + 1e-9)
     online = obsynth.online_monitor(design, noise_bound=bound, sample_time=dt)
-    assert online._rule._limit >= sums[-1]
+    assert online.rule.limit >= sums[-1]
 
 
 def test_two_loads_of_a_sampled_design_add_up():
@@ -245,8 +245,8 @@ def test_two_loads_of_a_sampled_design_add_up():
     )  # fmt: skip
     design = obsynth.fault_estimation_filter(obsynth.discretise(written, 0.6).plant)
     bounds = {"load": 1.0, "wind": 1.0}
-    alone = [obsynth.online_monitor(design, disturbance_bounds={**bounds, name: 0.0})._rule._limit for name in bounds]
-    both = obsynth.online_monitor(design, disturbance_bounds=bounds)._rule._limit
+    alone = [obsynth.online_monitor(design, disturbance_bounds={**bounds, name: 0.0}).rule.limit for name in bounds]
+    both = obsynth.online_monitor(design, disturbance_bounds=bounds).rule.limit
     assert both == pytest.approx(sum(alone), rel=1e-9)
     scenario = obsynth.Scenario(horizon=60, disturbances={name: obsynth.Uniform(low=-1, high=1) for name in bounds})
     assert obsynth.monitor(design, scenario).threshold[-1] <= both * (1.0 + 1e-9)
@@ -321,7 +321,7 @@ def test_a_sampled_design_knows_what_moves_between_its_samples(direct: float, tm
     assert "between samples" in watched.statement
     again = obsynth.load(design.save(tmp_path / "gains.json"))
     online = obsynth.online_monitor(again, disturbance_bounds={"load": 1.0})
-    assert online._rule._limit == pytest.approx(watched.threshold[-1], rel=1e-3)
+    assert online.rule.limit == pytest.approx(watched.threshold[-1], rel=1e-3)
     held = design.replace(source=None)
     assert obsynth.monitor(held, scenario).threshold[-1] < watched.threshold[-1]
     assert "held between samples" in obsynth.monitor(held, scenario).statement

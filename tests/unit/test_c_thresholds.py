@@ -33,7 +33,7 @@ def test_c_gives_the_thresholds_of_python(tmp_path: Path, make) -> None:
     flags = ["-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-shared", "-fPIC"]
     subprocess.run([str(COMPILER), *flags, str(source), "-o", str(library), "-lm"], check=True)
     code = ctypes.CDLL(str(library))
-    bound = monitor.bound
+    bound = monitor.rule.plan.bound
     rows, u, y, _ = exact_records(design, np.zeros((1, bound.counts[0])), 120, 3)
     python = thresholds_of_records(bound, rows @ bound.structure.reading.T, u, y).total[0]
     state = (ctypes.c_double * 4_000_000)()

@@ -153,7 +153,7 @@ def changed(log, **columns):
         (lambda log: changed(log, y=1000.0 * log["y"] + 500.0), "explains-nothing"),
         (lambda log: changed(log, time=log["time"] + 0.2 * np.sin(np.arange(150.0) * 9.0)), "irregular"),
         (lambda log: changed(log, time=log["time"][::-1]), "time"),
-        (lambda log: changed(log, u=np.where(np.arange(150) == 70, np.nan, log["u"])), "nan"),
+        (lambda log: changed(log, u=np.full(150, np.nan)), "nan"),
         (lambda log: changed(log, y=np.full(150, np.nan)), "nan"),
         (lambda log: {name: values[:8] for name, values in log.items()}, "too-short"),
         (lambda log: changed(log, u=np.ones(150), y=np.ones(150)), "not-exciting"),

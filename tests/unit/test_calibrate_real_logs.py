@@ -92,8 +92,13 @@ def test_a_sample_that_stands_out_is_named() -> None:
 def test_a_sensor_of_another_sign_and_one_with_a_bias_are_named() -> None:
     turned = calibrate(circuit(), circuit_log(vm=lambda column: -column), WIDE, starts=1)
     assert said(turned, "The best simulation leaves nearly all of what vm does")
-    biased = calibrate(circuit(), circuit_log(vm=lambda column: column + 0.3), WIDE, starts=1)
+    bias = circuit_log(vm=lambda column: column + 0.3)
+    biased = calibrate(circuit(), bias, WIDE, starts=1, offset={}, input_delay=0)
     assert said(biased, "The innovations of vm have the mean +1.00 deviations: a bias")
+    taken = calibrate(circuit(), bias, WIDE, starts=1, input_delay=0)
+    assert said(taken, "The sensor vm has an offset")
+    assert tuple(taken.offset) == ("vm",)
+    assert taken.box.holds(TRUE)
     assert not said(biased, "of im have the mean")
 
 
@@ -177,3 +182,27 @@ def test_another_unit_of_one_sensor_of_a_linear_plant_is_refused() -> None:
 def test_bounds_that_are_none_are_refused(unknown) -> None:
     with pytest.raises(SpecError, match="unknown"):
         calibrate(circuit(), circuit_log(), unknown)
+
+
+@pytest.mark.parametrize("late", [0, 1])
+def test_the_record_of_another_simulator_has_its_own_start_and_no_delay_that_it_lacks(late: int) -> None:
+    from scipy.integrate import solve_ivp
+
+    true, n = {"A": 2.2, "c": 0.55}, 80
+    rng = np.random.default_rng(0)
+    q, h = 0.5 + 0.2 * np.repeat(rng.uniform(-1.0, 1.0, n // 8), 8), np.zeros(n)
+    h[0] = 1.6
+    for k in range(1, n):
+        flow = q[k - late]
+        h[k] = solve_ivp(
+            lambda _, x, flow=flow: (flow - true["c"] * np.sqrt(x)) / true["A"], (0.0, 1.0), [h[k - 1]], rtol=1e-9,
+            atol=1e-10,
+        ).y[0, -1]  # fmt: skip
+    tank = DAEModel(
+        {"balance": "A * der(h) = q - c * sqrt(h)"}, {"seen": "h"}, states={"h": 1.0}, inputs={"q": 0.5},
+        constants={"A": 2.0, "c": 0.5},
+    )  # fmt: skip
+    log = {"time": np.arange(float(n)), "q": q, "seen": h + 1e-4 * rng.standard_normal(n)}
+    found = calibrate(tank, log, {"A": (1.0, 4.0), "c": (0.3, 0.8)}, starts=1)
+    assert found.input_delay == late
+    assert found.box.holds(true)

@@ -76,7 +76,7 @@ def test_sensitivity_is_proved_on_the_whole_range(seed: int) -> None:
     assert found.fault_sensitivity <= least <= found.fault_sensitivity * (1.0 + 3e-3)
 
 
-def claiming(found: obsynth.DetectionFilter, **changed: float) -> dict[str, Any]:
+def claiming(found: obsynth.types.DetectionFilter, **changed: float) -> dict[str, Any]:
     certificate = found.certificate
     return {"certificate": replace(certificate, claims={**certificate.claims, **changed})}
 
@@ -104,7 +104,7 @@ CORRUPTED = {
 
 
 @functools.cache
-def with_input() -> obsynth.DetectionFilter:
+def with_input() -> obsynth.types.DetectionFilter:
     system = plant(1).replace(B=[[1.0], [0.0], [0.0]], D=None, input_names=None)
     return obsynth.detection_filter(system, band=(0.0, 10.0))
 

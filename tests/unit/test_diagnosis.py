@@ -241,3 +241,12 @@ def test_a_method_whose_numbers_fail_is_a_row_of_check_and_not_its_end(error, mo
     assert {method: report.passed for method, report in found.items() if method != "ui-pi-observer"} == {
         method: report.passed for method, report in before.items() if method != "ui-pi-observer"
     }
+
+
+@pytest.mark.parametrize(("faults", "said"), [(16, "obsynth.sensor_sets searches"), (2, "Add one of: x1.")])
+def test_what_would_help_many_faults_is_left_to_the_search_for_sensors(faults: int, said: str) -> None:
+    states = 30
+    a = 0.5 * np.eye(states) + 0.25 * np.eye(states, k=-1)
+    plant = obsynth.DescriptorSystem(None, a, C=np.eye(states)[[-1]], Bf=np.eye(states)[:, :faults], dt=0.1)
+    for fault in obsynth.diagnose(plant).faults:
+        assert said in fault.sentences[-1]

@@ -15,6 +15,7 @@ import scipy.signal
 import obsynth
 from obsynth import LinearObserver, SpecError
 from obsynth.exporting.c_source import c_identifier
+from obsynth.numerics.continuous import first_order_hold
 from obsynth.spec import load_spec
 
 ROOT = Path(__file__).parents[2]
@@ -184,6 +185,12 @@ def test_large_matrices_by_columns_and_by_entries(tmp_path):
     np.testing.assert_allclose(found, wanted, rtol=1e-12, atol=1e-12)
 
 
+def start_of(observer: LinearObserver, dt: float, first: np.ndarray) -> np.ndarray:
+    """Return the state of a continuous observer, as `sample_observer` keeps it, that starts at rest where the first
+    sample is: less by the ramp to it."""
+    return -first_order_hold(observer.Az, np.hstack([observer.Bu, observer.By]), dt)[2] @ first
+
+
 @pytest.mark.parametrize(("which", "sample_time"), [("sampled", None), ("network", None), ("continuous", 0.01)])
 def test_c_equals_python_over_ten_thousand_steps(request, tmp_path, which, sample_time):
     design = request.getfixturevalue(which)
@@ -193,7 +200,8 @@ def test_c_equals_python_over_ten_thousand_steps(request, tmp_path, which, sampl
     nu = len(observer.input_names)
     signals = np.random.default_rng(1).normal(size=(STEPS, nu + len(observer.output_names)))
     found = through_c(observer, files[0], signals)
-    run = observer.run(signals[:, nu:], signals[:, :nu])
+    start = None if sample_time is None else start_of(design.observer, sample_time, signals[0])
+    run = observer.run(signals[:, nu:], signals[:, :nu], initial_state=start)
     wanted = np.hstack([run.states, run.faults, run.residuals])
     assert found.shape == wanted.shape
     assert np.all(np.abs(found - wanted).max(axis=0) <= 1e-12 * np.abs(wanted).max(axis=0))

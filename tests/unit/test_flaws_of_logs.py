@@ -260,9 +260,9 @@ def test_a_stream_keeps_its_state_every_few_rows(tmp_path: Path, monkeypatch: py
         obsynth.run_on_data(designed("ui-pi-observer"), log(), state_every=0)
 
 
-def flawed(flaw: str) -> pd.DataFrame:
+def flawed(flaw: str, rows: int = 200) -> pd.DataFrame:
     """Return a log with one flaw after row 40; what is measured there is as it would be without."""
-    data, rng = log(fault=0.5, rows=200), np.random.default_rng(5)
+    data, rng = log(fault=0.5, rows=rows), np.random.default_rng(5)
     if flaw == "blank cell":
         data.loc[60, "b"] = np.nan
     if flaw == "blank row":
@@ -275,12 +275,15 @@ def flawed(flaw: str) -> pd.DataFrame:
         data = pd.concat([data.iloc[:61], data.iloc[55:56], data.iloc[61:]])
     if flaw == "jitter":
         data["time"] += DT * rng.uniform(-0.2, 0.2, len(data))
+    if flaw == "text cell":
+        data["b"] = data["b"].astype(object)
+        data.loc[60, "b"] = "I/O Timeout"
     if flaw == "column order":
         data = data[["b", "u", "time", "a"]]
     return data.reset_index(drop=True)
 
 
-FLAWS = ("blank cell", "blank row", "gap", "repeated stamp", "out of order", "jitter", "column order")
+FLAWS = ("blank cell", "blank row", "gap", "repeated stamp", "out of order", "jitter", "text cell", "column order")
 
 
 @pytest.mark.parametrize("flaw", FLAWS)
@@ -299,7 +302,13 @@ def test_runs_live_on_over_flaws_and_keep_the_estimate(tmp_path: Path, method: s
         table = pd.read_csv(io.StringIO(out.getvalue()))
     assert table is not None
     assert len(table) == len(data)
-    told = {"blank cell": "gap", "blank row": "gap", "repeated stamp": flaw, "out of order": flaw}.get(flaw, "ok")
+    told = {
+        "blank cell": "gap",
+        "blank row": "gap",
+        "text cell": "gap",
+        "repeated stamp": flaw,
+        "out of order": flaw,
+    }.get(flaw, "ok")
     assert told in set(table["status"])
     # Rows that may alarm say what they say of a clean log, but for the 2 % that a gap leaves of the states.
     clean = obsynth.run_on_data(designed(method), log(fault=0.5, rows=200)).table
@@ -359,3 +368,97 @@ def test_one_blank_cell_does_not_blind_for_a_warm_up(method: str) -> None:
     # What is left of a gap stays below half of what the estimate changes by from row to row; gaps may add up.
     usual = np.sqrt(np.mean(np.diff(clean["fhat[f]"][60:]) ** 2))
     assert np.sqrt(np.mean(away**2)) <= usual
+
+
+@functools.cache
+def recursive() -> obsynth.ObserverDesign:
+    plant = heated()
+    varying = obsynth.TimeVaryingDescriptorSystem(
+        E=plant.E, A=plant.A, B=plant.B, C=plant.C, Phi=plant.Bf, dt=plant.dt, parameter_names=["f"],
+        input_names=["u"], output_names=["a", "b"], state_names=["a", "b"],
+    )  # fmt: skip
+    return obsynth.adaptive_observer(
+        varying, Q=1e-4 * np.eye(2), R=1e-4 * np.eye(2), forgetting=0.98, initial_state=[0.0, 0.0],
+        initial_covariance=np.eye(2), initial_parameters=[0.0], initial_parameter_covariance=[[1.0]],
+    )  # fmt: skip
+
+
+MORE_FLAWS = (*FLAWS, "outlier", "stuck sensor")
+
+
+def more_flawed(flaw: str, rows: int = 200) -> pd.DataFrame:
+    data = flawed(flaw, rows)
+    if flaw == "outlier":
+        data.loc[60, "b"] += 50.0
+    if flaw == "stuck sensor":
+        data.loc[150:, "b"] = data.loc[150, "b"]
+    return data
+
+
+@pytest.mark.parametrize("flaw", MORE_FLAWS)
+def test_recursive_designs_live_on_over_flaws(flaw: str) -> None:
+    data = more_flawed(flaw)
+    run = obsynth.run_on_data(recursive(), data)
+    table = run.table
+    assert table is not None
+    assert len(table) == len(data)
+    if flaw == "stuck sensor":
+        return
+    # One sample, or some rows, cost no more than three of the deviations that the observer states.
+    away = np.abs(table["fhat[f]"] - 0.5)[70:]
+    assert (away <= 3.0 * table["sd fhat[f]"][70:] + 0.05).all()
+    assert run.outliers == ({"b": 1} if flaw == "outlier" else {})
+
+
+@pytest.mark.parametrize("flaw", MORE_FLAWS)
+@pytest.mark.parametrize("kind", ["linear", "recursive"])
+def test_thresholds_are_learned_over_flaws(flaw: str, kind: str) -> None:
+    design, rng = recursive() if kind == "recursive" else designed("ui-pi-observer"), np.random.default_rng(8)
+    data = more_flawed(flaw, 300)
+    for name in ("a", "b"):
+        noisy = [cell if isinstance(cell, str) else cell + 0.01 * rng.standard_normal() for cell in data[name]]
+        data[name] = noisy
+    learned = obsynth.learn_thresholds(design, data)
+    assert np.isfinite(learned.levels).all()
+    assert learned.rows >= 100
+
+
+@pytest.mark.parametrize("flaw", ["repeated stamp", "out of order"])
+def test_an_alarm_is_proved_from_the_rows_that_a_run_takes(flaw: str) -> None:
+    from obsynth.data.alarm_proof import rows_of
+
+    data = flawed(flaw)
+    design = designed("fault-estimation-filter")
+    found, clean = rows_of(design, data, 100), rows_of(design, log(fault=0.5, rows=200), 99)
+    np.testing.assert_array_equal(found, clean)
+    with pytest.raises(obsynth.SpecError, match="is left out"):
+        rows_of(design, data, 62)
+
+
+@pytest.mark.parametrize("flaw", ["blank cell", "blank row", "gap", "repeated stamp", "out of order", "jitter"])
+def test_calibration_reads_the_rows_that_a_run_takes(flaw: str) -> None:
+    from obsynth.calibration.logs import read_log
+
+    data, clean = flawed(flaw), read_log(log(fault=0.5, rows=200), ["u"], ["a", "b"])
+    found = read_log(data, ["u"], ["a", "b"], dt=DT)
+    assert found.samples == 200
+    same = np.isfinite(found.y).all(axis=1)
+    assert same.sum() >= 195
+    np.testing.assert_array_equal(found.y[same], clean.y[same])
+    assert np.isfinite(found.u).all()
+    if flaw in ("blank row", "repeated stamp", "out of order"):
+        assert found.notes
+    stuck = data.assign(time=np.minimum(data["time"], 3.0))
+    with pytest.raises(obsynth.SpecError, match="must rise"):
+        read_log(stuck, ["u"], ["a", "b"], dt=DT)
+
+
+@pytest.mark.parametrize("flaw", ["blank cell", "blank row", "gap", "text cell"])
+def test_a_comparison_replays_a_log_with_flaws(flaw: str) -> None:
+    data = flawed(flaw)
+    data["f"] = 0.5
+    plant = heated()
+    scenario = obsynth.Scenario(horizon=10.0, faults={"f": obsynth.Step(size=0.5, start=0.0)})
+    found = obsynth.compare(plant, scenario=scenario, runs=1, methods=["ui-pi-observer"], data=data)
+    assert np.isfinite(found.methods[0].rms)
+    assert found.methods[0].rms < 0.2

@@ -133,10 +133,13 @@ def test_alarms_thresholds_and_operating_points_can_be_changed(design, tmp_path,
     assert stepped.flag("alarm")
     assert stepped.flag("alarm[fhat[actuator 1]]")
     assert stepped.flag("sample_used")
-    # A sample that is no number leaves the estimates as they are and raises nothing.
-    held = stepped.values(shown)
+    # A sample that is no number raises nothing: the model goes on, faults are held, and there is no residual.
+    held = dict(zip(shown, stepped.values(shown), strict=True))
     stepped.run(names, np.array([np.where(np.arange(len(names)) == 1, np.nan, rest)]), 1.0, shown)
-    assert stepped.values(shown) == held
+    after = dict(zip(shown, stepped.values(shown), strict=True))
+    assert all(after[name] == held[name] for name in shown if name.startswith("fhat["))
+    assert all(np.isnan(after[name]) for name in shown if name.startswith("r["))
+    assert after["xhat[x2]"] != held["xhat[x2]"]
     assert not stepped.flag("sample_used")
     assert not stepped.flag("alarm")
     stepped.end()
@@ -198,7 +201,7 @@ def test_the_observer_of_a_nonlinear_plant_is_a_unit_too(tmp_path):
     assert fmpy.validation.validate_fmu(str(path)) == []
     model, observer = design.nonlinear
     names = (*model.input_names, *model.output_names)
-    shown = [f"xhat[{name}]" for name in model.state_names] + [f"theta[{name}]" for name in model.parameter_names]
+    shown = [f"xhat[{name}]" for name in model.state_names] + [f"fhat[{name}]" for name in model.parameter_names]
     u = np.tile(list(model.inputs.values()), (200, 1))
     y = obsynth.simulate_dae(model, u, dt=observer.dt).outputs[:200]
     y = y + 1e-4 * np.random.default_rng(3).normal(size=y.shape)
@@ -209,6 +212,37 @@ def test_the_observer_of_a_nonlinear_plant_is_a_unit_too(tmp_path):
     stepped.end()
     whole = np.hstack([wanted.states, wanted.parameters])
     assert np.abs(found - whole).max() <= 1e-9 * max(1.0, np.abs(whole).max())
+
+
+@pytest.mark.usefixtures("compiler")
+def test_the_unit_of_the_tanks_watches_its_leak_by_a_level_and_by_what_was_learned(tmp_path):
+    """As a run on the same log: the leak, its deviation, the statistic, and both alarms."""
+    from test_c_on_logs import log_of, told
+
+    spec = obsynth.load_spec(ROOT / "designs" / "threetank" / "spec.yaml")
+    design = obsynth.design(spec.plant, spec.method, name=spec.name, **dict(spec.options))
+    monitor, log = obsynth.online_monitor(design, "learned", normal=told(design)), log_of(design)
+    quiet = obsynth.run_on_data(design, log).table["fhat[leak]"]
+    level = {"fhat[leak]": float(quiet.abs().quantile(0.7))}
+    (path,) = obsynth.export(design, tmp_path / "tanks.fmu", thresholds=level, monitor=monitor, warm_up=20.0)
+    assert fmpy.validation.validate_fmu(str(path)) == []
+    run = obsynth.run_on_data(design, log, thresholds=level, monitor=monitor, warm_up=20.0).table
+    model, observer = design.nonlinear
+    shown = ["fhat[leak]", "sd fhat[leak]", "statistic", "alarm[fhat[leak]]", "alarm[statistic]", "sample_used"]
+    stepped = Stepped(path, tmp_path / "unpacked")
+    stepped.begin()
+    found = []
+    for row in log.to_numpy()[:, 1:]:
+        stepped.run((*model.input_names, *model.output_names), row[None], observer.dt, shown[:3])
+        found.append([*stepped.values(shown[:3]), *(stepped.flag(name) for name in shown[3:])])
+    stepped.end()
+    table = np.array(found, dtype=float)
+    np.testing.assert_allclose(table[:, :3], run[shown[:3]].to_numpy(float), rtol=1e-9)
+    alarms = run.alarm.to_numpy(str)
+    np.testing.assert_array_equal(table[:, 3] > 0.0, np.char.find(alarms, "fhat[leak]") >= 0)
+    np.testing.assert_array_equal(table[:, 4] > 0.0, np.char.find(alarms, "learned") >= 0)
+    np.testing.assert_array_equal(table[:, 5] > 0.0, run.status != "gap")
+    assert 0.0 < table[:, 3].mean() < 1.0
 
 
 @pytest.mark.parametrize(
@@ -228,6 +262,6 @@ def test_wrong_options_are_refused(design, tmp_path, options, words):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_thresholds_are_for_units_only(design, tmp_path):
+def test_thresholds_are_for_units_and_c_only(design, tmp_path):
     with pytest.raises(SpecError, match=r"FMU"):
-        obsynth.export(design, tmp_path / "observer.c", thresholds={"fhat[actuator 1]": 1.0})
+        obsynth.export(design, tmp_path / "observer.npz", thresholds={"fhat[actuator 1]": 1.0})

@@ -10,6 +10,7 @@ import pandas as pd
 import pytest
 
 import obsynth
+from obsynth.results.design import Certificate
 
 ROOT = Path(__file__).parents[2]
 
@@ -74,13 +75,28 @@ def tanks() -> obsynth.DescriptorSystem:
     return obsynth.load_spec(ROOT / "designs/tanks/spec.yaml").plant
 
 
+LEVELS = ("leak 1", "leak 2", "clog 13")
 OPTIONS = {"course": "constant", "samples": 12, "noise_bound": 3.0}
 
 
+@cache
+def three() -> obsynth.GuaranteedTest:
+    return obsynth.guaranteed_test(tanks(), isolate=True, **OPTIONS)
+
+
 def test_three_levels_isolate_three_faults() -> None:
-    bank = obsynth.guaranteed_bank(tanks(), **OPTIONS)
-    assert bank.isolates
+    bank = three()
+    assert bank.report.passed
     assert bank.groups == (("leak 1",), ("leak 2",), ("clog 13",))
+    with pytest.raises(obsynth.SpecError, match="Nothing hides this fault"):
+        obsynth.plotting.plot_hidden_course(bank)
+    assert set(bank.pairs) == {(one, two) for one in LEVELS for two in LEVELS if one != two}
+    # Blind to less, a test is no worse; blind to all others it is that alone.
+    assert all(bank.pairs[one, two] <= bank.tests[LEVELS.index(one)].threshold for one, two in bank.pairs)
+    alone = obsynth.guaranteed_test(tanks(), "leak 2", **OPTIONS)
+    assert bank.tests[1].threshold == pytest.approx(alone.threshold, rel=1e-12)
+    with pytest.raises(obsynth.SpecError, match="is a bank"):
+        _ = bank.threshold
     plant, rng = tanks(), np.random.default_rng(2)
     # Leak 2 alone, of twice its threshold, with noise within its bounds and an input that moves.
     size = 1.001 * bank.tests[1].surely_found
@@ -90,19 +106,75 @@ def test_three_levels_isolate_three_faults() -> None:
         rows.append(plant.C @ x + plant.Dw @ rng.uniform(-3.0, 3.0, 3))
         inputs.append(u)
         x = plant.A @ x + plant.B @ u + plant.Bf[:, 1] * size
-    found = bank.alarms(np.array(rows), np.array(inputs))
-    assert {name for name, alarms in found.items() if alarms[-1]} == {"leak 2"}
+    y, u = np.array(rows), np.array(inputs)
+    for test in bank.tests:
+        assert test.alarms(test.observer.run(y, u))[-1] == (test.fault == "leak 2")
+    point = [plant.operating_point.get(name, 0.0) for name in (*plant.input_names, *plant.output_names)]
+    data = pd.DataFrame(np.hstack([u, y]) + point, columns=[*plant.input_names, *plant.output_names])
+    data.insert(0, "time", np.arange(20) * plant.dt)
+    run = obsynth.run_on_data(bank, data, monitor=obsynth.online_monitor(bank))
+    assert run.isolated == "leak 2"
+    assert {event.fault for event in run.events} == {"leak 2"}
 
 
-def test_two_levels_tell_pairs_and_name_the_smallest_group() -> None:
+def test_a_bank_over_many_runs_is_never_wrong(tmp_path: Path) -> None:
+    size = 2.0 * three().tests[0].threshold
+    scenario = obsynth.load_spec(ROOT / "designs/tanks/spec.yaml").scenario.replace(
+        horizon=60.0, faults={"leak 1": obsynth.Step(size=1.05 * size, start=20.0)}, sensors={}, disturbances={}
+    )
+    bounded = scenario.replace(noise=1.0)
+    watched = obsynth.monitor(three(), bounded)
+    found = obsynth.evaluate(three(), bounded, runs=10, monitor=watched)
+    # Noise of one deviation does not pass three: no alarm is false, no fault is missed, none is taken for another.
+    assert (found.false_alarm_rate.value, found.missed_detection_rate.value) == (0.0, 0.0)
+    assert found.isolation_error_rate.value == 0.0
+    seen = watched.watch(obsynth.simulate(three(), bounded).estimates)
+    assert seen.fault == "leak 1"
+    assert np.all(seen.threshold[11:] == 1.0)
+
+
+def test_exact_intervals_over_many_runs() -> None:
+    plant, size = drive().linear[0], 0.4
+    options = {"course": "constant", "samples": 8, "disturbance_bounds": 1.0, "noise_bound": 3}
+    fixed, exact = obsynth.guaranteed_test(plant, **options), obsynth.guaranteed_test(plant, exact=True, **options)
+    scenario = spec().scenario.replace(horizon=1.0, faults={"loss of torque": obsynth.Step(size=size, start=0.4)})
+    found = {test: obsynth.evaluate(test, scenario, runs=4, monitor=obsynth.monitor(test, scenario))
+             for test in (fixed, exact)}  # fmt: skip
+    assert (found[fixed].missed_detection_rate.value, found[exact].missed_detection_rate.value) == (1.0, 0.0)
+    assert found[exact].false_alarm_rate.value == 0.0
+
+
+def test_two_levels_tell_pairs_and_name_the_smallest_group(tmp_path: Path) -> None:
     two = tanks().replace(C=tanks().C[:2], D=None, Df=None, Dw=None, Bw=None, noise_names=None,
                           output_names=["h1", "h2"], operating_point={}, units={})  # fmt: skip
-    bank = obsynth.guaranteed_bank(two, **{**OPTIONS, "noise_bound": {"h1": 0.003, "h2": 0.003}, "samples": 30})
-    assert set(bank.refused) == {"leak 1", "leak 2", "clog 13"}
+    bank = obsynth.guaranteed_test(
+        two, isolate=True, **{**OPTIONS, "noise_bound": {"h1": 0.003, "h2": 0.003}, "samples": 9}
+    )
     assert all(np.isfinite(size) for size in bank.pairs.values())
     assert all(len(group) == 2 for group in bank.groups)
-    assert "together give the same outputs" in bank.refused["leak 1"]
-    assert " or " in str(bank)
+    assert bank.report["smallest group[leak 1]"].passed
+    assert "together give the same outputs" in " ".join(bank.notes)
+    # What is drawn is a course of the plant that no output shows.
+    course = bank.hidden_course("leak 2")
+    x, f = (np.array([course.get(name, np.zeros(8)) for name in names]).T for names in (two.state_names, LEVELS))
+    assert np.abs(x[1:] - x[:-1] @ two.A.T - f[:-1] @ two.Bf.T).max() <= 1e-12 * np.abs(f).max()
+    assert np.abs(x @ two.C.T).max() <= 1e-12 * np.abs(x).max()
+    assert course["leak 2"].tolist() == [1.0] * 8
+    page = obsynth.html_report(bank, tmp_path / "bank.html").read_text()
+    assert "Why leak 2 is not isolated" in page
+    saved = obsynth.load(bank.save(tmp_path / "bank.json"))
+    assert obsynth.verify(saved).passed
+    monitor = obsynth.online_monitor(saved)
+    assert "never passed without leak 1 or clog 13 while" in monitor.statement
+    # One fault less in a group, or a smaller threshold of a pair, is a claim that does not hold.
+    groups, pairs = saved.certificate.matrices["groups"].copy(), saved.certificate.matrices["pairs"].copy()
+    groups[0], pairs[0, 1] = [1.0, 0.0, 0.0], 0.999 * pairs[0, 1]
+    for name, changed, row in (("groups", groups, "certificate[leak 1]"), ("pairs", pairs, "pairs")):
+        certificate = Certificate({**saved.certificate.matrices, name: changed}, saved.certificate.claims)
+        assert row in {check.name for check in obsynth.verify(saved.replace(certificate=certificate)).failures}
+    whole = np.ones((3, 3))
+    certificate = Certificate({**saved.certificate.matrices, "groups": whole}, saved.certificate.claims)
+    assert not obsynth.verify(saved.replace(certificate=certificate)).passed
 
 
 def test_the_least_interval_of_a_window_holds_the_fault_and_finds_what_no_fixed_test_does() -> None:

@@ -263,9 +263,6 @@ def test_an_fmu_is_linearised_at_its_equilibrium(tmp_path, version):
 def test_what_is_no_such_fmu_is_refused(tmp_path):
     from tank_fmu import tank
 
-    path = tank(tmp_path, "2.0", derivatives=False)
-    with pytest.raises(SpecError, match=r"no directional derivatives"):
-        obsynth.from_fmu(path)
     path = tank(tmp_path, "2.0")
     with pytest.raises(SpecError, match=r"'levl'.*'level'"):
         obsynth.from_fmu(path, at={"levl": 1.0})

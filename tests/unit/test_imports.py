@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 import tomllib
 from collections.abc import Iterator, Mapping
 from graphlib import CycleError, TopologicalSorter
@@ -47,7 +48,7 @@ def levels() -> list[tuple[str, ...]]:
     """Return the packages of each level as the contract says, the uppermost first."""
     tool = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["tool"]["importlinter"]
     (layers,) = (contract["layers"] for contract in tool["contracts"] if contract["type"] == "layers")
-    return [tuple(part.strip(" ()") for part in layer.split("|")) for layer in layers]
+    return [tuple(part.strip(" ()") for part in re.split("[|:]", layer)) for layer in layers]
 
 
 def package_of(name: str) -> str:
@@ -103,9 +104,10 @@ def test_an_arrow_in_a_text_is_found() -> None:
 
 
 def test_types_are_told_of_every_public_name() -> None:
-    stub = ast.parse((SOURCE / "__init__.pyi").read_text())
-    told = {alias.asname: (str(node.module), alias.name) for node in stub.body if isinstance(node, ast.ImportFrom)
-            for alias in node.names if alias.name not in ("__version__", "conditions", "plotting")}  # fmt: skip
-    assert set(told) == set(obsynth.__all__)
-    for name, (module, there) in told.items():
-        assert getattr(import_module(module), there) is getattr(obsynth, name), name
+    for stub, public in (("__init__.pyi", obsynth), ("types.pyi", obsynth.types)):
+        lines = [node for node in ast.parse((SOURCE / stub).read_text()).body if isinstance(node, ast.ImportFrom)]
+        told = {alias.asname: (str(node.module), alias.name) for node in lines for alias in node.names
+                if alias.name not in ("__version__", "conditions", "plotting", "types")}  # fmt: skip
+        assert set(told) == set(public.__all__)
+        for name, (module, there) in told.items():
+            assert getattr(import_module(module), there) is getattr(public, name), name

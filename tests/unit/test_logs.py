@@ -46,7 +46,7 @@ def wanted(design, frame) -> pd.DataFrame:
     return obsynth.run_on_data(design, frame, thresholds={"fhat[leak]": 0.25}).table
 
 
-def same(found: obsynth.DataRun, wanted: pd.DataFrame) -> None:
+def same(found: obsynth.types.DataRun, wanted: pd.DataFrame) -> None:
     pd.testing.assert_frame_equal(
         found.table.drop(columns=["time", "time of fhat[leak]"]), wanted.drop(columns=["time", "time of fhat[leak]"]),
         check_dtype=False, atol=1e-12,
@@ -183,6 +183,24 @@ def test_a_picture_of_one_s_own_data(design, frame):
         plot_data(run, show=["states"])
     with pytest.raises(SpecError, match=r"run_on_data"):
         plot_data(run.table)
+
+
+def test_a_fault_is_shaded_red_at_its_own_alarms_alone():
+    """Two faults, of which the second comes alone: the panel of the first stays white, both alarms are in the third."""
+    plant = obsynth.DescriptorSystem(
+        None, np.diag([0.8, 0.7]), None, ["level", "flow"], Bf=np.eye(2), dt=0.5, state_names=["level", "flow"],
+        fault_names=["leak", "clog"],
+    )  # fmt: skip
+    rows, x = [], np.zeros(2)
+    for k in range(ROWS):
+        rows.append([0.5 * k, *x])
+        x = plant.A @ x + plant.Bf[:, 1] * (k >= 20)
+    log = pd.DataFrame(rows, columns=["time", "level", "flow"])
+    design = obsynth.fault_estimation_filter(plant)
+    run = obsynth.run_on_data(design, log, thresholds={"fhat[leak]": 0.25, "fhat[clog]": 0.25})
+    panels = plot_data(run, show=["faults", "residuals"], axes=list(Figure().subplots(3, 1)))
+    red = [sum(patch.get_alpha() == 0.15 for patch in panel.patches) for panel in panels]
+    assert red == [0, 1, 1]
 
 
 def test_a_run_to_a_file_holds_no_table(design, frame, tmp_path):

@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import types
-from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
@@ -26,7 +25,6 @@ from obsynth.analysis.transformations.recovery import Transformation
 from obsynth.methods.method import Method
 from obsynth.methods.registry import Plant
 from obsynth.results.design import ObserverDesign
-from obsynth.simulation.scenario import Scenario
 
 def design_function(method: type[Method]) -> Callable[..., ObserverDesign]: ...
 """
@@ -48,8 +46,6 @@ def written(kind: Any) -> str:
 def function(method: type[Method]) -> str:
     """Return the declaration of a method's public function."""
     options = [f"    {name}: {written(kind)} = ...," for name, kind in field_types(method).items()]
-    if any(option.name == "model_error" for option in fields(method)):
-        options.append("    scenario: Scenario | None = ...,")
     name = method.id.replace("-", "_")
     lines = [f"def {name}(", "    plant: Plant | Transformation,", "    *,", *options, "    name: str = ...,"]
     return "\n".join([*lines, ") -> ObserverDesign: ...", ""])

@@ -215,7 +215,7 @@ def test_the_statistic_without_faults_is_chi_square(noisy) -> None:
     bench = make_bench(design, scenario)
     rows = bench.run(range(600)).rows
     late = watched.statistic(rows[:, :, design.observer.residual_rows])[-1]
-    degrees = len(watched.whitener)
+    degrees = len(watched.rule.whitener)
     assert stats.kstest(late, stats.chi2(degrees).cdf).pvalue > 1e-3
     assert stats.kstest(late, stats.chi2(degrees + 1).cdf).pvalue < 1e-3
 

@@ -13,7 +13,7 @@ from scipy.linalg import expm
 
 import obsynth
 from obsynth import SpecError, run_on_data
-from obsynth.experiments.monitors.online import share_of_look
+from obsynth.experiments.monitors.rules import share_of_look
 from obsynth.spec import load_spec
 
 DESIGNS = Path(__file__).parents[2] / "designs"
@@ -46,7 +46,7 @@ def machine():
     return obsynth.pd_observer(plant, decay=1.0)
 
 
-def log_of(run: obsynth.Simulation) -> pd.DataFrame:
+def log_of(run: obsynth.types.Simulation) -> pd.DataFrame:
     table = pd.DataFrame(np.hstack([run.inputs, run.outputs]), columns=[*run.input_names, *run.output_names])
     table.insert(0, "time", run.time)
     return table
@@ -223,7 +223,7 @@ def test_chi_square_of_a_sampled_continuous_design(machine):
     bench = make_bench(machine, scenario)
     rows = bench.run(range(500)).rows
     late = watched.statistic(rows[:, :, bench.observer.residual_rows])[-1]
-    degrees = len(watched.whitener)
+    degrees = len(watched.rule.whitener)
     assert stats.kstest(late, stats.chi2(degrees).cdf).pvalue > 1e-3
     assert stats.kstest(late, stats.chi2(degrees + 1).cdf).pvalue < 1e-3
 

@@ -83,7 +83,7 @@ def test_a_record_without_outliers_is_as_before(kind):
     assert np.abs(observer.run(true.outputs, u).states - design.observer.run(true.outputs, u).states).max() < 1e-12
 
 
-def test_a_sensor_that_stays_away_is_believed_after_two_samples():
+def test_a_sensor_that_stays_away_is_believed_at_its_second_sample():
     y, u = filter_record()
     design = filter_design(outliers="gate")
     y[80:] += [3.0, 0.0]
@@ -93,7 +93,21 @@ def test_a_sensor_that_stays_away_is_believed_after_two_samples():
         state, _ = design.observer.advance(state, y[k], u[k])
         refused.append(state.refused.copy())
     assert refused[79].sum() == 0.0
-    assert [counts[0, 0] for counts in refused[80:83]] == [1.0, 2.0, 0.0]
+    assert [counts[0, 0] for counts in refused[80:82]] == [1.0, 2.0]
+    # One sample is left out in all, however long the sensor stays where it is.
+    assert refused[-1][1].tolist() == [1.0, 0.0]
+
+
+def test_samples_that_jump_from_side_to_side_are_left_out_one_by_one():
+    y, u = filter_record()
+    design = filter_design(outliers="gate")
+    y[80, 0], y[81, 0], y[100, 0] = y[80, 0] + 5.0, y[81, 0] - 5.0, y[100, 0] - 5.0
+    state, sides = design.observer.init(), []
+    for k in range(len(y)):
+        state, _ = design.observer.advance(state, y[k], u[k])
+        sides.append(state.refused[0, 0])
+    assert (sides[80], sides[81], sides[100], sides[101]) == (1.0, -2.0, -1.0, 0.0)
+    assert state.refused[1].tolist() == [3.0, 0.0]
 
 
 def test_run_leaves_outliers_out_by_default_and_counts_them(tmp_path):

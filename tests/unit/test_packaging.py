@@ -50,7 +50,7 @@ def test_the_readme_is_short():
 
 def test_dir_is_the_public_names_only():
     shown = set(dir(obsynth))
-    assert shown == {*obsynth.__all__, "conditions", "plotting", "__version__"}
+    assert shown == {*obsynth.__all__, "conditions", "plotting", "types", "__version__"}
     assert obsynth.plotting.plot_data is not None
     assert obsynth.conditions.wang2015 is not None
     assert obsynth.check is not None

@@ -1,4 +1,4 @@
-"""The ways to a PD observer: the whole inequality, the smaller one with its way back, and none at all."""
+"""The ways to a PD observer: the inequality of the theorem, and a closed form."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ import pytest
 import scipy.linalg
 
 import obsynth
-from obsynth.methods.pd_observer import gain_search as pd_design
-from obsynth.methods.pd_observer import reduced_inequality as pd_reduced
-from obsynth.methods.pd_observer.checks.certificate import prove_gains, prove_symmetric_positive
-from obsynth.methods.pd_observer.inequalities import PdTask, solve
+from obsynth.methods.pd_observer import synthesis
+from obsynth.methods.pd_observer.checks.certificate import prove_gains
+from obsynth.methods.pd_observer.closed_form import closed_form
+from obsynth.methods.pd_observer.inequalities import PdTask
 from obsynth.methods.pd_observer.method import MOST_STATES_FOR_LMI, PdObserver
 from obsynth.methods.pd_observer.realisation import with_faults_as_states
 from obsynth.spec import load_spec
 
 PLANT = load_spec(Path(__file__).parents[2] / "designs" / "filasova" / "spec.yaml").plant
-ENGINES = ("lmi", "reduced-lmi", "riccati")
+ENGINES = ("lmi", "riccati")
 
 
 def task_of(plant: obsynth.DescriptorSystem, *, theorem: int, delta: float, decay: float) -> PdTask:
@@ -40,69 +40,17 @@ def large_plant(nx: int, seed: int = 0) -> obsynth.DescriptorSystem:
     )
 
 
-class TestWayBack:
-    """What is lifted from the smaller inequality is a solution of the theorem itself, for the delta that was asked."""
-
-    @pytest.mark.parametrize("theorem", [1, 2])
-    @pytest.mark.parametrize("delta", [1e-2, 0.3, 5.0])
-    @pytest.mark.parametrize("decay", [0.0, 1.5])
-    def test_the_whole_inequality_holds(self, theorem: int, delta: float, decay: float) -> None:
-        task = task_of(PLANT, theorem=theorem, delta=delta, decay=decay)
-        found = pd_reduced.reduced_lmi(task, solver="CLARABEL")
-        a, c = task.plants[0]
-        assert prove_symmetric_positive(found.P1[0]).proved
-        if theorem == 2:
-            np.testing.assert_allclose(found.P3, found.P3.T, rtol=1e-12)
-        assert prove_gains(a, c, found.J, found.L, found.P1[0], found.P3, delta=delta, decay=decay).proved
-        assert not np.any(found.L)
-
-    @pytest.mark.parametrize("theorem", [1, 2])
-    def test_gains_are_in_proportion_to_those_of_the_whole_inequality(self, theorem: int) -> None:
-        """The general formula of the elimination lemma gives 40 to 100 times larger ones."""
-        task = task_of(PLANT, theorem=theorem, delta=0.1, decay=0.0)
-        whole, smaller = solve(task, solver="CLARABEL"), pd_reduced.reduced_lmi(task, solver="CLARABEL")
-        assert np.linalg.norm(smaller.J, 2) < 10.0 * np.linalg.norm(np.hstack([whole.J, whole.L]), 2)
-
-    def test_coordinates_in_which_the_last_states_are_the_outputs(self) -> None:
-        rng = np.random.default_rng(3)
-        a, c = rng.normal(size=(6, 6)), rng.normal(size=(2, 6))
-        c = np.vstack([c, c[0] - 2.0 * c[1]])  # a third output that says nothing new
-        found = pd_reduced.ReducedPlant.of(a, c)
-        assert found.hidden == 4
-        np.testing.assert_allclose(found.basis.T @ found.basis, np.eye(6), atol=1e-12)
-        np.testing.assert_allclose((c @ found.basis)[:, :4], 0.0, atol=1e-12)
-        np.testing.assert_allclose(found.inverse @ c @ found.basis, np.eye(2, 6, 4), atol=1e-12)
-        np.testing.assert_allclose(found.basis @ found.A @ found.basis.T, a, atol=1e-12)
-
-    def test_every_state_measured_leaves_nothing_to_solve(self) -> None:
-        plant = obsynth.DescriptorSystem(None, [[1.0]], C=[[1.0], [0.0]], Bf=[[0.0]], Df=[[0.0], [2.0]])
-        design = obsynth.pd_observer(plant, engine="reduced-lmi", decay=2.0)
-        assert design.report.passed
-        assert design.solver["runs"][0]["solver"] == "none needed"
-
-    def test_a_solution_that_is_none_is_refused(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        right = pd_reduced.solve
-
-        def wrong(task: PdTask, *, solver: str) -> object:
-            found = right(task, solver=solver)
-            return replace(found, J=-5.0 * found.J)
-
-        monkeypatch.setattr(pd_reduced, "solve", wrong)
-        with pytest.raises(obsynth.SolverError, match="smaller inequality"):
-            pd_reduced.reduced_lmi(task_of(PLANT, theorem=1, delta=0.1, decay=0.0), solver="CLARABEL")
-
-
 class TestClosedForm:
     @pytest.mark.parametrize("theorem", [1, 2])
     @pytest.mark.parametrize("decay", [0.0, 1.5])
     def test_it_serves_below_its_delta(self, theorem: int, decay: float) -> None:
         task = task_of(PLANT, theorem=theorem, delta=1e3, decay=decay)
-        found, delta = pd_reduced.closed_form(task, free_delta=True)
+        found, delta = closed_form(task, free_delta=True)
         assert delta < 1e3
         a, c = task.plants[0]
         assert prove_gains(a, c, found.J, found.L, found.P1[0], found.P3, delta=delta, decay=decay).proved
         np.testing.assert_array_equal(found.P3, found.P3.T)
-        smaller, same = pd_reduced.closed_form(replace(task, delta=0.1 * delta), free_delta=True)
+        smaller, same = closed_form(replace(task, delta=0.1 * delta), free_delta=True)
         assert same == 0.1 * delta
         np.testing.assert_array_equal(smaller.J, found.J)
 
@@ -115,16 +63,16 @@ class TestClosedForm:
 
     def test_two_algorithms_for_the_riccati_equation_and_an_error(self, monkeypatch: pytest.MonkeyPatch) -> None:
         task = task_of(PLANT, theorem=1, delta=0.1, decay=0.0)
-        expected = pd_reduced.closed_form(task, free_delta=True)[0].J
+        expected = closed_form(task, free_delta=True)[0].J
 
         def failing(*_: object, **__: object) -> None:
             raise np.linalg.LinAlgError("broken")
 
         monkeypatch.setattr(scipy.linalg, "schur", failing)
-        np.testing.assert_allclose(pd_reduced.closed_form(task, free_delta=True)[0].J, expected, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(closed_form(task, free_delta=True)[0].J, expected, rtol=1e-9, atol=1e-12)
         monkeypatch.setattr(scipy.linalg, "solve_continuous_are", failing)
         with pytest.raises(obsynth.SolverError, match="not solved") as caught:
-            pd_reduced.closed_form(task, free_delta=True)
+            closed_form(task, free_delta=True)
         assert caught.value.record["what"]
 
 
@@ -149,36 +97,32 @@ class TestChoice:
         assert design.solver["engine"] == "riccati"
         assert any("62 unknown states" in note for note in design.notes)
 
-    def test_where_the_closed_form_does_not_serve_the_smaller_inequality_does(self) -> None:
+    def test_where_the_closed_form_does_not_serve_the_inequality_does(self) -> None:
         """Theorem 2 for a delta of many time constants: "auto" goes on, and says so."""
         plant = large_plant(MOST_STATES_FOR_LMI)
         design = obsynth.pd_observer(plant, theorem=2, delta=20.0, decay=0.0)
         assert design.report.passed
-        assert design.solver["engine"] == "reduced-lmi"
+        assert design.solver["engine"] == "lmi"
         assert any("'riccati' failed" in note for note in design.notes)
 
     def test_what_is_asked_besides_takes_the_whole_inequality(self) -> None:
         assert PdObserver(gain_bound=3.0).engines_for(10 * MOST_STATES_FOR_LMI) == ("lmi",)
         assert obsynth.pd_observer(PLANT, fault_rate_gain=0.7).solver["engine"] == "lmi"
-        for engine in ("reduced-lmi", "riccati"):
-            with pytest.raises(obsynth.SpecError, match="stability and a decay rate alone") as caught:
-                obsynth.pd_observer(PLANT, engine=engine, gain_bound=30.0)
-            assert "gain_bound" in str(caught.value)
-        with pytest.raises(obsynth.SpecError, match="engine is 'sdp'"):
-            obsynth.pd_observer(PLANT, engine="sdp")
+        with pytest.raises(obsynth.SpecError, match="stability and a decay rate alone") as caught:
+            obsynth.pd_observer(PLANT, engine="riccati", gain_bound=30.0)
+        assert "gain_bound" in str(caught.value)
+        with pytest.raises(obsynth.SpecError, match="engine is 'reduced-lmi'"):
+            obsynth.pd_observer(PLANT, engine="reduced-lmi")
 
-    def test_adaptation_gain_and_scan_work_with_each(self) -> None:
+    def test_adaptation_gain_works_with_each(self) -> None:
         for engine in ENGINES:
-            design = obsynth.pd_observer(PLANT, engine=engine, adaptation_gain=5.0, delta_scan=[0.05, 0.5])
-            assert design.report.passed
-            scan = obsynth.DeltaScan.from_dict(design.solver["delta_scan"])
-            assert set(scan.failures) == {""}
+            assert obsynth.pd_observer(PLANT, engine=engine, adaptation_gain=5.0).report.passed
 
     def test_the_spare_engine_is_named(self, monkeypatch: pytest.MonkeyPatch) -> None:
         def failing(*_: object, **__: object) -> None:
             raise obsynth.SolverError("broken")
 
-        monkeypatch.setattr(pd_design, "reduced_lmi", failing)
-        design = obsynth.pd_observer(PLANT, engine="reduced-lmi")
+        monkeypatch.setattr(synthesis, "solve", failing)
+        design = obsynth.pd_observer(PLANT, engine="lmi")
         assert design.solver["engine"] == "riccati"
-        assert any("'reduced-lmi' failed" in note and "Riccati" in note for note in design.notes)
+        assert any("'lmi' failed" in note and "Riccati" in note for note in design.notes)

@@ -87,7 +87,7 @@ class TestSplit:
     @pytest.mark.parametrize("modes", [[-1], [-1, -2], [-1, -1], [-1 + 2j, -1 - 2j], [-0.5, -1 + 2j, -1 - 2j]])
     def test_hidden_modes_are_found_and_the_rest_can_be_placed(self, modes: list[complex], seed: int) -> None:
         f, c = self.hidden([complex(mode) for mode in modes], seed)
-        split = observable_split(f, c, np.array(modes, dtype=complex))
+        split = observable_split(f, c, np.array(modes, dtype=complex), dt=0.0)
         assert split.order == 4
         np.testing.assert_allclose(np.poly(split.fixed_modes).real, np.real(np.poly(modes)), rtol=1e-6)
         found = place(split.F, split.C, [-3 + 0j, -4 + 0j, -5 + 0j, -6 + 0j])
@@ -97,13 +97,22 @@ class TestSplit:
     def test_a_double_mode_that_rounding_has_split_into_a_pair(self) -> None:
         f = np.diag([-2.0, -3.0, -1.0, -1.0, -1.0])
         c = np.array([[1.0, 1.0, 0.0, 0.0, 0.0]])
-        split = observable_split(f, c, np.array([-1 + 1e-15j, -1 - 1e-15j, -1.0]))
+        split = observable_split(f, c, np.array([-1 + 1e-15j, -1 - 1e-15j, -1.0]), dt=0.0)
         assert split.order == 2
 
-    def test_a_mode_that_the_pair_shows_is_refused(self) -> None:
-        f, c = np.diag([-1.0, -2.0]), np.array([[1.0, 1.0]])
+    @pytest.mark.parametrize(("modes", "dt"), [((-1.0, -2.0), 0.0), ((0.3, -0.5), 1.0)])
+    def test_a_stable_mode_that_the_pair_shows_stays_in_it(self, modes: tuple[float, float], dt: float) -> None:
+        f, c = np.diag(modes), np.array([[1e-7, 1.0]])
+        split = observable_split(f, c, np.array([modes[0] + 0j]), dt=dt)
+        assert split.order == 2
+        assert not split.fixed_modes.size
+        np.testing.assert_allclose(np.sort(np.linalg.eigvals(split.F).real), np.sort(modes), rtol=1e-12)
+
+    @pytest.mark.parametrize(("mode", "dt"), [(0.5, 0.0), (-1.5, 1.0), (0.0, 0.0)])
+    def test_an_unstable_mode_that_the_pair_shows_is_refused(self, mode: float, dt: float) -> None:
+        f, c = np.diag([mode, -0.2]), np.array([[1.0, 1.0]])
         with pytest.raises(PreconditionError, match="rescale the plant"):
-            observable_split(f, c, np.array([-1.0 + 0j]))
+            observable_split(f, c, np.array([mode + 0j]), dt=dt)
 
 
 class TestKalman:

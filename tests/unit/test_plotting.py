@@ -80,6 +80,19 @@ def test_axes_say_names_units_and_seconds() -> None:
     assert [axes.get_xlabel() for axes in panels] == ["", "time (s)"]
 
 
+@pytest.mark.parametrize(("dt", "unit"), [(1.0, "s"), (30.0, "min"), (600.0, "h"), (14400.0, "d")])
+def test_long_times_are_told_in_their_unit(dt: float, unit: str) -> None:
+    """Forty samples: their last one is told by a tick at its place, in the unit of the axis."""
+    seconds = {"s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}[unit]
+    panel = plot_faults(made_estimates(), faults=FAULTS, dt=dt)[-1]
+    assert panel.get_xlabel() == f"time ({unit})"
+    panel.figure.canvas.draw()
+    ticks = [(place, text.get_text()) for place, text in zip(panel.get_xticks(), panel.get_xticklabels(), strict=True)]
+    assert len(ticks) > 3
+    for place, text in ticks:
+        assert float(text.replace("\N{MINUS SIGN}", "-")) == pytest.approx(place / seconds, abs=1e-12)
+
+
 def test_lines_differ_by_more_than_colour() -> None:
     true, estimate = plot_faults(made_estimates(), faults=FAULTS)[0].get_lines()
     assert true.get_linestyle() != estimate.get_linestyle()

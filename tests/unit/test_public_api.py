@@ -58,7 +58,7 @@ def documented_parameters(item) -> set[str]:
 
 
 def public_names():
-    return [(name, getattr(obsynth, name)) for name in obsynth.__all__]
+    return [(name, getattr(home, name)) for home in (obsynth, obsynth.types) for name in home.__all__]
 
 
 @pytest.mark.parametrize(
@@ -113,7 +113,6 @@ def test_functions_say_what_they_return_and_raise(name, item):
     [
         "fault_estimation_filter",
         "pd_observer",
-        "pd_delta_scan",
         "ui_pi_observer",
         "design_from_gains",
         "descriptor_kalman",
@@ -144,3 +143,13 @@ def test_functions_of_old_say_what_has_replaced_them():
     assert old(plant, **gains).observer.as_dict().keys() == new.observer.as_dict().keys()
     assert old(plant, **gains).report.passed == new.report.passed
     assert "fault_estimation_filter_from_gains" not in obsynth.__all__
+
+
+def test_types_are_in_a_module_of_their_own_and_names_are_few():
+    assert len(obsynth.__all__) <= 100
+    assert not set(obsynth.__all__) & set(obsynth.types.__all__)
+    assert set(dir(obsynth.types)) == set(obsynth.types.__all__)
+    with pytest.warns(DeprecationWarning, match=r"obsynth\.Simulation is now obsynth\.types\.Simulation"):
+        assert obsynth.Simulation is obsynth.types.Simulation
+    with pytest.raises(AttributeError, match=r"'obsynth\.types' has no attribute 'nonsense'"):
+        _ = obsynth.types.nonsense

@@ -25,7 +25,7 @@ def design() -> ObserverDesign:
 
 
 @cache
-def estimates() -> obsynth.Estimates:
+def estimates() -> obsynth.types.Estimates:
     return design().observer.run(Y, U)
 
 

@@ -147,7 +147,7 @@ def test_summary_and_file_hold_every_signal(shifted, tmp_path: Path) -> None:
         rows = list(csv.DictReader(stream))
     assert list(rows[0]) == [
         "time", "u1", "y1", "y2", "x[level]", "x[flow]", "f[leak]", "f[clog]", "xhat[level]", "xhat[flow]",
-        "std xhat[level]", "std xhat[flow]", "fhat[leak]", "fhat[clog]", "std fhat[leak]", "std fhat[clog]",
+        "sd xhat[level]", "sd xhat[flow]", "fhat[leak]", "fhat[clog]", "sd fhat[leak]", "sd fhat[clog]",
     ]  # fmt: skip
     assert rows[0]["y1"] == ""
     assert float(rows[7]["fhat[clog]"]) == found.estimates.parameters[7, 1]

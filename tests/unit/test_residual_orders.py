@@ -8,6 +8,7 @@ from flint import fmpq_mat
 
 import obsynth
 from obsynth.analysis.diagnosis.exact import question
+from obsynth.analysis.diagnosis.residual_orders import exact_residual_order
 
 
 def least_order(plant: obsynth.DescriptorSystem, removed: tuple[int, ...], fault: int) -> int | None:
@@ -131,3 +132,15 @@ def test_a_residual_that_sees_two_faults_has_the_larger_of_their_orders() -> Non
     )  # fmt: skip
     orders = {one.sees: one.order for one in obsynth.diagnose(plant, suggest=False).bank}
     assert orders == {("a",): 0, ("b",): 2, ("a", "b"): 2}
+
+
+def test_orders_that_follow_by_hand_where_a_fault_acts_at_once_and_later() -> None:
+    """Shifted by hand: ``0 = -z2 - f, z2+ = 0``, and ``0 = z2 - f - w2, z2+ = z2 + z3, z3+ = w2 - w1``."""
+
+    def order(*matrices: list[list[int]]) -> int | None:
+        return exact_residual_order(*(fmpq_mat(matrix) for matrix in matrices))
+
+    column, none = [[0], [0], [1]], [[0]]
+    assert order([[0, 1, 0], [0, 0, 0], [0, 1, 0]], [[0, -1, 0]], column, [[-1]], [[1], [0], [0]], none) == 1
+    known = [[1, -1], [0, 0], [-1, 1]]
+    assert order([[0, 0, 1], [0, 1, 1], [0, 0, 0]], [[0, 1, 0]], [[-1], [0], [0]], [[-1]], known, [[0, -1]]) == 2

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 from collections.abc import Callable
 
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 
 import obsynth
+from obsynth.report.plants import is_unclear
 
 
 def test_a_fault_of_which_elimination_leaves_only_rounding_is_unclear() -> None:
@@ -24,6 +26,15 @@ def test_a_fault_of_which_elimination_leaves_only_rounding_is_unclear() -> None:
     with pytest.raises(obsynth.PreconditionError, match=r"Unclear.*\(D3\)") as caught:
         obsynth.ui_pi_observer(plant)
     assert caught.value.condition == "(D3) fault model at 1"
+    assert caught.value.unclear
+    # The row says so in a field; its words alone say nothing.
+    (row,) = [row for row in obsynth.check(plant)["ui-pi-observer"].failures if row.unclear]
+    assert row.name == "exists: (D3) fault model at 1"
+    assert is_unclear([row])
+    assert not is_unclear([dataclasses.replace(row, unclear=False)])
+    report = obsynth.VerificationReport.of([row, dataclasses.replace(row, name="other", unclear=False)])
+    assert obsynth.VerificationReport.from_dict(report.as_dict()) == report
+    assert [("unclear" in data) for data in report.as_dict()["checks"]] == [True, False]
 
 
 METHODS: dict[str, tuple[float, Callable[[obsynth.DescriptorSystem], obsynth.ObserverDesign]]] = {

@@ -58,7 +58,6 @@ MADE = {
     "wang, quiet": lambda: obsynth.fault_estimation_filter(quiet_plant()),
     "pd, inequality": lambda: obsynth.pd_observer(plant_of("filasova/spec.yaml"), delta=0.1, engine="lmi"),
     "pd, riccati": lambda: obsynth.pd_observer(plant_of("filasova/spec.yaml"), engine="riccati"),
-    "pd, smaller inequality": lambda: obsynth.pd_observer(plant_of("filasova/spec.yaml"), engine="reduced-lmi"),
     "pd, theorem 2": lambda: obsynth.pd_observer(plant_of("filasova/spec.yaml"), theorem=2, delta=0.1),
     "pd, decay": lambda: obsynth.pd_observer(plant_of("filasova/spec.yaml"), delta=0.1, decay=2.0),
     "pd, G": lambda: obsynth.pd_observer(plant_of("filasova/spec.yaml"), delta=0.1, adaptation_gain=FEW),

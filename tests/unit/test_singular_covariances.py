@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -41,18 +43,19 @@ def test_singular_covariances_are_verified(name: str) -> None:
 
 
 @pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("seed", range(24))
-def test_no_stable_plant_is_refused_for_noise_that_is_missing(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    n, ny = int(rng.integers(1, 5)), int(rng.integers(1, 4))
-    A = rng.standard_normal((n, n))
-    A *= rng.uniform(0.1, 0.95) / max(abs(np.linalg.eigvals(A)))
-    if seed % 3 == 0:
-        A[:, 0] = 0.0
-    C = rng.standard_normal((ny, n))
-    root = rng.standard_normal((n, max(n - 1, 1)))
-    for Q, R in ((0.0, 1e-4), (1e-4, 0.0), (root @ root.T, 1e-2), (root @ root.T, 0.0)):
-        assert obsynth.descriptor_kalman(sampled(A, C), Q=Q, R=R).report.passed
+@pytest.mark.parametrize("first", range(4))
+def test_no_stable_plant_is_refused_for_noise_that_is_missing(first: int, share: Callable[..., Any]) -> None:
+    for seed in share(range(first, 24, 4)):
+        rng = np.random.default_rng(seed)
+        n, ny = int(rng.integers(1, 5)), int(rng.integers(1, 4))
+        A = rng.standard_normal((n, n))
+        A *= rng.uniform(0.1, 0.95) / max(abs(np.linalg.eigvals(A)))
+        if seed % 3 == 0:
+            A[:, 0] = 0.0
+        C = rng.standard_normal((ny, n))
+        root = rng.standard_normal((n, max(n - 1, 1)))
+        for Q, R in ((0.0, 1e-4), (1e-4, 0.0), (root @ root.T, 1e-2), (root @ root.T, 0.0)):
+            assert obsynth.descriptor_kalman(sampled(A, C), Q=Q, R=R).report.passed, seed
 
 
 def failed(design: ObserverDesign, **changes) -> set[str]:

@@ -13,12 +13,16 @@ import scipy.sparse as sp
 from scipy.sparse.csgraph import structural_rank
 
 import obsynth
+from obsynth.analysis.diagnosis.decoupled import decouple
 from obsynth.analysis.transformations.elimination import eliminated_by_sparsity
 from obsynth.analysis.transformations.recovery_operator import without_rounding
 from obsynth.methods.designing import check
+from obsynth.methods.pd_observer.conditions import pd_observer_conditions
+from obsynth.methods.ui_pi_observer.conditions import existence_conditions
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE
 from obsynth.numerics.sparse import blocks_of, coarse_structure
 from obsynth.numerics.sparse_factor import SparseFactor, scales_by_all_entries
+from obsynth.plants.fault_models import exosystem
 from obsynth.spec.loader import load_spec
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -435,3 +439,46 @@ def test_a_time_constant_that_is_taken_as_zero_is_told():
         found = eliminated_by_sparsity(plant.replace(E=e.tocsr()))
         assert found.plant.nx == whole.plant.nx - told
         assert any("Taken as algebraic" in note and "'LAG_y TGOV1 1'" in note for note in found.notes) == told
+
+
+def chain_of_parts(seed: int, states: int = 70) -> obsynth.DescriptorSystem:
+    """Return a plant whose parts hardly touch each other, and one way less than the other: its natural units drift."""
+    rng, apart = np.random.default_rng(seed), np.subtract.outer(np.arange(states), np.arange(states))
+    couplings = np.where(apart < 0, 0.55 ** np.abs(apart), 5e-4 ** np.abs(apart))
+    a = couplings * rng.choice([-1.0, 1.0], size=(states, states))
+    np.fill_diagonal(a, -2 - np.arange(states) / states)
+    c, faults = np.eye(states)[np.sort(rng.permutation(states)[:6])], np.eye(states)[:, rng.permutation(states)[:2]]
+    return obsynth.DescriptorSystem(None, a, C=c, Bf=faults)
+
+
+@pytest.mark.parametrize("seed", [0, 4])
+def test_units_that_drift_along_a_plant_hide_no_fault(seed: int) -> None:
+    plant = chain_of_parts(seed)
+    rows = np.block([[plant.A, plant.Bf], [plant.C, plant.Df]])
+    values = np.linalg.svd(rows, compute_uv=False)
+    assert values[-1] > 1e-6 * values[0]
+    assert not [found.name for found in pd_observer_conditions(plant) if not found.holds]
+    courses = exosystem("step", plant.fault_names, plant.dt)
+    assert not [found.name for found in existence_conditions(plant, courses) if not found.holds]
+    assert obsynth.pd_observer(plant).report.passed
+
+
+def test_a_fault_twice_is_refused_in_any_units() -> None:
+    plant = chain_of_parts(0)
+    twice = plant.replace(Bf=plant.Bf[:, [0, 0]])
+    assert [found.name for found in pd_observer_conditions(twice) if not found.holds] == ["rank F"]
+
+
+def test_filters_of_networks_keep_to_their_identities() -> None:
+    """Units by least squares drift apart along a network, and of the reduction only half of the digits were left."""
+    network = random_network(400, 80, 3)
+    plant = obsynth.discretise(obsynth.eliminate_algebraic_states(network.plant()), 0.02).plant
+    found = decouple(plant, without=plant.fault_names[:1])
+    still, moving = np.vstack([plant.E, np.zeros((plant.ny, plant.nx))]), np.vstack([plant.A, plant.C])
+    e, a = np.vstack([found.E, np.zeros_like(found.C)]), np.vstack([found.A, found.C])
+    disturbed = np.hstack([np.vstack([plant.Bd, plant.Dd]), np.vstack([plant.Bf, plant.Df])[:, :1]])
+    for left, right in ((found.rows @ moving, a @ found.states), (found.rows @ disturbed, 0.0)):
+        size = np.abs(found.rows) @ np.abs(moving if left.shape[1] == plant.nx else disturbed)
+        assert np.all(np.abs(left - right) <= 1e-9 * np.max(size, axis=1, keepdims=True))
+    assert np.linalg.cond(found.E) < 1e4
+    np.testing.assert_allclose(found.rows @ still, e @ found.states, atol=1e-9 * np.max(np.abs(found.rows)))

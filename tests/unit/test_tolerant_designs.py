@@ -1,4 +1,4 @@
-"""Designs that know their tolerances: smaller thresholds, the same claims, and what can never be told from a fault."""
+"""Tolerances: what can never be told from a fault, and options of old."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from uncertain_plants import drive
 
 import obsynth
 from obsynth.errors import SpecError
-from obsynth.experiments.tolerant_designs import mean_thresholds
 from obsynth.tolerances.exact_plant import told_from_faults
 
 
@@ -17,29 +16,11 @@ def wang() -> tuple:
     return spec.plant, spec.scenario
 
 
-def test_columns_make_thresholds_smaller_and_keep_the_claims(wang) -> None:
-    plant, scenario = wang
-    quiet = scenario.replace(faults={}, horizon=200)
-    plain = obsynth.fault_estimation_filter(plant)
-    better = obsynth.design(plant, "fault-estimation-filter", scenario=scenario, model_error="columns")
-    # The reference finds 0.220 where 0.471 and 0.354 were, over inputs of its own.
-    assert (mean_thresholds(better, quiet) < 0.6 * mean_thresholds(plain, quiet)).all()
-    assert better.report.passed
-    assert better.plant.nw == plant.nw
-    assert better.options["model_error"] == "columns"
-    assert "noise in the equation of x1" in better.notes[-1]
-    again = obsynth.verify(better)
-    assert again.passed
-
-
-def test_columns_need_tolerances_and_a_scenario(wang) -> None:
-    plant, scenario = wang
-    with pytest.raises(SpecError, match="scenario"):
-        obsynth.fault_estimation_filter(plant, model_error="columns")
-    with pytest.raises(SpecError, match="tolerances"):
-        obsynth.fault_estimation_filter(plant.replace(uncertainty=None), model_error="columns", scenario=scenario)
-    with pytest.raises(SpecError, match="model_error"):
-        obsynth.fault_estimation_filter(plant, model_error="rows")
+def test_columns_are_gone_and_the_message_says_what_to_take(wang) -> None:
+    with pytest.raises(SpecError, match=r"no option 'model_error' any more: .* guaranteed-test"):
+        obsynth.fault_estimation_filter(wang[0], model_error="columns")
+    with pytest.raises(SpecError, match="no option 'delta_scan' any more: a scan is a sweep"):
+        obsynth.pd_observer(wang[0], delta_scan=[0.1])
 
 
 def test_what_acts_where_a_fault_acts_is_never_told_from_it(wang) -> None:

@@ -365,6 +365,5 @@ def test_a_transformation_stands_for_its_plant_everywhere():
     ]  # fmt: skip
     assert [design.recovery.names for design in designs] == [("a", "b", "c")] * 5
     assert obsynth.detection_filter(reduced).fault_sensitivity > 0.0
-    assert len(obsynth.pd_delta_scan(reduced, delta=[0.1, 1.0], decay=0.1).delta) == 2
     with pytest.raises(obsynth.SpecError, match=r"give an obsynth\.DescriptorSystem"):
         obsynth.diagnose("plant.yaml")

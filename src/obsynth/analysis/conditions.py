@@ -13,7 +13,8 @@ from obsynth.plants.descriptor import DescriptorSystem
 
 @dataclass(frozen=True)
 class Condition:
-    """One existence condition: ``value`` against ``bound``, the evidence, the ``mode`` where it fails, a doubt."""
+    """One existence condition: ``value`` against ``bound``, the evidence, the ``mode`` where it fails, a doubt (or that
+    its numbers cannot be computed, ``True``)."""
 
     name: str
     claim: str
@@ -24,7 +25,7 @@ class Condition:
     detail: str = ""
     mode: complex | None = None
     signals: tuple[str, ...] = ()
-    unclear: Unclear | None = None
+    unclear: Unclear | bool | None = None
 
     def require(self) -> None:
         """Raise `PreconditionError` when the condition fails."""
@@ -41,6 +42,7 @@ class Condition:
                 condition=self.name,
                 mode=self.mode,
                 signals=self.signals,
+                unclear=bool(self.unclear),
             )
 
     def in_doubt(self, found: Unclear, plant: DescriptorSystem) -> Condition:
@@ -50,13 +52,13 @@ class Condition:
 
 def is_refused(conditions: Iterable[Condition]) -> bool:
     """Whether a condition fails beyond doubt."""
-    return any(not condition.holds and condition.unclear is None for condition in conditions)
+    return any(not condition.holds and not condition.unclear for condition in conditions)
 
 
 def is_doubted(conditions: Iterable[Condition]) -> bool:
     """Whether conditions fail, and all that do in doubt."""
     failed = [condition for condition in conditions if not condition.holds]
-    return bool(failed) and all(condition.unclear is not None for condition in failed)
+    return bool(failed) and all(condition.unclear for condition in failed)
 
 
 def require_all(conditions: Iterable[Condition]) -> None:

@@ -119,14 +119,14 @@ def analyse_structure(plant: DescriptorSystem | Transformation) -> Structure:
 #: A sampled plant with an eigenvalue this far from zero grows so fast that it is hardly one.
 _FAR = 3.0
 #: Larger plants are not asked: their eigenvalues would take too long for a question.
-_MOST_STATES = 200
+_MOST_STATES_FOR_QUESTIONS = 200
 #: Signals that a question lists.
-_MOST_NAMES = 5
+_MOST_QUESTIONED = 5
 
 
 def questions(plant: DescriptorSystem) -> tuple[str, ...]:
     """Return what to ask about a linear plant: half an operating point, or matrices of another time than ``dt``."""
-    return (*_half_a_point(plant), *(_other_time(plant) if plant.nx <= _MOST_STATES else ()))
+    return (*_half_a_point(plant), *(_other_time(plant) if plant.nx <= _MOST_STATES_FOR_QUESTIONS else ()))
 
 
 def _half_a_point(plant: DescriptorSystem) -> tuple[str, ...]:
@@ -135,10 +135,10 @@ def _half_a_point(plant: DescriptorSystem) -> tuple[str, ...]:
     missing = [name for name in measured if name not in point]
     if not missing or not any(point.values()):
         return ()
-    listed = ", ".join(missing[:_MOST_NAMES])
-    more = f" and {len(missing) - _MOST_NAMES} more" if len(missing) > _MOST_NAMES else ""
+    listed = ", ".join(missing[:_MOST_QUESTIONED])
+    more = f" and {len(missing) - _MOST_QUESTIONED} more" if len(missing) > _MOST_QUESTIONED else ""
     return (
-        f"operating_point has {', '.join(list(point)[:_MOST_NAMES])}, but not {listed}{more}: what a log holds of "
+        f"operating_point has {', '.join(list(point)[:_MOST_QUESTIONED])}, but not {listed}{more}: what a log holds of "
         f"these is taken as a deviation. Give their values at that point as well{_rest(plant, missing)}.",
     )
 
@@ -146,7 +146,7 @@ def _half_a_point(plant: DescriptorSystem) -> tuple[str, ...]:
 def _rest(plant: DescriptorSystem, missing: Sequence[str]) -> str:
     """Return in words where the missing outputs are at rest, if the equations hold for absolute values."""
     names = [name for name in missing if name in plant.output_names]
-    if not names or plant.nx > _MOST_STATES:
+    if not names or plant.nx > _MOST_STATES_FOR_QUESTIONS:
         return ""
     plain, point = plant.dense(), plant.operating_point
     known = np.array([point.get(name, 0.0) for name in plant.input_names])
@@ -158,7 +158,7 @@ def _rest(plant: DescriptorSystem, missing: Sequence[str]) -> str:
         return ""
     values = plain.C @ state + plain.D @ known + plain.Dd @ unknown
     found = dict(zip(plant.output_names, values, strict=True))
-    told = ", ".join(f"{name} {found[name]:.5g}" for name in names[:_MOST_NAMES])
+    told = ", ".join(f"{name} {found[name]:.5g}" for name in names[:_MOST_QUESTIONED])
     return f" (if the equations hold for absolute values, the plant rests there at {told})"
 
 

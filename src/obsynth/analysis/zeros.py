@@ -275,6 +275,10 @@ def _frozen(vector: NDArray[Any]) -> ComplexArray:
     return copy
 
 
+#: At most this many signals are named in a failed condition.
+MOST_NAMES = 4
+
+
 def leading_names(shares: FloatArray, names: Sequence[str], *, most: int | None = None) -> tuple[str, ...]:
     """Return the names whose share ``(n,)`` is not small beside the largest: the ``most`` largest, in given order."""
     sizes = np.abs(shares)

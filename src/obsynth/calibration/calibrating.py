@@ -14,17 +14,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from obsynth.calibration.diagnostics import wrong_samples
+from obsynth.calibration.diagnostics import STANDS_OUT, BoolArray, standing_out, wrong_samples
 from obsynth.calibration.innovations_fit import InnovationsFit, Timing, chosen_timing, innovations_fit
-from obsynth.calibration.logs import Log, LogData, read_log, refused
+from obsynth.calibration.logs import TOLD_ROWS, Log, LogData, read_log, refused
+from obsynth.calibration.noise_proposals import proposed_states
+from obsynth.calibration.noise_states import NoiseStates, PlantWithNoise, asked_states, with_states
 from obsynth.calibration.plants import CalibrationPlant, NonlinearPlant
 from obsynth.calibration.problem import Problem, calibration_problem, require_variation
 from obsynth.calibration.reporting import IntegrationError, integration_error, reported
 from obsynth.calibration.result import Calibration
 from obsynth.calibration.simulation_error import FIRST_ROWS, Fit, SimulationError, simulation_fits, with_seen_start
-from obsynth.errors import SpecError
+from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.arguments import chosen, is_whole, whole_number
-from obsynth.numerics.arrays import SMALLEST, FloatArray
+from obsynth.numerics.arrays import SMALLEST, FloatArray, read_only
 from obsynth.numerics.ranks import rounding_rank
 from obsynth.plants.dae.functions import BUTCHER
 from obsynth.plants.dae.model import DAEModel
@@ -41,7 +43,9 @@ SIZED_SAMPLES = 50
 LEAST_EFFECT = 1e-6
 #: What the matrices of varying and of invariant plants are called here; G and L are of constant effects.
 VARYING = {"E": "E", "A": "A", "B": "B", "C": "C", "Phi": "G", "Psi": "L"}
-INVARIANT = {"E": "E", "A": "A", "B": "B", "C": "C", "D": "D", "Bf": "G", "Df": "L"}
+INVARIANT = {"E": "E", "A": "A", "B": "B", "C": "C", "D": "D"}
+#: Constant effects of an invariant plant: its faults, then its unknown inputs.
+EFFECTS = {"G": ("Bf", "Bd"), "L": ("Df", "Dd")}
 
 Known = Mapping[str, Any]
 
@@ -103,12 +107,18 @@ class LinearPlant(CalibrationPlant):
                 key: _with_entries(getattr(plant, name), entries.get(name, ()), uncertainty)
                 for name, key in INVARIANT.items()
             }
-            values, effects = {name: item.nominal for name, item in constants.items()}, plant.fault_names
+            for key, both in EFFECTS.items():
+                self.matrices[key] = _beside(
+                    *(_with_entries(getattr(plant, name), entries.get(name, ()), uncertainty) for name in both)
+                )
+            values = {name: item.nominal for name, item in constants.items()}
+            effects = (*plant.fault_names, *(_own_name(name, plant.fault_names) for name in plant.disturbance_names))
             self.continuous = not plant.is_discrete
         self.state_names = self.equation_names = plant.state_names
         self.nx, self.nu, self.ny = len(plant.state_names), plant.nu, plant.ny
         self.effects = tuple(effects)
         self.unstated = frozenset(self.effects)
+        self.unknown_inputs = self.effects[len(self.effects) - len(getattr(plant, "disturbance_names", ())) :]
         self.values = {**values, **dict.fromkeys(self.effects, 0.0)}
         self.units = {**{name: item.unit or "1" for name, item in constants.items()}, **plant.units}
         if unknown := getattr(plant, "disturbance_names", ()):
@@ -309,6 +319,19 @@ def _with_entries(matrix: FloatArray, entries: Sequence[tuple[int, int, str]], u
     return _Matrix((matrix.shape[0], matrix.shape[1]), symbolic)
 
 
+def _beside(one: _Matrix, two: _Matrix) -> _Matrix:
+    """Return two matrices with as many rows side by side."""
+    import casadi as ca
+
+    shape = (one.shape[0], one.shape[1] + two.shape[1])
+    return _Matrix(shape, lambda known, _: ca.horzcat(one.symbolic(known, None), two.symbolic(known, None)))
+
+
+def _own_name(name: str, taken: Sequence[str]) -> str:
+    """Return the name of an unknown input, which a fault may have too."""
+    return f"unknown input {name}" if name in taken else name
+
+
 def plant_as_written(given: Any) -> Any:
     """Return the plant whose matrices hold the constants: that before elimination and sampling, if there were any."""
     plant = getattr(given, "source", given)
@@ -324,6 +347,10 @@ def plant_as_written(given: Any) -> Any:
     return made[0]
 
 
+#: How often samples that stand out are left out: each time the others are known better.
+OUTLIER_ROUNDS = 3
+#: What is said of an offset without which the model follows nothing.
+OFFSET_TAKEN = "Without an offset of the sensor {} the model does not follow the log: a state stands for it."
 METHODS = ("innovations", "simulation")
 INTEGRATIONS = ("auto", "backward-euler", "radau")
 #: Two sample times are the same within this share.
@@ -352,6 +379,9 @@ def calibrate(
     level: float = 0.95,
     starts: int = 3,
     seed: int = 0,
+    sensor_noise: Mapping[str, Any] | None = None,
+    offset: Mapping[str, Any] | Sequence[str] | None = None,
+    walks: Mapping[str, Any] | Sequence[str] | None = None,
     progress: Callable[[str], object] | None = None,
 ) -> Calibration:
     r"""Fit constants and noise covariances of a plant to a log of rows without faults.
@@ -415,6 +445,15 @@ def calibrate(
         Fits of simulations, from the nominal constants and from random ones.
     seed : int, optional
         Of those.
+    sensor_noise : mapping, optional
+        ``{y: {"correlation": seconds or "unknown"}}``: outputs whose noise is coloured, as in `with_noise`; white
+        noise is found beside it.  ``{}`` says that all noise is white.  By default coloured noise is taken where the
+        innovations ask for it and the likelihood says so, which is told.
+    offset : mapping or list of str, optional
+        Outputs with an offset that is not known; ``{}`` says that there is none.  By default as for ``sensor_noise``.
+    walks : mapping or list of str, optional
+        Unknown inputs, faults and parameters that walk at random; inputs of a nonlinear plant that no log holds.
+        Unknown inputs of linear plants by default as for ``sensor_noise``.
     progress : callable, optional
         Called with the name of each stage.
 
@@ -448,7 +487,7 @@ def calibrate(
     if input_delay != "auto" and not is_whole(input_delay):
         raise SpecError(f"input_delay is {input_delay!r}: give whole rows, or 'auto'.", path="input_delay")
     note = progress or (lambda text: None)
-    model = require_plant(model)
+    model = _loads_as_parameters(require_plant(model), walks)
     factors = dict(getattr(model, "scales", {})) | dict(scales or {})
     whole = read_log(
         log,
@@ -463,52 +502,179 @@ def calibrate(
     whole = whole.without(wrong_samples(whole.y))
     whole = whole.shifted(input_delay) if isinstance(input_delay, int) else whole
     plant = NonlinearPlant(model) if isinstance(model, DAEModel) else LinearPlant(model, whole)
-    problem = calibration_problem(
-        plant,
-        whole,
-        unknown=unknown,
-        priors=priors,
-        noisy=noisy,
-        Q=Q,
-        R=R,
-        initial_state=initial_state,
-        initial_covariance=initial_covariance,
-        substeps=substeps,
-        integration=plant.integration(integration),
-    )
+    asked = asked_states(sensor_noise, offset, walks, model.output_names)
+
+    def problem_with(states: NoiseStates, log: Log) -> Problem:
+        extended = with_states(plant, states, log)
+        return calibration_problem(
+            extended,
+            log,
+            unknown=unknown,
+            priors=priors,
+            noisy=_noisy(extended, noisy),
+            Q=Q,
+            R=R,
+            initial_state=_by_name(initial_state, plant.state_names),
+            initial_covariance=_by_name(initial_covariance, plant.state_names),
+            substeps=substeps,
+            integration=plant.integration(integration),
+        )
+
+    problem = problem_with(asked, whole)
     require_variation(problem)
-    fits = simulation_fits(problem, starts, seed, note)
-    if initial_covariance is None and (seen := with_seen_start(problem, fits[0])) is not problem:
-        problem, fits = seen, simulation_fits(seen, 1, seed, note, start=fits[0].t)
-    error = None
-    if integration == "auto" and isinstance(plant, NonlinearPlant):
-        error = _step_error(problem, plant, fits[0])
-        if error is not None and error.matters:
-            note("integrating by Radau")
-            problem = problem.integrated("radau", substeps)
-            fits = simulation_fits(problem, starts, seed, note)
+    fitting = _Fitting(
+        plant, starts, seed, level, note, integration == "auto", initial_covariance is None, method == "innovations"
+    )
     timing = Timing(input_delay if isinstance(input_delay, int) else 0, {})
-    if method == "innovations" and input_delay == "auto" and model.input_names:
-        problem, fits, timing = chosen_timing(problem, fits, seed, note)
-    fit = None
-    if method == "innovations":
-        before = problem, error
-        problem, fit, error = _innovations(problem, fits, level, note, error)
-        if initial_covariance is None and fit is not None:
-            seen = with_seen_start(before[0], fits[0], first=fit.whitened[:FIRST_ROWS])
-            if seen is not before[0]:
-                fits = simulation_fits(seen, 1, seed, note, start=fits[0].t)
-                problem, fit, error = _innovations(seen, fits, level, note, before[1])
-    return reported(problem, fits[0], fit, level=level, timing=timing, error=error, digest=digest)
+    search = method == "innovations" and input_delay == "auto" and bool(model.input_names)
+    offsets: tuple[str, ...] = ()
+    try:
+        found = fitting.fitted(problem, timing, search=search)
+    except PreconditionError as error:
+        # An offset as large as what a sensor does looks like a model that explains nothing.
+        if offset is not None or method != "innovations" or error.condition != "explains-nothing":
+            raise
+        offsets = tuple(model.output_names)
+        asked = replace(asked, offsets=offsets)
+        try:
+            found = fitting.fitted(problem_with(asked, whole), timing, search=search)
+        except PreconditionError:
+            raise error from None
+        found = replace(found, problem=found.problem.with_notes(*map(OFFSET_TAKEN.format, offsets)))
+    found = fitting.without_outliers(found)
+    open_kinds = tuple(
+        kind for kind, given in (("coloured", sensor_noise), ("offset", offset), ("walk", walks)) if given is None
+    )
+    if found.fit is not None and open_kinds:
+        states, told = proposed_states(
+            found.problem, found.fit, asked, open_kinds, lambda states: problem_with(states, found.problem.log), note
+        )
+        if told:
+            told = [*map(OFFSET_TAKEN.format, offsets), *told]
+            found = fitting.fitted(problem_with(states, found.problem.log), found.timing, search=False)
+            found = replace(found, problem=found.problem.with_notes(*told))
+    return reported(
+        found.problem, found.fits[0], found.fit, level=level, timing=found.timing, error=found.error, digest=digest
+    )
+
+
+def _loads_as_parameters(model: Any, walks: Mapping[str, Any] | Sequence[str] | None) -> Any:
+    """Return a nonlinear plant whose inputs that walk are parameters: no log holds them."""
+    if not isinstance(model, DAEModel) or not (loads := [name for name in walks or () if name in model.inputs]):
+        return model
+    inputs = {name: value for name, value in model.inputs.items() if name not in loads}
+    return model.replace(inputs=inputs, parameters={**model.parameters, **{name: model.inputs[name] for name in loads}})
+
+
+def _noisy(plant: CalibrationPlant, asked: Sequence[str] | None) -> Sequence[str] | None:
+    """Return the noisy equations: those asked for, and those of further states that noise drives."""
+    if not isinstance(plant, PlantWithNoise):
+        return asked
+    own = plant.inner.equation_names if asked is None else tuple(asked)
+    return (*own, *plant.noisy)
+
+
+def _by_name(value: Any, names: Sequence[str]) -> Any:
+    """Return what is said of the plant's own states by their names, where it is an array: others may follow."""
+    if value is None or isinstance(value, Mapping) or np.ndim(value) == 0:
+        return value
+    array = np.asarray(value, dtype=np.float64)
+    if array.shape == (len(names),):
+        return dict(zip(names, array.tolist(), strict=True))
+    if array.shape == (len(names), len(names)) and not np.any(array - np.diag(np.diag(array))):
+        return dict(zip(names, np.diag(array).tolist(), strict=True))
+    return value
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """A problem as it was fitted at last, with its fits, its timing, and what backward Euler errs."""
+
+    problem: Problem
+    fits: list[Fit]
+    fit: InnovationsFit | None
+    timing: Timing
+    error: IntegrationError | None
+
+
+@dataclass(frozen=True, eq=False)
+class _Fitting:
+    """How a problem is fitted: simulations first, steps that are exact enough, timing, then the innovations."""
+
+    plant: CalibrationPlant
+    starts: int
+    seed: int
+    level: float
+    note: Callable[[str], object]
+    choose_steps: bool
+    widen_start: bool
+    innovations: bool
+
+    def fitted(self, problem: Problem, timing: Timing, *, search: bool) -> _Found:
+        """Return the fit of a problem; the timing is searched for where asked."""
+        fits = simulation_fits(problem, self.starts, self.seed, self.note)
+        if self.widen_start and (seen := with_seen_start(problem, fits[0])) is not problem:
+            problem, fits = seen, simulation_fits(seen, 1, self.seed, self.note, start=fits[0].t)
+        error = None
+        if self.choose_steps and isinstance(self.plant, NonlinearPlant):
+            error = _step_error(problem, self.plant, fits[0])
+            if error is not None and error.matters:
+                self.note("integrating by Radau")
+                problem = problem.integrated("radau", problem.substeps)
+                fits = simulation_fits(problem, self.starts, self.seed, self.note)
+        if search:
+            problem, fits, timing = chosen_timing(problem, fits, self.seed, self.note, any_start=self.widen_start)
+        fit = None
+        if self.innovations:
+            before = problem, error
+            problem, fit, error = _innovations(problem, fits, self.level, self.note, error)
+            if self.widen_start and fit is not None:
+                seen = with_seen_start(before[0], fits[0], first=fit.whitened[:FIRST_ROWS])
+                if seen is not before[0]:
+                    fits = simulation_fits(seen, 1, self.seed, self.note, start=fits[0].t)
+                    problem, fit, error = _innovations(seen, fits, self.level, self.note, before[1])
+        return _Found(problem, fits, fit, timing, error)
+
+    def without_outliers(self, found: _Found) -> _Found:
+        """Return the fit again without single samples that stand out: they would make R a multiple of what it is."""
+        for _ in range(OUTLIER_ROUNDS):
+            if found.fit is None:
+                break
+            problem = found.problem
+            wrong = standing_out(np.where(np.isfinite(problem.y), found.fit.whitened, np.nan))
+            if not wrong.any():
+                break
+            self.note("without samples that stand out")
+            names, log = problem.output_names, problem.log
+            told = [
+                f"Samples of {name} stand out by more than {STANDS_OUT:g} deviations ({_rows(log, wrong[:, i])}): they "
+                "count as not measured."
+                for i, name in enumerate(names)
+                if wrong[:, i].any()
+            ]
+            kept = replace(log, y=read_only(np.where(wrong, np.nan, problem.y)), notes=(*log.notes, *told))
+            found = self.refitted(replace(found, problem=problem.with_log(kept)))
+        return found
+
+    def refitted(self, found: _Found) -> _Found:
+        """Return the innovations fitted again, from the constants that were found."""
+        problem = found.problem
+        fits = simulation_fits(problem, 1, self.seed, self.note, start=None if found.fit is None else found.fit.t)
+        problem, fit, error = _innovations(problem, fits, self.level, self.note, found.error)
+        return _Found(problem, fits, fit, found.timing, error)
+
+
+def _rows(log: Log, wrong: BoolArray) -> str:
+    rows = log.rows[0] + np.flatnonzero(wrong)
+    return f"row {', '.join(map(str, rows[:TOLD_ROWS]))}{', ...' if len(rows) > TOLD_ROWS else ''}"
 
 
 def _step_error(problem: Problem, plant: NonlinearPlant, fit: Fit) -> IntegrationError | None:
     """Return what backward Euler errs along the best simulation."""
-    states, theta = (
-        SimulationError(problem).states(fit),
-        np.array(plant.theta(problem.unknown, fit.t), dtype=np.float64),
-    )
-    return integration_error(plant.promoted(problem.unknown), states, problem.u, theta, fit.deviations, problem.log.dt)
+    names, own = problem.names, len(plant.state_names)
+    states = SimulationError(problem).states(fit)[:, :own]
+    theta = np.array(plant.theta(names, fit.t), dtype=np.float64)
+    return integration_error(plant.promoted(names), states, problem.u, theta, fit.deviations, problem.log.dt)
 
 
 def _innovations(

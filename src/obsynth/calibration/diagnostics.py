@@ -32,6 +32,11 @@ CHANGE_MARGIN, LEAST_ROWS = 5, 20
 MEAN_LIMIT = 4.0
 #: A whitened innovation of this size stands out.
 STANDS_OUT = 6.0
+#: The standard deviation of a normal distribution over its median of absolute values; the largest share of samples that
+#: are wrong, of a sensor that is right.
+NORMAL_OF_MEDIAN, MOST_OUTLIERS = 1.4826, 0.03
+#: The least usual size, in deviations: values that rest on a quantum have a median of zero.
+LEAST_USUAL = 0.3
 #: A value is no measurement if it is further from the median than this multiple of what 90 % of the others are, alone
 #: or in pairs, between values that are not; what 90 % are counts as this share of the median at least.
 FAR_OFF, OTHERS, LEAST_SPREAD, LONGEST_SPIKE = 100.0, 0.9, 1e-3, 2
@@ -128,6 +133,25 @@ def wrong_samples(y: FloatArray) -> BoolArray:
         for begin, end in zip(edges[::2], edges[1::2], strict=True):
             if spread > 0.0 and begin > 0 and end < len(column) and end - begin <= LONGEST_SPIKE:
                 found[begin:end, i] = True
+    return found
+
+
+def standing_out(whitened: FloatArray) -> BoolArray:
+    """Return single whitened innovations ``(n, ny)`` that stand out of what most of their sensor are, as truth values.
+
+    Those whose neighbours stand out too are no wrong samples, but something that happened.
+    """
+    found = np.zeros(whitened.shape, dtype=bool)
+    for i, column in enumerate(whitened.T):
+        seen = np.isfinite(column)
+        if seen.sum() < LEAST_ROWS:
+            continue
+        usual = max(NORMAL_OF_MEDIAN * float(np.median(np.abs(column[seen]))), LEAST_USUAL)
+        far = seen & (np.abs(column) > STANDS_OUT * usual)
+        beside = np.concatenate([[False], far[:-1]]) | np.concatenate([far[1:], [False]])
+        found[:, i] = far & ~beside
+        if found[:, i].sum() > MOST_OUTLIERS * seen.sum():
+            found[:, i] = False
     return found
 
 

@@ -88,6 +88,14 @@ def _together(innovations: FloatArray, regressors: FloatArray) -> tuple[float, F
     return 0.5 * len(y) * float(np.log(whole / left)) - 0.5 * count * float(np.log(len(y))), coefficients
 
 
+def regression_gain(column: FloatArray, others: Sequence[FloatArray], regressor: FloatArray) -> float:
+    """Return what a regressor ``(n,)`` of innovations ``(n,)`` gains beside others, in nats."""
+    seen = np.isfinite(column) & np.isfinite(regressor)
+    y, x = column[seen], np.column_stack([*others, regressor])[seen]
+    left = [float(np.sum((y - part @ np.linalg.lstsq(part, y, rcond=None)[0]) ** 2)) for part in (x[:, :-1], x)]
+    return 0.5 * len(y) * float(np.log(left[0] / left[1])) if left[1] > 0.0 else 0.0
+
+
 def whitened(innovations: FloatArray) -> FloatArray:
     """Return innovations ``(n, ny)`` less what each column keeps of its sample before: a change of mean stays one."""
     found = np.array(innovations)

@@ -11,9 +11,11 @@ from numpy.typing import NDArray
 from obsynth.calibration.intervals import Information, Side, information, profile_box, quantile, upper_limit
 from obsynth.calibration.likelihood import IMPOSSIBLE
 from obsynth.calibration.maximum import Maximum, Objective, at_bounds, collapsed, greatest_likelihood, without_collapse
+from obsynth.calibration.noise_states import PlantWithNoise
 from obsynth.calibration.problem import Problem
-from obsynth.calibration.simulation_error import Fit, simulation_fits
+from obsynth.calibration.simulation_error import UNKNOWN_START, Fit, simulation_fits
 from obsynth.numerics.arrays import FloatArray
+from obsynth.plants.noise_model import WHITE_SHARE
 
 BoolArray = NDArray[np.bool_]
 #: Nats by which another timing of the inputs must be better to be taken: a likelihood ratio of about 150.
@@ -55,15 +57,16 @@ class InnovationsFit:
 
 
 def chosen_timing(
-    problem: Problem, fits: list[Fit], seed: int, note: Callable[[str], object]
+    problem: Problem, fits: list[Fit], seed: int, note: Callable[[str], object], *, any_start: bool = False
 ) -> tuple[Problem, list[Fit], Timing]:
-    """Return the problem with the inputs as the likelihood wants them."""
-    objective = Objective(problem, fits[0])
+    """Return the problem with the inputs as the likelihood wants them; a start that nobody stated must not decide."""
+    compared = problem.with_start(UNKNOWN_START**2 * problem.P0) if any_start else problem
+    objective = Objective(compared, fits[0])
     value, z = objective.descent(objective.start(fits[0].t))
     values = {0: value}
     for delay in TRIED_DELAYS:
         note(f"inputs {delay:+d} row")
-        moved = Objective(problem.with_log(problem.log.shifted(delay)), fits[0])
+        moved = Objective(compared.with_log(problem.log.shifted(delay)), fits[0])
         values[delay] = moved.descent(z)[0]
     best = min(values.values())
     delay = 1 if values[0] - values[1] > TIMING_NATS and values[1] == best else 0
@@ -104,7 +107,7 @@ def moved_by(exact: Problem, start: Fit, maximum: Maximum, avoided: FloatArray, 
     value, z = objective.descent(maximum.z)
     if value >= IMPOSSIBLE:
         return 0.0
-    moves = np.abs(objective.constants(z) - objective.constants(maximum.z))
+    moves = np.abs(objective.constants(z) - objective.constants(maximum.z))[: len(exact.names)]
     return float(np.max(moves / np.sqrt(np.diag(said.covariance)), initial=0.0))
 
 
@@ -119,7 +122,7 @@ def innovations_fit(
     if moved > TOLERATED_MOVE:
         return None, moved
     variances = int((objective.is_q | objective.is_r).sum())
-    root = quantile(level, objective.nt, problem.log.samples, variances)
+    root = quantile(level, len(problem.names), problem.log.samples, variances)
     note("boxes by profile likelihood")
     sides = profile_box(objective, maximum, root, found)
     # Variances are kept from zero for the sake of the boxes; where the log tells them from it, it says them itself.
@@ -127,6 +130,8 @@ def innovations_fit(
     limited, limits = _limits(objective, maximum)
     Q, R = np.where(limited[: len(Q)], limits[: len(Q)], Q), np.where(limited[len(Q) :], limits[len(Q) :], R)
     whitened, e, spread = objective.likelihood.innovations(objective.full(maximum.z))
+    coloured = [len(Q) + j in _beside(problem) for j in range(len(R))]
+    R = np.where(coloured, np.maximum(R, WHITE_SHARE**2 * np.mean(e**2, axis=0)), R)
     bounds = at_bounds(maximum.z, objective.low, objective.high)[: objective.nt]
     return InnovationsFit(
         objective.constants(maximum.z),
@@ -144,6 +149,15 @@ def innovations_fit(
     ), moved
 
 
+def _beside(problem: Problem) -> list[int]:
+    """Return places of variances, of equations and then of sensors, that stand beside a plant's own."""
+    if not isinstance(problem.plant, PlantWithNoise):
+        return []
+    equations = [i for i, name in enumerate(problem.noisy) if name in problem.plant.added]
+    coloured = problem.plant.states.correlations
+    return equations + [len(problem.noisy) + j for j, name in enumerate(problem.output_names) if name in coloured]
+
+
 def _limits(objective: Objective, maximum: Maximum) -> tuple[BoolArray, FloatArray]:
     """Return which variances, of equations and then of sensors, are told by an upper limit, and the limits."""
     free = np.flatnonzero(objective.is_q | objective.is_r)
@@ -151,8 +165,10 @@ def _limits(objective: Objective, maximum: Maximum) -> tuple[BoolArray, FloatArr
     limited = np.zeros(len(objective.free) - objective.nt, dtype=bool)
     limits = np.zeros(len(limited))
     weak = (objective.avoided > 0.0) | collapsed(objective, maximum)
+    # Where coloured noise and walks are of no size there are none, and white noise beside coloured noise needs none.
+    beside = _beside(objective.problem)
     for i, place in zip(free, places, strict=True):
-        if weak[i]:
+        if weak[i] and place not in beside:
             limit = upper_limit(objective, maximum, int(i))
             limited[place] = maximum.likeliest[i] - limit < np.log(ZERO_SHARE)
             limits[place] = np.exp(limit)

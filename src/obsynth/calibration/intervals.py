@@ -54,7 +54,8 @@ def information(
     hessian: FloatArray, objective: Objective, z: FloatArray, *, apart: NDArray[np.bool_] | None = None
 ) -> Information:
     """Return what the log says of the constants, the variances integrated out but for those that are held ``apart``."""
-    nt, widths = objective.nt, objective.problem.widths
+    names = objective.problem.names
+    nt, widths = len(names), objective.problem.widths[: len(names)]
     held = at_bounds(z, objective.low, objective.high)
     held = held if apart is None else held | apart
     nuisance = [i for i in range(nt, len(z)) if not held[i]]
@@ -64,7 +65,7 @@ def information(
         kept = values > LEAST_INFORMATION * max(float(values.max()), SMALLEST)
         across = hessian[:nt, nuisance] @ vectors[:, kept]
         found = found - (across / values[kept]) @ across.T
-    return covariance_of(found, widths, objective.problem.unknown)
+    return covariance_of(found, widths, names)
 
 
 def covariance_of(found: FloatArray, widths: FloatArray, names: tuple[str, ...]) -> Information:
@@ -107,8 +108,8 @@ class Side:
 def profile_box(objective: Objective, maximum: Maximum, root: float, said: Information) -> list[tuple[Side, Side]]:
     """Return both ends of each constant's box, in its own units."""
     found, problem = [], objective.problem
-    names = problem.unknown
-    for i, width in enumerate(problem.widths):
+    names = problem.names
+    for i, width in enumerate(problem.widths[: len(names)]):
         weak = objective.bent or any(names[i] in direction for direction in said.undetermined)
         side = _side_along_valley if weak else _side
         sides = [side(objective, maximum, i, sign, root) for sign in (-1.0, 1.0)]

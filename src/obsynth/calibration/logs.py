@@ -37,6 +37,10 @@ LogData: TypeAlias = "str | Path | pd.DataFrame | Mapping[str, Any] | Log"
 #: Stamps further off the grid than this share of a step are refused, and further than the second are told.
 LARGEST_JITTER = 0.2
 NOTED_JITTER = 0.02
+#: The same of stamps and the grid itself, where two of them are off each other by more.
+LARGEST_OFFSET = 0.25
+#: So many rows in a row whose stamps do not rise are no slip of a clock.
+MOST_STALE = 10
 #: What counts as one quantum between values of a column: all differences are whole multiples within this.
 QUANTUM_SLACK = 0.02
 #: Share of distinct values above which a column shows no quantum that limits its noise: a ramp has none twice.
@@ -220,7 +224,13 @@ def _on_grid(
     rows: tuple[int, int],
     source: str,
 ) -> Log:
-    """Return the log on its grid; missing rows become rows without outputs whose inputs are those that follow."""
+    """Return the log on its grid; missing rows become rows without outputs whose inputs are those that follow.
+    Rows whose stamps do not rise are left out, and inputs that are missing are held."""
+    notes = []
+    stale = np.isfinite(time) & (time <= np.maximum.accumulate(np.concatenate([[-np.inf], time[:-1]])))
+    if stale.any() and not _longest(stale) > MOST_STALE:
+        notes.append(f"{int(stale.sum())} row(s) are left out, as their stamps do not rise.")
+        time, u, y = time[~stale], u[~stale], y[~stale]
     if not np.isfinite(time).all() or (np.diff(time) <= 0).any():
         wrong = ~np.isfinite(time) if not np.isfinite(time).all() else np.diff(time, prepend=-np.inf) <= 0
         bad = int(np.argmax(wrong))
@@ -233,8 +243,13 @@ def _on_grid(
     step = float(np.median(gaps)) if dt is None and gaps.size else float(dt or 1.0)
     counts = np.round(gaps / step).astype(np.int64)
     jitter = np.abs(gaps / step - counts)
-    notes = []
-    if jitter.max(initial=0.0) > LARGEST_JITTER or (counts < 1).any():
+    irregular = jitter.max(initial=0.0) > LARGEST_JITTER
+    if irregular and (counts >= 1).all():
+        # Two stamps that are off the grid may be off each other by twice as much: against the grid itself.
+        away = time - time[0] - step * np.concatenate([[0], np.cumsum(counts)])
+        jitter = np.abs(away - np.median(away))[1:] / step
+        irregular = jitter.max() > LARGEST_OFFSET
+    if irregular or (counts < 1).any():
         worst = int(np.argmax(jitter))
         raise bad_log(
             "irregular",
@@ -245,14 +260,14 @@ def _on_grid(
     if jitter.max(initial=0.0) > NOTED_JITTER:
         notes.append(f"The stamps jitter by {jitter.max():.1%} of a step.")
     for name, column in zip(inputs, u.T, strict=True):
-        if not np.isfinite(column).all():
-            row = rows[0] + int(np.argmax(~np.isfinite(column)))
-            raise bad_log(
-                "nan",
-                f"The input {name!r} is not finite in row {row}: inputs must be known. Fill the gap, "
-                "or take other rows.",
-                path=f"log.{name}",
-            )
+        known = np.isfinite(column)
+        if not known.any():
+            raise bad_log("nan", f"The input {name!r} is nowhere finite in these rows.", path=f"log.{name}")
+        if not known.all():
+            notes.append(f"{int((~known).sum())} value(s) of {name} are missing: the ones before are held.")
+            places = np.maximum.accumulate(np.where(known, np.arange(len(column)), np.argmax(known)))
+            u = u.copy()
+            u[:, inputs.index(name)] = column[places]
     for name, column in zip(outputs, y.T, strict=True):
         if np.isinf(column).any() or not np.isfinite(column).any():
             what = "infinite" if np.isinf(column).any() else "nowhere finite"
@@ -266,6 +281,12 @@ def _on_grid(
         wide[places] = y
         y, time = wide, time[0] + step * whole
     return Log(read_only(time), read_only(u), read_only(y), step, inputs, outputs, rows, source, tuple(notes))
+
+
+def _longest(true: NDArray[np.bool_]) -> int:
+    """Return the length of the longest run of true values."""
+    ends = np.flatnonzero(np.diff(np.concatenate([[0], true.astype(np.int64), [0]])))
+    return int((ends[1::2] - ends[::2]).max(initial=0))
 
 
 def quantum(column: FloatArray) -> float:

@@ -20,6 +20,8 @@ BoolArray = NDArray[np.bool_]
 NOISE_STARTS = ((0.0, 0.0), (3.0, -2.0), (-5.0, 0.0), (0.0, -4.0))
 #: Logarithms by which variances may leave their first guess.
 LOWEST_VARIANCE, HIGHEST_VARIANCE = -16.0, 12.0
+#: How often these are widened, where a variance stops there and the likelihood would have it go on.
+MOST_WIDENINGS = 4
 #: First guess of the process noise: what it moves a state by in a sample, in sizes of the states.
 FIRST_PROCESS_NOISE = 1e-3
 #: Scales of the search: constants in widths of their bounds, logarithms of variances.
@@ -102,6 +104,16 @@ class Objective:
         gradient[: self.nt] *= p.widths
         value += 0.5 * float(p.prior_weights @ away**2) - 0.5 * float(self.avoided @ z)
         return value, gradient[self.free] - 0.5 * self.avoided
+
+    def widened(self, z: FloatArray) -> bool:
+        """Widen the search of variances that stop at a bound of it and would go on; whether there are any."""
+        slope, room = self(z)[1], AT_BOUND * (1.0 + np.abs(z))
+        # A sensor's variance ends at its floor, which is what its resolution says.
+        down = self.is_q & (z - self.low <= room) & (slope > COLLAPSE_NATS)
+        up = (self.is_q | self.is_r) & (self.high - z <= room) & (slope < -COLLAPSE_NATS)
+        self.low = np.where(down, self.low + LOWEST_VARIANCE, self.low)
+        self.high = np.where(up, self.high + HIGHEST_VARIANCE, self.high)
+        return bool((down | up).any())
 
     def descent(self, start: FloatArray) -> tuple[float, FloatArray]:
         """Return a minimum within the bounds near a start, and where it is."""
@@ -193,6 +205,10 @@ def greatest_likelihood(objective: Objective, fits: Sequence[Fit], note: Callabl
             "The filter has no finite likelihood from any start: check units, bounds and the initial covariance.",
             signals=list(objective.problem.unknown),
         )
+    for _ in range(MOST_WIDENINGS):
+        if not objective.widened(best):
+            break
+        value, best = objective.descent(best)
     value, best, curvature = polished(objective, best)
     return Maximum(best, value, curvature, best)
 

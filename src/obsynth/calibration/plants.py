@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -34,6 +35,8 @@ class CalibrationPlant(ABC):
     nominal_signals: FloatArray  # ``(ns,)``
     notes: tuple[str, ...] = ()  # sentences of every verdict
     has_levels: bool = True  # whether signals are values, and no deviations from an operating point
+    unknown_inputs: tuple[str, ...] = ()  # of which nothing is known, among ``values``
+    bounds: Mapping[str, tuple[float, float]] = MappingProxyType({})  # of what is sought beside constants, by name
 
     @abstractmethod
     def integration(self, asked: str) -> str:

@@ -56,6 +56,11 @@ class Problem:
         return self.log.y
 
     @property
+    def names(self) -> tuple[str, ...]:
+        """The constants that were asked for; what is sought beside them stands last."""
+        return self.unknown[: len(self.unknown) - len(self.plant.bounds)]
+
+    @property
     def widths(self) -> FloatArray:
         """Width of the bounds of each unknown ``(nt,)``."""
         return self.high - self.low
@@ -80,6 +85,10 @@ class Problem:
     def with_start(self, P0: FloatArray, *notes: str) -> Problem:
         """Return the same problem with another covariance of the initial state, and what is said of that."""
         return Problem(**{**vars(self), "P0": P0, "notes": notes})
+
+    def with_notes(self, *notes: str) -> Problem:
+        """Return the same problem with more that is said of it."""
+        return Problem(**{**vars(self), "notes": (*self.notes, *notes)})
 
     def with_log(self, log: Log) -> Problem:
         """Return the same problem with another log of the same signals."""
@@ -106,6 +115,7 @@ def calibration_problem(
         raise bad_log("too-short", f"The log has {log.samples} row(s): a calibration needs more.")
     if not isinstance(unknown, Mapping):
         raise SpecError("unknown must be a mapping from names to [low, high], such as {k: [0.5, 2]}.", path="unknown")
+    unknown = {**unknown, **plant.bounds}
     names = tuple(unknown)
     for name in names:
         index_of(name, list(plant.values), what="unknown")

@@ -23,14 +23,16 @@ from obsynth.calibration.diagnostics import (
 from obsynth.calibration.innovations_fit import InnovationsFit, Timing
 from obsynth.calibration.intervals import Side, covariance_of, quantile
 from obsynth.calibration.logs import EVEN, TOLD_ROWS
+from obsynth.calibration.noise_states import PlantWithNoise, correlation_name
 from obsynth.calibration.problem import Problem
 from obsynth.calibration.result import CalibratedBox, Calibration
 from obsynth.calibration.simulation_error import Fit, SimulationError, unexplained
 from obsynth.errors import SolverError
 from obsynth.numerics.arrays import FloatArray, read_only
-from obsynth.plants.dae.functions import DAEFunctions
+from obsynth.plants.dae.functions import BUTCHER, DAEFunctions
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.dae.step import ImplicitStep
+from obsynth.plants.noise_model import noise_state, noise_variance, offset_state
 
 #: A step whose error in an output exceeds this share of the sensor's deviation is not exact enough.
 TOLERATED = 0.25
@@ -83,6 +85,8 @@ CORRELATED = 0.9
 AT_QUANTISATION = 1.5
 #: A timing that is better by this many nats is told, even where it is not taken.
 NOTED_NATS = 2.0
+#: A variance of a sensor above this share of what its signal has stands for the signal.
+SIGNAL_SHARE = 0.1
 #: A constant within this share of the bounds' width from one of them is at it.
 END_SHARE = 1e-6
 
@@ -99,7 +103,7 @@ def reported(
 ) -> Calibration:
     """Return the calibration of a fit of innovations, or of a simulation where there is none."""
     found = fit if fit is not None else _of_simulation(problem, start, level)
-    names, seen = problem.unknown, np.isfinite(problem.y)
+    names, seen = problem.names, np.isfinite(problem.y)
     covariance = found.information.covariance
     deviations = np.sqrt(np.diag(covariance))
     correlation = covariance / np.outer(deviations, deviations)
@@ -107,14 +111,14 @@ def reported(
     colours = {name: whiteness(column) for name, column in zip(problem.output_names, whitened.T, strict=True)}
     change = change_of_mean(whitened)
     nis = consistency(float((found.whitened[seen] ** 2).sum()), int(seen.sum()))
-    sides = dict(zip(names, found.sides, strict=True))
+    sides = dict(zip(names, found.sides[: len(names)], strict=True))
     open_sides = tuple(
         (name, side)
         for name, pair in sides.items()
         for side, end in zip(("low", "high"), pair, strict=True)
         if end.is_open
     )
-    nominal = {name: float(value) for name, value in zip(names, found.t, strict=True)}
+    nominal = {name: float(value) for name, value in zip(names, found.t[: len(names)], strict=True)}
     box = CalibratedBox(
         nominal,
         {name: min(pair[0].value, nominal[name]) for name, pair in sides.items()},
@@ -122,6 +126,7 @@ def reported(
         open_sides,
         level,
         digest,
+        stands=all(colour.probability >= SIGNIFICANT for colour in colours.values()),
     )
     Q = {name: float(value) for name, value in zip(problem.noisy, found.Q, strict=True)} if fit is not None else {}
     R = {name: float(value) for name, value in zip(problem.output_names, found.R, strict=True)}
@@ -133,13 +138,13 @@ def reported(
         if weak
     ]
     row = None if change is None else problem.log.rows[0] + change
-    at_end = tuple(name for name, there in zip(names, found.at_bounds, strict=True) if there)
+    at_end = tuple(name for name, there in zip(problem.unknown, found.at_bounds, strict=True) if there)
     verdict = [
         *problem.log.notes,
         *problem.plant.notes,
         *problem.notes,
         *_fitted(problem, box, found, at_end, correlation, limited, Q, R),
-        *_misfits(problem, start, whitened),
+        *_misfits(problem, start, whitened, R),
         *_checked(nis, colours, row, fit is None),
         *_told(problem, R, timing, error),
     ]
@@ -170,7 +175,30 @@ def reported(
         problem.log.described | {"digest": digest},
         {name: problem.plant.units.get(name, "1") for name in names},
         problem.output_names,
+        *_noise_model(problem, found, Q, R),
+        dict(zip(problem.plant.state_names, np.diag(problem.P0).tolist(), strict=True)),
+        getattr(problem.plant, "inner", problem.plant).equation_names,
     )
+
+
+def _noise_model(
+    problem: Problem, found: InnovationsFit, Q: dict[str, float], R: dict[str, float]
+) -> tuple[dict[str, dict[str, float]], dict[str, float], dict[str, float]]:
+    """Return coloured noise, deviations of offsets, and walks, in the terms of `with_noise`."""
+    if not isinstance(problem.plant, PlantWithNoise) or not Q:
+        return {}, {}, {}
+    states, dt = problem.plant.states, problem.log.dt
+    t = dict(zip(problem.unknown, found.t.tolist(), strict=True))
+    sensors = {}
+    for name, value in states.correlations.items():
+        time = float(np.exp(t[correlation_name(name)])) if value is None else value
+        variance = noise_variance(Q[noise_state(name)], time, dt, problem.integration)
+        sensors[name] = {"deviation": variance**0.5, "correlation": time, "white": R[name] ** 0.5}
+    spread = dict(zip(problem.plant.state_names, np.sqrt(np.diag(problem.P0)).tolist(), strict=True))
+    offsets = {name: spread[offset_state(name)] for name in states.offsets}
+    # Continuous plants: what is added to the rate of a load during a step, as a walk over one second.
+    step = dt**0.5 if problem.integration in BUTCHER else 1.0
+    return sensors, offsets, {name: step * Q[name] ** 0.5 for name in states.loads}
 
 
 def _of_simulation(problem: Problem, start: Fit, level: float) -> InnovationsFit:
@@ -179,13 +207,15 @@ def _of_simulation(problem: Problem, start: Fit, level: float) -> InnovationsFit
     nt, scale = error.nt, error.scale
     inner = start.information
     found = inner[:nt, :nt] - inner[:nt, nt:] @ np.linalg.solve(inner[nt:, nt:], inner[nt:, :nt])
-    information = covariance_of(found, problem.widths, problem.unknown)
+    kept = slice(None, len(problem.names))
+    found = np.linalg.inv(np.linalg.inv(found)[kept, kept]) if problem.plant.bounds else found
+    information = covariance_of(found, problem.widths[kept], problem.names)
     y = error.simulated(np.concatenate([start.t, start.x0]) / scale)[0]
     e = np.where(np.isfinite(problem.y), problem.y - y, 0.0)
-    root = quantile(level, nt, problem.log.samples, len(problem.output_names))
+    root = quantile(level, len(problem.names), problem.log.samples, len(problem.output_names))
     spread = root * np.sqrt(np.diag(information.covariance))
     sides = []
-    for t, half, low, high in zip(start.t, spread, problem.low, problem.high, strict=True):
+    for t, half, low, high in zip(start.t[kept], spread, problem.low[kept], problem.high[kept], strict=True):
         sides.append((Side(max(t - half, low), t - half <= low), Side(min(t + half, high), t + half >= high)))
     ends = (start.t - problem.low < END_SHARE * problem.widths) | (problem.high - start.t < END_SHARE * problem.widths)
     variances = np.tile(start.deviations**2, (len(y), 1))
@@ -230,7 +260,7 @@ def _fitted(
     found += [f"{name} is at a bound: widen it if the constant may lie beyond." for name in at_end]
     free = [
         i
-        for i, name in enumerate(problem.unknown)
+        for i, name in enumerate(problem.names)
         if not any(name in direction for direction in fit.information.undetermined)
     ]
     found += [
@@ -240,19 +270,28 @@ def _fitted(
         if abs(correlation[i, j]) > CORRELATED
     ]
     values = {**Q, **R}
+    if not box.stands:
+        found.append(
+            f"The box does not stand: its {100 * box.level:g} % are those of white innovations, which these are not."
+        )
     return found + [
         f"The variance of {name} cannot be told from zero: its upper limit {values[name]:.3g} is used."
         for name in limited
     ]
 
 
-def _misfits(problem: Problem, start: Fit, whitened: FloatArray) -> list[str]:
+def _misfits(problem: Problem, start: Fit, whitened: FloatArray, R: dict[str, float]) -> list[str]:
     """Return sentences about sensors that the model does not follow, their mean, and single samples that stand out."""
     found = []
     for name in unexplained(problem, start.deviations):
+        signal = float(np.nanvar(problem.y[:, problem.output_names.index(name)]))
         found.append(
-            f"The best simulation leaves nearly all of what {name} does: its sign, its unit or its equation "
-            "is another, and its R stands for the signal itself."
+            f"The best simulation leaves nearly all of what {name} does: "
+            + (
+                "its sign, its unit or its equation is another, and its R stands for the signal itself."
+                if R[name] > SIGNAL_SHARE * signal
+                else "noise of the equations moves it, more than the inputs do."
+            )
         )
     for name, column in zip(problem.output_names, whitened.T, strict=True):
         mean = mean_off(column)

@@ -6,7 +6,7 @@ A box of constants that a log allows, with its level: what tolerances take.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
@@ -38,6 +38,8 @@ class CalibratedBox:
         SHA-256 of the log that was used.
     source : str
         ``"calibrated"``.
+    stands : bool
+        Whether the innovations are white: else the level is not that of the box, which a verdict says.
     """
 
     nominal: Mapping[str, float]
@@ -47,10 +49,11 @@ class CalibratedBox:
     level: float
     digest: str
     source: str = "calibrated"
+    stands: bool = True
 
     def __post_init__(self) -> None:
-        for field in ("nominal", "low", "high"):
-            object.__setattr__(self, field, MappingProxyType(dict(getattr(self, field))))
+        for name in ("nominal", "low", "high"):
+            object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
 
     def holds(self, values: Mapping[str, float]) -> bool:
         """Return whether given values of all constants are inside.
@@ -91,6 +94,7 @@ class CalibratedBox:
             "level": self.level,
             "digest": self.digest,
             "source": self.source,
+            "stands": self.stands,
         }
 
 
@@ -149,6 +153,13 @@ class Calibration:
         By constant, where the model says one.
     output_names : tuple of str
         The sensors.
+    sensor_noise, offset, walks : mapping
+        The noise model as `with_noise` takes it: what was stated and what the innovations asked for, with the numbers
+        that were found; empty where all noise is white.
+    initial_covariance : mapping of str to float
+        Variances of the first states that were used.
+    own_equations : tuple of str
+        The equations of the plant as written: without those of noise, offsets and walks.
     """
 
     nominal: Mapping[str, float]
@@ -177,6 +188,11 @@ class Calibration:
     log: Mapping[str, Any]
     units: Mapping[str, str]
     output_names: tuple[str, ...]
+    sensor_noise: Mapping[str, Any] = field(default_factory=dict)
+    offset: Mapping[str, float] = field(default_factory=dict)
+    walks: Mapping[str, float] = field(default_factory=dict)
+    initial_covariance: Mapping[str, float] = field(default_factory=dict)
+    own_equations: tuple[str, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -192,7 +208,7 @@ class Calibration:
         rows = f"rows {self.log['rows'][0]}:{self.log['rows'][1]}"
         lines = [
             f"Calibration of {len(self.nominal)} constants from {self.log['source'] or 'a log'}, {rows} ("
-            f"{100 * self.box.level:g} % box, all at once)"
+            f"{100 * self.box.level:g} % box, all at once{'' if self.box.stands else '; it DOES NOT STAND'})"
         ]
         if not self.nominal:
             lines = [f"Calibration of the noise from {self.log['source'] or 'a log'}, {rows}"]
@@ -212,6 +228,13 @@ class Calibration:
         if self.Q:
             lines.append("  Q per step: " + ", ".join(told[name] for name in self.Q))
         lines.append("  R: " + ", ".join(told[name] for name in self.R))
+        for name, noise in self.sensor_noise.items():
+            lines.append(
+                f"  coloured noise of {name}: deviation {noise['deviation']:.3g}, correlation "
+                f"{noise['correlation']:.3g} s"
+            )
+        lines += [f"  offset of {name}: unknown" for name in self.offset]
+        lines += [f"  walk of {name}: {step:.3g} per root of a second" for name, step in self.walks.items()]
         lines.append(
             f"  NIS per degree of freedom {self.nis.value:.2f} (95 %: {self.nis.low:.2f} to {self.nis.high:.2f})"
         )
@@ -230,6 +253,11 @@ class Calibration:
                 for name, value in self.nominal.items()
             },
             "level": self.box.level,
+            "stands": self.box.stands,
+            "sensor_noise": {name: dict(item) for name, item in self.sensor_noise.items()},
+            "offset": dict(self.offset),
+            "walks": dict(self.walks),
+            "initial_covariance": dict(self.initial_covariance),
             "covariance": self.covariance.tolist(),
             "correlation": self.correlation.tolist(),
             "undetermined": [dict(direction) for direction in self.undetermined],

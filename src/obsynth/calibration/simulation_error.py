@@ -30,6 +30,8 @@ UNEXPLAINED = 0.9
 UNEXPLAINED_AT_REST = 5.0
 #: A signal moves if its deviation is this many times its roughness from sample to sample.
 MOVING = 3.0
+#: A simulated output that moves by less than this share of what its sensor does is moved by no input.
+UNMOVED = 1e-9
 #: Without inputs, outputs that move by more than this multiple of what the states' sizes make are of other units.
 OUTSIZED = 10.0
 #: A sensor that the best fit does not explain, and whose level is so many times another, is in other units.
@@ -152,8 +154,10 @@ def simulation_fits(
             signals=list(problem.unknown),
         )
     fits.sort(key=lambda fit: fit.cost)
-    _require_explained(problem, fits[0].deviations)
-    _require_levels(problem, fits[0], error)
+    simulated = error.simulated(np.concatenate([fits[0].t, fits[0].x0]) / error.scale)[0]
+    judged = _judged(problem, simulated)
+    _require_explained(problem, fits[0].deviations, judged)
+    _require_levels(problem, fits[0], simulated, judged)
     return fits
 
 
@@ -193,11 +197,21 @@ def _shares(problem: Problem, left: FloatArray) -> tuple[FloatArray, BoolArray]:
     return left / np.maximum(deviations, SMALLEST), moves
 
 
-def _require_explained(problem: Problem, left: FloatArray) -> None:
+def _judged(problem: Problem, simulated: FloatArray) -> BoolArray:
+    """Return of which sensors a simulation without noise must say something ``(ny,)``: those that inputs move, and only
+    where no input is unknown."""
+    if problem.plant.unknown_inputs:
+        return np.zeros(len(problem.output_names), dtype=bool)
+    moved = np.std(simulated, axis=0) > UNMOVED * np.nanstd(problem.y, axis=0)
+    return np.asarray(moved | problem.plant.has_levels)
+
+
+def _require_explained(problem: Problem, left: FloatArray, judged: BoolArray) -> None:
     """Refuse a model whose best fit leaves as much as there was: its units, scales or sample time are wrong."""
     deviations = np.nanstd(problem.y, axis=0)
     share, moves = _shares(problem, left)
-    bad = np.where(moves, share > UNEXPLAINED, share > UNEXPLAINED_AT_REST)
+    bad = judged & np.where(moves, share > UNEXPLAINED, share > UNEXPLAINED_AT_REST)
+    moves = moves & judged
     if bad.any() and (bad[moves].all() if moves.any() else True) and not _moved_by_noise(problem, deviations):
         names = [name for name, wrong in zip(problem.output_names, bad, strict=True) if wrong]
         told = ", ".join(f"{name}: {100 * part:.3g} %" for name, part in zip(problem.output_names, share, strict=True))
@@ -210,16 +224,16 @@ def _require_explained(problem: Problem, left: FloatArray) -> None:
         )
 
 
-def _require_levels(problem: Problem, fit: Fit, error: SimulationError) -> None:
+def _require_levels(problem: Problem, fit: Fit, simulated: FloatArray, judged: BoolArray) -> None:
     """Refuse a single sensor in other units: the best fit leaves nearly all of it, on another level altogether."""
-    simulated, y = error.simulated(np.concatenate([fit.t, fit.x0]) / error.scale)[0], problem.y
+    y = problem.y
     if not problem.plant.has_levels:
         # Deviations from an operating point have no level, but a size.
         simulated, y = simulated - simulated.mean(axis=0), y - np.nanmean(y, axis=0)
     levels = np.sqrt(np.nanmean(simulated**2, axis=0)) / np.maximum(np.sqrt(np.nanmean(y**2, axis=0)), SMALLEST)
     far = (levels > OTHER_LEVEL) | (levels < 1.0 / OTHER_LEVEL)
     far &= fit.deviations > UNEXPLAINED * np.nanstd(y, axis=0)
-    far &= problem.plant.has_levels | _shares(problem, fit.deviations)[1]
+    far &= judged & (problem.plant.has_levels | _shares(problem, fit.deviations)[1])
     if far.any():
         names = [name for name, wrong in zip(problem.output_names, far, strict=True) if wrong]
         told = ", ".join(

@@ -227,7 +227,7 @@ def validate(
         raise SpecError(
             f"The log has {found.samples} rows here: at least {LEAST_ROWS} are needed.", path="rows", code="too-short"
         )
-    found = found.without(wrong_samples(found.y))
+    found = found.shifted(design.input_delay).without(wrong_samples(found.y))
     record = recorded_innovations(design, found)
     sensors = _sensors(record, plant.output_names)
     whole = consistency(record.squares, record.degrees)

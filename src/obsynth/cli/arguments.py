@@ -9,6 +9,8 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from obsynth.errors import SpecError
+
 #: Probability of a false alarm in the whole run, where none is given.
 FALSE_ALARMS = 0.01
 
@@ -91,6 +93,11 @@ def read_settings(
             given += [f"--{name}"] if value.casefold() in ("true", "yes", "1") else []
         else:
             given.append(f"--{name}={value}")
+    # Once more without defaults: what is left was stated.
+    bare = _settings_parser(prog, settings_of(arguments))
+    for action in bare._actions:
+        action.default = argparse.SUPPRESS
+    options.stated = frozenset(vars(bare.parse_known_args([*given, *rest])[0]))
     return parser.parse_known_args([*given, *rest], namespace=options)[1]
 
 
@@ -159,6 +166,21 @@ def count(text: str) -> int:
     return value
 
 
+#: Settings with a default, which count as given only where they were stated.
+_WITH_DEFAULTS = ("false_alarms", "window", "change", "confidence", "state_every")
+
+
+def refuse_given(options: argparse.Namespace, names: Iterable[str], meant: str) -> None:
+    """Refuse arguments that would do nothing; ``meant`` says what they are for."""
+    for name in names:
+        if name in ("verb", "settings", "stated"):
+            continue
+        default = name in _WITH_DEFAULTS and name not in getattr(options, "stated", ())
+        if not default and getattr(options, name, None) not in (None, False, []):
+            flag = f"--{name.replace('_', '-')}"
+            raise SpecError(f"{flag} is for {meant}. Leave it out.", path=flag)
+
+
 def columns_of(options: argparse.Namespace) -> dict[str, str]:
     """Return the columns of signals, and of the time, that the command line names."""
     named = dict(options.map)
@@ -170,6 +192,13 @@ def delay(text: str) -> int | str:
     return text if text == "auto" else int(text)
 
 
+INPUT_DELAY = option(
+    "--input-delay",
+    "ROWS",
+    "rows of the log by which inputs act later than the design takes them (default: what the spec says by inputs.hold; "
+    "calibrate: or 'auto')",
+    type=delay,
+)
 SYSTEM = option("--system", "FILE", "the spec (YAML)", type=Path, required=True)
 GAINS = option("--gains", "FILE", "a gain set (JSON) that design wrote", type=Path, required=True)
 SPEC_GAINS = option("--gains", "FILE", "a gain set for the spec's plant: nothing is designed", type=Path)
@@ -179,7 +208,7 @@ UNVERIFIED = Settings(
 JSON = flag("--json", "print JSON on stdout, for programs; errors too")
 FORCE = flag("--force", "replace an existing file whatever it is; never an input")
 QUIET = flag("--quiet", "print no progress")
-JOBS = option("--jobs", "N", "processes (default: 1)", type=count, default=1)
+JOBS = option("--jobs", "N", "processes (default: 1)", type=count)
 CLUSTER = option("--cluster", "ADDRESS", "of the scheduler of a Dask cluster, instead of --jobs")
 MAP = option("--map", "SIGNAL=COLUMN", "column of a signal (or of time) where the names differ; may be repeated")
 _SCALE = option(
@@ -189,10 +218,9 @@ SCALE = Settings((_SCALE,))
 TIME_COLUMN = option("--time-column", "COLUMN", "column of the time, in seconds or as dates (ISO 8601); default: time")
 #: How a log without faults is read.
 LOG_OPTIONS = (
-    option("--rows", "A:B", "rows of the log without faults, as Python counts (default: all)"),
     MAP,
     SCALE,
-    Settings((TIME_COLUMN,)),
+    Settings((option("--rows", "A:B", "rows of the log without faults, as Python counts (default: all)"), TIME_COLUMN)),
 )
 #: What a monitor is made of.
 MONITOR = Group("monitor", (option("--monitor", "KIND", "watch the residual (or the parameters) by a threshold"),))
@@ -232,6 +260,7 @@ DATA_OPTIONS = (
     Settings(
         (
             TIME_COLUMN,
+            INPUT_DELAY,
             option(
                 "--normal",
                 "FILE",

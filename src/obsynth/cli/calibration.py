@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from obsynth.cli.arguments import columns_of, pair
-from obsynth.cli.data_run import numbers_of
+from obsynth.cli.arguments import columns_of, pair, refuse_given
+from obsynth.cli.data_run import numbers_of, with_input_delay
 from obsynth.cli.output import answer, gains_to_hand_on, output_file, progress
 from obsynth.errors import SpecError, VerificationError
 from obsynth.files.inputs import protect
@@ -41,7 +43,9 @@ def run_linearise(options: argparse.Namespace) -> int:
     from obsynth.spec.loader import load_model
 
     model, spec = load_model(options.system)
-    if options.data is not None:
+    if options.data is None:
+        refuse_given(options, ("rows", "map", "scale", "time_column"), "a log: give --data")
+    else:
         protect(options.data)
     target = None if options.out is None else output_file(options.out, PLANT, options)
     free: Any = [name for name in options.free if "=" not in name]
@@ -95,6 +99,7 @@ def run_calibrate(options: argparse.Namespace) -> int:
     from obsynth.results.calibration_files import KIND, calibration_text
     from obsynth.results.gain_sets import plain
     from obsynth.spec.loader import load_plant
+    from obsynth.spec.writing import calibrated_spec
 
     with progress(quiet=options.quiet) as report_stage:
         report_stage(f"reading {options.system}")
@@ -105,6 +110,7 @@ def run_calibrate(options: argparse.Namespace) -> int:
             raise SpecError("There is no log: give --data, or calibrate.log in the spec.", path="calibrate.log")
         protect(log)
         target = None if options.out is None else output_file(options.out, CALIBRATION, options)
+        written = None if options.write_spec is None else _spec_file(options)
         found = calibrate(plant, log, progress=report_stage, **asked)
         if digest is not None and digest != found.box.digest:
             raise SpecError(
@@ -115,8 +121,24 @@ def run_calibrate(options: argparse.Namespace) -> int:
     data = {"kind": KIND, "system": options.system.name, **found.to_dict()}
     if target is not None:
         write_atomically(target, calibration_text({**data, "asked": plain(told)}))
+    if written is not None:
+        beside = target if target is not None and target.parent == written.parent else None
+        write_atomically(written, calibrated_spec(options.system, found, calibration=beside))
     answer(options, {"file": target, **data}, f"{found}\n  digest of the log: {found.box.digest}")
     return 0
+
+
+def _spec_file(options: argparse.Namespace) -> Path:
+    """Return where the calibrated spec is written: beside the one that was read, whose files it names too."""
+    from obsynth.spec.writing import CALIBRATED_SPEC
+
+    target = output_file(options.write_spec, CALIBRATED_SPEC, options)
+    if target.resolve().parent != options.system.resolve().parent:
+        raise SpecError(
+            f"{target} is in another folder than {options.system}, whose files it names: write it beside that.",
+            path="write-spec",
+        )
+    return target
 
 
 def _asked(spec: Spec | None, options: argparse.Namespace) -> dict[str, Any]:
@@ -132,6 +154,8 @@ def _asked(spec: Spec | None, options: argparse.Namespace) -> dict[str, Any]:
             for name in ("dt", "initial_state", "initial_covariance"):
                 if method.get(name) is not None:
                     asked[name] = method[name]
+        for name, value in (spec.noise or {}).items():
+            asked[name] = value if name != "sensor_noise" else _coloured(value)
         asked |= dict(spec.calibrate or {})
         if asked["log"] is not None:
             asked["log"] = spec.path.parent / asked["log"]
@@ -139,10 +163,18 @@ def _asked(spec: Spec | None, options: argparse.Namespace) -> dict[str, Any]:
         asked["log"] = options.data
     asked |= _log_arguments(options)
     asked["unknown"] = dict(asked.get("unknown", {})) | {name: _range(name, text) for name, text in options.unknown}
+    late = None if spec is None or spec.inputs is None else spec.input_delay(spec.model or spec.plant)
+    if late is not None:
+        asked["input_delay"] = late
     for name in ("input_delay", "level"):
         if getattr(options, name) is not None:
             asked[name] = getattr(options, name)
     return asked
+
+
+def _coloured(noise: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Return the coloured noise that a spec states; none where all that it states is white."""
+    return {name: item for name, item in noise.items() if isinstance(item, dict)} or None
 
 
 def run_validate(options: argparse.Namespace) -> int:
@@ -153,6 +185,6 @@ def run_validate(options: argparse.Namespace) -> int:
     protect(options.data)
     with progress(quiet=options.quiet) as report_stage:
         report_stage(f"running {options.gains} over {options.data}")
-        found = validate(design, options.data, **_log_arguments(options))
+        found = validate(with_input_delay(design, options), options.data, **_log_arguments(options))
     answer(options, {"gains": options.gains, "data": options.data, **found.to_dict()}, str(found))
     return 0 if found.passed else VerificationError.exit_code

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from obsynth.cli.arguments import refuse_given
 from obsynth.cli.output import answer, gains_to_hand_on, output_file, print_json, progress, stdout_console
 from obsynth.errors import PreconditionError, SolverError, SpecError, VerificationError
 from obsynth.files.outputs import write_atomically
@@ -66,14 +67,6 @@ def _print_design(design: ObserverDesign, file: Path, *, verbose: bool) -> None:
         design_report(design, console=console)
         console.print()
     print_summary(summary(design, file=file, everything=verbose), console=console)
-    if "delta_scan" in design.solver:
-        from obsynth.report.designs import delta_scan_table
-        from obsynth.results.delta_scan import DeltaScan
-        from obsynth.results.layout import print_section
-
-        console.print()
-        scan = DeltaScan.from_dict(design.solver["delta_scan"])
-        print_section(console, "Other values of delta", delta_scan_table(scan))
     if not verbose and not design.report.passed:
         console.print(checks_table(design.report.failures, width=console.width))
 
@@ -105,7 +98,9 @@ def designed(spec: Spec, report_stage: Any) -> ObserverDesign:
         **dict(spec.options),
     )
     noted = () if spec.transformation is None else spec.transformation.notes
-    return found.replace(notes=(*noted, *found.notes)) if noted else found
+    found = found.replace(notes=(*noted, *found.notes)) if noted else found
+    late = spec.input_delay(spec.plant)
+    return found.replace(input_delay=late) if late else found
 
 
 def designed_or_loaded(
@@ -147,6 +142,8 @@ def run_check(options: argparse.Namespace) -> int:
     from obsynth.plants.descriptor import DescriptorSystem
     from obsynth.report.plants import is_unclear
 
+    if not isinstance(spec.plant, DescriptorSystem):
+        refuse_given(options, ("whole_bank",), "linear plants with constant matrices")
     # A pencil, its eigenvalues and its index are those of one matrix pair: a plant that changes with k has none.
     structures, diagnosis, not_known = {}, None, ""
     if isinstance(spec.plant, DescriptorSystem):
@@ -190,7 +187,7 @@ def run_check(options: argparse.Namespace) -> int:
         },
         told,
     )
-    # What double precision cannot decide is no impossibility: nothing is known.
+    # What double precision cannot decide is no impossibility: it is inconclusive.
     undecided = any(is_unclear(report.failures) for report in own)
     return 0 if passed else SolverError.exit_code if undecided else PreconditionError.exit_code
 
@@ -217,51 +214,73 @@ def _structure_as_dict(structure: Structure) -> dict[str, Any]:
     return facts
 
 
-def _kind_of(path: Path) -> str:
-    """Return what kind of certificate a file begins like: ``alarm``, ``calibration``, or else a gain set."""
-    from obsynth.experiments.alarm_proof import CERTIFICATE
-    from obsynth.results.calibration_files import KIND
+def run_sensors(options: argparse.Namespace) -> int:
+    """Run ``sensors``: spec in, least sets of sensors to add out; 3 where nothing reaches the goal."""
+    from obsynth.analysis.transformations.recovery import linear_plant
+    from obsynth.comparison.sensor_sets import sensor_sets
+    from obsynth.spec import load_spec
 
-    if not path.is_file():  # who reads it says so
-        return "gain set"
-    try:
-        with path.open("rb") as stream:
-            start = stream.read(200)
-    except OSError:
-        return "gain set"
-    return "alarm" if CERTIFICATE.mark in start else "calibration" if KIND.encode() in start else "gain set"
+    with progress(quiet=options.quiet) as report_stage:
+        spec = load_spec(options.system)
+        plant = linear_plant(spec.plant)
+        given: dict[str, Any] = {"goal": options.goal, "noise": options.noise, "largest": options.largest}
+        if options.goal == "threshold":
+            own = dict(spec.options) if spec.method == "guaranteed-test" else {}
+            fault = options.fault or own.pop("fault", None)
+            if fault is None and plant.nf == 1:
+                fault = plant.fault_names[0]
+            own = {name: value for name, value in own.items() if name != "fault"}
+            given |= {"fault": fault, "below": options.below, "sample_time": options.sample_time, "test": own}
+        else:
+            refuse_given(options, ("below", "sample_time"), "--goal threshold")
+            given |= {"faults": None if options.fault is None else [options.fault]}
+        found = sensor_sets(plant, progress=report_stage, **given)
+    answer(options, {"spec": spec.path, **found.to_dict()}, lambda: stdout_console().print(str(found), highlight=False))
+    return 0
 
 
 def run_verify(options: argparse.Namespace) -> int:
     """Run ``verify``: recheck any certificate, without a solver, to the end of what it rests on."""
-    kind = _kind_of(options.gains)
-    _require_fitting(options, kind)
-    if kind == "gain set":
+    from obsynth.experiments.alarm_proof import KIND as ALARM
+    from obsynth.experiments.certificates import kind_of_file, verify_certificate
+    from obsynth.results.calibration_files import KIND as CALIBRATION
+    from obsynth.results.calibration_files import verify_calibration
+    from obsynth.results.certificate_files import RESULTS
+
+    # A pipe would keep us waiting; who reads a gain set says what is wrong with it.
+    found = kind_of_file(options.gains) if options.gains.is_file() else ""
+    kind = {ALARM: "alarm", CALIBRATION: "calibration"}.get(found, found.removeprefix("obsynth "))
+    if found not in (ALARM, CALIBRATION, *RESULTS):
+        _require_fitting(options, "gain set")
         return _verify_gain_set(options)
+    _require_fitting(options, kind)
     from obsynth.results.layout import print_checks
 
-    if kind == "alarm":
-        from obsynth.experiments.alarm_proof import design_of_alarm, verify_alarm
-
-        report = verify_alarm(options.gains, data=options.data)
-        if options.calibration is not None and report.passed:
-            report = _with_calibration(report, design_of_alarm(options.gains), options.calibration)
-    else:
-        from obsynth.results.calibration_files import verify_calibration
-
+    if found == CALIBRATION:
         report = verify_calibration(options.gains, None if options.data is None else _calibrated_again(options))
+    else:
+        report = verify_certificate(options.gains, data=options.data)
+    if options.calibration is not None and report.passed:
+        from obsynth.experiments.certificates import designs_inside
+
+        for design in designs_inside(options.gains):
+            report = _with_calibration(report, design, options.calibration)
+    told = next((row.claim for row in report.checks if row.name == "statement"), "")
     answer(
         options,
-        {"file": str(options.gains), "kind": kind, "passed": report.passed, "report": report.as_dict()},
+        {
+            "file": str(options.gains), "kind": kind, "passed": report.passed, "statement": told,
+            "report": report.as_dict(),
+        },
         lambda: print_checks(report.checks, console=stdout_console()),
-    )
+    )  # fmt: skip
     return 0 if report.passed else VerificationError.exit_code
 
 
 def _require_fitting(options: argparse.Namespace, kind: str) -> None:
     """Refuse options that do nothing for a kind of certificate."""
-    meant = {"data": ("alarm", "calibration"), "calibration": ("gain set", "alarm"), "system": ("calibration",),
-             "printed_digits": ("gain set",)}  # fmt: skip
+    meant = {"data": ("alarm", "comparison", "calibration"), "calibration": ("gain set", "alarm", "robustness"),
+             "system": ("calibration",), "printed_digits": ("gain set",)}  # fmt: skip
     for name, kinds in meant.items():
         if getattr(options, name) is not None and kind not in kinds:
             option = f"--{name.replace('_', '-')}"

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
+from obsynth.cli.arguments import refuse_given
 from obsynth.cli.data_run import (
     STREAM,
     alarm_of_run,
@@ -34,13 +35,19 @@ def run_run(options: argparse.Namespace) -> int:
     if options.gains.is_dir():
         from obsynth.cli.sweep import run_many
 
+        if options.input_delay is not None:
+            raise SpecError(
+                "--input-delay is for one gain set: state inputs.hold in the specs of a folder.", path="--input-delay"
+            )
         return run_many(options)
-    for name, given in (("--jobs", options.jobs != 1), ("--cluster", options.cluster is not None)):
+    for name, given in (("--jobs", options.jobs is not None), ("--cluster", options.cluster is not None)):
         if given:
             raise SpecError(
                 f"{name} spreads the gain sets of a folder: {options.gains} is one gain set. Leave {name} out.",
                 path=name,
             )
+    if options.state is None:
+        refuse_given(options, ("state_every",), "the file of --state")
     if options.json and options.out == STREAM:
         raise SpecError("--json and the estimates cannot both go to stdout: give --out a file.", path="--json")
     out = _target(options)
@@ -92,13 +99,20 @@ def run_export(options: argparse.Namespace) -> int:
     design, mark = gains_to_hand_on(options.gains, unverified=options.unverified)
     for file, kind in exported_files(options.to).items():
         output_file(file, kind, options, option="--to")
+    monitor = None
+    if options.normal is not None:
+        from obsynth.experiments.monitors.online_monitor import online_monitor
+
+        monitor = online_monitor(design, "learned", normal=options.normal, unverified=options.unverified)
     files = export(
         design,
         options.to,
         sample_time=options.sample_time,
-        fmi=options.fmi,
+        **({} if options.fmi is None else {"fmi": options.fmi}),
         thresholds=numbers_of(options.threshold) or None,
         warm_up=options.warm_up,
+        monitor=monitor,
+        precision=options.precision,
         unverified=options.unverified,
     )
     answer(options, {"gains": options.gains, "files": files, **({"unverified": mark} if mark else {})}, mark)
@@ -137,6 +151,11 @@ def run_report(options: argparse.Namespace) -> int:
     from obsynth.results.gain_sets import load
 
     require_distinct({"--gains": options.gains, "--system": options.system, "--out": options.out})
+    if options.out.suffix.lower() == ".json":
+        return _run_robustness(options)
+    if options.data is None:
+        own = ("gains", "unverified", "system", "out", "force", "json")
+        refuse_given(options, [name for name in vars(options) if name not in own], "a log: give --data")
     design = load(options.gains)
     from obsynth.report.page import PAGE, html_report
     from obsynth.spec import load_spec
@@ -166,6 +185,25 @@ def run_report(options: argparse.Namespace) -> int:
     )
     answer(options, {"gains": options.gains, "file": file, "passed": report.passed})
     return 0 if report.passed else VerificationError.exit_code
+
+
+def _run_robustness(options: argparse.Namespace) -> int:
+    """Write what holds for every plant within its tolerances as a certificate."""
+    from obsynth.results.certificate_files import RESULT_FILE
+    from obsynth.tolerances.robustness import robustness
+
+    refuse_given(
+        options,
+        [name for name in vars(options) if name not in ("gains", "out", "force", "json")],
+        "the page: a certificate (.json) is of the gain set alone",
+    )
+    output_file(options.out, RESULT_FILE, options)
+    design, _ = gains_to_hand_on(options.gains, unverified=False)
+    found = robustness(design)
+    file = found.save(options.out)
+    told = {"gains": options.gains, "file": file, "statement": found.statement, **found.as_dict()}
+    answer(options, told, found.statement)
+    return 0
 
 
 def _target(options: argparse.Namespace) -> Path | TextIO:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import math
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
@@ -11,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
-from obsynth.cli.arguments import columns_of
+from obsynth.cli.arguments import columns_of, refuse_given
 from obsynth.cli.output import output_file
 from obsynth.errors import SpecError
 from obsynth.files.inputs import protect, protect_stream
@@ -19,7 +18,7 @@ from obsynth.files.inputs import protect, protect_stream
 if TYPE_CHECKING:
     from obsynth.data.run import DataRun
     from obsynth.experiments.alarm_proof import AlarmProof
-    from obsynth.experiments.monitors.online import OnlineMonitor
+    from obsynth.experiments.monitors.monitor import Monitor
     from obsynth.plants.uncertainty import Uncertainty
     from obsynth.results.design import ObserverDesign
     from obsynth.simulation.scenario import Scenario
@@ -40,13 +39,14 @@ def protect_inputs(options: argparse.Namespace) -> None:
 def run_of(
     design: ObserverDesign,
     options: argparse.Namespace,
-    watched: OnlineMonitor | None,
+    watched: Monitor | None,
     out: Path | TextIO | None = None,
     **more: Any,
 ) -> DataRun:
     """Return a run of a design on the data of the command line, with its table where it is not written to ``out``."""
     from obsynth.data.run import run_on_data
 
+    design = with_input_delay(design, options)
     with rows_done(options.data, quiet=getattr(options, "quiet", True) or out is sys.stdout) as progress:
         found = run_on_data(
             design,
@@ -64,6 +64,14 @@ def run_of(
     for text in found.warnings:
         print(f"Warning: {text}", file=sys.stderr)
     return found
+
+
+def with_input_delay(design: ObserverDesign, options: argparse.Namespace) -> ObserverDesign:
+    """Return a design for a log whose inputs act as many rows later as the command line says."""
+    rows = options.input_delay
+    if rows == "auto":
+        raise SpecError("--input-delay auto is for calibrate: give a number of rows.", path="--input-delay")
+    return design if rows is None else design.replace(input_delay=rows)
 
 
 def number_of(name: str, text: str) -> float:
@@ -95,6 +103,9 @@ def own_tolerances(design: ObserverDesign, kind: str | None) -> Uncertainty | No
     from obsynth.plants.descriptor import DescriptorSystem
 
     plant = design.plant
+    if design.method == "guaranteed-test" and not design.observer.state_names:
+        # Nothing beside the test follows the state: its threshold is that of an exact model, and says so.
+        return None
     if kind != "pointwise" or not isinstance(plant, DescriptorSystem) or (plant.nu and not plant.is_discrete):
         return None
     return plant.uncertainty if isinstance(design.observer, LinearObserver) else None
@@ -102,6 +113,9 @@ def own_tolerances(design: ObserverDesign, kind: str | None) -> Uncertainty | No
 
 def monitor_settings(design: ObserverDesign, options: argparse.Namespace) -> dict[str, Any]:
     """Return what any monitor of a design is made of, by the names of the arguments of `obsynth.monitor`."""
+    from obsynth.observers.linear.observer import LinearObserver
+
+    refuse_other_kinds(options, LINEAR_SETTINGS if isinstance(design.observer, LinearObserver) else PARAMETER_SETTINGS)
     return {
         "disturbance_bounds": numbers_of(options.disturbance),
         "noise_bound": options.noise_bound,
@@ -115,28 +129,56 @@ def monitor_settings(design: ObserverDesign, options: argparse.Namespace) -> dic
     }
 
 
-def monitor_of(
-    design: ObserverDesign, options: argparse.Namespace, *, has_scenario: bool = False
-) -> OnlineMonitor | None:
+#: Settings that act, by kind of monitor: of linear designs, and of those that estimate parameters.
+LINEAR_SETTINGS: Mapping[str, tuple[str, ...]] = {
+    "pointwise": ("disturbance", "noise_bound", "initial_error", "initial"),
+    "window": ("disturbance", "noise_bound", "initial_error", "window"),
+    "paper": ("disturbance", "initial_error"),
+    "chi-square": ("disturbance", "window", "false_alarms"),
+    "cusum": ("disturbance", "window", "false_alarms", "change"),
+    "learned": ("normal",),
+}
+PARAMETER_SETTINGS: Mapping[str, tuple[str, ...]] = {
+    "chi-square": ("nominal", "false_alarms"),
+    "cusum": ("nominal", "false_alarms", "change"),
+    "glr": ("false_alarms",),
+    "nis": ("nominal", "false_alarms"),
+    "learned": ("normal",),
+}
+
+
+def monitor_names() -> list[str]:
+    """Return the names of all settings of monitors."""
+    return sorted(
+        {name for table in (LINEAR_SETTINGS, PARAMETER_SETTINGS) for names in table.values() for name in names}
+    )
+
+
+def refuse_other_kinds(options: argparse.Namespace, table: Mapping[str, tuple[str, ...]]) -> None:
+    """Refuse settings that do nothing for the kind of monitor that is asked for."""
+    used = table.get(options.monitor)
+    if used is None:
+        return  # who makes the monitor says which kinds there are
+    # The window of ``run --prove`` is that of the proof.
+    proving = ("window",) if getattr(options, "prove", None) is not None else ()
+    names = [name for name in monitor_names() if name not in (*used, *proving) and hasattr(options, name)]
+    kinds = {name: [kind for kind, own in table.items() if name in own] for name in names}
+    for name, others in kinds.items():
+        where = f"the monitor {' or '.join(others)}" if others else "designs of another kind"
+        refuse_given(options, (name,), f"{where}, not for {options.monitor}")
+
+
+def monitor_of(design: ObserverDesign, options: argparse.Namespace, *, has_scenario: bool = False) -> Monitor | None:
     """Return the monitor that is asked for."""
     if options.monitor is None:
-        of_monitors = (
-            *(() if has_scenario else ("system",)),
-            "noise_bound",
-            "initial_error",
-            "sample_time",
-            "disturbance",
-            "nominal",
-            "initial",
-            "normal",
-        )
-        asked = [name for name in of_monitors if getattr(options, name)]
-        if asked:
-            flag = f"--{asked[0].replace('_', '-')}"
-            raise SpecError(f"{flag} is for a monitor: say which one by --monitor.", path=flag)
+        of_monitors = (*(() if has_scenario else ("system",)), "sample_time", *monitor_names())
+        refuse_given(options, of_monitors, "a monitor: say which one by --monitor")
         return None
     from obsynth.experiments.monitors.online_monitor import online_monitor
+    from obsynth.observers.linear.observer import LinearObserver
 
+    if not isinstance(design.observer, LinearObserver):
+        refuse_given(options, ("sample_time", *(() if has_scenario else ("system",))), "monitors of linear designs")
     scenario = None
     if options.system is not None:
         from obsynth.cli.commands import require_same_signals
@@ -156,9 +198,9 @@ def monitor_of(
     )
 
 
-def summary_of_run(found: DataRun, watched: OnlineMonitor | None) -> str:
+def summary_of_run(found: DataRun, watched: Monitor | None) -> str:
     """Return what a run was, in a few lines."""
-    from obsynth.data.alarm_events import silent_rows
+    from obsynth.data.alarm_events import silence
 
     counts = ", ".join(f"{count} {status}" for status, count in found.statuses.items())
     lines = [f"{found.rows} rows: {counts}."]
@@ -175,40 +217,22 @@ def summary_of_run(found: DataRun, watched: OnlineMonitor | None) -> str:
         lines.append(f"Alarm: {name} first above its threshold at {found.stamps.shown(time)}{fault}.")
     lines += _alarm_table(found)
     if watched is not None or found.thresholds:
-        silent = sum(found.silent.values())
-        if not found.alarms and silent < found.rows:
-            told = f" in the {found.rows - silent} rows that could alarm" if silent else ""
-            lines.append(f"No alarm by {watched.kind if watched else 'any threshold'}{told}.")
-        if silent:
-            lines.append(f"{silent} of {found.rows} rows could not alarm: {'; '.join(silent_rows(found.silent))}.")
+        lines += silence(found, watched.kind if watched else "any threshold")
     if watched is not None:
         lines.append(f"The {watched.kind} threshold: {watched.statement}.")
     return "\n".join(lines)
 
 
-#: Alarms that a summary lists.
-MOST_LISTED = 20
-
-
 def _alarm_table(found: DataRun) -> list[str]:
     """Return lines of a table of all alarms."""
-    if not found.events:
+    from obsynth.data.alarm_events import alarm_rows
+
+    rows, more = alarm_rows(found.events, found.stamps.shown)
+    if not rows:
         return []
-
-    def number(value: float) -> str:
-        return "" if math.isnan(value) else f"{value:.4g}"
-
-    rows = [("alarm by", "from", "to", "rows", "fault", "size", "interval", "of its threshold")]
-    for event in found.events[:MOST_LISTED]:
-        interval = "" if math.isnan(event.low) else f"{number(event.low)} to {number(event.high)}"
-        first, last = found.stamps.shown(event.start), found.stamps.shown(event.end)
-        evidence = f"{event.evidence:.3g} times"
-        rows.append((event.by, first, last, str(event.rows), event.fault, number(event.size), interval, evidence))
-    kept = [i for i in range(len(rows[0])) if any(row[i] for row in rows[1:])]
-    widths = {i: max(len(row[i]) for row in rows) for i in kept}
-    lines = ["  " + "  ".join(row[i].ljust(widths[i]) for i in kept).rstrip() for row in rows]
-    more = len(found.events) - MOST_LISTED
-    return [*lines, *([f"  and {more} more"] if more > 0 else [])]
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    lines = ["  " + "  ".join(text.ljust(w) for text, w in zip(row, widths, strict=True)).rstrip() for row in rows]
+    return [*lines, *([f"  and {more} more"] if more else [])]
 
 
 @contextmanager
@@ -288,7 +312,7 @@ def proof_of(design: ObserverDesign, options: argparse.Namespace, row: int, **mo
     from obsynth.data.alarm_proof import prove_alarm
 
     return prove_alarm(
-        design,
+        with_input_delay(design, options),
         Path(options.data),
         row,
         window=options.window,

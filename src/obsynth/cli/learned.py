@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 from obsynth.cli.arguments import columns_of
-from obsynth.cli.data_run import STREAM, numbers_of
+from obsynth.cli.data_run import STREAM, numbers_of, with_input_delay
 from obsynth.cli.output import answer, gains_to_hand_on, output_file
 from obsynth.errors import SpecError
 from obsynth.files.inputs import protect, protect_stream
@@ -31,7 +31,7 @@ def run_thresholds(options: argparse.Namespace) -> int:
         raise SpecError(f"{target}: thresholds are written as JSON (.json).", path="--out")
     design, _ = gains_to_hand_on(options.gains, unverified=options.unverified)
     found = learn_thresholds(
-        design,
+        with_input_delay(design, options),
         sys.stdin if is_stream else Path(options.data),
         false_alarms=options.false_alarms or FALSE_ALARMS,
         rows=options.rows,

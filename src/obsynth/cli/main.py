@@ -23,6 +23,7 @@ from obsynth.cli.arguments import (
     DATA_OPTIONS,
     FORCE,
     GAINS,
+    INPUT_DELAY,
     JOBS,
     JSON,
     LOG_OPTIONS,
@@ -40,7 +41,6 @@ from obsynth.cli.arguments import (
     Settings,
     add_arguments,
     add_settings,
-    delay,
     digits,
     flag,
     option,
@@ -69,7 +69,7 @@ exit codes:
   2  wrong arguments, or a malformed spec, plant or file
   3  an existence condition fails: no design of this kind exists for this plant
   4  the matrix inequalities have no solution, and that is proved
-  5  a solver gave up: nothing is known
+  5  a solver gave up: inconclusive
   6  a check of the shipped gains failed
 """
 _SWEEP_DETAILS = """\
@@ -141,16 +141,64 @@ VERBS = {
             JSON,
         ),
     ),
+    "sensors": Verb(
+        "commands:run_sensors",
+        "Find the cheapest sensors to add with which faults are told, or found above a size.",
+        (
+            SYSTEM,
+            option(
+                "--goal",
+                "GOAL",
+                "detect, isolate, estimate-step, estimate (default), or threshold: the least threshold of --fault is "
+                "at most --below",
+                default="estimate",
+            ),
+            option("--fault", "NAME", "which fault (default: all; for threshold: that of the spec's method)"),
+            Settings(
+                (
+                    option("--below", "SIZE", "for threshold: half of the size that must surely be found", type=float),
+                    option("--noise", "DEVIATION", "of each candidate; threshold needs it", type=float),
+                    option("--largest", "N", "sensors to add at most", type=int),
+                    option("--sample-time", "SECONDS", "of a continuous plant, for threshold", type=float),
+                )
+            ),
+            JSON,
+            QUIET,
+        ),
+    ),
     "verify": Verb(
         "commands:run_verify",
-        "Verify a saved gain set, an alarm's certificate or a calibration again, to the end of what it rests on.",
+        "Verify a saved gain set or certificate of any kind again, to the end of what it rests on.",
         (
-            option("gains", "FILE", "a gain set, an alarm's certificate, or what calibrate wrote", type=Path),
-            option("--data", "FILE", "the log that an alarm or a calibration names", type=Path),
-            option("--calibration", "FILE", "the calibration that the box of a gain set or an alarm names", type=Path),
-            option("--system", "FILE", "with --data: the spec of a calibration, which is then done again", type=Path),
             option(
-                "--printed-digits", "N", "judge the gains as numbers that were printed with N decimals", type=digits
+                "gains",
+                "FILE",
+                "a gain set, what calibrate wrote, or the certificate of an alarm, a robustness analysis, a tolerance "
+                "study or a comparison",
+                type=Path,
+            ),
+            option("--data", "FILE", "the log that an alarm, a comparison or a calibration names", type=Path),
+            Settings(
+                (
+                    option(
+                        "--calibration",
+                        "FILE",
+                        "the calibration that the box of a gain set, an alarm or a robustness analysis names",
+                        type=Path,
+                    ),
+                    option(
+                        "--system",
+                        "FILE",
+                        "with --data: the spec of a calibration, which is then done again",
+                        type=Path,
+                    ),
+                    option(
+                        "--printed-digits",
+                        "N",
+                        "judge the gains as numbers that were printed with N decimals",
+                        type=digits,
+                    ),
+                )
             ),
             verbose("every claim and every check"),
             JSON,
@@ -177,16 +225,17 @@ VERBS = {
             option("--data", "FILE", "a log, as for run, to replay through every method", type=Path),
             MAP,
             SCALE,
-            option("--out", "FILE", "write a page (HTML) with table and picture", type=Path),
-            option("--runs", "N", "drawn runs of the scenario (default: 20)", type=int, default=20),
+            option("--out", "FILE", "write a page (HTML), or a certificate for verify (.json)", type=Path),
             Settings(
                 (
+                    option("--runs", "N", "drawn runs of the scenario (default: 20)", type=int, default=20),
                     option(
                         "--tolerance", "T", "relative error of parameters that is drawn (0.05)", type=float, default=0.0
                     ),
                     option("--within", "SECONDS", "90 %% of a step must be shown within this time", type=float),
                     option("--sample-time", "SECONDS", "the clock of a continuous plant", type=float),
                     TIME_COLUMN,
+                    INPUT_DELAY,
                 )
             ),
             FORCE,
@@ -202,15 +251,25 @@ VERBS = {
             SPEC_GAINS,
             UNVERIFIED,
             option("--runs", "N", "how many, each with its seed (default: 100)", type=int, default=100),
-            Settings((option("--confidence", "P", "of the intervals (default: 0.95)", type=float, default=0.95),)),
-            option("--plants", "N", "draw N plants from the tolerances, half of them vertices", type=int),
-            JOBS,
-            option(
-                "--tolerances",
-                "LIST",
-                "instead, a fixed bound beside the adaptive threshold for these tolerances, such as 0,1%%,2%%,5%%",
+            Settings(
+                (
+                    option(
+                        "--tolerances",
+                        "LIST",
+                        "instead, a fixed bound beside the adaptive threshold for these tolerances, such as "
+                        "0,1%%,2%%,5%%",
+                    ),
+                    option("--confidence", "P", "of the intervals (default: 0.95)", type=float, default=0.95),
+                    option("--plants", "N", "draw N plants from the tolerances, half of them vertices", type=int),
+                    JOBS,
+                )
             ),
-            option("--out", "FILE", "with --tolerances: write the picture (.png, .svg or .pdf)", type=Path),
+            option(
+                "--out",
+                "FILE",
+                "with --tolerances: write the picture (.png, .svg or .pdf), or a certificate for verify (.json)",
+                type=Path,
+            ),
             MONITOR,
             MONITOR_SETTINGS,
             JSON,
@@ -249,10 +308,17 @@ VERBS = {
             ),
             *DATA_OPTIONS,
             _EXPECTED,
-            JOBS,
-            CLUSTER,
             Settings(
                 (
+                    option(
+                        "--prove",
+                        "FILE",
+                        "with --monitor pointwise: prove the first alarm, and write the certificate that 'verify' "
+                        "rechecks",
+                        type=Path,
+                    ),
+                    JOBS,
+                    CLUSTER,
                     option(
                         "--outliers",
                         None,
@@ -293,12 +359,6 @@ VERBS = {
                 ),
             ),
             option("--state", "FILE", "go on from this saved state if it exists, and save the new one", type=Path),
-            option(
-                "--prove",
-                "FILE",
-                "with --monitor pointwise: prove the first alarm, and write the certificate that 'verify' rechecks",
-                type=Path,
-            ),
             JSON,
             FORCE,
             flag("--quiet", "print no progress and no summary"),
@@ -322,6 +382,7 @@ VERBS = {
             *LOG_OPTIONS,
             Settings(
                 (
+                    INPUT_DELAY,
                     option("--gap", "SECONDS", "continuous designs: longer intervals are gaps", type=float),
                     option(
                         "--warm-up", "SECONDS", "how long to leave out the start, and what follows gaps", type=float
@@ -342,17 +403,34 @@ VERBS = {
             GAINS,
             UNVERIFIED,
             option("--to", "FILE", ".mat, .npz, .c (with a header), or .fmu", type=Path, required=True),
-            option("--sample-time", "SECONDS", "sample a continuous-time observer (needed for C and FMU)", type=float),
-            option("--fmi", None, "version of FMI for .fmu (default: 2.0)", choices=("2.0", "3.0"), default="2.0"),
             Settings(
                 (
                     option(
+                        "--sample-time",
+                        "SECONDS",
+                        "sample a continuous-time observer (needed for C and FMU)",
+                        type=float,
+                    ),
+                    option("--fmi", None, "version of FMI for .fmu (default: 2.0)", choices=("2.0", "3.0")),
+                    option(
+                        "--precision",
+                        None,
+                        "of the numbers in .c (default: double); the header says what floats change",
+                        choices=("double", "float"),
+                    ),
+                    option(
+                        "--normal",
+                        "FILE",
+                        "for .c and .fmu: the monitor that the verb thresholds wrote (.json)",
+                        type=Path,
+                    ),
+                    option(
                         "--threshold",
                         "OUTPUT=LEVEL",
-                        "for .fmu: alarm when the absolute value of an output, such as "
+                        "for .c and .fmu: alarm when the absolute value of an output, such as "
                         "fhat[pump], passes a level; may be repeated",
                     ),
-                    option("--warm-up", "SECONDS", "for .fmu: no alarms in these seconds", type=float),
+                    option("--warm-up", "SECONDS", "for .c and .fmu: no alarms in these seconds", type=float),
                 )
             ),
             FORCE,
@@ -367,13 +445,17 @@ VERBS = {
             UNVERIFIED,
             option("--data", "FILE", _LOG, required=True),
             option("--out", "FILE", "picture (.png, .svg or .pdf); without it, a window", type=Path),
-            option(
-                "--show",
-                "PARTS",
-                "what is drawn, of outputs,faults,residuals,statistic,shares (default: all there is)",
-                default="outputs,faults,residuals,statistic,shares",
-            ),
             *DATA_OPTIONS,
+            Settings(
+                (
+                    option(
+                        "--show",
+                        "PARTS",
+                        "what is drawn, of outputs,faults,residuals,statistic,shares (default: all there is)",
+                        default="outputs,faults,residuals,statistic,shares",
+                    ),
+                )
+            ),
             _EXPECTED,
             FORCE,
             JSON,
@@ -386,11 +468,18 @@ VERBS = {
         (
             GAINS,
             UNVERIFIED,
-            option("--out", "FILE", "the page (HTML)", type=Path, required=True),
+            option(
+                "--out",
+                "FILE",
+                "the page (HTML), or what holds for every plant within its tolerances, as a certificate for verify "
+                "(.json)",
+                type=Path,
+                required=True,
+            ),
             option("--system", "SPEC", "show the design on the scenario of this spec", type=Path),
             option("--data", "FILE", "show the design on this log as well: text, Parquet, TDMS or MDF file"),
-            option("--rows", "A:B", "rows without faults, which are to agree (default: all)"),
             *DATA_OPTIONS,
+            Settings((option("--rows", "A:B", "rows without faults, which are to agree (default: all)"),)),
             FORCE,
             JSON,
         ),
@@ -451,19 +540,20 @@ VERBS = {
             SYSTEM,
             option("--data", "FILE", "the log, as for run", type=Path),
             *LOG_OPTIONS,
-            option(
-                "--unknown",
-                "NAME=LOW:HIGH",
-                "a constant that is to be found, with its bounds, beside those of the spec; may be repeated",
-            ),
             Settings(
                 (
                     option(
-                        "--input-delay",
-                        "ROWS",
-                        "rows by which inputs act later than they are written, or 'auto' (default)",
-                        type=delay,
+                        "--unknown",
+                        "NAME=LOW:HIGH",
+                        "a constant that is to be found, with its bounds, beside those of the spec; may be repeated",
                     ),
+                    option(
+                        "--write-spec",
+                        "FILE",
+                        "write the spec with what was found in it: constants, boxes, noise",
+                        type=Path,
+                    ),
+                    INPUT_DELAY,
                     option("--level", "P", "probability of the box (default: 0.95)", type=float),
                 )
             ),
@@ -481,6 +571,7 @@ VERBS = {
             UNVERIFIED,
             option("--data", "FILE", "the log, as for run", type=Path, required=True),
             *LOG_OPTIONS,
+            Settings((INPUT_DELAY,)),
             JSON,
             QUIET,
         ),
@@ -499,6 +590,7 @@ VERBS = {
             Settings(
                 (
                     TIME_COLUMN,
+                    INPUT_DELAY,
                     option("--window", "N", "samples (default: 20)", type=int, default=20),
                     option("--disturbance", "NAME=BOUND", "largest absolute value of a disturbance; may be repeated"),
                     option(
@@ -662,9 +754,17 @@ def _options(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -
     return options
 
 
+def _require_written(options: argparse.Namespace) -> None:
+    """Refuse ``--force`` where no file is written."""
+    places = [getattr(options, name) for name in ("output", "out", "to", "state", "prove") if hasattr(options, name)]
+    if getattr(options, "force", False) and options.verb != "design" and all(place in (None, "-") for place in places):
+        raise SpecError("--force replaces a file, and none is written here: give --out.", path="--force")
+
+
 def _outcome(options: argparse.Namespace) -> int:
     """Run the verb; return its exit code, or that of its error after telling it."""
     try:
+        _require_written(options)
         module, _, function = VERBS[options.verb].run.partition(":")
         run: Callable[[argparse.Namespace], int] = getattr(import_module(f"obsynth.cli.{module}"), function)
         return run(options)

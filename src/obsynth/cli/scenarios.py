@@ -7,15 +7,23 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from obsynth.cli.arguments import columns_of
+from obsynth.cli.arguments import columns_of, refuse_given
 from obsynth.cli.commands import designed_or_loaded, spec_output
 from obsynth.cli.data_commands import picture_kind, written_picture
-from obsynth.cli.data_run import monitor_settings, numbers_of, required_scenario
+from obsynth.cli.data_run import (
+    PARAMETER_SETTINGS,
+    monitor_names,
+    monitor_settings,
+    numbers_of,
+    refuse_other_kinds,
+    required_scenario,
+)
 from obsynth.cli.output import answer, output_file, progress, stdout_console
 from obsynth.cli.sweep import chosen_executor
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.files.inputs import protect
 from obsynth.files.outputs import FileKind, write_atomically
+from obsynth.results.certificate_files import RESULT_FILE
 
 if TYPE_CHECKING:
     from obsynth.experiments.monitors.monitor import Monitor
@@ -37,6 +45,8 @@ def _prepared(
     scenario = required_scenario(spec)
     if options.gains is not None:
         protect(options.gains)
+    else:
+        refuse_given(options, ("unverified",), "a gain set: give --gains, as what is designed here is verified")
     target = None if options.out is None else spec_output(options.out, kind, spec, options, option="--out")
     return spec, scenario, target, designed_or_loaded(spec, options.gains, report_stage, unverified=options.unverified)
 
@@ -62,14 +72,12 @@ def run_simulate(options: argparse.Namespace) -> int:
 
 def _run_tolerances(options: argparse.Namespace) -> int:
     """Run ``evaluate --tolerances``: spec in, a table and a picture out."""
-    if options.plants is not None or options.monitor not in (None, "pointwise"):
-        raise SpecError(
-            "--tolerances compares two pointwise monitors on plants that it draws itself: leave out "
-            "--plants and --monitor.",
-            path="--tolerances",
-        )
+    if options.monitor not in (None, "pointwise"):
+        raise SpecError("--tolerances compares two pointwise monitors: leave out --monitor.", path="--tolerances")
+    unused = ("plants", "confidence", "jobs", "initial_error", "initial", "false_alarms", "window", "change")
+    refuse_given(options, unused, "one monitor on many runs, and --tolerances compares two on plants that it draws")
     with progress(quiet=options.quiet) as report_stage:
-        kind = None if options.out is None else picture_kind(options.out)
+        kind = None if options.out is None else RESULT_FILE if _is_json(options.out) else picture_kind(options.out)
         spec, scenario, target, design = _prepared(options, report_stage, kind)
         from obsynth.experiments.tolerance_study import tolerance_study
 
@@ -82,12 +90,22 @@ def _run_tolerances(options: argparse.Namespace) -> int:
             noise_bound=options.noise_bound,
             progress=report_stage,
         )
-    if target is not None:
+    if target is not None and _is_json(target):
+        found.save(target)
+    elif target is not None:
         from obsynth.plotting.trade_off import plot_tolerances
 
         written_picture(target, 2, lambda axes: plot_tolerances(found, axes=axes))
-    answer(options, {"spec": spec.path, "file": target, **found.as_dict()}, str(found))
+    answer(
+        options,
+        {"spec": spec.path, "file": target, "statement": found.statement, **found.as_dict()},
+        f"{found}\n{found.statement}",
+    )
     return 0
+
+
+def _is_json(path: Path) -> bool:
+    return path.suffix.lower() == ".json"
 
 
 def _tolerance(text: str) -> float | str:
@@ -102,21 +120,21 @@ def run_evaluate(options: argparse.Namespace) -> int:
     """Run ``evaluate``: spec in, table of rates and errors out."""
     if options.tolerances is not None:
         return _run_tolerances(options)
-    if options.out is not None:
-        raise SpecError("--out is for the picture of --tolerances.", path="--out")
+    refuse_given(options, ("out", "force"), "the picture or certificate of --tolerances")
+    if options.monitor is None:
+        refuse_given(options, monitor_names(), "a monitor: say which one by --monitor")
     with progress(quiet=options.quiet) as report_stage:
         spec, scenario, _, design = _prepared(options, report_stage)
         report_stage("running")
         from obsynth.experiments.monitors.residual_monitor import monitor
         from obsynth.experiments.monte_carlo import evaluate
-        from obsynth.observers.decisions import ParameterMonitor
         from obsynth.observers.linear.observer import LinearObserver
 
         watched: Monitor | ParameterMonitor | None = None
         if options.monitor is not None and isinstance(design.observer, LinearObserver):
             watched = monitor(design, scenario, options.monitor, **monitor_settings(design, options))
         elif options.monitor is not None:
-            watched = ParameterMonitor(options.monitor, false_alarms=options.false_alarms, change=options.change)
+            watched = _parameter_monitor(options)
         with chosen_executor(options.jobs, None) as executor:
             found = evaluate(
                 design,
@@ -128,20 +146,44 @@ def run_evaluate(options: argparse.Namespace) -> int:
                 confidence=options.confidence,
                 plants=options.plants,
             )
+    from obsynth.comparison.least_thresholds import design_beside_least, in_words
     from obsynth.report.scenarios import described, evaluation_report, final_threshold
 
+    least = design_beside_least(design, scenario)
+    sentences = [in_words(name, *pair, design.plant.units.get(name, "")) for name, pair in least.items()]
     told: dict[str, Any] | None = None
     if watched is not None:
         kind, statement = described(watched)
         told = {"kind": kind, "statement": statement, "final_threshold": final_threshold(watched)}
     answer(
         options,
-        {"spec": spec.path, "monitor": told, **found.as_dict()},
+        {
+            "spec": spec.path,
+            "monitor": told,
+            "least_thresholds": {name: {"bound": pair[0], "least": pair[1]} for name, pair in least.items()},
+            **found.as_dict(),
+        },
         lambda: evaluation_report(
-            design.name, found, monitor=watched, console=stdout_console(), units=design.plant.units
+            design.name, found, monitor=watched, console=stdout_console(), units=design.plant.units, beside=sentences
         ),
     )
     return 0
+
+
+def _parameter_monitor(options: argparse.Namespace) -> ParameterMonitor:
+    """Return the decision on parameters that is asked for."""
+    from obsynth.observers.decisions import ParameterMonitor
+
+    refuse_other_kinds(options, PARAMETER_SETTINGS)
+    return ParameterMonitor(options.monitor, false_alarms=options.false_alarms, change=options.change)
+
+
+def _compared_delay(spec: Spec, options: argparse.Namespace) -> int:
+    """Return rows by which the inputs of the log act later than linear designs on samples take them."""
+    if options.input_delay == "auto":
+        raise SpecError("--input-delay auto is for calibrate: give a number of rows.", path="--input-delay")
+    told = options.input_delay if options.input_delay is not None else spec.input_delay(spec.plant)
+    return told or 0
 
 
 def run_compare(options: argparse.Namespace) -> int:
@@ -153,8 +195,10 @@ def run_compare(options: argparse.Namespace) -> int:
     with progress(quiet=options.quiet) as report_stage:
         report_stage(f"reading {options.system}")
         spec = load_spec(options.system)
+        if options.data is None:
+            refuse_given(options, ("map", "scale", "time_column", "input_delay"), "a log: give --data")
         if options.out is not None:
-            output_file(options.out, COMPARISON_PAGE, options)
+            output_file(options.out, RESULT_FILE if _is_json(options.out) else COMPARISON_PAGE, options)
         plant, clock = _plant_and_clock(spec, options.sample_time)
         given = {} if spec.method == "auto" else {spec.method: spec.options}
         found = compare(
@@ -168,16 +212,20 @@ def run_compare(options: argparse.Namespace) -> int:
             data=options.data,
             columns=columns_of(options),
             scales=numbers_of(options.scale),
+            input_delay=_compared_delay(spec, options),
             progress=report_stage,
         )
         if options.out is not None:
             report_stage(f"writing {options.out}")
-            write_atomically(options.out, found.page())
+            if _is_json(options.out):
+                found.save(options.out)
+            else:
+                write_atomically(options.out, found.page())
     from obsynth.report.scenarios import comparison_report
 
     answer(
         options,
-        {"spec": spec.path, **found.to_dict()},
+        {"spec": spec.path, "statement": found.statement, **found.to_dict()},
         lambda: comparison_report(found, console=stdout_console(), file=options.out),
     )
     return 0 if found.recommended else PreconditionError.exit_code

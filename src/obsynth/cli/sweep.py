@@ -10,7 +10,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from obsynth.cli.data_run import STREAM, numbers_of
+from obsynth.cli.arguments import refuse_given
+from obsynth.cli.data_run import STREAM, monitor_names, numbers_of
 from obsynth.cli.output import output_file, print_json, progress, stdout_console
 from obsynth.errors import SpecError
 from obsynth.files.inputs import input_file
@@ -79,6 +80,7 @@ def run_many(options: argparse.Namespace) -> int:
     if given:
         names = ", ".join(f"--{name}" for name in given)
         raise SpecError(f"{names}: for one gain set; --gains is a folder of many.", path=f"--{given[0]}")
+    refuse_given(options, ("state_every", "sample_time", *monitor_names()), "one gain set: --gains is a folder of many")
     folder = Path(options.out)
     if options.out == STREAM or (folder.exists() and not folder.is_dir()):
         raise SpecError("Many designs need a folder for their estimates: give one to --out.", path="--out")
@@ -150,10 +152,10 @@ def _tell(options: argparse.Namespace, found: Any, files: tuple[Path, ...], what
 
 
 @contextmanager
-def chosen_executor(jobs: int, cluster: str | None) -> Iterator[Executor | None]:
+def chosen_executor(jobs: int | None, cluster: str | None) -> Iterator[Executor | None]:
     """Yield where work goes: nowhere else, processes, or a Dask cluster."""
-    if jobs < 1:
-        raise SpecError(f"--jobs is {jobs}: give a number of processes, 1 or more.", path="--jobs")
+    if jobs is not None and cluster is not None:
+        raise SpecError("--jobs and --cluster are two places for the work: give one of them.", path="--jobs")
     if cluster is not None:
         from dask import distributed
 
@@ -165,7 +167,7 @@ def chosen_executor(jobs: int, cluster: str | None) -> Iterator[Executor | None]
         with client:
             yield client.get_executor()
         return
-    if jobs == 1:
+    if jobs in (None, 1):
         yield None
         return
     from concurrent.futures import ProcessPoolExecutor

@@ -13,11 +13,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from obsynth.analysis.transformations.recovery import Transformation, linear_plant
-from obsynth.comparison.result import ComparedMethod, Comparison, FaultComparison
+from obsynth.comparison.least_thresholds import thresholds_beside_least
+from obsynth.comparison.result import ComparedMethod, Comparison, FaultComparison, comparison_statement
+from obsynth.data.linear_log import faults_on_rows
 from obsynth.data.log_tables import log_table
 from obsynth.data.signals import TIME
 from obsynth.errors import SpecError
-from obsynth.methods.automatic import Candidate, candidate, linear_methods
+from obsynth.experiments.assumptions import Log
+from obsynth.experiments.monitors.residual_model import largest_disturbances
+from obsynth.methods.automatic import SETTLING_TIMES, Candidate, Maker, candidate, linear_methods
 from obsynth.methods.designing import design
 from obsynth.methods.fault_figures import DECOUPLED, Held, held, on_the_clock, step_responses
 from obsynth.methods.functional_filter.rates import settling_time
@@ -35,8 +39,10 @@ from obsynth.numerics.continuous import driven
 from obsynth.numerics.libraries import on_one_thread_if_small
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.uncertainty import UNCERTAIN_MATRICES
+from obsynth.results.design import ObserverDesign
 from obsynth.simulation.profiles import Sine, Step
-from obsynth.simulation.scenario import Scenario
+from obsynth.simulation.scenario import Scenario, scenario_from
 from obsynth.simulation.signals import resolve
 from obsynth.tolerances.exact_plant import plant_at
 
@@ -153,13 +159,14 @@ def alarms(
 
 
 def rms(errors: Sequence[float] | FloatArray) -> float:
-    """Return the root of the mean square."""
+    """Return the root of the mean square; where a sample is missing (NaN) there is no error."""
     values = np.asarray(errors, dtype=np.float64)
+    values = values[~np.isnan(values)]
     return float(np.sqrt(np.mean(values**2))) if values.size else float("nan")
 
 
 #: Runs of the scenario, and samples and settling times where nothing is stated.
-RUNS, SAMPLES, SETTLING_TIMES, MOST_STEPS = 20, 40, 8, 6000
+RUNS, SCENARIO_SAMPLES, MOST_SCENARIO_SAMPLES = 20, 40, 6000
 SEED = 7
 #: Unknown inputs of the scenario that is made up are sines with so many periods in a settling time.
 PERIOD_SHARE = 0.2
@@ -181,6 +188,7 @@ def compare(
     data: Any = None,
     columns: Mapping[str, str] | None = None,
     scales: Mapping[str, float] | None = None,
+    input_delay: int = 0,
     progress: Callable[[str], None] | None = None,
 ) -> Comparison:
     """Design every method that exists for a plant and put them side by side, on one clock and the same draws.
@@ -212,6 +220,8 @@ def compare(
         Share of fault-free runs that pass the threshold of an alarm.
     data : str, Path or DataFrame, optional
         A log with the outputs and inputs by name, replayed through every method; columns named as faults are the truth.
+    input_delay : int, optional
+        Rows of ``data`` by which inputs act later than during the step that begins with them.
     columns, scales : mapping, optional
         Columns of signals where their names differ, and factors of their values, as for `obsynth.run_on_data`.
     progress : callable, optional
@@ -241,29 +251,86 @@ def compare(
     for name, value in (("sample_time", sample_time), ("within", within)):
         if value is not None:
             checked_value(value, name, Positive)
+    unused = sorted(name for name, given in (("columns", columns), ("scales", scales)) if given and data is None)
+    if unused:
+        raise SpecError(f"{unused[0]} is for a log: give data.", path=unused[0])
+    if scenario is not None and disturbance != 1.0:
+        raise SpecError("disturbance is for the scenario that is made up: one is given, which says its own.",
+                        path="disturbance")  # fmt: skip
+    if plant.dt and sample_time not in (None, plant.dt):
+        raise SpecError(f"sample_time is for continuous plants: this one has {plant.dt:g} s.", path="sample_time")
+    ids = _checked_methods(methods)
+    for method in options or {}:
+        if method not in ids:
+            raise SpecError(f"options has {method!r}, which is not compared: {', '.join(ids)} are.", path="options")
+    numbers: dict[str, Any] = {
+        "sample_time": sample_time,
+        "within": within,
+        "tolerance": float(tolerance),
+        "disturbance": float(disturbance),
+        "runs": int(runs),
+        "false_alarms": float(false_alarms),
+        "input_delay": int(input_delay),
+    }
+    chosen = options or {}
+    return side_by_side(
+        plant,
+        scenario,
+        ids,
+        lambda given, method, own: design(given, method, **own),
+        options=chosen,
+        data=data,
+        columns=columns,
+        scales=scales,
+        progress=progress,
+        **numbers,
+    )
+
+
+def side_by_side(
+    plant: DescriptorSystem,
+    scenario: Scenario | None,
+    methods: Sequence[str],
+    maker: Maker,
+    *,
+    sample_time: float | None,
+    within: float | None,
+    tolerance: float,
+    disturbance: float,
+    runs: int,
+    false_alarms: float,
+    input_delay: int = 0,
+    options: Mapping[str, Mapping[str, Any]] | None = None,
+    data: Any = None,
+    columns: Mapping[str, str] | None = None,
+    scales: Mapping[str, float] | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> Comparison:
+    """Return the designs that ``maker(plant, method, options)`` gives side by side; arguments as for `compare`."""
     report_stage = progress or (lambda _: None)
+    asked = {"plant": plant.as_dict(), "scenario": None if scenario is None else scenario.as_dict(),
+             "sample_time": sample_time, "within": within, "tolerance": tolerance, "disturbance": disturbance,
+             "runs": runs, "false_alarms": false_alarms,
+             **({"input_delay": input_delay} if input_delay else {})}  # fmt: skip
     plant = plant.dense() if plant.is_sparse else plant
     stated = None if scenario is None else scenario.sample_time
-    dt = plant.dt or sample_time or stated or settling_time(plant) / SAMPLES
+    dt = plant.dt or sample_time or stated or settling_time(plant) / SCENARIO_SAMPLES
     sampled = on_the_clock(plant, dt)
     happening = _scenario(plant, scenario, dt, disturbance)
-    steps = int(min(happening.horizon / dt, MOST_STEPS)) + 1
+    steps = int(min(happening.horizon / dt, MOST_SCENARIO_SAMPLES)) + 1
     kept = held(sampled, steps)
     if kept.steps < steps:
         steps, happening = kept.steps, happening.replace(horizon=kept.steps * dt)
-    ids = _checked_methods(methods)
     found = []
-    for method in ids:
+    for method in methods:
         report_stage(f"designing by {method}")
-        chosen = (options or {}).get(method, {})
-        found.append(candidate(method, plant, sampled, steps, lambda p, m, given: design(p, m, **given), chosen))
+        found.append(candidate(method, plant, sampled, steps, maker, (options or {}).get(method, {})))
     report_stage("running the scenario")
-    drawn = drawn_runs(
-        plant, sampled, happening, runs=runs, tolerance=float(tolerance), seed=SEED, feedback=kept.feedback
-    )
-    log = None if data is None else _log(data, sampled, columns, scales)
+    drawn = drawn_runs(plant, sampled, happening, runs=runs, tolerance=tolerance, seed=SEED, feedback=kept.feedback)
+    log = None if data is None else _log(data, sampled, columns, scales, input_delay)
     limit = within if within is not None else settling_time(plant)
-    compared = [_compared(entry, sampled, drawn, log, kept, limit, false_alarms) for entry in found]
+    bounds = largest_disturbances(happening, sampled.disturbance_names, kept.steps, dt)
+    compared = [_compared(entry, sampled, drawn, log, kept, limit, false_alarms, bounds) for entry in found]
     compared.sort(key=lambda entry: (bool(entry.refused), not entry.fast_enough, entry.rms))
     setting = (
         f"{runs} runs of {happening.horizon:g} s, sampled every {dt:g} s, disturbances and noise drawn"
@@ -275,6 +342,7 @@ def compare(
     times = _clock(len(drawn.faults), dt) if log is None else log.times
     truth = drawn.faults if log is None else log.truth
     best = next((entry for entry in compared if not entry.refused), None)
+    from_file = isinstance(data, (str, Path))
     return Comparison(
         tuple(compared),
         "" if best is None else best.method,
@@ -284,7 +352,58 @@ def compare(
         read_only(truth),
         plant.fault_names,
         setting,
+        asked if data is None or from_file else {},
+        Log.of(Path(data), columns, scales).as_dict() if from_file else None,
     )
+
+
+def compared_again(
+    body: Mapping[str, Any], designs: Mapping[str, ObserverDesign], log: Path | None
+) -> tuple[dict[str, Any], str, list[str]]:
+    """Return figures and sentence of a certificate made again from its plant and gain sets, and designs of others."""
+    asked = dict(body["asked"])
+    plant = DescriptorSystem(**asked.pop("plant"))
+    scenario = asked.pop("scenario")
+    read = {} if log is None else {"data": log, "columns": body["log"]["columns"], "scales": body["log"]["scales"]}
+    found = side_by_side(
+        plant,
+        None if scenario is None else scenario_from(scenario),
+        sorted(designs),
+        lambda _, method, __: designs[method],
+        **asked,
+        **read,
+    )
+    result = found.claims()
+    if log is None and body["log"] is not None:
+        # The errors on a log that is not given are assumed.
+        for name, entry in result["methods"].items():
+            for fault, stored in zip(entry["faults"], body["result"]["methods"][name]["faults"], strict=True):
+                fault["rms"] = float(stored["rms"])
+            entry["rms"] = rms([fault["rms"] for fault in entry["faults"]])
+    sampled = on_the_clock(plant, found.sample_time)
+    others = [f"plant of {name}" for name, one in designs.items() if not _is_of(one, (plant, sampled))]
+    digests = {name: inside["sha256"] for name, inside in body["gain_sets"].items()}
+    return result, comparison_statement(body["result"], digests, body["log"]), others
+
+
+#: Entries of a plant that was sampled again agree to this share of the largest of their matrix.
+SAME_PLANT = 1e-9
+
+
+def _is_of(made: ObserverDesign, plants: Sequence[DescriptorSystem]) -> bool:
+    """Whether a design is for one of some plants, as it was written or transformed."""
+    own = [made.plant] if made.source is None else [made.source.plant, made.plant]
+
+    def same(one: Any, other: DescriptorSystem) -> bool:
+        pairs = [(getattr(one, name), getattr(other, name)) for name in UNCERTAIN_MATRICES]
+        return all(
+            a.shape == b.shape
+            and float(np.max(np.abs(a - b), initial=0.0)) <= SAME_PLANT * np.max(np.abs(b), initial=0.0)
+            for a, b in pairs
+        )
+
+    return any(isinstance(one, DescriptorSystem) and same(one.dense() if one.is_sparse else one, other)
+               for one in own for other in plants)  # fmt: skip
 
 
 def _checked_methods(methods: Sequence[str] | None) -> list[str]:
@@ -311,7 +430,7 @@ def _scenario(plant: DescriptorSystem, given: Scenario | None, dt: float, distur
     }
     frequency = PERIOD_SHARE / settle
     return Scenario(
-        horizon=min(plant.nf * length, MOST_STEPS * dt),
+        horizon=min(plant.nf * length, MOST_SCENARIO_SAMPLES * dt),
         sample_time=None if plant.dt else dt,
         faults=faults,
         noise=1.0,
@@ -321,7 +440,7 @@ def _scenario(plant: DescriptorSystem, given: Scenario | None, dt: float, distur
     )
 
 
-class _Log(NamedTuple):
+class _Record(NamedTuple):
     """A log on the clock: known inputs, outputs, faults where it has them."""
 
     times: FloatArray
@@ -332,8 +451,12 @@ class _Log(NamedTuple):
 
 
 def _log(
-    data: Any, plant: DescriptorSystem, columns: Mapping[str, str] | None, scales: Mapping[str, float] | None
-) -> _Log:
+    data: Any,
+    plant: DescriptorSystem,
+    columns: Mapping[str, str] | None,
+    scales: Mapping[str, float] | None,
+    input_delay: int = 0,
+) -> _Record:
     import pandas as pd
 
     if not isinstance(data, (str, Path)):
@@ -354,8 +477,6 @@ def _log(
         offsets = np.array([plant.operating_point.get(name, 0.0) for name in names])
         factors = np.array([(scales or {}).get(name, plant.scales.get(name, 1.0)) for name in names])
         values = np.column_stack([frame[name] for name in names]) if names else np.zeros((count, 0))
-        if not np.all(np.isfinite(values)):
-            raise SpecError("The log has gaps: give rows without missing values.", path="data")
         return np.asarray(values * factors - offsets)
 
     there = [name for name in plant.fault_names if name in frame]
@@ -363,7 +484,9 @@ def _log(
     for name in there:
         truth[:, plant.fault_names.index(name)] = frame[name]
     u, y = signals(plant.input_names), signals(plant.output_names)
-    return _Log(_clock(count, plant.dt), u, y, truth, bool(there))
+    u = u[np.clip(np.arange(count) - input_delay, 0, count - 1)]
+    stamps = table.get((columns or {}).get(TIME, TIME))
+    return _Record(_clock(count, plant.dt) if stamps is None else stamps, u, y, truth, bool(there))
 
 
 def _clock(samples: int, dt: float) -> FloatArray:
@@ -374,19 +497,22 @@ def _compared(
     entry: Candidate,
     plant: DescriptorSystem,
     drawn: DrawnRuns,
-    log: _Log | None,
+    log: _Record | None,
     kept: Held,
     limit: float,
     false_alarms: float,
+    bounds: FloatArray,
 ) -> ComparedMethod:
     nothing = np.zeros((0, 0))
     if entry.observer is None:
         return ComparedMethod(entry.method, entry.refused, None, 0, entry.milliseconds, (), False, nothing, nothing)
     observer = entry.observer
-    _, responses = step_responses(plant, observer, kept.steps, kept.feedback)
+    impulses, responses = step_responses(plant, observer, kept.steps, kept.feedback)
+    names = [figures.fault for figures in entry.figures]
+    beside = thresholds_beside_least(plant, impulses, names, bounds)
     found = estimates(observer, drawn.faulty_u, drawn.faulty)
     quiet = estimates(observer, drawn.healthy_u, drawn.healthy)
-    replayed = None if log is None else estimates(observer, log.u[None], log.y[None])[0]
+    replayed = None if log is None or entry.design is None else faults_on_rows(entry.design, log.times, log.u, log.y)
     rows = []
     for row, figures in enumerate(entry.figures):
         column = plant.fault_names.index(figures.fault)
@@ -397,7 +523,7 @@ def _compared(
         if replayed is not None and log is not None and log.known:
             error = replayed[:, row] - log.truth[:, column]
         bias = float(np.max(np.abs(np.mean(quiet[:, :, row], axis=1)), initial=0.0))
-        rows.append(FaultComparison(figures, rms(error), bias, level, delay, smallest))
+        rows.append(FaultComparison(figures, rms(error), bias, level, delay, smallest, *beside[row]))
     shown = found[0] if replayed is None else replayed
     fast = all(fault.figures.reaches and fault.figures.most <= limit for fault in rows)
     own = np.column_stack([responses[:, i, plant.fault_names.index(f.fault)] for i, f in enumerate(entry.figures)])
@@ -423,7 +549,7 @@ def _reason(best: ComparedMethod | None, compared: Sequence[ComparedMethod], pla
         words[0] += f" against {others[0].rms:.3g} of {others[0].method}"
     leak = max(fault.figures.leak for fault in best.faults)
     if plant.nd:
-        words.append("no unknown input leaks" if leak <= DECOUPLED else f"an unknown input leaks by {leak:.2g}")
+        words.append("decoupled from unknown inputs" if leak <= DECOUPLED else f"gain from unknown inputs {leak:.2g}")
     if not best.fast_enough:
         words.append("though none shows a step as fast as asked for")
     slow = [entry.method for entry in others if not entry.fast_enough] if best.fast_enough else []

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from html import escape
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from obsynth.files.outputs import FileKind
+from obsynth.errors import SpecError
+from obsynth.files.outputs import FileKind, write_atomically
+from obsynth.files.pages import standing_page
 from obsynth.files.tables import html_table, text_table
 from obsynth.methods.fault_figures import FaultFigures
 from obsynth.numerics.arrays import FloatArray
+from obsynth.results.certificate_files import COMPARISON, SHOWN_DIGITS, result_text
 from obsynth.results.design import ObserverDesign
+from obsynth.results.gain_sets import design_as_dict
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -36,6 +42,12 @@ class FaultComparison:
         Median over the runs, from the start of the fault.
     smallest_found : float
         Size of a step that half of the runs find.
+    bound : float
+        What the estimate never passes without a fault, with disturbances as large as in the scenario and three
+        deviations of noise: sums of absolute values.
+    least : float
+        The least such bound that any test with the same delay can have, linear or not: of a fault of any course where
+        the estimate is one sample of it, else of a constant one.
     """
 
     figures: FaultFigures
@@ -44,6 +56,8 @@ class FaultComparison:
     threshold: float
     detection_delay: float
     smallest_found: float
+    bound: float = float("nan")
+    least: float = float("nan")
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,15 +110,17 @@ _HEADER = (
     "method",
     "fault",
     "order",
-    "50 % s",
-    "90 % s",
+    "s to 50 %",
+    "s to 90 %",
     "at horizon",
     "peak",
     "deviation",
-    "leak",
+    "gain from d",
     "bias",
-    "alarm s",
+    "s to alarm",
     "smallest",
+    "bound",
+    "x least",
     "rms",
     "ms",
 )
@@ -132,6 +148,10 @@ class Comparison:
         Columns of `truth`.
     setting : str
         What was drawn, in words.
+    asked : mapping, optional
+        Plant, scenario and options, as plain data; empty where a log is in no file.
+    log : mapping, optional
+        The log by its name and digest, and how its columns were read.
     """
 
     methods: tuple[ComparedMethod, ...]
@@ -142,6 +162,8 @@ class Comparison:
     truth: FloatArray
     fault_names: tuple[str, ...]
     setting: str
+    asked: Mapping[str, Any] = field(default_factory=dict)
+    log: Mapping[str, Any] | None = None
 
     def __getitem__(self, method: str) -> ComparedMethod:
         for found in self.methods:
@@ -165,6 +187,8 @@ class Comparison:
                     fault.bias,
                     fault.detection_delay,
                     fault.smallest_found,
+                    fault.bound,
+                    fault.bound / fault.least if fault.least > 0.0 else np.nan,
                     fault.rms,
                 )
                 rows.append(
@@ -193,21 +217,55 @@ class Comparison:
             "setting": self.setting,
             "refusals": list(self.refusals),
             "rows": [dict(zip(header, row, strict=True)) for row in rows],
-            "methods": [
-                {
-                    "method": entry.method,
-                    "order": entry.order,
-                    "fast_enough": entry.fast_enough,
-                    "rms": entry.rms,
-                    "faults": [
-                        {**vars(fault.figures), **{k: v for k, v in vars(fault).items() if k != "figures"}}
-                        for fault in entry.faults
-                    ],
-                }
-                for entry in self.methods
-                if not entry.refused
-            ],
+            "methods": [{"method": name, **entry} for name, entry in self.claims()["methods"].items()],
         }
+
+    def claims(self) -> dict[str, Any]:
+        """Return what a certificate claims: the figures of every design on the same draws."""
+        figures = {
+            entry.method: {
+                "order": entry.order,
+                "fast_enough": entry.fast_enough,
+                "rms": entry.rms,
+                "faults": [
+                    {**vars(fault.figures), **{k: v for k, v in vars(fault).items() if k != "figures"}}
+                    for fault in entry.faults
+                ],
+            }
+            for entry in self.methods
+            if not entry.refused
+        }
+        return {"setting": self.setting, "methods": figures}
+
+    @property
+    def statement(self) -> str:
+        """Which method is best on what, in one sentence, with everything that it rests on."""
+        if not self.recommended:
+            return f"None exists: {self.reason}."
+        digests = {name: design_as_dict(design)["sha256"] for name, design in self._designs().items()}
+        return comparison_statement(self.claims(), digests, self.log)
+
+    def _designs(self) -> dict[str, ObserverDesign]:
+        return {entry.method: entry.design for entry in self.methods if entry.design is not None}
+
+    def save(self, path: str | Path) -> Path:
+        """Write a certificate that `obsynth verify` recomputes, with every gain set inside.
+
+        Parameters
+        ----------
+        path : str or Path
+            Where to write (.json).
+
+        Raises
+        ------
+        SpecError
+            No method exists, or the log is in no file: there is nothing to certify.
+        """
+        if not self.recommended or not self.asked:
+            why = "no method exists" if not self.recommended else "the log is in no file"
+            raise SpecError(f"There is nothing to certify: {why}.", path="methods")
+        text = result_text(COMPARISON, self._designs(), self.asked, self.claims(), self.statement, self.log)
+        return write_atomically(path, text)
 
     def plot(self) -> Figure:
         """Return a figure: for each fault, what each method makes of a unit step, and its estimate on the scenario."""
@@ -264,14 +322,32 @@ class Comparison:
         picture = BytesIO()
         self.plot().savefig(picture, format="png", dpi=110)
         encoded = b64encode(picture.getvalue()).decode("ascii")
-        style = "body{font-family:sans-serif;margin:2em;max-width:75em}td,th{padding:.2em .6em;text-align:right}"
-        return (
-            "<!DOCTYPE html><html lang='en'><head><meta charset='utf-8'>"
-            '<meta name="generator" content="obsynth compare"><title>Comparison of methods</title>'
-            f"<style>{style}</style></head><body><h1>{escape(self.advice)}</h1>{self._repr_html_()}"
-            f"<img alt='Estimates of each method' style='max-width:100%' src='data:image/png;base64,{encoded}'></body>"
-            "</html>\n"
-        )
+        body = [
+            f'<p class="verdict {"holds" if self.recommended else "fails"}">{escape(self.advice)}</p>',
+            f"<p>{escape(self.setting)}</p>",
+            f'<div class="scroll">{html_table(self.rows())}</div>',
+            *(f"<p>{escape(text)}</p>" for text in self.refusals),
+            f'<figure><img alt="Estimates of each method" src="data:image/png;base64,{encoded}"></figure>',
+        ]
+        return standing_page("Comparison of methods", body, generator="obsynth compare")
+
+
+def comparison_statement(claims: Mapping[str, Any], digests: Mapping[str, str], log: Mapping[str, Any] | None) -> str:
+    """Return what the figures of a comparison come to; ``digests`` are those of the gain sets."""
+    methods = claims["methods"]
+    errors = {
+        name: float(np.sqrt(np.mean([fault["rms"] ** 2 for fault in entry["faults"]])))
+        for name, entry in methods.items()
+    }
+    best = min(methods, key=lambda name: (not methods[name]["fast_enough"], errors[name]))
+    others = ", ".join(f"{errors[name]:.4g} of {name}" for name in methods if name != best)
+    fast = "" if methods[best]["fast_enough"] else ", though none shows a step as fast as wanted"
+    where = "" if log is None else f", errors on {log['name']} (sha256 {log['sha256'][:SHOWN_DIGITS]})"
+    kept = ", ".join(f"{name} {digest[:SHOWN_DIGITS]}" for name, digest in digests.items())
+    return (
+        f"Of the methods that exist, {best} has the least rms error of the fault estimates ({errors[best]:.4g}"
+        f"{f' against {others}' if others else ''}){fast}: {claims['setting']}{where}. Gain sets: {kept}."
+    )
 
 
 def _number(value: float) -> str:

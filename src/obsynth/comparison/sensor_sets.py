@@ -25,7 +25,7 @@ from obsynth.numerics.libraries import on_one_thread_if_small
 from obsynth.plants.descriptor import DescriptorSystem
 
 #: So many sets are returned at most by default, and so many of them designed for.
-MOST = 24
+MOST_LISTED_SETS = 24
 
 
 @dataclass(frozen=True)
@@ -142,7 +142,7 @@ def sensor_sets(
     largest: int | None = None,
     copies: int = 1,
     may_fail: bool = False,
-    most: int = MOST,
+    most: int = MOST_LISTED_SETS,
     fault: str | None = None,
     below: float | None = None,
     sample_time: float | Sequence[float] | None = None,

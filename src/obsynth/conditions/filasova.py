@@ -33,7 +33,7 @@ from obsynth.errors import SpecError
 from obsynth.methods.conic import lmi
 from obsynth.methods.designing import design_from_gains
 from obsynth.methods.pd_observer.conditions import explicit_form, pd_observer_conditions
-from obsynth.methods.pd_observer.inequalities import MARGIN
+from obsynth.methods.pd_observer.inequalities import PD_MARGIN
 from obsynth.numerics.arguments import chosen, is_finite_number, shown
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.regions import LMIRegion, checked_region
@@ -51,7 +51,7 @@ def filasova_theorem1(
     reading: str = "safe",
     decay: float = 0.0,
     region: LMIRegion | None = None,
-    margin: float = MARGIN,
+    margin: float = PD_MARGIN,
 ) -> Conditions:
     """Return Theorem 1 of Filasova, Krokavec and Serbak: (40)-(43) in P1, P3, Y, Z.
 
@@ -98,7 +98,7 @@ def filasova_theorem2(
     reading: str = "safe",
     decay: float = 0.0,
     region: LMIRegion | None = None,
-    margin: float = MARGIN,
+    margin: float = PD_MARGIN,
 ) -> Conditions:
     """Return Theorem 2 of Filasova, Krokavec and Serbak: (61)-(64) in P1 (the paper's P), P3 (its Q), Y, Z.
 

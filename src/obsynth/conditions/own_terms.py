@@ -17,9 +17,9 @@ from obsynth.conditions import atoms
 from obsynth.conditions.filasova import filasova_theorem1, filasova_theorem2
 from obsynth.conditions.problem import Conditions, named_constraints
 from obsynth.conditions.share_pasand import sharepasand
-from obsynth.conditions.wang import error_norm, wang2015
+from obsynth.conditions.wang import error_norm, h2_terms, noise_paths, wang2015
 from obsynth.errors import PreconditionError, SolverError
-from obsynth.methods.conic.lmi import AUTO, SCHUR, SOLVER_SETTINGS, USABLE_STATUSES, semidefinite_solvers
+from obsynth.methods.conic.lmi import SOLVER_SETTINGS, USABLE_STATUSES, semidefinite_solvers
 from obsynth.methods.fault_estimation_filter.conditions import fault_filter_conditions
 from obsynth.methods.fault_estimation_filter.method import FaultEstimationFilter
 from obsynth.methods.fault_estimation_filter.prepared_plant import with_sensor_faults_as_states
@@ -218,26 +218,9 @@ def _h2_terms(plant: DescriptorSystem, found: Conditions, added: dict[str, Any])
     """Add the H2 inequalities from unit white disturbances and noise to the fault errors; return what is minimised."""
     import cvxpy as cp
 
-    work, data = with_sensor_faults_as_states(plant), found.data
+    work = with_sensor_faults_as_states(plant)
     b, d = np.hstack([work.Bd, work.Bw]), np.hstack([work.Dd, work.Dw])
-    rest = np.eye(work.ny) - work.C @ data["N"]
-    entering = data["T"] @ b - data["T"] @ work.A @ (data["N"] @ d) - data["L0"] @ rest @ d
-    measured = (np.eye(work.ny) - data["Upsilon"] @ data["W"]) @ rest @ d
-    Z = cp.Variable((b.shape[1], b.shape[1]), symmetric=True, name="Z")
-    weight = found.weight if found.weight is not None else data["W"]
-    stable, variance = atoms.h2(
-        data["A1"],
-        entering,
-        weight @ work.C,
-        weight @ rest @ d,
-        found.variables["P"],
-        Z,
-        plant.dt,
-        Y=found.variables["Y"],
-        Cy=data["C1"],
-        Dy=measured,
-    )
-    added["H2 stable"], added["H2"] = stable, variance
+    added["H2 stable"], added["H2"], Z = h2_terms(plant, found, *noise_paths(plant, found, b, d))
     return cp.trace(Z)
 
 
@@ -251,7 +234,7 @@ def _with_z(found: Conditions, added: Mapping[str, Any]) -> Conditions:
 
 def _solved(found: Conditions, asked: Any) -> dict[str, Any]:
     """Solve a problem by the solver that was asked for, and return the record of the run."""
-    names = AUTOMATIC if asked.solver in (AUTO, SCHUR) else (asked.solver,)
+    names = AUTOMATIC if asked.solver == AUTOMATIC[0] else (asked.solver,)
     for name in (name for name in names if name == names[0] or name in semidefinite_solvers()):
         settings = {**SOLVER_SETTINGS.get(name, {}), **(asked.solver_options or {})}
         failure = None
@@ -279,7 +262,6 @@ def _told(
 ) -> Synthesis:
     """Return a synthesis from gains as the one that was asked for, with its record."""
     options = {**asked.as_plain(), **resolved, "constraints": list(found.constraints)}
-    options.pop("model_error", None)
     imposed = f", and every eigenvalue in {where}" if where is not None else ""
     note = f"The inequality was solved as it stands in the paper, with {', '.join(found.constraints)}{imposed}."
     return replace(made, options=options, solver={"engine": "lmi", "runs": runs}, notes=(note, *made.notes))

@@ -21,18 +21,17 @@ from numpy.typing import ArrayLike
 
 from obsynth.analysis.conditions import Condition
 from obsynth.analysis.transformations.recovery import Transformation, linear_plant
+from obsynth.conditions import atoms
 from obsynth.conditions.atoms import MARGIN
 from obsynth.conditions.problem import Conditions, Values, require_data
 from obsynth.errors import SpecError
 from obsynth.methods.conic import lmi
-from obsynth.methods.conic.lmi import AUTO
 from obsynth.methods.designing import design_from_gains
+from obsynth.methods.fault_estimation_filter.central_filter import search_least_gain
 from obsynth.methods.fault_estimation_filter.conditions import examine_fault_filter
 from obsynth.methods.fault_estimation_filter.detectability_indexes import exact_indexes, fault_detectability
 from obsynth.methods.fault_estimation_filter.gamma_lower_bound import proved_lower_bound
-from obsynth.methods.fault_estimation_filter.inequality_search import search_least_gain
-from obsynth.methods.fault_estimation_filter.inequality_solutions import null_basis
-from obsynth.methods.fault_estimation_filter.injection_problem import GainProblem, normalise
+from obsynth.methods.fault_estimation_filter.injection_problem import GainProblem, normalise, null_basis
 from obsynth.methods.fault_estimation_filter.prepared_plant import (
     prepare,
     restricted_equivalent_from,
@@ -142,7 +141,7 @@ def wang2015(
     )
     X, R0, unit = as_matrix(np.eye(n), "X"), np.zeros((n, m)), 1.0
     if chosen(coordinates, "coordinates", ("plant", "balanced")) == "balanced":
-        start = search_least_gain(convex, solver=AUTO, polish=False)
+        start = search_least_gain(convex)
         found = normalise(convex, start=start.injection, gain=start.gain or None)
         X, rest, unit = found.states, found.measurements @ V.T, found.gain or 1.0
         R0 = start.injection.R @ V.T
@@ -201,6 +200,7 @@ def wang2015(
         "D1": D1,
         "X": X,
         "R0": R0,
+        "rest": rest,
     }
     return Conditions(
         "Wang et al. 2015, Theorem 2, (45)",
@@ -274,11 +274,11 @@ def _existence(held: Sequence[Condition], convex: GainProblem, gamma: float | No
     found = list(held)
     if gamma is None or not convex.disturbances or not all(condition.holds for condition in held):
         return found
-    best = search_least_gain(convex, solver="auto")
+    best = search_least_gain(convex)
     bound = (
         best.gain
         if not convex.measured
-        else proved_lower_bound(convex, solver="auto", best=best.injection, enough=gamma)
+        else proved_lower_bound(convex, solver="CLARABEL", best=best.injection, enough=gamma)
     )
     holds = bool(best.gain <= gamma or bound <= gamma)
     detail = f"the best filter found has {best.gain:.9g}, and no filter is below {bound:.9g}"
@@ -303,6 +303,43 @@ def _design(
         if found.report.passed:
             break
     return found
+
+
+def noise_paths(
+    plant: DescriptorSystem, found: Conditions, b: FloatArray, d: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return how inputs by ``b (nx, k)`` and ``d (ny, k)`` enter the errors, but for R, and the outputs less C N d."""
+    work, data = with_sensor_faults_as_states(plant), found.data
+    free = (np.eye(work.ny) - work.C @ data["N"]) @ d
+    return data["T"] @ b - data["T"] @ work.A @ (data["N"] @ d) - data["L0"] @ free, free
+
+
+def h2_terms(
+    plant: DescriptorSystem, found: Conditions, entering: FloatArray, free: FloatArray
+) -> tuple[Any, Any, Any]:
+    """Return the H2 inequalities for inputs that enter the errors by ``entering - R free`` and the estimates by W free.
+
+    They are a constraint of stability and one of variance; the third is the variable whose trace bounds the variance.
+    """
+    import cvxpy as cp
+
+    data, k = found.data, free.shape[1]
+    C = with_sensor_faults_as_states(plant).C
+    Z = cp.Variable((k, k), symmetric=True, name="Z")
+    weight = found.weight if found.weight is not None else data["W"]
+    stable, variance = atoms.h2(
+        data["A1"],
+        np.linalg.solve(data["X"], entering - data["R0"] @ free),
+        weight @ (C @ data["X"]),
+        weight @ free,
+        found.variables["P"],
+        Z,
+        plant.dt,
+        Y=found.variables["Y"],
+        Cy=data["C1"],
+        Dy=data["rest"] @ free,
+    )
+    return stable, variance, Z
 
 
 def error_norm(plant: DescriptorSystem, gains: Mapping[str, FloatArray]) -> float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -117,3 +117,36 @@ class AlarmLog:
 def silent_rows(silent: Mapping[str, int]) -> list[str]:
     """Return a text for each reason why rows could not alarm."""
     return [f"{count} {status}: {REASONS.get(status, status)}" for status, count in silent.items() if status != PARTIAL]
+
+
+#: Alarms that a summary lists.
+MOST_LISTED = 20
+
+
+def alarm_rows(events: Sequence[AlarmEvent], shown: Callable[[float], str]) -> tuple[list[tuple[str, ...]], int]:
+    """Return a table of alarms, heading first and without empty columns, and how many more there are."""
+    if not events:
+        return [], 0
+
+    def number(value: float) -> str:
+        return "" if math.isnan(value) else f"{value:.4g}"
+
+    rows = [("alarm by", "from", "to", "rows", "fault", "size", "interval", "of its threshold")]
+    for event in events[:MOST_LISTED]:
+        interval = "" if math.isnan(event.low) else f"{number(event.low)} to {number(event.high)}"
+        ends = shown(event.start), shown(event.end)
+        evidence = f"{event.evidence:.3g} times"
+        rows.append((event.by, *ends, str(event.rows), event.fault, number(event.size), interval, evidence))
+    kept = [i for i in range(len(rows[0])) if any(row[i] for row in rows[1:])]
+    return [tuple(row[i] for i in kept) for row in rows], len(events) - len(rows) + 1
+
+
+def silence(run: Any, by: str) -> list[str]:
+    """Return what a run without alarms says, and how many rows could not alarm; ``by`` names what watched."""
+    silent, found = sum(run.silent.values()), list[str]()
+    if not run.alarms and silent < run.rows:
+        told = f" in the {run.rows - silent} rows that could alarm" if silent else ""
+        found.append(f"No alarm by {by}{told}.")
+    if silent:
+        found.append(f"{silent} of {run.rows} rows could not alarm: {'; '.join(silent_rows(run.silent))}.")
+    return found

@@ -13,8 +13,11 @@ from obsynth.data.linear_log import DataObserver
 from obsynth.data.signals import Signals
 from obsynth.data.sources import Data, samples
 from obsynth.errors import SpecError
+from obsynth.experiments.alarm_multipliers import rows_of_test
 from obsynth.experiments.alarm_proof import WINDOW, AlarmProof, proved_alarm
 from obsynth.experiments.assumptions import Log
+from obsynth.experiments.monitors.guaranteed import is_guaranteed
+from obsynth.methods.guaranteed_test.result import GuaranteedTest
 from obsynth.numerics.arguments import is_whole, require_kind, require_mapping
 from obsynth.numerics.arrays import FloatArray
 from obsynth.results.design import ObserverDesign
@@ -36,15 +39,17 @@ def prove_alarm(
 ) -> AlarmProof:
     """Return a proof that measured data up to a row are not fault-free, or that there is none.
 
-    The window's samples are written as a linear programme over states, disturbances, noise and constants (products by
-    McCormick); its dual is checked in rational arithmetic.  "Cannot be proved" is an answer, not an error.
+    The alarm of a guaranteed test is proved by one fraction for each equation of its window, on the bounds of its
+    design: added up, the equations leave a sum of disturbances and noise that the bounds do not allow.  For other
+    designs the window's samples are written as a linear programme over states, disturbances, noise and constants
+    (products by McCormick); its dual is checked in rational arithmetic.  "Cannot be proved" is an answer, not an error.
 
     Parameters
     ----------
     design : ObserverDesign
         Linear, discrete in time; its plant's tolerances count.
     data : path, text stream or pandas.DataFrame
-        As for `run_on_data`, without gaps from the first row to ``row``.
+        As for `run_on_data`, without gaps from the first row to ``row`` (guaranteed tests: in the window).
     row : int
         Last row of the window, counted from 1.
     window : int, optional
@@ -85,7 +90,10 @@ def prove_alarm(
         require_mapping(value, name)
     if not is_whole(row) or row < 2:
         raise SpecError(f"row is {row!r}: give the number of a row, 2 or more.", path="row")
-    values, nu = rows_of(design, data, row, columns, scales), design.linear[0].nu
+    own = max(map(rows_of_test, GuaranteedTest.of(design).tests)) if is_guaranteed(design) else None
+    if own is not None and window not in (WINDOW, own):
+        raise SpecError(f"window is {window}: the window of this test has {own} samples.", path="window")
+    values, nu = rows_of(design, data, row, columns, scales, own), design.linear[0].nu
     log = Log.of(Path(data), columns, scales) if isinstance(data, (str, Path)) else None
     return proved_alarm(
         design,
@@ -107,18 +115,29 @@ def rows_of(
     row: int,
     columns: Mapping[str, str] | None = None,
     scales: Mapping[str, float] | None = None,
+    complete: int | None = None,
 ) -> FloatArray:
-    """Return the rows of data up to one, ``(row, nu + ny)``, as a design reads them; refuse what has gaps."""
+    """Return the rows of data up to one, ``(row, nu + ny)``, as a design reads them; refuse what has gaps.
+
+    ``complete``: so many of the last rows have to be without gaps; all by default.
+    """
     reader = DataObserver(design)
     signals = Signals.of(reader, columns, scales)
-    found: list[FloatArray] = []
-    for time, values in itertools.islice(samples(data, signals), row):
-        _, missing = reader.clock.advance(time, len(found) + 1)
-        if (len(found) and missing) or not np.isfinite(values).all():
-            raise SpecError(
-                f"Row {len(found) + 1} has a gap before it or misses a sample: give complete rows.", path="data"
-            )
+    found, flawed, count, status = list[FloatArray](), list[tuple[bool, bool, int]](), 0, ""
+    for count, (time, values) in enumerate(itertools.islice(samples(data, signals), row), 1):
+        status = reader.clock.stale(time)
+        if status:
+            # The same rows are left out as in a run.
+            continue
+        _, missing = reader.clock.advance(time, count)
+        flawed.append((bool(missing and found), not np.isfinite(values).all(), count))
         found.append(values)
-    if len(found) < row:
-        raise SpecError(f"The data have {len(found)} rows: row {row} is not among them.", path="row")
+    if count < row:
+        raise SpecError(f"The data have {count} rows: row {row} is not among them.", path="row")
+    if status:
+        raise SpecError(f"Row {row} is left out ({status}): give another one.", path="row")
+    for place, (gap, blank, number) in enumerate(flawed[-(complete or len(flawed)) :]):
+        # Of what is before the first row of a window nothing is asked.
+        if blank or (gap and (place or complete is None)):
+            raise SpecError(f"Row {number} has a gap before it or misses a sample: give complete rows.", path="data")
     return np.array(found)

@@ -15,9 +15,9 @@ from obsynth.analysis.transformations.recovery import StateRecovery
 from obsynth.data.alarm_events import NO_DECISION, AlarmLog
 from obsynth.data.log_estimator import DECIDING, STALE, Engine, Entry, LagBuffer, Row
 from obsynth.data.recovered import LATE, RecoveredStates
-from obsynth.data.signals import TIME, Signals
+from obsynth.data.signals import TIME, Signals, Stamps
 from obsynth.errors import SpecError
-from obsynth.experiments.monitors.online import OnlineMonitor
+from obsynth.experiments.monitors.monitor import LinearSample, Monitor, Sample
 from obsynth.files.inputs import read_json
 from obsynth.files.outputs import FileKind, write_atomically
 from obsynth.numerics.arguments import is_finite_number, is_number
@@ -84,11 +84,14 @@ class Job:
         signals: Signals,
         recovery: StateRecovery | None,
         thresholds: Mapping[str, float],
-        monitor: OnlineMonitor | None,
+        monitor: Monitor | None,
         recovered: str | Sequence[str] | None = None,
         later: LagBuffer | None = None,
+        stamps: Stamps | None = None,
     ) -> None:
+        self.stamps = stamps
         self.engine, self.signals, self.monitor, self.later = engine, signals, monitor, later
+        self._watching: Any = None if monitor is None else monitor.init()
         self.recovered = RecoveredStates.of(recovery, engine, recovered)
         extra = () if self.recovered is None else self.recovered.columns
         names = (*engine.columns, *extra)
@@ -144,37 +147,24 @@ class Job:
         return found
 
     def _taken(self, chunk: FloatArray) -> list[list[Any]]:
-        entries: list[Entry] = []
-        scaled = self.signals.deviations(chunk)
+        times, scaled = chunk[:, 0].tolist(), self.signals.deviations(chunk)
         if self.later is None:
-            return self._shown(self._in_order(chunk[:, 0].tolist(), scaled))
-        for time, deviations in zip(chunk[:, 0].tolist(), scaled, strict=True):
-            entry = Entry(time, deviations, self.engine.step(time, deviations, self.rows + 1))
-            self.rows += 1
-            self.first.take(time, deviations)
-            entries.extend(ready for ready, *_ in self.later.take(entry))
-        return self._shown(entries)
+            return self._shown(self._entries(times, scaled))
+        # What waits for a row is smoothed by it before the next one is taken.
+        return self._shown(
+            [
+                ready
+                for k in range(len(times))
+                for entry in self._entries(times[k : k + 1], scaled[k : k + 1])
+                for ready, *_ in self.later.take(entry)
+            ]
+        )
 
-    def _in_order(self, times: list[float], scaled: FloatArray) -> list[Entry]:
-        """Return the entries of rows, of which those whose stamps do not rise are left out by the observer."""
-        found: list[Entry] = []
-        nothing, done = np.full(len(self.engine.columns), np.nan), 0
-        while done < len(times):
-            # Rows that rise are taken in one piece, beginning with the first that does.
-            status = self.engine.clock.stale(times[done])
-            if status:
-                found.append(Entry(times[done], scaled[done], Row(status, nothing)))
-                self.rows, done = self.rows + 1, done + 1
-                continue
-            end = done + 1
-            while end < len(times) and times[end] > times[end - 1]:
-                end += 1
-            rows = self.engine.steps(times[done:end], scaled[done:end], self.rows + 1)
-            self.rows += len(rows)
-            self.first.take_rows(times[done:end], scaled[done:end])
-            found += [Entry(*parts) for parts in zip(times[done:end], scaled[done:end], rows, strict=True)]
-            done = end
-        return found
+    def _entries(self, times: list[float], scaled: FloatArray) -> list[Entry]:
+        rows = self.engine.rows(times, scaled, self.rows + 1)
+        self.rows += len(rows)
+        self.first.take_rows(times, scaled)
+        return [Entry(*parts) for parts in zip(times, scaled, rows, strict=True)]
 
     def finish(self) -> list[list[Any]]:
         """Return the rows of output that waited for what does not come any more."""
@@ -194,8 +184,8 @@ class Job:
         ]
         if self._levels or self.monitor is not None:
             first = self.rows - len(rows) + 1
-            for number, ((time, _, row), values, cells) in enumerate(zip(entries, estimates, rows, strict=True), first):
-                cells.extend(self._decided(time, row, values, number, cells))
+            for number, (entry, values, cells) in enumerate(zip(entries, estimates, rows, strict=True), first):
+                cells.extend(self._decided(entry, values, number, cells))
         return rows
 
     def _recovered_in(self, entry: Entry) -> FloatArray:
@@ -203,8 +193,9 @@ class Job:
             return np.full(0 if self.recovered is None else len(self.recovered.columns), np.nan)
         return self.recovered.take(entry.row, entry.deviations[: len(self.engine.input_names)])
 
-    def _decided(self, time: float, row: Row, values: FloatArray, number: int, said: Sequence[Any]) -> list[Any]:
+    def _decided(self, entry: Entry, values: FloatArray, number: int, said: Sequence[Any]) -> list[Any]:
         """Return statistic and threshold, if there is a monitor, and what alarms there are; ``said``: cells so far."""
+        time, deviations, row = entry
         if row.status in STALE:
             self.events.silent[row.status] += 1
             return [*([math.nan] * (0 if self.monitor is None else len(self.monitor.columns) + 2)), ""]
@@ -219,17 +210,14 @@ class Job:
         undecided = not deciding
         if self.monitor is not None:
             deciding = deciding and (row.forgotten or not self.monitor.guarantees)
-            seen = self.monitor.see(
-                time,
-                deciding=deciding,
-                skipped=row.skipped,
-                residuals=row.values[self._residuals],
-                faults=row.values[self._faults],
-                evidence=row.evidence,
-            )
+            residuals, faults = row.values[self._residuals], row.values[self._faults]
+            sample = Sample(time, residuals, faults, self._evidence(row, deviations), deciding, row.skipped)
+            self._watching, seen = self.monitor.step(self._watching, sample)
             more = seen.more or (math.nan,) * len(self.monitor.columns)
             cells = [*(np.array(more) + self._shifts).tolist(), seen.statistic, seen.threshold]
-            undecided = undecided or (not self._levels and math.isnan(seen.statistic))
+            undecided = (undecided and not self.monitor.rule.takes_gaps) or (
+                not self._levels and math.isnan(seen.statistic)
+            )
             if seen.alarm:
                 evidence = seen.statistic / seen.threshold if seen.threshold else math.inf
                 self.events.take(self.monitor.kind, seen.fault, evidence, time, number, [*said, *cells])
@@ -245,12 +233,20 @@ class Job:
             self.events.silent[row.status if row.status not in DECIDING else NO_DECISION] += 1
         return [*cells, "; ".join(names)]
 
+    def _evidence(self, row: Row, deviations: FloatArray) -> Any:
+        """Return what was learnt from a row; of one with missing samples, to who takes these, what there is."""
+        if row.evidence is not None or self.monitor is None or not self.monitor.rule.takes_gaps:
+            return row.evidence
+        nu = len(self.engine.input_names)
+        return LinearSample(row.values, deviations[:nu], deviations[nu:], len(self.engine.state_names))
+
     def as_dict(self) -> dict[str, Any]:
         """Return the state that goes from row to row, as data."""
         return {
             "observer": self.engine.as_dict(),
             "recovered": None if self.recovered is None else self.recovered.as_dict(),
-            "monitor": None if self.monitor is None else self.monitor.as_dict(),
+            "inputs": None if self.stamps is None else self.stamps.earlier,
+            "monitor": None if self.monitor is None else self.monitor.as_data(self._watching),
         }
 
     def resume(self, data: dict[str, Any]) -> None:
@@ -258,14 +254,16 @@ class Job:
         if (data["monitor"] is None) != (self.monitor is None):
             raise SpecError("The saved state is of a run with another monitor: use the same options.", path="state")
         self.engine.resume(data["observer"])
+        if self.stamps is not None:
+            self.stamps.earlier = data["inputs"]
         if self.recovered is not None:
             self.recovered.resume(data["recovered"])
         if self.monitor is not None:
-            self.monitor.resume(data["monitor"])
+            self._watching = self.monitor.from_data(data["monitor"])
 
 
 KIND = "obsynth run state"
-SCHEMA_VERSION = 6
+SCHEMA_VERSION = 7
 STATE = FileKind("a saved state of obsynth", rb'\A\s*\{\s*"kind":\s*"obsynth run state"')
 #: Parts that are seconds, or nothing before the first row.
 _TIMES = frozenset({"last", "longest"})

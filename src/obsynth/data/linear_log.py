@@ -9,10 +9,11 @@ from functools import lru_cache, partial
 from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from obsynth.data.log_estimator import GAP, LONGEST_BRIDGE, OK, RECOVERING, WARM_UP, Engine, Row
 from obsynth.errors import ObsynthError, PreconditionError, SpecError
-from obsynth.experiments.monitors.online import LinearSample
+from obsynth.experiments.monitors.monitor import LinearSample
 from obsynth.numerics.arguments import is_finite_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import first_order_hold
@@ -27,7 +28,7 @@ KEPT_INTERVALS = 64
 PIECE = 4096
 #: A gap is over when what it can have left in fault estimates and residuals is below this share of their usual changes
 #: from row to row, which so many rows must have shown.
-LEFT_SHARE, LEAST_SHOWN = 0.5, 20
+LEFT_SHARE, LEAST_SHOWN = 1.0, 20
 SAMPLED_GAP = "gap is for continuous-time designs: a sampled one knows which rows are missing."
 _Part = TypeVar("_Part")
 
@@ -98,12 +99,12 @@ class PartialEstimates:
 
         self.plant, _ = design.linear
         errors = error_model(design)
-        self._solver = np.linalg.pinv(np.vstack([errors.own[:, : self.plant.nx] @ self.plant.E, self.plant.C]))
+        self.solver = np.linalg.pinv(np.vstack([errors.own[:, : self.plant.nx] @ self.plant.E, self.plant.C]))
 
     def state(self, z: FloatArray, v: FloatArray, fault: FloatArray) -> FloatArray:
         """Return the states ``(nx_source,)`` at a sample with inputs and outputs ``v``."""
         nu = self.plant.nu
-        return np.asarray(self._solver @ np.concatenate([z, v[nu:] - self.plant.D @ v[:nu] - self.plant.Df @ fault]))
+        return np.asarray(self.solver @ np.concatenate([z, v[nu:] - self.plant.D @ v[:nu] - self.plant.Df @ fault]))
 
 
 def _partial_estimates(design: ObserverDesign) -> PartialEstimates | None:
@@ -134,7 +135,7 @@ class DataObserver(Engine):
         if gap is not None and self.observer.dt > 0.0:
             raise SpecError(SAMPLED_GAP, path="gap")
         super().__init__(self.observer, gap, warm_up, transient(self.observer))
-        self.options["gap"] = gap
+        self.options["gap"], self.input_delay = gap, design.input_delay
         self.input_names, self.output_names = self.observer.input_names, self.observer.output_names
         self.point, self.scales = self.plant.operating_point, self.plant.scales
         self.columns = self.observer.row_names
@@ -159,8 +160,8 @@ class DataObserver(Engine):
         # Squares of changes of fault estimates and residuals from row to row, summed up, and how many there are.
         self.shown = slice(len(self.observer.state_names), None)
         self.changes, self.counted = np.zeros(len(self.observer.Cz[self.shown])), 0
-        # What a unit error of each output that the model told has left in z; NaN where inputs were missing, too.
-        self.left = np.zeros((self.observer.order, len(self.output_names)))
+        # What a unit error of each input that was held, and of each output that the model told, has left in z.
+        self.left, self.held = np.zeros(self.b.shape), np.zeros(self.nu)
         self.transient = transient(self.observer)
         # Of every fault of the plant; those of which nothing is estimated are held to be absent.
         self.fault = np.zeros(self.plant.nf)
@@ -168,13 +169,17 @@ class DataObserver(Engine):
         self.measured = self.v
         self.inputs: deque[FloatArray] = deque(maxlen=max(lags) + 1)
 
+    @property
+    def usual_changes(self) -> tuple[float, int]:
+        """Share of usual changes that a gap may have left, and how many rows must have shown them."""
+        return LEFT_SHARE, LEAST_SHOWN
+
     def step(self, time: float, values: FloatArray, row: int) -> Row:
         """Take one row of data."""
         seconds, missing = self.clock.advance(time, row)
+        since = seconds
         good = bool(np.isfinite(values).all())
         previous = self.row if self.model is None and self.z is not None else None
-        if not np.isfinite(values[: self.nu]).all() or (missing and self.nu):
-            self.left = np.full_like(self.left, np.nan)
         u = values[: self.nu]
         u = np.where(np.isfinite(u), u, self.v[: self.nu])
         # A number that overflows in what follows is a bad sample like any other: the state is looked at below.
@@ -195,19 +200,26 @@ class DataObserver(Engine):
                 recovered = self.warm_up if self.model is None else self._recovering(seconds, values)
                 found = self._measured(seconds, values)
                 if self.model is not None:
-                    self.model, self.settled_at, self.phase = None, time + recovered, RECOVERING
-                    self.left = np.zeros_like(self.left)
+                    self.model, self.left = None, np.zeros_like(self.left)
+                    # The start is forgotten by as many measured rows as without a gap: what the gap adds is no larger
+                    # than what is left of the start then, and goes with it.
+                    self.settled_at += since * missing / (missing + 1)
+                    if self.phase != WARM_UP or time >= self.settled_at:
+                        self.settled_at, self.phase = time + recovered, RECOVERING
                     self.forgotten_at = time + max(self.warm_up, self.transient)
                 status = OK if time >= self.settled_at else self.phase
             else:
-                found, status = self._unmeasured(seconds, u), GAP
+                found, status = self._unmeasured(seconds, u, ~np.isfinite(values[: self.nu])), GAP
         if status == GAP:
+            self.settled_at += since if self.phase == WARM_UP else 0.0
             return Row(GAP, found, missing)
         if self.z is None or not (np.isfinite(self.z).all() and np.isfinite(found).all()):
             self._restart()
             return Row(GAP, self._held(), missing)
         self.fault = self._faults_in(found)
-        if previous is not None and status == OK and not missing:
+        # Until enough is known of what is usual, rows after a gap tell it, too: others may never come.
+        counts = status == OK or (status == RECOVERING and self.counted < LEAST_SHOWN)
+        if previous is not None and counts and not missing:
             self._count((found - previous)[None])
         sample = LinearSample(found, values[: self.nu], values[self.nu :], len(self.state_names))
         return Row(status, found, missing, sample, time >= self.forgotten_at)
@@ -253,8 +265,10 @@ class DataObserver(Engine):
                 return []
         last = count - 1
         self.clock.take(times[:count], steps[:count])
-        deciding = np.array(times[:count]) >= self.settled_at
-        self._count(np.diff(np.vstack([self.row, rows[:count]]), axis=0)[deciding])
+        counts = np.array(times[:count]) >= self.settled_at
+        if self.phase == RECOVERING:
+            counts |= self.counted + np.cumsum(~counts) <= LEAST_SHOWN
+        self._count(np.diff(np.vstack([self.row, rows[:count]]), axis=0)[counts])
         self.z, self.v, self.row, self.measured = np.array(after[last]), values[last], rows[last], values[last]
         self.fault = self._faults_in(rows[last])
         self.seen = (
@@ -302,6 +316,8 @@ class DataObserver(Engine):
         """
         gap_model, nu = _running(self.gap_model), self.nu
         missed = np.abs(v[nu:] - gap_model.outputs(_running(self.model), v[:nu], self.fault))
+        # An input that was held was off by no more than it has changed since.
+        missed = np.concatenate([np.abs(v[:nu] - self.held), missed])
         if self.counted < LEAST_SHOWN or not np.isfinite(self.left).all():
             return self.warm_up
         step = self.observer.dt or self.clock.longest
@@ -310,7 +326,8 @@ class DataObserver(Engine):
         a, left = self.observer.Az, self.left
         if self.observer.dt == 0.0:
             transition, constant, _ = self._hold(seconds or step)
-            a, left = self._hold(step)[0], transition @ left + constant[:, nu:]
+            told = np.repeat([False, True], [nu, len(self.output_names)])
+            a, left = self._hold(step)[0], transition @ left + constant * told
         usual = LEFT_SHARE * np.sqrt(self.changes / self.counted)
         rows, waited = self.observer.Cz[self.shown], 0.0
         # The first row after a gap always counts as recovering.
@@ -348,14 +365,16 @@ class DataObserver(Engine):
             return
         if self.observer.dt > 0.0:
             for _ in range(missing):
-                self._unmeasured(0.0, self.v[: self.nu])
+                self._unmeasured(0.0, self.v[: self.nu], np.ones(self.nu, dtype=bool))
             return
         begin, part = self.v[: self.nu].copy(), seconds / (missing + 1)
         for i in range(missing + 1):
-            self._unmeasured(part, begin + (u - begin) * ((i + 1) / (missing + 1)))
+            share = (i + 1) / (missing + 1)
+            self._unmeasured(part, begin + (u - begin) * share, np.ones(self.nu, dtype=bool))
 
-    def _unmeasured(self, seconds: float, u: FloatArray) -> FloatArray:
-        """Let the plant model stand in for the sensors at one sample; return the estimates, faults held."""
+    def _unmeasured(self, seconds: float, u: FloatArray, unsure: NDArray[np.bool_]) -> FloatArray:
+        """Let the plant model stand in for the sensors at one sample; return the estimates, faults held.
+        ``unsure (nu,)``: which inputs are held."""
         if self.z is None:
             return self._held()
         if self.gap_model is None:
@@ -363,18 +382,22 @@ class DataObserver(Engine):
             return self._held()
         if self.model is None:
             known = list(self.inputs) if self.observer.dt > 0.0 else []
-            self.model = self.gap_model.start(self.seen, known, self.fault)
+            self.model, self.held = self.gap_model.start(self.seen, known, self.fault), self.v[: self.nu]
             if self.observer.dt == 0.0:
                 self._propagate(seconds, u)
         else:
             self._propagate(seconds, u)
         v = np.concatenate([u, self.gap_model.outputs(self.model, u, self.fault)])
+        told = np.concatenate([unsure, np.ones(len(self.output_names), dtype=bool)])
+        if (unsure & self.left[:, : self.nu].any(axis=0)).any():
+            # What an input has done in more than one row is not known.
+            self.left = np.full_like(self.left, np.nan)
         if self.observer.dt == 0.0:
             self._flow(seconds, v)
             transition, constant, _ = self._hold(seconds)
-            self.left = transition @ self.left + constant[:, self.nu :]
+            self.left = transition @ self.left + constant * told
         else:
-            self.left = self.observer.Az @ self.left + self.observer.By
+            self.left = self.observer.Az @ self.left + self.b * told
         row = np.asarray(self.observer.Cz @ self.z + self.d @ v)
         self._taken(v)
         row[self.observer.fault_rows] = self.fault[self.told_faults]
@@ -414,6 +437,7 @@ class DataObserver(Engine):
             "changes": self.changes,
             "counted": self.counted,
             "left": self.left,
+            "held": self.held,
         }
 
     def _resume_own(self, data: dict[str, Any]) -> None:
@@ -421,6 +445,7 @@ class DataObserver(Engine):
         self.fault, self.measured = data["fault"], data["measured"]
         self.seen, self.forgotten_at, self.begun = data["seen"], data["forgotten_at"], data["begun"]
         self.changes, self.counted, self.left = data["changes"], data["counted"], data["left"]
+        self.held = data["held"]
         self.inputs.clear()
         self.inputs.extend(data["inputs"])
 
@@ -443,3 +468,11 @@ def engine_of(
     from obsynth.data.step_log import SteppingEngine
 
     return SteppingEngine(design, warm_up=warm_up, outliers=outliers)
+
+
+def faults_on_rows(design: ObserverDesign, times: FloatArray, u: FloatArray, y: FloatArray) -> FloatArray:
+    """Return fault estimates ``(rows, nf)`` on rows of a log, as `run_on_data` has them; NaN where there is none."""
+    engine = engine_of(design)
+    first = len(engine.state_names)
+    rows = engine.rows(times.tolist(), np.hstack([u, y]), 1)
+    return np.array([row.values[first : first + len(engine.fault_names)] for row in rows])

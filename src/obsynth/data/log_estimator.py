@@ -8,8 +8,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol
 
+import numpy as np
+
 from obsynth.errors import SpecError
-from obsynth.experiments.monitors.online import Evidence, LinearSample
+from obsynth.experiments.monitors.monitor import Evidence, LinearSample
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear.derived import checked_warm_up
 from obsynth.plants.descriptor import DescriptorSystem
@@ -198,6 +200,7 @@ class Engine(ABC):
     scales: Mapping[str, float] = MappingProxyType({})  # factor of inputs and outputs by name
     notes: tuple[str, ...] = ()  # what a user should know before anything is run
     plant: DescriptorSystem | None = None  # of a linear design
+    input_delay: int = 0  # rows of a log by which inputs act later than the design takes them
 
     def __init__(self, observer: Any, gap: float | None, warm_up: float | None, default_warm_up: float) -> None:
         self.state_names, self.fault_names = observer.state_names, observer.fault_names
@@ -228,6 +231,21 @@ class Engine(ABC):
     def steps(self, times: list[float], values: FloatArray, row: int) -> list[Row]:
         """Take rows of data, ``values (rows, nu + ny)``, of which the first has this number: as `step` one by one."""
         return [self.step(time, found, row + i) for i, (time, found) in enumerate(zip(times, values, strict=True))]
+
+    def rows(self, times: Sequence[float], values: FloatArray, first: int) -> list[Row]:
+        """Take rows of a log as they come, ``values (rows, nu + ny)``; those whose stamps do not rise are left out."""
+        found: list[Row] = []
+        while (done := len(found)) < len(times):
+            # Rows that rise are taken in one piece, beginning with the first that does.
+            status = self.clock.stale(times[done])
+            if status:
+                found.append(Row(status, np.full(len(self.columns), np.nan)))
+                continue
+            end = done + 1
+            while end < len(times) and times[end] > times[end - 1]:
+                end += 1
+            found += self.steps(list(times[done:end]), values[done:end], first + done)
+        return found
 
     def as_dict(self) -> dict[str, Any]:
         """Return the state that goes from row to row, as data."""

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from obsynth.calibration.logs import parsed_rows
 from obsynth.data.linear_log import engine_of
-from obsynth.data.log_estimator import DECIDING
+from obsynth.data.log_estimator import DECIDING, STALE
 from obsynth.data.signals import TIME, Signals, Stamps
 from obsynth.data.sources import CHUNK_ROWS, Data, chunks
 from obsynth.errors import SpecError
@@ -109,8 +109,11 @@ def _said(
     numbers, times, rows = list[int](), list[float](), list[FloatArray]()
     count, settling = 0, settling_rows(design)
     for chunk in chunks(data, signals, Stamps(), CHUNK_ROWS):
-        for time, deviations in zip(chunk[:, 0].tolist(), signals.deviations(chunk), strict=True):
-            row = engine.step(time, deviations, count + 1)
+        stamps = chunk[:, 0].tolist()
+        for time, row in zip(stamps, engine.rows(stamps, signals.deviations(chunk), count + 1), strict=True):
+            if row.status in STALE:
+                count += 1
+                continue
             said = watched_values(row.values[residuals], row.evidence)
             if row.status not in DECIDING or count < settling:
                 said = None

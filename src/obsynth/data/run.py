@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -17,9 +16,12 @@ from obsynth.data.signals import TIME, Signals, Stamps
 from obsynth.data.sinks import FrameSink, Sink, measured_frame, sink_for
 from obsynth.data.sources import CHUNK_ROWS, Data, chunks
 from obsynth.errors import ObsynthError, SpecError
-from obsynth.experiments.monitors.online import OnlineMonitor
+from obsynth.experiments.monitors.monitor import Monitor
 from obsynth.files.outputs import check_output, require_distinct
 from obsynth.files.signals import HeldSignals, ending_signals
+from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
+from obsynth.methods.guaranteed_test.result import GuaranteedTest
+from obsynth.methods.guaranteed_test.tolerant import rows_before
 from obsynth.numerics.arguments import is_whole, require_kind, require_mapping, truth
 from obsynth.numerics.arrays import FloatArray
 from obsynth.results.design import ObserverDesign
@@ -72,6 +74,8 @@ class DataRun:
         are one.
     silent : mapping of str to int
         How many rows could not alarm, by their status; ``undecided`` where the monitor decides nothing.
+    statement : str
+        What the threshold of its monitor promises, and what that rests on; empty without one.
     """
 
     rows: int
@@ -89,6 +93,7 @@ class DataRun:
     alarm_rows: Mapping[str, int] = field(default_factory=dict)
     events: tuple[AlarmEvent, ...] = ()
     silent: Mapping[str, int] = field(default_factory=dict)
+    statement: str = ""
 
     def as_dict(self) -> dict[str, Any]:
         """Return the summary as plain data, without the table."""
@@ -117,7 +122,7 @@ def run_on_data(
     time_column: str | None = None,
     scales: Mapping[str, float] | None = None,
     thresholds: Mapping[str, float] | None = None,
-    monitor: OnlineMonitor | None = None,
+    monitor: Monitor | None = None,
     gap: float | None = None,
     warm_up: float | None = None,
     outliers: str | None = None,
@@ -158,7 +163,7 @@ def run_on_data(
         Level of the absolute value by column of the output, such as ``fhat[actuator]`` or ``r[speed]`` (of faults
         with an operating point, of the deviation): the column ``alarm`` names those above their level.  Alarms are
         suspended in rows that are not ``ok`` or ``partial``.
-    monitor : OnlineMonitor, optional
+    monitor : Monitor, optional
         From `obsynth.online_monitor`: columns ``statistic`` and ``threshold``, and its alarms in ``alarm``, with the
         fault that stands out.
     gap : float, optional, seconds
@@ -220,7 +225,7 @@ def run_on_data(
     for name, value in (("columns", columns), ("scales", scales), ("thresholds", thresholds)):
         require_mapping(value, name)
     if monitor is not None:
-        require_kind(monitor, OnlineMonitor, "monitor", "what obsynth.online_monitor returns")
+        require_kind(monitor, Monitor, "monitor", "what obsynth.online_monitor returns")
     if state is not None:
         require_kind(state, (str, Path), "state", "the name of a file")
     if out is not None and not hasattr(out, "write"):
@@ -242,10 +247,17 @@ def run_on_data(
         columns = {**(columns or {}), TIME: time_column}
     engine = engine_of(design, gap=gap, warm_up=warm_up, outliers=outliers)
     stamps = Stamps()
-    # The monitor is not used up: a second run may begin with it.
-    watched = None if monitor is None else copy.deepcopy(monitor)
     later = _later_rows(engine, data, smooth=smooth, lag=lag, state=state)
-    job = Job(engine, Signals.of(engine, columns, scales), design.recovery, thresholds or {}, watched, recovered, later)
+    job = Job(
+        engine,
+        Signals.of(engine, columns, scales),
+        design.recovery,
+        thresholds or {},
+        monitor,
+        recovered,
+        later,
+        stamps,
+    )
     digest = gain_set_digest(design)
     if state is not None and Path(state).exists():
         resume_state(Path(state), job, digest)
@@ -256,6 +268,8 @@ def run_on_data(
         save = partial(save_state, Path(state), job, digest)
     with sink_for(out, job.header, stamps) as sink:
         _run_rows(job, chunks(data, job.signals, stamps, chunk_rows), sink, kept, save, progress or bool, state_every)
+        if state is None and not hasattr(data, "readline"):
+            _require_a_window(design, job.rows)
     if state is not None:
         save_state(Path(state), job, digest)
     table = sink.frame() if isinstance(sink, FrameSink) else None
@@ -267,7 +281,7 @@ def run_on_data(
         job.isolated,
         shown,
         dict(getattr(engine, "outliers", {})),
-        (*engine.notes, *job.first.warnings()),
+        (*engine.notes, *stamps.warnings(), *job.first.warnings()),
         digest,
         table,
         measured_frame(kept, job.signals, stamps),
@@ -276,7 +290,21 @@ def run_on_data(
         dict(job.alarm_rows),
         job.events.events(),
         dict(job.events.silent),
+        "" if monitor is None else monitor.statement,
     )
+
+
+def _require_a_window(design: ObserverDesign, rows: int) -> None:
+    """Raise `SpecError` where a log is shorter than the window of a guaranteed test, which then says nothing of it."""
+    if design.method != GuaranteedTestMethod.id:
+        return
+    needed = max(map(rows_before, GuaranteedTest.of(design).tests)) + 1
+    if rows < needed:
+        raise SpecError(
+            f"The log has {rows} rows, but a window of {design.name!r} has {needed} samples: none of them has a "
+            "verdict. Design the test with fewer samples.",
+            path="samples",
+        )
 
 
 def _later_rows(

@@ -30,6 +30,18 @@ class Stamps:
     def __init__(self) -> None:
         self.is_dated: bool | None = None
         self.zone: tzinfo | None = None  # of the first stamp, `None` where it names none (taken as UTC)
+        #: Rows and texts of cells that hold a word instead of a number, by column: they count as missing.
+        self.words: dict[str, list[tuple[int, str]]] = {}
+        #: Inputs ``(delay, nu)`` of the latest rows, where inputs act later than they are written.
+        self.earlier: FloatArray | None = None
+
+    def warnings(self) -> tuple[str, ...]:
+        """Return a text for each column with words in it."""
+        return tuple(
+            f"{len(found)} cell(s) of {column!r} hold no number and count as missing, first {found[0][1]!r} in row "
+            f"{found[0][0]}."
+            for column, found in self.words.items()
+        )
 
     def read(self, text: str, row: int, column: str, *, comma: bool = False) -> float:
         """Return the seconds of one cell; ``comma`` takes a decimal comma."""
@@ -119,6 +131,8 @@ class Signals:
     offset: FloatArray
     point: Mapping[str, float]  # the operating point
     one: int | None = None  # number of the signal that is one in every row and has no column, if there is such a one
+    inputs: int = 0  # columns of known inputs
+    delay: int = 0  # rows by which these act later than the design takes them; negative: earlier
 
     @classmethod
     def of(cls, engine: Engine, columns: Mapping[str, str] | None, scales: Mapping[str, float] | None) -> Signals:
@@ -143,6 +157,8 @@ class Signals:
             read_only(np.array([engine.point.get(name, 0.0) for name in names])),
             dict(engine.point),
             names.index(shift) if shift and shift in names else None,
+            len(engine.input_names) - int(bool(shift) and shift in engine.input_names),
+            engine.input_delay,
         )
 
     def measured(self, rows: FloatArray) -> FloatArray:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.data.linear_log import engine_of
-from obsynth.data.log_estimator import Engine, Entry
+from obsynth.data.log_estimator import STALE, Engine, Entry
 from obsynth.data.signals import TIME, Signals
 from obsynth.data.sources import samples
 from obsynth.data.step_log import SteppingEngine
@@ -81,6 +81,8 @@ class LaterRows:
 
     def _shown(self, ready: _Waiting, found: Smoothed) -> tuple[Entry, Any, Smoothed]:
         nx, row = len(self.engine.state_names), ready.entry.row
+        if row.status in STALE:
+            return ready.entry, ready.chain.row(ready.k), found
         theta, spread = parameters_of(found, nx)
         own = (
             found.x[:nx],
@@ -198,7 +200,8 @@ def _smoothed_log(engine: Any, data: Any, lag: int | None, signals: Signals) -> 
     later, observer = LaterRows(engine, lag), engine.observer.observer
     found: list[tuple[Entry, Any, Smoothed]] = []
     for row, (time, deviations) in enumerate(samples(data, signals), 1):
-        found.extend(later.take(Entry(time, deviations, engine.step(time, deviations, row))))
+        taken = engine.rows([time], deviations[None], row)[0]
+        found.extend(later.take(Entry(time, deviations, taken)))
     found.extend(later.flush())
     known = smoothed_estimates(observer, [row for _, row, _ in found], [sample for _, _, sample in found])
     point = signals.estimates_point(engine)

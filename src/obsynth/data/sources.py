@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib import import_module
@@ -38,7 +39,49 @@ Data: TypeAlias = "str | Path | TextIO | pd.DataFrame"
 
 
 def chunks(data: Data, signals: Signals, stamps: Stamps, rows: int) -> Iterator[FloatArray]:
-    """Yield ``(rows, 1 + nu + ny)``: time and signals, in order; NaN where a sample is missing."""
+    """Yield ``(rows, 1 + nu + ny)``: time and signals, in order; NaN where a sample is missing.  Inputs are those that
+    act in a row as the design takes it."""
+    found = _chunks(data, signals, stamps, rows)
+    if not signals.delay or not signals.inputs:
+        yield from found
+    elif signals.delay > 0:
+        yield from _delayed(found, signals, stamps)
+    else:
+        yield from _advanced(found, signals)
+
+
+def _delayed(found: Iterator[FloatArray], signals: Signals, stamps: Stamps) -> Iterator[FloatArray]:
+    """Yield rows with the inputs of so many rows before; the first ones hold their own."""
+    inputs = slice(1, 1 + signals.inputs)
+    for chunk in found:
+        if stamps.earlier is None:
+            stamps.earlier = np.repeat(chunk[:1, inputs], signals.delay, axis=0)
+        whole = np.vstack([stamps.earlier, chunk[:, inputs]])
+        stamps.earlier = whole[len(chunk) :]
+        chunk[:, inputs] = whole[: len(chunk)]
+        yield chunk
+
+
+def _advanced(found: Iterator[FloatArray], signals: Signals) -> Iterator[FloatArray]:
+    """Yield rows with the inputs of so many rows after, for which they wait; the last ones hold the last."""
+    inputs, wait = slice(1, 1 + signals.inputs), -signals.delay
+    kept: FloatArray | None = None
+    for chunk in found:
+        whole = chunk if kept is None else np.vstack([kept, chunk])
+        ready = max(len(whole) - wait, 0)
+        kept = whole[ready:].copy()
+        if ready:
+            done = whole[:ready].copy()
+            done[:, inputs] = whole[wait : wait + ready, inputs]
+            yield done
+    if kept is not None and len(kept):
+        # Of a short log fewer rows than these are left.
+        after = np.minimum(np.arange(len(kept)) + wait, len(kept) - 1)
+        kept[:, inputs] = kept[after][:, inputs]
+        yield kept
+
+
+def _chunks(data: Data, signals: Signals, stamps: Stamps, rows: int) -> Iterator[FloatArray]:
     if isinstance(data, str | Path):
         path = Path(data)
         check_suffix(path, (*TEXTS, *PACKAGES))
@@ -208,7 +251,7 @@ def _converted(frames: Iterator[pd.DataFrame], signals: Signals, stamps: Stamps)
     for frame in frames:
         places = signals.positions(tuple(str(name) for name in frame.columns))
         times = _times(frame.iloc[:, places[0]], done, stamps)
-        yield np.column_stack([times, *(_numbers(frame.iloc[:, place], done) for place in places[1:])])
+        yield np.column_stack([times, *(_numbers(frame.iloc[:, place], done, stamps) for place in places[1:])])
         done += len(frame)
     if done == 0:
         raise SpecError("The data have no rows.", path="data")
@@ -228,12 +271,15 @@ def _times(column: pd.Series, done: int, stamps: Stamps) -> FloatArray:
     return np.array([stamps.read(text, done + i + 1, str(column.name)) for i, text in enumerate(texts)])
 
 
-def _numbers(column: pd.Series, done: int) -> FloatArray:
+def _numbers(column: pd.Series, done: int, stamps: Stamps | None = None) -> FloatArray:
     """Return a column as numbers; a cell that is no number is named with its row."""
     import pandas as pd
 
     if pd.api.types.is_numeric_dtype(column) and not pd.api.types.is_bool_dtype(column):
         return np.asarray(column.to_numpy(dtype=np.float64, na_value=np.nan))
     texts = [None if pd.isna(cell) else str(cell) for cell in column]
-    plain = Dialect(",")
-    return np.array([plain.number(text, done + i + 1, str(column.name)) for i, text in enumerate(texts)])
+    plain, shown, found = Dialect(","), False, list[float]()
+    for i, text in enumerate(texts):
+        found.append(plain.number(text, done + i + 1, str(column.name), stamps if shown else None))
+        shown = shown or math.isfinite(found[-1])
+    return np.array(found)

@@ -8,7 +8,7 @@ import numpy as np
 
 from obsynth.data.log_estimator import GAP, LONGEST_BRIDGE, OK, PARTIAL, RECOVERING, WARM_UP, Engine, Row
 from obsynth.errors import ObsynthError, PreconditionError, SolverError, SpecError
-from obsynth.experiments.monitors.online import Evidence
+from obsynth.experiments.monitors.monitor import Evidence
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.dae.estimates import DAERow
 from obsynth.observers.dae.observer import DAEObserver
@@ -35,6 +35,7 @@ class SteppingEngine(Engine):
         plant = design.plant
         super().__init__(self.observer, None, warm_up, 0.0)
         self.input_names, self.output_names = plant.input_names, plant.output_names
+        self.input_delay = design.input_delay
         self.is_recursive, self.may_restart = isinstance(self.observer, RecursiveObserver), True
         residuals: tuple[str, ...] = plant.output_names
         if isinstance(self.observer, RecursiveObserver):
@@ -64,18 +65,6 @@ class SteppingEngine(Engine):
         """How many samples of each output were outliers, since the observer last started."""
         counts = self.state.refused[1]
         return {name: int(count) for name, count in zip(self.output_names, counts, strict=True) if count}
-
-    def _first_inputs(self, values: FloatArray, row: int) -> FloatArray:
-        """Return what stands for inputs that are not known in the first row; a nonlinear plant must know them."""
-        if self.is_recursive:
-            return np.zeros_like(values)
-        if not np.isfinite(values).all():
-            raise SpecError(
-                f"Row {row}: an input is missing before it was ever known, and a nonlinear model has no zero to begin "
-                "with: begin with a row in which all inputs are known.",
-                path=f"row {row}",
-            )
-        return values
 
     def _taken(self, y: FloatArray, u: FloatArray, row: int) -> StepRow | None:
         """Take one sample, or none of it: `None` where numbers are no finite ones any more."""
@@ -119,12 +108,16 @@ class SteppingEngine(Engine):
         _, missing = self.clock.advance(time, row)
         nu, fresh = len(self.input_names), self.u is None
         known = np.isfinite(values)
-        held = self._first_inputs(values[:nu], row) if self.u is None else self.u
+        if self.u is None and not self.is_recursive and not known[:nu].all():
+            # A nonlinear model has no zero to begin with: it begins when all inputs are known.
+            return Row(GAP, np.full(len(self.columns), np.nan), missing)
+        held = np.zeros(nu) if self.u is None else self.u
         u, y = np.where(known[:nu], values[:nu], held), np.where(known[nu:], values[nu:], np.nan)
         if missing > LONGEST_BRIDGE and self.may_restart:
             self.state, fresh = self.observer.init(), True
         else:
             fresh = self._bridged(missing, held, row) or fresh
+        total = self.state.refused[1]
         found, spoiled, restarted = self._found(y, u, row, may_restart=self.may_restart and not fresh)
         self.u, fresh = u, fresh or restarted
         if fresh:
@@ -134,7 +127,7 @@ class SteppingEngine(Engine):
             self.settled_at = time + self.warm_up
             self.phase = WARM_UP if self.phase == WARM_UP else RECOVERING
         # A filter that begins with y(1) does not miss y(0).
-        heard = (known[nu:] & ~self._refused()) | ~self.observer.timing.expected(self.state.k - 1)
+        heard = (known[nu:] & ~self._refused(total)) | ~self.observer.timing.expected(self.state.k - 1)
         if fresh and self.is_recursive:
             heard = np.ones_like(heard)
         status = self._status(time, known[:nu], heard, spoiled=spoiled)
@@ -143,9 +136,9 @@ class SteppingEngine(Engine):
         )
         return Row(status, self._values(found), missing, evidence)
 
-    def _refused(self) -> np.ndarray:
-        """Return which outputs of the last sample were left out as outliers, as truth values."""
-        return np.asarray(self.state.refused[0] > 0.0) & (self.observer.outliers == "gate")
+    def _refused(self, total: FloatArray) -> np.ndarray:
+        """Return which outputs of the last sample were left out as outliers: of which more are than before it."""
+        return np.asarray(self.state.refused[1] > total) & (self.observer.outliers == "gate")
 
     def _bridged(self, missing: int, held: FloatArray, row: int) -> bool:
         """Take samples without outputs; return whether the observer had to start again."""

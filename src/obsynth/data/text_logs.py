@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import itertools
+import math
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -37,14 +38,18 @@ class Dialect:
         """Whether a comma in a number stands for its point."""
         return self.separator != ","
 
-    def number(self, text: str | None, row: int, column: str) -> float:
-        """Return the number in a cell, NaN where it is missing; a cell that is none is named with its row."""
+    def number(self, text: str | None, row: int, column: str, stamps: Stamps | None = None) -> float:
+        """Return the number in a cell, NaN where it is missing; a cell that is none is named with its row.
+        In a column that has shown numbers, a word is what loggers write for a bad sample: ``stamps`` counts these."""
         cell = "" if text is None else text.strip()
         if cell.lower() in MISSING:
             return float("nan")
         try:
             return number_in_text(cell.replace(",", ".") if self.comma and "." not in cell else cell)
         except ValueError:
+            if stamps is not None and ("#" in cell or not any(letter.isdigit() for letter in cell)):
+                stamps.words.setdefault(column, []).append((row, cell))
+                return float("nan")
             advice = ""
             if "," in cell:
                 advice = (
@@ -82,7 +87,7 @@ def stream_rows(stream: TextIO, signals: Signals, stamps: Stamps) -> Iterator[Fl
     table = _cells(itertools.chain([head], lines), dialect)
     header = tuple(unquoted(name.strip()) for name in next(table, []))
     places = signals.positions(header)
-    row = 0
+    row, shown = 0, set[int]()  # columns that have shown a number
     for cells in table:
         if not any(cell.strip() for cell in cells):
             continue
@@ -93,7 +98,11 @@ def stream_rows(stream: TextIO, signals: Signals, stamps: Stamps) -> Iterator[Fl
             )
         cells += [""] * (len(header) - len(cells))
         time = stamps.read(cells[places[0]], row, header[places[0]], comma=dialect.comma)
-        yield np.array([[time, *(dialect.number(cells[place], row, header[place]) for place in places[1:])]])
+        values = [
+            dialect.number(cells[place], row, header[place], stamps if place in shown else None) for place in places[1:]
+        ]
+        shown.update(place for place, value in zip(places[1:], values, strict=True) if math.isfinite(value))
+        yield np.array([[time, *values]])
     if row == 0:
         raise SpecError("The data have no rows.", path="data")
 

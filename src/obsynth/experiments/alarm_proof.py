@@ -14,18 +14,28 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import ObsynthError, PreconditionError, SpecError, VerificationError
+from obsynth.experiments.alarm_multipliers import (
+    checked,
+    refuse_bounds,
+    refuted,
+    rows_of_test,
+    statement_of,
+    written,
+)
 from obsynth.experiments.alarm_window import Window, window_data, window_programme
-from obsynth.experiments.assumptions import SHOWN_DIGITS, Assumptions, Log, file_digest
+from obsynth.experiments.assumptions import Assumptions, Log, file_digest
 from obsynth.extensions import extension
-from obsynth.files.inputs import read_json
 from obsynth.files.outputs import FileKind, write_atomically
+from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
+from obsynth.methods.guaranteed_test.result import GuaranteedTest
 from obsynth.methods.verifying import verify
 from obsynth.numerics.arguments import is_whole
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.validation import index_of
+from obsynth.results.certificate_files import SHOWN_DIGITS, opened, sealed
 from obsynth.results.checks import Check, VerificationReport, information
 from obsynth.results.design import ObserverDesign
-from obsynth.results.gain_sets import design_as_dict, digest_of, loaded, plain, restored
+from obsynth.results.gain_sets import design_as_dict, loaded, plain, restored
 
 SCHEMA_VERSION = 2
 KIND = "obsynth alarm certificate"
@@ -83,13 +93,7 @@ class AlarmProof:
         """
         if not self.proved:
             raise SpecError("There is no proof to write: the alarm cannot be proved.", path="certificate")
-        body = {
-            "kind": KIND,
-            "schema_version": SCHEMA_VERSION,
-            "sha256": digest_of(self.certificate),
-            "certificate": self.certificate,
-        }
-        return write_atomically(path, json.dumps(body, indent=1, allow_nan=False) + "\n")
+        return write_atomically(path, sealed(KIND, SCHEMA_VERSION, self.certificate))
 
     def __str__(self) -> str:
         return self.statement
@@ -111,19 +115,17 @@ def proved_alarm(
     """Return the proof for the last sample of a record ``u (steps, nu)``, ``y (steps, ny)`` of deviations.
     A design that fails its own verification proves nothing: `VerificationError`, unless ``unverified``, and then no
     alarm is proved."""
+    if design.method == GuaranteedTestMethod.id:
+        given = {
+            "disturbance_bounds": disturbance_bounds, "noise_bound": noise_bound, "initial_set": initial_set,
+            "state_bounds": state_bounds,
+        }  # fmt: skip
+        refuse_bounds(given)
+        return _proved_by_test(design, u, y, log, unverified=unverified)
     question = Question.of(design, disturbance_bounds, noise_bound, initial_set, state_bounds, window)
     row, length = len(y), min(window, len(y))
-    report = verify(design)
-    if not report.passed:
-        failing = ", ".join(check.name for check in report.failures)
-        if not unverified:
-            raise VerificationError(
-                f"The gain set {design.name!r} fails its own verification ({failing}): no alarm can be proved by it.",
-                report=report,
-            )
-        return AlarmProof(
-            False, row, length, 0.0, f"Cannot be proved: the gain set is unverified ({failing} fails).", "", {}
-        )
+    if (failing := _failing(design, unverified=unverified)) is not None:
+        return AlarmProof(False, row, length, 0.0, failing, "", {})
     try:
         programme, origin = question.programme(design, u, y)
     except PreconditionError as error:
@@ -156,6 +158,70 @@ def proved_alarm(
         "log": None if log is None else log.as_dict(),
     }
     return AlarmProof(True, row, length, margin, text, origin, {**plain(certificate), "gain_set": gain_set})
+
+
+def _failing(design: ObserverDesign, *, unverified: bool) -> str | None:
+    """Return why a design that fails its own verification proves nothing; raise it unless ``unverified``."""
+    report = verify(design)
+    if report.passed:
+        return None
+    failing = ", ".join(check.name for check in report.failures)
+    if not unverified:
+        raise VerificationError(
+            f"The gain set {design.name!r} fails its own verification ({failing}): no alarm can be proved by it.",
+            report=report,
+        )
+    return f"Cannot be proved: the gain set is unverified ({failing} fails)."
+
+
+def _proved_by_test(
+    design: ObserverDesign, u: FloatArray, y: FloatArray, log: Log | None, *, unverified: bool
+) -> AlarmProof:
+    """Return the proof of a guaranteed test: a fraction for each equation of its window."""
+    whole, row = GuaranteedTest.of(design), len(y)
+    most = max(map(rows_of_test, whole.tests))
+    if (failing := _failing(design, unverified=unverified)) is not None:
+        return AlarmProof(False, row, most, 0.0, failing, "", {})
+    found = refuted(design, u, y)
+    if found is None:
+        text = f"Cannot be proved: within the bounds of the design, the last {most} samples may be without a fault."
+        return AlarmProof(False, row, most, 0.0, text, "", {})
+    place = [test.fault for test in whole.tests].index(found.test)
+    gain_set = design_as_dict(design)
+    text = statement_of(whole.tests[place], whole.groups[place], row, log, gain_set["sha256"])
+    certificate = {
+        **written(found), "u": u[-found.rows :], "y": y[-found.rows :], "row": row, "statement": text,
+        "log": None if log is None else log.as_dict(),
+    }  # fmt: skip
+    return AlarmProof(True, row, found.rows, found.margin, text, "", {**plain(certificate), "gain_set": gain_set})
+
+
+def _checked_by_test(
+    design: ObserverDesign, body: Mapping[str, Any], data: Mapping[str, Any], log_file: Path | None
+) -> Iterator[Check]:
+    """Yield the rows on a certificate of a guaranteed test."""
+    plant, row = design.linear[0], data["row"]
+    u = np.asarray(data["u"], dtype=np.float64).reshape(-1, plant.nu)
+    y = np.asarray(data["y"], dtype=np.float64).reshape(-1, plant.ny)
+    log = None if data["log"] is None else Log.from_dict(data["log"])
+    yield gain_set_row(design, body["gain_set"]["sha256"])
+    yield _log_row(log, log_file, design, u, y, last=row)
+    ((test, group, margin),) = checked(design, data, u, y)
+    said, stated = statement_of(test, group, row, log, body["gain_set"]["sha256"]), float(data["margin"])
+    rows = is_whole(row) and row >= len(y) > 0
+    yield _row("rows", "the record ends at the stated row", float(rows), 1.0, rows)
+    yield _row("statement", said, float(said == data["statement"]), 1.0, said == data["statement"])
+    yield Check(
+        "proof",
+        "share by which all bounds would have to be exceeded: each equation times its number, added up in fractions",
+        margin,
+        0.0,
+        margin,
+        bool(margin > 0.0),
+        "duality of linear programmes",
+        "proved",
+    )
+    yield _row("margin", "the stated margin is not above what is proved", stated, margin, 0.0 < stated <= margin)
 
 
 def statement(design: ObserverDesign, question: Question, row: int, origin: str, log: Log | None, gain_set: str) -> str:
@@ -212,6 +278,8 @@ class Question:
                 "(--disturbance), finite and 0 or more.",
                 path="disturbance_bounds",
             )
+        if initial_set is not None and state_bounds is not None:
+            raise SpecError("Bounds of the state follow from initial_set: leave state_bounds out.", path="state_bounds")
         if plant.nw and noise_bound is None:
             raise SpecError(
                 "Noise has no bound: give noise_bound (--noise-bound), in standard deviations.", path="noise_bound"
@@ -244,7 +312,7 @@ class Question:
             self.bounds,
             self.noise_bound,
             self.initial_set,
-            self.state_bounds if self.initial_set is None else None,
+            self.state_bounds,
         )
 
     def as_dict(self) -> dict[str, Any]:
@@ -310,21 +378,8 @@ def verify_alarm(path: str | Path, *, data: str | Path | None = None) -> Verific
     SpecError
         The file is no certificate.
     """
-    source = Path(path)
-    content = read_json(source)
-    if not isinstance(content, dict) or content.get("kind") != KIND:
-        raise SpecError(f"{source} is no certificate of an alarm.", path=str(source))
-    body = content.get("certificate")
-    version = content.get("schema_version")
-    if version == OLD_VERSION:
-        raise SpecError(
-            f"{source} is of schema {OLD_VERSION}, which does not say what it rests on: prove the alarm "
-            "again (obsynth prove-alarm).",
-            path=str(source),
-        )
-    if version != SCHEMA_VERSION or not isinstance(body, dict):
-        raise SpecError(f"{source} has an unknown schema version.", path=str(source))
-    intact = content.get("sha256") == digest_of(body)
+    again = "prove the alarm again (obsynth prove-alarm)"
+    _, body, intact = opened(Path(path), (KIND,), SCHEMA_VERSION, "certificate of an alarm", again)
     checks = [_row("digest", "the file is as it was written", float(intact), 1.0, intact)]
     try:
         for check in _checked(body, None if data is None else Path(data)):
@@ -334,30 +389,23 @@ def verify_alarm(path: str | Path, *, data: str | Path | None = None) -> Verific
     return VerificationReport.of(checks)
 
 
-def design_of_alarm(path: str | Path) -> ObserverDesign:
-    """Return the design inside a certificate of an alarm."""
-    inside = read_json(Path(path))["certificate"]["gain_set"]
-    return loaded(json.dumps(inside).encode(), "the certificate's gain set")
-
-
-#: Its sentence did not tell bounds, start, constants and log.
-OLD_VERSION = 1
-
-
 def _checked(body: Mapping[str, Any], log_file: Path | None) -> Iterator[Check]:
     data = restored({name: value for name, value in body.items() if name != "gain_set"})
     design = loaded(json.dumps(body["gain_set"]).encode(), "the certificate's gain set")
+    if "multipliers" in data:
+        yield from _checked_by_test(design, body, data, log_file)
+        return
     plant, _ = design.linear
     u = np.asarray(data["u"], dtype=np.float64).reshape(-1, plant.nu)
     y = np.asarray(data["y"], dtype=np.float64).reshape(-1, plant.ny)
     bounds = np.asarray(data["bounds"], dtype=np.float64)
     log = None if data["log"] is None else Log.from_dict(data["log"])
-    yield _gain_set_row(design, body["gain_set"]["sha256"])
+    yield gain_set_row(design, body["gain_set"]["sha256"])
     yield _log_row(log, log_file, design, u, y)
     question = Question.of(
         design,
         dict(zip(plant.disturbance_names, bounds.tolist(), strict=True)),
-        data["noise_bound"],
+        data["noise_bound"] if plant.nw else None,
         data["initial_set"],
         data["state_bounds"],
         data["window"],
@@ -383,12 +431,12 @@ def _checked(body: Mapping[str, Any], log_file: Path | None) -> Iterator[Check]:
     yield _row("margin", "the stated margin is not above what is proved", stated, margin, 0.0 < stated <= margin)
 
 
-def _gain_set_row(design: ObserverDesign, digest: str) -> Check:
-    """Return the row on the gain set inside, verified like any other."""
+def gain_set_row(design: ObserverDesign, digest: str, name: str = "gain set") -> Check:
+    """Return the row on a gain set inside a certificate, verified like any other."""
     report = verify(design)
     failing = ", ".join(check.name for check in report.failures)
     return _row(
-        "gain set",
+        name,
         f"the gain set inside ({design.name}, {digest[:SHOWN_DIGITS]}) verifies: {len(report.checks)} checks",
         float(len(report.failures)),
         0.0,
@@ -397,8 +445,11 @@ def _gain_set_row(design: ObserverDesign, digest: str) -> Check:
     )
 
 
-def _log_row(log: Log | None, file: Path | None, design: ObserverDesign, u: FloatArray, y: FloatArray) -> Check:
-    """Return the row on the log: compared where it is given, else assumed."""
+def _log_row(
+    log: Log | None, file: Path | None, design: ObserverDesign, u: FloatArray, y: FloatArray, last: int | None = None
+) -> Check:
+    """Return the row on the log: compared where it is given, else assumed; ``last``: its row that y ends with."""
+    last = len(y) if last is None else last
     if file is None:
         name = "a record that no file holds" if log is None else f"{log.name}, sha256 {log.sha256}"
         return information(
@@ -414,21 +465,21 @@ def _log_row(log: Log | None, file: Path | None, design: ObserverDesign, u: Floa
         return _row(
             "log", f"{file.name} is the log that the certificate names ({log.sha256[:SHOWN_DIGITS]})", 0.0, 1.0, False
         )
-    values = rows_of_log(design, file, len(y), dict(log.columns), dict(log.scales))
+    values = rows_of_log(design, file, last, len(y), dict(log.columns), dict(log.scales))
     equal = bool(np.array_equal(values, np.hstack([u, y])))
     return _row(
         "log",
-        f"rows 1 to {len(y)} are those of {file.name}, sha256 {log.sha256[:SHOWN_DIGITS]}",
+        f"rows {last - len(y) + 1} to {last} are those of {file.name}, sha256 {log.sha256[:SHOWN_DIGITS]}",
         float(equal),
         1.0,
         equal,
     )
 
 
-def rows_of_log(design: ObserverDesign, path: Path, count: int, columns: Any, scales: Any) -> FloatArray:
-    """Return the first rows of a log as a design reads them, known inputs first."""
-    found: FloatArray = extension("rows of a log")(design, path, count, columns, scales)
-    return found
+def rows_of_log(design: ObserverDesign, path: Path, last: int, count: int, columns: Any, scales: Any) -> FloatArray:
+    """Return so many rows of a log up to one as a design reads them, known inputs first."""
+    found: FloatArray = extension("rows of a log")(design, path, last, columns, scales, count)
+    return found[-count:]
 
 
 def _row(

@@ -12,16 +12,9 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray
-from obsynth.plants.constants import ConstantsBox
+from obsynth.plants.constants import MOST_LISTED, ConstantsBox, shown
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.gain_sets import digest_of, plain
-
-#: Signals, states and constants that a sentence lists; the digest of all assumptions stands for the others.
-MOST_LISTED = 6
-#: Digits of a digest that a sentence shows.
-SHOWN_DIGITS = 12
-#: Shares of tolerances that agree so well are one share: they were stated as per cent.
-SAME_SHARE = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +26,7 @@ class Assumptions:
     noise_bound: float
     initial_set: Mapping[str, Any] | None = None
     state_bounds: Mapping[str, Any] | None = None
+    initial_error: float | None = None
 
     @property
     def box(self) -> ConstantsBox | None:
@@ -56,13 +50,14 @@ class Assumptions:
         return digest_of(plain(self.as_dict()))
 
     def parts(self) -> list[str]:
-        """Return one phrase for each kind of assumption."""
+        """Return one phrase for each kind of bound."""
         found, plant = [], self.plant
-        if plant.nd:
-            each = [
-                f"{name} within {shown(bound, plant.units.get(name, ''))}"
-                for name, bound in zip(plant.disturbance_names, self.bounds, strict=True)
-            ]
+        each = [
+            f"{name} within {shown(bound, plant.units.get(name, ''))}"
+            for name, bound in zip(plant.disturbance_names, self.bounds, strict=True)
+            if np.isfinite(bound)  # others reach nothing that is watched
+        ]
+        if each:
             found.append(_enough(each, "disturbances within their bounds"))
         if plant.nw:
             found.append(self._noise())
@@ -70,7 +65,9 @@ class Assumptions:
             if given is not None:
                 each = [f"{name} {_range(value, plant.units.get(name, ''))}" for name, value in given.items()]
                 found.append(f"{what} with {_enough(each, 'each state within its bound')}")
-        found.append(constants_phrase(self.box))
+        if self.initial_error is not None:
+            size = shown(float(f"{self.initial_error:.6g}"))
+            found.append(f"an observer's error at the start {f'within {size}' if self.initial_error else 'of zero'}")
         return found
 
     def _noise(self) -> str:
@@ -87,23 +84,29 @@ class Assumptions:
             return f"noise within {times}"
         return f"sensor noise within {times} ({', '.join(each)})"
 
+    @property
+    def bounds_phrase(self) -> str:
+        """All bounds in one phrase; empty where there are none."""
+        return _joined(self.parts())
+
+    @property
+    def model_phrase(self) -> str:
+        """What is assumed of the model."""
+        return "an exact model" if self.box is None else self.box.phrase
+
     def phrase(self) -> str:
         """Return everything that is assumed in one phrase."""
-        parts = self.parts()
-        return f"{', '.join(parts[:-1])}, and {parts[-1]}" if len(parts) > 1 else parts[0]
+        return _joined([*self.parts(), self.model_phrase])
 
 
-def shown(value: float, unit: str = "") -> str:
-    """Return a number with all its digits, and its unit."""
-    number = float(value)
-    text = str(int(number)) if number.is_integer() and abs(number) < 10.0**SHOWN_DIGITS else repr(number)
-    return f"{text} {unit}".rstrip()
+def _joined(parts: Sequence[str]) -> str:
+    return f"{', '.join(parts[:-1])}, and {parts[-1]}" if len(parts) > 1 else "".join(parts)
 
 
 def _range(value: Any, unit: str) -> str:
     if isinstance(value, (list, tuple, np.ndarray)):
         low, high = (float(end) for end in value)
-        return f"in {shown(low)} .. {shown(high, unit)}"
+        return f"at {shown(low, unit)}" if low == high else f"in {shown(low)} .. {shown(high, unit)}"
     return f"within {shown(value, unit)}"
 
 
@@ -118,27 +121,6 @@ def _listed(given: Mapping[str, Any]) -> dict[str, Any]:
 
 def _enough(each: Sequence[str], otherwise: str) -> str:
     return ", ".join(each) if len(each) <= MOST_LISTED else f"{otherwise} ({len(each)})"
-
-
-def constants_phrase(box: ConstantsBox | None) -> str:
-    """Return which constants are assumed to be where, and whether they may change."""
-    if box is None or not box.names:
-        return "an exact model"
-    shares = [item.half / abs(item.nominal) if item.nominal else np.nan for item in box.uncertain]
-    centred = [
-        abs(item.middle - item.nominal) <= SAME_SHARE * max(item.half, abs(item.nominal)) for item in box.uncertain
-    ]
-    one = max(shares) - min(shares) <= SAME_SHARE and all(centred)
-    names = ", ".join(box.names) if len(box.names) <= MOST_LISTED else f"{len(box.names)} constants"
-    if one:
-        text = f"{names} within {100.0 * float(np.mean(shares)):.6g} % of nominal"
-    elif len(box.names) <= MOST_LISTED:
-        text = ", ".join(f"{item.name} in {shown(item.low)} .. {shown(item.high, item.unit)}" for item in box.uncertain)
-    else:
-        text = f"{names} within their ranges"
-    kept = "the same at all times" if box.variation == "constant" else "anything there at each sample"
-    origin = "" if box.source == "stated" else f"; {box.origin}"
-    return f"constants ({text}; {kept}{origin})"
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from obsynth.simulation.profiles import Step
 from obsynth.simulation.scenario import Scenario
 
 #: A segment lasts as long as the slowest error needs to shrink by this factor, and more.
-SETTLED = 0.005
+SEGMENT_LEFT = 0.005
 #: Samples in a segment, at least and at most; those of a continuous observer are chosen.
 SHORTEST, LONGEST, CHOSEN = 12, 1500, 150
 #: An observer with this forgetting factor or more, or none, is shown for as long as one with this.
@@ -34,7 +34,7 @@ def demonstration_scenario(design: ObserverDesign) -> Scenario | None:
 
 def _of_linear(plant: DescriptorSystem, observer: LinearObserver) -> Scenario:
     slowest = float(np.min(decay_rates(eigenvalues(observer.Az), observer.dt), initial=np.inf))
-    settling = -np.log(SETTLED) / slowest if slowest > 0.0 else 0.0
+    settling = -np.log(SEGMENT_LEFT) / slowest if slowest > 0.0 else 0.0
     if observer.dt > 0.0:
         step = observer.dt
         samples = int(np.clip(np.ceil(settling / step), SHORTEST, LONGEST)) + max(observer.fault_delays)
@@ -76,7 +76,7 @@ def _of_recursive(observer: RecursiveObserver | DAEObserver) -> Scenario | None:
             spread, forgetting = adaptation.initial_covariance, adaptation.forgetting
             forgets = adaptation.form != "random-walk"
     memory = min(forgetting, LONG_MEMORY) if forgets else LONG_MEMORY
-    samples = int(np.clip(np.log(SETTLED) / np.log(memory), SHORTEST, LONGEST))
+    samples = int(np.clip(np.log(SEGMENT_LEFT) / np.log(memory), SHORTEST, LONGEST))
     count = len(observer.fault_names) + 1
     if longest is not None:
         samples = min(samples, (longest - 1) // count)

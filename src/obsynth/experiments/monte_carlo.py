@@ -125,6 +125,7 @@ class _Task(NamedTuple):
     watched: Monitor | ParameterMonitor | None
     warm_ups: tuple[int, int]
     seeds: tuple[int, ...]
+    fault_names: tuple[str, ...]  # of the plant
 
 
 def _run(task: _Task) -> dict[str, FloatArray]:
@@ -146,7 +147,7 @@ def _run(task: _Task) -> dict[str, FloatArray]:
         found[name] = np.sqrt(np.mean(errors**2, axis=0)) if len(errors) else np.full(errors.shape[1:], np.nan)
     judged = np.full((3, len(task.seeds)), np.nan)
     if isinstance(task.watched, Monitor):
-        judged = _judged_residuals(task.watched, task.bench, runs)
+        judged = _judged_residuals(task.watched, task.bench, runs, task.fault_names)
     elif task.watched is not None:
         decided = [_judged_parameters(task.watched, task.bench, estimates) for estimates in runs.estimates]
         judged = np.array(decided).T
@@ -210,8 +211,9 @@ def evaluate(
     size = max(1, BATCH_SAMPLES // bench.drive.steps)
     # The first row of a plant with parameters is what was known before: no sample has been used.
     states, faults = ((end or 0) if isinstance(bench, LinearBench) else 1 for end in bench.warm_ups())
+    names = design.linear[0].fault_names if isinstance(bench, LinearBench) else ()
     tasks = [
-        _Task(one, monitor, (states, faults), tuple(seeds[i] for i in part[begin : begin + size]))
+        _Task(one, monitor, (states, faults), tuple(seeds[i] for i in part[begin : begin + size]), names)
         for one, part in zip(benches, np.array_split(np.arange(runs), len(benches)), strict=True)
         for begin in range(0, len(part), size)
     ]
@@ -251,20 +253,25 @@ def _drawn_benches(design: ObserverDesign, scenario: Scenario, plants: int) -> l
     return [make_bench(design.replace(plant=plant_at(plant, box.values(q))), scenario) for q in points]
 
 
-def _judged_residuals(watched: Monitor, bench: Bench, runs: Runs) -> FloatArray:
+def _judged_residuals(watched: Monitor, bench: Bench, runs: Runs, fault_names: tuple[str, ...]) -> FloatArray:
     """Return ``(3, runs)``: whether an alarm is false, when a fault is found, and whether another one is blamed."""
     observer = cast(LinearBench, bench).observer
-    rows = observer.fault_rows if watched.watches_estimates else observer.residual_rows
     begin = len(runs.rows) if bench.onset is None else bench.onset
-    passed = watched.passed_in(runs, rows, onset=begin)
+    passed = watched.passed_in(runs, onset=begin)
     judged = np.full((3, passed.shape[1]), np.nan)
     judged[0] = passed[:begin].any(axis=0)
     for run in np.flatnonzero(passed[begin:].any(axis=0)):
         k = begin + int(np.argmax(passed[begin:, run]))
         end = min(k + watched.isolation_delay, len(passed) - 1) + 1
-        acted = np.any(runs.faults[:end, run, list(bench.estimated)] != 0.0, axis=0)
-        estimates = runs.rows[:, run, observer.fault_rows]
-        judged[1:, run] = k, float(not acted[watched.isolated(estimates, k)]) if acted.any() else np.nan
+        if watched.groups:
+            rows = observer.fault_rows if watched.watches_estimates else observer.residual_rows
+            group = watched.groups[watched.isolated(runs.rows[:, run, rows], k)]
+            acted = np.any(runs.faults[:end, run] != 0.0, axis=0)
+            wrong = not acted[[fault_names.index(name) for name in group]].any()
+        else:
+            acted = np.any(runs.faults[:end, run, list(bench.estimated)] != 0.0, axis=0)
+            wrong = acted.any() and not acted[watched.isolated(runs.rows[:, run, observer.fault_rows], k)]
+        judged[1:, run] = k, float(wrong) if acted.any() else np.nan
     return judged
 
 

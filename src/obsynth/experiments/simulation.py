@@ -130,7 +130,7 @@ class Simulation:
         """Return every column by name: ``time``, inputs and outputs, ``x[..]``, ``f[..]``, ``d[..]``, and estimates.
 
         An output with the name of an input is ``y[..]``.  Estimates ``xhat[..]``, ``fhat[..]``, standard deviations
-        ``std xhat[..]``, ``std fhat[..]`` and residuals ``r[..]`` stand where the observer gave them.
+        ``sd xhat[..]``, ``sd fhat[..]`` and residuals ``r[..]`` stand where the observer gave them.
         """
         shown, spread = self.estimates, self.estimates.has_deviations
         x, f = shown.state_names, shown.fault_names
@@ -142,9 +142,9 @@ class Simulation:
             ("f[{}]", f, self.faults[:, list(self.fault_columns)]),
             ("d[{}]", self.disturbance_names, self.disturbances),
             ("xhat[{}]", x, shown.states),
-            *([("std xhat[{}]", x, shown.state_deviations)] if spread else []),
+            *([("sd xhat[{}]", x, shown.state_deviations)] if spread else []),
             ("fhat[{}]", f, shown.faults),
-            ("std fhat[{}]", f, shown.fault_deviations) if spread else ("r[{}]", shown.residual_names, shown.residuals),
+            ("sd fhat[{}]", f, shown.fault_deviations) if spread else ("r[{}]", shown.residual_names, shown.residuals),
         ):
             for i, name in enumerate(names):
                 # Inputs and outputs go by their own names, unless those are taken.

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,12 +13,17 @@ from obsynth.errors import SpecError
 from obsynth.experiments.benches import Runs, make_bench
 from obsynth.experiments.monitors.monitor import Monitor
 from obsynth.experiments.monitors.residual_monitor import monitor
+from obsynth.files.outputs import write_atomically
 from obsynth.files.tables import text_table
+from obsynth.methods.handing_on import require_verified
+from obsynth.methods.verifying import verify
 from obsynth.numerics.arguments import require_kind, whole_number
 from obsynth.numerics.arrays import FloatArray, read_only
-from obsynth.plants.constants import tolerance_share
+from obsynth.plants.constants import shown, tolerance_share
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.results.certificate_files import SHOWN_DIGITS, STUDY, result_text
 from obsynth.results.design import ObserverDesign
+from obsynth.results.gain_sets import design_as_dict
 from obsynth.simulation.profiles import Step
 from obsynth.simulation.scenario import Scenario
 from obsynth.tolerances.exact_plant import drawn_points, plant_at
@@ -50,6 +56,10 @@ class ToleranceStudy:
         Of it; empty where it is not known.
     runs : int
         For each number, each with a plant of its own from the box, half of them vertices.
+    design : ObserverDesign, optional
+        Which was studied.
+    asked : mapping, optional
+        Scenario and options, as plain data.
     """
 
     tolerances: FloatArray
@@ -58,31 +68,45 @@ class ToleranceStudy:
     fault: str
     unit: str
     runs: int
+    design: ObserverDesign | None = None
+    asked: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for name in ("tolerances", "false_alarms", "least_faults"):
             object.__setattr__(self, name, read_only(getattr(self, name)))
 
     def rows(self) -> list[tuple[str, ...]]:
-        """Return a heading and a row for each tolerance, as text."""
+        """Return a heading, and for each tolerance a row of each monitor, as text."""
         unit = f" ({self.unit})" if self.unit else ""
-        heading = (
-            "tolerance",
-            *(
-                f"{what}, {name}"
-                for what in ("false alarms", f"least {self.fault}{unit}")
-                for name in (FIXED, ADAPTIVE)
-            ),
-        )
         body = [
             (
                 f"{100.0 * tolerance:.3g} %",
-                *(f"{100.0 * value:.0f} %" for value in alarms),
-                *(f"{value:.3g}" if np.isfinite(value) else "none" for value in least),
+                name,
+                f"{100.0 * self.false_alarms[i, j]:.0f} %",
+                f"{self.least_faults[i, j]:.3g}" if np.isfinite(self.least_faults[i, j]) else "none",
             )
-            for tolerance, alarms, least in zip(self.tolerances, self.false_alarms, self.least_faults, strict=True)
+            for i, tolerance in enumerate(self.tolerances)
+            for j, name in enumerate((FIXED, ADAPTIVE))
         ]
-        return [heading, *body]
+        return [("tolerance", "monitor", "false alarms", f"least {self.fault} found{unit}"), *body]
+
+    @property
+    def conclusion(self) -> str:
+        """Which of the two monitors to take, and from which tolerance on."""
+        alarming = [
+            tolerance for tolerance, alarms in zip(self.tolerances, self.false_alarms, strict=True) if alarms[0] > 0.0
+        ]
+        if not alarming:
+            return f"The {FIXED} had no false alarm in these runs: it is enough, and the {ADAPTIVE} proves it."
+        blind = [
+            tolerance
+            for tolerance, least in zip(self.tolerances, self.least_faults, strict=True)
+            if not np.isfinite(least[1])
+        ]
+        return (
+            f"Take the {ADAPTIVE}: the {FIXED} has false alarms from {100.0 * min(alarming):.3g} % of tolerance on."
+            + (f" It finds no {self.fault} from {100.0 * min(blind):.3g} % on." if blind else "")
+        )
 
     def as_dict(self) -> dict[str, Any]:
         """Return everything as plain data; `None` for a fault that is never told."""
@@ -97,8 +121,57 @@ class ToleranceStudy:
             "monitors": [FIXED, ADAPTIVE],
         }
 
+    @property
+    def statement(self) -> str:
+        """What was found at the largest tolerance, in one sentence, with everything that it rests on."""
+        if self.design is None:
+            return ""
+        return study_statement(self.as_dict(), self.asked, design_as_dict(self.design)["sha256"])
+
+    def save(self, path: str | Path) -> Path:
+        """Write a certificate that `obsynth verify` recomputes, with the gain set inside.
+
+        Parameters
+        ----------
+        path : str or Path
+            Where to write (.json).
+
+        Raises
+        ------
+        SpecError
+            The study does not know its design, or the file cannot be written.
+        VerificationError
+            The design fails its own verification.
+        """
+        if self.design is None:
+            raise SpecError("The study does not know its design: there is nothing to certify.", path="design")
+        require_verified(self.design.replace(report=verify(self.design)))
+        text = result_text(STUDY, {"design": self.design}, self.asked, self.as_dict(), self.statement)
+        return write_atomically(path, text)
+
     def __str__(self) -> str:
-        return "\n".join(text_table(self.rows(), left=0))
+        return "\n".join([*text_table(self.rows(), left=2), self.conclusion])
+
+
+def study_statement(result: Mapping[str, Any], asked: Mapping[str, Any], digest: str) -> str:
+    """Return what a study found at its largest tolerance; ``digest`` is that of the gain set."""
+    last = int(np.argmax(result["tolerances"]))
+    unit = f" {result['unit']}" if result["unit"] else ""
+    told = [
+        f"the {name} alarms without a fault in {100.0 * alarms:.4g} % of them and tells a step of {result['fault']} "
+        + ("of no size" if least is None else f"from {least:.4g}{unit} on")
+        for name, alarms, least in zip(
+            result["monitors"], result["false_alarms"][last], result["least_faults"][last], strict=True
+        )
+    ]
+    bounds = ", ".join(f"{name} within {shown(value)}" for name, value in (asked["disturbance_bounds"] or {}).items())
+    noise = "" if asked["noise_bound"] is None else f"noise within {shown(asked['noise_bound'])} standard deviations"
+    kept = "; ".join(part for part in (bounds, noise) if part)
+    return (
+        f"Of {result['runs']} runs of {shown(asked['scenario']['horizon'])} s, seeds from {asked['scenario']['seed']}, "
+        f"each of a plant drawn within {100.0 * result['tolerances'][last]:.4g} % tolerances"
+        f"{f' ({kept})' if kept else ''}: {', and '.join(told)}. Gain set {digest[:SHOWN_DIGITS]}."
+    )
 
 
 def tolerance_study(
@@ -168,7 +241,15 @@ def tolerance_study(
                 scaled, quiet, constants=constants, disturbance_bounds=disturbance_bounds, noise_bound=noise_bound
             )
             alarms[i, j], least[i, j] = _counted(watched, without, with_one)
-    return ToleranceStudy(np.array(shares), alarms, least, chosen, plant.units.get(chosen, ""), runs)
+    asked = {
+        "scenario": scenario.as_dict(),
+        "tolerances": shares,
+        "fault": chosen,
+        "runs": runs,
+        "disturbance_bounds": None if disturbance_bounds is None else dict(disturbance_bounds),
+        "noise_bound": noise_bound,
+    }
+    return ToleranceStudy(np.array(shares), alarms, least, chosen, plant.units.get(chosen, ""), runs, design, asked)
 
 
 def _tolerance_of(plant: DescriptorSystem) -> float:
@@ -213,9 +294,7 @@ def _together(found: list[Runs]) -> Runs:
 
 def _counted(watched: Monitor, without: Runs, with_one: Runs) -> tuple[float, float]:
     """Return the share of false alarms, and the least size of the fault that is told in every run."""
-    observer: Any = without.observer
-    rows = observer.fault_rows if watched.watches_estimates else observer.residual_rows
-    false = watched.passed_in(without, rows)
+    false = watched.passed_in(without)
 
     def told(size: float) -> bool:
         # Plant and observer are linear: what the fault does goes with its size.
@@ -223,7 +302,7 @@ def _counted(watched: Monitor, without: Runs, with_one: Runs) -> tuple[float, fl
         for name in ("states", "outputs", "inputs", "faults", "rows"):
             quiet = getattr(without, name)
             moved[name] = quiet + size * (getattr(with_one, name) - quiet)
-        passed = watched.passed_in(replace(without, **moved), rows)
+        passed = watched.passed_in(replace(without, **moved))
         return bool((passed & ~false).any(axis=0).all())
 
     level = np.abs(watched.threshold[np.isfinite(watched.threshold)])

@@ -4,10 +4,15 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from importlib.resources import files
+from typing import Any
 
 import numpy as np
 
+from obsynth.errors import SpecError
+from obsynth.experiments.monitors.learned_levels import AGES, FORGETTING, HOLD
+from obsynth.exporting.alarms import Alarms
 from obsynth.exporting.realisation import Realisation
 from obsynth.numerics.arrays import FloatArray
 
@@ -89,6 +94,8 @@ _NUMBERS_PER_LINE = 4
 LARGE_TABLE = 1024
 #: At most this share of entries that are not zero makes a matrix sparse.
 SPARSE_SHARE = 0.25
+#: Least power of a step or ramp.
+_NOTHING = 1e-300
 #: Columns that are added in one pass over the rows.
 UNROLLED = 4
 PLAIN, ENTRIES, COLUMNS = "plain", "entries", "columns"
@@ -98,100 +105,317 @@ ADVICE = (
 )
 
 
-def header_text(found: Realisation, prefix: str) -> str:
+#: What a row is called in C, as runs call it.
+STATUSES = ("OK", "WARM_UP", "GAP", "RECOVERING", "PARTIAL")
+
+
+def status_lines(prefix: str) -> list[str]:
+    """Return the declaration of what a row is."""
+    upper = prefix.upper()
+    listed = ", ".join(f"{upper}_{name}" for name in STATUSES)
+    return [comment("What a row is: alarms are raised in rows that are OK or PARTIAL."), f"enum {{ {listed} }};"]
+
+
+def header_text(found: Realisation, prefix: str, alarms: Alarms) -> str:
     """Return the header."""
-    observer = found.observer
-    guard = f"{prefix.upper()}_H"
+    observer, upper = found.observer, prefix.upper()
     before, after = found.operating_point
+    units = found.units
     lines = [
         comment(f"Observer {quoted(found.design.name)} by {quoted(found.design.method)}, written by obsynth."),
         *([comment(found.note)] if found.note else []),
-        *([comment(quoted(found.mark))] if found.mark else []),
-        f"#ifndef {guard}",
-        f"#define {guard}",
+        comment(quoted(found.status)),
+        *(comment(line) for line in alarm_comments(alarms)),
+        f"#ifndef {upper}_H",
+        f"#define {upper}_H",
         "",
         comment("sha256 of the gain set"),
-        f'#define {prefix.upper()}_SHA256 "{found.digest}"',
+        f'#define {upper}_SHA256 "{found.digest}"',
         comment("seconds between samples"),
-        f"#define {prefix.upper()}_DT {observer.dt!r}",
+        f"#define {upper}_DT {observer.dt!r}",
+        comment("outputs that may be watched"),
+        f"#define {upper}_WATCHED {len(alarms.levels)}",
         "",
-        "typedef struct {",
-        f"    double z[{max(observer.order, 1)}];",
-        f"}} {prefix}_state;",
+        *status_lines(prefix),
+        "",
+        *_state_struct(found, prefix, alarms),
         "",
         comment("Start where the design does." if found.start.any() else "Start at rest."),
         f"void {prefix}_reset({prefix}_state *state);",
         "",
         comment("Take one sample of each signal, write the estimates at that sample, and advance."),
-        comment("Signals are deviations from the operating point. Returns 0; or 1 if a sample is not finite:"),
-        comment("the state and the estimates are left as they were then."),
-        *_signal_comments("u", found.inputs[: len(observer.input_names)], before),
-        *_signal_comments("y", observer.output_names, before[len(observer.input_names) :]),
-        *_signal_comments("states", observer.state_names, after, observer.state_delays),
-        *_signal_comments("faults", observer.fault_names, after[len(observer.state_names) :], observer.fault_delays),
-        *_signal_comments("residuals", observer.residual_names, None),
+        comment("Signals are deviations from the operating point; a missing one is NaN. Returns 0; or 1 if a sample"),
+        comment("is missing: the model of the plant goes on then, faults are held, and residuals are NaN."),
+        *_signal_comments("u", "", found.inputs[: len(observer.input_names)], before, units),
+        *_signal_comments("y", "", observer.output_names, before[len(observer.input_names) :], units),
+        *_signal_comments("states", "xhat", observer.state_names, after, units, observer.state_delays),
+        *_signal_comments(
+            "faults", "fhat", observer.fault_names, after[len(observer.state_names) :], units, observer.fault_delays
+        ),
+        *_signal_comments("residuals", "r", observer.residual_names, None, units),
         f"{_step_signature(found, prefix)};",
+        "",
+        comment("The same with signals and estimates as they are, not as deviations."),
+        f"{_step_signature(found, prefix, 'take')};",
         "",
         "#endif",
     ]
     return "\n".join(lines) + "\n"
 
 
-def source_text(found: Realisation, prefix: str, header: str) -> str:
+def alarm_comments(alarms: Alarms) -> list[str]:
+    """Return what C says of alarms."""
+    found = [f"alarm[{i}]: {quoted(name)}" for i, name in enumerate(alarms.levels)]
+    if alarms.learned is not None:
+        found += [f"Monitor: {quoted(alarms.learned.statement)}"]
+        found += [f"monitor.fault {i}: {quoted(name)}" for i, name in enumerate(alarms.fault_names)]
+    return found
+
+
+def monitor_struct(alarms: Alarms, prefix: str) -> list[str]:
+    """Return the declaration of the learned monitor, if there is one."""
+    if alarms.learned is None:
+        return []
+    model = alarms.learned.statistics.model
+    m = model.channels
+    return [
+        "typedef struct {",
+        "    /* Read these after a step: the largest statistic in units of its level (NaN where nothing is",
+        "     * decided), whether it passes 1, which fault stands out (-1: none), and an alarm that lasts. */",
+        "    REAL statistic;",
+        "    int alarm, fault, event;",
+        "    /* Everything else is the monitor's own. */",
+        f"    REAL past[{max(model.order * m, 1)}];",
+        f"    REAL white[{max(AGES) * m}];",
+        f"    REAL means[{len(FORGETTING) * m}];",
+        "    int at, quiet;",
+        "    long taken;",
+        f"}} {prefix}_monitor;",
+        "",
+    ]
+
+
+def monitor_source(alarms: Alarms, prefix: str) -> str:
+    """Return the tables and functions of the learned monitor, if there is one."""
+    if alarms.learned is None:
+        return ""
+    found, model = alarms.learned, alarms.learned.statistics.model
+    shapes, slopes = found.statistics.responses()
+    order, shares = model.order, np.array(FORGETTING)
+    straight = shapes[:, -1:] + (np.arange(order + 1) - order)[:, None] * slopes[:, None, :]
+    rows = np.concatenate([shapes, shapes[:, -1:] + np.arange(1, max(AGES))[:, None] * slopes[:, None, :]], axis=1)
+    powers = np.cumsum(np.sum(rows**2, axis=2), axis=1)[:, np.array(AGES) - 1]
+    sizes = {
+        "CHANNELS": model.channels,
+        "ORDER": order,
+        "OLDEST": max(AGES),
+        "AGES": len(AGES),
+        "MEANS": len(shares),
+        "SHAPES": len(shapes),
+        "MONITOR_FAULTS": len(found.scales),
+        "MONITOR_SETTLING": found.settling,
+        "MONITOR_HOLD": HOLD,
+    }
+    tables: dict[str, Any] = {
+        "monitor_mean": model.mean[None],
+        "monitor_offset": model.offset[None],
+        "monitor_A": model.A.reshape(-1, model.channels),
+        "monitor_whitener": model.whitener,
+        "monitor_shares": shares[None],
+        "monitor_sizes": ((2.0 - shares) / shares)[None],
+        "monitor_levels": found.levels[None],
+        "monitor_flat": straight[:, 0],
+        "monitor_slopes": slopes,
+        "monitor_early": (shapes - straight).reshape(-1, model.channels),
+        "monitor_weights": 1.0 / np.maximum(powers, _NOTHING),
+        "monitor_centres": found.centres[None],
+        "monitor_scales": found.scales[None],
+    }
+    faults = {f"fhat[{name}]": i for i, name in enumerate(alarms.fault_names)}
+    faults |= {f"fault {name}": i for i, name in enumerate(alarms.fault_names)}
+    listed = ", ".join(f"{name} = {value}" for name, value in sizes.items())
+    lines = [
+        f"enum {{ {listed} }};",
+        *(line for name, table in tables.items() for line in table_lines(name, filled_table(table))),
+        *integer_table("monitor_ages", AGES),
+        *integer_table("monitor_places", [alarms.columns.index(name) for name in found.columns]),
+        *integer_table("monitor_told", [faults.get(name, -1) for name in found.statistics.told]),
+    ]
+    return "\n".join(lines) + template("learned.c").replace("PREFIX", prefix)
+
+
+def _state_struct(found: Realisation, prefix: str, alarms: Alarms) -> list[str]:
+    """Return what the observer remembers, as C declares it."""
+    observer, gap = found.observer, found.gap
+    nz, nu, ny = observer.order, len(observer.input_names), len(observer.output_names)
+    shown = len(observer.fault_names) + len(observer.residual_names)
+    sizes = {
+        "z": nz,
+        "v": nu + ny,
+        "measured": nu + ny,
+        "inputs": gap.kept_inputs * nu,
+        "fault": gap.faults,
+        "shown": shown,
+        "seen": gap.seen,
+        "model": gap.states,
+        "left": nz * (nu + ny),
+        "held": nu,
+        "changes": shown,
+    }
+    watched = max(len(alarms.levels), 1)
+    return [
+        *monitor_struct(alarms, prefix),
+        "typedef struct {",
+        comment("Read these after a step: what the row was, and which outputs passed their levels."),
+        "    int status;",
+        f"    int alarm[{watched}];",
+        "    int any_alarm;",
+        comment("Set these after the reset: levels (0 for none), and seconds without alarms after the start."),
+        f"    REAL level[{watched}];",
+        "    double warm_up;",
+        *(f"    {prefix}_monitor monitor;" for _ in ("monitor",) if alarms.learned is not None),
+        comment("Everything else is the observer's own."),
+        *(f"    REAL {name}[{max(size, 1)}];" for name, size in sizes.items()),
+        "    double time, from, waiting;",
+        "    long k, counted;",
+        "    int kept, is_started, is_gap, inputs_known, phase;",
+        f"}} {prefix}_state;",
+    ]
+
+
+def source_text(found: Realisation, prefix: str, header: str, alarms: Alarms) -> str:
     """Return the source."""
-    observer = found.observer
-    sizes = {"z": observer.order, "u": len(observer.input_names), "y": len(observer.output_names)}
+    observer, gap = found.observer, found.gap
+    nu, ny = len(observer.input_names), len(observer.output_names)
     groups = {"states": observer.state_rows, "faults": observer.fault_rows, "residuals": observer.residual_rows}
-    blocks: dict[str, dict[str, FloatArray]] = {
-        target: {"z": observer.Cz[rows], "u": observer.Du[rows], "y": observer.Dy[rows]}
+    said: dict[str, dict[str, FloatArray]] = {
+        target: {"z": found.running.Cz[rows], "u": found.running.Du[rows], "y": found.running.Dy[rows]}
         for target, rows in groups.items()
         if rows.stop > rows.start
     }
-    blocks["next"] = {"z": observer.Az, "u": observer.Bu, "y": observer.By}
+    moved: dict[str, dict[str, FloatArray]] = {"next": found.transition}
+    large = any(_form(matrix) != PLAIN for parts in (*said.values(), *moved.values()) for matrix in parts.values())
     tables = [
         line
-        for target, parts in blocks.items()
+        for target, parts in {**said, **moved}.items()
         for signal, matrix in parts.items()
         if matrix.size
         for line in _tables(f"{target}_{signal}", matrix)
     ]
-    large = any(_form(matrix) != PLAIN for parts in blocks.values() for matrix in parts.values())
-    body = [
-        "int i;",
-        *(["int j;"] if any(sizes.values()) else []),
-        f"double next[{sizes['z']}];" if sizes["z"] else "(void)state;",
-    ]
-    for signal in "uy":
-        if sizes[signal]:
-            body += _loop("i", sizes[signal], [f"if (!isfinite({signal}[i])) {{", "    return 1;", "}"])
-    for target, parts in blocks.items():
-        body += _product(target, parts)
-    body += _loop("i", sizes["z"], ["state->z[i] = next[i];"]) if sizes["z"] else []
+    shown = len(observer.fault_names) + len(observer.residual_names)
+    sizes = {
+        "Z_COUNT": observer.order,
+        "U_COUNT": nu,
+        "Y_COUNT": ny,
+        "V_COUNT": nu + ny,
+        "STATE_COUNT": len(observer.state_names),
+        "FAULT_COUNT": len(observer.fault_names),
+        "SHOWN_COUNT": shown,
+        "WATCHED_COUNT": shown + 1,
+        "MODEL_STATES": gap.states,
+        "SEEN_COUNT": gap.seen,
+        "PLANT_FAULTS": gap.faults,
+        "KEPT_INPUTS": gap.kept_inputs,
+        "LEAST_SHOWN": gap.least_shown,
+    }
+    before, after = found.operating_point
+    constants = {
+        "start": found.start.reshape(1, -1),
+        "point_before": before.reshape(1, -1),
+        **({"point_after": after.reshape(1, -1)} if len(observer.state_names) + len(observer.fault_names) else {}),
+        "levels": np.array([list(alarms.levels.values())]),
+        **gap.tables,
+    }
     return (
         "\n".join(
             [
                 comment(f"sha256 of the gain set: {found.digest}"),
-                *([comment(quoted(found.mark))] if found.mark else []),
+                comment(quoted(found.status)),
                 f'#include "{included(header)}"',
                 "",
                 "#include <math.h>",
+                "#include <stddef.h>",
+                "",
+                "#if defined(__FAST_MATH__)",
+                "#error a missing sample is NaN, which -ffast-math does not know",
+                "#endif",
+                "#define LENGTH(n) ((n) > 0 ? (n) : 1)",
+                "#define ABS(x) ((x) < 0 ? -(x) : (x))",
+                f"#define MODEL {int(gap.exists)}",
+                f"#define SOLVED {int(gap.solved)}",
+                f"#define STRAIGHT {int(found.straight)}",
+                f"#define WARM_UP_SECONDS {alarms.warm_up!r}",
+                f"#define LEFT_SHARE ((REAL){gap.left_share!r})",
+                "enum {",
+                *(f"    {name} = {value}," for name, value in sizes.items()),
+                "};",
                 "",
                 *([comment(ADVICE), ""] if large else []),
                 *tables,
-                *_reset(found, prefix),
-                *_function(_step_signature(found, prefix), [*body, "return 0;"]),
+                *(line for name, table in constants.items() for line in table_lines(name, filled_table(table))),
+                *integer_table("told", gap.told),
+                *integer_table("watched", alarms.places),
+                "",
+                *_products("say", ("z", "u", "y"), said, tuple(groups)),
+                *_products("next_of", tuple(found.transition), moved, ("next",)),
+                monitor_source(alarms, prefix),
+                _step_text(found, prefix, alarms),
             ]
         )
         + "\n"
     )
 
 
-def _reset(found: Realisation, prefix: str) -> list[str]:
-    table, start = [], "0.0"
-    if found.start.any():
-        table, start = [*table_lines("start", found.start.reshape(1, -1))], "start[0][i]"
-    body = ["int i;", *_loop("i", max(found.observer.order, 1), [f"state->z[i] = {start};"])]
-    return [*table, *_function(f"void {prefix}_reset({prefix}_state *state)", body), ""]
+def _products(
+    name: str, given: Sequence[str], blocks: dict[str, dict[str, FloatArray]], targets: Sequence[str]
+) -> list[str]:
+    """Return a function that writes products of vectors into its targets."""
+    arguments = [f"const REAL *{signal}" for signal in given] + [f"REAL *{target}" for target in targets]
+    body = ["int i;", "int j;", *(f"(void){word};" for word in ("i", "j", *given, *targets))]
+    for target in targets:
+        if target in blocks:
+            body += _product(target, blocks[target])
+    return [*_function(f"static void {name}({', '.join(arguments)})", body), ""]
+
+
+def _step_text(found: Realisation, prefix: str, alarms: Alarms) -> str:
+    """Return everything that follows the tables: start, step, and the step of signals as they are."""
+    observer = found.observer
+    nu, ny = len(observer.input_names), len(observer.output_names)
+    nx, nf, nr = len(observer.state_names), len(observer.fault_names), len(observer.residual_names)
+    learned = alarms.learned is not None
+    copied = (("v", "u", nu), ("v + U_COUNT", "y", ny))
+    shown = (("faults", "shown", nf), ("residuals", "shown + FAULT_COUNT", nr))
+    parts = {
+        "STATES_SCRATCH": "" if nx else "REAL states[1] = {0};",
+        "COPY_IN": " ".join(f"copied({to}, {of}, {n});" for to, of, n in copied if n),
+        "COPY_OUT": " ".join(f"copied({to}, {of}, {n});" for to, of, n in shown if n),
+        "MONITOR_RESET": "monitor_reset(&s->monitor);" if learned else "",
+        "MONITOR_STEP": (
+            f"monitor_take(&s->monitor, shown, s->status == {prefix.upper()}_OK);\n"
+            "    shown[SHOWN_COUNT] = s->monitor.statistic;"
+            if learned
+            else ""
+        ),
+        "STEP_ARGUMENTS": ", ".join(_step_arguments(found, prefix)).replace("*state", "*s", 1),
+    }
+    text = template("linear_step.c")
+    for word, value in parts.items():
+        text = text.replace(f"    {word}\n", f"    {value}\n" if value else "").replace(word, value)
+    given = ["state"]
+    body = ["REAL deviation[LENGTH(V_COUNT)] = {0};", "int i, missing;"]
+    for array, offset, count in (("u", "", nu), ("y", "U_COUNT + ", ny)):
+        if count:
+            body += _loop("i", count, [f"deviation[{offset}i] = {array}[i] - point_before[0][{offset}i];"])
+            given.append("deviation" if array == "u" else "deviation + U_COUNT")
+    given += [name for name, count in (("states", nx), ("faults", nf), ("residuals", nr)) if count]
+    body.append(f"missing = {prefix}_step({', '.join(given)});")
+    for array, offset, count in (("states", "", nx), ("faults", f"{nx} + ", nf)):
+        if count:
+            body += _loop("i", count, [f"{array}[i] += point_after[0][{offset}i];"])
+    body += ["(void)i;", "return missing;"]
+    take = _function(_step_signature(found, prefix, "take"), body)
+    return text.replace("PREFIX", prefix).replace("UPPER", prefix.upper()) + "\n" + "\n".join(take)
 
 
 def _function(signature: str, body: Iterable[str]) -> list[str]:
@@ -222,19 +446,15 @@ def _product(target: str, parts: dict[str, FloatArray]) -> list[str]:
             line
             for signal, matrix in parts.items()
             if matrix.size
-            for line in _row_sum("sum", f"{target}_{signal}", _vector(signal), matrix.shape[1])
+            for line in _row_sum("sum", f"{target}_{signal}", signal, matrix.shape[1])
         ]
-        return _loop("i", rows, ["double sum = 0.0;", *sums, f"{target}[i] = sum;"])
-    lines = [f"double sum[{rows}];", *_loop("i", rows, ["sum[i] = 0.0;"])]
+        return _loop("i", rows, ["REAL sum = 0;", *sums, f"{target}[i] = sum;"])
+    lines = [f"REAL sum[{rows}];", *_loop("i", rows, ["sum[i] = 0;"])]
     for signal, matrix in parts.items():
         if matrix.size:
-            lines += _added(f"{target}_{signal}", _vector(signal), matrix)
+            lines += _added(f"{target}_{signal}", signal, matrix)
     lines += _loop("i", rows, [f"{target}[i] = sum[i];"])
     return ["{", *(f"    {line}" for line in lines), "}"]
-
-
-def _vector(signal: str) -> str:
-    return "state->z" if signal == "z" else signal
 
 
 def _row_sum(total: str, name: str, vector: str, columns: int) -> list[str]:
@@ -272,9 +492,7 @@ def _tables(name: str, matrix: FloatArray) -> Iterator[str]:
         starts = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=len(matrix)))])
         yield from _list("int", f"{name}_start", [str(int(start)) for start in starts])
         yield from _list("int", f"{name}_column", [str(int(column)) for column in columns] or ["0"])
-        yield from _list(
-            "double", f"{name}_value", [repr(value) for value in matrix[rows, columns].tolist()] or ["0.0"]
-        )
+        yield from _list("REAL", f"{name}_value", [repr(value) for value in matrix[rows, columns].tolist()] or ["0.0"])
 
 
 def _list(kind: str, name: str, texts: list[str]) -> Iterator[str]:
@@ -285,7 +503,7 @@ def _list(kind: str, name: str, texts: list[str]) -> Iterator[str]:
 
 def table_lines(name: str, matrix: FloatArray) -> Iterator[str]:
     """Yield the lines of a table of constants."""
-    yield f"static const double {name}[{matrix.shape[0]}][{matrix.shape[1]}] = {{"
+    yield f"static const REAL {name}[{matrix.shape[0]}][{matrix.shape[1]}] = {{"
     for row in matrix.tolist():
         # repr gives the shortest text that is read back bit for bit.
         yield "    {" + ",\n     ".join(_in_lines([repr(value) for value in row])) + "},"
@@ -296,22 +514,73 @@ def _in_lines(texts: list[str]) -> list[str]:
     return [", ".join(texts[i : i + _NUMBERS_PER_LINE]) for i in range(0, len(texts), _NUMBERS_PER_LINE)]
 
 
-def _step_signature(found: Realisation, prefix: str) -> str:
+def _step_arguments(found: Realisation, prefix: str) -> list[str]:
     observer = found.observer
     inputs = {"u": observer.input_names, "y": observer.output_names}
     outputs = {"states": observer.state_names, "faults": observer.fault_names, "residuals": observer.residual_names}
-    arguments = [
+    return [
         f"{prefix}_state *state",
-        *(f"const double {name}[{len(names)}]" for name, names in inputs.items() if names),
-        *(f"double {name}[{len(names)}]" for name, names in outputs.items() if names),
+        *(f"const REAL {name}[{len(names)}]" for name, names in inputs.items() if names),
+        *(f"REAL {name}[{len(names)}]" for name, names in outputs.items() if names),
     ]
-    return f"int {prefix}_step({', '.join(arguments)})"
+
+
+def _step_signature(found: Realisation, prefix: str, name: str = "step") -> str:
+    return f"int {prefix}_{name}({', '.join(_step_arguments(found, prefix))})"
 
 
 def _signal_comments(
-    array: str, names: Sequence[str], point: FloatArray | None, delays: Sequence[int] = ()
+    array: str,
+    column: str,
+    names: Sequence[str],
+    point: FloatArray | None,
+    units: Mapping[str, str],
+    delays: Sequence[int] = (),
 ) -> Iterator[str]:
     for i, name in enumerate(names):
         at = f", operating point {float(point[i])!r}" if point is not None and point[i] else ""
         late = f", {delays[i]} sample(s) late" if delays and delays[i] else ""
-        yield comment(f"{array}[{i}]: {quoted(name)}{at}{late}")
+        unit = f", {quoted(units[name])}" if units.get(name) else ""
+        yield comment(f"{array}[{i}]: {quoted(f'{column}[{name}]' if column else name)}{unit}{at}{late}")
+
+
+def filled_table(table: FloatArray) -> FloatArray:
+    """Return a table without an empty side, which C has not."""
+    found = np.zeros(tuple(max(size, 1) for size in table.shape))
+    found[: table.shape[0], : table.shape[1]] = table
+    return found
+
+
+def integer_table(name: str, values: Sequence[int]) -> list[str]:
+    """Return a constant table of whole numbers."""
+    return [f"static const int {name}[{max(len(values), 1)}] = {{{', '.join(map(str, values)) or '0'}}};"]
+
+
+def template(name: str) -> str:
+    """Return the text of a file of C that is written around tables."""
+    return files("obsynth.exporting").joinpath("templates", name).read_text(encoding="utf-8")
+
+
+#: A number of a table, or of a line that a macro names.
+_NUMBER = re.compile(r"(?<![\w.\"])-?\d+(?:\.\d+(?:e[+-]?\d+)?|e[+-]?\d+)(?![\w.\"])")
+
+
+def in_precision(text: str, precision: str) -> str:
+    """Return C in which numbers of signals are doubles, or floats as near to these as they can be."""
+    if precision == "double":
+        return re.sub(r"\bREAL\b", "double", text)
+    rounded = []
+    for line in re.sub(r"\bREAL\b", "float", text).split("\n"):
+        plain = line.startswith(("#define", "/*", " *"))
+        rounded.append(line if plain else _NUMBER.sub(_as_float, line))
+    return "\n".join(rounded)
+
+
+def _as_float(found: re.Match[str]) -> str:
+    value = np.float32(found.group())
+    if not np.isfinite(value):
+        raise SpecError(
+            f"{found.group()} is beyond the largest number of precision 'float': scale the signals, or export doubles.",
+            path="precision",
+        )
+    return f"{value}f"

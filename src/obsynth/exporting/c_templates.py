@@ -6,36 +6,57 @@ CasADi writes the equations of a DAE; the loop of Newton around them, its dampin
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from importlib.resources import files
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.experiments.monitors.adaptive_bound import THRESHOLD_ROUNDING, AdaptiveBound
-from obsynth.exporting.c_source import c_identifier, comment, included, quoted, table_lines, with_c_linkage
+from obsynth.experiments.monitors.learned import LearnedThresholds, watched_names
+from obsynth.exporting.alarms import Alarms
+from obsynth.exporting.c_source import (
+    alarm_comments,
+    c_identifier,
+    comment,
+    filled_table,
+    in_precision,
+    included,
+    monitor_source,
+    monitor_struct,
+    quoted,
+    status_lines,
+    table_lines,
+    template,
+    with_c_linkage,
+)
+from obsynth.exporting.realisation import verification_words
 from obsynth.files.outputs import write_together
-from obsynth.methods.handing_on import unverified_mark
 from obsynth.observers.dae.c_code import observer_code, observer_struct
+from obsynth.observers.linear.derived import checked_warm_up
+from obsynth.observers.running import changed
 from obsynth.plants.dae.model import DAEModel
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import gain_set_digest
 
 
-def _template(name: str) -> str:
-    return files("obsynth.exporting").joinpath("templates", name).read_text(encoding="utf-8")
-
-
-def write_dae_c(design: ObserverDesign, target: Path, sample_time: float | None) -> tuple[Path, ...]:
+def write_dae_c(
+    design: ObserverDesign, target: Path, sample_time: float | None, alarms: Alarms, precision: str
+) -> tuple[Path, ...]:
     """Write source and header."""
     if target.suffix.lower() != ".c":
         raise SpecError(
             f"{target}: the observer of a nonlinear plant is no matrices; it is exported as C (.c).", path=str(target)
         )
     require_no_sample_time(design, sample_time)
+    if precision != "double":
+        raise SpecError(
+            "The steps of a nonlinear observer are solved to more digits than a float has: leave precision at double.",
+            path="precision",
+        )
     prefix, header = c_identifier(target.stem), target.with_suffix(".h")
-    source, declarations, _ = dae_c_texts(design, prefix, header.name)
+    source, declarations, _ = dae_c_texts(design, prefix, header.name, alarms)
     return write_together({target: source, header: with_c_linkage(declarations, prefix)})
 
 
@@ -48,10 +69,30 @@ def require_no_sample_time(design: ObserverDesign, sample_time: float | None) ->
         )
 
 
-def dae_c_texts(design: ObserverDesign, prefix: str, header: str) -> tuple[str, str, str]:
+def dae_alarms(
+    design: ObserverDesign,
+    thresholds: Mapping[str, float] | None,
+    warm_up: float | None,
+    learned: LearnedThresholds | None,
+) -> tuple[ObserverDesign, Alarms]:
+    """Return the alarms of a nonlinear design, and the design as these want it: thresholds were learned from a run,
+    which leaves outliers out where the design says nothing of them."""
+    model, observer = design.nonlinear
+    if learned is not None and observer.outliers == "none":
+        design = design.replace(observer=changed(observer, outliers="gate"))
+    columns = (*(f"fhat[{name}]" for name in model.parameter_names), *(f"r[{name}]" for name in model.output_names))
+    seconds = checked_warm_up(warm_up, 0.0)
+    found = Alarms.of(columns, model.parameter_names, thresholds, seconds, learned, more=("nis",))
+    if learned is not None:
+        # A run numbers innovations of any kind.
+        found = replace(found, columns=watched_names(design))
+    return design, found
+
+
+def dae_c_texts(design: ObserverDesign, prefix: str, header: str, alarms: Alarms) -> tuple[str, str, str]:
     """Return source, header and the digest of the gain set."""
-    _, observer = design.nonlinear
-    digest = gain_set_digest(design)
+    model, observer = design.nonlinear
+    digest = alarms.learned.gains if alarms.learned is not None else gain_set_digest(design)
     inner = f"{prefix}_observer" if observer.timing.is_plain else f"{prefix}_observer_memory"
     source = "\n".join(
         [
@@ -60,60 +101,93 @@ def dae_c_texts(design: ObserverDesign, prefix: str, header: str) -> tuple[str, 
             "",
             f"#define observer {inner}",
             *([f"#define waiting {prefix}_observer"] if inner != f"{prefix}_observer" else []),
+            f"#define WARM_UP_SECONDS {alarms.warm_up!r}",
             "",
             observer_code(observer.steps),
-            _step_text(prefix, design.nonlinear[0]),
+            "#include <stddef.h>",
+            "#define ABS fabs",
+            *table_lines("levels", np.array([list(alarms.levels.values())])),
+            monitor_source(alarms, prefix),
+            _step_text(prefix, model, alarms),
         ]
     )
-    return source, "\n".join(_header(design, prefix, digest)) + "\n", digest
+    declared = "\n".join(_header(design, prefix, digest, alarms)) + "\n"
+    return in_precision(source, "double"), in_precision(declared, "double"), digest
 
 
-def _step_text(prefix: str, model: DAEModel) -> str:
+def _step_text(prefix: str, model: DAEModel, alarms: Alarms) -> str:
     """Return the two functions of the header; without inputs, C has no array for them."""
-    arguments, given, nothing = (
-        ("const double u[NU], ", "u", "")
-        if model.nu
-        else ("", "nothing", "    static const double nothing[1] = {0.0};\n")
-    )
-    text = _template("dae_step.c").replace("PREFIX", prefix).replace("ARGUMENTS", arguments)
-    return text.replace("NOTHING", nothing).replace("INPUT", given)
+    parts = {
+        "ARGUMENTS": "const double u[NU], " if model.nu else "",
+        "INPUT": "u" if model.nu else "s->u",
+        "MONITOR_RESET": "monitor_reset(&s->monitor);" if alarms.learned is not None else "",
+        "MONITOR_STEP": (
+            "monitor_take(&s->monitor, shown, is_deciding);\n    shown[NQ + NY + 1] = s->monitor.statistic;"
+            if alarms.learned is not None
+            else ""
+        ),
+    }
+    text = template("dae_step.c").replace("PREFIX", prefix).replace("UPPER", prefix.upper())
+    for word, value in parts.items():
+        text = text.replace(f"    {word}\n", f"    {value}\n" if value else "").replace(word, value)
+    return text
 
 
-def _header(design: ObserverDesign, prefix: str, digest: str) -> Iterator[str]:
+def _header(design: ObserverDesign, prefix: str, digest: str, alarms: Alarms) -> Iterator[str]:
     model, observer = design.nonlinear
     guard, upper = f"{prefix.upper()}_H", prefix.upper()
     sizes = {
         "states": model.nx,
         "state_deviations": model.nx,
-        "parameters": model.nq,
-        "parameter_deviations": model.nq,
-        "innovations": model.ny,
+        "faults": model.nq,
+        "fault_deviations": model.nq,
+        "residuals": model.ny,
     }
+    watched = max(len(alarms.levels), 1)
     yield comment(f"Observer {quoted(design.name)} by {quoted(design.method)}, written by obsynth.")
-    if mark := unverified_mark(design.report):
-        yield comment(quoted(mark))
+    yield comment(quoted(verification_words(design)))
+    yield from map(comment, alarm_comments(alarms))
     yield from (f"#ifndef {guard}", f"#define {guard}", "", comment("sha256 of the gain set"))
     yield from (f'#define {upper}_SHA256 "{digest}"', comment("seconds between samples"))
-    yield from (f"#define {upper}_DT {observer.dt!r}", "", *observer_struct(observer.steps, f"{prefix}_observer"))
-    yield from (f"typedef struct {prefix}_observer {prefix}_state;", "")
+    yield from (f"#define {upper}_DT {observer.dt!r}", comment("outputs that may be watched"))
+    yield from (f"#define {upper}_WATCHED {len(alarms.levels)}", "", *status_lines(prefix), "")
+    yield from (*observer_struct(observer.steps, f"{prefix}_observer"), *monitor_struct(alarms, prefix))
+    yield from ("typedef struct {", comment("Read these after a step: what the row was, what passed its level."))
+    yield from ("    int status;", f"    int alarm[{watched}];", "    int any_alarm;")
+    yield comment("Set these after the reset: levels (0 for none), and seconds without alarms after the start.")
+    yield from (f"    double level[{watched}];", "    double warm_up;")
+    if alarms.learned is not None:
+        yield f"    {prefix}_monitor monitor;"
+    yield from (comment("Everything else is the observer's own."), f"    struct {prefix}_observer running;")
+    yield from (f"    double u[{max(model.nu, 1)}];", "    double time, from;", "    long k;")
+    yield from ("    int is_started, phase;", f"}} {prefix}_state;", "")
     yield comment("States after the measurement, parameters, their standard deviations; innovations (NaN where y is);")
     yield comment("their square in units of their covariance; the residual of the step in sizes of the states.")
     yield "typedef struct {"
     yield from (f"    double {name}[{max(size, 1)}];" for name, size in sizes.items())
-    yield from ("    double nis;", "    double residual;", f"}} {prefix}_estimates;", "")
+    yield from ("    double nis;", "    double step_residual;", f"}} {prefix}_estimates;", "")
     yield from (comment("Start as the design does."), f"void {prefix}_reset({prefix}_state *state);", "")
-    yield comment("Take one sample: y at this sample, NaN where it is missing, and u during the step that ends at it.")
-    yield comment("Returns 0; 1 if an input is not finite or an output infinite; 2 if the step has no solution:")
-    yield comment("state and estimates are left as they were then.")
-    for array, names in (
-        ("u", model.input_names),
-        ("y", model.output_names),
-        ("states", model.state_names),
-        ("parameters", model.parameter_names),
+    yield comment("Take one sample: y at this sample, and u during the step that ends at it; what is missing is NaN.")
+    yield comment(
+        "A missing output is predicted over, a missing input stays as it was. Returns 0; 1 where inputs or all"
+    )
+    yield comment(
+        "outputs are missing (status GAP), or before all inputs were ever known, which takes nothing; 2 if the"
+    )
+    yield comment("step has no solution: state and estimates are left as they were then.")
+    for array, column, names in (
+        ("u", "", model.input_names),
+        ("y", "", model.output_names),
+        ("states", "xhat", model.state_names),
+        ("faults", "fhat", model.parameter_names),
+        ("state_deviations", "sd xhat", model.state_names),
+        ("fault_deviations", "sd fhat", model.parameter_names),
+        ("residuals", "r", model.output_names),
     ):
         for i, name in enumerate(names):
             unit = model.units.get(name)
-            yield comment(f"{array}[{i}]: {quoted(name)}" + (f", {quoted(unit)}" if unit else ""))
+            told = quoted(f"{column}[{name}]" if column else name)
+            yield comment(f"{array}[{i}]: {told}" + (f", {quoted(unit)}" if unit else ""))
     taken = [f"{prefix}_state *state", f"const double y[{model.ny}]", f"{prefix}_estimates *estimates"]
     taken[1:1] = [f"const double u[{model.nu}]"] if model.nu else []
     yield f"int {prefix}_step({', '.join(taken)});"
@@ -192,7 +266,7 @@ def threshold_source(bound: AdaptiveBound, prefix: str) -> str:
         "later": later[None],
         "driven": np.array([bound.remainder_inputs], dtype=np.float64),
     }
-    text = _template("adaptive_threshold.c")
+    text = template("adaptive_threshold.c")
     enumerated = ", ".join(f"{name} = {value}" for name, value in sizes.items())
     lines = [
         "",
@@ -200,13 +274,6 @@ def threshold_source(bound: AdaptiveBound, prefix: str) -> str:
         f"static const double THETA = {theta!r};",
         f"static const double ROUNDED = {THRESHOLD_ROUNDING!r};",
         "",
-        *(line for name, table in tables.items() for line in table_lines(f"thresholds_{name}", _filled(table))),
+        *(line for name, table in tables.items() for line in table_lines(f"thresholds_{name}", filled_table(table))),
     ]
-    return "\n".join(lines) + "\n" + text.replace("PREFIX", prefix)
-
-
-def _filled(table: np.ndarray) -> np.ndarray:
-    """Return a table without an empty side, which C has not."""
-    found = np.zeros(tuple(max(size, 1) for size in table.shape))
-    found[: table.shape[0], : table.shape[1]] = table
-    return found
+    return in_precision("\n".join(lines) + "\n" + text.replace("PREFIX", prefix), "double")

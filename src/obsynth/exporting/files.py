@@ -10,21 +10,35 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.exporting.c_source import c_identifier, header_text, source_text, with_c_linkage
-from obsynth.exporting.c_templates import threshold_header, threshold_source, write_dae_c
+from obsynth.experiments.monitors.learned import LearnedRule, LearnedThresholds
+from obsynth.exporting.alarms import Alarms, linear_alarms
+from obsynth.exporting.c_source import (
+    c_identifier,
+    comment,
+    header_text,
+    in_precision,
+    quoted,
+    source_text,
+    with_c_linkage,
+)
+from obsynth.exporting.c_templates import dae_alarms, threshold_header, threshold_source, write_dae_c
+from obsynth.exporting.c_window import is_window, require_fixed, window_c_texts
+from obsynth.exporting.float_error import float_error
 from obsynth.exporting.realisation import Realisation
 from obsynth.files.outputs import FileKind, write_atomically, write_together
 from obsynth.methods.handing_on import require_verified
-from obsynth.numerics.arguments import require_kind
+from obsynth.numerics.arguments import chosen, require_kind
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.sensor_timing import require_plain
 from obsynth.results.design import ObserverDesign
+from obsynth.results.gain_sets import gain_set_digest
 
+PRECISIONS = ("double", "float")
 SUFFIXES = (".mat", ".npz", ".c", ".fmu")
 if TYPE_CHECKING:
     from obsynth.experiments.monitors.adaptive_bound import AdaptiveBound
-    from obsynth.experiments.monitors.online import OnlineMonitor
+    from obsynth.experiments.monitors.monitor import Monitor
 
 #: What an existing file has to be for another export to take its place.
 _C_FILE = FileKind("C code that obsynth has exported", rb"sha256 of the gain set")
@@ -42,10 +56,11 @@ def export(
     path: str | Path,
     *,
     sample_time: float | None = None,
-    fmi: str = "2.0",
+    fmi: str | None = None,
     thresholds: Mapping[str, float] | None = None,
     warm_up: float | None = None,
-    monitor: OnlineMonitor | None = None,
+    monitor: Monitor | None = None,
+    precision: str | None = None,
     unverified: bool = False,
 ) -> tuple[Path, ...]:
     """Write the observer of a design for MATLAB and Simulink, for numpy, as C99, or as a functional mock-up unit.
@@ -61,23 +76,27 @@ def export(
         ``[xhat; fhat; r]``, as a State-Space block takes them, with ``input_names``, ``output_names``, ``delays``
         (samples, of states and faults), ``input_point``, ``output_point``, ``name``, ``method`` and ``sha256``; a
         ``.mat`` has the structures ``gains``, by the letters of the method's paper, and ``certificate`` besides.
-        ``.c``: a source file and the header beside it, with functions ``<stem>_reset`` and ``<stem>_step``; the only
+        ``.c``: a source file and the header beside it, with functions ``<stem>_reset`` and ``<stem>_step`` (of a
+        guaranteed test a dot product over its window, with its threshold and its alarm); the only
         one besides ``.fmu`` for an observer of a nonlinear DAE, which holds the implicit step with its homotopy.
         ``.fmu``: a functional mock-up unit for co-simulation with that C inside, and a binary for this machine where
         a compiler is: inputs by the names of the signals, outputs ``xhat[...]``, ``fhat[...]``, ``r[...]`` and
         ``alarm[...]``, parameters ``operating_point[...]``, ``threshold[...]`` and ``warm_up``, with units.
     sample_time : float, optional, seconds
         Samples a continuous-time observer by a first-order hold; needed for C and an FMU.
-    fmi : str
-        Version of FMI, ``"2.0"`` or ``"3.0"``; for ``.fmu`` only.
+    fmi : str, optional
+        Version of FMI, ``"2.0"`` (the default) or ``"3.0"``; for ``.fmu`` only.
     thresholds : mapping, optional
         Level of the absolute value by output, such as ``fhat[actuator]`` or ``r[speed]`` (of faults with an operating
-        point, of the deviation), above which its alarm is raised; for ``.fmu`` only, where they can be changed.
+        point, of the deviation), above which its alarm is raised; for ``.c`` and ``.fmu``, where they can be changed.
     warm_up : float, optional, seconds
-        Without alarms after the start; by default until the slowest mode has shrunk to 2 %.  For ``.fmu`` only.
-    monitor : OnlineMonitor, optional
-        From `online_monitor` with ``constants``: its thresholds over the tolerances as ``<stem>_thresholds_step``, for
-        constants that stay the same; for ``.c`` only.
+        Without alarms after the start; by default until the slowest mode has shrunk to 2 %.  For ``.c``, ``.fmu``.
+    monitor : Monitor, optional
+        From `online_monitor`: one that was learned from rows without faults (``"learned"``; its statistic and alarms
+        are those of a run), for ``.c`` and ``.fmu``; or with ``constants``, its thresholds over the tolerances as
+        ``<stem>_thresholds_step``, for constants that stay the same; for ``.c`` only.
+    precision : {"double", "float"}, optional
+        Of the numbers in C, of linear observers; the header of floats bounds what these change.
     unverified : bool, optional
         Whether a design whose report fails is written all the same, with a mark in the file that says so.
 
@@ -102,6 +121,10 @@ def export(
     except in an FMU, whose signals are absolute: it subtracts the operating point and adds it back.  An FMU takes its
     inputs at the beginning of a communication step, which is a multiple of ``dt``, and shows the estimates of that
     sample at its end.
+
+    C and FMU start as `run_on_data` does, and take a missing sample (NaN) as it does on regular rows: of linear designs
+    the model of the plant stands in for the sensors, faults are held and residuals are NaN; nonlinear ones predict.
+    ``status`` says what a row was, and alarms are raised in rows that are ``OK`` or ``PARTIAL``.
     """
     require_kind(path, (str, Path), "path", "the name of a file")
     target = Path(path)
@@ -110,24 +133,61 @@ def export(
         raise SpecError(f"{target} has an unknown suffix: use one of {', '.join(SUFFIXES)}.", path=str(target))
     if isinstance(design, ObserverDesign):
         require_verified(design, unverified=unverified)
+        require_fixed(design)
     if isinstance(design, ObserverDesign) and isinstance(design.observer, RecursiveObserver):
         require_plain(design.observer, "An export")
+    if precision is not None and suffix != ".c":
+        raise SpecError("precision is for C (.c): other files hold doubles.", path="precision")
+    if monitor is not None and suffix not in (".c", ".fmu"):
+        raise SpecError("A monitor is written as C (.c) or in an FMU (.fmu).", path="monitor")
+    numbers = chosen(precision or "double", "precision", PRECISIONS)
+    learned = None if monitor is None else _learned_by(monitor, design)
     if suffix == ".fmu":
         from obsynth.exporting.fmu.archive import write_fmu
 
         require_kind(design, ObserverDesign, "design", "an ObserverDesign, such as obsynth.load(path)")
+        if monitor is not None and learned is None:
+            raise SpecError("An FMU holds learned monitors and levels of outputs: others are for .c.", path="monitor")
         return (
-            write_fmu(design, target, version=fmi, sample_time=sample_time, thresholds=thresholds, warm_up=warm_up),
+            write_fmu(
+                design,
+                target,
+                version=fmi or "2.0",
+                sample_time=sample_time,
+                thresholds=thresholds,
+                warm_up=warm_up,
+                learned=learned,
+            ),
         )
-    if thresholds or warm_up is not None:
-        raise SpecError("Thresholds and warm-up are for an FMU (.fmu): other files hold no alarms.", path="thresholds")
+    if fmi is not None:
+        raise SpecError("fmi is the version of an FMU (.fmu): other files have none.", path="fmi")
+    if suffix != ".c" and (thresholds or warm_up is not None):
+        raise SpecError(
+            "Thresholds and warm-up are for C (.c) and an FMU (.fmu): other files hold no alarms.", path="thresholds"
+        )
     if isinstance(design, ObserverDesign) and isinstance(design.observer, DAEObserver):
-        return write_dae_c(design, target, sample_time)
-    found = Realisation.of(design, sample_time)
-    if monitor is not None and suffix != ".c":
-        raise SpecError("Thresholds over tolerances are written as C (.c).", path="monitor")
+        if monitor is not None and learned is None:
+            raise SpecError("Of nonlinear designs, learned monitors are written as C.", path="monitor")
+        shipped, alarms = dae_alarms(design, thresholds, warm_up, learned)
+        return write_dae_c(shipped, target, sample_time, alarms, numbers)
+    found = Realisation.of(design, sample_time, numbers)
+    if suffix == ".c" and is_window(design):
+        if monitor is not None or thresholds or warm_up is not None or numbers != "double":
+            raise SpecError(
+                "A guaranteed test brings its threshold, in doubles: leave monitor, thresholds, warm-up and precision "
+                "out.",
+                path="monitor",
+            )
+        prefix, header = c_identifier(target.stem), target.with_suffix(".h")
+        source, declared = (in_precision(text, numbers) for text in window_c_texts(found, prefix, header.name))
+        return write_together({target: source, header: with_c_linkage(declared, prefix)})
     if suffix == ".c":
-        return _write_c(found, target, None if monitor is None else _bound_of(monitor, found))
+        if found.observer.dt == 0.0:
+            raise SpecError(
+                "The observer is continuous in time: give the sample time, in seconds, for C.", path="sample_time"
+            )
+        bound = None if monitor is None or learned is not None else _bound_of(monitor, found)
+        return _write_c(found, target, linear_alarms(found, thresholds, warm_up, learned), bound)
     buffer = io.BytesIO()
     if suffix == ".npz":
         np.savez(buffer, **found.as_arrays())
@@ -155,10 +215,11 @@ def exported_files(target: Path) -> dict[Path, FileKind | None]:
     return {target: EXPORTED.get(suffix), **header}
 
 
-def _bound_of(monitor: OnlineMonitor, found: Realisation) -> AdaptiveBound:
+def _bound_of(monitor: Monitor, found: Realisation) -> AdaptiveBound:
     """Return the bound of an adaptive monitor of the design that is written."""
     monitor.require_fit(len(found.observer.residual_names), found.observer.fault_names)
-    bound: AdaptiveBound | None = monitor.bound
+    plan = getattr(monitor.rule, "plan", None)
+    bound: AdaptiveBound | None = None if plan is None else plan.bound
     if bound is None:
         raise SpecError("The monitor has no thresholds over tolerances: make it with constants.", path="monitor")
     if bound.first is not None:
@@ -168,15 +229,32 @@ def _bound_of(monitor: OnlineMonitor, found: Realisation) -> AdaptiveBound:
     return bound
 
 
-def _write_c(found: Realisation, target: Path, bound: AdaptiveBound | None = None) -> tuple[Path, ...]:
-    if found.observer.dt == 0.0:
+def _learned_by(monitor: Monitor, design: ObserverDesign) -> LearnedThresholds | None:
+    """Return what a monitor has learned, of this design."""
+    if not isinstance(monitor.rule, LearnedRule):
+        return None
+    learned = monitor.rule.learned
+    if learned.gains != gain_set_digest(design):
+        raise SpecError("The thresholds were learned with another gain set: learn them again.", path="monitor")
+    if isinstance(design.observer, RecursiveObserver):
         raise SpecError(
-            "The observer is continuous in time: give the sample time, in seconds, for C.", path="sample_time"
+            "The steady state of a recursive design, which is what is exported, has other innovations than the "
+            "recursion that the thresholds were learned from: watch its outputs by levels (thresholds).",
+            path="monitor",
         )
+    return learned
+
+
+def _write_c(found: Realisation, target: Path, alarms: Alarms, bound: AdaptiveBound | None = None) -> tuple[Path, ...]:
     prefix = c_identifier(target.stem)
     header = target.with_suffix(".h")
-    source, declared = source_text(found, prefix, header.name), header_text(found, prefix)
+    source, declared = source_text(found, prefix, header.name, alarms), header_text(found, prefix, alarms)
+    if found.precision != "double":
+        declared = f"{comment(quoted(float_error(found)))}\n{declared}"
+    source, declared = in_precision(source, found.precision), in_precision(declared, found.precision)
     if bound is not None:
+        if found.precision != "double":
+            raise SpecError("Thresholds over tolerances are guaranteed in double precision only.", path="precision")
         begin, end = declared.rsplit("#endif", 1)
         declared = begin + threshold_header(bound, prefix) + "#endif" + end
         source += threshold_source(bound, prefix)

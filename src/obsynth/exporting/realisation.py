@@ -2,29 +2,51 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from functools import cached_property
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from obsynth.errors import SpecError
+from obsynth.extensions import extension
 from obsynth.methods.handing_on import unverified_mark
 from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.continuous import first_order_hold
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.linear.derived import sample_observer
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.recursive.gain_schedule import steady_observer
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.plants.dae.model import DAEModel
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import gain_set_digest
 
 #: What a file says about the steady state of a recursion.
 STEADY = (
     "The steady state of a recursive design: its estimates are those of the recursion once the covariances have "
-    "settled, and it takes complete samples only."
+    "settled, and where a sample is missing the model alone goes on."
 )
+
+
+class GapTables(NamedTuple):
+    """What stands in for the sensors where a sample is missing: the model of the plant, as runs have it."""
+
+    faults: int  # of the plant
+    told: tuple[int, ...]  # which of them the observer estimates
+    kept_inputs: int = 1
+    states: int = 0
+    seen: int = 0
+    exists: bool = False
+    solved: bool = False
+    tables: Mapping[str, FloatArray] = MappingProxyType({})
+    left_share: float = 0.0
+    least_shown: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,9 +58,10 @@ class Realisation:
     digest: str
     start: FloatArray
     note: str = ""
+    precision: str = "double"
 
     @classmethod
-    def of(cls, design: ObserverDesign, sample_time: float | None) -> Realisation:
+    def of(cls, design: ObserverDesign, sample_time: float | None, precision: str = "double") -> Realisation:
         """Return the realisation of a design."""
         require_kind(design, ObserverDesign, "design", "an ObserverDesign, such as obsynth.load(path)")
         digest = gain_set_digest(design)
@@ -52,7 +75,7 @@ class Realisation:
             found = steady_observer(design.observer)
             if sample_time is not None:
                 raise SpecError("A recursive design is sampled already: leave the sample time out.", path="sample_time")
-            return cls(design, found.observer, digest, found.start, STEADY)
+            return cls(design, found.observer, digest, found.start, STEADY, precision)
         if isinstance(design.observer, DAEObserver):
             raise SpecError(
                 f"Design {design.name!r} is for a nonlinear plant: it has no constant gains to write. Run it with "
@@ -67,7 +90,75 @@ class Realisation:
                     path="sample_time",
                 )
             observer = sample_observer(observer, sample_time)
-        return cls(design, observer, digest, np.zeros(observer.order))
+        return cls(design, observer, digest, np.zeros(observer.order), precision=precision)
+
+    @property
+    def straight(self) -> bool:
+        """Whether signals are taken as straight lines between samples, as the design is continuous in time."""
+        return isinstance(self.design.observer, LinearObserver) and self.design.observer.dt == 0.0 < self.observer.dt
+
+    @property
+    def running(self) -> LinearObserver:
+        """The observer whose rows are said: a continuous one as it is, whose state a run starts at zero."""
+        return self.design.linear[1] if self.straight else self.observer
+
+    @cached_property
+    def transition(self) -> dict[str, FloatArray]:
+        """What makes z of a sample from that of the one before: of inputs and outputs there, or of these before and
+        their rise, where lines between them are straight."""
+        if not self.straight:
+            return {"z": self.observer.Az, "u": self.observer.Bu, "y": self.observer.By}
+        driven = np.hstack([self.running.Bu, self.running.By])
+        return dict(
+            zip(("z", "before", "rise"), first_order_hold(self.running.Az, driven, self.observer.dt), strict=True)
+        )
+
+    @cached_property
+    def gap(self) -> GapTables:
+        """The model that goes on where a sample is missing; without one the observer starts again."""
+        observer, plant = self.observer, _constant_plant(self.design.plant)
+        nothing = GapTables(len(observer.fault_names), tuple(range(len(observer.fault_names))))
+        signals = observer.input_names, observer.output_names
+        if plant is None or (plant.input_names, plant.output_names) != signals:
+            return nothing
+        if not set(observer.fault_names) <= set(plant.fault_names):
+            return nothing
+        engine = extension("running design")(self.design.replace(plant=plant, observer=self.running))
+        model = engine.gap_model
+        told = tuple(engine.told_faults)
+        if model is None:
+            return GapTables(plant.nf, told)
+        moving = model.plant
+        if self.straight:
+            held = first_order_hold(moving.A, np.hstack([moving.B, moving.Bf]), observer.dt)
+            moves: tuple[FloatArray, ...] = (
+                held[0],
+                held[1][:, : moving.nu],
+                held[1][:, moving.nu :],
+                held[2][:, : moving.nu],
+            )
+        else:
+            moves = (moving.A, moving.B, moving.Bf)
+        tables = dict(zip(("model_A", "model_B", "model_F", "model_R"), moves, strict=False))
+        tables |= {"model_C": moving.C, "model_D": moving.D, "model_Df": moving.Df, "model_into": model.into}
+        if engine.partial is not None:
+            tables |= {"source_D": plant.D, "source_Df": plant.Df, "model_solver": engine.partial.solver}
+        kept = engine.inputs.maxlen
+        return GapTables(
+            plant.nf, told, kept, moving.nx, len(engine.seen), True, engine.partial is not None, tables,
+            *engine.usual_changes,
+        )  # fmt: skip
+
+    @property
+    def units(self) -> Mapping[str, str]:
+        """Units of signals by name."""
+        found: Mapping[str, str] = self.design.plant.units
+        return found
+
+    @property
+    def status(self) -> str:
+        """What every file says of the verification of the design."""
+        return verification_words(self.design)
 
     @property
     def mark(self) -> str:
@@ -116,3 +207,27 @@ class Realisation:
             "sha256": self.digest,
             **({"unverified": self.mark} if self.mark else {}),
         }
+
+
+def verification_words(design: ObserverDesign) -> str:
+    """Return the status of a design's verification, in a sentence."""
+    mark = unverified_mark(design.report)
+    return mark or f"Verified: all {len(design.report.checks)} checks of obsynth hold."
+
+
+def _constant_plant(plant: Any) -> DescriptorSystem | None:
+    """Return the plant of a linear observer; that of a recursion, if it is one that changes with nothing."""
+    if isinstance(plant, DescriptorSystem):
+        return plant
+    if not isinstance(plant, TimeVaryingDescriptorSystem) or not plant.is_time_invariant:
+        return None
+    parts = {name: sequence.at(1) for name, sequence in plant.matrices.items()}
+    names = ("state_names", "input_names", "output_names", "operating_point", "units")
+    try:
+        return DescriptorSystem(
+            parts["E"], parts["A"], B=parts["B"], C=parts["C"], Bf=parts["Phi"], Df=parts["Psi"], dt=plant.dt,
+            fault_names=plant.parameter_names, **{name: getattr(plant, name) for name in names},
+        )  # fmt: skip
+    except SpecError:
+        # More or fewer equations than states.
+        return None

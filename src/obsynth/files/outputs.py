@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import re
 import shutil
@@ -10,6 +11,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from obsynth.errors import SpecError
 from obsynth.files.inputs import protected_as, reason, special_kind
@@ -221,3 +223,16 @@ def _written(target: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise SpecError(f"{target} cannot be written: {reason(error)}.", path=str(target)) from error
+
+
+def yaml_text(data: Mapping[str, Any]) -> str:
+    """Return plain data as YAML in the order in which it is given, every number as exact as it is."""
+    from ruamel.yaml import YAML
+
+    text = io.StringIO()
+    yaml: Any = YAML(typ="safe", pure=True)
+    yaml.default_flow_style = None
+    yaml.width = 4096
+    yaml.sort_base_mapping_type_on_output = False
+    yaml.dump(data, text)
+    return text.getvalue()

@@ -1,4 +1,5 @@
-"""Functional mock-up units (FMI 2 and 3, model exchange), linearised at an operating point by their own derivatives.
+"""Functional mock-up units (FMI 2 and 3, model exchange), linearised at an operating point by their own derivatives, or
+by central differences.
 
 One instance of an FMU for model exchange, of either version of FMI, with the same few functions.
 """
@@ -12,7 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
@@ -34,24 +35,50 @@ _SPELLED = {
 _GET, _SET, _UPDATE = 1, 2, 3
 
 
-class Instance:
-    """States, values and Jacobians of an unpacked FMU at one point."""
+#: A step of central differences, in sizes of the variable: it balances rounding with the third derivative.
+STEP = float(np.cbrt(np.finfo(np.float64).eps))
 
-    def __init__(self, description: Any, folder: str) -> None:
-        self.description = description
+
+class Place(NamedTuple):
+    """A number of an FMU: the reference of its variable, and which entry it is of an array, in C's order.
+    Names that stand for the same number have the same place."""
+
+    reference: int
+    entry: int = 0
+
+
+def _places(variable: Any) -> dict[str, Place]:
+    """Return the numbers of a variable by name: ``x``, or ``x[1]`` and ``A[1,2]`` of arrays."""
+    shape = tuple(getattr(variable, "shape", None) or ())
+    if not shape:
+        return {variable.name: Place(int(variable.valueReference))}
+    entries = (",".join(str(i + 1) for i in entry) for entry in np.ndindex(*shape))
+    return {
+        f"{variable.name}[{entry}]": Place(int(variable.valueReference), index) for index, entry in enumerate(entries)
+    }
+
+
+class Instance:
+    """States, values and Jacobians of an unpacked FMU at one point; ``differentiates``: it tells derivatives."""
+
+    def __init__(self, description: Any, folder: str, *, differentiates: bool) -> None:
+        self.description, self.differentiates = description, differentiates
         self.version = "2" if description.fmiVersion.startswith("2") else "3"
-        variables = [v for v in description.modelVariables if v.type in _REAL and not getattr(v, "dimensions", None)]
-        self.variables = {v.name: v for v in variables}
+        variables = [v for v in description.modelVariables if v.type in _REAL]
+        self.places = {name: place for v in variables for name, place in _places(v).items()}
+        self.variables = {name: v for v in variables for name in _places(v)}
+        self._sizes = {int(v.valueReference): len(_places(v)) for v in variables}
+        self._nominals = {int(v.valueReference): abs(float(v.nominal or 1.0)) for v in variables}
         derivatives = [unknown.variable for unknown in description.derivatives]
-        self.derivative_references = [v.valueReference for v in derivatives]
-        self.state_references = [v.derivative.valueReference for v in derivatives]
-        self.state_names = [v.derivative.name for v in derivatives]
-        self.input_names = [v.name for v in variables if v.causality == "input"]
-        self.output_names = [v.name for v in variables if v.causality == "output"]
+        self.derivative_places = [place for v in derivatives for place in _places(v).values()]
+        states = {name: place for v in derivatives for name, place in _places(v.derivative).items()}
+        self.state_names, self.state_places = list(states), list(states.values())
+        self.input_names = [name for name, v in self.variables.items() if v.causality == "input"]
+        self.output_names = [name for name, v in self.variables.items() if v.causality == "output"]
         self.settable = [
-            v.name
-            for v in variables
-            if v.causality in ("input", "parameter") or v.name in self.state_names or v.initial in ("exact", "approx")
+            name
+            for name, v in self.variables.items()
+            if v.causality in ("input", "parameter") or name in self.state_names or v.initial in ("exact", "approx")
         ]
         self.model = self._instantiate(folder)
 
@@ -83,20 +110,65 @@ class Instance:
         self.model.enterContinuousTimeMode()
         self._set(at, ("input",))
 
-    def _get(self, references: Sequence[int]) -> FloatArray:
-        return np.array(self._call(_GET, list(references)), dtype=np.float64) if references else np.zeros(0)
+    def _whole(self, references: Sequence[int]) -> list[FloatArray]:
+        """Return all numbers of variables."""
+        if not references:
+            return []
+        sizes = [self._sizes[reference] for reference in references]
+        more = () if self.version == "2" else (sum(sizes),)
+        flat = np.array(self._call(_GET, list(references), *more), dtype=np.float64)
+        return np.split(flat, np.cumsum(sizes)[:-1])
+
+    def _get(self, places: Sequence[Place]) -> FloatArray:
+        references = list(dict.fromkeys(at.reference for at in places))
+        whole = dict(zip(references, self._whole(references), strict=True))
+        return np.array([whole[at.reference][at.entry] for at in places], dtype=np.float64)
+
+    def _put(self, at: Place, value: float) -> None:
+        (whole,) = self._whole([at.reference]) if self._sizes[at.reference] > 1 else (np.zeros(1),)
+        whole[at.entry] = value
+        self._call(_SET, [at.reference], whole.tolist())
 
     def _set(self, at: Mapping[str, float], causalities: Sequence[str]) -> None:
         for name, value in at.items():
             if self.variables[name].causality in causalities:
-                self._call(_SET, [self.variables[name].valueReference], [float(value)])
+                self._put(self.places[name], float(value))
 
-    def _derivative(self, unknowns: Sequence[int], known: int) -> FloatArray:
-        return np.array(self.model.getDirectionalDerivative(list(unknowns), [known], [1.0]))
+    def _derivative(self, unknowns: Sequence[Place], known: Place) -> FloatArray:
+        """Return what a change of one number does to others, as the FMU tells it."""
+        references = list(dict.fromkeys(at.reference for at in unknowns))
+        sizes = [self._sizes[reference] for reference in references]
+        seed = np.zeros(self._sizes[known.reference])
+        seed[known.entry] = 1.0
+        more = () if self.version == "2" else (sum(sizes),)
+        flat = np.array(self.model.getDirectionalDerivative(references, [known.reference], seed.tolist(), *more))
+        begins = dict(zip(references, np.cumsum([0, *sizes[:-1]]).tolist(), strict=True))
+        return np.array([flat[begins[at.reference] + at.entry] for at in unknowns])
+
+    def _difference(self, unknowns: Sequence[Place], known: Place) -> FloatArray:
+        """Return the same by central differences around the present point."""
+        states = self.states()
+        place = self.state_places.index(known) if known in self.state_places else None
+        value = float(self._get([known])[0])
+        step = STEP * max(abs(value), self._nominals[known.reference])
+        found, at = [], []
+        for side in (1.0, -1.0):
+            moved = value + side * step
+            if place is None:
+                self._put(known, moved)
+            else:
+                self.set_states(np.concatenate([states[:place], [moved], states[place + 1 :]]))
+            found.append(self._get(unknowns))
+            at.append(moved)
+        if place is None:
+            self._put(known, value)
+        else:
+            self.set_states(states)
+        return np.asarray((found[0] - found[1]) / (at[0] - at[1]))
 
     def states(self) -> FloatArray:
         """Return the continuous states ``(nx,)``."""
-        return self._get(self.state_references)
+        return self._get(self.state_places)
 
     def set_states(self, states: FloatArray) -> None:
         """Set the continuous states ``(nx,)``."""
@@ -108,11 +180,11 @@ class Instance:
 
     def derivatives(self) -> FloatArray:
         """Return the derivatives of the states ``(nx,)``."""
-        return self._get(self.derivative_references)
+        return self._get(self.derivative_places)
 
     def value(self, name: str) -> float:
         """Return the value of a variable."""
-        return float(self._get([self.variables[name].valueReference])[0])
+        return float(self._get([self.places[name]])[0])
 
     def unit(self, name: str) -> str:
         """Return the unit of a variable, empty where it has none."""
@@ -124,12 +196,22 @@ class Instance:
         self, inputs: Sequence[str], outputs: Sequence[str]
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Return A ``(nx, nx)``, B, C and D of the named inputs and outputs."""
-        unknowns = [*self.derivative_references, *(self.variables[name].valueReference for name in outputs)]
-        knowns = [*self.state_references, *(self.variables[name].valueReference for name in inputs)]
-        nx = len(self.state_references)
+        unknowns = [*self.derivative_places, *(self.places[name] for name in outputs)]
+        knowns = [*self.state_places, *(self.places[name] for name in inputs)]
+        nx = len(self.state_places)
         whole = np.zeros((len(unknowns), len(knowns)))
+        told = self._derivative if self.differentiates else self._difference
         for column, known in enumerate(knowns):
-            whole[:, column] = self._derivative(unknowns, known)
+            whole[:, column] = told(unknowns, known)
+        # An output that is a state, or an input, is that: FMUs are only asked for outputs that they calculate.
+        for row, unknown in enumerate(unknowns[nx:], nx):
+            if unknown in knowns:
+                whole[row] = [float(unknown == known) for known in knowns]
+        # Of one that nothing seems to move, the FMU may tell no derivative although it has one.
+        still = [row for row in range(nx, len(unknowns)) if not whole[row].any()]
+        if self.differentiates and still:
+            for column, known in enumerate(knowns):
+                whole[still, column] = self._difference([unknowns[row] for row in still], known)
         return whole[:nx, :nx], whole[:nx, nx:], whole[nx:, :nx], whole[nx:, nx:]
 
     def end(self) -> None:
@@ -139,7 +221,7 @@ class Instance:
 
 
 #: Newton steps towards an equilibrium.
-_STEPS = 50
+_NEWTON_STEPS = 50
 #: A derivative counts as zero when it is this small next to the terms it is the sum of.
 _AT_REST = 1e-8
 
@@ -153,12 +235,15 @@ def from_fmu(
     outputs: Sequence[str] | None = None,
     **plant: Any,
 ) -> DescriptorSystem:
-    """Return the plant of an FMU, linearised at an operating point by its own directional derivatives.
+    """Return the plant of an FMU, linearised at an operating point.
+
+    By its own directional derivatives where it provides them, else by central differences, which are right to about
+    eight digits where it is smooth.
 
     Parameters
     ----------
     path : path
-        An FMU for model exchange, FMI 2.0 or 3.0, that provides directional derivatives.
+        An FMU for model exchange, FMI 2.0 or 3.0.  Arrays have a signal for each entry, ``x[1]`` or ``A[1,2]``.
     at : mapping, optional
         Values of states, inputs and parameters at the operating point; those of the FMU by default.
     equilibrium : bool
@@ -216,12 +301,12 @@ def from_fmu(
 @contextmanager
 def _instance(path: Path) -> Iterator[Instance]:
     fmpy = imported("fmpy", extra="fmu")
-    _require_readable(fmpy, path)
+    differentiates = _differentiates(fmpy, path)
     description = _read(lambda: fmpy.read_model_description(str(path)), path)
     # A library that cannot be loaded leaves the process in the folder of the FMU, which is then deleted.
     before, folder = os.getcwd(), _read(lambda: fmpy.extract(str(path)), path)
     try:
-        instance = _read(lambda: Instance(description, folder), path)
+        instance = _read(lambda: Instance(description, folder, differentiates=differentiates), path)
         try:
             yield instance
         finally:
@@ -241,8 +326,8 @@ def _read(make: Callable[[], Any], path: Path) -> Any:
         raise SpecError(f"{path} cannot be used as an FMU: {error}", path=str(path)) from error
 
 
-def _require_readable(fmpy: Any, path: Path) -> None:
-    """Raise `SpecError` unless a file is an FMU that can be linearised on this machine."""
+def _differentiates(fmpy: Any, path: Path) -> bool:
+    """Return whether an FMU tells derivatives; raise `SpecError` unless it can be linearised on this machine."""
     if not path.is_file():
         raise SpecError(f"{path} does not exist.", path=str(path))
     try:
@@ -260,18 +345,15 @@ def _require_readable(fmpy: Any, path: Path) -> None:
             "for model exchange.",
             path=str(path),
         )
-    # fmpy does not read the attribute of FMI 3, which is spelled differently.
-    named = "providesDirectionalDerivative" + ("" if version.startswith("2") else "s")
-    if exchange.get(named) not in ("true", "1"):
-        raise SpecError(
-            f"{path} provides no directional derivatives: switch them on in the tool that exports it.", path=str(path)
-        )
     platforms = _read(lambda: fmpy.supported_platforms(str(path)), path)
     if fmpy.platform not in platforms and fmpy.platform_tuple not in platforms:
         raise SpecError(
             f"{path} has no binary for this machine ({fmpy.platform_tuple}); it has {', '.join(platforms) or 'none'}.",
             path=str(path),
         )
+    # fmpy does not read the attribute of FMI 3, which is spelled differently.
+    named = "providesDirectionalDerivative" + ("" if version.startswith("2") else "s")
+    return exchange.get(named) in ("true", "1")
 
 
 def _used(known: Sequence[str], picked: Sequence[str] | None, what: str) -> list[str]:
@@ -288,7 +370,7 @@ def _used(known: Sequence[str], picked: Sequence[str] | None, what: str) -> list
 def _equilibrium(instance: Instance, states: FloatArray) -> FloatArray:
     """Return the states at which the derivatives vanish, by Newton with halved steps."""
     rates = instance.derivatives()
-    for _ in range(_STEPS):
+    for _ in range(_NEWTON_STEPS):
         a = instance.jacobians([], [])[0]
         if _is_rest(rates, a, states, np.zeros(len(states))):
             return states

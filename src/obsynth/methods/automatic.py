@@ -111,7 +111,7 @@ def linear_methods() -> Sequence[type[Method]]:
 
 
 #: Samples of the plant's settling time, and how many settling times figures look ahead.
-SAMPLES, SETTLING_TIMES, MOST_STEPS = 200, 8, 2000
+SAMPLES, SETTLING_TIMES, MOST_FIGURE_SAMPLES = 200, 8, 2000
 
 
 Maker = Callable[[Any, str, Mapping[str, Any]], ObserverDesign]
@@ -176,7 +176,7 @@ def _chosen(
 def designed(plant: DescriptorSystem, options: Mapping[str, Any], methods: list[str], maker: Maker) -> list[Candidate]:
     """Return every method for a plant in its own time, with figures on one clock."""
     step = plant.dt if plant.dt > 0.0 else settling_time(plant) / SAMPLES
-    steps = int(min(max(SETTLING_TIMES * settling_time(plant) / step, 50), MOST_STEPS))
+    steps = int(min(max(SETTLING_TIMES * settling_time(plant) / step, 50), MOST_FIGURE_SAMPLES))
     try:
         sampled = on_the_clock(plant, step)
     except ObsynthError:

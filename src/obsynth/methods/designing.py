@@ -65,7 +65,7 @@ def design(
     progress : callable, optional
         Called with a text at the start of each stage.
     scenario : Scenario, optional
-        What the plant is expected to do, for options that compare designs over it (``model_error``).
+        What the plant is expected to do, for guaranteed tests of plants with tolerances.
     **options
         Options of the method.
 
@@ -95,13 +95,10 @@ def design(
     def made(plant: Plant, method: str, options: Mapping[str, Any], *, advise: bool = False) -> ObserverDesign:
         asked = method_class(method).of(options)
         each = partial(_designed, name=name, recovery=recovery, progress=report_stage, advise=advise)
-        if asked.as_given().get("model_error", "none") == "none":
-            return each(plant, asked)
-        exact_model = replace(asked, **{"model_error": "none"})
-        found: ObserverDesign = extension("designs with model error")(
-            plant, scenario, partial(each, asked=exact_model), report_stage
-        )
-        return found
+        uncertain = plant.uncertainty if isinstance(plant, DescriptorSystem) else None
+        if asked.over_scenario and scenario is not None and uncertain is not None and uncertain.box.names:
+            each = partial(each, synthesise=partial(extension(asked.over_scenario), asked, scenario))
+        return each(plant, asked)
 
     if method == AUTO:
         report_stage("designing by every method that exists")
@@ -120,14 +117,18 @@ def _designed(
     recovery: StateRecovery | None,
     progress: Callable[[str], None],
     advise: bool,
+    synthesise: Callable[..., Synthesis] | None = None,
 ) -> ObserverDesign:
-    """Return the verified design of one method; with ``advise`` a refusal says what would help."""
+    """Return the verified design of one method; with ``advise`` a refusal says what would help.
+
+    ``synthesise``: how, where it is not as the method does.
+    """
     for condition in kind_conditions(plant, type(asked)):
         condition.require()
     with failed_computations(), one_thread_if_small(plant.nx):
         plant, recovery, notes = _with_arrays(plant, recovery, progress)
         try:
-            found = asked.synthesise(plant, progress=progress)
+            found = (synthesise or asked.synthesise)(plant, progress=progress)
         except PreconditionError as error:
             if not isinstance(plant, DescriptorSystem) or not advise:
                 raise
@@ -213,13 +214,14 @@ def _existence(plant: Plant, asked: Method) -> Sequence[Condition]:
     try:
         return asked.existence(plant)
     except PreconditionError as error:
-        name, told, signals = error.condition, str(error), error.signals
+        name, told, signals, unclear = error.condition, str(error), error.signals, error.unclear
     except (SolverError, np.linalg.LinAlgError, ArithmeticError, ValueError, MemoryError) as error:
         failure = error if isinstance(error, SolverError) else failure_of(error)
         if failure is None:
             raise
-        name, told, signals = "computed", f"Unclear: {failure}", ()
-    return (Condition(name, "conditions that can be decided", False, np.nan, np.nan, asked.id, told, signals=signals),)
+        name, told, signals, unclear = "computed", str(failure), (), True
+    claim = "conditions that can be decided"
+    return (Condition(name, claim, False, np.nan, np.nan, asked.id, told, signals=signals, unclear=unclear),)
 
 
 def draft_of(

@@ -21,14 +21,14 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.simulation.linear import stabilising_feedback
 
 #: Shares of a step at which its delay is read.
-HALF, MOST = 0.5, 0.9
+HALF, NEARLY_ALL = 0.5, 0.9
 #: A fault estimate off its step by more than this at the horizon did not reach it.
 REACHED = 0.1
 #: Peak gain from an unknown input to a fault estimate, in fault per input, above which it is not decoupled.
 DECOUPLED = 1e-3
 #: An unstable plant that grows by more than this is held by a feedback; one without inputs is followed until it has
 #: grown by the second, beyond which differences of its outputs are rounding.
-GROWTH, MOST_GROWTH = 1e3, 1e6
+GROWTH, LARGEST_STEP_GROWTH = 1e3, 1e6
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ def held(plant: DescriptorSystem, steps: int) -> Held:
             return Held(found, steps)
     except PreconditionError:
         pass
-    return Held(nothing, max(int(np.log(MOST_GROWTH) / rate), 2))
+    return Held(nothing, max(int(np.log(LARGEST_STEP_GROWTH) / rate), 2))
 
 
 def step_responses(
@@ -140,7 +140,7 @@ def _figures(
         yield FaultFigures(
             name,
             _first(own >= HALF, plant.dt),
-            _first(own >= MOST, plant.dt),
+            _first(own >= NEARLY_ALL, plant.dt),
             float(own[-1]),
             float(np.max(np.abs(own))),
             float(np.sqrt(np.sum(noise[:, row] ** 2))),

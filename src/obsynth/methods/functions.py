@@ -16,7 +16,7 @@ from obsynth.results.design import ObserverDesign
 def design_function(method: type[Method]) -> Callable[..., ObserverDesign]:
     """Return the function that designs by a method: the plant, and its options by name.
 
-    Signature and docstring are those of the class; ``model_error`` takes a scenario besides.
+    Signature and docstring are those of the class; some methods take a scenario besides.
     """
 
     def designed(plant: Any, **options: Any) -> ObserverDesign:
@@ -24,7 +24,7 @@ def design_function(method: type[Method]) -> Callable[..., ObserverDesign]:
 
     keyword = Parameter.KEYWORD_ONLY
     options = [Parameter(o.name, keyword, default=o.default, annotation=o.type) for o in fields(method)]
-    if any(option.name == "model_error" for option in options):
+    if method.over_scenario:
         options.append(Parameter("scenario", keyword, default=None, annotation="Scenario | None"))
     options.append(Parameter("name", keyword, default="design", annotation="str"))
     given = Parameter("plant", Parameter.POSITIONAL_OR_KEYWORD)

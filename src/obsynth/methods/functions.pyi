@@ -6,7 +6,6 @@ from obsynth.analysis.transformations.recovery import Transformation
 from obsynth.methods.method import Method
 from obsynth.methods.registry import Plant
 from obsynth.results.design import ObserverDesign
-from obsynth.simulation.scenario import Scenario
 
 def design_function(method: type[Method]) -> Callable[..., ObserverDesign]: ...
 def fault_estimation_filter(
@@ -28,8 +27,6 @@ def fault_estimation_filter(
     tolerance: float = ...,
     prove_least: bool = ...,
     mean: int = ...,
-    model_error: Literal["none", "columns"] = ...,
-    scenario: Scenario | None = ...,
     name: str = ...,
 ) -> ObserverDesign: ...
 def pd_observer(
@@ -44,8 +41,7 @@ def pd_observer(
     noise_gain: float | None = ...,
     adaptation_gain: Any = ...,
     adaptation_range: Any = ...,
-    delta_scan: Any = ...,
-    engine: Literal["auto", "lmi", "reduced-lmi", "riccati"] = ...,
+    engine: Literal["auto", "lmi", "riccati"] = ...,
     solver: Any = ...,
     solver_options: Any = ...,
     constraints: Any = ...,

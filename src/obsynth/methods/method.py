@@ -33,6 +33,12 @@ Purpose: TypeAlias = Literal[
 ]
 
 
+#: Where errors say that options are.
+OPTIONS_PATH = "method.options"
+#: Gains from fast errors of a measurement to a fault estimate above this are worth a note.
+WARN_AMPLIFICATION = 50.0
+
+
 @dataclass(frozen=True)
 class ClaimMeaning:
     """A number that a method may claim; ``row`` checks it, or is `obsynth.verification.claims.STATED`: none can."""
@@ -87,8 +93,12 @@ class Method(ABC):
     imposed: ClassVar[frozenset[str]] = frozenset()
     #: Whether an option ``mean`` puts registers behind the observer, which the checks are not about.
     averaged: ClassVar[bool] = False
+    #: The extension that synthesises for a scenario where constants of the plant have tolerances, if there is one.
+    over_scenario: ClassVar[str] = ""
     #: Values of required options, for questions that do not depend on them.
     placeholders: ClassVar[Mapping[str, Any]] = {}
+    #: Options of old, and what to take instead.
+    gone: ClassVar[Mapping[str, str]] = {}
 
     def __post_init__(self) -> None:
         kinds = field_types(type(self))
@@ -96,16 +106,19 @@ class Method(ABC):
         # Rules across options presume that each of them is of its type.
         problems = problems or list(self.conflicts())
         if problems:
-            raise SpecError(f"Options of {self.id}:", path="method.options", problems=problems)
+            raise SpecError(f"Options of {self.id}:", path=OPTIONS_PATH, problems=problems)
 
     @classmethod
     def of(cls, given: Mapping[str, Any]) -> Self:
         """Return the method with these options; raise `SpecError` for unknown names, wrong types and broken rules."""
         unknown = sorted(set(given) - set(field_types(cls)))
+        for name in unknown:
+            if name in cls.gone:
+                raise SpecError(f"{cls.id} has no option {name!r} any more: {cls.gone[name]}", path=OPTIONS_PATH)
         if unknown:
             listed = ", ".join(sorted(field_types(cls)))
             raise SpecError(
-                f"{cls.id} has no option {', '.join(map(repr, unknown))}; there are: {listed}.", path="method.options"
+                f"{cls.id} has no option {', '.join(map(repr, unknown))}; there are: {listed}.", path=OPTIONS_PATH
             )
         return cls(**given)
 

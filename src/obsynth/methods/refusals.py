@@ -45,6 +45,7 @@ def require_all_told(conditions: Iterable[Condition]) -> None:
             condition=first.name,
             mode=next((condition.mode for condition in failed if condition.mode is not None), None),
             signals=tuple(dict.fromkeys(name for condition in failed for name in condition.signals)),
+            unclear=error.unclear,
         ) from None
 
 
@@ -63,7 +64,12 @@ def with_advice(error: PreconditionError, plant: DescriptorSystem, asked: Method
     else:
         text = _nothing(plant)
     return PreconditionError(
-        f"{error} {text}", condition=error.condition, mode=error.mode, signals=error.signals, add=sets
+        f"{error} {text}",
+        condition=error.condition,
+        mode=error.mode,
+        signals=error.signals,
+        add=sets,
+        unclear=error.unclear,
     )
 
 
@@ -104,11 +110,11 @@ def _nothing(plant: DescriptorSystem) -> str:
 
 
 #: Share of a unit fault that rounding of the outputs may be of its estimate.
-MOST = 0.1
+LARGEST_ROUNDED_SHARE = 0.1
 #: Share of a unit fault from which on rounding of the observer's own numbers is told.
 TOLD = 1e-6
 #: Observers of more states are not examined: their certificates bound what rounding of their numbers does.
-MOST_STATES = 150
+MOST_OBSERVER_STATES = 150
 #: Points at which that is judged, in continuous time in units of the plant's own rate.
 POINTS = (0.0, 1e-2, 1e-1, 1.0)
 
@@ -119,7 +125,7 @@ def require_above_rounding(plant: DescriptorSystem, observer: LinearObserver) ->
     if least is None:
         return
     worst = int(np.argmax(least))
-    if least[worst] >= MOST:
+    if least[worst] >= LARGEST_ROUNDED_SHARE:
         name = plant.fault_names[worst]
         raise PreconditionError(
             "Unclear: gains were found, but they are so large that rounding of the outputs to double "
@@ -127,6 +133,7 @@ def require_above_rounding(plant: DescriptorSystem, observer: LinearObserver) ->
             f"tried. {_doubt(plant, observer, worst).described(plant)}",
             condition="gains against rounding",
             signals=(name,),
+            unclear=True,
         )
 
 
@@ -134,7 +141,10 @@ def _doubt(plant: DescriptorSystem, observer: LinearObserver, fault: int) -> Unc
     """Return the last digit of a number of the plant, or else of the observer, that moves an estimate most."""
     found = max(
         (witness for point in _points(plant) for witness in last_digits(plant, observer, fault, point)),
-        key=lambda witness: (witness.changes[0].matrix in ("C", "Df") and witness.size >= MOST, witness.size),
+        key=lambda witness: (
+            witness.changes[0].matrix in ("C", "Df") and witness.size >= LARGEST_ROUNDED_SHARE,
+            witness.size,
+        ),
         default=None,
     )
     size, place = (0.0, 0j) if found is None else (found.size, found.point or 0j)
@@ -195,7 +205,12 @@ def rounding_notes(plant: DescriptorSystem, observer: LinearObserver) -> tuple[s
 
 def _least(plant: DescriptorSystem, observer: LinearObserver, *, own: bool) -> FloatArray | None:
     """Return the least share of each fault over the points; ``None`` where it is not examined."""
-    if not plant.nf or observer.order > MOST_STATES or plant.is_sparse or len(observer.fault_names) != plant.nf:
+    if (
+        not plant.nf
+        or observer.order > MOST_OBSERVER_STATES
+        or plant.is_sparse
+        or len(observer.fault_names) != plant.nf
+    ):
         return None
     with np.errstate(all="ignore"):
         shares = [

@@ -18,7 +18,7 @@ from obsynth.numerics.least_squares_step import OUTGROWN
 
 #: A factorisation that changes by no more than this, relative to each column, and so many times in a row, has settled:
 #: what it would change from then on is what rounding does at every step.
-SETTLED = 4.0 * np.finfo(np.float64).eps
+SETTLED_FACTOR = 4.0 * np.finfo(np.float64).eps
 SETTLED_STEPS = 3
 
 Function = TypeVar("Function", bound=Callable[..., object])
@@ -232,7 +232,7 @@ def _steps(
             _solve(triangle, right, top, x, factor, states[k])
             _note_spreads(factor, deviations[k], covariances[k])
             if stays:
-                settled = settled + 1 if _is_settled(triangle, before, factor, lengths, SETTLED) else 0
+                settled = settled + 1 if _is_settled(triangle, before, factor, lengths, SETTLED_FACTOR) else 0
         else:
             _solve_estimate(right, top, x, states[k])
             deviations[k] = deviations[k - 1]

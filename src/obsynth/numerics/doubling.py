@@ -26,7 +26,7 @@ FIRST_POWER = 3
 SHARE = 0.5
 #: What they leave of a power, relative to it, that counts as rounding; its logarithm tells when to look
 #: again, since each squaring doubles it.
-ROUNDING = 4e-15
+POWER_ROUNDING = 4e-15
 #: Diagonal entries of a solution are taken to be at least this share of the largest when they set units.
 LEAST_SIZE = 1e-20
 #: Directions in which that is measured, beside those that make the basis.
@@ -63,9 +63,9 @@ class RankWatch:
         probes = images[:, kept:]
         left = float(np.linalg.norm(probes - basis @ (basis.T @ probes)))
         share = left / max(float(np.linalg.norm(probes)), float(np.finfo(np.float64).tiny))
-        if share <= ROUNDING:
+        if share <= POWER_ROUNDING:
             return SlowPart(np.asarray(basis), basis.T @ power)
-        self.wait = max(0, math.ceil(math.log2(math.log(ROUNDING) / math.log(share))) - 1) if share < 1.0 else 1
+        self.wait = max(0, math.ceil(math.log2(math.log(POWER_ROUNDING) / math.log(share))) - 1) if share < 1.0 else 1
         return None
 
 

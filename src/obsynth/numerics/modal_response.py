@@ -14,11 +14,11 @@ NEAR = 0.5
 #: How many peaks are refined, by how many points on either side, and how often.
 MOST_PEAKS = 3
 POINTS_BESIDE = 4
-REFINEMENTS = 3
+MODE_REFINEMENTS = 3
 #: Rows or columns up to which the largest singular value has a formula.
 TWO = 2
 #: From so many states on, steps of power iteration take the place of eigenvalues.
-MANY_STATES = 60
+STATES_FOR_POWER_ITERATION = 60
 POWER_STEPS, ROUGH_STEPS = 8, 4
 
 
@@ -71,7 +71,7 @@ class ModalResponse:
         """
         factors = 1.0 / (np.exp(1j * angles)[:, None] - self.poles)
         order = min(self.direct.shape)
-        if order <= TWO or len(self.poles) < MANY_STATES:
+        if order <= TWO or len(self.poles) < STATES_FOR_POWER_ITERATION:
             sizes = self._by_gram_matrices(factors, roughly=roughly)
         else:
             sizes = self._by_power_iteration(factors, steps=ROUGH_STEPS if roughly else POWER_STEPS)
@@ -124,7 +124,7 @@ class ModalResponse:
         reaches = np.concatenate([np.full(points, np.pi), 2.0 * (1.0 - np.abs(near))])[order]
         widths = np.minimum(widths, reaches[tops])
         steps, everyone = np.arange(-POINTS_BESIDE, POINTS_BESIDE + 1) / POINTS_BESIDE, np.arange(len(centres))
-        for _ in range(REFINEMENTS):
+        for _ in range(MODE_REFINEMENTS):
             tried = np.minimum(np.maximum(centres[:, None] + widths[:, None] * steps, 0.0), np.pi)
             found = self.gains(tried.ravel()).reshape(tried.shape)
             best = np.argmax(found, axis=1)

@@ -14,13 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.numerics.arrays import ComplexArray, FloatArray
+from obsynth.numerics.least_squares_step import BLOCK
 from obsynth.numerics.ranks import RANK_TOLERANCE, RankDecision, rank_from
 from obsynth.numerics.scaling import EquilibratedPencil
 
 #: Matrices with fewer columns are decomposed as a whole.
 FEW_COLUMNS = 80
 #: Steps of inverse iteration: values that decide are smaller than the next by many digits, and each step squares that.
-STEPS = 4
+INVERSE_STEPS = 4
 
 
 class SmallestSingular(NamedTuple):
@@ -57,7 +58,7 @@ def iterated(triangle: NDArray[Any], count: int) -> SmallestSingular:
     diagonal[small] = np.finfo(float).eps * norm
     basis = np.random.default_rng(0).normal(size=(size, count)).astype(work.dtype)
     with np.errstate(over="ignore", invalid="ignore"):
-        for _ in range(STEPS):
+        for _ in range(INVERSE_STEPS):
             inner = solve_triangular(work, basis, trans="C", check_finite=False)
             inner /= np.max(np.abs(inner), axis=0, initial=0.0) + np.finfo(float).tiny
             basis = np.linalg.qr(solve_triangular(work, inner, check_finite=False))[0]
@@ -67,8 +68,6 @@ def iterated(triangle: NDArray[Any], count: int) -> SmallestSingular:
 
 #: Above this condition of its leading part the Schur basis is not orthonormal enough to judge the pencil in it.
 SAFE_CONDITION = 1e5
-#: Columns that LAPACK's ``tpqrt`` treats at once.
-BLOCK = 32
 #: Most null directions that are looked for at a point.
 MOST_DIRECTIONS = 4
 #: Steps in which a computed zero is improved before the pencil there is judged.

@@ -25,7 +25,7 @@ from obsynth.numerics.ranks import CLUSTER_TOLERANCE, RANK_TOLERANCE, RankDecisi
 from obsynth.numerics.scaling import equilibrate_pencil
 
 #: From so many states on, a well-conditioned E is inverted: ordinary eigenvalues take a fraction of the time.
-MANY_STATES = 100
+STATES_FOR_INVERTED_E = 100
 SAFE_CONDITION = 1e5
 #: An eigenvalue belongs to the closest of others unless a second one is not further away than this many times that.
 TIE = 4.0
@@ -229,7 +229,7 @@ def _eigenvalues(E: FloatArray, A: FloatArray) -> ComplexArray:
 
     if not E.size:
         return _in_pairs(np.zeros(0, dtype=np.complex128))
-    if len(E) >= MANY_STATES and (inverse := _safe_inverse(E)) is not None:
+    if len(E) >= STATES_FOR_INVERTED_E and (inverse := _safe_inverse(E)) is not None:
         return _in_pairs(np.asarray(np.linalg.eigvals(inverse @ A), dtype=np.complex128))
     try:
         values = eigvals(A, E)

@@ -14,7 +14,16 @@ from numpy.typing import ArrayLike
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import chosen, real_array, real_number, real_vector
 from obsynth.numerics.arrays import FloatArray, read_only
-from obsynth.observers.alarms import Alarm, Decision, alone, likelihood_ratio, pull_of_the_start, quantile, tail
+from obsynth.observers.alarms import (
+    Alarm,
+    Decision,
+    alone,
+    likelihood_ratio,
+    pull_of_the_start,
+    quantile,
+    tail,
+    two_sided_sums,
+)
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.estimates import Estimates
 from obsynth.observers.recursive.observer import RecursiveObserver
@@ -223,12 +232,10 @@ def _cusum(
 ) -> Decision:
     """Decide by sums of log likelihood ratios, from scores at the nominal parameters and their variances."""
     samples, nq = along.shape
-    signs = np.concatenate([change, -change])
-    steps = np.hstack([along, along]) * signs - 0.5 * np.hstack([squares, squares]) * signs**2
     threshold = float(np.log(2.0 * nq * samples / false_alarms))
     level, started, values, alarm = np.zeros(2 * nq), np.zeros(2 * nq, dtype=np.int64), np.zeros(samples), None
     for k in range(samples):
-        level = np.maximum(level + steps[k], 0.0)
+        level = two_sided_sums(level, along[k], squares[k], change)
         started[level == 0.0] = k + 1
         values[k] = level.max()
         if alarm is None and values[k] > threshold:

@@ -25,7 +25,8 @@ KINDS = ("none", "gate", "huber")
 LIMITS = {"gate": 6.0, "huber": 3.0}
 #: What is larger has no square: it is no measurement, whatever the model says.
 OVERFLOW = 1e150
-#: Samples of one sensor in a row that are left out; the next is believed.
+#: Samples of one sensor in a row that are left out where their sides change; the second on one side is believed, and
+#: so are those that follow it there.
 LONGEST = 2
 #: How many times further off than the limit a sample must be that nothing contradicts but the equations of the model;
 #: and what rounding makes of a prediction without noise.
@@ -49,7 +50,8 @@ def checked_limit(kind: str, limit: float | None) -> float:
 
 
 def no_refusals(outputs: int) -> FloatArray:
-    """Return the memory of outliers at a start, ``(2, ny)``: how many in a row of each sensor, and how many at all."""
+    """Return the memory of outliers at a start, ``(2, ny)``: how many samples in a row of each sensor were far from
+    their prediction, negative where the last was below it, and how many were left out or pulled at all."""
     return np.zeros((2, outputs))
 
 
@@ -81,8 +83,10 @@ def robust_advance(
         failed = True
     if not far.any():
         mean, deviation, far = _judged(limit, predicted, state, y, u)
+    sides, before = np.where(far, np.where(y < mean, -1.0, 1.0), 0.0), state.refused[0]
     if kind == "gate":
-        far &= (state.refused[0] < LONGEST) | (np.abs(y) > OVERFLOW)
+        # A wrong sample stands alone; of a sensor, or a plant, that has moved the next is on the same side.
+        far &= ((sides * before <= 0.0) & (np.abs(before) < LONGEST)) | (np.abs(y) > OVERFLOW)
         heard = np.where(far, np.nan, y)
     else:
         pulled = mean + limit * deviation * np.sign(y - mean)
@@ -94,7 +98,7 @@ def robust_advance(
         # A sample that nothing predicts, and with which there is no step.
         far = ~np.isnan(y)
         after, row = plain(state, np.full(len(y), np.nan), u)
-    counts = np.where(np.isnan(y), state.refused[0], np.where(far, state.refused[0] + 1.0, 0.0))
+    counts = np.where(np.isnan(y), before, sides * (np.abs(before) + 1.0))
     return after._replace(refused=np.stack([counts, state.refused[1] + far])), row
 
 

@@ -268,5 +268,7 @@ def _from_data(like: Any, value: Any) -> Any:
     return _array(value) if isinstance(like, np.ndarray) else value
 
 
-def _array(value: Any) -> FloatArray:
+def _array(value: Any) -> Any:
+    if isinstance(value, (int, float)):
+        return value
     return np.asfortranarray(value[BY_COLUMNS]) if isinstance(value, dict) else np.array(value)

@@ -17,7 +17,20 @@ from obsynth.numerics.arrays import FloatArray
 VARIATIONS = ("constant", "varying")
 SOURCES = ("stated", "set-membership", "calibrated")
 _KEYS = ("nominal", "tolerance", "range", "unit")
+#: Signals, states and constants that a sentence lists; a digest stands for the others.
+MOST_LISTED = 6
+#: Whole numbers up to so many digits are shown without a point.
+WHOLE_DIGITS = 12
+#: Shares of tolerances that agree so well are one share: they were stated as per cent.
+SAME_SHARE = 1e-9
 _PER_CENT = re.compile(r"\s*([0-9]*\.?[0-9]+(?:[eE][+-]?[0-9]+)?)\s*%\s*")
+
+
+def shown(value: float, unit: str = "") -> str:
+    """Return a number with all its digits, and its unit."""
+    number = float(value)
+    text = str(int(number)) if number.is_integer() and abs(number) < 10.0**WHOLE_DIGITS else repr(number)
+    return f"{text} {unit}".rstrip()
 
 
 @dataclass(frozen=True)
@@ -169,6 +182,28 @@ class ConstantsBox:
         if self.source == "set-membership":
             return "a constant outside the set that the log's bounds allow"
         return "a constant outside its stated tolerance"
+
+    @property
+    def phrase(self) -> str:
+        """Which constants are assumed to be where, and whether they may change."""
+        if not self.names:
+            return "an exact model"
+        shares = [item.half / abs(item.nominal) if item.nominal else np.nan for item in self.uncertain]
+        centred = [
+            abs(item.middle - item.nominal) <= SAME_SHARE * max(item.half, abs(item.nominal)) for item in self.uncertain
+        ]
+        names = ", ".join(self.names) if len(self.names) <= MOST_LISTED else f"{len(self.names)} constants"
+        if np.ptp(shares) <= SAME_SHARE and all(centred):  # false where there is no share
+            text = f"{names} within {100.0 * float(np.mean(shares)):.6g} % of nominal"
+        elif len(self.names) <= MOST_LISTED:
+            text = ", ".join(
+                f"{item.name} in {shown(item.low)} .. {shown(item.high, item.unit)}" for item in self.uncertain
+            )
+        else:
+            text = f"{names} within their ranges"
+        kept = "the same at all times" if self.variation == "constant" else "anything there at each sample"
+        origin = "" if self.source == "stated" else f"; {self.origin}"
+        return f"constants ({text}; {kept}{origin})"
 
     @property
     def offsets(self) -> FloatArray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, TypeAlias
 
@@ -22,6 +22,8 @@ MatrixLike: TypeAlias = ArrayLike | Callable[[int], ArrayLike] | Sequence[Sequen
 
 #: The name of the time index in expressions.
 INDEX_NAME = "k"
+#: Numbers of a computed sequence that are kept: two megabytes.
+MOST_KEPT = 2**18
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +39,7 @@ class MatrixSequence:
     constants: Mapping[str, float] | None = None
     still: FloatArray | None = None  # entries that do not depend on k
     moving: tuple[tuple[int, int], ...] = ()  # places of the others
+    computed: dict[int, FloatArray] = field(default_factory=dict, repr=False)  # from entries, by k
 
     @classmethod
     def of(
@@ -101,11 +104,18 @@ class MatrixSequence:
     def _computed(self, k: int) -> FloatArray:
         if self.function is not None:
             return as_matrix(self.function(k), f"{self.name}({k})")
+        kept = self.computed.get(k)
+        if kept is not None:
+            return kept
         values = {**(self.constants or {}), INDEX_NAME: np.float64(k)}
         matrix = np.array(self.still)
         for i, j in self.moving:
             matrix[i, j] = (self.entries or ())[i][j](values)
-        return as_matrix(matrix, f"{self.name}({k})")
+        found = as_matrix(matrix, f"{self.name}({k})")
+        # Design, checks and runs ask for the same k many times; what does not fit is computed again.
+        if len(self.computed) * matrix.size < MOST_KEPT:
+            self.computed[k] = found
+        return found
 
     def as_data(self) -> Any:
         """Return an array or rows of texts."""

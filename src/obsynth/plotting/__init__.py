@@ -10,19 +10,19 @@ if TYPE_CHECKING:
     from obsynth.plotting.data import plot_data
     from obsynth.plotting.estimates import plot_faults, plot_parameters, plot_residuals, plot_states
     from obsynth.plotting.frequency import estimate_gains, plot_gains
-    from obsynth.plotting.guaranteed import plot_intervals, plot_least_thresholds
+    from obsynth.plotting.guaranteed import plot_hidden_course, plot_intervals, plot_least_thresholds
     from obsynth.plotting.simulation import plot_decision, plot_detection, plot_simulation
     from obsynth.plotting.spectra import plot_poles
-    from obsynth.plotting.trade_off import plot_delta_scan, plot_tolerances, plot_trade_off
+    from obsynth.plotting.trade_off import plot_tolerances, plot_trade_off
 
 __all__ = [
     "estimate_gains",
     "plot_data",
     "plot_decision",
-    "plot_delta_scan",
     "plot_detection",
     "plot_faults",
     "plot_gains",
+    "plot_hidden_course",
     "plot_intervals",
     "plot_least_thresholds",
     "plot_parameters",
@@ -40,10 +40,10 @@ _HOMES = {
         "data": "plot_data",
         "estimates": "plot_faults plot_parameters plot_residuals plot_states",
         "frequency": "estimate_gains plot_gains",
-        "guaranteed": "plot_least_thresholds plot_intervals",
+        "guaranteed": "plot_hidden_course plot_intervals plot_least_thresholds",
         "simulation": "plot_decision plot_detection plot_simulation",
         "spectra": "plot_poles",
-        "trade_off": "plot_delta_scan plot_tolerances plot_trade_off",
+        "trade_off": "plot_tolerances plot_trade_off",
     }.items()
     for name in names.split()
 }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from obsynth.plotting.panels import (
     THRESHOLD_STYLES,
     TRUE_STYLE,
     WIDTH,
+    label_time,
     legend_above,
     mark,
     new_panels,
@@ -39,8 +41,10 @@ if TYPE_CHECKING:
 
 #: Kinds of panels, in their order.
 PARTS = ("outputs", "faults", "residuals", "statistic", "shares")
+#: Letters in a line of the sentence below a picture.
+STATEMENT_LETTERS = 125
 #: Signals of a kind that are drawn.
-MOST = 6
+MOST_DRAWN = 6
 #: A statistic this many times above its threshold gets a logarithmic axis.
 _FAR = 30.0
 #: Rows in which nothing is decided lie in grey, those with an alarm in red.
@@ -75,7 +79,8 @@ def plot_data(
     -------
     list of Axes
         One for each of the first six outputs and faults, one for all residuals, one for the statistic, one for the
-        shares.  Rows in which nothing is decided (warm-up, gaps) lie in grey, rows with an alarm in red.
+        shares.  Rows in which nothing is decided (warm-up, gaps) lie in grey, rows with an alarm in red; in the panel
+        of a fault those that name it.
 
     Raises
     ------
@@ -95,7 +100,7 @@ def plot_data(
     told = {"alarm"} if any(part == "faults" and name in run.alarms for part, name in plans) else set[str]()
     drawing = _Drawing(run, run.table, units, design)
     for panel, (part, name) in zip(panels, plans, strict=True):
-        _shade(panel, run.table, told, alarms=part != "outputs")
+        _shade(panel, run.table, told, _alarm_rows(run.table, part, name))
         getattr(drawing, part)(panel, name)
         legend_above(panel)
         tidy(panel)
@@ -111,10 +116,22 @@ def plot_data(
             fontsize=8,
             color="tab:red",
         )
-    if panels:
-        panels[-1].set_xlabel("time" if run.stamps.is_dated else "time (s)")
-        if run.stamps.is_dated:
-            short_dates(panels[-1])
+    if panels and run.statement:
+        # What an alarm means stands below the picture, as in the run's summary.
+        panels[-1].annotate(
+            fill(f"The threshold: {run.statement}.", STATEMENT_LETTERS),
+            (0.0, 0.0),
+            xycoords="axes fraction",
+            xytext=(0, -36),
+            textcoords="offset points",
+            va="top",
+            fontsize=7,
+        )
+    if panels and run.stamps.is_dated:
+        panels[-1].set_xlabel("time")
+        short_dates(panels[-1])
+    elif panels:
+        label_time(panels[-1])
     return panels
 
 
@@ -130,8 +147,8 @@ def _plans(table: pd.DataFrame, measured: pd.DataFrame, show: Sequence[str]) -> 
     outputs = [str(name) for name in measured.columns if name != "time"]
     # Known inputs come first and are no outputs; of these the estimated ones say more.
     outputs.sort(key=lambda name: name not in estimated)
-    plans = [("outputs", name) for name in outputs[:MOST]]
-    plans += [("faults", name) for name in [name for name in columns if name.startswith("fhat[")][:MOST]]
+    plans = [("outputs", name) for name in outputs[:MOST_DRAWN]]
+    plans += [("faults", name) for name in [name for name in columns if name.startswith("fhat[")][:MOST_DRAWN]]
     plans += [("residuals", "")] if any(name.startswith("r[") for name in columns) else []
     plans += [("statistic", "")] if "statistic" in columns else []
     plans += [("shares", "")] if any(name.startswith("share ") for name in columns) else []
@@ -187,7 +204,7 @@ class _Drawing:
 
     def residuals(self, panel: Axes, _: str) -> None:
         """Draw all residuals with the thresholds of the run."""
-        names = [name for name in self.table.columns if name.startswith("r[")][:MOST]
+        names = [name for name in self.table.columns if name.startswith("r[")][:MOST_DRAWN]
         for name, colour in zip(names, LINE_COLOURS, strict=False):
             style = {**RESIDUAL_STYLE, "linewidth": 0.9, "color": colour}
             panel.plot(self.table["time"], self.table[name], label=name, **style)
@@ -217,7 +234,7 @@ class _Drawing:
         names = [name for name in self.table.columns if name.startswith("share ")]
         values = 100.0 * np.nan_to_num(self.table[names].to_numpy(float))
         order = np.argsort(-values.mean(axis=0), kind="stable")
-        shown, others = order[: MOST - 1], order[MOST - 1 :]
+        shown, others = order[: MOST_DRAWN - 1], order[MOST_DRAWN - 1 :]
         parts = [values[:, i] for i in shown] + ([values[:, others].sum(axis=1)] if len(others) else [])
         labels = [names[i].removeprefix("share ") for i in shown] + (["other constants"] if len(others) else [])
         panel.stackplot(
@@ -247,11 +264,25 @@ def _limits(panel: Axes, centre: float, level: float, label: str, style: dict[st
         panel.axhline(centre + side, label=text, **style)
 
 
-def _shade(panel: Axes, table: Any, told: set[str], *, alarms: bool) -> None:
+def _alarm_rows(table: Any, part: str, column: str) -> Any:
+    """Return in which rows a panel shows an alarm: that of a fault when it is the one named, others at every alarm."""
+    if part == "outputs" or "alarm" not in table:
+        return np.zeros(len(table), dtype=bool)
+    if part != "faults":
+        return table["alarm"].to_numpy() != ""
+
+    def is_named(text: str) -> bool:
+        # "fhat[leak]; pointwise: leak or clog": what passed its threshold; a monitor and whom it names.
+        alarms = (alarm.split(": ", 1) for alarm in text.split("; "))
+        return any(words[0] == column or column[5:-1] in words[-1].split(" or ") for words in alarms)
+
+    return table["alarm"].astype(str).map(is_named).to_numpy(bool)
+
+
+def _shade(panel: Axes, table: Any, told: set[str], alarms: Any) -> None:
     """Shade the rows in which nothing is decided, and those with an alarm; each is explained in one panel."""
-    marks = [(~table["status"].isin(DECIDING).to_numpy(), _UNDECIDED, "warm-up or gap")]
-    if alarms and "alarm" in table:
-        marks.append((table["alarm"].to_numpy() != "", _ALARM, "alarm"))
+    undecided = ~table["status"].isin(DECIDING).to_numpy()
+    marks = [(undecided, _UNDECIDED, "warm-up or gap"), (alarms, _ALARM, "alarm")]
     times = table["time"]
     for where, style, label in marks:
         edges = np.flatnonzero(np.diff(np.concatenate([[False], where, [False]]).astype(np.int64)))

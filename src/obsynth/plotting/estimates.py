@@ -19,6 +19,7 @@ from obsynth.plotting.panels import (
     THRESHOLD_STYLES,
     TRUE_STYLE,
     finish,
+    label_time,
     legend_above,
     mark,
     new_panels,
@@ -29,6 +30,8 @@ from obsynth.plotting.panels import (
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+#: Of the model: a parameter that moves faster than the model says leaves it.
+BAND = "95 % band of the model"
 CROSSING_MARKERS = ("o", "s", "^")
 #: Around what is drawn there is this share of its range, and room for this many usual half-widths of the band.
 ROOM_SHARE, USUAL_BANDS = 0.2, 3.0
@@ -92,7 +95,7 @@ def plot_parameters(
     units: Mapping[str, str] | None = None,
     axes: Iterable[Axes] | None = None,
 ) -> list[Axes]:
-    """Plot each parameter estimate with its 95 % band, on the true parameter.
+    """Plot each parameter estimate with the 95 % band of its model, on the true parameter.
 
     Parameters
     ----------
@@ -209,7 +212,9 @@ def _draw(
             panel.plot(time[late:], true[: steps - late, i], **TRUE_STYLE, label=label)
         if deviations is not None:
             half = np.where(np.isfinite(deviations[:, i]), BAND_WIDTH * deviations[:, i], np.nan)
-            panel.fill_between(time, values[:, i] - half, values[:, i] + half, **BAND_STYLE, label="95 % band")
+            low, high = values[:, i] - half, values[:, i] + half
+            label = BAND + ("" if true is None else _share_within(true[: steps - late, i], low[late:], high[late:]))
+            panel.fill_between(time, low, high, **BAND_STYLE, label=label)
         panel.plot(time, values[:, i], **ESTIMATE_STYLE, label="estimate")
         panel.set_ylabel(with_unit(names[i], units))
         tidy(panel)
@@ -217,7 +222,14 @@ def _draw(
             _show_what_moves(panel, values[:, i] if true is None else np.hstack([values[:, i], true[:, i]]), half)
     if panels:
         legend_above(panels[0])
-        panels[-1].set_xlabel("time (s)")
+        label_time(panels[-1])
+
+
+def _share_within(true: FloatArray, low: FloatArray, high: FloatArray) -> str:
+    """Return how often the truth lies in a band, in words: a parameter that moves leaves that of its model."""
+    known = np.isfinite(true) & np.isfinite(low)
+    held = np.count_nonzero((low <= true) & (true <= high) & known)
+    return f", holds the truth in {100.0 * held / np.count_nonzero(known):.0f} % of samples" if known.any() else ""
 
 
 def _matching(given: ArrayLike | None, shape: tuple[int, ...], what: str) -> FloatArray | None:

@@ -6,14 +6,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from obsynth.errors import SpecError
 from obsynth.methods.guaranteed_test.result import GuaranteedTest
 from obsynth.observers.estimates import Estimates
-from obsynth.plotting.panels import PANEL_HEIGHT, WIDTH, legend_above, new_panels, tidy
+from obsynth.plotting.panels import PANEL_HEIGHT, WIDTH, label_time, legend_above, new_panels, tidy
 from obsynth.results.design import ObserverDesign
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+#: Courses below this share of the largest number are zero but for rounding.
+ROUNDED = 1e-12
 #: From this ratio of largest to smallest threshold on, its axis is logarithmic.
 WIDE_SPREAD = 5.0
 
@@ -108,8 +111,59 @@ def plot_intervals(design: ObserverDesign, estimates: Estimates, *, axes: Axes |
     if alarms.size:
         panel.axvline(float(seconds[alarms[0]]), color="tab:red", linestyle="--", label="alarm")
     unit = plant.units.get(found.fault, "")
-    panel.set_xlabel("time (s)")
+    label_time(panel)
     panel.set_ylabel(f"{found.fault}{f' ({unit})' if unit else ''}")
+    legend_above(panel)
+    tidy(panel)
+    return panel
+
+
+def plot_hidden_course(design: ObserverDesign, *, fault: str | None = None, axes: Axes | None = None) -> Axes:
+    """Plot the courses with which a fault looks like none: why no test finds a smaller one, or tells it from others.
+
+    Parameters
+    ----------
+    design : ObserverDesign
+        By `obsynth.guaranteed_test`: of a test its witness; of a bank what hides a fault from a smaller group.
+    fault : str, optional
+        Of a bank: which one; the first by default.
+    axes : Axes, optional
+        Where; new ones by default.
+
+    Returns
+    -------
+    Axes
+        Faults, disturbances and states over the window, each as a share of its largest value, which the legend has.
+
+    Raises
+    ------
+    SpecError
+        The design is by another method, or nothing hides the fault.
+    """
+    found = GuaranteedTest.of(design)
+    plant, courses = found.linear[0], found.hidden_course(fault)
+    if not courses:
+        raise SpecError("Nothing hides this fault: there is no course to draw.", path="fault")
+    (panel,) = new_panels(None if axes is None else [axes], 1, size=(WIDTH, 1.6 * PANEL_HEIGHT))
+    styles = {name: "-" for name in plant.fault_names} | {name: "--" for name in plant.disturbance_names}
+    sizes = {name: float(np.max(np.abs(course))) for name, course in courses.items()}
+    largest = max(sizes.values())
+    shown = [name for name in courses if sizes[name] > ROUNDED * largest]
+    # Faults first, then disturbances, then states.
+    for name in sorted(shown, key=lambda name: ("-", "--", ":").index(styles.get(name, ":"))):
+        style, unit = styles.get(name, ":"), plant.units.get(name, "")
+        panel.plot(
+            np.arange(len(courses[name])) * plant.dt,
+            courses[name] / sizes[name],
+            style,
+            # What acts on a sampled plant is held between samples.
+            drawstyle="default" if style == ":" else "steps-post",
+            linewidth=1.0 if style == ":" else 1.8,
+            label=f"{name}, up to {sizes[name]:.3g}{f' {unit}' if unit else ''}",
+        )
+    panel.axhline(0.0, color="0.4", linewidth=0.8)
+    panel.set_xlabel("time (s)")
+    panel.set_ylabel("share of the largest")
     legend_above(panel)
     tidy(panel)
     return panel

@@ -39,6 +39,8 @@ MARK_STYLE: dict[str, Any] = {
     "linestyle": "none",
 }
 
+#: Units of a long time: its name, its seconds, and how many of it a record is longer than that is drawn in it.
+LONG_UNITS = (("d", 86400, 4), ("h", 3600, 3), ("min", 60, 10))
 #: Letters of small print that fit in an inch, and those that the sample of a line takes.
 LETTERS_PER_INCH, KEY_LETTERS = 12.5, 8
 
@@ -97,10 +99,24 @@ def tidy(panel: Axes) -> None:
 def finish(panel: Axes, label: str) -> Axes:
     """Label the axes of a panel over the time, and give it a legend and a grid."""
     panel.set_ylabel(label)
-    panel.set_xlabel("time (s)")
+    label_time(panel)
     legend_above(panel)
     tidy(panel)
     return panel
+
+
+def label_time(panel: Axes) -> None:
+    """Label the axis of a panel over the time in seconds, in minutes, hours or days where it is long."""
+    from matplotlib.ticker import FuncFormatter, MaxNLocator, MultipleLocator
+
+    begin, end = panel.get_xlim()
+    fitting = ((unit, seconds) for unit, seconds, many in LONG_UNITS if end - begin > many * seconds)
+    unit, seconds = next(fitting, ("s", 1))
+    panel.set_xlabel(f"time ({unit})")
+    if seconds > 1:
+        ticks = MaxNLocator(nbins=6, steps=[1, 2, 3, 5, 6, 10]).tick_values(begin / seconds, end / seconds)
+        panel.xaxis.set_major_locator(MultipleLocator(seconds * (ticks[1] - ticks[0])))
+        panel.xaxis.set_major_formatter(FuncFormatter(lambda time, _: f"{time / seconds:g}"))
 
 
 def mark(panel: Axes, time: Any, value: Any, label: str, *, marker: str = "o", color: str = "black") -> None:

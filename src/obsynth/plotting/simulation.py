@@ -163,7 +163,7 @@ def plot_detection(detection: Detection, *, dt: float, axes: Axes | None = None)
     Raises
     ------
     SpecError
-        Never for a detection as `obsynth.Monitor` makes it.
+        Never for a detection as `obsynth.types.Monitor` makes it.
     """
     (panel,) = new_panels(None if axes is None else [axes], 1)
     time = dt * np.arange(len(detection.values))

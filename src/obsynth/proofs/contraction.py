@@ -27,9 +27,9 @@ RATES = (0.5, 0.2, 0.8, 0.95)
 #: Roundings of an entry, of every order n, that a Lyapunov equation by Schur vectors and its square root may take.
 OPERATIONS = 1e3
 #: Up to so many states Lyapunov equations are solved by sums first; doublings of these, and when they have settled.
-MANY_STATES, MOST_DOUBLINGS, SETTLED = 100, 80, 1e-17
+MOST_STATES_FOR_SUMS, MOST_SUM_DOUBLINGS, SUMS_SETTLED = 100, 80, 1e-17
 #: Beside sums up to so large rounding hides no identity matrix: 1e-16 of them is 1e-7 of it.
-MOST_GROWTH = 1e9
+LARGEST_SUM = 1e9
 #: The same where the rate itself is what is asked for.
 TIGHT_RATES = (0.01, 0.1)
 
@@ -139,7 +139,7 @@ def proved_rate(matrix: FloatArray | Ball, known: Contraction | None = None) -> 
 def _tried(ball: Ball, rate: float, *, discrete: bool) -> Contraction | None:
     # Sums of squares lose no digits to the slowest mode; with many states they take too long.
     ways = (_summed_factor, _lyapunov_factor)
-    for way in ways if len(ball.midpoint) <= MANY_STATES else ways[::-1]:
+    for way in ways if len(ball.midpoint) <= MOST_STATES_FOR_SUMS else ways[::-1]:
         factor = way(ball.midpoint, rate, discrete=discrete)
         found = None if factor is None else _proved(ball, factor, rate, discrete=discrete)
         if found is not None:
@@ -193,19 +193,19 @@ def _summed_factor(a: FloatArray, rate: float, *, discrete: bool) -> FloatArray 
                 return None
             power, start = inverse @ (size * one + shifted), np.sqrt(2.0 * size) * inverse
         found = _summed(power, start)
-        if found is not None and size * float(np.max(np.sum(found**2, axis=0))) > MOST_GROWTH:
+        if found is not None and size * float(np.max(np.sum(found**2, axis=0))) > LARGEST_SUM:
             found = _summed(power, found / np.max(np.abs(found)) @ start)
         return None if found is None else np.asarray(np.triu(np.linalg.qr(found / scale[None, :], mode="r")))
 
 
 def _summed(power: FloatArray, factor: FloatArray) -> FloatArray | None:
     """Return a triangular factor of the sum of ``(F A^k)'(F A^k)`` over all k; ``None`` where it does not settle."""
-    for _ in range(MOST_DOUBLINGS):
+    for _ in range(MOST_SUM_DOUBLINGS):
         later = factor @ power
         if not np.all(np.isfinite(later)):
             return None
         factor = np.asarray(np.linalg.qr(np.vstack([factor, later]), mode="r"))
-        if np.all(np.linalg.norm(later, axis=0) <= SETTLED * np.linalg.norm(factor, axis=0)):
+        if np.all(np.linalg.norm(later, axis=0) <= SUMS_SETTLED * np.linalg.norm(factor, axis=0)):
             return np.asarray(factor)
         power = power @ power
     return None
@@ -241,7 +241,7 @@ def _lyapunov_factor(a: FloatArray, rate: float, *, discrete: bool) -> FloatArra
 #: What is added to a matrix, as a share of its largest entry, so that it has a positive eigenvector.
 _SHIFTS = (1e-4, 1e-7, 1e-10, 1e-13)
 #: The inverse is given up where its residual is larger.
-_LARGEST_RESIDUAL = 0.5
+_LARGEST_INVERSE_RESIDUAL = 0.5
 
 
 def spectral_radius_bound(matrix: FloatArray) -> float:
@@ -286,7 +286,7 @@ def inverse_bound(matrix: FloatArray) -> FloatArray | None:
     residual = np.abs(np.eye(size) - (near - scaled @ near))
     residual = residual + gamma(2 * size + 8) * (near + scaled @ near)
     norm = float(rounded_up(residual.sum(axis=1), size + 4).max())
-    if not norm < _LARGEST_RESIDUAL:
+    if not norm < _LARGEST_INVERSE_RESIDUAL:
         return None
     # inverse = near (I - residual)^-1 = near (I + residual + ...); no entry of residual^k is larger than norm^k.
     more = norm / (1.0 - norm) * near.sum(axis=1, keepdims=True)

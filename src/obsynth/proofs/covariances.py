@@ -19,9 +19,9 @@ from obsynth.proofs.extended_balls import arb_matrix
 #: Relative difference of two ways of computing a variance up to which double precision is believed.
 SURE = 1e-6
 #: With more states nothing is enclosed, and this much is believed.
-MOST_STATES, AGREEMENT = 40, 1e-2
+MOST_ENCLOSED_STATES, AGREEMENT = 40, 1e-2
 #: Digits in bits, tried in turn; doublings, of which each doubles the time; and the radius that is small enough.
-BITS, MOST_DOUBLINGS, RADIUS = (160, 640), 100, 1e-9
+TRIED_BITS, MOST_COVARIANCE_DOUBLINGS, RADIUS = (160, 640), 100, 1e-9
 
 
 def certain_noise_covariance(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, dt: float) -> FloatArray:
@@ -46,11 +46,11 @@ def enclosed_noise_covariance(
     a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, dt: float
 ) -> FloatArray | None:
     """Return the covariance of the stored numbers, of which nine digits are proved; ``None`` where they are not."""
-    if not 0 < len(a) <= MOST_STATES or not all(np.all(np.isfinite(part)) for part in (a, b, c, d)):
+    if not 0 < len(a) <= MOST_ENCLOSED_STATES or not all(np.all(np.isfinite(part)) for part in (a, b, c, d)):
         return None
     # States of like size need fewer digits; powers of two change none of the numbers.
     a, b, c = balanced_realisation(a, b, c)
-    for bits in BITS:
+    for bits in TRIED_BITS:
         with flint.ctx.workprec(bits):
             states = _enclosed(arb_matrix(a), arb_matrix(b), dt, float(np.linalg.norm(a, 2)) or 1.0)
             if states is None:
@@ -78,7 +78,7 @@ def _enclosed(a: Any, b: Any, dt: float, size: float) -> Any | None:
         except ZeroDivisionError:
             return None
         states, power = inverse * states * inverse.transpose() * flint.arb(2.0 * size), inverse * (one + a)
-    for _ in range(MOST_DOUBLINGS):
+    for _ in range(MOST_COVARIANCE_DOUBLINGS):
         states, power = states + power * states * power.transpose(), power * power
         left = _squared_norm(power)
         if not left.is_finite():

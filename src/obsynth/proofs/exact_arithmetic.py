@@ -202,7 +202,7 @@ def _is_short(value: float) -> bool:
 FIRST_BITS = 106
 
 
-MOST_DOUBLINGS = 7
+MOST_DIGIT_DOUBLINGS = 7
 
 
 @dataclass(frozen=True)
@@ -264,7 +264,7 @@ def _isolated(polynomial: fmpz_poly, *, discrete: bool, may_lie_on_boundary: boo
         return []
     bits = FIRST_BITS
     found: list[tuple[flint.acb, int, str]] = []
-    for _ in range(MOST_DOUBLINGS):
+    for _ in range(MOST_DIGIT_DOUBLINGS):
         with flint.ctx.workprec(bits):
             pairs: Any = polynomial.complex_roots()
             found = [(root, int(times), _side(root, discrete)) for root, times in pairs]

@@ -21,15 +21,15 @@ from obsynth.proofs.contraction import Contraction
 from obsynth.proofs.products import exponential
 
 #: Most steps that are summed up one by one, and the share of the sum that the rest may then have.
-MOST_STEPS, LEFT = 65_536, 1e-3
+MOST_SUMMED_STEPS, LEFT = 65_536, 1e-3
 #: Steps that are taken together; what is left is looked at when their number has grown by one in so many.
-BLOCK, LOOKS = 64, 8
+STEPS_AT_ONCE, LOOKS = 64, 8
 #: A piece of an interval is at most this share of one over the norm of A; most pieces.
 PIECE, MOST_PIECES = 0.05, 1_024
 #: More than the square root of what underflows in a square.
 LOST_SQUARES = 2.0**-510
 #: Length of an interval in units of one over the norm of A, and the largest order, for gains in continuous time.
-LENGTH, MOST_STATES = 0.4, 12
+LENGTH, MOST_CONTINUOUS_STATES = 0.4, 12
 #: Share of such a gain that the rest may have, and most steps towards it: what it bounds is a rounding, and slow modes
 #: would take a hundred thousand.
 LEFT_OF_GAINS, MOST_STEPS_OF_GAINS = 0.05, 1_024
@@ -51,7 +51,7 @@ def peak_sums(
     least: int = 0,
     left: float = LEFT,
     each: bool = False,
-    most: int = MOST_STEPS,
+    most: int = MOST_SUMMED_STEPS,
 ) -> PeakSums:
     """Return bounds on the sums over j of ``|c M^j b|`` (Euclidean; ``each``: by row) of columns ``b``, ``c (p, n)``.
 
@@ -69,8 +69,8 @@ def peak_sums(
         products = np.abs(block @ driven)
         terms.append(products if each else _norms(products))
         total, collected = total + np.sum(terms[-1], axis=0), collected + np.sum(np.abs(block), axis=0)
-        done = BLOCK * len(terms) >= max(most, least)
-        if done or (BLOCK * len(terms) >= least and len(terms) >= looked):
+        done = STEPS_AT_ONCE * len(terms) >= max(most, least)
+        if done or (STEPS_AT_ONCE * len(terms) >= least and len(terms) >= looked):
             looked = len(terms) + len(terms) // LOOKS + 1
             after = contraction.factor * _seen(contraction, powers, _missed(matrix, np.abs(block[-1]), growth), each)
             after = np.asarray(after * sizes)
@@ -92,10 +92,10 @@ def peak_sums(
 
 
 def _block(rows: FloatArray, moving: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return rows ``(p, n)`` moved zero times and more, ``(BLOCK, p, n)``, and moved once more than the last."""
-    found = np.empty((BLOCK, *rows.shape))
+    """Return rows ``(p, n)`` moved zero times and more, ``(steps, p, n)``, and moved once more than the last."""
+    found = np.empty((STEPS_AT_ONCE, *rows.shape))
     found[0] = rows
-    for i in range(1, BLOCK):
+    for i in range(1, STEPS_AT_ONCE):
         np.matmul(found[i - 1], moving, out=found[i])
     return found, found[-1] @ moving
 
@@ -182,7 +182,7 @@ def absolute_gains(a: FloatArray, rows: FloatArray, contraction: Contraction) ->
     """Return upper bounds on ``sum_j |c A^j|`` (the integral of ``|c e^{A t}|``), entry by entry, for ``c (p, n)``."""
     n = len(a)
     loose = contraction.gain(rows, np.eye(n))
-    if not n or (not contraction.discrete and n > MOST_STATES):
+    if not n or (not contraction.discrete and n > MOST_CONTINUOUS_STATES):
         return loose
     if contraction.discrete:
         moving, columns, gather = Ball.exact(a), Ball.exact(np.eye(n)), None

@@ -25,9 +25,9 @@ from obsynth.proofs.balls import UNDERFLOW, UNIT_ROUNDOFF, Ball, gamma, rounded_
 from obsynth.proofs.extended_balls import arb_matrix
 
 #: Digits in which exponentials are formed, in bits.
-BITS = 160
+EXPONENTIAL_BITS = 160
 #: With more states double precision comes first, where its radius is below this share of the largest entry.
-MANY_STATES, LARGEST_SHARE = 60, 1e-7
+MOST_STATES_FOR_BALLS, LARGEST_SHARE = 60, 1e-7
 #: Norm of the shortest interval's exponent, and orders of the Taylor polynomials: what is left is below 1e-18.
 SHORT, ORDER, ENERGY_ORDER = 2.0**-4, 10, 12
 
@@ -37,18 +37,18 @@ def exponential(matrix: FloatArray, time: float) -> Ball:
     n = len(matrix)
     if not n:
         return Ball.exact(np.zeros((0, 0)))
-    if n > MANY_STATES and (found := _Doubling(matrix, time).exponential()) is not None:
+    if n > MOST_STATES_FOR_BALLS and (found := _Doubling(matrix, time).exponential()) is not None:
         return found
-    with flint.ctx.workprec(BITS):
+    with flint.ctx.workprec(EXPONENTIAL_BITS):
         return as_ball((arb_matrix(matrix) * flint.arb(float(time))).exp())
 
 
 def energy(a: FloatArray, b: FloatArray, time: float) -> Ball:
     r"""Return a ball that holds ``\int_0^t e^{A s} B B' e^{A' s} ds`` (Van Loan), for ``A (n, n)``, ``B (n, m)``."""
     n = len(a)
-    if n > MANY_STATES and (found := _Doubling(a, time).energy(b)) is not None:
+    if n > MOST_STATES_FOR_BALLS and (found := _Doubling(a, time).energy(b)) is not None:
         return found
-    with flint.ctx.workprec(2 * BITS):
+    with flint.ctx.workprec(2 * EXPONENTIAL_BITS):
         whole = arb_matrix(np.block([[-a, np.zeros((n, n))], [np.zeros((n, n)), a.T]]))
         square = arb_matrix(b) * arb_matrix(b).transpose()
         for i in range(n):

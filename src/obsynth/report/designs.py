@@ -24,7 +24,6 @@ from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.plotting.frequency import FaultGains, fault_gains
-from obsynth.results.delta_scan import DeltaScan
 from obsynth.results.design import ObserverDesign
 from obsynth.results.layout import facts_table, headed_table, name_list, number, print_checks, print_section
 
@@ -106,13 +105,17 @@ def design_report(design: ObserverDesign, *, console: Console) -> None:
 #: The check without which observer and plant say nothing of one another.
 FITS = "fits the plant"
 #: Curves of at most so many faults; plants with more states have none, and no steps are followed there.
-MOST_CURVES, MOST_STATES = 3, 80
+MOST_CURVES, MOST_STATES_OF_CURVES = 3, 80
 
 
 def delay_curves(design: ObserverDesign) -> list[DelayCurve]:
     """Return what delay buys on the plant of a design, for each fault that it estimates, where noise is stated."""
     plant, observer = design.plant, design.observer
-    if not isinstance(plant, DescriptorSystem) or not isinstance(observer, LinearObserver) or plant.nx > MOST_STATES:
+    if (
+        not isinstance(plant, DescriptorSystem)
+        or not isinstance(observer, LinearObserver)
+        or plant.nx > MOST_STATES_OF_CURVES
+    ):
         return []
     names = [name for name in observer.fault_names if name in plant.fault_names][:MOST_CURVES]
     rates = design.options.get("fault_rate")
@@ -128,15 +131,6 @@ def delay_table(curve: DelayCurve) -> Table:
     table = headed_table("walk per sample", *(f"lag {lag}" for lag in curve.lags))
     for rate, row in zip(curve.rates, curve.deviations, strict=True):
         table.add_row(Text(f"{rate:.3g}"), *(Text(number(float(value), digits=3)) for value in row))
-    return table
-
-
-def delta_scan_table(scan: DeltaScan) -> Table:
-    """Return the table of a scan of delta: decay against gains against noise."""
-    table = headed_table("delta (s)", "decay (1/s)", "norm of gains", "f' to fault (s)", "noise to fault", "fast noise")
-    for row in scan.rows():
-        names = ("delta", "decay", "gain", "rate_gain", "noise_gain", "fast_noise_gain")
-        table.add_row(*(Text(number(float(row[name]))) for name in names))
     return table
 
 
@@ -162,7 +156,7 @@ def promises(design: ObserverDesign) -> Iterator[tuple[str, str, str]]:
     """Yield name, value and meaning of what a design claims."""
     known = method_class(design.method).claims if design.method in REGISTRY else {}
     for name, value in design.certificate.claims.items():
-        claim = known.get(name)
+        claim = known.get(name.partition("[")[0])
         unit, meaning = (claim.unit, claim.meaning) if claim else ("", "unknown to this version")
         if not design.report.passed:
             meaning = f"{unproved(meaning)} (claimed only: checks fail)"
@@ -191,9 +185,9 @@ def fault_estimates(design: ObserverDesign, gains: FaultGains | None) -> tuple[t
 
     if gains is None or not isinstance(plant, DescriptorSystem):
         when = "after the nominal run" if isinstance(plant, DAEModel) else "at the end of the horizon"
-        return ("parameter", f"std {when}"), [(name, deviation(name, "-")) for name in observer.fault_names]
+        return ("parameter", f"deviation {when}"), [(name, deviation(name, "-")) for name in observer.fault_names]
     linear = design.linear[1]
-    none, noise = "by sampling" if plant.nw else "none stated", "deviation" if plant.is_discrete else "dev. at 1 s"
+    none, noise = "by sampling" if plant.nw else "none stated", "deviation" if plant.is_discrete else "deviation, 1 s"
     delays = ("delay", "delay in s") if plant.is_discrete else ()
     rows: list[tuple[str, ...]] = []
     for name, late, leaks in zip(linear.fault_names, linear.fault_delays, gains.leaks, strict=True):
@@ -207,7 +201,7 @@ def fault_estimates(design: ObserverDesign, gains: FaultGains | None) -> tuple[t
 
 
 #: Without a scenario steps are followed for so many settling times of the plant, at most so many samples.
-SETTLING_TIMES, MOST_STEPS = 30, 6000
+STEP_SETTLING_TIMES, MOST_STEP_SAMPLES = 30, 6000
 
 
 @dataclass(frozen=True)
@@ -221,7 +215,11 @@ class Followed:
 def _estimating(design: ObserverDesign) -> tuple[DescriptorSystem, LinearObserver] | None:
     """Return plant and observer of a linear design that estimates faults of a plant that is not too large."""
     plant, observer = design.plant, design.observer
-    if not isinstance(plant, DescriptorSystem) or not isinstance(observer, LinearObserver) or plant.nx > MOST_STATES:
+    if (
+        not isinstance(plant, DescriptorSystem)
+        or not isinstance(observer, LinearObserver)
+        or plant.nx > MOST_STATES_OF_CURVES
+    ):
         return None
     return (plant, observer) if observer.fault_names and set(observer.fault_names) <= set(plant.fault_names) else None
 
@@ -235,8 +233,8 @@ def followed_steps(design: ObserverDesign, horizon: float | None = None) -> Foll
     if (observer.Bu.shape[1], observer.By.shape[1]) != (plant.nu, plant.ny):
         return nothing
     step = plant.dt if plant.dt > 0.0 else settling_time(plant) / SAMPLES
-    length = horizon if horizon is not None else SETTLING_TIMES * settling_time(plant)
-    steps = int(min(max(length / step, 20), MOST_STEPS))
+    length = horizon if horizon is not None else STEP_SETTLING_TIMES * settling_time(plant)
+    steps = int(min(max(length / step, 20), MOST_STEP_SAMPLES))
     try:
         sampled = on_the_clock(plant, step)
         clocked = observer if observer.dt > 0.0 else sample_observer(observer, step)

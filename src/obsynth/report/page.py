@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from html import escape
-from importlib.resources import files
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -20,10 +19,12 @@ from rich.text import Text
 
 from obsynth.calibration.diagnostics import Validation, draw_validation
 from obsynth.calibration.validating import states_innovations, validate
+from obsynth.data.alarm_events import alarm_rows, silence
 from obsynth.data.log_estimator import DECIDING
 from obsynth.data.run import DataRun
 from obsynth.errors import ObsynthError
 from obsynth.files.outputs import FileKind, write_atomically
+from obsynth.files.pages import standing_page
 from obsynth.methods.registry import REGISTRY, method_class
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plotting.data import panel_count, plot_data
@@ -252,17 +253,19 @@ def data_section(design: ObserverDesign, run: DataRun, statement: str) -> Iterat
         )
         yield stacked("", text, count, lambda axes: plot_data(run, design=design, axes=axes)).html()
     yield from fact_rows(_counts(run, statement))
+    rows, more = alarm_rows(run.events, run.stamps.shown)
+    if rows:
+        yield "<h3>Alarms</h3>"
+        yield from table_lines(rows[0], rows[1:])
+        yield f"<p>and {more} more</p>" if more else ""
     yield from (f'<p class="warning">Warning: {escape(text)}</p>' for text in run.warnings)
     yield from _statistics(design, run)
 
 
 def _counts(run: DataRun, statement: str) -> Iterator[tuple[str, str]]:
     yield "rows", f"{run.rows}: " + ", ".join(f"{count} {status}" for status, count in run.statuses.items())
-    for name, time in run.alarms.items():
-        fault = f"; {run.isolated} stands out" if run.isolated and name not in run.thresholds else ""
-        yield "alarm", f"{name}, first at {run.stamps.shown(time)}{fault}"
-    if not run.alarms:
-        yield "alarm", "none"
+    if statement or run.thresholds:
+        yield from (("alarms", text) for text in silence(run, "the monitor" if statement else "any threshold"))
     if statement:
         yield "threshold", statement
 
@@ -286,8 +289,8 @@ def _statistics(design: ObserverDesign, run: DataRun) -> Iterator[str]:
     yield from copied_table(table)
 
 
-#: A page that `html_report` has written; the second mark is that of its first pages.
-PAGE = FileKind("a report of obsynth", rb'name="generator" content="obsynth|<p class="verdict (holds|fails)">')
+#: A page that `html_report` has written.
+PAGE = FileKind("a report of obsynth", rb'name="generator" content="obsynth"')
 #: Gains with more entries are not printed: the gain set has them.
 MOST_ENTRIES = 900
 
@@ -358,7 +361,6 @@ def _page_text(
     design: ObserverDesign, scenario: Scenario | None, own: Mapping[str, list[str]], reproduction: list[str]
 ) -> str:
     report = design.report
-    style = files("obsynth.report").joinpath("page.css").read_text(encoding="utf-8")
     title = escape(f"{design.name}: {design.method}")
     state = "holds" if report.passed else "fails"
     sections = {
@@ -377,23 +379,12 @@ def _page_text(
     shown = {heading: lines for heading, lines in sections.items() if lines}
     links = "".join(f'<a href="#{_anchor(heading)}">{heading}</a>' for heading in shown)
     parts = [
-        "<!DOCTYPE html>",
-        '<html lang="en">',
-        "<head>",
-        '<meta charset="utf-8">',
-        '<meta name="generator" content="obsynth">',
-        '<meta name="viewport" content="width=device-width, initial-scale=1">',
-        f"<title>{title}</title>",
-        f"<style>{style}</style>",
-        "</head>",
-        "<body>",
-        f"<h1>{title}</h1>",
         f'<p class="verdict {state}">{escape(verdict_line(report.checks).plain)}</p>',
         f"<nav>{links}</nav>",
     ]
     for heading, lines in shown.items():
         parts += [f'<section id="{_anchor(heading)}">', f"<h2>{heading}</h2>", *lines, "</section>"]
-    return "\n".join([*parts, "</body>", "</html>"]) + "\n"
+    return standing_page(title, parts)
 
 
 def _in_short(design: ObserverDesign) -> Iterator[str]:

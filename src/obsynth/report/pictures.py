@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from html import escape
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -12,12 +13,15 @@ from obsynth.experiments.demonstration import demonstration_scenario
 from obsynth.experiments.monitors.monitor import Detection
 from obsynth.experiments.monitors.residual_monitor import monitor
 from obsynth.experiments.simulation import Simulation, simulate
+from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
+from obsynth.methods.guaranteed_test.result import GuaranteedTest
 from obsynth.observers.alarms import Decision
 from obsynth.observers.decisions import decide
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.plotting.estimates import plot_states
 from obsynth.plotting.frequency import plot_gains
+from obsynth.plotting.guaranteed import plot_hidden_course
 from obsynth.plotting.panels import image_of
 from obsynth.plotting.simulation import plot_simulation
 from obsynth.plotting.spectra import plot_poles
@@ -31,9 +35,9 @@ if TYPE_CHECKING:
 #: Inches: a picture beside another one, and one of a row of its own; small, so that texts stay readable on a phone.
 HALF, WIDE = 5.6, 6.6
 #: Inches: a panel of several, and what the axis of time takes.
-PANEL, MARGIN = 1.5, 0.6
+PANEL, EDGE = 1.5, 0.6
 #: More states than this are not drawn.
-MOST_STATES = 6
+MOST_DRAWN_STATES = 6
 
 
 class Picture(NamedTuple):
@@ -56,6 +60,8 @@ class Picture(NamedTuple):
 def pictures_of(design: ObserverDesign, *, scenario: Scenario | None = None) -> Iterator[Picture]:
     """Yield the pictures of a design."""
     yield from _at_work(design, scenario)
+    if design.method == GuaranteedTestMethod.id:
+        yield from _hidden(GuaranteedTest.of(design))
     if not isinstance(design.observer, LinearObserver):
         return
     sampled = design.observer.dt > 0.0
@@ -81,6 +87,33 @@ def pictures_of(design: ObserverDesign, *, scenario: Scenario | None = None) -> 
             "What reaches the state estimates",
             "Largest singular values over the frequency, to the errors of the states: less is better.",
         )
+
+
+def _hidden(test: GuaranteedTest) -> Iterator[Picture]:
+    """Yield how small a fault so many samples tell, and the courses that hide a fault from every test."""
+    if len(test.tests) == 1:
+        if len(test.trade_off) > 1:
+            text = "The least threshold of any test against the time that its samples take; the marked one is proved."
+            yield Picture("How small a fault", text, drawn((HALF, 4.2), 1, lambda axes: test.plot(axes=axes[0])))
+        if test.least > 0.0:
+            yield Picture(
+                "Why no smaller one",
+                f"This course of {test.fault} with these disturbances, and the opposite of all of them, give the same "
+                "samples: every equation and all bounds hold.",
+                drawn((HALF, 4.2), 1, lambda axes: plot_hidden_course(test, axes=axes[0])),
+            )
+        return
+    for own, group in zip(test.tests, test.groups, strict=True):
+        if len(group) > 1:
+            yield Picture(
+                f"Why {own.fault} is not isolated",
+                "Together these courses change no output: every equation holds, without disturbance and noise.",
+                drawn((HALF, 4.2), 1, partial(_draw_hidden, test, own.fault)),
+            )
+
+
+def _draw_hidden(test: GuaranteedTest, fault: str, axes: Sequence[Axes]) -> None:
+    plot_hidden_course(test, fault=fault, axes=axes[0])
 
 
 def _gains(design: ObserverDesign, to: str, title: str, text: str) -> Picture:
@@ -113,7 +146,7 @@ def _at_work(design: ObserverDesign, scenario: Scenario | None) -> Iterator[Pict
             faults + len(seen),
             lambda axes: plot_simulation(simulation, detections=seen, units=units, axes=axes),
         )
-    if 0 < len(states) <= MOST_STATES:
+    if 0 < len(states) <= MOST_DRAWN_STATES:
         run = "in the same run" if faults or seen else "in a run with the stated noise"
         bands = "" if linear else ", with 95 % bands"
         yield stacked(
@@ -152,7 +185,7 @@ def _story(scenario: Scenario, *, given: bool, linear: bool) -> str:
 
 def stacked(title: str, text: str, panels: int, draw: Callable[[Sequence[Axes]], Any]) -> Picture:
     """Return a wide picture of so many panels."""
-    return Picture(title, text, drawn((WIDE, PANEL * panels + MARGIN), panels, draw), wide=True)
+    return Picture(title, text, drawn((WIDE, PANEL * panels + EDGE), panels, draw), wide=True)
 
 
 def drawn(size: tuple[float, float], panels: int, draw: Callable[[Sequence[Axes]], Any]) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
@@ -14,12 +13,14 @@ from rich.text import Text
 
 from obsynth.analysis.diagnosis.verdicts import Diagnosis
 from obsynth.analysis.structure import Structure
+from obsynth.files.outputs import yaml_text
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.report.designs import plant_facts
 from obsynth.results.checks import Check, VerificationReport
 from obsynth.results.layout import checks_table, complex_numbers, facts_table, headed_table, name_list, print_section
+from obsynth.verification.plant import PLANT_MATRICES
 
 
 def check_report(
@@ -55,7 +56,7 @@ def _existence_line(method: str, report: VerificationReport) -> Text:
 
 def is_unclear(failed: Sequence[Check]) -> bool:
     """Whether all conditions that do not hold are undecided."""
-    return bool(failed) and all(check.detail.startswith("Unclear") for check in failed)
+    return bool(failed) and all(check.unclear for check in failed)
 
 
 def _verdict(failed: Sequence[Check]) -> str:
@@ -177,7 +178,6 @@ def _reason(failed: Sequence[Check]) -> str:
     return told.rstrip(".") + (f" (and {len(more)} more with -v)" if more else "")
 
 
-_MATRICES = ("E", "A", "B", "C", "D", "Bf", "Df", "Bd", "Dd")
 _NAMES = ("state_names", "input_names", "output_names", "fault_names", "disturbance_names")
 
 
@@ -205,21 +205,13 @@ def linear_plant_text(plant: DescriptorSystem) -> str:
 
 def plant_document(plant: DescriptorSystem, source: str) -> str:
     """Return the plant as YAML that a spec can name; every number as exact as it is."""
-    from ruamel.yaml import YAML
-
     data: dict[str, Any] = {"schema_version": 1, "dt": float(plant.dt)}
-    for name in _MATRICES:
+    for name in PLANT_MATRICES:
         matrix = getattr(plant, name)
         if matrix.size and (np.any(matrix) or name in "EAC"):
             data[name] = [[float(value) + 0.0 for value in row] for row in matrix]
     data |= {name: list(getattr(plant, name)) for name in _NAMES if getattr(plant, name)}
     data["operating_point"] = {name: float(value) for name, value in plant.operating_point.items()}
     data["units"] = dict(plant.units)
-    text = io.StringIO()
-    yaml: Any = YAML(typ="safe", pure=True)
-    yaml.default_flow_style = None
-    yaml.width = 4096
-    yaml.sort_base_mapping_type_on_output = False
-    yaml.dump(data, text)
     where = "at the operating point below and at nominal values of all constants"
-    return f"# Linearised by obsynth from {source}, {where}.\n{text.getvalue()}"
+    return f"# Linearised by obsynth from {source}, {where}.\n{yaml_text(data)}"

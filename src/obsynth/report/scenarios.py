@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -35,8 +35,9 @@ def evaluation_report(
     monitor: Monitor | ParameterMonitor | None,
     console: Console,
     units: Mapping[str, str],
+    beside: Sequence[str] = (),
 ) -> None:
-    """Print rates, delays and errors over many runs."""
+    """Print rates, delays and errors over many runs; ``beside``: sentences on thresholds."""
     share = f"{100.0 * found.confidence:g} % interval"
     console.print(Text(f"{name}: {found.runs} runs", style="bold"))
     console.print()
@@ -52,6 +53,8 @@ def evaluation_report(
         size = "" if end is None else f" ({number(end)} at the end of a run)"
         console.print(Text(f"Its threshold{size}: {statement}."))
         console.print()
+    for sentence in beside:
+        console.print(Text(sentence))
     for title, errors in (("Fault estimates", found.fault_rmse), ("State estimates", found.state_rmse)):
         if errors:
             table = headed_table("signal", "RMSE after warm-up", share, "unit")
@@ -91,7 +94,7 @@ def _interval(item: Interval) -> str:
 
 #: Columns left out where the console is narrower than so many characters.
 NARROW = 130
-_LESS = ("order", "50 % s", "peak", "bias", "alarm s", "smallest", "ms")
+_LESS = ("order", "s to 50 %", "peak", "bias", "s to alarm", "smallest", "ms")
 
 
 def comparison_report(found: Comparison, *, console: Console, file: Path | None = None) -> None:

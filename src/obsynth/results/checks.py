@@ -45,6 +45,8 @@ class Check:
         ``interval``) or ``assumed`` (stated by whoever made the design, and not checked).  That of the kind by default.
     interval : tuple of float, optional
         Of an estimate: where it lies by chance alone, with the probability that ``detail`` says.
+    unclear : bool, optional
+        Of a condition that does not hold: whether double precision could not decide it.
     """
 
     name: str
@@ -58,6 +60,7 @@ class Check:
     detail: str = ""
     status: Status | Literal[""] = ""
     interval: tuple[float, float] | None = None
+    unclear: bool = False
 
     def __post_init__(self) -> None:
         if not self.status:
@@ -143,7 +146,11 @@ class VerificationReport:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the report as plain data."""
-        return {"passed": self.passed, "checks": [asdict(check) for check in self.checks]}
+        rows = [asdict(check) for check in self.checks]
+        for row in rows:
+            if not row["unclear"]:
+                del row["unclear"]
+        return {"passed": self.passed, "checks": rows}
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> VerificationReport:

@@ -12,6 +12,7 @@ from obsynth.errors import SpecError
 from obsynth.extensions import extension
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.sensor_timing import LONGEST_DELAY
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.checks import VerificationReport
 from obsynth.results.gain_set_writing import save
@@ -78,6 +79,10 @@ class ObserverDesign:
         The report of this very object.
     source : PlantSource, optional
         The plant as written, where algebraic states were eliminated or the plant was sampled: `verify` does it again.
+    input_delay : int
+        Rows by which inputs of a log act later than this design takes them.  Designs of linear discrete and of
+        time-varying plants take the inputs of a row to act during the step that begins there, those of nonlinear plants
+        during the step that ends there, continuous ones as straight lines between rows.
     """
 
     name: str
@@ -92,8 +97,14 @@ class ObserverDesign:
     recovery: StateRecovery | None = None
     report: VerificationReport = field(default_factory=VerificationReport)
     source: PlantSource | None = None
+    input_delay: int = 0
 
     def __post_init__(self) -> None:
+        rows = self.input_delay
+        if isinstance(rows, bool) or not isinstance(rows, int) or abs(rows) > LONGEST_DELAY:
+            raise SpecError(
+                f"input_delay is {rows!r}: give a whole number of rows, at most {LONGEST_DELAY}.", path="input_delay"
+            )
         frozen = {name: read_only(matrix) for name, matrix in self.gains.items()}
         object.__setattr__(self, "gains", MappingProxyType(frozen))
         object.__setattr__(self, "options", MappingProxyType(dict(self.options)))

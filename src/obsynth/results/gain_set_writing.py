@@ -107,6 +107,7 @@ def _body_of(design: Any) -> dict[str, Any]:
         "recovery": None if design.recovery is None else _fields_of(design.recovery),
         "report": design.report.as_dict(),
         "source": None if design.source is None else design.source.as_dict(),
+        **({"input_delay": design.input_delay} if design.input_delay else {}),
         **_tag(design),
     }
 

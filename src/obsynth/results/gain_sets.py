@@ -203,6 +203,7 @@ def _design_from(data: dict[str, Any]) -> ObserverDesign:
         recovery=None if recovery is None else _made("recovery", _recovery_from, **recovery),
         report=_made("report", VerificationReport.from_dict, data["report"]),
         source=None if data.get("source") is None else _made("source", PlantSource.from_dict, data["source"]),
+        input_delay=data.get("input_delay", 0),
     )
 
 

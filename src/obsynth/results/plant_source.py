@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from obsynth.analysis.transformations.recovery import Transformation
 
 #: Larger plants are not stored: their elimination is checked where it is done.
-MOST_STATES = 500
+MOST_STORED_STATES = 500
 #: Most states of a plant behind which there are exact numbers.
 MOST_EXACT = 64
 
@@ -78,7 +78,7 @@ def _matrix(entries: Mapping[str, Any]) -> FloatArray:
 def source_of(plant: Any) -> PlantSource | None:
     """Return what a plant was made from by elimination and sampling, where that is known and can be stored."""
     made = getattr(plant, "_made_from", None)
-    if made is None or type(made[0]) is not DescriptorSystem or made[0].nx > MOST_STATES:
+    if made is None or type(made[0]) is not DescriptorSystem or made[0].nx > MOST_STORED_STATES:
         return None
     return PlantSource(made[0], made[1])
 

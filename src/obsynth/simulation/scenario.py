@@ -121,6 +121,17 @@ class Scenario:
         """
         return replace(self, **changes)
 
+    def as_dict(self) -> dict[str, Any]:
+        """Return the scenario as plain data, as `scenario_from` reads it."""
+        kinds = {kind: name for name, kind in KINDS.items()}
+        found = dict(vars(self))
+        for group in _ALLOWED:
+            found[group] = {
+                name: [{"kind": kinds[type(profile)], **vars(profile)} for profile in profiles]
+                for name, profiles in getattr(self, group).items()
+            }
+        return {name: dict(value) if isinstance(value, Mapping) else value for name, value in found.items()}
+
     def step_of(self, plant: DescriptorSystem) -> float:
         """Return the seconds between samples.
 
@@ -167,6 +178,19 @@ class Scenario:
                     index_of(name, known, what="The plant")
                 except SpecError as error:
                     raise SpecError(str(error), path=f"{group}.{name}") from None
+
+
+def scenario_from(data: Mapping[str, Any]) -> Scenario:
+    """Return the scenario that `Scenario.as_dict` described."""
+    given = dict(data)
+    for group in _ALLOWED:
+        given[group] = {
+            name: [
+                KINDS[item["kind"]](**{key: value for key, value in item.items() if key != "kind"}) for item in profiles
+            ]
+            for name, profiles in given[group].items()
+        }
+    return Scenario(**given)
 
 
 def profiles_of(scenario: Scenario, group: str) -> list[tuple[str, Profile]]:

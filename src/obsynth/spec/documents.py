@@ -149,7 +149,7 @@ class DocumentProblems:
 
 def checked_spec(document: Mapping[str, Any], source: Path) -> tuple[SpecDocument, dict[str, Any]]:
     """Check a whole spec, and the options of its method."""
-    from obsynth.methods.registry import AUTO, REGISTRY
+    from obsynth.methods.registry import AUTO, REGISTRY, method_class
     from obsynth.spec.schema import SpecDocument
     from obsynth.spec.schema_values import options_schema
 
@@ -170,7 +170,11 @@ def checked_spec(document: Mapping[str, Any], source: Path) -> tuple[SpecDocumen
         known = ", ".join(sorted([*REGISTRY, AUTO]))
         problems.add("method.id", f"unknown method {identifier!r}; the known methods are: {known}.{close}")
     elif isinstance(identifier, str) and identifier != AUTO and isinstance(raw_options, dict):
-        options = _validated(options_schema(identifier), raw_options, problems, prefix="method.options")
+        gone = method_class(identifier).gone
+        for name in (name for name in raw_options if name in gone):
+            problems.add(f"method.options.{name}", f"there is no such option any more: {gone[name]}")
+        kept = {name: value for name, value in raw_options.items() if name not in gone}
+        options = _validated(options_schema(identifier), kept, problems, prefix="method.options")
     problems.raise_if_any()
     if checked is None or options is None:
         raise SpecError(f"{source} is no valid spec.", path=str(source))

@@ -383,12 +383,28 @@ def _varying_plant(section: TimeVaryingSection, source: Path, prefix: str) -> Ti
     return _placed(lambda: TimeVaryingDescriptorSystem(**arguments), source, prefix)
 
 
-#: White noise that the linear model of a nonlinear plant has.
+#: Noise of a nonlinear plant, which its linear model or the options of a method take; and what `with_noise` takes.
 _NOISE = ("sensor_noise", "process_noise")
+_NOISE_MODEL = ("sensor_noise", "offset", "walks")
+
+
+def _noise_model(section: Any) -> dict[str, Any]:
+    """Return what a section says of noise that needs states, as `with_noise` takes it; white noise of others too."""
+    found = {name: getattr(section, name, None) or {} for name in _NOISE_MODEL}
+    found["sensor_noise"] = {
+        name: item if isinstance(item, (int, float)) else item.model_dump(exclude_none=True)
+        for name, item in found["sensor_noise"].items()
+    }
+    return {name: dict(value) for name, value in found.items() if value}
+
+
+def _needs_states(noise: Mapping[str, Any]) -> bool:
+    coloured = any(isinstance(item, dict) for item in noise.get("sensor_noise", {}).values())
+    return coloured or "offset" in noise or "walks" in noise
 
 
 def _nonlinear_plant(section: DAESection, source: Path, prefix: str) -> DAEModel:
-    left_out = {"kind", "schema_version", "transform", "variation", "box", *_NOISE}
+    left_out = {"kind", "schema_version", "transform", "variation", "box", *_NOISE, *_NOISE_MODEL}
     arguments = section.model_dump(exclude=left_out, exclude_none=True)
 
     def made() -> DAEModel:
@@ -407,6 +423,8 @@ def _invariant_plant(section: PlantSection, source: Path, prefix: str) -> Descri
     arguments = _read(
         section, source, prefix, ("dt", "sensor_noise", *_LABELS), MATRICES, SIGNAL_NAMES, keep_sparse=True
     )
+    if _needs_states(_noise_model(section)):
+        arguments["sensor_noise"] = None
     for matrix, names in _SIGNAL_OF_PICK.items():
         if isinstance(arguments[matrix], list) and arguments[names] is None:
             arguments[names] = arguments[matrix]
@@ -592,6 +610,11 @@ class Spec:
         The nonlinear plant as written, where the plant is one, or is linearised from one.
     calibrate : mapping, optional
         What `obsynth.calibrate` is asked to find, as written; its log is looked up beside the spec.
+    inputs : mapping, optional
+        When the inputs of a row act: ``hold`` (``begins`` or ``ends``: during the step that begins or ends with the
+        row) and ``delay`` (rows).
+    noise : mapping, optional
+        Noise of the sensors, offsets and walks as written, for which the plant has states (`obsynth.with_noise`).
     """
 
     name: str
@@ -604,6 +627,29 @@ class Spec:
     scenario: Scenario | None = None
     model: DAEModel | None = None
     calibrate: Mapping[str, Any] | None = None
+    noise: Mapping[str, Any] | None = None
+    inputs: Mapping[str, Any] | None = None
+
+    def input_delay(self, plant: Any) -> int | None:
+        """Return rows by which a log's inputs act later than a plant takes them; ``None`` where the spec says nothing.
+
+        Nonlinear plants take the inputs of a row during the step that ends there, others during the one that begins.
+
+        Parameters
+        ----------
+        plant : DescriptorSystem, TimeVaryingDescriptorSystem or DAEModel
+            The one that takes the log.
+        """
+        own = "ends" if isinstance(plant, DAEModel) else "begins"
+        if self.inputs is not None:
+            hold = self.inputs["hold"] or own
+            return int(self.inputs["delay"]) + (hold == "begins") - (own == "begins")
+        found = (self.calibrate or {}).get("input_delay")
+        if not isinstance(found, int):
+            return None
+        # What a calibration of a nonlinear plant found is by the convention of that plant.
+        sampled = isinstance(plant, DescriptorSystem) and plant.is_discrete and self.model is not None
+        return found - int(sampled)
 
 
 def load_model(path: str | Path) -> tuple[DAEModel, Spec | None]:
@@ -622,7 +668,7 @@ def load_plant(
     document = read_yaml(source)
     if "method" not in document and "plant" not in document:
         return built_plant(checked_plant(document, source), source, ""), None
-    spec = load_spec(source)
+    spec = spec_of(document, source, with_states=False)
     if spec.model is not None:
         return spec.model, spec
     return spec.plant if spec.transformation is None else spec.transformation.source, spec
@@ -653,8 +699,17 @@ def load_spec(path: str | Path) -> Spec:
     return spec_of(read_yaml(source), source)
 
 
-def spec_of(document: Mapping[str, Any], source: Path, *, plant_changes: Mapping[str, Any] | None = None) -> Spec:
-    """Return the spec that a document stands for, as if it were in ``source``; a plant in a file may be changed."""
+def spec_of(
+    document: Mapping[str, Any],
+    source: Path,
+    *,
+    plant_changes: Mapping[str, Any] | None = None,
+    with_states: bool = True,
+) -> Spec:
+    """Return the spec that a document stands for, as if it were in ``source``; a plant in a file may be changed.
+
+    ``with_states``: whether the plant gets states for noise that is not white, offsets and walks.
+    """
     checked, raw_options = checked_spec(document, source)
     section: Any = checked.plant
     plant_source, prefix = source, "plant"
@@ -676,8 +731,12 @@ def spec_of(document: Mapping[str, Any], source: Path, *, plant_changes: Mapping
     if reference is not None and reference.transform is not None:
         asked = (reference.transform, source, "plant")
     model = plant if isinstance(plant, DAEModel) else None
+    noise = _noise_model(section)
+    states = with_states and _needs_states(noise)
     if model is not None:
-        linear = _linearised(asked[0], model, section, plant_source.parent, *asked[1:])
+        linear = _linearised(asked[0], model, section, plant_source.parent, noise if states else {}, *asked[1:])
+        if linear is None and with_states and (noise or section.process_noise):
+            plant, options = _noisy_model(model, section, noise, checked.method.id, options, plant_source, prefix)
         plant = plant if linear is None else linear
     elif asked[0] is not None and asked[0].linearise is not None:
         raise SpecError(
@@ -685,15 +744,30 @@ def spec_of(document: Mapping[str, Any], source: Path, *, plant_changes: Mapping
             path="plant.transform.linearise",
         )
     if isinstance(plant, DescriptorSystem):
+        noisy: Any = None
+        if states and model is None:
+            noisy, more = _placed_noise(plant, noise, plant_source, prefix)
+            transformation, plant = noisy, noisy.plant
         if asked[0] is not None:
             with one_thread_if_small(plant.nx):
-                transformation = _transformed(asked[0], plant, *asked[1:])
+                later = _transformed(asked[0], plant, *asked[1:])
+            if later is not None:
+                transformation = later if transformation is None else transformation.then(later)
         plant = plant if transformation is None else transformation.plant
+        if noisy is not None and plant.state_names == noisy.plant.state_names:
+            options = _with_options(options, more, checked.method.id)
     elif model is None and reference is not None and reference.transform is not None:
         raise SpecError(
             f"{source}: plant.transform is for linear plants with constant matrices, which {plant_source.name} is not: "
             "remove it.",
             path="plant.transform",
+        )
+    inputs = None if checked.inputs is None else checked.inputs.model_dump()
+    if inputs is not None and inputs["hold"] and isinstance(plant, DescriptorSystem) and not plant.is_discrete:
+        raise SpecError(
+            f"{source}: inputs.hold is for plants on samples, and a continuous design takes inputs as straight lines "
+            "between rows: sample the plant (transform: sample_time).",
+            path="inputs.hold",
         )
     return Spec(
         name=checked.name,
@@ -706,11 +780,61 @@ def spec_of(document: Mapping[str, Any], source: Path, *, plant_changes: Mapping
         scenario=built_scenario(checked.scenario, plant, source),
         model=model,
         calibrate=None if checked.calibrate is None else checked.calibrate.model_dump(exclude_none=True),
+        noise=noise or None,
+        inputs=inputs,
     )
 
 
+def _placed_noise(plant: Any, noise: Mapping[str, Any], source: Path, prefix: str, **more: Any) -> Any:
+    """Return what `with_noise` makes of a plant; an error gets its place in the document."""
+    from obsynth.analysis.transformations.noise import with_noise
+
+    try:
+        return with_noise(plant, **noise, **more)
+    except SpecError as error:
+        raise SpecError(f"{source}: {error.args[0]}", path=joined(prefix, error.path or "")) from error
+
+
+def _noisy_model(
+    model: DAEModel,
+    section: DAESection,
+    noise: Mapping[str, Any],
+    method: str,
+    options: Mapping[str, Any],
+    source: Path,
+    prefix: str,
+) -> tuple[DAEModel, dict[str, Any]]:
+    """Return a nonlinear plant with states for its noise, and the options of its method with variances from it."""
+    steps = {"integration": options["integration"]} if options.get("integration") == "radau" else {}
+    given = {"process_noise": section.process_noise, "dt": options.get("dt"), **steps}
+    made, more = _placed_noise(model, noise, source, prefix, **given)
+    return made, _with_options(options, more, method)
+
+
+def _with_options(options: Mapping[str, Any], more: Mapping[str, Any], method: str) -> dict[str, Any]:
+    """Return options with others that the method has, where they are not given; of those by name, what is missing."""
+    from obsynth.methods.registry import REGISTRY, method_class
+
+    known = {field.name for field in fields(method_class(method))} if method in REGISTRY else set()
+    found = dict(options)
+    for name, value in more.items():
+        if name not in known:
+            continue
+        if name not in found:
+            found[name] = value
+        elif isinstance(value, dict) and isinstance(found[name], dict):
+            found[name] = {**value, **found[name]}
+    return found
+
+
 def _linearised(
-    wanted: TransformSection | None, model: DAEModel, section: DAESection, folder: Path, source: Path, prefix: str
+    wanted: TransformSection | None,
+    model: DAEModel,
+    section: DAESection,
+    folder: Path,
+    noise: Mapping[str, Any],
+    source: Path,
+    prefix: str,
 ) -> DescriptorSystem | None:
     """Return the linear model of a nonlinear plant where a spec asks for one; ``folder``: of the plant's file."""
     constants, box = boxed_constants(section, folder)
@@ -721,13 +845,6 @@ def _linearised(
                 f"{source}: {joined(prefix, 'constants')}: tolerances are for the linear model of a nonlinear plant: "
                 "add transform: {linearise: {at: equilibrium}}, or write numbers.",
                 path=joined(prefix, "constants"),
-            )
-        stated = [name for name in _NOISE if getattr(section, name) is not None]
-        if stated:
-            raise SpecError(
-                f"{source}: {joined(prefix, stated[0])} is for the linear model of a nonlinear plant: add transform: "
-                "{linearise: {at: equilibrium}}, or state the variances R and Q of the nonlinear method.",
-                path=joined(prefix, stated[0]),
             )
         return None
     where = joined(prefix, "transform")
@@ -740,7 +857,14 @@ def _linearised(
     from obsynth.analysis.transformations.entries_in_constants import box_of_model
     from obsynth.analysis.transformations.linearisation import linearise
 
-    arguments = wanted.linearise.model_dump(exclude_none=True) | {name: getattr(section, name) for name in _NOISE}
+    arguments = wanted.linearise.model_dump(exclude_none=True)
+    if noise:
+        model, more = _placed_noise(model, noise, source, prefix, process_noise=section.process_noise)
+    else:
+        white = {name: item for name, item in (section.sensor_noise or {}).items() if isinstance(item, (int, float))}
+        more = {"sensor_noise": white or None, "process_noise": section.process_noise}
+    arguments["given"] = more.pop("given", {}) | arguments.get("given", {})
+    arguments |= more
     tolerances |= arguments.pop("constants", {})
     if not tolerances and (box or section.variation is not None):
         raise SpecError(

@@ -27,6 +27,7 @@ SCHEMA_VERSION = 1
 
 # Tags of unions appear in the locations of pydantic's errors; the bracket marks them for removal.
 _FILE, _LIST, _INLINE, _VARYING, _ONE, _NONLINEAR = "<file>", "<list>", "<inline>", "<varying>", "<one>", "<dae>"
+_COLOURED = "<coloured>"
 
 
 def _kind_of_plant(value: Any) -> str:
@@ -75,6 +76,26 @@ class BoxSection(Section):
     file: Text | None = None
 
 
+class ColouredNoise(Section):
+    """Noise of a sensor that is not white; see `obsynth.with_noise`."""
+
+    deviation: Positive | Literal["unknown"]
+    correlation: Positive | Text | None = None
+    white: Positive | Literal["unknown"] | None = None
+
+
+def _kind_of_noise(value: Any) -> str:
+    return _COLOURED if isinstance(value, dict) else _ONE
+
+
+SensorNoises = dict[
+    Text, Annotated[Annotated[Positive, Tag(_ONE)] | Annotated[ColouredNoise, Tag(_COLOURED)],
+                    Discriminator(_kind_of_noise)]
+]  # fmt: skip
+#: Offsets and walks: a number, or what a calibration is to find.
+Sizes = dict[Text, Literal["unknown"] | Positive]
+
+
 class PlantSection(Section):
     """A plant, matrix by matrix."""
 
@@ -99,7 +120,9 @@ class PlantSection(Section):
     operating_point: dict[Text, float] | None = None
     scales: dict[Text, float] | None = None
     units: dict[Text, str] | None = None
-    sensor_noise: dict[Text, Positive] | None = None
+    sensor_noise: SensorNoises | None = None
+    offset: Sizes | None = None
+    walks: Sizes | None = None
     constants: dict[Text, Any] | None = None
     entries: dict[Text, list[EntrySection]] | None = None
     tolerance: dict[Text, Text | float] | None = None
@@ -162,7 +185,9 @@ class DAESection(Section):
     variation: Literal["constant", "varying"] | None = None
     box: BoxSection | None = None
     definitions: dict[Text, Text] | None = None
-    sensor_noise: dict[Text, Positive] | None = None
+    sensor_noise: SensorNoises | None = None
+    offset: Sizes | None = None
+    walks: Sizes | None = None
     process_noise: dict[Text, Positive] | None = None
     transform: TransformSection | None = None
 
@@ -272,7 +297,17 @@ class CalibrateSection(Section):
     level: Annotated[float, Field(gt=0.0, lt=1.0)] | None = None
     starts: Annotated[int, Field(ge=1)] | None = None
     seed: Annotated[int, Field(ge=0)] | None = None
+    sensor_noise: dict[Text, dict[Text, float | Text]] | None = None
+    offset: dict[Text, Literal["unknown"]] | None = None
+    walks: dict[Text, Literal["unknown"]] | None = None
     digest: Text | None = None
+
+
+class InputsSection(Section):
+    """When the known inputs of a row act."""
+
+    hold: Literal["begins", "ends"] | None = None
+    delay: Annotated[int, Field(ge=-10_000, le=10_000)] = 0
 
 
 class SpecDocument(Section):
@@ -290,4 +325,5 @@ class SpecDocument(Section):
     ]
     method: MethodSection = Field(default_factory=MethodSection)
     scenario: ScenarioSection | None = None
+    inputs: InputsSection | None = None
     calibrate: CalibrateSection | None = None

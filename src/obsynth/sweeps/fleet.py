@@ -7,7 +7,7 @@ import io
 import json
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,7 +18,6 @@ from obsynth.data.run import run_on_data
 from obsynth.errors import ObsynthError, SpecError
 from obsynth.experiments.assumptions import file_digest
 from obsynth.files.inputs import input_file
-from obsynth.files.outputs import write_atomically
 from obsynth.methods.handing_on import require_verified
 from obsynth.methods.verifying import verify
 from obsynth.results.design import ObserverDesign
@@ -29,10 +28,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _KIND = "obsynth fleet result"
-#: What is kept of a run in its file.
-_KEPT = ("name", "status", "message", "rows", "statuses", "alarms", "largest")
-#: Letters of a run's name in the names of its files.
-LONGEST_STEM = 80
 #: What ends the name of a gain set; logs by their suffix.
 GAINS_ENDING = ".gains.json"
 LOG_ENDINGS = (".csv", ".tsv", ".parquet", ".tdms", ".mf4", ".mdf", ".dat")
@@ -86,14 +81,9 @@ class Fleet(ResultTable):
 
     runs: tuple[FleetRun, ...]
 
-    def __len__(self) -> int:
-        return len(self.runs)
-
     @property
-    def counts(self) -> dict[str, int]:
-        """Number of runs by status."""
-        statuses = sorted({run.status for run in self.runs})
-        return {status: sum(run.status == status for run in self.runs) for status in statuses}
+    def _found(self) -> Sequence[FleetRun]:
+        return self.runs
 
     def rows(self) -> tuple[list[str], list[list[Any]]]:
         """Return the table as a header and rows: one column for each alarm and each largest value of any run."""
@@ -206,15 +196,15 @@ def run_fleet(
     if wrong:
         raise SpecError(f"{', '.join(wrong)}: use some of {', '.join(known)}.", path=wrong[0])
     pairs = _pairs(_files(gains, (GAINS_ENDING,), "gains"), _files(data, LOG_ENDINGS, "data"), options)
-    place = ResultFolder(folder, _KIND, _KEPT, letters=LONGEST_STEM)
+    place = ResultFolder(folder, _KIND, FleetRun, ending=".csv")
     return Fleet(
         carried_out(
             pairs,
             _run,
             executor=executor,
             told=progress,
-            known=lambda pair: _known(pair, place),
-            kept=lambda pair, outcome: _kept(pair, *outcome, place),
+            known=place.known,
+            kept=lambda pair, outcome: place.kept(pair, *outcome),
         )
     )
 
@@ -279,24 +269,6 @@ def _largest(text: str) -> dict[str, float]:
 
     table = pd.read_csv(io.StringIO(text))
     settled = table if "status" not in table else table[table["status"] != "warm-up"]
-    chosen = [name for name in table.columns if name.startswith(("fhat[", "thetahat[", "r["))]
+    chosen = [name for name in table.columns if name.startswith(("fhat[", "r["))]
     values = {name: pd.to_numeric(settled[name], errors="coerce").abs().max() for name in chosen}
     return {name: float(value) for name, value in values.items() if np.isfinite(value)}
-
-
-def _kept(pair: _Pair, run: FleetRun, text: str, place: ResultFolder) -> FleetRun:
-    """Write the estimates, then the result."""
-    table = write_atomically(place.file(pair.name, pair.key, ".csv"), text) if text else None
-    place.keep(pair.name, pair.key, run, sha256=hashlib.sha256(text.encode()).hexdigest() if text else None)
-    return replace(run, file=table)
-
-
-def _known(pair: _Pair, place: ResultFolder) -> FleetRun | None:
-    """Return a run that is there already, whole and of the same files; a damaged one is made again."""
-    body, table = place.known(pair.name, pair.key), place.file(pair.name, pair.key, ".csv")
-    if body is None:
-        return None
-    digest = body.get("sha256")
-    if digest is not None and (not table.is_file() or hashlib.sha256(table.read_bytes()).hexdigest() != digest):
-        return None
-    return FleetRun(**{name: body[name] for name in _KEPT}, file=None if digest is None else table)

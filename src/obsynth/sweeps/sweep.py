@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any, get_args
 import numpy as np
 
 from obsynth.errors import ObsynthError, SpecError
-from obsynth.files.outputs import write_atomically
 from obsynth.methods.designing import design
 from obsynth.methods.registry import Plant
+from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.progress import RunsProgress, progress_of_runs
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import gain_set_bytes, load, loaded, plain
@@ -36,10 +36,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _KIND = "obsynth sweep result"
-#: What is kept of a result in its file.
-_KEPT = ("name", "parameters", "status", "message", "condition", "signals", "claims", "facts", "seconds")
-#: Letters of a case's name in the names of its files.
-LONGEST_STEM = 60
 _PLANTS = get_args(Plant)
 
 
@@ -114,14 +110,9 @@ class Sweep(ResultTable):
 
     results: tuple[SweepResult, ...]
 
-    def __len__(self) -> int:
-        return len(self.results)
-
     @property
-    def counts(self) -> dict[str, int]:
-        """Number of cases by what they came to."""
-        found = [result.status for result in self.results]
-        return {status: found.count(status) for status in STATUSES.values() if status in found}
+    def _found(self) -> Sequence[SweepResult]:
+        return self.results
 
     def rows(self) -> tuple[list[str], list[list[Any]]]:
         """Return the header and the rows of the table; what does not apply is empty."""
@@ -145,6 +136,22 @@ class Sweep(ResultTable):
             for result in self.results
         ]
         return header, rows
+
+    def values(self, name: str) -> FloatArray:
+        """Return a claim, or the value of a row of the report, of each case; NaN where there is none.
+
+        Parameters
+        ----------
+        name : str
+            Of the claim or of the row, such as ``"gain"``.
+        """
+        found = np.full(len(self.results), np.nan)
+        for i, result in enumerate(self.results):
+            if name in result.claims:
+                found[i] = result.claims[name]
+            elif result.status == STATUSES[0]:
+                found[i] = next((row.value for row in result.design.report.checks if row.name == name), np.nan)
+        return found
 
     def plot(self, claim: str | None = None, *, parameter: str | None = None) -> Figure:
         """Draw a claim of every case over a parameter; cases without a design are marked by what they came to.
@@ -208,7 +215,7 @@ def sweep(
         The cases or parameters are malformed, or the folder cannot be written.
     """
     made = _cases(cases, parameters or {}, method)
-    place = None if folder is None else ResultFolder(folder, _KIND, _KEPT, letters=LONGEST_STEM)
+    place = None if folder is None else ResultFolder(folder, _KIND, SweepResult, ending=".gains.json")
     with progress_of_runs(progress) as told:
         return Sweep(
             carried_out(
@@ -217,8 +224,10 @@ def sweep(
                 executor=executor,
                 told=told,
                 at_start=True,
-                known=lambda case: None if place is None else _known(case, place),
-                kept=lambda case, result: result if place is None else _kept(case, result, place),
+                known=lambda case: None if place is None else place.known(case, parameters=case.parameters),
+                kept=lambda case, result: (
+                    result if place is None else place.kept(case, replace(result, content=None), result.content)
+                ),
             )
         )
 
@@ -288,30 +297,6 @@ def _designed(case: SweepCase) -> ObserverDesign:
     )
     notes = () if spec.transformation is None else spec.transformation.notes
     return found.replace(notes=(*notes, *found.notes)) if notes else found
-
-
-def _kept(case: SweepCase, result: SweepResult, place: ResultFolder) -> SweepResult:
-    """Write a gain set, then its result, and return the result with the file."""
-    gains = place.file(case.name, case.key, ".gains.json")
-    written = None if result.content is None else write_atomically(gains, result.content)
-    place.keep(case.name, case.key, result, gains=None if written is None else written.name)
-    return replace(result, file=written, content=None)
-
-
-def _known(case: SweepCase, place: ResultFolder) -> SweepResult | None:
-    """Return the result of a case that is there already, whole and of the same data; a damaged one is made again."""
-    body = place.known(case.name, case.key)
-    if body is None:
-        return None
-    gains = None if body.get("gains") is None else place.folder / str(body["gains"])
-    if gains is not None:
-        try:
-            load(gains)
-        except SpecError:
-            return None
-    kept = {name: body[name] for name in _KEPT}
-    own = {"name": case.name, "parameters": case.parameters, "signals": tuple(body["signals"])}
-    return SweepResult(**{**kept, **own}, file=gains)
 
 
 def _cell(value: Any) -> Any:

@@ -9,9 +9,9 @@ import json
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast
 
 from obsynth.errors import SpecError
 from obsynth.files.inputs import input_file, read_json
@@ -180,6 +180,8 @@ def _distinct(cases: list[SweepCase]) -> list[SweepCase]:
 STATUSES = {0: "designed", 2: "malformed", 3: "impossible", 4: "infeasible", 5: "unknown", 6: "unverified"}
 #: Digits of the digest of a piece of work in the names of its files.
 DIGITS = 16
+#: Letters of its name there.
+LONGEST_STEM = 60
 _Item = TypeVar("_Item")
 _Outcome = TypeVar("_Outcome")
 _Result = TypeVar("_Result")
@@ -187,6 +189,20 @@ _Result = TypeVar("_Result")
 
 class ResultTable(ABC):
     """Results with a row each."""
+
+    @property
+    @abstractmethod
+    def _found(self) -> Sequence[Any]:
+        """The results, each with a status."""
+
+    def __len__(self) -> int:
+        return len(self._found)
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Number of results by what they came to."""
+        found = [result.status for result in self._found]
+        return {status: found.count(status) for status in ("run", *STATUSES.values()) if status in found}
 
     @abstractmethod
     def rows(self) -> tuple[list[str], list[list[Any]]]:
@@ -234,33 +250,52 @@ def carried_out(
     return tuple(found[i] for i in range(len(items)))
 
 
-class ResultFolder:
-    """Results of pieces of work, in files of a folder by the first ``letters`` of their names and digests."""
+class ResultFolder(Generic[_Result]):
+    """Results of pieces of work with a name and a digest each, and what they made: two files of a folder for each.
 
-    def __init__(self, folder: str | Path, kind: str, fields: tuple[str, ...], *, letters: int) -> None:
-        self.folder, self.kind, self.fields, self.letters = Path(folder), kind, fields, letters
+    The fields of a result but ``file`` and ``content`` are kept; what was made has the name that ``ending`` ends.
+    """
+
+    def __init__(self, folder: str | Path, kind: str, record: type[_Result], *, ending: str) -> None:
+        self.folder, self.kind, self.ending = Path(folder), kind, ending
+        self.record = cast(Any, record)
+        self.fields = [item.name for item in fields(self.record) if item.name not in ("file", "content")]
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise SpecError(f"{folder} cannot be used as a folder: {error.strerror}.", path=str(folder)) from error
 
-    def file(self, name: str, key: str, ending: str) -> Path:
+    def _file(self, item: Any, ending: str) -> Path:
         """Return a file of a piece of work: its name in letters that every file may have, and its digest."""
-        stem = "".join(letter if letter.isalnum() or letter in "-_." else "-" for letter in name)[: self.letters]
-        return self.folder / f"{stem}-{key[:DIGITS]}{ending}"
+        stem = "".join(letter if letter.isalnum() or letter in "-_." else "-" for letter in item.name)[:LONGEST_STEM]
+        return self.folder / f"{stem}-{item.key[:DIGITS]}{ending}"
 
-    def keep(self, name: str, key: str, result: object, **more: Any) -> None:
-        """Write the fields of a result, and what else is known of it."""
-        body = {"kind": self.kind, "key": key, **{item: getattr(result, item) for item in self.fields}, **more}
-        write_atomically(self.file(name, key, ".result.json"), json.dumps(plain(body), indent=1) + "\n")
+    def kept(self, item: Any, result: _Result, content: bytes | str | None) -> _Result:
+        """Write what was made, then the result; return the result with the file."""
+        file = write_atomically(self._file(item, self.ending), content) if content else None
+        body = {name: getattr(result, name) for name in self.fields}
+        known = {"kind": self.kind, "key": item.key, "sha256": None if file is None else _digest_of(file)}
+        write_atomically(self._file(item, ".result.json"), json.dumps(plain({**known, **body}), indent=1) + "\n")
+        return replace(result, file=file)  # type: ignore[type-var]
 
-    def known(self, name: str, key: str) -> dict[str, Any] | None:
-        """Return the result that is there, `None` where it is missing, damaged, or of other work."""
-        file = self.file(name, key, ".result.json")
+    def known(self, item: Any, **own: Any) -> _Result | None:
+        """Return a result that is there already, whole and of the same work; `None` where it is to be made again."""
+        written, file = self._file(item, ".result.json"), self._file(item, self.ending)
         try:
-            body = read_json(file, where=str(file)) if file.is_file() else None
+            body = restored(read_json(written, where=str(written))) if written.is_file() else None
         except SpecError:
             return None
-        if not isinstance(body, dict) or not {"kind", "key", *self.fields} <= set(body):
+        if not isinstance(body, dict) or not {"kind", "key", "sha256", *self.fields} <= set(body):
             return None
-        return restored(body) if (body["kind"], body["key"]) == (self.kind, key) else None
+        if (body["kind"], body["key"]) != (self.kind, item.key):
+            return None
+        made = body["sha256"] is not None
+        if made and (not file.is_file() or _digest_of(file) != body["sha256"]):
+            return None
+        values = {name: tuple(body[name]) if isinstance(body[name], list) else body[name] for name in self.fields}
+        found: _Result = self.record(**{**values, **own}, file=file if made else None)
+        return found
+
+
+def _digest_of(file: Path) -> str:
+    return hashlib.sha256(file.read_bytes()).hexdigest()

@@ -189,6 +189,10 @@ def _fault_columns(
     target[nz + n : nz + n + nf] = np.eye(nf)
     target[nz + n + nf :] = np.eye(nf)
     late = np.array(observer.fault_delays, dtype=np.int64)
+    if len(late) != nf:
+        raise PreconditionError(
+            "Not every fault is estimated, so none has a guaranteed interval.", condition="fault interval"
+        )
     if (late > 1).any():
         raise PreconditionError(
             "A fault estimate that lags by more than one sample has no guaranteed interval.", condition="fault interval"

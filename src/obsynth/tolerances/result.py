@@ -4,15 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from obsynth.plants.constants import ConstantsBox
+from obsynth.errors import SpecError
+from obsynth.files.outputs import write_atomically
+from obsynth.methods.handing_on import require_verified
+from obsynth.methods.verifying import verify
+from obsynth.plants.constants import SAME_SHARE, ConstantsBox
+from obsynth.results.certificate_files import ROBUSTNESS, SHOWN_DIGITS, result_text
+from obsynth.results.design import ObserverDesign
+from obsynth.results.gain_sets import design_as_dict
 
 #: A design without tolerances says this.
 EXACT_MODEL = "assumes an exact model"
-#: Tolerances whose shares agree so well are one tolerance; what is to blame for less is left out.
-SAME_SHARE, LISTED_SHARE = 1e-9, 5e-3
+#: What is to blame for less is left out.
+LISTED_SHARE = 5e-3
+#: What a certificate of robustness claims.
+CLAIMS = (
+    "regular", "stable", "breaking", "loop_radius", "largest_factor", "error_per_unit", "vertex_gains", "sharing",
+    "untouched",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +67,8 @@ class Robustness:
         Modes of the plant that no constant touches and that are not stable: ``stable`` is about all others.
     not_covered : str
         For a linear model of a nonlinear plant: that its nonlinearity is not covered.
+    design : ObserverDesign, optional
+        Which all of this is about, with the tolerances that were asked for.
     """
 
     box: ConstantsBox
@@ -72,6 +87,7 @@ class Robustness:
     sharing: tuple[str, ...] = ()
     untouched: tuple[complex, ...] = ()
     not_covered: str = ""
+    design: ObserverDesign | None = None
 
     def __post_init__(self) -> None:
         for name in ("breaking", "blame", "rows", "error_per_unit", "vertex_gains"):
@@ -90,6 +106,41 @@ class Robustness:
             return None
         common = max(shares) - min(shares) <= SAME_SHARE * max(shares)
         return self.largest_factor * shares[0] if common else None
+
+    def claims(self) -> dict[str, Any]:
+        """Return what a certificate claims, as plain data."""
+        found = self.as_dict()
+        return {name: found[name] for name in CLAIMS}
+
+    @property
+    def statement(self) -> str:
+        """What holds for every plant in the box, in one sentence, with everything that it rests on."""
+        if self.assumes_exact_model or self.design is None:
+            return f"The design {EXACT_MODEL}."
+        return robustness_statement(self.claims(), self.design, design_as_dict(self.design)["sha256"])
+
+    def save(self, path: str | Path) -> Path:
+        """Write a certificate that `obsynth verify` recomputes, with the gain set inside.
+
+        Parameters
+        ----------
+        path : str or Path
+            Where to write (.json).
+
+        Raises
+        ------
+        SpecError
+            No constant has a tolerance: there is nothing to certify.
+        VerificationError
+            The design fails its own verification.
+        """
+        if self.assumes_exact_model or self.design is None:
+            raise SpecError("No constant has a tolerance: there is nothing to certify.", path="constants")
+        design = self.design.replace(report=verify(self.design))
+        require_verified(design)
+        return write_atomically(
+            path, result_text(ROBUSTNESS, {"design": self.design}, {}, self.claims(), self.statement)
+        )
 
     def facts(self) -> Iterator[tuple[str, str]]:
         """Yield label and text of what a report shows."""
@@ -157,6 +208,31 @@ class Robustness:
 
         rows = "".join(f"<tr><th>{escape(a)}</th><td>{escape(b)}</td></tr>" for a, b in self.facts())
         return f"<table>{rows}</table>"
+
+
+def robustness_statement(claims: Mapping[str, Any], design: ObserverDesign, digest: str) -> str:
+    """Return what claims over the box of a design's plant say, in one sentence; ``digest`` is that of the gain set."""
+    plant, _ = design.linear
+    uncertain = plant.uncertainty
+    box = "an exact model" if uncertain is None else uncertain.box.phrase
+    where = ", ".join(f"{name} = {value:.6g}" for name, value in claims["breaking"].items())
+    verdicts = {"proved": "proved", "refuted": f"refuted at {where}" if where else "refuted", "open": "not decided"}
+    lasting = f" but for {len(claims['untouched'])} mode(s) that no constant touches" if claims["untouched"] else ""
+    words = [
+        f"regular of index 1 ({verdicts.get(claims['regular'])})",
+        f"stable{lasting} ({verdicts.get(claims['stable'])})",
+    ]
+    radius, factor = claims["loop_radius"], claims["largest_factor"]
+    if radius is None:
+        words.append("no bound of the observer's error is known")
+    elif radius < 1.0:
+        words.append(f"the observer's error keeps within bounds for ever (loop radius {radius:.4g})")
+    else:
+        words.append(f"bounds of the observer's error may grow (loop radius {radius:.4g})")
+    if factor is not None:
+        words.append(f"also for tolerances up to {factor:.4g} times as large")
+    linear = "" if uncertain is None or not uncertain.not_covered else f"; {uncertain.not_covered}"
+    return f"For every plant with {box}: {', '.join(words)}{linear}. Gain set {digest[:SHOWN_DIGITS]}."
 
 
 def _top(shares: Mapping[str, float], most: int = 4) -> str:

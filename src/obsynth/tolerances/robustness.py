@@ -178,6 +178,7 @@ def robustness(
         tuple(name for name, found in told_from_faults(plant).items() if found.shares),
         untouched,
         uncertain.not_covered,
+        design,
     )
 
 

@@ -37,7 +37,7 @@ from obsynth.proofs.products import as_ball
 from obsynth.results.checks import Check, upper_bound_check
 
 #: With more states of plant or observer the identities are evaluated in balls of double precision.
-MOST_EXACT = 300
+MOST_EXACT_IDENTITIES = 300
 #: Digits, in bits, in which products of three stored numbers and their sums are all but exact.
 EXACT_BITS = 320
 #: How much wider a ball of double precision is than where another machine's may lie: both hold the same number.
@@ -261,7 +261,7 @@ class ErrorModel:
     @property
     def is_evaluated_exactly(self) -> bool:
         """Whether what the identities miss comes out the same on every machine, all but one rounding."""
-        return bool(max(self.observer.order, len(self.E), self.plant.ny) <= MOST_EXACT)
+        return bool(max(self.observer.order, len(self.E), self.plant.ny) <= MOST_EXACT_IDENTITIES)
 
     def _remainder(self, kind: type[Ball] | type[ExtendedBall]) -> RemainderChannel:
         exact: Callable[[FloatArray], Any] = kind.exact

@@ -21,6 +21,10 @@ EQUALITY_TOLERANCE = 1e-9
 ROUGHLY = 4.0
 
 
+#: What an observer of the plant's own states has in common with it.
+ALIKE = ("input_names", "output_names", "state_names", "fault_names", "dt")
+
+
 @dataclass(frozen=True, eq=False)
 class Residual:
     """Error and scale (size of terms) of an identity at its worst entry, and what rounding of printed gains allows."""

@@ -25,7 +25,7 @@ from obsynth.verification.error_system import ErrorModel
 #: Imaginary parts below this are not shown.
 SHOWN_AS_REAL = 1e-12
 #: Eigenvalues that are listed; the others are counted.
-MOST_SHOWN = 6
+MOST_EIGENVALUES = 6
 
 
 def plant_information(plant: DescriptorSystem, structure: PencilStructure | None = None) -> Iterator[Check]:
@@ -61,9 +61,10 @@ def plant_information(plant: DescriptorSystem, structure: PencilStructure | None
 def _eigenvalue_text(values: Iterable[complex]) -> str:
     listed = sorted((complex(value) for value in values), key=abs, reverse=True)
     shown = [
-        f"{v.real:.4g}" if abs(v.imag) < SHOWN_AS_REAL else f"{v.real:.4g}{v.imag:+.4g}j" for v in listed[:MOST_SHOWN]
+        f"{v.real:.4g}" if abs(v.imag) < SHOWN_AS_REAL else f"{v.real:.4g}{v.imag:+.4g}j"
+        for v in listed[:MOST_EIGENVALUES]
     ]
-    return ", ".join(shown) + (f", and {len(listed) - MOST_SHOWN} more" if len(listed) > MOST_SHOWN else "")
+    return ", ".join(shown) + (f", and {len(listed) - MOST_EIGENVALUES} more" if len(listed) > MOST_EIGENVALUES else "")
 
 
 def condition_rows(conditions: Iterable[Condition]) -> Iterator[Check]:
@@ -79,12 +80,13 @@ def condition_rows(conditions: Iterable[Condition]) -> Iterator[Check]:
             condition.source,
             "condition",
             f"Unclear: {condition.detail}" if condition.unclear else condition.detail,
+            unclear=bool(condition.unclear),
         )
 
 
 #: Matrices found again may differ by this share of the largest entry of their row or column: another order of sums.
 DERIVED_TOLERANCE = 1e-9
-_MATRICES = ("E", "A", "B", "C", "D", "Bf", "Df", "Bd", "Dd")
+PLANT_MATRICES = ("E", "A", "B", "C", "D", "Bf", "Df", "Bd", "Dd")
 _MAPS = ("from_state", "from_input", "from_fault", "from_disturbance")
 _SOURCE = "the plant as written, eliminated and sampled again"
 
@@ -114,7 +116,7 @@ def derivation_rows(design: ObserverDesign, model: ErrorModel) -> Iterator[Check
     follows = upper_bound_check(
         "plant as written",
         "the plant of the design follows from it",
-        _difference(found.plant, plant, _MATRICES),
+        _difference(found.plant, plant, PLANT_MATRICES),
         DERIVED_TOLERANCE,
         source=_SOURCE,
         kind="equality",
@@ -203,6 +205,10 @@ def _sampling_rows(
 _PARTS = ("midpoint", "radius")
 
 
+#: Terms that are summed up for a row that only informs: the bound on all that follow is a little wider, and holds.
+STEPS_OF_INFORMATION = 8_192
+
+
 def _peak_gain(
     smooth: DescriptorSystem, dt: float, observer: LinearObserver, t: FloatArray, direct: FloatArray
 ) -> float:
@@ -214,6 +220,6 @@ def _peak_gain(
     az = Ball.exact(observer.Az)
     at_samples, count = Ball.exact(observer.By) @ Ball.exact(smooth.Dd), pieces.columns.shape[1]
     both = Ball(*(np.hstack([getattr(part, name) for part in (pieces.columns, at_samples)]) for name in _PARTS))
-    sums = peak_sums(az, rows, both, contraction).whole
+    sums = peak_sums(az, rows, both, contraction, most=STEPS_OF_INFORMATION).whole
     between, sampled = gathered(pieces, sums[..., :count], smooth.nd), sums[..., count:]
     return float(np.sum(between + sampled + column_norms(Ball.exact(direct))))

@@ -33,7 +33,7 @@ MOST_ROOM = 1.0
 #: A gain is claimed for disturbances that last up to one over this, rad per sample: slower ones are reported.
 SLOWEST, POINTS = 1e-7, 120
 #: With more states, of plant and observer together, fewer are looked at.
-MANY_STATES, FEWER_POINTS = 300, 40
+MANY_JOINT_STATES, FEWER_POINTS = 300, 40
 #: Frequencies beyond that at which the time is looked for after which stored numbers matter, rad per sample.
 SLOWER = tuple(10.0**-k for k in range(8, 17))
 #: Multiple poles scatter; those this close to the boundary may be on it, and this far apart they are different ones.
@@ -179,7 +179,7 @@ def _gain_rows(design: ObserverDesign, model: ErrorModel, gamma: float | None) -
         return
     system = _Composite(model)
     unit = 1.0 if plant.dt > 0.0 else system.fastest
-    few = plant.nx + observer.order <= MANY_STATES
+    few = plant.nx + observer.order <= MANY_JOINT_STATES
     points = POINTS if few else FEWER_POINTS
     frequencies = unit * np.geomspace(SLOWEST, np.pi if plant.dt > 0.0 else 10.0, points)
     angles = system.boundary_angles(unit)

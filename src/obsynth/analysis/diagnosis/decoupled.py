@@ -16,7 +16,7 @@ from obsynth.numerics.ranks import CLEAR_GAP, RankDecision, product_but_rounding
 from obsynth.plants.descriptor import DescriptorSystem
 
 #: Entries of unit rows below this are rounding of the orthogonal transformations that made them.
-ROUNDING = 1e-14
+ROTATION_ROUNDING = 1e-14
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,7 +188,7 @@ def decoupled(plant: DescriptorSystem, removed: Sequence[int], kept: Sequence[in
         units.rows[:, None] * pencil_e * units.columns * units.time, units.rows[:, None] * pencil_a * units.columns
     )
     # Rows of the orthogonal reduction have unit length: what is below rounding is nothing.
-    rows = np.where(np.abs(found.left) > ROUNDING, found.left, 0.0) * units.rows
+    rows = np.where(np.abs(found.left) > ROTATION_ROUNDING, found.left, 0.0) * units.rows
     faults = np.vstack([plant.Bf, plant.Df])[:, list(kept)]
     signals = np.block([[plant.B, np.zeros((nx, ny))], [plant.D, -np.eye(ny)]])
     sizes = np.linalg.norm(units.rows[:, None] * signals, axis=0)
@@ -226,7 +226,7 @@ def decoupled(plant: DescriptorSystem, removed: Sequence[int], kept: Sequence[in
 
 def _told(matrix: FloatArray) -> FloatArray:
     """Return a matrix of the balanced plant, in which entries are near one, without what is only rounding."""
-    size = ROUNDING * max(1.0, float(np.max(np.abs(matrix), initial=0.0)))
+    size = ROTATION_ROUNDING * max(1.0, float(np.max(np.abs(matrix), initial=0.0)))
     return np.where(np.abs(matrix) > size, matrix, 0.0)
 
 

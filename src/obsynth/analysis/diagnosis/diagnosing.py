@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from obsynth.analysis.diagnosis.exact import Questions, decided_exactly
 from obsynth.analysis.diagnosis.explanations import (
     MOST_FOR_ONE,
+    MOST_FOR_PAIRS,
     Sensor,
     hidden_motion,
     least_additions,
@@ -37,6 +38,8 @@ from obsynth.numerics.ranks import REST_TOLERANCE
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.fault_models import Exosystem, exosystem, stated_eigenvalues
 
+#: States that could be measured times faults: with more, what would help is not searched here.
+MOST_ADDITIONS = 300
 #: Zeros that are named in a sentence; the others are counted.
 MOST_ZEROS = 4
 _PART_OF_THE_BANK = (
@@ -214,6 +217,13 @@ class _Candidates:
     def sensors(self) -> tuple[Sensor, ...]:
         return state_sensors(self.plant)
 
+    @property
+    def searched(self) -> str:
+        """Which additions are searched, in words; empty where none are: each is asked anew for each fault."""
+        if self.plant.nx > MOST_FOR_ONE or len(self.sensors) * self.plant.nf > MOST_ADDITIONS:
+            return ""
+        return "state" if self.plant.nx > MOST_FOR_PAIRS else "state or pair of states"
+
     @cached_property
     def responses(self) -> SensorResponses | None:
         return SensorResponses.of(self.plant, self.sensors)
@@ -226,7 +236,7 @@ class _Candidates:
         def promising(sets: NDArray[np.int64]) -> NDArray[np.bool_]:
             return np.ones(len(sets), bool) if responses is None else responses.shows(sets, fault, beside) > 0.0
 
-        if self.plant.nx > MOST_FOR_ONE:
+        if not self.searched:
             return ()
         responses = self.responses
         return least_additions(self.plant, self.sensors, reached, promising=promising)
@@ -254,8 +264,10 @@ def _suggestion(candidates: _Candidates, name: str, shown: Question, *, step: bo
         more = [names for names in showing if names not in (*full, *constant)]
         if more:
             texts.append(f"{name}: {listed(more)} would show it, but not its size.")
-    if not texts and plant.nx:
-        texts.append(f"{name}: no further state or pair of states makes it estimable.")
+    if not candidates.searched:
+        texts.append(f"{name}: obsynth.sensor_sets searches which sensors would help.")
+    elif not texts and plant.nx:
+        texts.append(f"{name}: no further {candidates.searched} makes it estimable.")
     return texts
 
 

@@ -36,7 +36,7 @@ from obsynth.proofs.exact_arithmetic import (
 from obsynth.proofs.exact_pencils import ExactPencil
 
 #: Plants with more unknowns are decided in floating point.
-MOST_UNKNOWNS = 70
+MOST_EXACT_UNKNOWNS = 70
 #: Plants with more unknowns are not reduced exactly, as the numbers grow: their fault polynomials come from pencils.
 MOST_REDUCED = 24
 
@@ -44,7 +44,7 @@ MOST_REDUCED = 24
 def decided_exactly(plant: DescriptorSystem) -> bool:
     """Whether a plant is small enough, and made of numbers as they were written."""
     matrices = (plant.E, plant.A, plant.C, plant.Bd, plant.Dd, plant.Bf, plant.Df)
-    return plant.nx + plant.nd + plant.nf <= MOST_UNKNOWNS and not any(map(holds_computed, matrices))
+    return plant.nx + plant.nd + plant.nf <= MOST_EXACT_UNKNOWNS and not any(map(holds_computed, matrices))
 
 
 def question(plant: DescriptorSystem, removed: Sequence[int], number: int, exactly: bool | None = None) -> Question:

@@ -13,7 +13,10 @@ import numpy as np
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.pencil_points import full_svd, largest_singular_value
 from obsynth.numerics.ranks import RankDecision, rank_from
-from obsynth.numerics.scaling import LogBalance
+from obsynth.numerics.scaling import LogBalance, equilibrate_pencil, power_of_two_below
+
+#: Pencils of more columns are of plants of many parts, whose couplings outnumber what each part is made of.
+BY_LEAST_SQUARES = 40
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +37,18 @@ class PencilUnits:
         balance.add(E, rows, columns, common=m + n)
         exponents = np.round(balance.solve())
         factors = np.exp2(exponents)
-        return cls(factors[:m], factors[m : m + n], float(factors[-1]))
+        found = cls(factors[:m], factors[m : m + n], float(factors[-1]))
+        return found if n <= BY_LEAST_SQUARES else found._held_together(E, A)
+
+    def _held_together(self, E: FloatArray, A: FloatArray) -> PencilUnits:
+        """Return units with the largest entry of each row and column near one, and both matrices of one size.
+
+        Many parts that hardly touch each other pull units by least squares apart, until E looks singular."""
+        e, a = (self.rows[:, None] * part * self.columns for part in (E, A))
+        largest, moving = float(np.linalg.norm(a)), float(np.linalg.norm(e))
+        time = float(power_of_two_below(np.array(largest / moving))) if largest and moving else self.time
+        pencil = equilibrate_pencil(time * e, a)
+        return PencilUnits(self.rows * pencil.rows, self.columns * pencil.columns, time)
 
 
 @dataclass(frozen=True, eq=False)

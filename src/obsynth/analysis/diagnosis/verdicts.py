@@ -187,7 +187,7 @@ class Diagnosis:
 
     def verdict_rows(self) -> tuple[tuple[str, ...], ...]:
         """Return the table of verdicts as texts: the header, then one row per fault."""
-        header = ("fault", "detectable", "at rest", "as a step", "any course", "delay", "residual", "filter")
+        header = ("fault", "detectable", "constant", "as a step", "any course", "delay", "residual", "filter")
         rows = [
             (
                 fault.name,

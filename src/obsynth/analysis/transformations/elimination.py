@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.analysis.transformations.exact_elimination import MOST_STATES, exact_elimination, rounded_once
+from obsynth.analysis.transformations.exact_elimination import MOST_STATES_EXACTLY, exact_elimination, rounded_once
 from obsynth.analysis.transformations.recovery import (
     StateRecovery,
     Transformation,
@@ -66,7 +66,7 @@ def eliminate_algebraic_states(plant: DescriptorSystem | Transformation) -> Tran
         same = plant.dense()
         return Transformation(plant, same, "", unchanged_states(plant, same, from_state=np.eye(plant.nx)))
     with one_thread_if_small(plant.nx):
-        if plant.nx > MOST_STATES and (plant.is_sparse or _has_few_entries(plant)):
+        if plant.nx > MOST_STATES_EXACTLY and (plant.is_sparse or _has_few_entries(plant)):
             return eliminated_by_sparsity(plant)
         arrays = plant.dense()
         found = eliminated_exactly(arrays) or _eliminated_in_floating_point(arrays)

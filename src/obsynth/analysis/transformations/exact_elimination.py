@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from flint import fmpq_mat
 
 #: Plants of more states are eliminated in floating point.
-MOST_STATES = 64
+MOST_STATES_EXACTLY = 64
 #: Digits (binary) in which coordinates that are not rational are changed.
 COORDINATE_BITS = 600
 
@@ -64,7 +64,7 @@ def exact_elimination(plant: DescriptorSystem) -> ExactElimination | None:
     """Return the elimination; ``None`` for too many states, or where no state can be eliminated so."""
     from obsynth.proofs.exact_arithmetic import holds_computed
 
-    if plant.nx > MOST_STATES or origin_of(plant) is not None:
+    if plant.nx > MOST_STATES_EXACTLY or origin_of(plant) is not None:
         return None
     computed = any(holds_computed(getattr(plant, name)) for name in ("E", "A", "C", *_SIGNALS, *_DIRECT))
     found = _eliminated(plant, clean=computed)

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from obsynth.analysis.transformations.elimination import columns_of, eliminate_algebraic_states
-from obsynth.analysis.transformations.exact_elimination import MOST_STATES, sampled_origin
+from obsynth.analysis.transformations.exact_elimination import MOST_STATES_EXACTLY, sampled_origin
 from obsynth.analysis.transformations.recovery import Transformation, unchanged_states
 from obsynth.analysis.zeros import fault_zeros
 from obsynth.errors import PreconditionError, SpecError
@@ -85,7 +85,7 @@ def discretise(plant: DescriptorSystem | Transformation, sample_time: float) -> 
     Dw = np.hstack([np.zeros((smooth.ny, factor.shape[1])), smooth.Dw[:, direct]])
     changes = {"A": transition, "B": B, "Bf": Bf, "Bd": Bd, "Bw": Bw, "Dw": Dw}
     sampled = smooth.replace(**changes, dt=float(sample_time), noise_names=noise_names)
-    sampled = with_origin(sampled, sampled_origin(smooth, sample_time)) if smooth.nx <= MOST_STATES else sampled
+    sampled = with_origin(sampled, sampled_origin(smooth, sample_time)) if smooth.nx <= MOST_STATES_EXACTLY else sampled
     noise_kept = np.hstack([np.zeros((smooth.nw, factor.shape[1])), np.eye(smooth.nw)[:, direct]])
     recovery = unchanged_states(smooth, sampled, from_state=np.eye(smooth.nx), noise_kept=noise_kept)
     description = f"sampled every {sample_time:g} s (zero-order hold)"

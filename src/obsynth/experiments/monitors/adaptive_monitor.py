@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
@@ -18,20 +18,26 @@ from obsynth.analysis.transformations.elimination import algebraic_coordinates, 
 from obsynth.analysis.transformations.sampling import discretise
 from obsynth.analysis.transformations.uncertain_plant import AffinePlant, affine_plant, reduced_family
 from obsynth.errors import PreconditionError, SpecError
+from obsynth.experiments.assumptions import Assumptions
 from obsynth.experiments.monitors.adaptive_bound import Start, adaptive_bound
-from obsynth.experiments.monitors.adaptive_rule import AdaptivePlan
-from obsynth.experiments.monitors.residual_model import watches_estimates
+from obsynth.experiments.monitors.adaptive_record import AdaptivePlan
+from obsynth.experiments.monitors.adaptive_rule import AdaptiveRule
+from obsynth.experiments.monitors.monitor import Rule
+from obsynth.experiments.monitors.residual_model import noisy_plant, watches_estimates
+from obsynth.experiments.monitors.rules import NormRule
 from obsynth.numerics.arguments import is_finite_number, require_mapping
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import first_order_hold
 from obsynth.observers.linear.derived import sample_observer
 from obsynth.observers.linear.observer import LinearObserver
-from obsynth.plants.constants import ConstantsBox
+from obsynth.plants.constants import ConstantsBox, shown
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.uncertainty import ELIMINATED, SAMPLED, Uncertainty
 from obsynth.proofs.affine import AffineMatrix, affine_block, affine_zero_order_hold
 from obsynth.proofs.balls import rounded_up
 from obsynth.results.design import ObserverDesign
+from obsynth.simulation.scenario import Scenario
+from obsynth.simulation.signals import resolve
 from obsynth.tolerances.error_structure import ErrorStructure, error_structure
 from obsynth.tolerances.exact_plant import Tracking, tracking_of
 from obsynth.tolerances.responses import loop_radius
@@ -237,7 +243,7 @@ def adaptive_plan(
             same,
             reason,
             begin.norm is None,
-            watches_estimates(design),
+            watches_estimates(design) or not observer.residual_names,
             affine.box.names,
             observer.fault_names,
             observer.residual_names,
@@ -363,44 +369,28 @@ def initial_box(plant: DescriptorSystem, given: Mapping[str, Any]) -> tuple[Floa
     return center, radius
 
 
-def adaptive_statement(plan: AdaptivePlan, design: ObserverDesign) -> str:
-    """Return what an alarm proves, and what bounds may do in the long run."""
-    uncertain = design.linear[0].uncertainty
-    box = None if uncertain is None or not uncertain.box.names else uncertain.box
-    outside = "a model that is not exact" if box is None else box.sentence
-    text = (
-        "never passed without a fault since the start while constants, disturbances, noise and the start keep their "
-        f"bounds: an alarm is a fault, or {outside}; a fault that passes it need not last: an interval that excludes "
-        "zero says that it does"
-    )
+def adaptive_statement(plan: AdaptivePlan, assumed: Assumptions) -> str:
+    """Return what an alarm proves, what it rests on, and what bounds may do in the long run."""
+    uncertain, box = assumed.plant.uncertainty, assumed.box
+    kept = assumed.bounds_phrase if box is None else assumed.phrase()
+    outside = "" if box is None else f": an alarm is a fault, or {box.sentence}"
+    text = f"never passed without a fault since the start{f', with {kept}' if kept else ''}{outside}"
     if box is None:
         return text + EXACT
     steps = () if uncertain is None else uncertain.steps
     sampled = any(kind == SAMPLED for kind, _ in steps)
-    kept = (
-        "constants stay the same"
-        if box.variation == "constant"
-        else (
-            "constants may change at each sample (where the state does not jump)"
-            if sampled
-            else "constants may change at each sample (the value at k + 1 multiplies x(k+1))"
-        )
-    )
+    kept = ""
+    if box.variation != "constant":
+        kept = "; the state does not jump" if sampled else "; the value at k + 1 multiplies x(k+1)"
     radius = loop_radius(plan.bound.responses)
-    ever = (
-        ""
-        if radius < 1.0
-        else (
-            f"; the loop through the tolerances has radius {radius:.3g}: the threshold holds at each sample, but may "
-            "grow"
-        )
-    )
+    ever = "" if radius < 1.0 else (f"; it holds at each sample, but may grow (loop radius {radius:.3g})")
     held = "; inputs and disturbances are held between samples" if sampled else ""
     if plan.sample_time is not None:
-        held = "; known inputs are held between rows, which are the sample time apart, disturbances may move in between"
+        apart = shown(plan.sample_time)
+        held = f"; known inputs are held between rows, {apart} s apart, disturbances may move in between"
     missing = "" if plan.intervals or not plan.fault_names else f"; no guaranteed interval of faults: {plan.reason}"
     linear = "" if uncertain is None or not uncertain.not_covered else f"; {uncertain.not_covered}"
-    return f"{text}; {kept}{held}{ever}{missing}{linear}"
+    return f"{text}{kept}{held}{ever}{missing}{linear}"
 
 
 def tolerances_of(
@@ -417,3 +407,49 @@ def tolerances_of(
     if initial_set is not None and initial_error is not None:
         raise SpecError("Give initial_set or initial_error, not both.", path="initial_set")
     return with_tolerances(design, constants)[0], bool(asked)
+
+
+def noisy_design(design: ObserverDesign, scenario: Scenario | None) -> ObserverDesign:
+    """Return a design whose plant has the noise of a scenario; tolerances stay."""
+    if scenario is None:
+        return design
+    plant, _ = design.linear
+    noise = noisy_plant(plant, scenario, resolve(plant, scenario))
+    kept = noise.Bw.any(axis=0) | noise.Dw.any(axis=0)
+    return design.replace(plant=noise.replace(Bw=noise.Bw[:, kept], Dw=noise.Dw[:, kept], noise_names=None))
+
+
+def over_box(
+    design: ObserverDesign,
+    noisy: ObserverDesign,
+    scenario: Scenario,
+    nominal: Rule,
+    bounds: FloatArray,
+    noise_bound: float | None,
+    initial_error: float | None,
+    initial_set: Mapping[str, Any] | None,
+) -> tuple[Rule, str]:
+    """Return the pointwise rule over the box of the design's plant, from the scenario's start unless one is given, and
+    what it promises; ``noisy`` is the design with the noise that is bounded."""
+    plant, _ = design.linear
+    if not plant.is_discrete and scenario.inputs:
+        raise PreconditionError(
+            "The design is continuous in time, and the inputs of a scenario move between its samples: thresholds over "
+            "tolerances need inputs that are held. Sample the plant first (transform: sample_time).",
+            condition="discrete time",
+        )
+    state = None if scenario.observer_state is None else np.array(scenario.observer_state)
+    if initial_set is None and initial_error is None:
+        initial_set = {name: (scenario.initial_state.get(name, 0.0),) * 2 for name in plant.state_names}
+    first, _ = adaptive_plan(
+        noisy,
+        bounds,
+        noise_bound or 0.0,
+        initial_error=initial_error,
+        initial_set=initial_set,
+        observer_state=state,
+        sample_time=None if plant.is_discrete else scenario.sample_time,
+    )
+    return AdaptiveRule(first, first, cast(NormRule, nominal)), adaptive_statement(
+        first, Assumptions(noisy.linear[0], bounds, noise_bound or 0.0, initial_set, initial_error=initial_error)
+    )

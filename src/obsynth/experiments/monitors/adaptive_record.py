@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from obsynth.experiments.benches import Runs
 from obsynth.experiments.monitors.adaptive_bound import THRESHOLD_ROUNDING, AdaptiveBound
 from obsynth.numerics.arrays import FloatArray
 
@@ -26,6 +28,45 @@ class Thresholds(NamedTuple):
     channels: FloatArray
 
 
+@dataclass(frozen=True, eq=False)
+class AdaptivePlan:
+    """What an adaptive monitor is made of."""
+
+    bound: AdaptiveBound  # without a fault
+    faults: AdaptiveBound | None  # of fault estimates during a fault; ``None`` if there is none, or the same
+    same: bool
+    reason: str  # why there is none
+    start_beyond_nominal: bool
+    estimates: bool
+    names: tuple[str, ...]
+    fault_names: tuple[str, ...]
+    residual_names: tuple[str, ...]
+    sample_time: float | None = None
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Columns of a run: thresholds, intervals, and the share of each constant in them."""
+        watched = (*(f"fhat[{name}]" for name in self.fault_names), *(f"r[{name}]" for name in self.residual_names))
+        faults = [f"{end} {name}" for name in self.fault_names for end in ("lowest", "highest")]
+        return (
+            *(f"threshold {name}" for name in watched),
+            *(faults if self.intervals else ()),
+            *(f"share {name}" for name in self.names),
+        )
+
+    @property
+    def intervals(self) -> bool:
+        """Whether faults have guaranteed intervals."""
+        return bool(self.fault_names) and (self.same or self.faults is not None)
+
+    @property
+    def residuals(self) -> slice:
+        """Rows of the outputs whose norm is watched: residuals, or fault estimates where these do not see faults."""
+        if self.estimates:
+            return slice(0, len(self.fault_names))
+        return slice(len(self.fault_names), len(self.fault_names) + len(self.residual_names))
+
+
 def thresholds_of_records(
     bound: AdaptiveBound, estimates: FloatArray, inputs: FloatArray, outputs: FloatArray
 ) -> Thresholds:
@@ -44,6 +85,29 @@ def thresholds_of_records(
     rest = found + largest @ bound.rounding[m:].T + ring @ bound.same[:, m:]
     total = (bound.nominal[m:] + start[:, m:] + first.sum(axis=2) + np.abs(shift) + rest) * THRESHOLD_ROUNDING
     return Thresholds(total, first, shift, np.broadcast_to(start[:, m:], total.shape), rest, ring[:, :, :m])
+
+
+def record_columns(
+    plan: AdaptivePlan, rows: FloatArray, inputs: FloatArray, outputs: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return thresholds ``(runs, steps, no)`` and intervals of faults ``(runs, steps, nf, 2)`` over whole records."""
+    found = thresholds_of_records(plan.bound, rows @ plan.bound.structure.reading.T, inputs, outputs)
+    nf, error = len(plan.fault_names), found
+    if plan.faults is not None:
+        error = thresholds_of_records(plan.faults, rows @ plan.faults.structure.reading.T, inputs, outputs)
+    first = rows.shape[2] - found.total.shape[2]
+    middle = rows[:, :, first : first + nf] - error.shift[:, :, :nf]
+    width = error.total[:, :, :nf] - np.abs(error.shift[:, :, :nf])
+    return found.total, np.stack([middle - width, middle + width], axis=3)
+
+
+def by_run(runs: Runs, chosen: Any = slice(None)) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return rows, inputs and outputs ``(runs, steps, any)`` of some runs."""
+    rows, inputs, outputs = (
+        np.ascontiguousarray(np.moveaxis(signals[:, chosen], 1, 0))
+        for signals in (runs.rows, runs.inputs, runs.outputs)
+    )
+    return rows, inputs, outputs
 
 
 def _first_constant(bound: AdaptiveBound, v: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

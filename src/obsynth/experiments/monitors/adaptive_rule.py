@@ -1,23 +1,25 @@
-"""The adaptive threshold on a log, row by row: the recursion of `adaptive_record` with its state as plain arrays."""
+"""The adaptive threshold as a rule: row by row with its state as plain arrays, and over many runs at once."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from functools import cached_property
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
+from obsynth.experiments.benches import Runs
 from obsynth.experiments.monitors.adaptive_bound import THRESHOLD_ROUNDING, AdaptiveBound
-from obsynth.experiments.monitors.adaptive_record import thresholds_of_records
-from obsynth.experiments.monitors.online import LinearSample, Rule
-from obsynth.experiments.monitors.rules import FITTING_SHARE, NormRule
+from obsynth.experiments.monitors.adaptive_record import AdaptivePlan
+from obsynth.experiments.monitors.adaptive_screening import Screening
+from obsynth.experiments.monitors.monitor import Judged, LinearSample, Rule, Sample
+from obsynth.experiments.monitors.rules import FITTING_SHARE, NormRule, NormState, norm_of
 from obsynth.numerics.arrays import FloatArray
 
 
-@dataclass
-class AdaptiveState:
+class AdaptiveState(NamedTuple):
     """What goes from sample to sample, rings with the oldest first."""
 
     psi: FloatArray  # ``(p, nz)``: sensitivities
@@ -39,16 +41,6 @@ class AdaptiveState:
         psi, ring, eps, past, moved = (np.zeros(shape) for shape in (*shapes, *memory))
         return cls(psi, ring, eps, largest, past, moved)
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return plain data."""
-        return dict(vars(self))
-
-    @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> AdaptiveState:
-        """Return what `as_dict` described."""
-        arrays: dict[str, Any] = {name: np.array(value) for name, value in data.items() if name != "k"}
-        return cls(**arrays, k=int(data["k"]))
-
 
 @dataclass(frozen=True, eq=False)
 class AdaptiveStep:
@@ -63,15 +55,15 @@ class AdaptiveStep:
 
 def adaptive_step(
     bound: AdaptiveBound, state: AdaptiveState, estimates: FloatArray, inputs: FloatArray, outputs: FloatArray
-) -> AdaptiveStep:
-    """Take one sample: ``estimates (n,)`` as `ErrorStructure.reading` gives them; the state is changed."""
+) -> tuple[AdaptiveState, AdaptiveStep]:
+    """Take one sample: ``estimates (n,)`` as `ErrorStructure.reading` gives them; return the state after it as well."""
     *_, m, no = bound.counts
     v = np.concatenate([estimates, inputs])
     if bound.first is not None and state.k == 0:
-        state.psi[-1] = bound.first @ inputs
-    moved, first, shift = (_varying if bound.varying else _constant)(bound, state, v)
-    sizes = np.abs(np.concatenate([inputs, outputs, estimates]))
-    np.maximum(state.largest[:-1], sizes, out=state.largest[:-1])
+        state = state._replace(psi=np.vstack([state.psi[:-1], bound.first @ inputs]))
+    state, moved, first, shift = (_varying if bound.varying else _constant)(bound, state, v)
+    sizes = np.abs(np.concatenate([inputs, outputs, estimates, np.ones(1)]))
+    state = state._replace(largest=np.maximum(state.largest, sizes))
     known = bound.known(estimates, inputs)
     start = bound.start_at(state.k)
     rounding = bound.rounding @ state.largest
@@ -81,83 +73,45 @@ def adaptive_step(
     h[:m] += older[:m] + fixed[:m] + bound.solved @ bound.structure.seen(moved)
     rest = older[m : m + no] + rounding[m:] + h @ bound.same[:, m:]
     total = (bound.nominal[m:] + start[m:] + first.sum(axis=0) + np.abs(shift) + rest) * THRESHOLD_ROUNDING
-    state.ring[:-1], state.eps[:-1] = state.ring[1:], state.eps[1:]
-    state.ring[-1], state.eps[-1] = h, older[m + no :]
-    state.k += 1
-    return AdaptiveStep(total, first, shift, start[m:], rest)
+    ring, eps = np.vstack([state.ring[1:], h]), np.vstack([state.eps[1:], older[m + no :]])
+    after = state._replace(ring=ring, eps=eps, k=state.k + 1)
+    return after, AdaptiveStep(total, first, shift, start[m:], rest)
 
 
-def _constant(bound: AdaptiveBound, state: AdaptiveState, v: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+_First: TypeAlias = tuple[AdaptiveState, FloatArray, FloatArray, FloatArray]
+
+
+def _constant(bound: AdaptiveBound, state: AdaptiveState, v: FloatArray) -> _First:
     p, nz, rows, _, no = bound.counts
     if not p:
-        return np.zeros(rows), np.zeros((0, no)), np.zeros(no)
+        return state, np.zeros(rows), np.zeros((0, no)), np.zeros(no)
     w = bound.drive @ v
     seen = w[:, nz:] + state.psi @ bound.shown.T
-    state.psi = state.psi @ bound.structure.Az.T + w[:, :nz]
+    state = state._replace(psi=state.psi @ bound.structure.Az.T + w[:, :nz])
     sizes, offsets = np.abs(seen), bound.structure.offsets
     moved, shift = sizes[:, :rows].sum(axis=0), np.zeros(no)
     if offsets.any():
         middle = offsets @ seen
         moved, shift = moved + np.abs(middle[:rows]), -middle[rows:]
-    return moved, sizes[:, rows:], shift
+    return state, moved, sizes[:, rows:], shift
 
 
-def _varying(bound: AdaptiveBound, state: AdaptiveState, v: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _varying(bound: AdaptiveBound, state: AdaptiveState, v: FloatArray) -> _First:
     p, nz, rows, _, no = bound.counts
     if not p:
-        return np.zeros(rows), np.zeros((0, no)), np.zeros(no)
+        return state, np.zeros(rows), np.zeros((0, no)), np.zeros(no)
     eps = np.abs(np.einsum("jprv,jv->jpr", bound.memory, state.past)).sum(axis=0) * bound.spans[:, None]
     sizes = np.abs(bound.drive[:, nz:] @ v) * bound.spans[:, None] + eps[:, : rows + no]
-    older = state.moved[0].copy()
+    older = state.moved[0]
     into = eps[:, rows + no :].sum(axis=0) + bound.responses.tail_eps @ older
-    state.past[:-1], state.moved[:-1] = state.past[1:], state.moved[1:]
-    state.past[-1], state.moved[-1] = v, into
+    state = state._replace(past=np.vstack([state.past[1:], v]), moved=np.vstack([state.moved[1:], into]))
     tail = bound.tail_rows @ older
     first = sizes[:, rows:] + (bound.responses.tail_outputs @ older) / p
-    return sizes[:, :rows].sum(axis=0) + tail, first, np.zeros(no)
+    return state, sizes[:, :rows].sum(axis=0) + tail, first, np.zeros(no)
 
 
 #: Rings after which an error that nothing is known of is forgotten to a millionth.
 FORGETTING_RINGS = 3
-
-
-@dataclass(frozen=True, eq=False)
-class AdaptivePlan:
-    """What an adaptive monitor is made of."""
-
-    bound: AdaptiveBound  # without a fault
-    faults: AdaptiveBound | None  # of fault estimates during a fault; ``None`` if there is none, or the same
-    same: bool
-    reason: str  # why there is none
-    start_beyond_nominal: bool
-    estimates: bool
-    names: tuple[str, ...]
-    fault_names: tuple[str, ...]
-    residual_names: tuple[str, ...]
-    sample_time: float | None = None
-
-    @property
-    def columns(self) -> tuple[str, ...]:
-        """Columns of a run: thresholds, intervals, and the share of each constant in them."""
-        watched = (*(f"fhat[{name}]" for name in self.fault_names), *(f"r[{name}]" for name in self.residual_names))
-        faults = [f"{end} {name}" for name in self.fault_names for end in ("lowest", "highest")]
-        return (
-            *(f"threshold {name}" for name in watched),
-            *(faults if self.intervals else ()),
-            *(f"share {name}" for name in self.names),
-        )
-
-    @property
-    def intervals(self) -> bool:
-        """Whether faults have guaranteed intervals."""
-        return bool(self.fault_names) and (self.same or self.faults is not None)
-
-    @property
-    def residuals(self) -> slice:
-        """Rows of the outputs whose norm is watched: residuals, or fault estimates where these do not see faults."""
-        if self.estimates:
-            return slice(0, len(self.fault_names))
-        return slice(len(self.fault_names), len(self.fault_names) + len(self.residual_names))
 
 
 def norm_beyond_nominal(plan: AdaptivePlan, found: AdaptiveStep) -> float:
@@ -169,65 +123,76 @@ def norm_beyond_nominal(plan: AdaptivePlan, found: AdaptiveStep) -> float:
     return math.fsum(math.hypot(*part) for part in parts)
 
 
+class AdaptiveRuleState(NamedTuple):
+    """The state of `AdaptiveRule`."""
+
+    nominal: NormState | None  # of the bound without the box, where there is one
+    without: AdaptiveState  # without a fault, and for fault estimates during one where that is another
+    during: AdaptiveState | None
+    first: bool = True  # whether this is the first start, of which more may be known than of later ones
+    last: float | None = None
+    waiting: int = 0
+
+
 class AdaptiveRule(Rule):
     """The norm of the residual against the nominal bound and what the box adds; rows and fault estimates beside it."""
 
     GUARANTEES = True
-    KEPT = ("last", "waiting")
 
-    def __init__(self, plan: AdaptivePlan, later: AdaptivePlan, nominal: NormRule) -> None:
-        self.plan, self._nominal = plan, nominal
-        self._restarted = later.bound, later.faults
-        self._bound, self._faults = plan.bound, plan.faults
-        self._state = AdaptiveState.of(self._bound)
-        self._fault_state = None if self._faults is None else AdaptiveState.of(self._faults)
-        self.cells: tuple[float, ...] = (math.nan,) * len(plan.columns)
-        self.last: float | None = None
-        self.waiting = 0
+    def __init__(self, plan: AdaptivePlan, later: AdaptivePlan, nominal: NormRule | None) -> None:
+        self.plan, self._later, self.nominal = plan, later, nominal
+        self.table, self.columns = None if nominal is None else nominal.table, plan.columns
 
-    def _irregular(self, time: float) -> bool:
-        """Whether a row of a continuous design is not where its sampled observer expects it."""
-        dt, last = self.plan.sample_time, self.last
-        self.last = time
-        return dt is not None and last is not None and abs(time - last - dt) > FITTING_SHARE * dt
+    def init(self) -> AdaptiveRuleState:
+        """Return the state before the first sample."""
+        return self._begun(None if self.nominal is None else self.nominal.init(), self.plan)
 
-    def take(
-        self, time: float, residuals: FloatArray, evidence: Any, *, deciding: bool
-    ) -> tuple[float, float, int | None]:
-        """Return statistic and threshold: those of the residual's norm, or of the row that is passed most."""
-        if not isinstance(evidence, LinearSample):
-            self.restart()
-            self.cells = (math.nan,) * len(self.plan.columns)
-            return math.nan, math.nan, None
-        if self._irregular(time):
+    def _begun(self, nominal: NormState | None, plan: AdaptivePlan) -> AdaptiveRuleState:
+        during = None if plan.faults is None else AdaptiveState.of(plan.faults)
+        return AdaptiveRuleState(nominal, AdaptiveState.of(plan.bound), during, plan is self.plan)
+
+    def restart(self, state: AdaptiveRuleState, skipped: int = 0) -> AdaptiveRuleState:
+        """Begin again: what is known of the error at the first start holds for no other one, but its norm."""
+        nominal = state.nominal
+        if self.nominal is not None and nominal is not None:
+            nominal = self.nominal.restart(nominal)
+        return self._begun(nominal, self._later)._replace(first=False, last=state.last, waiting=state.waiting)
+
+    def step(self, state: AdaptiveRuleState, sample: Sample) -> tuple[AdaptiveRuleState, Judged]:
+        """Return the state, statistic and threshold: those of the residual's norm, or of the row passed most."""
+        said, dt = sample.said, self.plan.sample_time
+        if not isinstance(said, LinearSample):
+            return self.restart(state), Judged(math.nan, math.nan, None, (math.nan,) * len(self.columns))
+        last, state = state.last, state._replace(last=sample.time)
+        if dt is not None and last is not None and abs(sample.time - last - dt) > FITTING_SHARE * dt:
             # What the observer did over another interval is an error of its own, which must be forgotten first.
-            self.restart()
-            self.waiting = FORGETTING_RINGS * self._bound.length
-        self.waiting = max(self.waiting - 1, 0)
-        signals = evidence.inputs, evidence.outputs
-        found = error = adaptive_step(self._bound, self._state, self._bound.structure.reading @ evidence.rows, *signals)
-        if self._faults is not None and self._fault_state is not None:
-            estimates = self._faults.structure.reading @ evidence.rows
-            error = adaptive_step(self._faults, self._fault_state, estimates, *signals)
-        values, at = evidence.rows[len(evidence.rows) - len(found.total) :], self.plan.residuals
-        if self.plan.sample_time is None:
-            statistic, nominal, _ = self._nominal.take(time, residuals, evidence, deciding=deciding)
-            threshold = (nominal + norm_beyond_nominal(self.plan, found)) * THRESHOLD_ROUNDING
+            state = self.restart(state)._replace(waiting=FORGETTING_RINGS * self._later.bound.length)
+        plan = self.plan if state.first else self._later
+        signals, bound = (said.inputs, said.outputs), plan.bound
+        without, found = adaptive_step(bound, state.without, bound.structure.reading @ said.rows, *signals)
+        during, error = state.during, found
+        if plan.faults is not None and during is not None:
+            during, error = adaptive_step(plan.faults, during, plan.faults.structure.reading @ said.rows, *signals)
+        state = state._replace(without=without, during=during, waiting=max(state.waiting - 1, 0))
+        values, at = said.rows[len(said.rows) - len(found.total) :], plan.residuals
+        if dt is None and self.nominal is not None and state.nominal is not None:
+            nominal, (statistic, threshold, *_) = self.nominal.step(state.nominal, sample)
+            state = state._replace(nominal=nominal)
+            threshold = (threshold + norm_beyond_nominal(plan, found)) * THRESHOLD_ROUNDING
         else:
             statistic, threshold = math.hypot(*values[at]), math.hypot(*found.total[at])
-        nf = len(self.plan.fault_names)
-        self.cells = self._cells(values[:nf], found, error)
-        if self.waiting:
-            return math.nan, math.nan, None
-        if not deciding:
-            return math.nan, threshold, None
+        nf = len(plan.fault_names)
+        cells = self._cells(values[:nf], found, error)
+        if state.waiting or not sample.deciding:
+            return state, Judged(math.nan, math.nan if state.waiting else threshold, None, cells)
         ratios = np.abs(values) / found.total
         worst = int(np.argmax(ratios)) if len(ratios) else 0
         if statistic <= threshold and len(ratios) and ratios[worst] > 1.0:
             # The row is passed although the norm is not: it decides, in the scale of the norm's threshold.
-            return threshold * float(ratios[worst]), threshold, worst if worst < nf else None
+            value = threshold * float(ratios[worst])
+            return state, Judged(value, threshold, worst if worst < nf else None, cells)
         passed = int(np.argmax(ratios[:nf])) if nf and ratios[:nf].max() > 1.0 else None
-        return statistic, threshold, passed
+        return state, Judged(statistic, threshold, passed, cells)
 
     def _cells(self, faults: FloatArray, found: AdaptiveStep, error: AdaptiveStep) -> tuple[float, ...]:
         nf = len(faults)
@@ -242,47 +207,19 @@ class AdaptiveRule(Rule):
         shares = (first[:, watched] / error.total[watched]).mean(axis=1) if count else np.zeros(0)
         return (*cells, *shares.tolist())
 
-    def restart(self) -> None:
-        """Begin again: what is known of the error at the first start holds for no other one, but its norm."""
-        self._nominal.restart()
-        self._bound, self._faults = self._restarted
-        self._state = AdaptiveState.of(self._bound)
-        self._fault_state = None if self._faults is None else AdaptiveState.of(self._faults)
-
     def options(self) -> list[Any]:
-        """Return names of constants, how they vary, and the size of the nominal bound."""
-        return [list(self.plan.names), self._bound.varying, float(self._bound.nominal.sum())]
+        """Return names of constants, how they vary, the size of the nominal bound, and the limit without the box."""
+        bound, limit = self.plan.bound, None if self.nominal is None else self.nominal.options()
+        return [list(self.plan.names), bound.varying, float(bound.nominal.sum()), limit]
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return the state that goes from row to row, as data."""
-        return {
-            **super().as_dict(),
-            "nominal": self._nominal.as_dict(),
-            "first": self._bound is self.plan.bound,
-            "state": self._state.as_dict(),
-            "faults": None if self._fault_state is None else self._fault_state.as_dict(),
-        }
+    def statistics(self, residuals: FloatArray) -> FloatArray:
+        """Return the norm of the residual in records."""
+        return np.asarray(norm_of(residuals))
 
-    def resume(self, data: Mapping[str, Any]) -> None:
-        """Go on from what `as_dict` returned."""
-        super().resume(data)
-        if not data["first"]:
-            self._bound, self._faults = self._restarted
-        self._nominal.resume(data["nominal"])
-        self._state = AdaptiveState.from_dict(data["state"])
-        if data["faults"] is not None:
-            self._fault_state = AdaptiveState.from_dict(data["faults"])
+    @cached_property
+    def _screening(self) -> Screening:
+        return Screening.of(self.plan)
 
-
-def record_columns(
-    plan: AdaptivePlan, rows: FloatArray, inputs: FloatArray, outputs: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return thresholds ``(runs, steps, no)`` and intervals of faults ``(runs, steps, nf, 2)`` over whole records."""
-    found = thresholds_of_records(plan.bound, rows @ plan.bound.structure.reading.T, inputs, outputs)
-    nf, error = len(plan.fault_names), found
-    if plan.faults is not None:
-        error = thresholds_of_records(plan.faults, rows @ plan.faults.structure.reading.T, inputs, outputs)
-    first = rows.shape[2] - found.total.shape[2]
-    middle = rows[:, :, first : first + nf] - error.shift[:, :, :nf]
-    width = error.total[:, :, :nf] - np.abs(error.shift[:, :, :nf])
-    return found.total, np.stack([middle - width, middle + width], axis=3)
+    def passed_in(self, runs: Runs, norm: FloatArray, limits: FloatArray, onset: int | None) -> NDArray[np.bool_]:
+        """Return where runs pass a threshold; nothing is computed in full that bounds decide."""
+        return self._screening.passed_in(runs, norm, limits, onset)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,24 +18,29 @@ from obsynth.experiments.monitors.learned_levels import (
     HOLD,
     SETTLING,
     Statistics,
+    conformal_levels,
+    is_conformal,
     learned_levels,
     rows_needed,
 )
-from obsynth.experiments.monitors.online import Evidence, LinearSample, OnlineMonitor, Rule
-from obsynth.files.inputs import read_json
+from obsynth.experiments.monitors.monitor import Evidence, Judged, LinearSample, Monitor, Rule, Sample
 from obsynth.files.outputs import FileKind, write_atomically
+from obsynth.methods.registry import error_model
 from obsynth.numerics.arguments import is_finite_number
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.numerics.autoregression import Autoregression, fitted_autoregression
 from obsynth.observers.linear.observer import LinearObserver
+from obsynth.results.certificate_files import opened, sealed
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import digest_of, gain_set_digest, plain, restored
 
 KIND = "obsynth learned thresholds"
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 LEARNED = FileKind("learned thresholds of obsynth", rb'\A\s*\{\s*"kind":\s*"obsynth learned thresholds"')
 #: Columns that are watched at most, and the least share of a column's variance that others leave unexplained.
 MOST_WATCHED, LEAST_NEW = 8, 1e-6
+#: A direction whose largest part is this share of its length is that of one column.
+OWN_DIRECTION = 0.99
 #: Rows without faults below which nothing is learned.
 LEAST_NORMAL = 100
 #: Seconds of the units of time in which a rate is told.
@@ -135,6 +139,7 @@ class LearnedThresholds:
             f"learned from {self.rows} rows without faults: at most one false alarm per {self.every:.6g} rows "
             f"({_duration(lasting)}) on average, in {len(self.columns)} column(s) whitened by an autoregression of "
             f"order {model.order}; alarms closer than {HOLD} rows are one"
+            + ("; the level is that of the second half of these rows" if is_conformal(self.rows, self.every) else "")
         )
         if self.holds:
             return text
@@ -158,7 +163,7 @@ class LearnedThresholds:
             "A": model.A,
             "whitener": model.whitener,
             "signatures": self.statistics.signatures,
-            "statistics": list(self.statistics.names),
+            "told": list(self.statistics.told),
             "levels": self.levels,
             "every": self.every,
             "rows": self.rows,
@@ -183,10 +188,7 @@ class LearnedThresholds:
         SpecError
             The file cannot be written.
         """
-        body = plain(self.as_dict())
-        document = {"kind": KIND, "schema_version": SCHEMA_VERSION, "sha256": digest_of(body), "thresholds": body}
-        write_atomically(Path(path), json.dumps(document, indent=1, allow_nan=False) + "\n")
-        return Path(path)
+        return write_atomically(path, sealed(KIND, SCHEMA_VERSION, plain(self.as_dict()), under="thresholds"))
 
 
 def _duration(seconds: float) -> str:
@@ -215,17 +217,11 @@ def load_thresholds(path: str | Path) -> LearnedThresholds:
         The file is none of these, or was changed.
     """
     file = Path(path)
-    document = read_json(file)
-    if not isinstance(document, dict) or document.get("kind") != KIND:
-        raise SpecError(f"{file} holds no learned thresholds.", path=str(file))
-    if document.get("schema_version") != SCHEMA_VERSION:
-        raise SpecError(
-            f"{file} was written by another version of obsynth: learn the thresholds again.", path=str(file)
-        )
+    again = "learn the thresholds again (obsynth thresholds)"
+    _, body, intact = opened(file, (KIND,), SCHEMA_VERSION, "file of learned thresholds", again, under="thresholds")
+    if not intact:
+        raise SpecError(f"{file} was changed after it was written: its digest does not match.", path=str(file))
     try:
-        body = document["thresholds"]
-        if digest_of(body) != document["sha256"]:
-            raise SpecError(f"{file} was changed after it was written: its digest does not match.", path=str(file))
         return _from_dict(restored(body))
     except SpecError:
         raise
@@ -238,15 +234,16 @@ def _from_dict(data: Mapping[str, Any]) -> LearnedThresholds:
     offset, a, whitener, signatures, levels = (
         np.asarray(data[name], dtype=np.float64) for name in ("offset", "A", "whitener", "signatures", "levels")
     )
-    names = tuple(map(str, data["statistics"]))
+    statistics = Statistics(Autoregression(offset, a, whitener), signatures, tuple(map(str, data["told"])))
     shapes = (offset.shape, a.shape[1:], whitener.shape, signatures.shape[1:], levels.shape)
-    fits = shapes == ((m,), (m, m), (m, m), (m,), (len(names),)) and len(names) == 1 + len(FORGETTING) + len(signatures)
+    fits = shapes == ((m,), (m, m), (m, m), (m,), (len(statistics.names),)) and len(statistics.told) == len(signatures)
     if not (fits and all(np.isfinite(part).all() for part in (offset, a, whitener, signatures)) and (levels > 0).all()):
         raise ValueError("its parts do not fit together")
-    model = Autoregression(read_only(offset), read_only(a), read_only(whitener))
+    for part in (offset, a, whitener, signatures):
+        part.setflags(write=False)
     return LearnedThresholds(
         columns,
-        Statistics(model, read_only(signatures), names),
+        statistics,
         read_only(levels),
         float(data["every"]),
         int(data["rows"]),
@@ -315,8 +312,11 @@ def thresholds_from_rows(
     kept, model = enough[0] if enough else min(fits, key=lambda fit: rows_needed(fit[1], 1.0))
     x = np.where(known[:, None], rows[:, kept], np.nan)
     told = tuple(names[i] for i in kept)
-    statistics = Statistics.of(model, np.diag(np.sqrt(np.nanvar(x, axis=0))), told)
-    levels = learned_levels(x, every, statistics, seed)
+    statistics = Statistics(model, *signatures(design, kept, np.sqrt(np.nanvar(x, axis=0))))
+    if is_conformal(count, every):
+        statistics, levels = conformal_levels(x, every, statistics)
+    else:
+        levels = learned_levels(x, every, statistics, seed)
     centres, scales = rows[known, :faults].mean(axis=0), rows[known, :faults].std(axis=0)
     return LearnedThresholds(
         told,
@@ -324,7 +324,7 @@ def thresholds_from_rows(
         read_only(levels.own * levels.factor),
         every,
         count,
-        rows_needed(model, every),
+        rows_needed(statistics.model, every),
         dt,
         read_only(centres),
         read_only(np.where(scales > 0.0, scales, 1.0)),
@@ -333,6 +333,34 @@ def thresholds_from_rows(
         tuple(name for i, name in enumerate(names) if i not in kept),
         settling_rows(design),
     )
+
+
+def signatures(design: ObserverDesign, kept: Sequence[int], sizes: FloatArray) -> tuple[FloatArray, tuple[str, ...]]:
+    """Return directions ``(s, m)`` of a step in the columns that are watched, of deviations ``sizes (m,)``, and what
+    each shows: a column alone, and what a constant fault of a linear design does to all of them where this is another
+    direction."""
+    names = [watched_names(design)[i] for i in kept]
+    found = list(np.diag(sizes))
+    if not isinstance(design.observer, LinearObserver):
+        return np.array(found), tuple(names)
+    errors = error_model(design)
+    observer, plant = errors.observer, errors.plant
+    if errors.Phi is not None:
+        # The observer expects faults of this course, which leave no constant behind.
+        return np.array(found), tuple(names)
+    c, direct, *_ = errors.output(slice(len(observer.state_names), None))
+    held = (np.eye(observer.order) if observer.dt > 0.0 else np.zeros_like(observer.Az)) - observer.Az
+    try:
+        gains = (direct - c @ np.linalg.solve(held, errors.fault))[kept]
+    except np.linalg.LinAlgError:
+        return np.array(found), tuple(names)
+    for name, gain in zip(plant.fault_names, gains.T, strict=True):
+        scaled = gain / sizes
+        size = float(np.linalg.norm(scaled))
+        if np.isfinite(size) and size > 0.0 and float(np.abs(scaled).max()) < OWN_DIRECTION * size:
+            found.append(gain / size)
+            names.append(f"fault {name}")
+    return np.array(found), tuple(names)
 
 
 def independent(rows: FloatArray, first: int) -> list[int]:
@@ -351,86 +379,90 @@ def independent(rows: FloatArray, first: int) -> list[int]:
     return kept
 
 
+class LearnedState(NamedTuple):
+    """The state of `LearnedRule`."""
+
+    past: FloatArray  # ``(order, m)``: rows, latest first
+    white: FloatArray  # ``(ages, m)``: whitened rows, latest last
+    means: FloatArray  # exponentially weighted, one row for each weight
+    last: float | None = None
+    taken: int = 0
+
+
 class LearnedRule(Rule):
     """The largest of all statistics in units of its level, row by row.  A row that is missing, or in which nothing may
     be decided, is as the autoregression predicts it: it adds no evidence, and takes none away."""
 
-    KEPT = ("past", "white", "means", "last", "taken")
-
-    def __init__(self, learned: LearnedThresholds, names: Sequence[str]) -> None:
+    def __init__(self, learned: LearnedThresholds, names: Sequence[str], faults: Sequence[str] = ()) -> None:
         self.learned = learned
+        self._faults = {f"fault {name}": i for i, name in enumerate(faults)}
         self._places = np.array([names.index(name) for name in learned.columns])
         templates = learned.statistics.templates()
         self._templates = templates.reshape(len(templates) * len(AGES), -1)
         self._model = learned.statistics.model
-        self._start()
 
-    def _start(self) -> None:
+    def init(self) -> LearnedState:
+        """Return the state before the first sample."""
         model = self._model
-        self.past = np.tile(model.mean, (model.order, 1))
-        self.white = np.zeros((max(AGES), model.channels))
-        self.means = np.zeros((len(FORGETTING), model.channels))
-        self.last: float | None = None
-        self.taken = 0
+        white, means = np.zeros((max(AGES), model.channels)), np.zeros((len(FORGETTING), model.channels))
+        return LearnedState(np.tile(model.mean, (model.order, 1)), white, means)
 
-    def take(
-        self, time: float, residuals: FloatArray, evidence: Any, *, deciding: bool
-    ) -> tuple[float, float, int | None]:
+    def step(self, state: LearnedState, sample: Sample) -> tuple[LearnedState, Judged]:
         """Return the largest statistic in units of its level, one as threshold, and the fault whose step it is."""
-        missing = 0 if self.last is None else round((time - self.last) / self.learned.dt) - 1
+        missing = 0 if state.last is None else round((sample.time - state.last) / self.learned.dt) - 1
         for _ in range(min(max(missing, 0), max(AGES))):
-            self._add(None)
-        self.last = time
-        self.taken += 1
-        found = watched_values(residuals, evidence)
-        if self.taken <= self.learned.settling:
+            state = self._added(state, None)
+        state = state._replace(last=sample.time, taken=state.taken + 1)
+        found = watched_values(sample.residuals, sample.said)
+        if state.taken <= self.learned.settling or not sample.deciding:
             found = None
-        if not deciding or found is None or not np.isfinite(found[self._places]).all():
-            self._add(None)
-            return math.nan, math.nan, None
-        self._add(found[self._places])
+        if found is None or not np.isfinite(found[self._places]).all():
+            return self._added(state, None), Judged(math.nan, math.nan)
+        state = self._added(state, found[self._places])
         # Products of numbers that overflow have passed any level.
         with np.errstate(over="ignore", invalid="ignore"):
-            ratios = ((self._templates @ self.white.ravel()) ** 2).reshape(-1, len(AGES)).max(axis=1)
+            ratios = ((self._templates @ state.white.ravel()) ** 2).reshape(-1, len(AGES)).max(axis=1)
             weights = np.array([(2.0 - share) / share for share in FORGETTING])
-            smooth = weights * np.sum(self.means**2, axis=1)
-            values = np.concatenate([[np.sum(self.white[-1] ** 2)], smooth, ratios]) / self.learned.levels
+            smooth = weights * np.sum(state.means**2, axis=1)
+            values = np.concatenate([[np.sum(state.white[-1] ** 2)], smooth, ratios]) / self.learned.levels
         values = np.where(np.isnan(values), np.inf, values)
-        return float(values.max()), 1.0, self._fault(found, ratios)
+        return state, Judged(float(values.max()), 1.0, self._fault(found, ratios))
 
     def _fault(self, found: FloatArray, ratios: FloatArray) -> int | None:
-        """Return the fault whose step explains most, or whose estimate is furthest from where it was."""
+        """Return the fault whose step or ramp explains most, or whose estimate is furthest from where it was."""
         names, count = self.learned.columns, len(self.learned.scales)
-        best = int(np.argmax(ratios))
-        if names[best].startswith("fhat["):
-            return int(self._places[best])
+        told = self.learned.statistics.told[int(np.argmax(ratios)) % len(self.learned.statistics.told)]
+        if told.startswith("fhat["):
+            return int(self._places[names.index(told)])
+        if told in self._faults:
+            return self._faults[told]
         if not count:
             return None
         return int(np.argmax(np.abs(found[:count] - self.learned.centres) / self.learned.scales))
 
-    def _add(self, x: FloatArray | None) -> None:
-        """Take a row, or `None` for one that is as predicted."""
+    def _added(self, state: LearnedState, x: FloatArray | None) -> LearnedState:
+        """Return the state after a row, or after one that is as predicted (`None`)."""
         model = self._model
         predicted = model.offset + sum(
-            (a @ row for a, row in zip(model.A, self.past, strict=True)), np.zeros(model.channels)
+            (a @ row for a, row in zip(model.A, state.past, strict=True)), np.zeros(model.channels)
         )
         with np.errstate(over="ignore", invalid="ignore"):
             e = np.zeros(model.channels) if x is None else model.whitener @ (x - predicted)
-        self.white = np.vstack([self.white[1:], e])
         shares = np.array(FORGETTING)[:, None]
-        self.means = (1.0 - shares) * self.means + shares * e
-        if model.order:
-            self.past = np.vstack([predicted if x is None else x, self.past[:-1]])
+        past = np.vstack([predicted if x is None else x, state.past[:-1]]) if model.order else state.past
+        means = (1.0 - shares) * state.means + shares * e
+        return state._replace(past=past, white=np.vstack([state.white[1:], e]), means=means)
 
-    def restart(self) -> None:
+    def restart(self, state: LearnedState, skipped: int = 0) -> LearnedState:
         """Keep everything: rows that are missing are predicted over."""
+        return state
 
     def options(self) -> Any:
         """Return the digest of what was learned."""
         return digest_of(plain(self.learned.as_dict()))
 
 
-def learned_monitor(design: ObserverDesign, learned: LearnedThresholds) -> OnlineMonitor:
+def learned_monitor(design: ObserverDesign, learned: LearnedThresholds) -> Monitor:
     """Return the monitor of thresholds that were learned with a design; raise `SpecError` for another design."""
     if learned.gains != gain_set_digest(design):
         raise SpecError("The thresholds were learned with another gain set: learn them again.", path="normal")
@@ -439,10 +471,10 @@ def learned_monitor(design: ObserverDesign, learned: LearnedThresholds) -> Onlin
     if missing:
         raise SpecError(f"The thresholds watch {missing[0]!r}, which the design does not say.", path="normal")
     residuals = len(observer.residual_names) if isinstance(observer, LinearObserver) else innovations(observer)
-    return OnlineMonitor(
+    return Monitor(
         "learned",
         learned.statement,
-        LearnedRule(learned, names),
+        LearnedRule(learned, names, observer.fault_names),
         residuals=residuals,
         fault_names=observer.fault_names,
         fault_scales=learned.scales,

@@ -1,7 +1,7 @@
 """Levels of alarms from rows without faults: statistics of whitened rows, and a bootstrap of all that is estimated.
 
 Residuals are whitened by their autoregression (Alwan & Roberts 1988).  Watched are Hotelling's T2, exponentially
-weighted means (MEWMA, Lowry et al. 1992) and likelihood ratios of steps and their ages (Willsky & Jones 1976).  The
+weighted means (MEWMA, Lowry et al. 1992) and likelihood ratios of steps and ramps (Willsky & Jones 1976).  The
 bootstrap makes streams from blocks of the whitened rows (Politis & Romano 1994) whose largest follow a generalised
 Pareto tail; from each it fits everything again, so that the uncertainty of a short log is in the levels, which hold in
 `SURE` of the streams (after Gandy & Kvaloy 2013).
@@ -39,38 +39,49 @@ POSITION, NO_SHAPE = 0.35, 1e-6
 RARER = (1.4, 2.0, 2.8, 4.0, 5.6, 8.0)
 #: Least sum of squares of a template.
 _NOTHING = 1e-300
+#: So many times the rows of a rate show it themselves: with 20 alarms in their second half, 1.5 times the rate is
+#: passed in 2 % of logs.
+CONFORMAL = 40
 #: A rate counts as observed when so many alarms of it are in the streams; rarer ones are extrapolated.
 OBSERVED = 10.0
 
 
 @dataclass(frozen=True, eq=False)
 class Statistics:
-    """What is computed of whitened rows: T2, two MEWMA, and for each signature the largest likelihood ratio of a step.
+    """What is computed of whitened rows: T2, two MEWMA, and for each signature the largest likelihood ratios of a step
+    and of a ramp.
 
-    ``signatures (s, m)``: directions of a step in the signals as they are.
+    ``signatures (s, m)``: directions of a step, and of a ramp, in the signals as they are; ``told``: what they show.
     """
 
     model: Autoregression
     signatures: FloatArray
-    names: tuple[str, ...]
+    told: tuple[str, ...]
 
-    @classmethod
-    def of(cls, model: Autoregression, signatures: FloatArray, told: tuple[str, ...]) -> Statistics:
-        """Return the statistics of signatures with names."""
-        means = tuple(f"MEWMA {share:g}" for share in FORGETTING)
-        return cls(model, signatures, ("T2", *means, *(f"GLR {name}" for name in told)))
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the statistics, in order."""
+        means = (f"MEWMA {share:g}" for share in FORGETTING)
+        return ("T2", *means, *(f"GLR of a {shape} in {name}" for shape in ("step", "ramp") for name in self.told))
 
-    def responses(self) -> FloatArray:
-        """Return what a step of each signature does to e, of its first p + 1 rows ``(s, p + 1, m)``: then it stays."""
+    def responses(self) -> tuple[FloatArray, FloatArray]:
+        """Return what steps, then ramps, of each signature do to e: their first p + 1 rows ``(2 s, p + 1, m)``, and
+        what each row after that adds ``(2 s, m)``."""
         gone = np.concatenate([np.zeros((1, *np.eye(self.model.channels).shape)), np.cumsum(self.model.A, axis=0)])
         left = self.signatures[:, None, :] - np.einsum("jab,sb->sja", gone, self.signatures)
-        return np.asarray(left @ self.model.whitener.T)
+        steps = np.asarray(left @ self.model.whitener.T)
+        # A ramp is a sum of steps, of which one more begins in each row.
+        return (
+            np.concatenate([steps, np.cumsum(steps, axis=1)]),
+            np.concatenate([np.zeros_like(steps[:, -1]), steps[:, -1]]),
+        )
 
     def templates(self) -> FloatArray:
-        """Return weights of the last ``max(AGES)`` rows of e, oldest first, for each signature and age, of norm 1:
-        ``(s, ages, rows, m)``."""
-        shapes = self.responses()
-        long = np.concatenate([shapes, np.repeat(shapes[:, -1:], max(AGES) - 1, axis=1)], axis=1)[:, : max(AGES)]
+        """Return weights of the last ``max(AGES)`` rows of e, oldest first, for steps and ramps of each signature and
+        age, of norm 1: ``(2 s, ages, rows, m)``."""
+        shapes, slopes = self.responses()
+        later = shapes[:, -1:] + np.arange(1, max(AGES))[:, None] * slopes[:, None, :]
+        long = np.concatenate([shapes, later], axis=1)[:, : max(AGES)]
         found = np.zeros((len(shapes), len(AGES), max(AGES), self.model.channels))
         for i, age in enumerate(AGES):
             part = long[:, :age]
@@ -86,29 +97,41 @@ class Statistics:
         for share in FORGETTING:
             smooth = lfilter([share], [1.0, share - 1.0], e, axis=1)
             found.append((2.0 - share) / share * np.sum(smooth**2, axis=-1))
-        found.extend(_likelihood_ratios(e, shape) for shape in self.responses())
+        found.extend(_likelihood_ratios(e, *response) for response in zip(*self.responses(), strict=True))
         return np.array(found)
 
 
-def _likelihood_ratios(e: FloatArray, shape: FloatArray) -> FloatArray:
-    """Return twice the largest log likelihood ratio of a step over its ages ``(runs, n)``; ``shape (p + 1, m)``."""
+def _likelihood_ratios(e: FloatArray, shape: FloatArray, slope: FloatArray) -> FloatArray:
+    """Return twice the largest log likelihood ratio over the ages of a step or ramp ``(runs, n)``, whose response is
+    ``shape (p + 1, m)`` and grows by ``slope (m,)`` in each row after these."""
     runs, n, _ = e.shape
-    last, settled = len(shape) - 1, shape[-1]
-    sums = np.concatenate([np.zeros((runs, 1)), np.cumsum(e @ settled, axis=1)], axis=1)
-    # What the first rows of a step add to a step that had settled at once, by the row at which it begins.
+    last = len(shape) - 1
+    # As if it had been straight from its first row on, by running sums; then what its first rows are besides.
+    straight = shape[-1] + (np.arange(last + 1) - last)[:, None] * slope
+    flat, rising = _sums(e @ straight[0]), _sums(e @ slope)
+    weighted = _sums((e @ slope) * np.arange(n))
     early, begun = np.zeros((runs, n)), 0
-    extra = [e @ (shape[j] - settled) for j in range(last)]
+    extra = [e @ (shape[j] - straight[j]) for j in range(last)]
     largest = np.zeros((runs, n))
-    power = np.cumsum([float(shape[min(j, last)] @ shape[min(j, last)]) for j in range(max(AGES))])
+    rows = [shape[j] if j <= last else shape[-1] + (j - last) * slope for j in range(max(AGES))]
+    power = np.cumsum([float(row @ row) for row in rows])
     for age in AGES:
         if age > n:
             break
         for j in range(begun, min(age, last)):
             early[:, : n - j] += extra[j][:, j:]
         begun = max(begun, min(age, last))
-        fit = sums[:, age:] - sums[:, :-age] + early[:, : n - age + 1]
+        fit = flat[:, age:] - flat[:, :-age] + early[:, : n - age + 1]
+        if slope.any():
+            fit += weighted[:, age:] - weighted[:, :-age]
+            fit -= np.arange(n - age + 1) * (rising[:, age:] - rising[:, :-age])
         np.maximum(largest[:, age - 1 :], fit**2 / max(power[age - 1], _NOTHING), out=largest[:, age - 1 :])
     return largest
+
+
+def _sums(values: FloatArray) -> FloatArray:
+    """Return the running sums ``(runs, n + 1)`` of values ``(runs, n)``, from nothing."""
+    return np.concatenate([np.zeros((len(values), 1)), np.cumsum(values, axis=1)], axis=1)
 
 
 def count_alarms(values: FloatArray, level: float) -> int:
@@ -201,6 +224,30 @@ class Levels(NamedTuple):
     extrapolated: bool
 
 
+def is_conformal(rows: int, every: float) -> bool:
+    """Whether so many rows show the rate themselves, so that no bootstrap has to."""
+    return rows >= CONFORMAL * every
+
+
+def conformal_levels(x: FloatArray, every: float, statistics: Statistics) -> tuple[Statistics, Levels]:
+    """Return statistics fitted to the first half of rows ``(n, m)``, and their levels from the second.
+
+    Alarms in the second half are as exchangeable with later ones as blocks of rows are: with one fewer than allowed
+    there, the mean rate of what comes is at most the stated one (split conformal: Papadopoulos et al. 2002).
+    """
+    half = len(x) // 2
+    model = fitted_autoregression(x[:half])
+    found = Statistics(model, statistics.signatures, statistics.told)
+    # A row that is missing adds no evidence.
+    runs = found.of_rows(np.nan_to_num(model.whitened(x[None])))
+    first, second = (np.moveaxis(part, 1, 0) for part in (runs[..., :half], runs[..., half:]))
+    own, _ = _union(first, every, half - SETTLING)
+    union = (second / own[None, :, None]).max(axis=1)
+    rows = int(np.asarray(np.isfinite(x[half + SETTLING :]).all(axis=1)).sum())
+    allowed = int(rows / every) - 1
+    return found, Levels(read_only(own), level_of(union, union[:, SETTLING:].size / allowed), extrapolated=False)
+
+
 def learned_levels(x: FloatArray, every: float, statistics: Statistics, seed: int = 0) -> Levels:
     """Return the levels for one alarm per ``every`` rows from rows ``(n, m)`` without faults."""
     rng = np.random.default_rng(seed)
@@ -214,7 +261,7 @@ def learned_levels(x: FloatArray, every: float, statistics: Statistics, seed: in
     for stream in streams:
         seen = np.where(known[:, None], stream[FORGOTTEN : FORGOTTEN + n], np.nan)
         again = fitted_autoregression(seen, order=model.order)
-        judged = Statistics(again, statistics.signatures, statistics.names)
+        judged = Statistics(again, statistics.signatures, statistics.told)
         found.append(judged.of_rows(again.whitened(stream[None, -rows:]))[:, 0])
     runs = np.array(found)
     total = runs[:, 0, SETTLING:].size

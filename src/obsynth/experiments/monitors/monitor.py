@@ -1,51 +1,66 @@
-"""Monitoring a residual: one statistic, one threshold, and a sentence that says what it promises."""
+"""Monitors: a statistic, a threshold, and a sentence that says what it promises; ``init`` and ``step``.
+
+A record is a scan of it, many runs are an axis before the signals, and the horizon is a number of samples or none.
+"""
 
 from __future__ import annotations
 
+import math
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.observers.estimates import Estimates
+from obsynth.observers.running import state_as_data, state_from_data
+from obsynth.plants.constants import shown
 
 if TYPE_CHECKING:
+    from obsynth.experiments.assumptions import Assumptions
+    from obsynth.experiments.benches import Runs
     from obsynth.experiments.monitors.residual_model import ResidualModel
 
 KINDS = ("paper", "pointwise", "window", "chi-square", "cusum")
 STATEMENTS: Mapping[str, str] = {
     "paper": "eq. (66) of Wang et al. 2015 with the norm of the power: not a pointwise bound, may be passed without a "
     "fault, and knows no sensor noise",
-    "pointwise": "never passed without a fault while disturbances, noise and the error at the start keep their bounds",
-    "window": "l2 norm over a window: never passed without a fault while disturbances, noise and the error at the "
-    "start keep their bounds",
-    "chi-square": "passed in a run without a fault with at most the stated probability, for Gaussian noise, after the "
-    "start is forgotten",
-    "cusum": "cumulative sum of the whitened residual: passed in a run without a fault with at most the stated "
-    "probability, for Gaussian noise, after the start is forgotten",
+    "pointwise": "never passed without a fault",
+    "window": "l2 norm of {window} samples: never passed without a fault",
+    "chi-square": "{window} samples: passed in a run without a fault with a probability of {false_alarms} at most, for "
+    "Gaussian noise, once the start is forgotten",
+    "cusum": "cumulative sum for a change of {change} deviations: passed in a run without a fault with a probability "
+    "of {false_alarms} at most, for Gaussian noise, once the start is forgotten",
 }
 #: What a statement adds for a continuous design.
-BETWEEN_SAMPLES = "; disturbances may do anything within their bounds between samples, at the stated sample time"
+BETWEEN_SAMPLES = "; disturbances move within their bounds between samples, which are {dt} s apart"
 #: The assumption of a sampled design: what happens between its samples is not in its model.
-HELD = "; inputs and disturbances are held between samples, as the sampled model has them"
+HELD = "; inputs and disturbances are held between samples"
 SAMPLED = BETWEEN_SAMPLES + "; known inputs are held between samples"
 #: The other assumptions of every bound that is never passed.
-ASSUMED = "; the plant starts at rest, and known inputs are held or go in straight lines between samples"
+ASSUMED = "; the plant starts at rest, known inputs are held or straight lines between samples"
 #: Where the residual is made not to see the faults that are modelled.
 OF_ESTIMATES = "the norm of the fault estimates, as the residual does not see the faults that are modelled: "
 
 
-def statement_of(kind: str, model: ResidualModel, *, estimates: bool) -> str:
-    """Return what a threshold promises; ``estimates``: of the fault estimates instead of the residual."""
+def statement_of(
+    kind: str, model: ResidualModel, assumed: Assumptions | None, *, estimates: bool, **numbers: float
+) -> str:
+    """Return what a threshold promises and what it rests on; ``estimates``: of the fault estimates instead of the
+    residual; ``numbers``: window, false_alarms, change and dt."""
     ending = ""
     if kind in ("pointwise", "window"):
         # Of a sampled plant disturbances may move between samples where the continuous one behind it is known.
         held = HELD if model.sampled is None else SAMPLED
         ending = held if model.flow is None else BETWEEN_SAMPLES + ASSUMED
-    return (OF_ESTIMATES if estimates else "") + STATEMENTS[kind] + ending
+    known = {name: shown(value) for name, value in numbers.items()}
+    kept = "" if assumed is None else assumed.bounds_phrase
+    words = (STATEMENTS[kind] + "{kept}" + ending).format(kept=f", with {kept}" if kept else "", **known)
+    return (OF_ESTIMATES if estimates else "") + words
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +79,7 @@ class Detection:
         The same.
     fault : str
         The isolated fault: largest estimate at (or a given number of samples after) the alarm, in its own deviations;
-        empty without an alarm.
+        of guaranteed tests the one that is there, or "one or another"; empty without an alarm.
     """
 
     kind: str
@@ -76,54 +91,259 @@ class Detection:
     fault: str
 
 
+class Evidence(NamedTuple):
+    """What a recursive observer learnt from a sample."""
+
+    theta: FloatArray  # ``(nq,)``
+    covariance: FloatArray
+    innovation: FloatArray  # ``(m,)``; less regressor times true parameters: white, N(0, I)
+    regressor: FloatArray
+    score: FloatArray  # ``(nq,)``
+    information: FloatArray  # ``(nq, nq)``
+
+
+class LinearSample(NamedTuple):
+    """What a linear observer took and gave at one row: its own rows, known inputs, outputs; deviations."""
+
+    rows: FloatArray
+    inputs: FloatArray
+    outputs: FloatArray
+    states: int  # how many of the rows are state estimates
+
+    @property
+    def faults_and_residuals(self) -> FloatArray:
+        """The rows after those of the states."""
+        return self.rows[self.states :]
+
+
+class Sample(NamedTuple):
+    """What a monitor takes: a row of estimates, deviations."""
+
+    time: float  # seconds
+    residuals: FloatArray  # ``(nr,)``
+    faults: FloatArray  # ``(nf,)``
+    said: Evidence | LinearSample | None  # by the observer; nothing in a gap
+    deciding: bool = True  # whether a decision may be taken: not in gaps, and not while a start is being forgotten
+    skipped: int = 0  # rows that were missing before this one
+
+
+class Judged(NamedTuple):
+    """What a rule says of a row: the fault by its number, if the rule knows it, and cells for columns of its own."""
+
+    statistic: float
+    threshold: float
+    fault: int | None = None
+    cells: tuple[float, ...] = ()
+
+
+class Seen(NamedTuple):
+    """What a monitor says of one row: NaN where nothing is decided; no fault stands out without an alarm."""
+
+    statistic: float
+    threshold: float
+    alarm: bool
+    fault: str
+    more: tuple[float, ...] = ()
+
+
+RuleState: TypeAlias = Any
+
+
+class MonitorState(NamedTuple):
+    """What goes from row to row."""
+
+    decided: bool  # whether a decision might be taken at the row before
+    rule: RuleState
+
+
+class Rule(ABC):
+    """A statistic and its threshold: values alone; a state is a tuple of numbers and arrays."""
+
+    #: Whether its threshold is never passed without a fault, which needs an error at the start that is as stated.
+    GUARANTEES: ClassVar[bool] = False
+    #: Thresholds ``(any,)`` by the sample since the start, where they are known beforehand.
+    table: FloatArray | None = None
+    #: Columns of a run besides statistic, threshold and alarm.
+    columns: tuple[str, ...] = ()
+    #: Whether it takes rows with missing samples (NaN) too.
+    takes_gaps: bool = False
+
+    @abstractmethod
+    def init(self) -> RuleState:
+        """Return the state before the first sample."""
+
+    @abstractmethod
+    def step(self, state: RuleState, sample: Sample) -> tuple[RuleState, Judged]:
+        """Return the state after a sample, and statistic and threshold at it."""
+
+    @abstractmethod
+    def restart(self, state: RuleState, skipped: int = 0) -> RuleState:
+        """Return the state without windows and sums: rows are missing, or nothing may be decided any more."""
+
+    @abstractmethod
+    def options(self) -> Any:
+        """Return what a saved state must share with the monitor that it is for."""
+
+    def fold(self, state: RuleState, residuals: FloatArray) -> tuple[RuleState, Any]:
+        """Return the state and the statistic ``(...)`` after residuals ``(..., nr)``, of one run or of many."""
+        raise NotImplementedError
+
+    def statistics(self, residuals: FloatArray) -> FloatArray:
+        """Return the statistic ``(steps, runs)`` of records ``(steps, runs, nr)``: a scan of `fold`."""
+        state, found = self.init(), np.empty(residuals.shape[:2])
+        for k, row in enumerate(residuals):
+            state, found[k] = self.fold(state, row)
+        return found
+
+    def passed_in(self, runs: Runs, norm: FloatArray, limits: FloatArray, onset: int | None) -> NDArray[np.bool_]:
+        """Return where runs pass thresholds ``limits (steps,)``, ``(steps, runs)``; ``norm``: their statistic."""
+        del runs, onset
+        return np.asarray(norm > limits[:, None])
+
+
 @dataclass(frozen=True, eq=False)
 class Monitor:
-    """A statistic of the residual with its threshold, for records of one length; see `obsynth.monitor`.
+    """A statistic with its threshold, for records of one length or for data of any; values alone, so that one serves
+    any number of runs.  Made by `obsynth.monitor` and `obsynth.online_monitor`.
 
     Parameters
     ----------
     kind, statement : str
         Which one, and what its threshold means.
-    threshold : FloatArray
-        ``(steps,)``; infinite where it does not decide yet.
-    floor : float
-        What rounding may add to the statistic.
-    dt : float, seconds
-        Between samples.
-    window : int
-        Samples that the statistic looks back.
-    mean : FloatArray
-        ``(nr,)``: subtracted from the residual.
-    whitener : FloatArray
-        ``(m, window nr)``, for the statistical kinds; empty otherwise.
-    change : float
-        Shift of the whitened residual that the cumulative sum is tuned for, in deviations.
+    rule : Rule
+        Statistic and threshold.
+    residuals : int
+        Columns of the residual that it watches.
+    fault_names : tuple of str
+        What an alarm may name.
     fault_scales : FloatArray
         ``(nf,)``: what fault estimates are compared in.
-    fault_names : tuple of str
-        Their names.
-    isolation_delay : int
+    horizon : int, optional
+        Samples of the records that it is for; without one, data may have any length.
+    dt : float, optional, seconds
+        Between samples of such records.
+    floor : float, optional
+        What rounding may add to the statistic.
+    isolation_delay : int, optional
         Samples from the alarm to the comparison.
-    watches_estimates : bool
+    watches_estimates : bool, optional
         Whether the fault estimates stand in place of the residual, which does not see modelled faults.
+    groups : tuple of tuple of str, optional
+        By row that is watched: an alarm of it proves that one of these faults is there.
     """
 
     kind: str
     statement: str
-    threshold: FloatArray
-    floor: float
-    dt: float
-    window: int
-    mean: FloatArray
-    whitener: FloatArray
-    change: float
-    fault_scales: FloatArray
+    rule: Rule
+    residuals: int
     fault_names: tuple[str, ...]
-    isolation_delay: int
+    fault_scales: FloatArray
+    horizon: int | None = None
+    dt: float = math.nan
+    floor: float = 0.0
+    isolation_delay: int = 0
     watches_estimates: bool = False
+    groups: tuple[tuple[str, ...], ...] = ()
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "threshold", read_only(self.threshold))
+    @property
+    def threshold(self) -> FloatArray:
+        """Thresholds ``(horizon,)`` of a record; infinite where nothing is decided yet."""
+        if self.horizon is None or self.rule.table is None:
+            raise SpecError("This monitor is for data of any length: only `step` knows its threshold.", path="monitor")
+        return read_only(self.rule.table)
+
+    @property
+    def guarantees(self) -> bool:
+        """Whether the threshold is never passed without a fault: nothing is decided while a gap is being forgotten."""
+        return self.rule.GUARANTEES
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Columns of a run besides statistic, threshold and alarm: those of an adaptive threshold."""
+        return self.rule.columns
+
+    def require_fit(self, residuals: int, fault_names: tuple[str, ...]) -> None:
+        """Refuse a design that this monitor was not made for.
+
+        Parameters
+        ----------
+        residuals : int
+            Columns of its residual.
+        fault_names : tuple of str
+            What it estimates.
+
+        Raises
+        ------
+        SpecError
+            They differ from those that are watched.
+        """
+        if residuals != self.residuals or fault_names != self.fault_names:
+            raise SpecError("The monitor was made for another design.", path="monitor")
+
+    def init(self) -> MonitorState:
+        """Return the state before the first sample."""
+        return MonitorState(False, self.rule.init())
+
+    def step(self, state: MonitorState, sample: Sample) -> tuple[MonitorState, Seen]:
+        """Take one row of estimates; return the state after it, and what the monitor sees.
+
+        Parameters
+        ----------
+        state : MonitorState
+            From `init`, or from the row before.
+        sample : Sample
+            The row.
+        """
+        inner = state.rule
+        if sample.skipped or (state.decided and not sample.deciding):
+            inner = self.rule.restart(inner, sample.skipped)
+        inner, (statistic, threshold, which, more) = self.rule.step(inner, sample)
+        after = MonitorState(sample.deciding, inner)
+        # A statistic that has overflowed has passed any threshold.
+        if math.isnan(statistic) or not math.isfinite(threshold):
+            return after, Seen(math.nan, math.nan, False, "", more)
+        if statistic <= threshold + self.floor:
+            return after, Seen(statistic, threshold, False, "", more)
+        if which is None and self.fault_names and np.isfinite(sample.faults).all():
+            which = int(np.argmax(np.abs(sample.faults) / self.fault_scales))
+        return after, Seen(statistic, threshold, True, self._named(which), more)
+
+    def _named(self, which: int | None) -> str:
+        """Return the fault of a number, or the group of faults one of which is there for certain."""
+        if which is None:
+            return ""
+        return " or ".join(self.groups[which]) if self.groups else (self.fault_names or ("",))[which]
+
+    def as_data(self, state: MonitorState) -> dict[str, Any]:
+        """Return a state as plain data, with what it must share with the monitor that goes on from it.
+
+        Parameters
+        ----------
+        state : MonitorState
+            Of this monitor.
+        """
+        return {"kind": self.kind, "options": self.rule.options(), "state": state_as_data(state)}
+
+    def from_data(self, data: Mapping[str, Any]) -> MonitorState:
+        """Return the state that `as_data` described.
+
+        Parameters
+        ----------
+        data : mapping
+            From a run with the same gain set and options.
+
+        Raises
+        ------
+        SpecError
+            The state is of another kind of monitor, or one with other options.
+        """
+        if data["kind"] != self.kind:
+            raise SpecError(
+                f"The saved state is of a run with the monitor {data['kind']!r}: use the same options.", path="state"
+            )
+        if data["options"] != self.rule.options():
+            raise SpecError("The saved state is of a run whose monitor had other options: use the same.", path="state")
+        return state_from_data(self.init(), data["state"])
 
     def statistic(self, residuals: FloatArray) -> FloatArray:
         """Return the statistic ``(steps, runs)`` of many runs at once.
@@ -142,59 +362,31 @@ class Monitor:
             raise SpecError(
                 f"The record has {len(residuals)} samples, but the monitor is for {len(self.threshold)}.", path="steps"
             )
-        if self.kind in ("paper", "pointwise"):
-            return np.asarray(np.linalg.norm(residuals, axis=2))
-        if self.kind == "window":
-            squares = np.sum(residuals**2, axis=2)
-            sums = [np.sum(part, axis=0) for part in _windows(squares, self.window)]
-            return np.asarray(np.sqrt(np.stack(sums)))
-        centred = residuals - self.mean
-        padded = np.concatenate([np.zeros((self.window - 1, *centred.shape[1:])), centred])
-        stacked = np.concatenate([padded[i : i + len(centred)] for i in range(self.window)], axis=2)
-        white = stacked @ self.whitener.T
-        return np.asarray(np.sum(white**2, axis=2)) if self.kind == "chi-square" else self._sums(white)
+        return self.rule.statistics(residuals)
 
-    def _sums(self, white: FloatArray) -> FloatArray:
-        increments = self.change * np.concatenate([white, -white], axis=2) - 0.5 * self.change**2
-        level, values = np.zeros(increments.shape[1:]), np.zeros(white.shape[:2])
-        for k in np.flatnonzero(np.isfinite(self.threshold)):
-            level = np.maximum(level + increments[k], 0.0)
-            values[k] = np.max(level, axis=1)
-        return values
-
-    def passed(self, residuals: FloatArray) -> np.ndarray:
+    def passed_in(self, runs: Runs, *, onset: int | None = None) -> NDArray[np.bool_]:
         """Return at which samples of which runs the threshold is passed, ``(steps, runs)``.
 
         Parameters
         ----------
-        residuals : FloatArray
-            ``(steps, runs, nr)``.
-        """
-        return np.asarray(self.statistic(residuals) > self.threshold[:, None] + self.floor)
-
-    def passed_in(self, runs: Any, residuals: slice, *, onset: int | None = None) -> np.ndarray:
-        """Return the same from everything that happened in many runs.
-
-        Parameters
-        ----------
         runs : Runs
-            With `rows` of the observer ``(steps, runs, rows)``.
-        residuals : slice
-            Which of them are residuals.
+            Everything that happened in them.
         onset : int, optional
             First sample at which something is wrong; with it, only whether a run passes before that, and where it
             passes first after that, need be right.
         """
-        del onset
-        return self.passed(runs.rows[:, :, residuals])
+        observer: Any = runs.observer
+        rows = observer.fault_rows if self.watches_estimates else observer.residual_rows
+        norm = self.statistic(runs.rows[:, :, rows])
+        return self.rule.passed_in(runs, norm, self.threshold + self.floor, onset)
 
     def isolated(self, faults: FloatArray, k: int) -> int:
-        """Return the number of the fault that stands out after an alarm at ``k``.
+        """Return the number of the fault that stands out after an alarm at ``k``; with `groups` it is proved.
 
         Parameters
         ----------
         faults : FloatArray
-            Fault estimates ``(steps, nf)``.
+            Fault estimates ``(steps, nf)``; of tests with `groups` the rows that are watched, each in its threshold.
         k : int
             Sample of the alarm.
         """
@@ -211,22 +403,19 @@ class Monitor:
         Raises
         ------
         SpecError
-            Another number of samples than the monitor was made for.
+            Another number of samples than the monitor was made for, or a threshold that follows inputs and outputs.
         """
-        residuals = (estimates.faults if self.watches_estimates else estimates.residuals)[:, None, :]
-        hits = np.flatnonzero(self.passed(residuals)[:, 0])
+        if self.columns:
+            raise SpecError(
+                "An adaptive threshold follows inputs and outputs, which estimates do not hold: use obsynth.evaluate, "
+                "or obsynth.online_monitor with obsynth.run_on_data.",
+                path="monitor",
+            )
+        watched = estimates.faults if self.watches_estimates else estimates.residuals
+        values = self.statistic(watched[:, None])[:, 0]
+        hits = np.flatnonzero(values > self.threshold + self.floor)
         k = int(hits[0]) if hits.size else None
-        fault = "" if k is None or not self.fault_names else self.fault_names[self.isolated(estimates.faults, k)]
-        return Detection(
-            self.kind,
-            self.statement,
-            read_only(self.statistic(residuals)[:, 0]),
-            self.threshold,
-            k,
-            None if k is None else k * self.dt,
-            fault,
-        )
-
-
-def _windows(values: FloatArray, window: int) -> list[FloatArray]:
-    return [values[max(k - window + 1, 0) : k + 1] for k in range(len(values))]
+        shown = watched if self.groups else estimates.faults
+        fault = "" if k is None or not shown.shape[1] else self._named(self.isolated(shown, k))
+        time = None if k is None else k * self.dt
+        return Detection(self.kind, self.statement, read_only(values), self.threshold, k, time, fault)

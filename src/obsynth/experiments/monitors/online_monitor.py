@@ -9,13 +9,18 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.experiments.monitors.adaptive_monitor import EXACT, adaptive_plan, adaptive_statement, tolerances_of
-from obsynth.experiments.monitors.adaptive_records_monitor import noisy_design
+from obsynth.experiments.assumptions import Assumptions
+from obsynth.experiments.monitors.adaptive_monitor import (
+    EXACT,
+    adaptive_plan,
+    adaptive_statement,
+    noisy_design,
+    tolerances_of,
+)
 from obsynth.experiments.monitors.adaptive_rule import AdaptiveRule
 from obsynth.experiments.monitors.guaranteed import data_monitor, is_guaranteed
 from obsynth.experiments.monitors.learned import LearnedThresholds, learned_monitor, load_thresholds
-from obsynth.experiments.monitors.monitor import KINDS, statement_of
-from obsynth.experiments.monitors.online import OnlineMonitor, Rule
+from obsynth.experiments.monitors.monitor import KINDS, Monitor, Rule, statement_of
 from obsynth.experiments.monitors.residual_model import ResidualModel, residual_model, watches_estimates
 from obsynth.experiments.monitors.residual_monitor import bounds_of, require_options
 from obsynth.experiments.monitors.rules import ANY_LENGTH, NormRule, WhitenedRule, parameter_monitor
@@ -28,14 +33,15 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import first_order_hold
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.plants.constants import shown
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.scenario import Scenario
 
-_FORGOTTEN = ", once the error at the start, which is not stated, is forgotten (else give a longer warm-up)"
-_AFTER_A_GAP = " (after a gap, too, while the error there is no larger than stated for the start)"
-_FROM_THE_FIRST = "; it holds from the first row on, and after a gap once the error there is forgotten"
-_NOT_CLOSER = "; rows must not be closer than the stated sample time, as noise drives the plant itself"
-_REGULAR = ", for rows that are the stated sample time apart (none further apart, where they are not regular)"
+_FORGOTTEN = ", once the start is forgotten (the warm-up)"
+_AFTER_A_GAP = " (after a gap likewise)"
+_FROM_THE_FIRST = "; from the first row on, after a gap once that is forgotten"
+_NOT_CLOSER = "; rows are no closer than {dt} s"
+_REGULAR = "; no row is further than {dt} s from the last"
 
 
 def online_monitor(
@@ -56,7 +62,7 @@ def online_monitor(
     initial_set: Mapping[str, Any] | None = None,
     normal: Any = None,
     unverified: bool = False,
-) -> OnlineMonitor:
+) -> Monitor:
     """Return a monitor for measured data, for `run_on_data`: its threshold holds however long the data are.
 
     Parameters
@@ -105,7 +111,7 @@ def online_monitor(
 
     Returns
     -------
-    OnlineMonitor
+    Monitor
         With a sentence that says what its threshold means.
 
     Raises
@@ -148,20 +154,24 @@ def online_monitor(
     _require_noise(model, noise_bound)
     bounds = _expected_bounds(design, model, disturbance_bounds, scenario)
     rule: Rule
-    if kind in ("pointwise", "window", "paper"):
+    limited = kind in ("pointwise", "window")
+    if limited or kind == "paper":
         start = 0.0 if initial_error is None else float(initial_error)
         norm, limit = _norm_rule(design, kind, model, bounds, noise_bound, start, gamma, window, dt, estimates)
         if adaptive:
             return _adaptive(design, scenario, norm, model, bounds, noise_bound, initial_error, initial_set, dt)
         _require_above_zero(limit)
         rule = norm
-        ending = (_FORGOTTEN if initial_error is None else _AFTER_A_GAP) + _more_words(kind, model, limit)
+        ending = (_FORGOTTEN if initial_error is None else _AFTER_A_GAP) + _more_words(kind, model, limit, dt)
     else:
         rule = _whitened(kind, model, bounds if scenario is None else None, window, change, false_alarms, dt)
         ending = ANY_LENGTH
-    return OnlineMonitor(
+    numbers = {"window": window, "false_alarms": false_alarms, "change": change, "dt": dt}
+    noisy = noisy_design(design, scenario).linear[0]
+    assumed = Assumptions(noisy, bounds, noise_bound or 0.0, initial_error=initial_error) if limited else None
+    return Monitor(
         kind,
-        statement_of(kind, model, estimates=estimates) + ending + EXACT,
+        statement_of(kind, model, assumed, estimates=estimates, **numbers) + ending + EXACT,
         rule,
         residuals=len(design.linear[1].residual_names),
         fault_names=design.linear[1].fault_names,
@@ -169,7 +179,7 @@ def online_monitor(
     )
 
 
-def _learned(design: ObserverDesign, normal: Any) -> OnlineMonitor:
+def _learned(design: ObserverDesign, normal: Any) -> Monitor:
     """Return the monitor of thresholds that were learned, or are to be."""
     if normal is None:
         raise SpecError(
@@ -261,15 +271,15 @@ def _norm_rule(
     return rule, limit
 
 
-def _more_words(kind: str, model: ResidualModel, limit: float) -> str:
+def _more_words(kind: str, model: ResidualModel, limit: float, dt: float) -> str:
     """Return what else the sentence of a bound must say."""
     words = ""
     if kind != "paper" and model.sensor_noise is not None and model.Bw[:, model.sensor_noise[0].shape[1] :].any():
         # The noise of the plant itself is what is gathered between samples: the closer they are, the less, but in all
         # the more of it that is of one sign.
-        words += _NOT_CLOSER
+        words += _NOT_CLOSER.format(dt=shown(dt))
     if kind != "paper" and model.continuous is not None:
-        words += _REGULAR + model.continuous.between.lasting_words(limit)
+        words += _REGULAR.format(dt=shown(dt)) + model.continuous.between.lasting_words(limit)
     return words
 
 
@@ -283,10 +293,12 @@ def _adaptive(
     initial_error: float | None,
     initial_set: Mapping[str, Any] | None,
     dt: float,
-) -> OnlineMonitor:
+) -> Monitor:
     """Return the monitor whose threshold holds for every plant within its tolerances."""
+    noisy = noisy_design(design, scenario)
+    assumed = Assumptions(noisy.linear[0], bounds, noise_bound or 0.0, initial_set, initial_error=initial_error)
     first, later = adaptive_plan(
-        noisy_design(design, scenario),
+        noisy,
         bounds,
         noise_bound or 0.0,
         initial_error=initial_error,
@@ -294,9 +306,9 @@ def _adaptive(
         sample_time=dt,
     )
     start = _FROM_THE_FIRST if initial_set is not None else _FORGOTTEN if initial_error is None else _AFTER_A_GAP
-    return OnlineMonitor(
+    return Monitor(
         "pointwise",
-        adaptive_statement(first, design) + start,
+        adaptive_statement(first, assumed) + start,
         AdaptiveRule(first, later, norm),
         residuals=len(design.linear[1].residual_names),
         fault_names=design.linear[1].fault_names,

@@ -239,6 +239,11 @@ def residual_model(
     )
 
 
+def largest_disturbances(scenario: Scenario, names: tuple[str, ...], steps: int, dt: float) -> FloatArray:
+    """Return the largest absolute value of each disturbance of a scenario; infinite where it has none."""
+    return _disturbances(scenario, names, steps, dt)[0]
+
+
 def _disturbances(
     scenario: Scenario, names: tuple[str, ...], steps: int, dt: float
 ) -> tuple[FloatArray, FloatArray, FloatArray, tuple[bool, ...]]:

@@ -9,11 +9,18 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SpecError
+from obsynth.experiments.assumptions import Assumptions
 from obsynth.experiments.benches import LinearBench, make_bench
-from obsynth.experiments.monitors.adaptive_monitor import EXACT, tolerances_of
+from obsynth.experiments.monitors.adaptive_monitor import (
+    EXACT,
+    noisy_design,
+    over_box,
+    tolerances_of,
+)
 from obsynth.experiments.monitors.guaranteed import is_guaranteed, record_monitor
-from obsynth.experiments.monitors.monitor import KINDS, Monitor, statement_of
+from obsynth.experiments.monitors.monitor import KINDS, Monitor, Rule, statement_of
 from obsynth.experiments.monitors.residual_model import ResidualModel, residual_model, watches_estimates
+from obsynth.experiments.monitors.rules import NormRule, WhitenedRule
 from obsynth.experiments.monitors.thresholds import (
     paper_threshold,
     pointwise_threshold,
@@ -133,43 +140,52 @@ def monitor(
     model = residual_model(design, scenario, estimates=estimates)
     start = 0.0 if adaptive else model.initial_error
     start = start if initial_error is None else float(initial_error)
-    bounds = bounds_of(design, model, disturbance_bounds)
-    whitener, mean = np.zeros((0, 0)), np.zeros(len(model.C))
-    if kind == "paper":
-        threshold = paper_threshold(model, bounds, start, gamma)
-    elif kind in ("pointwise", "window"):
-        inputs = scaled_inputs(model, bounds, noise_bound)
-        threshold = pointwise_threshold(model, inputs, start)
-        if kind == "window":
-            threshold = window_threshold(model, inputs, start, window)
-    else:
-        (whitener, white), mean = whitened(kind, model, window), steady_mean(model)
-        threshold = _statistical(kind, model, len(whitener), start, window, false_alarms, white=white)
-    bench = make_bench(design, scenario)
+    bounds, bench = bounds_of(design, model, disturbance_bounds), make_bench(design, scenario)
     rows = bench.observer.fault_rows if estimates else bench.observer.residual_rows
-    if model.flow is not None:
-        threshold = threshold + _straight_lines(design, scenario, model, kind, window, rows)
-    statement = statement_of(kind, model, estimates=estimates) + EXACT
-    found = Monitor(
+    rule: Rule
+    if kind in ("chi-square", "cusum"):
+        whitener, white = whitened(kind, model, window)
+        rule = WhitenedRule(
+            whitener,
+            steady_mean(model),
+            window=window,
+            change=None if kind == "chi-square" else float(change),
+            false_alarms=false_alarms,
+            dt=bench.drive.dt,
+            white=white,
+            table=_statistical(kind, model, len(whitener), start, window, false_alarms, white=white),
+        )
+    else:
+        if kind == "paper":
+            threshold = paper_threshold(model, bounds, start, gamma)
+        else:
+            inputs = scaled_inputs(model, bounds, noise_bound)
+            threshold = pointwise_threshold(model, inputs, start)
+            if kind == "window":
+                threshold = window_threshold(model, inputs, start, window)
+        if model.flow is not None:
+            threshold = threshold + _straight_lines(design, scenario, model, kind, window, rows)
+        rule = NormRule(threshold, np.inf, window=window if kind == "window" else 1, dt=bench.drive.dt)
+    noisy = noisy_design(design, scenario)
+    assumed = Assumptions(noisy.linear[0], bounds, noise_bound or 0.0, initial_error=start)
+    numbers = {"window": window, "false_alarms": false_alarms, "change": change, "dt": bench.drive.dt}
+    bounded = assumed if kind in ("pointwise", "window") else None
+    statement = statement_of(kind, model, bounded, estimates=estimates, **numbers) + EXACT
+    if adaptive:
+        rule, statement = over_box(design, noisy, scenario, rule, bounds, noise_bound, initial_error, initial_set)
+    return Monitor(
         kind,
         statement,
-        threshold,
-        _floor(bench, scenario, rows),
-        bench.drive.dt,
-        window,
-        mean,
-        whitener,
-        float(change),
-        model.fault_scales(),
-        design.linear[1].fault_names,
-        isolation_delay,
-        estimates,
+        rule,
+        residuals=len(bench.observer.residual_names),
+        fault_names=design.linear[1].fault_names,
+        fault_scales=model.fault_scales(),
+        horizon=model.steps,
+        dt=bench.drive.dt,
+        floor=_floor(bench, scenario, rows),
+        isolation_delay=isolation_delay,
+        watches_estimates=estimates,
     )
-    if not adaptive:
-        return found
-    from obsynth.experiments.monitors.adaptive_records_monitor import with_box
-
-    return with_box(design, scenario, found, bounds, noise_bound, initial_error=initial_error, initial_set=initial_set)
 
 
 def require_options(

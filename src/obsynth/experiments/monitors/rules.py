@@ -1,23 +1,22 @@
-"""Rules of monitors, row by row: norms and whitened windows of residuals; parameters and innovations."""
+"""Rules of monitors: norms and whitened windows of residuals; parameters and innovations."""
 
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.experiments.monitors.between_samples import InputResponse
-from obsynth.experiments.monitors.online import Evidence, OnlineMonitor, Rule, share_of_look
+from obsynth.experiments.monitors.monitor import Judged, Monitor, Rule, Sample
 from obsynth.experiments.monitors.thresholds import UnlimitedHorizonBound
 from obsynth.numerics.arguments import is_finite_number
 from obsynth.numerics.arrays import FloatArray
-from obsynth.observers.alarms import alone
+from obsynth.observers.alarms import alone, two_sided_sums
 from obsynth.observers.dae.observer import DAEObserver
-from obsynth.observers.decisions import WALKING_FORMS
+from obsynth.observers.decisions import NIS_WINDOW, WALKING_FORMS
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.plants.validation import index_of
 
@@ -27,6 +26,29 @@ FITTING_SHARE = 0.01
 SAME_SHARE = 1e-6
 #: What rounding may take from a number of samples, as a share of it.
 ROUNDING = 1e-9
+#: What a rule says where nothing is decided.
+UNDECIDED = Judged(math.nan, math.nan)
+
+
+def share_of_look(look: int) -> float:
+    """Return the share of the probability of a false alarm for look ``look`` (from 1); all sum up to one.
+    Looks ``2^j`` to ``2^(j+1) - 1`` share ``6 / (pi (j + 1))^2`` evenly."""
+    epoch = look.bit_length() - 1
+    return 6.0 / (math.pi * (epoch + 1.0)) ** 2 / 2.0**epoch
+
+
+class NormState(NamedTuple):
+    """The state of `NormRule`; of many runs norms have an axis."""
+
+    norms: tuple[Any, ...] = ()  # of the latest samples
+    begin: float | None = None  # first, latest stamp since the start
+    last: float | None = None
+    regular: bool = True  # whether all samples were as far apart as stated, or some further
+    late: bool = False
+    added: tuple[float, ...] = ()  # what known inputs add, of the latest samples; what that is made of
+    driven: FloatArray | None = None
+    inputs: FloatArray | None = None
+    moved: bool = False
 
 
 class NormRule(Rule):
@@ -35,8 +57,6 @@ class NormRule(Rule):
     known inputs add.  ``watched``: rows of the observer that take the place of the residual."""
 
     GUARANTEES = True
-    KEPT = ("norms", "begin", "last", "regular", "added", "states", "inputs", "moved", "late")
-    SAME = "limit"
 
     def __init__(
         self,
@@ -49,77 +69,92 @@ class NormRule(Rule):
         watched: slice | None = None,
         driven: InputResponse | None = None,
     ) -> None:
-        self._table, self._limit, self._dt = table, limit, dt
-        self._watched, self._driven = watched, driven
-        self.states = None if driven is None else driven.start()
-        self.inputs: FloatArray | None = None
-        self.moved, self.late = False, False
-        self.added: deque[float] = deque(maxlen=window)
-        self._other, self.regular = irregular, True
-        self.norms: deque[float] = deque(maxlen=window)
-        self.begin: float | None = None
-        self.last: float | None = None
+        self.table, self.limit, self.irregular = table, limit, irregular
+        self._regular = UnlimitedHorizonBound(table, limit)
+        self._window, self._dt, self._watched, self._driven = window, dt, watched, driven
 
-    def take(
-        self, time: float, residuals: FloatArray, evidence: Any, *, deciding: bool
-    ) -> tuple[float, float, int | None]:
-        """Return statistic and threshold."""
-        if self._watched is not None:
-            residuals = evidence.rows[self._watched]
-        late = 0.0 if self.last is None else (time - self.last - self._dt) / self._dt
-        away = abs(late)
-        self.late |= self._other is not None and late > FITTING_SHARE
-        fits = away <= FITTING_SHARE
-        self.regular &= away <= SAME_SHARE
-        if self.norms.maxlen != 1 and not fits:
-            # A window is a number of samples at the sampling that its bound is for.
-            self.norms.clear()
-        self.begin, self.last = (time if self.begin is None else self.begin), time
-        k = math.floor((time - self.begin) / self._dt * (1.0 + ROUNDING))
-        table, limit = (self._table, self._limit) if self.regular or self._other is None else self._other
-        threshold = float(table[k]) if k < len(table) else limit
-        self.added.append(self._from_inputs(evidence))
-        # Neither rows further apart than stated nor inputs that move at other stamps are in the bound.
-        if self.late or (self.moved and not self.regular):
-            threshold = math.inf
-        threshold += math.hypot(*self.added)
-        if not deciding:
-            return math.nan, threshold, None
-        # Not squared: the square of a number of any size may be none.
-        self.norms.append(math.hypot(*residuals))
+    def init(self) -> NormState:
+        """Return the state before the first sample."""
+        return NormState(driven=None if self._driven is None else self._driven.start())
+
+    def fold(self, state: NormState, residuals: FloatArray) -> tuple[NormState, Any]:
+        """Return the state and the norm of the window after residuals ``(..., nr)``."""
         # The bound counts samples before the window as well: a window that is not full is bounded all the more.
-        return math.hypot(*self.norms), threshold, None
+        norms = (*state.norms, norm_of(residuals))[-self._window :]
+        return state._replace(norms=norms), norm_of(np.stack(norms, axis=-1)) if len(norms) > 1 else norms[0]
 
-    def _from_inputs(self, evidence: Any) -> float:
-        """Return what known inputs add to the norm, and take those of this row."""
-        if self._driven is None or self.states is None:
-            return 0.0
-        u = evidence.inputs
-        if not np.isfinite(u).all():
-            u = np.zeros(len(u)) if self.inputs is None else self.inputs
-        if self.inputs is not None:
-            self.states = self._driven.advanced(self.states, self.inputs, u)
-            self.moved |= bool(u.any() or self.inputs.any())
-        self.inputs = u
-        return self._driven.size(self.states)
+    def statistics(self, residuals: FloatArray) -> FloatArray:
+        """Return the statistic of records: without a window every sample stands for itself."""
+        return norm_of(residuals) if self._window == 1 else super().statistics(residuals)
 
-    def restart(self) -> None:
+    def step(self, state: NormState, sample: Sample) -> tuple[NormState, Judged]:
+        """Return the state after a sample, statistic and threshold."""
+        said: Any = sample.said
+        late = 0.0 if state.last is None else (sample.time - state.last - self._dt) / self._dt
+        begin = sample.time if state.begin is None else state.begin
+        regular = state.regular and abs(late) <= SAME_SHARE
+        state = state._replace(
+            # A window is a number of samples at the sampling that its bound is for.
+            norms=() if self._window > 1 and abs(late) > FITTING_SHARE else state.norms,
+            begin=begin,
+            last=sample.time,
+            regular=regular,
+            late=state.late or (self.irregular is not None and late > FITTING_SHARE),
+        )
+        if self._driven is not None:
+            state = self._with_inputs(self._driven, state, said)
+        k = math.floor((sample.time - begin) / self._dt * (1.0 + ROUNDING))
+        table, limit = self._regular if regular or self.irregular is None else self.irregular
+        threshold = float(table[k]) if k < len(table) else limit
+        # Neither rows further apart than stated nor inputs that move at other stamps are in the bound.
+        if state.late or (state.moved and not regular):
+            threshold = math.inf
+        threshold += math.hypot(*state.added)
+        if not sample.deciding:
+            return state, Judged(math.nan, threshold)
+        state, value = self.fold(state, sample.residuals if self._watched is None else said.rows[self._watched])
+        return state, Judged(value, threshold)
+
+    def _with_inputs(self, driven: InputResponse, state: NormState, said: Any) -> NormState:
+        """Return the state with the known inputs of a row, and what they add to the norm; in a gap they are held."""
+        before, states = state.inputs, state.driven
+        u = before if said is None or not np.isfinite(said.inputs).all() else said.inputs
+        if u is None:
+            return state
+        moved = state.moved
+        if before is not None and states is not None:
+            states, moved = driven.advanced(states, before, u), moved or bool(u.any() or before.any())
+        size = 0.0 if states is None else driven.size(states)
+        return state._replace(driven=states, inputs=u, moved=moved, added=(*state.added, size)[-self._window :])
+
+    def restart(self, state: NormState, skipped: int = 0) -> NormState:
         """Begin again: the error at a new start is taken to be no larger than that at the first."""
-        self.norms.clear()
-        self.added.clear()
-        self.begin = self.last = None
-        self.regular, self.late = True, False
+        return state._replace(norms=(), added=(), begin=None, last=None, regular=True, late=False)
 
     def options(self) -> float:
         """Return the limit: it depends on all options."""
-        return self._limit
+        return self.limit
+
+
+def norm_of(values: FloatArray) -> Any:
+    """Return the norms ``(...)`` of rows ``(..., n)``; a row alone is not squared, as its square may be no number."""
+    return math.hypot(*values) if values.ndim == 1 else np.linalg.norm(values, axis=-1)
+
+
+class WindowState(NamedTuple):
+    """The state of `WhitenedRule`; of many runs rows and sums have an axis before their last."""
+
+    window: tuple[FloatArray, ...]  # latest residuals ``(..., nr)``, oldest first
+    levels: FloatArray  # ``(..., 2 m)``: cumulative sums
+    filled: int = 0  # rows since the start
+    looks: int = 0
+    last: float | None = None
 
 
 class WhitenedRule(Rule):
     """A window of residuals in the metric of its covariance: chi-square, or cumulative sums for a ``change``.
-    ``whitener (m, window nr)``, oldest sample first; ``white``: see `whitening.cusum_whitener`."""
-
-    KEPT = ("window", "levels", "looks", "last")
+    ``whitener (m, window nr)``, oldest sample first; ``white``: see `whitening.cusum_whitener`; ``table``: thresholds
+    of a record, in place of those for any number of looks."""
 
     def __init__(
         self,
@@ -131,50 +166,59 @@ class WhitenedRule(Rule):
         false_alarms: float,
         dt: float,
         white: bool = True,
+        table: FloatArray | None = None,
     ) -> None:
-        self._whitener, self._mean, self._change = whitener, mean, change
-        self._probability, self._dt, self._white = false_alarms, dt, white
-        self.window: deque[FloatArray] = deque(maxlen=window)
-        self.levels = np.zeros(2 * len(whitener))
-        self.looks = 0
-        self.last: float | None = None
+        self.whitener, self._mean, self._change, self._window = whitener, mean, change, window
+        self._probability, self._dt, self._white, self.table = false_alarms, dt, white, table
 
-    def take(
-        self, time: float, residuals: FloatArray, evidence: Any, *, deciding: bool
-    ) -> tuple[float, float, int | None]:
-        """Return statistic and threshold."""
-        del evidence
-        if self.last is not None and abs(time - self.last - self._dt) > FITTING_SHARE * self._dt:
-            self.restart()
-        self.last = time
-        if not deciding:
-            return math.nan, math.nan, None
-        self.window.append(residuals - self._mean)
-        if len(self.window) < (self.window.maxlen or 1):
-            return math.nan, math.nan, None
-        self.looks += 1
-        probability = self._probability * share_of_look(self.looks)
+    def init(self) -> WindowState:
+        """Return the state before the first sample."""
+        return WindowState((np.zeros_like(self._mean),) * self._window, np.zeros(2 * len(self.whitener)))
+
+    def fold(self, state: WindowState, residuals: FloatArray) -> tuple[WindowState, Any]:
+        """Return the state and the statistic ``(...)`` after residuals ``(..., nr)``."""
+        centred = residuals - self._mean
+        shape, count = centred.shape, state.filled + 1
+        window = tuple(np.broadcast_to(row, shape) for row in (*state.window[1:], centred))
+        state = state._replace(window=window, filled=count)
+        deciding = count >= self._window if self.table is None else np.isfinite(self.table[count - 1])
+        if self._change is not None and not deciding:
+            return state, np.zeros(shape[:-1])
         with np.errstate(over="ignore", invalid="ignore"):
-            white = _finite(self._whitener @ np.concatenate(self.window))
+            white = _finite(np.concatenate(window, axis=-1) @ self.whitener.T)
             if self._change is None:
-                from scipy.special import chdtri
+                return state, np.sum(white**2, axis=-1)
+            one = np.ones_like(white)
+            levels = _finite(two_sided_sums(state.levels, white, one, self._change * one))
+        return state._replace(levels=levels), levels.max(axis=-1)
 
-                return float(white @ white), float(chdtri(len(white), probability)), None
-            rise = self._change * np.concatenate([white, -white]) - 0.5 * self._change**2
-            self.levels = _finite(np.maximum(self.levels + _finite(rise), 0.0))
+    def step(self, state: WindowState, sample: Sample) -> tuple[WindowState, Judged]:
+        """Return the state after a sample, statistic and threshold."""
+        if state.last is not None and abs(sample.time - state.last - self._dt) > FITTING_SHARE * self._dt:
+            state = self.restart(state)
+        state = state._replace(last=sample.time)
+        if not sample.deciding:
+            return state, UNDECIDED
+        state, value = self.fold(state, sample.residuals)
+        if state.filled < self._window:
+            return state, UNDECIDED
+        state = state._replace(looks=state.looks + 1)
+        probability, degrees = self._probability * share_of_look(state.looks), len(self.whitener)
+        if self._change is None:
+            from scipy.special import chdtri
+
+            return state, Judged(float(value), float(chdtri(degrees, probability)))
         # Sums of what is not white are counted one by one: as many end here as there were looks.
-        ending = 1 if self._white else self.looks
-        return float(self.levels.max()), math.log(len(self.levels) * ending / probability), None
+        ending = 1 if self._white else state.looks
+        return state, Judged(float(value), math.log(2 * degrees * ending / probability))
 
-    def restart(self) -> None:
+    def restart(self, state: WindowState, skipped: int = 0) -> WindowState:
         """Forget window and sums; looks that were taken stay taken."""
-        self.window.clear()
-        self.levels = np.zeros_like(self.levels)
-        self.last = None
+        return self.init()._replace(looks=state.looks)
 
     def options(self) -> list[float]:
         """Return probability, window and change."""
-        return [self._probability, float(self.window.maxlen or 0), self._change or 0.0]
+        return [self._probability, float(self._window), self._change or 0.0]
 
 
 def _finite(values: FloatArray) -> FloatArray:
@@ -184,8 +228,6 @@ def _finite(values: FloatArray) -> FloatArray:
 
 
 PARAMETER_KINDS = ("chi-square", "cusum", "nis")
-#: Samples that the NIS sums up.
-NIS_WINDOW = 20
 ANY_LENGTH = " (the run may have any length)"
 _PARAMETER_STATEMENTS = {
     "chi-square": "distance of the parameters from their nominal values in the metric of their covariance: passed in a "
@@ -197,69 +239,58 @@ _PARAMETER_STATEMENTS = {
 }
 
 
+class ParameterState(NamedTuple):
+    """The state of `ParameterRule`."""
+
+    levels: FloatArray  # ``(2 nq,)``: cumulative sums
+    looks: int = 0
+    squares: tuple[float, ...] = ()  # of the latest innovations, and how many numbers each has
+    degrees: tuple[int, ...] = ()
+
+
 class ParameterRule(Rule):
     """Parameters against nominal values, or innovations against what noise explains, in a run of any length.
     ``chi-square`` of theta by its covariance; ``cusum`` of the innovations for a ``change (nq,)``; ``nis``, squares of
     the innovations over 20 samples, for all that the model does not explain."""
 
-    KEPT = ("levels", "looks", "squares")
-
     def __init__(self, kind: str, nominal: FloatArray, change: FloatArray, false_alarms: float) -> None:
         self._kind, self._nominal, self._change, self._probability = kind, nominal, change, false_alarms
-        self._signs = np.concatenate([change, -change])
-        self.levels, self.looks = np.zeros(2 * len(nominal)), 0
-        self.squares: deque[tuple[float, int]] = deque(maxlen=NIS_WINDOW)
 
-    def take(
-        self, time: float, residuals: FloatArray, evidence: Evidence, *, deciding: bool
-    ) -> tuple[float, float, int | None]:
-        """Return statistic, threshold, and the number of the parameter if it is known."""
-        del time, residuals
-        if not deciding:
-            return math.nan, math.nan, None
-        gap = evidence.innovation
-        if evidence.regressor.size:
-            gap = gap - evidence.regressor @ self._nominal
+    def init(self) -> ParameterState:
+        """Return the state before the first sample."""
+        return ParameterState(np.zeros(2 * len(self._nominal)))
+
+    def step(self, state: ParameterState, sample: Sample) -> tuple[ParameterState, Judged]:
+        """Return the state after a sample, statistic, threshold, and the number of the parameter if it is known."""
+        if not sample.deciding:
+            return state, UNDECIDED
+        found: Any = sample.said
+        looked = state._replace(looks=state.looks + 1)
+        share = self._probability * share_of_look(looked.looks)
+        if self._kind == "cusum":
+            along, information = found.score - found.information @ self._nominal, np.diag(found.information)
+            levels = two_sided_sums(state.levels, along, information, self._change)
+            which = int(np.argmax(levels)) % len(self._nominal)
+            return looked._replace(levels=levels), Judged(float(levels.max()), math.log(len(levels) / share), which)
+        from scipy.special import chdtri
+
         if self._kind == "chi-square":
-            return self._chi_square(evidence)
-        return self._nis(gap) if self._kind == "nis" else self._cusum(evidence)
+            away = found.theta - self._nominal
+            weights = np.linalg.pinv(found.covariance, hermitian=True)
+            value, limit = float(away @ weights @ away), float(chdtri(len(away), share))
+            return looked, Judged(value, limit, alone(weights @ away, np.diag(weights)))
+        gap = found.innovation
+        if found.regressor.size:
+            gap = gap - found.regressor @ self._nominal
+        squares, degrees = (*state.squares, float(gap @ gap))[-NIS_WINDOW:], (*state.degrees, len(gap))[-NIS_WINDOW:]
+        if not sum(degrees):
+            return state._replace(squares=squares, degrees=degrees), UNDECIDED
+        looked = looked._replace(squares=squares, degrees=degrees)
+        return looked, Judged(sum(squares), float(chdtri(sum(degrees), share)))
 
-    def _share(self) -> float:
-        self.looks += 1
-        return self._probability * share_of_look(self.looks)
-
-    def _chi_square(self, found: Evidence) -> tuple[float, float, int | None]:
-        from scipy.special import chdtri
-
-        away = found.theta - self._nominal
-        weights = np.linalg.pinv(found.covariance, hermitian=True)
-        return (
-            float(away @ weights @ away),
-            float(chdtri(len(away), self._share())),
-            alone(weights @ away, np.diag(weights)),
-        )
-
-    def _nis(self, gap: FloatArray) -> tuple[float, float, int | None]:
-        from scipy.special import chdtri
-
-        self.squares.append((float(gap @ gap), len(gap)))
-        degrees = sum(count for _, count in self.squares)
-        if not degrees:
-            return math.nan, math.nan, None
-        return sum(value for value, _ in self.squares), float(chdtri(degrees, self._share())), None
-
-    def _cusum(self, found: Evidence) -> tuple[float, float, int | None]:
-        along, squares = found.score - found.information @ self._nominal, np.diag(found.information)
-        rise = np.concatenate([along, along]) * self._signs
-        rise -= 0.5 * np.concatenate([squares, squares]) * self._signs**2
-        self.levels = np.maximum(self.levels + rise, 0.0)
-        which = int(np.argmax(self.levels)) % len(self._nominal)
-        return float(self.levels.max()), math.log(len(self.levels) / self._share()), which
-
-    def restart(self) -> None:
+    def restart(self, state: ParameterState, skipped: int = 0) -> ParameterState:
         """Forget sums; the filter itself knows what missing rows cost."""
-        self.levels = np.zeros_like(self.levels)
-        self.squares.clear()
+        return self.init()._replace(looks=state.looks)
 
     def options(self) -> list[Any]:
         """Return kind, probability, nominal values and change."""
@@ -282,7 +313,7 @@ def parameter_monitor(
     nominal: Mapping[str, float],
     change: float,
     false_alarms: float,
-) -> OnlineMonitor:
+) -> Monitor:
     """Return the monitor of parameters, or of innovations, for data of any length."""
     if kind not in PARAMETER_KINDS:
         hint = _whole_record(observer) if kind == "glr" else ""
@@ -304,7 +335,7 @@ def parameter_monitor(
             f"cusum needs regressors, which a {observer.form} design does not have: use chi-square or nis.", path="kind"
         )
     rule = ParameterRule(kind, theta, np.full(len(theta), float(change)), false_alarms)
-    return OnlineMonitor(
+    return Monitor(
         kind,
         _PARAMETER_STATEMENTS[kind] + ANY_LENGTH,
         rule,

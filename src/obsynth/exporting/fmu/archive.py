@@ -6,7 +6,6 @@ The model description of an FMU, in XML, for FMI 2.0 and 3.0: inputs, estimates,
 from __future__ import annotations
 
 import io
-import math
 import platform
 import subprocess
 import sys
@@ -22,27 +21,28 @@ from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
 
 from obsynth.errors import SpecError
-from obsynth.exporting.c_source import c_identifier, comment, header_text, source_text
-from obsynth.exporting.c_templates import dae_c_texts, require_no_sample_time
-from obsynth.exporting.realisation import Realisation
+from obsynth.experiments.monitors.learned import LearnedThresholds
+from obsynth.experiments.monitors.learned_levels import HOLD
+from obsynth.exporting.alarms import STATISTIC, Alarms, linear_alarms
+from obsynth.exporting.c_source import c_identifier, comment, header_text, in_precision, source_text
+from obsynth.exporting.c_templates import dae_alarms, dae_c_texts, require_no_sample_time
+from obsynth.exporting.realisation import Realisation, verification_words
 from obsynth.files.outputs import write_atomically
 from obsynth.methods.handing_on import unverified_mark
-from obsynth.numerics.arguments import chosen, is_finite_number, require_mapping
+from obsynth.numerics.arguments import chosen
 from obsynth.observers.dae.c_code import FLAGS, compiler
 from obsynth.observers.dae.observer import DAEObserver
-from obsynth.observers.linear.derived import checked_warm_up, transient
 from obsynth.results.design import ObserverDesign
 
 
 @dataclass(frozen=True)
 class Output:
-    """One estimate: its name, the signal whose operating point it has, unit, and whether it is watched."""
+    """One estimate: its name, the signal whose operating point it has, and unit."""
 
     name: str
     signal: str | None
     unit: str
     description: str
-    watched: bool = False
 
 
 @dataclass(frozen=True)
@@ -53,22 +53,16 @@ class Signals:
     input_signals: tuple[str, ...]
     outputs: tuple[Output, ...]
     points: Mapping[str, float]
-    thresholds: Mapping[str, float]
+    alarms: Alarms
     units: Mapping[str, str]
-    warm_up: float
     dt: float
 
     def point_index(self, signal: str | None) -> int:
         """Return the position of a signal among the operating points, -1 for none."""
         return -1 if signal is None else list(self.points).index(signal)
 
-    @property
-    def watched(self) -> tuple[str, ...]:
-        """Outputs that have a threshold."""
-        return tuple(output.name for output in self.outputs if output.watched)
 
-
-def signals_of_linear(found: Realisation, thresholds: Mapping[str, float] | None, warm_up: float) -> Signals:
+def signals_of_linear(found: Realisation, alarms: Alarms) -> Signals:
     """Return the signals of a linear observer; fault estimates and residuals may be watched."""
     plant, observer = found.design.plant, found.observer
     biases = getattr(plant, "sensor_faults", ())
@@ -83,27 +77,35 @@ def signals_of_linear(found: Realisation, thresholds: Mapping[str, float] | None
             None if name in biases else name,
             units.get(name, ""),
             _late(f"estimate of the fault {name}", delay),
-            watched=True,
         )
         for name, delay in zip(observer.fault_names, observer.fault_delays, strict=True)
     ]
-    outputs += [
-        Output(f"r[{name}]", None, units.get(name, ""), f"residual {name}", watched=True)
-        for name in observer.residual_names
-    ]
+    outputs += [Output(f"r[{name}]", None, units.get(name, ""), f"residual {name}") for name in observer.residual_names]
+    outputs += _learned_outputs(alarms)
     signals = (*found.inputs, *observer.state_names, *observer.fault_names)
     points = {name: float(stated.get(name, 0.0)) for name in dict.fromkeys(signals)}
     inputs = _apart(observer.input_names, observer.output_names)
-    return Signals(
-        inputs, found.inputs, tuple(outputs), points, _checked(thresholds, outputs), units, warm_up, observer.dt
-    )
+    return Signals(inputs, found.inputs, tuple(outputs), points, alarms, units, observer.dt)
 
 
-def signals_of_dae(design: ObserverDesign, thresholds: Mapping[str, float] | None, warm_up: float) -> Signals:
-    """Return the signals of the observer of a nonlinear plant; innovations and their square may be watched."""
+def _learned_outputs(alarms: Alarms) -> list[Output]:
+    """Return what a learned monitor shows, if there is one."""
+    if alarms.learned is None:
+        return []
+    listed = ", ".join(f"{i + 1}: {name}" for i, name in enumerate(alarms.fault_names))
+    return [
+        Output(STATISTIC, None, "", f"largest statistic in units of its level: {alarms.learned.statement}"),
+        Output("isolated", None, "", f"number of the fault that stands out at an alarm, 0 for none ({listed})"),
+        Output("event", None, "", f"1 while an alarm lasts, {HOLD} rows more than the statistic is above its level"),
+    ]
+
+
+def signals_of_dae(design: ObserverDesign, alarms: Alarms) -> Signals:
+    """Return the signals of the observer of a nonlinear plant; parameters, innovations and their square may be
+    watched."""
     model, observer = design.nonlinear
     units = dict(model.units)
-    estimated = (("xhat", "", model.state_names), ("theta", "the parameter ", model.parameter_names))
+    estimated = (("xhat", "", model.state_names), ("fhat", "the parameter ", model.parameter_names))
     outputs = []
     for kind, of, names in estimated:
         outputs += [Output(f"{kind}[{name}]", None, units.get(name, ""), f"estimate of {of}{name}") for name in names]
@@ -111,19 +113,16 @@ def signals_of_dae(design: ObserverDesign, thresholds: Mapping[str, float] | Non
             Output(f"sd {kind}[{name}]", None, units.get(name, ""), f"standard deviation of the estimate of {name}")
             for name in names
         ]
-    outputs += [
-        Output(f"r[{name}]", None, units.get(name, ""), f"innovation of {name}", watched=True)
-        for name in model.output_names
-    ]
-    outputs.append(Output("nis", None, "", "square of the innovations in units of their covariance", watched=True))
+    outputs += [Output(f"r[{name}]", None, units.get(name, ""), f"innovation of {name}") for name in model.output_names]
+    outputs.append(Output("nis", None, "", "square of the innovations in units of their covariance"))
+    outputs += _learned_outputs(alarms)
     return Signals(
         _apart(model.input_names, model.output_names),
         (*model.input_names, *model.output_names),
         tuple(outputs),
         {},
-        _checked(thresholds, outputs),
+        alarms,
         units,
-        warm_up,
         observer.dt,
     )
 
@@ -139,27 +138,6 @@ def _apart(known: Sequence[str], measured: Sequence[str]) -> tuple[str, ...]:
         *(f"u[{name}]" if name in both else name for name in known),
         *(f"y[{name}]" if name in both else name for name in measured),
     )
-
-
-def _checked(thresholds: Mapping[str, float] | None, outputs: Sequence[Output]) -> dict[str, float]:
-    """Return the level of each watched output, 0 where there is none."""
-    require_mapping(thresholds, "thresholds")
-    watched = [output.name for output in outputs if output.watched]
-    for name, level in (thresholds or {}).items():
-        if name not in watched:
-            raise SpecError(f"There is no {name!r} to watch: there are {', '.join(watched)}.", path="thresholds")
-        if not is_finite_number(level) or level <= 0.0:
-            raise SpecError(f"The threshold of {name!r} is {level!r}: give a positive number.", path="thresholds")
-    return {name: float((thresholds or {}).get(name, 0.0)) for name in watched}
-
-
-def finite_warm_up(seconds: float) -> float:
-    """Return a number that a description may hold: an observer that never settles raises no alarm."""
-    return seconds if math.isfinite(seconds) else _NEVER
-
-
-#: Seconds, about thirty years.
-_NEVER = 1e9
 
 
 @dataclass(frozen=True)
@@ -205,14 +183,14 @@ def _variables(signals: Signals) -> Iterator[_Variable]:
             units[name],
             f"alarm above this absolute value of {name} (its deviation); 0: none",
         )
-        for name, level in signals.thresholds.items()
+        for name, level in signals.alarms.levels.items()
     ]
-    parameters.append(("warm_up", signals.warm_up, "s", "no alarm in these seconds after the start"))
+    parameters.append(("warm_up", signals.alarms.warm_up, "s", "no alarm in these seconds after the start"))
     for name, value, unit, told in parameters:
         yield _Variable(name, "real", "parameter", "tunable", "exact", value, unit, told)
-    flags = [(f"alarm[{name}]", f"{name} is above its threshold") for name in signals.thresholds]
+    flags = [(f"alarm[{name}]", f"{name} is above its threshold") for name in signals.alarms.levels]
     flags.append(("alarm", "any alarm"))
-    flags.append(("sample_used", "the last sample was finite and used; else the estimates are held"))
+    flags.append(("sample_used", "the last sample was complete enough to be used; else the model went on alone"))
     for name, told in flags:
         yield _Variable(name, "flag", "output", "discrete", "calculated", None, "", told)
 
@@ -352,15 +330,16 @@ def write_fmu(
     sample_time: float | None,
     thresholds: Mapping[str, float] | None,
     warm_up: float | None,
+    learned: LearnedThresholds | None,
 ) -> Path:
     """Write an FMU for co-simulation; the binary is left out where there is no compiler."""
     chosen(version, "fmi", VERSIONS)
-    signals, texts, digest = _contents(design, sample_time, thresholds, warm_up)
+    signals, texts, digest = _contents(design, sample_time, thresholds, warm_up, learned)
     identifier = c_identifier(target.stem)
     token = f"{{{uuid.uuid5(uuid.NAMESPACE_URL, ' '.join((digest, version, repr(signals))))}}}"
     sentence = f"Observer of {design.name} by {design.method}, written by obsynth; sha256 of the gain set {digest}"
     mark = unverified_mark(design.report)
-    sentence = f"{mark}. {sentence}" if mark else sentence
+    sentence = f"{mark}. {sentence}" if mark else f"{sentence}. {verification_words(design)}"
     model = Model(identifier, token, design.name, sentence, signals)
     wrapper = f"fmi{version[0]}.c"
     sources = {f"{_PREFIX}.c": texts[0], f"{_PREFIX}.h": texts[1], "layout.h": _layout(design, model)}
@@ -380,20 +359,28 @@ def write_fmu(
 
 
 def _contents(
-    design: ObserverDesign, sample_time: float | None, thresholds: Mapping[str, float] | None, warm_up: float | None
+    design: ObserverDesign,
+    sample_time: float | None,
+    thresholds: Mapping[str, float] | None,
+    warm_up: float | None,
+    learned: LearnedThresholds | None,
 ) -> tuple[Signals, tuple[str, str], str]:
     """Return the signals, source and header, and the digest of the gain set."""
+    header = f"{_PREFIX}.h"
     if isinstance(design.observer, DAEObserver):
         require_no_sample_time(design, sample_time)
-        text, header, digest = dae_c_texts(design, _PREFIX, f"{_PREFIX}.h")
-        return signals_of_dae(design, thresholds, finite_warm_up(checked_warm_up(warm_up, 0.0))), (text, header), digest
+        shipped, alarms = dae_alarms(design, thresholds, warm_up, learned)
+        text, declared, digest = dae_c_texts(shipped, _PREFIX, header, alarms)
+        return signals_of_dae(design, alarms), (text, declared), digest
     found = Realisation.of(design, sample_time)
     if found.observer.dt == 0.0:
         raise SpecError(
             "The observer is continuous in time: give the sample time, in seconds, for an FMU.", path="sample_time"
         )
-    signals = signals_of_linear(found, thresholds, finite_warm_up(checked_warm_up(warm_up, transient(found.observer))))
-    return signals, (source_text(found, _PREFIX, f"{_PREFIX}.h"), header_text(found, _PREFIX)), found.digest
+    alarms = linear_alarms(found, thresholds, warm_up, learned)
+    texts = source_text(found, _PREFIX, header, alarms), header_text(found, _PREFIX, alarms)
+    source, declared = (in_precision(text, found.precision) for text in texts)
+    return signals_of_linear(found, alarms), (source, declared), found.digest
 
 
 def _layout(design: ObserverDesign, model: Model) -> str:
@@ -406,9 +393,9 @@ def _layout(design: ObserverDesign, model: Model) -> str:
         "N_IN": len(signals.inputs),
         "N_OUT": len(names),
         "N_POINT": len(signals.points),
-        "N_WATCHED": len(signals.watched),
+        "N_WATCHED": len(signals.alarms.levels),
     }
-    body = _taking_dae(design) if isinstance(design.observer, DAEObserver) else _taking_linear(design, signals)
+    body = _taking_dae(design, signals) if isinstance(design.observer, DAEObserver) else _taking_linear(design, signals)
     return "\n".join(
         [
             comment("Sizes and start values of this observer, written by obsynth."),
@@ -426,14 +413,13 @@ def _layout(design: ObserverDesign, model: Model) -> str:
             _table("double", "start_values", [repr(value) for value in start_values(signals)]),
             _table("int", "point_of_in", points),
             _table("int", "point_of_out", shown),
-            _table("int", "watched", [names.index(name) for name in signals.watched]),
             "",
-            "static void observer_begin(observer_memory *memory)",
+            "static void begin_observer(observer_memory *memory)",
             "{",
             f"    {_PREFIX}_reset(memory);",
             "}",
             "",
-            "static int observer_take(observer_memory *memory, const double *in, double *out)",
+            "static int take_sample(observer_memory *memory, const double *in, double *out)",
             "{",
             *body,
             "}",
@@ -458,24 +444,36 @@ def _taking_linear(design: ObserverDesign, signals: Signals) -> list[str]:
         groups.append((f"out + {place}", kinds.count(kind)))
         place += kinds.count(kind)
     arguments = ", ".join(text for text, count in (*counts, *groups) if count)
-    return [f"    return {_PREFIX}_step(memory, {arguments});"]
+    return [
+        f"    int failed = {_PREFIX}_step(memory, {arguments});",
+        *_taking_learned(signals, place),
+        "    return failed;",
+    ]
 
 
-def _taking_dae(design: ObserverDesign) -> list[str]:
+def _taking_learned(signals: Signals, place: int) -> list[str]:
+    """Return the lines that show what a learned monitor says, if there is one."""
+    if signals.alarms.learned is None:
+        return []
+    said = ("statistic", "fault + 1.0", "event")
+    return [f"    out[{place + i}] = memory->monitor.{text};" for i, text in enumerate(said)]
+
+
+def _taking_dae(design: ObserverDesign, signals: Signals) -> list[str]:
     model, _ = design.nonlinear
     parts = (
         ("states", model.nx),
         ("state_deviations", model.nx),
-        ("parameters", model.nq),
-        ("parameter_deviations", model.nq),
-        ("innovations", model.ny),
+        ("faults", model.nq),
+        ("fault_deviations", model.nq),
+        ("residuals", model.ny),
     )
     lines = [f"    {_PREFIX}_estimates said;", "    int i;"]
     inputs = "in, " if model.nu else ""
     lines += [
         f"    int failed = {_PREFIX}_step(memory, {inputs}in + {model.nu}, &said);",
-        "    if (failed) {",
-        "        return failed;",
+        "    if (failed == 2 || (failed && !memory->is_started)) {",
+        "        return 2;",
         "    }",
     ]
     place = 0
@@ -483,7 +481,8 @@ def _taking_dae(design: ObserverDesign) -> list[str]:
         if size:
             lines += [f"    for (i = 0; i < {size}; i++) {{", f"        out[{place} + i] = said.{name}[i];", "    }"]
         place += size
-    return [*lines, f"    out[{place}] = said.nis;", "    return 0;"]
+    lines.append(f"    out[{place}] = said.nis;")
+    return [*lines, *_taking_learned(signals, place + 1), "    return failed;"]
 
 
 def _binary_folder(version: str) -> tuple[str, str] | None:

@@ -43,7 +43,6 @@ EXPORTED fmi2Status fmi2SetupExperiment(fmi2Component c, fmi2Boolean has_toleran
 {
     instance *m = c;
     (void)has_tolerance; (void)tolerance; (void)has_stop; (void)stop;
-    m->begin = start;
     m->real[0] = start;
     return fmi2OK;
 }

@@ -76,7 +76,6 @@ EXPORTED fmi3Status fmi3EnterInitializationMode(fmi3Instance c, fmi3Boolean has_
 {
     instance *m = c;
     (void)has_tolerance; (void)tolerance; (void)has_stop; (void)stop;
-    m->begin = start;
     m->real[0] = start;
     return fmi3OK;
 }

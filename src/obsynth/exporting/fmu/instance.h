@@ -33,7 +33,6 @@
 typedef struct {
     double real[N_REAL];
     int flag[N_FLAG];
-    double begin;
     observer_memory memory;
 } instance;
 
@@ -49,8 +48,7 @@ static void begin(instance *m)
     for (i = 0; i < N_FLAG; i++) {
         m->flag[i] = 0;
     }
-    m->begin = 0.0;
-    observer_begin(&m->memory);
+    begin_observer(&m->memory);
 }
 
 /* After the operating point may have been set: estimates start at it. */
@@ -62,27 +60,30 @@ static void show_start(instance *m)
     }
 }
 
-/* One sample: the inputs as they are, the estimates at that sample. Returns 0, or why it was not used. */
+/* One sample: the inputs as they are, the estimates at that sample. Returns 0; 1 where the model went on alone; 2 if
+   nothing could be taken. */
 static int sample(instance *m)
 {
     double in[N_IN + 1];
     double out[N_OUT + 1];
-    int i, failed, settled;
+    int i, failed;
+    m->memory.warm_up = m->real[AT_WARM_UP];
+    for (i = 0; i < N_WATCHED; i++) {
+        m->memory.level[i] = m->real[AT_THRESHOLD + i];
+    }
     for (i = 0; i < N_IN; i++) {
         in[i] = m->real[AT_IN + i] - point_of(m, point_of_in[i]);
     }
-    failed = observer_take(&m->memory, in, out);
-    m->flag[AT_USED] = !failed;
+    failed = take_sample(&m->memory, in, out);
+    m->flag[AT_USED] = failed != 2 && m->memory.status != OBSERVER_GAP;
     m->flag[AT_ANY] = 0;
-    if (!failed) {
+    if (failed != 2) {
         for (i = 0; i < N_OUT; i++) {
             m->real[AT_OUT + i] = out[i] + point_of(m, point_of_out[i]);
         }
     }
-    settled = m->real[0] - m->begin >= m->real[AT_WARM_UP];
     for (i = 0; i < N_WATCHED; i++) {
-        double level = m->real[AT_THRESHOLD + i];
-        m->flag[i] = !failed && settled && level > 0.0 && fabs(out[watched[i]]) > level;
+        m->flag[i] = failed != 2 && m->memory.alarm[i];
         m->flag[AT_ANY] |= m->flag[i];
     }
     return failed;

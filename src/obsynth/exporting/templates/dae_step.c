@@ -1,32 +1,141 @@
 
-void PREFIX_reset(PREFIX_state *state)
+void PREFIX_reset(PREFIX_state *s)
 {
-    begin(state);
+    int i;
+    begin(&s->running);
+    for (i = 0; i < LENGTH(NU); i++) {
+        s->u[i] = 0.0;
+    }
+    s->is_started = 0;
+    s->status = s->phase = UPPER_WARM_UP;
+    s->k = 0;
+    s->time = s->from = 0.0;
+    s->warm_up = WARM_UP_SECONDS;
+    s->any_alarm = 0;
+    for (i = 0; i < UPPER_WATCHED; i++) {
+        s->level[i] = levels[0][i];
+        s->alarm[i] = 0;
+    }
+    MONITOR_RESET
 }
 
-int PREFIX_step(PREFIX_state *state, ARGUMENTSconst double y[NY], PREFIX_estimates *estimates)
+/* Whether a value of an output arrives in a row. */
+static int is_due(long k, int i)
 {
+#if WAITS
+    return k >= DELAYS[i] && (k - DELAYS[i]) % EVERY[i] == 0;
+#else
+    (void)k;
+    (void)i;
+    return 1;
+#endif
+}
+
+/* What a row is: inputs that nobody measured, and outputs that were missing or left out, make it another one. */
+static int status_of(PREFIX_state *s, const double *seen, int inputs_known, int is_first)
+{
+    int known = 0;
+    int all = 1;
+    int i;
+    if (is_first || (NU > 0 && !inputs_known)) {
+        s->phase = s->phase == UPPER_WARM_UP || is_first ? UPPER_WARM_UP : UPPER_RECOVERING;
+        s->from = s->time;
+    }
+    for (i = 0; i < NY; i++) {
+        int is_refused = GATE && latest_of(&s->running)->in_a_row[i] > 0;
+        int is_heard = !is_due(latest_of(&s->running)->k - 1, i) || (!isnan(seen[i]) && !is_refused);
+        known = known || is_heard;
+        all = all && is_heard;
+    }
+    if (!inputs_known || !known) {
+        return UPPER_GAP;
+    }
+    if (s->time < s->from + s->warm_up) {
+        return s->phase;
+    }
+    s->phase = UPPER_OK;
+    return all ? UPPER_OK : UPPER_PARTIAL;
+}
+
+int PREFIX_step(PREFIX_state *s, ARGUMENTSconst double y[NY], PREFIX_estimates *estimates)
+{
+    double used[LENGTH(NU)];
+    double seen[NY];
+    double none[NY];
     double heard[NY];
     double said[ROW];
+    double shown[UPPER_WATCHED];
     const double *after;
-    int i, failed;
-NOTHING    failed = advance(state, INPUT, y, heard, said);
-    if (failed) {
-        return failed;
+    int inputs_known = 1;
+    int is_first = !s->is_started;
+    int is_deciding, i, failed;
+    used[0] = 0.0;
+    for (i = 0; i < NU; i++) {
+        int is_known = isfinite(INPUT[i]) != 0;
+        used[i] = is_known ? INPUT[i] : s->u[i];
+        inputs_known = inputs_known && is_known;
     }
-    after = latest_of(state)->memory;
+    if (is_first && !inputs_known) {
+        return 1;
+    }
+    for (i = 0; i < NY; i++) {
+        seen[i] = isfinite(y[i]) ? y[i] : NAN;
+        none[i] = NAN;
+    }
+    failed = advance(&s->running, used, seen, heard, said);
+    if (failed && !is_first) {
+        /* A sample without a solution is predicted over; where that has none either, the observer starts again. */
+        failed = advance(&s->running, used, none, heard, said);
+        if (failed) {
+            struct PREFIX_observer before = s->running;
+            begin(&s->running);
+            is_first = 1;
+            failed = advance(&s->running, used, seen, heard, said);
+            if (failed) {
+                copy(seen, none, NY);
+                failed = advance(&s->running, used, seen, heard, said);
+            }
+            if (failed) {
+                s->running = before;
+            }
+        } else {
+            copy(seen, none, NY);
+        }
+    } else if (failed) {
+        copy(seen, none, NY);
+        failed = advance(&s->running, used, seen, heard, said);
+    }
+    if (failed) {
+        return 2;
+    }
+    s->is_started = 1;
+    s->time = (double)s->k * UPPER_DT;
+    s->k++;
+    copy(s->u, used, LENGTH(NU));
+    s->status = status_of(s, seen, inputs_known, is_first);
+    is_deciding = s->status == UPPER_OK || s->status == UPPER_PARTIAL;
+    after = latest_of(&s->running)->memory;
     copy(estimates->states, after + AT_POSTERIOR, NX);
-    copy(estimates->parameters, after + AT_THETA, NQ);
+    copy(estimates->faults, after + AT_THETA, NQ);
     for (i = 0; i < NX; i++) {
         estimates->state_deviations[i] = sqrt(fmax(said[AT_COVARIANCE + i * (NX + 1)], 0.0));
     }
     for (i = 0; i < NQ; i++) {
-        estimates->parameter_deviations[i] = sqrt(fmax(after[AT_SPREAD + i * (NQ + 1)], 0.0));
+        estimates->fault_deviations[i] = sqrt(fmax(after[AT_SPREAD + i * (NQ + 1)], 0.0));
     }
     for (i = 0; i < NY; i++) {
-        estimates->innovations[i] = isnan(heard[i]) ? NAN : said[AT_INNOVATION + i];
+        estimates->residuals[i] = isnan(heard[i]) ? NAN : said[AT_INNOVATION + i];
     }
     estimates->nis = said[AT_NIS];
-    estimates->residual = said[AT_RESIDUAL];
-    return 0;
+    estimates->step_residual = said[AT_RESIDUAL];
+    copy(shown, estimates->faults, NQ);
+    copy(shown + NQ, estimates->residuals, NY);
+    shown[NQ + NY] = estimates->nis;
+    MONITOR_STEP
+    s->any_alarm = 0;
+    for (i = 0; i < UPPER_WATCHED; i++) {
+        s->alarm[i] = is_deciding && s->level[i] > 0.0 && fabs(shown[i]) > s->level[i];
+        s->any_alarm = s->any_alarm || s->alarm[i];
+    }
+    return !inputs_known;
 }

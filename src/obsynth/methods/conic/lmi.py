@@ -9,13 +9,11 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence
 from functools import cache
-from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from obsynth.errors import SolverError, SpecError
-from obsynth.methods.conic.interior_point import solve_cone_programme
 from obsynth.methods.own_terms import ChosenSolver
 from obsynth.numerics.arrays import FloatArray
 
@@ -24,18 +22,11 @@ if TYPE_CHECKING:
 
 #: Statuses that come with numbers; whether they count is decided by verification, not here.
 USABLE_STATUSES = ("optimal", "optimal_inaccurate")
-#: Our own solver, see `obsynth.methods.conic.interior_point`, and what "auto" tries in turn.
-SCHUR = "SCHUR"
-AUTO = "auto"
-AUTO_SOLVERS = (SCHUR, "CLARABEL")
-FIRST_ORDER_SOLVERS = ("SCS",)
 #: Solvers of cvxpy that take semidefinite constraints, and the settings we use.
 SOLVER_SETTINGS: dict[str, dict[str, Any]] = {
     "CLARABEL": {},
     "SCS": {"eps_abs": 1e-9, "eps_rel": 1e-9, "max_iters": 20_000},
 }
-#: Problems with more unknowns are made into cones faster by SciPy than by the usual way of cvxpy.
-MANY_UNKNOWNS = 500
 
 
 @cache
@@ -53,17 +44,15 @@ def semidefinite_solvers() -> tuple[str, ...]:
     return tuple(name for name, cones in taken.items() if cones & {"PSD", "SvecPSD"})
 
 
-def chosen_solver(name: str, options: Mapping[str, Any] | None, *, ours: tuple[str, ...] = ()) -> ChosenSolver:
+def chosen_solver(name: str, options: Mapping[str, Any] | None) -> ChosenSolver:
     """Return a solver with its settings; raise `SpecError` with the list of those installed for another name."""
-    if name not in ours and name not in SOLVER_SETTINGS and name not in semidefinite_solvers():
-        listed = ", ".join(dict.fromkeys([*ours, *semidefinite_solvers()]))
+    if name not in SOLVER_SETTINGS and name not in semidefinite_solvers():
+        listed = ", ".join(semidefinite_solvers())
         raise SpecError(
             f"method.options.solver: there is no solver {name!r} that does semidefinite programmes; "
             f"installed are: {listed}.",
             path="method.options.solver",
         )
-    if options and name in ours:
-        raise SpecError(f"solver_options are for a solver of cvxpy, not for {name!r}.", path="method.options.solver")
     if options and name == "CLARABEL":
         import clarabel
 
@@ -162,19 +151,10 @@ def minimise(objective: Any, constraints: Sequence[Any], *, what: str, solver: s
     import cvxpy
 
     problem: cvxpy.Problem = cvxpy.Problem(cvxpy.Minimize(0 if objective is None else objective), list(constraints))
-    if solver != AUTO:
-        return _solved(problem, what, solver)
-    first, second = AUTO_SOLVERS
-    try:
-        return _solved(problem, what, first)
-    except SolverError as error:
-        if error.record["status"] == "infeasible":
-            raise
-        before = {key: error.record[key] for key in ("solver", "status")}
-    return _solved(problem, what, second) | {"tried_before": before}
+    return solved(problem, what, solver)
 
 
-def _solved(problem: cvxpy.Problem, what: str, solver: str) -> dict[str, Any]:
+def solved(problem: cvxpy.Problem, what: str, solver: str) -> dict[str, Any]:
     """Solve a problem by one solver and return the record."""
     settings = {**SOLVER_SETTINGS.get(solver, {}), **getattr(solver, "options", {})}
     record: dict[str, Any] = {"what": what, "solver": str(solver), "version": _version(solver), "settings": settings}
@@ -182,13 +162,10 @@ def _solved(problem: cvxpy.Problem, what: str, solver: str) -> dict[str, Any]:
         with warnings.catch_warnings():
             # "Solution may be inaccurate": every solution is verified, so the warning tells nobody anything.
             warnings.simplefilter("ignore")
-            if solver == SCHUR:
-                record |= _solved_by_schur_complement(problem)
-            else:
-                problem.solve(solver=solver, **settings)
-                stats = problem.solver_stats
-                iterations = None if stats is None or stats.num_iters is None else int(stats.num_iters)
-                record |= {"status": str(problem.status), "iterations": iterations}
+            problem.solve(solver=solver, **settings)
+        stats = problem.solver_stats
+        iterations = None if stats is None or stats.num_iters is None else int(stats.num_iters)
+        record |= {"status": str(problem.status), "iterations": iterations}
     except (KeyboardInterrupt, SystemExit):
         raise
     except BaseException as error:  # Rust panics, and memory that ran out inside the solver
@@ -205,37 +182,9 @@ def _solved(problem: cvxpy.Problem, what: str, solver: str) -> dict[str, Any]:
     return record
 
 
-def _solved_by_schur_complement(problem: cvxpy.Problem) -> dict[str, Any]:
-    """Solve a problem by our own method, from the cones that cvxpy makes of it, and give its variables their values."""
-    # As for CLARABEL: lower triangles, row by row, times sqrt(2) off the diagonal.
-    size = sum(variable.size for variable in problem.variables())
-    backend = "SCIPY" if size > MANY_UNKNOWNS else None
-    data, chain, inverse = problem.get_problem_data("CLARABEL", canon_backend=backend, solver_opts={})
-    cones = data["dims"]
-    if cones.zero or cones.soc or cones.exp or cones.p3d or "P" in data:
-        raise ValueError("only semidefinite blocks, numbers that are not negative and linear objectives are taken")
-    orders = [1] * int(cones.nonneg) + [int(order) for order in cones.psd]
-    found = solve_cone_programme(data["c"], data["A"].toarray(), data["b"], orders)
-    if found.status in USABLE_STATUSES:
-        solution = SimpleNamespace(
-            status="Solved",
-            x=found.x,
-            z=found.z,
-            obj_val=float(data["c"] @ found.x),
-            solve_time=0.0,
-            iterations=found.iterations,
-        )
-        problem.unpack_results(solution, chain, inverse)
-    return {"status": found.status, "iterations": found.iterations}
-
-
 def _version(solver: str) -> str:
     from importlib.metadata import PackageNotFoundError, version
 
-    if solver == SCHUR:
-        from obsynth.version import __version__
-
-        return __version__
     try:
         return version(solver.lower())
     except PackageNotFoundError:

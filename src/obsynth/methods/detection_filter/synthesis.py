@@ -25,11 +25,11 @@ from obsynth.results.design import Certificate
 #: The grid of frequencies begins at this share of its end, where the band begins at zero.
 LEAST_FREQUENCY = 1e-6
 #: The proved gain is this much above one, and the proved sensitivity one of these below what a grid finds.
-MARGIN, SENSITIVITY_MARGINS = 1e-6, (1e-4, 1e-3, 1e-2, 0.1, 0.5)
+PROOF_MARGIN, SENSITIVITY_MARGINS = 1e-6, (1e-4, 1e-3, 1e-2, 0.1, 0.5)
 #: Strictness of the equation that proves a gain, relative to what drives it.
 STRICTNESS = 1e-9
 #: Frequencies of the grid, and how often the least value is refined between its neighbours.
-GRID, REFINEMENTS = 400, 40
+GRID, GRID_REFINEMENTS = 400, 40
 
 
 def synthesise(plant: DescriptorSystem, asked: DetectionFilterMethod, *, progress: Callable[[str], None]) -> Synthesis:
@@ -57,8 +57,8 @@ def synthesise(plant: DescriptorSystem, asked: DetectionFilterMethod, *, progres
         fault_delays=(),
     )
     felt = error_transfer(smooth, observer, *unknown_inputs(smooth))
-    witness = _gain_witness(felt, 1.0 + MARGIN)
-    if witness is None or not gain_is_proved(felt, 1.0 + MARGIN, witness):
+    witness = _gain_witness(felt, 1.0 + PROOF_MARGIN)
+    if witness is None or not gain_is_proved(felt, 1.0 + PROOF_MARGIN, witness):
         raise SolverError(
             "The Riccati equation of the detection filter has no solution of which a gain can be proved: the slowest "
             f"pole is at {abscissa(observer.Az, 0.0):.3g} 1/s, next to a zero from the unknown inputs to the outputs "
@@ -67,7 +67,7 @@ def synthesise(plant: DescriptorSystem, asked: DetectionFilterMethod, *, progres
     low, high = (float(value) for value in asked.band)
     least, where = _sensitivity(smooth, observer, low, high)
     claims = {
-        "disturbance_gain": 1.0 + MARGIN,
+        "disturbance_gain": 1.0 + PROOF_MARGIN,
         "fault_sensitivity": _provable(smooth, observer, least, low, high),
         "band_from": low,
         "band_to": high,
@@ -152,7 +152,7 @@ def _sensitivity(plant: DescriptorSystem, observer: LinearObserver, low: float, 
     values = least(grid)
     at = int(np.argmin(values))
     left, right = grid[max(at - 1, 0)], grid[min(at + 1, len(grid) - 1)]
-    for _ in range(REFINEMENTS):
+    for _ in range(GRID_REFINEMENTS):
         inner = np.linspace(left, right, 5)
         best = int(np.argmin(least(inner)))
         left, right = inner[max(best - 1, 0)], inner[min(best + 1, 4)]

@@ -14,7 +14,7 @@ from obsynth.proofs.exact_arithmetic import nearest_doubles, stored_matrix
 from obsynth.verification.error_system import contraction_of
 
 #: With more states what the stored numbers miss is enclosed, not computed exactly.
-MOST_STATES = 64
+MOST_EXACT_STATES = 64
 
 
 def error_transfer(plant: DescriptorSystem, observer: LinearObserver, b: FloatArray, d: FloatArray) -> Transfer:
@@ -28,7 +28,7 @@ def error_transfer(plant: DescriptorSystem, observer: LinearObserver, b: FloatAr
 def missed(plant: DescriptorSystem, observer: LinearObserver) -> tuple[Ball, Ball]:
     """Return ``K = Az + By C - A`` and ``J = Cz + Dy C``: zero but for the rounding of the stored numbers."""
     parts = observer.Az, observer.By, plant.A, observer.Cz, observer.Dy, plant.C
-    if plant.nx > MOST_STATES:
+    if plant.nx > MOST_EXACT_STATES:
         az, by, a, cz, dy, c = (Ball.exact(part) for part in parts)
         return az + by @ c - a, cz + dy @ c
     stored = [stored_matrix(part) for part in parts]

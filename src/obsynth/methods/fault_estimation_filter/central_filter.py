@@ -19,10 +19,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
-from obsynth.methods.fault_estimation_filter.injection_problem import GainProblem, Injection
+from obsynth.methods.fault_estimation_filter.injection_problem import (
+    GainProblem,
+    Injection,
+    NormalisedProblem,
+    normalise,
+)
 from obsynth.numerics.arrays import SMALLEST, FloatArray
 from obsynth.numerics.doubling import MOST_JUMPS, doubled_riccati_solution, is_positive
 from obsynth.numerics.norms import spectral_radius
@@ -503,3 +509,82 @@ def _with_noise(problem: GainProblem, weight: float) -> GainProblem:
         D=np.hstack([problem.D, weight * problem.Dn]),
         Zd=np.hstack([problem.Zd, weight * problem.Zn]),
     )
+
+
+#: A gain this close to one that no filter is below is the least.
+AT_THE_BOUND = 1e-6
+#: Coordinates in which the Riccati equations are solved, at most.
+MOST_PASSES = 8
+#: Riccati equations need no other coordinates when the gain is at least this fraction of that behind those they had.
+GOOD_COORDINATES = 0.1
+#: Gains below this fraction of the starting filter's are treated as zero: the disturbance is decoupled.
+NEGLIGIBLE_GAIN = 1e-6
+#: The bracket of a bisection ends at this share of the width asked for: the filter in hand is at its upper end.
+BRACKET_SHARE = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class LeastGain:
+    """The outcome of the search: the true norm of the best filter (0 without d), and its gains.
+
+    ``first``: coordinates of the starting (Kalman) filter; ``starting_gain``: its norm; ``bracket``: of a bisection.
+    """
+
+    gain: float
+    first: NormalisedProblem
+    injection: Injection
+    starting_gain: float
+    bracket: tuple[float, float]
+    records: list[dict[str, Any]] = field(default_factory=list)
+
+
+def search_least_gain(problem: GainProblem) -> LeastGain:
+    """Minimise the gain directly, improving the coordinates between passes."""
+    first = normalised = normalise(problem)
+    best = first.start
+    gain = starting = first.start_gain
+    records: list[dict[str, Any]] = []
+    if problem.measured == 0 or gain == 0.0:
+        return LeastGain(gain, first, best, starting, (gain, gain))
+    for number in range(MOST_PASSES):
+        if problem.order == 0 or gain <= least_level(problem) * (1.0 + AT_THE_BOUND):
+            break  # nothing is below
+        before = gain
+        if best is not normalised.start:
+            normalised = normalise(problem, start=best, gain=gain)
+        # In coordinates in which the artificial noise is of a natural size.
+        work, start = with_least_weight(normalised.problem), normalised.contracted(best)
+        known: float | None = gain / normalised.gain
+        if not work.weight_is_free and np.any(start.V):
+            start, known = Injection(start.R, np.zeros_like(start.V)), None
+        found, level = search_central_filter(work, start, known, start_is_good=number > 0)
+        records.append({"what": "least gain", "solver": "central filter", "status": "optimal", "gain": level})
+        if level * normalised.gain < gain:
+            best, gain = normalised.restore(found), level * normalised.gain
+        if gain >= GOOD_COORDINATES * before or gain <= NEGLIGIBLE_GAIN * starting:
+            break
+    gain = replace(problem, judged_exactly=True).achieved_gain(best)
+    return LeastGain(gain, first, best, starting, (gain, gain), records)
+
+
+def search_by_bisection(problem: GainProblem, *, tolerance: float) -> LeastGain:
+    """Minimise the gain by bisection: the paper's Algorithm 1, made to end.
+
+    Every upper end of the bracket is the true norm of a filter in hand, the lower end a level at which none was found.
+    """
+    problem = replace(problem, judged_exactly=True)
+    normalised = normalise(problem)
+    gain = normalised.start_gain
+    if problem.measured == 0 or gain == 0.0:
+        return LeastGain(gain, normalised, normalised.start, gain, (gain, gain))
+    work, best = normalised.problem, normalised.contracted(normalised.start)
+    high, low = work.achieved_gain(best), 0.0
+    while high - low > BRACKET_SHARE * tolerance * high:
+        middle = 0.5 * (low + high)
+        better = central_filter_at(work, middle)
+        if better is None:
+            low = middle
+        else:
+            best, high = better, min(middle, work.achieved_gain(better))
+    injection, bracket = normalised.restore(best), (low * normalised.gain, high * normalised.gain)
+    return LeastGain(problem.achieved_gain(injection), normalised, injection, gain, bracket)

@@ -22,7 +22,7 @@ TAILS = (1e-2, 1e-4, 1e-6, 1e-9, 1e-12, 1e-16, 1e-20)
 #: Slack of the Riccati equation relative to the output weight, largest first: the first that proves is taken.
 SLACKS = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10)
 #: Steps towards coordinates in which the norm of the error dynamics is near one: how many, and down to which power.
-MOST_STEPS = 60
+MOST_CONTRACTIONS = 60
 STEP_POWER = 0.75
 NEAR_ONE = 1.05
 
@@ -91,7 +91,7 @@ def _contracted(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
     change, identity = _balanced(a, b, c), np.eye(a.shape[0])
     moved = np.linalg.solve(change, a @ change)
     norm = float(np.linalg.norm(moved, 2))
-    for _ in range(MOST_STEPS):
+    for _ in range(MOST_CONTRACTIONS):
         level = max(min(0.5 * norm, norm**STEP_POWER), 1.0)
         p = output_covariance(moved.T / level, identity, identity, np.zeros_like(a))  # the sum of A'^k A^k
         if norm <= NEAR_ONE or not np.all(np.isfinite(p)):

@@ -33,7 +33,15 @@ from obsynth.analysis.existence.verdicts import (
 )
 from obsynth.analysis.existence.witnesses import EntryChange, Unclear, Witness, rational_matrices
 from obsynth.analysis.plant_units import PlantUnits, sized_plant
-from obsynth.analysis.zeros import Zero, fault_zeros, hidden_direction, leading_names, system_pencil, zero_at
+from obsynth.analysis.zeros import (
+    MOST_NAMES,
+    Zero,
+    fault_zeros,
+    hidden_direction,
+    leading_names,
+    system_pencil,
+    zero_at,
+)
 from obsynth.errors import PreconditionError
 from obsynth.methods.fault_estimation_filter.detectability_indexes import (
     REFUSE_CONDITION,
@@ -166,8 +174,6 @@ def _scalar(value: Fraction) -> fmpq_mat:
     return fmpq_mat(1, 1, [fmpq(value.numerator, value.denominator)])
 
 
-#: At most this many signals are named in a failed condition.
-MOST_NAMES = 4
 _fault_zeros = partial(
     Condition,
     name="fault zeros",

@@ -24,7 +24,7 @@ from obsynth.methods.fault_estimation_filter.injection_problem import (
 from obsynth.methods.fault_estimation_filter.least_gain_proof import (
     ALONE,
     LAST,
-    MOST_STATES,
+    MOST_EXAMINED_STATES,
     PAIRS,
     PROVED_SHARE,
     InvisiblePairs,
@@ -166,9 +166,9 @@ MOST_REACHED = 24
 #: Where two steps show less than this share of the gain in double precision, they prove nothing exactly either.
 HOPEFUL_SHARE = 0.99
 #: Filters of so many states are examined in any case: exact null spaces cost next to nothing there.
-FEW_STATES = 8
+CHEAP_STATES = 8
 #: Runs from rest have at most so many unknowns, and are long enough when less than this share of the gain is missing.
-MOST_UNKNOWNS = 96
+MOST_RUN_UNKNOWNS = 96
 LONG_ENOUGH = 1e-5
 _PARTS = ("S", "top", "bottom", "image", "shown", "Z", "Zd")
 
@@ -184,7 +184,7 @@ def proved_lower_bound(
     """
     bound = 0.0
     for work, start in product(_with_fewer_disturbances(problem), (None,) if best is None else (None, best)):
-        bound = max(bound, _bound_in(normalise(work, solver=solver, start=start), solver))
+        bound = max(bound, _bound_in(normalise(work, start=start), solver))
         if bound > enough:
             break
     return bound
@@ -358,7 +358,7 @@ def least_gain_certificate(
 
 def _is_hopeless(problem: GainProblem, gain: float, *, thorough: bool) -> bool:
     """Return whether two steps show too little in double precision, and more would cost much or is not tried."""
-    if not (MOST_REACHED if thorough else FEW_STATES) < problem.order <= MOST_STATES:
+    if not (MOST_REACHED if thorough else CHEAP_STATES) < problem.order <= MOST_EXAMINED_STATES:
         return False
     top, bottom, image = invisible_pairs(problem)
     if thorough and reached_from_rest(top, image).shape[1] <= MOST_REACHED:
@@ -390,7 +390,7 @@ def _best_run(dual: _DualProblem, enough: float) -> tuple[FloatArray, FloatArray
         _, values, vectors = np.linalg.svd(np.block(blocks), full_matrices=False)
         shown, strongest = float(values[0]), vectors[0]
         long_enough = shown >= enough * (1.0 - LONG_ENOUGH)
-        if long_enough or width + starts.shape[1] > MOST_UNKNOWNS or len(run) >= MOST_UNKNOWNS:
+        if long_enough or width + starts.shape[1] > MOST_RUN_UNKNOWNS or len(run) >= MOST_RUN_UNKNOWNS:
             break
         # Pairs that go on: what leads out of the states of all pairs is left out.
         kept = null_space(outside @ dual.image @ run[-1]) if len(outside) else np.eye(width)

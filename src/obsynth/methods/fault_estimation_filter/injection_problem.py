@@ -11,7 +11,6 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from obsynth.errors import SolverError
-from obsynth.methods.conic.lmi import FIRST_ORDER_SOLVERS
 from obsynth.methods.riccati import bounded_real_matrix, normalising_change, stabilising_gain
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.modal_response import Modes
@@ -28,7 +27,7 @@ NORMALISING_SLACK = 1e-6
 #: The normalising Riccati solution is taken at this multiple of the starting filter's norm.
 NORMALISING_LEVEL = 1.3
 #: A share that norms are certain to, and no one misses.
-ROUNDING = 1e-12
+NORM_ROUNDING = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +47,7 @@ class WeightLimit:
         least, found = float(np.linalg.norm(self.fixed, 2)), self.norm(v)
         if found <= self.bound or least >= self.bound:
             return v
-        return np.asarray((1.0 - ROUNDING) * (self.bound - least) / (found - least) * v)
+        return np.asarray((1.0 - NORM_ROUNDING) * (self.bound - least) / (found - least) * v)
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,10 +192,11 @@ class NormalisedProblem:
         return Injection(np.linalg.solve(self.states, solution.R) @ inverse, solution.V @ inverse)
 
 
-def normalise(
-    problem: GainProblem, *, solver: str = "auto", start: Injection | None = None, gain: float | None = None
-) -> NormalisedProblem:
-    """Return the problem in coordinates that suit the solver; ``gain`` is that of ``start``, where known."""
+def normalise(problem: GainProblem, *, start: Injection | None = None, gain: float | None = None) -> NormalisedProblem:
+    """Return the problem in coordinates in which a solution of its inequality is near the identity.
+
+    ``gain`` is that of ``start``, where known.
+    """
     start = start if start is not None else _starting_filter(problem)
     # As a scale, a gain that is attained is as good as the largest one, and for many states much cheaper.
     gain = problem.achieved_gain(start) if gain is None else gain
@@ -206,12 +206,7 @@ def normalise(
     p = bounded_real_matrix(a, b, z, zd, NORMALISING_LEVEL * size, slack=tail)
     if p is None:
         p = bounded_real_matrix(a, b[:, :0], z, zd[:, :0], 1.0, slack=tail)
-    if p is None:
-        states = np.eye(problem.order)
-    elif solver not in FIRST_ORDER_SOLVERS:
-        states = normalising_change(p)
-    else:
-        states = np.eye(problem.order) / np.sqrt(np.trace(p) / problem.order)
+    states = np.eye(problem.order) if p is None else normalising_change(p)
     inverse = np.linalg.inv(states)
     c = problem.C @ states
     measurements = np.linalg.inv(np.linalg.cholesky(c @ c.T)) if problem.measured else np.zeros((0, 0))
@@ -230,6 +225,14 @@ def normalise(
         Dn=measurements @ problem.Dn,
     )
     return NormalisedProblem(changed, states, measurements, size, start, gain)
+
+
+def null_basis(matrix: FloatArray) -> FloatArray:
+    """Return an orthonormal basis ``(cols, cols - rows)`` of the null space of a matrix of full row rank."""
+    rows, columns = matrix.shape
+    if rows == 0:
+        return np.eye(columns)
+    return np.asarray(np.linalg.qr(matrix.T, mode="complete")[0][:, rows:])
 
 
 def _starting_filter(problem: GainProblem) -> Injection:

@@ -23,16 +23,16 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.checks import Check, information
 
 #: Filters of more states are not examined: exact null spaces of that many doubles take seconds.
-MOST_STATES = 64
+MOST_EXAMINED_STATES = 64
 #: Digits (bits) of the sums.
-BITS = 512
+SUM_BITS = 512
 #: Names of the certificate's matrices: F, K and M; one that is left out is zero.
 PAIRS, LAST, ALONE = "least_gain_pairs", "least_gain_last", "least_gain_alone"
 WITNESSES = frozenset({PAIRS, LAST, ALONE})
 #: The least gain found counts as proved where the proved bound is below it by this share at most.
 PROVED_SHARE = 1e-4
 #: Norms are computed in double precision: a bound may be above one by this share.
-NORM_TOLERANCE = 1e-6
+BOUND_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +54,7 @@ class InvisiblePairs:
     @classmethod
     def of(cls, work: DescriptorSystem, gains: Mapping[str, FloatArray]) -> InvisiblePairs | None:
         """Return the pairs of a plant with its sensor faults as states; ``None`` where there are too many states."""
-        if work.nx > MOST_STATES or not work.nd:
+        if work.nx > MOST_EXAMINED_STATES or not work.nd:
             return None
         parts = (*(gains[letter] for letter in ("T", "N", "L", "W", "Upsilon")), work.A, work.C, work.Bd, work.Dd)
         return cls._of(*((part.shape, part.tobytes()) for part in parts))
@@ -102,7 +102,7 @@ class InvisiblePairs:
             return 0.0
         if len(f) != k or last.shape != (nd, s) or len(alone) != nd:
             return 0.0
-        with flint.ctx.workprec(BITS):
+        with flint.ctx.workprec(SUM_BITS):
             mixed, later, direct = (arb_matrix(part) for part in (f, last, alone))
             image, top = (_balls(part) * mixed for part in (self.image, self.top))
             slack = image * image.transpose() - top * top.transpose()
@@ -143,13 +143,13 @@ def least_gain_row(
         )
     pairs = None if work is None else InvisiblePairs.of(work, gains)
     found = 0.0 if pairs is None else pairs.bound(matrices, free_weight=free_weight)
-    holds = found * (1.0 - NORM_TOLERANCE) <= claimed and claimed * (1.0 - PROVED_SHARE) <= found
+    holds = found * (1.0 - BOUND_TOLERANCE) <= claimed and claimed * (1.0 - PROVED_SHARE) <= found
     return Check(
         "least gain",
         f"no filter with {family} has a smaller gain than the claimed one, to {PROVED_SHARE:.0e} of it",
         found,
         claimed,
-        min(claimed * (1.0 + NORM_TOLERANCE) - found, found - claimed * (1.0 - PROVED_SHARE)),
+        min(claimed * (1.0 + BOUND_TOLERANCE) - found, found - claimed * (1.0 - PROVED_SHARE)),
         bool(holds),
         "disturbances that no gain sees, exactly; sums in ball arithmetic",
         "proved",

@@ -23,7 +23,7 @@ from obsynth.methods.fault_estimation_filter.detectability_indexes import (
     fault_detectability,
 )
 from obsynth.methods.fault_estimation_filter.prepared_plant import prepare, with_sensor_faults_as_states
-from obsynth.methods.method import Synthesis
+from obsynth.methods.method import WARN_AMPLIFICATION, Synthesis
 from obsynth.numerics.arguments import is_whole
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.numerics.norms import spectral_radius
@@ -98,10 +98,6 @@ def realise_filter(
     return observer, tracking, lag
 
 
-#: Amplifications of measurement errors above this are worth a note.
-WARN_AMPLIFICATION = 50.0
-
-
 #: Spectral radii above this are worth a note.
 SLOW_FILTER = 0.98
 
@@ -129,7 +125,9 @@ def notes(
             )
     radius = spectral_radius(observer.Az)
     if radius >= 1.0:
-        found.append(f"The filter never forgets its start: its spectral radius is {radius:.6g}, not below 1.")
+        found.append(
+            f"The filter's initial-condition response does not decay: its spectral radius is {radius:.6g}, not below 1."
+        )
     elif radius > SLOW_FILTER:
         found.append(
             f"The filter settles slowly: spectral radius {radius:.6g}, time constant "

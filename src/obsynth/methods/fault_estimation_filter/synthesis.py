@@ -28,22 +28,24 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import partial
-from typing import Any, NamedTuple
+from functools import cached_property, partial
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from obsynth.analysis.conditions import require_all
 from obsynth.errors import InfeasibleError, SolverError
-from obsynth.extensions import extension
-from obsynth.methods.conic.lmi import AUTO, SCHUR, chosen_solver
-from obsynth.methods.fault_estimation_filter import inequality_solutions
+from obsynth.methods.conic.lmi import chosen_solver, solved
 from obsynth.methods.fault_estimation_filter.central_filter import (
+    AT_THE_BOUND,
     FEW_STATES,
     MOST_STATES_FOR_LEVELS,
-    central_filter_at,
+    LeastGain,
+    least_level,
     least_noise_filter,
     noise_weighted_filters,
+    search_by_bisection,
+    search_least_gain,
 )
 from obsynth.methods.fault_estimation_filter.certificate import bounded_real_certificate
 from obsynth.methods.fault_estimation_filter.conditions import examine_fault_filter
@@ -52,24 +54,29 @@ from obsynth.methods.fault_estimation_filter.gamma_lower_bound import (
     least_gain_certificate,
     proved_lower_bound,
 )
-from obsynth.methods.fault_estimation_filter.inequality_search import SMALLEST_USEFUL_GAIN, LeastGain, search_least_gain
-from obsynth.methods.fault_estimation_filter.inequality_solutions import null_basis
 from obsynth.methods.fault_estimation_filter.injection_problem import (
     GainProblem,
     Injection,
-    NormalisedProblem,
     WeightLimit,
-    normalise,
+    null_basis,
 )
 from obsynth.methods.fault_estimation_filter.method import FaultEstimationFilter
-from obsynth.methods.fault_estimation_filter.prepared_plant import PreparedPlant, prepare
+from obsynth.methods.fault_estimation_filter.prepared_plant import (
+    PreparedPlant,
+    prepare,
+    with_sensor_faults_as_states,
+)
 from obsynth.methods.fault_estimation_filter.realisation import notes, realise_filter
 from obsynth.methods.method import Synthesis
 from obsynth.numerics.arrays import FloatArray, as_matrix
+from obsynth.numerics.regions import disk
 from obsynth.observers.linear.derived import averaged
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import Certificate
+
+if TYPE_CHECKING:
+    from obsynth.conditions.problem import Conditions
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,109 +125,91 @@ class Goal:
         return float(np.linalg.norm(np.vstack([injection.R, injection.V])))
 
 
-#: Descent in steps: ratios of successive levels, tried in turn, and how many steps at most.
-STEP_RATIOS = (0.6, 0.9)
-MOST_STEPS = 24
-#: A step counts when its level is met to this relative accuracy.
-LEVEL_ACCURACY = 1e-6
-#: Further solutions of the inequality at most, and the ratio of costs below which another one is worth its time.
-MOST_REPETITIONS = 2
-WORTH_REPEATING = 0.95
+@dataclass(frozen=True, eq=False)
+class PrintedInequality:
+    """The paper's inequality (45) for a prepared plant, from `obsynth.conditions`, and its gains in balanced units."""
 
+    plant: DescriptorSystem
+    prepared: PreparedPlant
+    parts: _Parts
+    free_weight: bool
+    solver: str
 
-def gains_by_inequality(goal: Goal, least: LeastGain, records: list[dict[str, Any]], *, solver: str) -> list[Injection]:
-    """Return what the inequality gives, in different coordinates until one is good and fast enough.
+    @cached_property
+    def conditions(self) -> Conditions:
+        """The inequality, written in the coordinates of a Riccati filter."""
+        from obsynth.conditions.wang import wang2015
 
-    The bounds on P mean something else in other coordinates, and those of the least gain can be extreme.
-    """
-    problem, gain, fresh = goal.problem, goal.gain, least.first
-    candidates: list[Injection] = []
-    close = normalise(problem, solver=solver, start=least.injection, gain=least.gain)
-    attempts = ((close, 1.0), (fresh, 1.0), (None, 1.0), (close, goal.slowest), (fresh, goal.slowest))
-    for normalised, decay in attempts:
-        if normalised is None:
-            injection = _small_gains_step_by_step(goal, fresh, records, solver=solver)
+        scaling = self.prepared.scaling
+        states = scaling.states[:, None]
+        return wang2015(
+            self.plant,
+            T=states * self.prepared.T * scaling.equations,
+            N=states * self.prepared.N * scaling.outputs,
+            W="free" if self.free_weight else self.parts.W0 * scaling.outputs,
+            coordinates="balanced",
+        )
+
+    def least(self, problem: GainProblem, records: list[dict[str, Any]]) -> Injection | None:
+        """Return the filter of the least gain of the inequality; ``None`` where the solver gives none."""
+        return self._filter("least gain", self.conditions, problem.weight_limit, records)
+
+    def small_gains(
+        self, problem: GainProblem, level: float, records: list[dict[str, Any]], *, decay: float = 1.0
+    ) -> Injection | None:
+        """Return a filter of small gains, or of little noise, at a level; ``None`` where the solver gives none."""
+        import cvxpy as cp
+
+        from obsynth.conditions.atoms import region
+        from obsynth.conditions.wang import h2_terms, noise_paths
+
+        found, added = self.conditions, dict[str, Any]()
+        P, Y = found.variables["P"], found.variables["Y"]
+        if problem.disturbances:
+            added["gamma"] = found.variables["gamma_squared"] <= level**2
+        if decay < 1.0:
+            added["decay"] = region(found.data["A1"], P, disk(0.0, decay), Y=Y, Cy=found.data["C1"])[1]
+        if problem.states_noise:
+            work = with_sensor_faults_as_states(self.plant)
+            entering, free = noise_paths(self.plant, found, work.Bw, work.Dw)
         else:
-            injection = _small_gains_in(problem, normalised, gain, records, solver=solver, decay=decay)
-        if injection is not None and goal.met(injection):
-            candidates.append(injection)
-            if goal.met_fast(injection):
-                candidates += _again(goal, injection, records, solver=solver, decay=decay)
-                break
-    if not candidates and problem.disturbances:
-        centre = inequality_solutions.feasible_point(close.problem, gain / close.gain, solver=solver)
-        candidates = [] if centre is None else [close.restore(centre.injection)]
-    return [item for item in candidates if goal.met(item)]
+            # Unit noise on what no fault reaches alone: its variance is the size of the gains.
+            free = self.parts.V / self.prepared.scaling.outputs[:, None]
+            entering = np.zeros((len(found.data["T"]), free.shape[1]))
+        _, added["variance"], Z = h2_terms(self.plant, found, entering, free)
+        changed = found.changed(constraints=added, objective=cp.trace(Z))
+        return self._filter("small gains", changed, problem.weight_limit, records)
 
+    def _filter(
+        self, what: str, found: Conditions, limit: WeightLimit | None, records: list[dict[str, Any]]
+    ) -> Injection | None:
+        import cvxpy as cp
 
-def _again(
-    goal: Goal, injection: Injection, records: list[dict[str, Any]], *, solver: str, decay: float
-) -> list[Injection]:
-    """Return what the inequality gives in the coordinates of its own answer, while that costs much less each time."""
-    found: list[Injection] = []
-    before, cost = np.inf, goal.cost(injection)
-    for _ in range(MOST_REPETITIONS):
-        if found and cost > WORTH_REPEATING * before:
-            break
-        normalised = normalise(goal.problem, solver=solver, start=injection)
-        better = _small_gains_in(goal.problem, normalised, goal.gain, records, solver=solver, decay=decay)
-        if better is None or not goal.met_fast(better):
-            break
-        found.append(better)
-        injection, before, cost = better, cost, goal.cost(better)
-    return found
-
-
-def _small_gains_in(
-    problem: GainProblem,
-    normalised: NormalisedProblem,
-    gain: float,
-    records: list[dict[str, Any]],
-    *,
-    solver: str,
-    decay: float = 1.0,
-) -> Injection | None:
-    try:
-        work, level = _with_scaled_noise(normalised), gain / normalised.gain
-        found = inequality_solutions.small_gains(work, level, solver=solver, decay=decay)
-    except (SolverError, np.linalg.LinAlgError) as error:
-        records.append(dict(getattr(error, "record", {})) | {"outcome": str(error)})
-        return None
-    records.append(found.record)
-    return normalised.restore(found.injection)
-
-
-def _small_gains_step_by_step(
-    goal: Goal, normalised: NormalisedProblem, records: list[dict[str, Any]], *, solver: str
-) -> Injection | None:
-    """Go from the filter of ``normalised`` down to the goal, each filter giving the next coordinates.
-
-    Far below the starting filter's gain its coordinates are too bad for one jump.
-    """
-    problem = goal.problem
-    reached = problem.achieved_gain(normalised.start)
-    for _ in range(MOST_STEPS):
-        for ratio in STEP_RATIOS:
-            level = max(goal.gain, ratio * reached)
-            injection = _small_gains_in(problem, normalised, level, records, solver=solver)
-            if injection is not None and goal.at(level * (1.0 + LEVEL_ACCURACY)).met(injection):
-                break
-        else:
+        if limit is not None and found.weight is not None:
+            found = found.changed(constraints={"weight": cp.norm(found.weight, 2) <= limit.bound})
+        try:
+            records.append(solved(found.problem, what, self.solver))
+            gains = found.gains()
+        except SolverError as error:
+            records.append({**error.record, "outcome": str(error)})
             return None
-        if goal.met(injection):
-            return injection
-        reached = problem.achieved_gain(injection)
-        normalised = normalise(problem, solver=solver, start=injection)
-    return None
+        scaling, parts = self.prepared.scaling, self.parts
+        r = (gains["L"] / scaling.states[:, None] / scaling.outputs - parts.L0) @ parts.V
+        if not self.free_weight:
+            return Injection(r, np.zeros((len(parts.W0), parts.V.shape[1])))
+        v = (gains["W"] / scaling.outputs - parts.W0) @ parts.V
+        return Injection(r, v if limit is None else limit.kept(v))
 
 
-def _with_scaled_noise(normalised: NormalisedProblem) -> GainProblem:
-    """Return the problem with its noise scaled so that the objective is of size one."""
-    work = normalised.problem
-    r = normalised.contracted(normalised.start).R
-    size = float(np.linalg.norm(np.vstack([work.Bn - r @ work.Dn, work.Zn])))
-    size = size if size > 0.0 else max(float(np.linalg.norm(work.Dn)), 1.0)
-    return replace(work, Bn=work.Bn / size, Dn=work.Dn / size, Zn=work.Zn / size)
+def gains_by_inequality(goal: Goal, printed: PrintedInequality, records: list[dict[str, Any]]) -> list[Injection]:
+    """Return what the inequality gives that meets the goal; with a decay imposed where that is too slow without."""
+    found: list[Injection] = []
+    for decay in (1.0, goal.slowest):
+        injection = printed.small_gains(goal.problem, goal.gain, records, decay=decay)
+        found += [injection] if injection is not None and goal.met(injection) else []
+        if any(map(goal.is_fast, found)):
+            break
+    return found
 
 
 #: The error shall be forgotten at least this fast (spectral radius), or half as fast as the starting filter does: the
@@ -239,7 +228,7 @@ COARSEST_LINE_STEPS = 2
 
 
 def small_gain_design(
-    problem: GainProblem, least: LeastGain, gain: float, *, solver: str, engine: str
+    problem: GainProblem, least: LeastGain, gain: float, *, printed: PrintedInequality, engine: str
 ) -> tuple[Injection, list[dict[str, Any]]]:
     """Return gains of least size or noise whose true norm is at most ``gain``, and records of what was tried.
 
@@ -274,11 +263,10 @@ def small_gain_design(
     wanted = {
         "auto": small and not candidates,
         "riccati": False,
-        "lmi": small or problem.weight_limit is not None or not candidates,
+        "lmi": problem.order <= MOST_STATES_TO_POLISH or problem.weight_limit is not None or not candidates,
     }
     if wanted[engine]:
-        # The eliminated inequality has no gains to make small: this takes the whole one.
-        candidates += gains_by_inequality(goal, least, records, solver=solver)
+        candidates += gains_by_inequality(goal, printed, records)
     if (wanted[engine] or not candidates) and goal.met(least.injection):
         candidates.append(least.injection)
     if not candidates:
@@ -328,37 +316,10 @@ def _towards(goal: Goal, injection: Injection, target: Injection | None, *, slow
     return best
 
 
-#: The bracket ends at this share of the width asked for: the filter in hand is at its upper end.
-BRACKET_SHARE = 0.1
-
-
-def search_by_bisection(problem: GainProblem, *, tolerance: float, solver: str, polish: bool = True) -> LeastGain:
-    """Minimise the gain by bisection: the paper's Algorithm 1, made to end.
-
-    Every upper end of the bracket is the true norm of a filter in hand, the lower end a level at which none was found.
-    """
-    problem = replace(problem, judged_exactly=True)
-    normalised = normalise(problem, solver=solver)
-    gain = normalised.start_gain
-    if problem.measured == 0 or gain == 0.0:
-        return LeastGain(gain, normalised, normalised.start, gain, (gain, gain))
-    work, best = normalised.problem, normalised.contracted(normalised.start)
-    high, low, records = work.achieved_gain(best), 0.0, list[dict[str, Any]]()
-    while high - low > BRACKET_SHARE * tolerance * high:
-        middle = 0.5 * (low + high)
-        better = central_filter_at(work, middle)
-        if better is None and polish:
-            found = inequality_solutions.feasible_point(work, middle, solver=solver)
-            better = None if found is None else found.injection
-            records += [] if found is None else [found.record]
-        if better is None:
-            low = middle
-        else:
-            best, high = better, min(middle, work.achieved_gain(better))
-    injection, bracket = normalised.restore(best), (low * normalised.gain, high * normalised.gain)
-    return LeastGain(problem.achieved_gain(injection), normalised, injection, gain, bracket, records)
-
-
+#: A shipped gain is never asked to be smaller than this fraction of the starting filter's.
+SMALLEST_USEFUL_GAIN = 1e-3
+#: Why the inequality was not asked.
+NOTHING_TO_POLISH = "reached: the disturbance does as much before any measurement can help; nothing to polish"
 #: Asking for a gain above this multiple of the starting filter's adds nothing but bad scaling.
 LARGEST_USEFUL_GAIN = 1e3
 #: The gains are designed for a slightly smaller gamma than claimed, so that the claim has a well-conditioned proof.
@@ -371,7 +332,7 @@ NOMINAL_GAIN = 1e-3
 #: A gamma between these multiples of the least gain found by the equations calls the inequality by default, up to so
 #: many states: far below the least no polish helps, and far above none is needed.
 BELOW_LEAST, ABOVE_LEAST = 0.95, 1.0 + 1e-4
-MOST_STATES_TO_POLISH = 64
+MOST_STATES_TO_POLISH = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -390,12 +351,18 @@ class FoundGains:
 
 
 def found_gains(
-    problem: GainProblem, asked: FaultEstimationFilter, engine: str, *, noisy: bool, progress: Callable[[str], None]
+    problem: GainProblem,
+    asked: FaultEstimationFilter,
+    engine: str,
+    *,
+    printed: PrintedInequality,
+    progress: Callable[[str], None],
 ) -> FoundGains:
     """Search the least gain, and small gains for a slightly larger one."""
     size = max(problem.disturbance_size, NOMINAL_GAIN)
     progress("searching the least gain")
-    least = _least_gain(problem, asked, engine)
+    noisy = printed.plant.nw > 0
+    least = _least_gain(problem, asked)
     unfelt = problem.disturbances and least.starting_gain <= ROUNDING_GAIN * problem.disturbance_size
     if unfelt and noisy and problem.weight_limit is None:
         # Against the noise, gains may take up measurements that feel the disturbance: it stays in the problem.
@@ -403,16 +370,14 @@ def found_gains(
     elif unfelt:
         # What is left of the disturbance in the estimates is rounding: nothing to minimise.
         problem = problem.without_disturbance()
-        least = replace(_least_gain(problem, asked, engine), gain=least.starting_gain)
-    elif engine == "auto" and asked.gamma is not None and _leaves_little(asked.gamma, least.gain, problem):
+        least = replace(_least_gain(problem, asked), gain=least.starting_gain)
+    elif engine == "lmi" or (engine == "auto" and _leaves_little(asked.gamma, least.gain, problem)):
         progress("polishing the least gain")
-        polished = _least_gain(problem, asked, "lmi")
-        records = [*least.records, *polished.records]
-        least = replace(min(least, polished, key=lambda found: found.gain), records=records)
+        least = _polished(problem, least, printed)
     gamma = _gain_to_ship(asked, problem, least, noisy=noisy)
     progress("choosing small gains")
     inner = gamma - min(CERTIFICATE_SHARE * (gamma - least.gain), CERTIFICATE_MARGIN * gamma)
-    chosen, records = small_gain_design(problem, least, inner, solver=asked.solver, engine=engine)
+    chosen, records = small_gain_design(problem, least, inner, printed=printed, engine=engine)
     return FoundGains(problem, least, gamma, chosen, records)
 
 
@@ -421,32 +386,47 @@ def found_within(
     limited: GainProblem,
     asked: FaultEstimationFilter,
     *,
-    noisy: bool,
+    printed: PrintedInequality,
     progress: Callable[[str], None],
 ) -> FoundGains:
     """Search gains with a limit on the weight, which Riccati equations do not cover."""
     if asked.engine == "auto" and limited.weight_limit is not None:
         # They do where the limit costs nothing: what is found without it keeps it.
         try:
-            free = found_gains(problem, asked, "auto", noisy=noisy, progress=progress)
+            free = found_gains(problem, asked, "auto", printed=printed, progress=progress)
         except SolverError:
             free = None
         if free is not None and free.within(limited.weight_limit):
             return free
     engine = "lmi" if asked.engine == "auto" else asked.engine
-    return found_gains(limited, asked, engine, noisy=noisy, progress=progress)
+    return found_gains(limited, asked, engine, printed=printed, progress=progress)
 
 
-def _least_gain(problem: GainProblem, asked: FaultEstimationFilter, engine: str) -> LeastGain:
-    polish = engine == "lmi"
+def _least_gain(problem: GainProblem, asked: FaultEstimationFilter) -> LeastGain:
     if asked.gamma_search == "direct":
-        return search_least_gain(problem, solver=asked.solver, polish=polish)
-    return search_by_bisection(problem, tolerance=asked.tolerance, solver=asked.solver, polish=polish)
+        return search_least_gain(problem)
+    return search_by_bisection(problem, tolerance=asked.tolerance)
 
 
-def _leaves_little(gamma: float, least: float, problem: GainProblem) -> bool:
+def _polished(problem: GainProblem, least: LeastGain, printed: PrintedInequality) -> LeastGain:
+    """Return the filter of the inequality's least gain where its true gain is less."""
+    records = list(least.records)
+    if problem.measured == 0 or problem.disturbances == 0:
+        return least
+    if least.gain <= least_level(problem) * (1.0 + AT_THE_BOUND):
+        told = {"what": "least gain", "solver": "lower bound", "status": NOTHING_TO_POLISH, "gain": least.gain}
+        return replace(least, records=[*records, told])
+    injection = printed.least(problem, records)
+    gain = np.inf if injection is None else replace(problem, judged_exactly=True).achieved_gain(injection)
+    if injection is None or not gain < least.gain:
+        return replace(least, records=records)
+    bracket = (min(least.bracket[0], gain), min(least.bracket[1], gain))
+    return replace(least, gain=gain, injection=injection, bracket=bracket, records=records)
+
+
+def _leaves_little(gamma: float | None, least: float, problem: GainProblem) -> bool:
     """Whether a gamma leaves less room above the least gain found than the inequality may still find."""
-    near = BELOW_LEAST * least <= gamma <= ABOVE_LEAST * least
+    near = gamma is not None and BELOW_LEAST * least <= gamma <= ABOVE_LEAST * least
     return near and problem.disturbances > 0 and problem.order <= MOST_STATES_TO_POLISH
 
 
@@ -497,10 +477,11 @@ FIRST_TRIES = 4
 
 def synthesise(plant: DescriptorSystem, asked: FaultEstimationFilter, *, progress: Callable[[str], None]) -> Synthesis:
     """Design the filter; see `obsynth.fault_estimation_filter` for the options, results and errors."""
-    solver = chosen_solver(asked.solver, asked.solver_options, ours=(AUTO, SCHUR))
+    solver = chosen_solver(asked.solver, asked.solver_options)
     if asked.own_inequality:
-        own: Synthesis = extension("filter by its inequality")(plant, asked, progress=progress)
-        return own
+        from obsynth.conditions.own_terms import filter_by_inequality
+
+        return filter_by_inequality(plant, asked, progress=progress)
     asked = replace(asked, solver=solver)
     progress("checking the existence conditions")
     held, prepared = examine_fault_filter(plant)
@@ -516,7 +497,8 @@ def synthesise(plant: DescriptorSystem, asked: FaultEstimationFilter, *, progres
         # With the paper's S the weight is its W = Upsilon^+ too, which is that of the outputs as given.
         problem, parts = centred(problem, prepared, parts)
     limited = None if limit is None else with_weight_limit(problem, prepared, parts, limit)
-    search = partial(_found, problem, limited, asked, noisy=plant.nw > 0, progress=progress)
+    printed = PrintedInequality(plant, prepared, parts, free, asked.solver)
+    search = partial(_found, problem, limited, asked, printed=printed, progress=progress)
     found = search(exactly=False)
     progress("building the realisation and its certificate")
     shipped = _Shipped.of(plant, prepared, parts, found, nominal, tries=FIRST_TRIES)
@@ -550,7 +532,6 @@ def synthesise(plant: DescriptorSystem, asked: FaultEstimationFilter, *, progres
         if "gamma_bracket_high" in claims:
             claims["gamma_bracket_high"] = max(claims["gamma_bracket_high"], claims["gamma_min"])
     resolved = asked.as_plain() | {"free_residual_weight": free, "S": None if s is None else s.tolist()}
-    del resolved["model_error"]  # decided before this
     if asked.mean > 1:
         # Registers hold estimates, which see no state: nothing of the plant is tracked there.
         zeros = np.zeros(((asked.mean - 1) * plant.nf, tracking.shape[1]))
@@ -575,13 +556,14 @@ def _found(
     asked: FaultEstimationFilter,
     *,
     exactly: bool,
-    noisy: bool,
+    printed: PrintedInequality,
     progress: Callable[[str], None],
 ) -> FoundGains:
     problem = replace(problem, judged_exactly=exactly)
     if limited is None:
-        return found_gains(problem, asked, asked.engine, noisy=noisy, progress=progress)
-    return found_within(problem, replace(limited, judged_exactly=exactly), asked, noisy=noisy, progress=progress)
+        return found_gains(problem, asked, asked.engine, printed=printed, progress=progress)
+    limited = replace(limited, judged_exactly=exactly)
+    return found_within(problem, limited, asked, printed=printed, progress=progress)
 
 
 class _Shipped(NamedTuple):

@@ -1,4 +1,4 @@
-"""When a functional filter exists: each fault shows free of all that must not show, at every pole of its model."""
+"""When a functional filter exists: each fault is visible, decoupled from the rest, at every pole of its model."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def fault_conditions(
     rest = dc_point(plant.dt)
     seen = Condition(
         f"{name} shows",
-        f"{name} shows free of {_rest(plant, fault)}",
+        f"{name} is visible, decoupled from {_rest(plant, fault)}",
         asked.visible,
         float(asked.visible),
         1.0,
@@ -140,7 +140,7 @@ def _residual_conditions(plant: DescriptorSystem, seen: Sequence[int], exactly: 
         rest = dc_point(plant.dt)
         shown = Condition(
             f"{name} shows" + (f" without {', '.join(plant.fault_names[j] for j in removed)}" if removed else ""),
-            f"{name} shows free of {', '.join(blind) or 'the initial state'}",
+            f"{name} is visible, decoupled from {', '.join(blind) or 'the initial state'}",
             asked.visible,
             float(asked.visible),
             1.0,

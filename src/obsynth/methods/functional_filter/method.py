@@ -11,15 +11,13 @@ from annotated_types import Ge
 
 from obsynth.analysis.conditions import Condition
 from obsynth.errors import SpecError
-from obsynth.methods.method import ClaimMeaning, Method, PlantKind, Purpose
+from obsynth.methods.method import OPTIONS_PATH, ClaimMeaning, Method, PlantKind, Purpose
 from obsynth.numerics.arguments import FewSamples, NonNegative, WrittenAs, is_finite_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.checks import Check
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.error_system import ErrorModel
-
-_PATH = "method.options"
 
 CLAIMS = {
     "order": ClaimMeaning("", "states of the filter", "order"),
@@ -177,7 +175,7 @@ class FunctionalFilter(Method):
 
 def _by_name(given: Any, names: Sequence[str], option: str, *, missing: float | None) -> FloatArray:
     """Return a number for each name, from one number or a mapping."""
-    path = f"{_PATH}.{option}"
+    path = f"{OPTIONS_PATH}.{option}"
     if isinstance(given, Mapping):
         unknown = [name for name in given if name not in names]
         lacking = [name for name in names if name not in given]

@@ -44,7 +44,7 @@ from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.fault_models import Exosystem, exosystem
 from obsynth.proofs.extended_balls import arb_matrix
-from obsynth.proofs.products import BITS, as_ball
+from obsynth.proofs.products import EXPONENTIAL_BITS, as_ball
 from obsynth.results.design import Certificate
 from obsynth.verification.certificates import slowest_decay
 
@@ -157,7 +157,7 @@ def _rounded_once(model: FilterModel, gain: KalmanGain, coordinates: FloatArray)
     """Return the dynamics in other coordinates; with digits to spare, for the small rows of entries that cancel."""
     import flint
 
-    with flint.ctx.workprec(BITS):
+    with flint.ctx.workprec(EXPONENTIAL_BITS):
         k, there = arb_matrix(gain.K), arb_matrix(coordinates)
         back = there.inv()
         parts = ((model.A, -model.C), (model.B, model.L), (model.T, model.T0))

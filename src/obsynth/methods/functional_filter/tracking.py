@@ -11,11 +11,11 @@ from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.covariances import certain_noise_covariance
 from obsynth.proofs.extended_balls import arb_matrix
-from obsynth.proofs.products import BITS, as_ball
+from obsynth.proofs.products import EXPONENTIAL_BITS, as_ball
 from obsynth.verification.error_system import ErrorModel
 
 #: Regulator equations of more unknowns are solved in double precision.
-MOST_UNKNOWNS = 100
+MOST_RATIONAL_UNKNOWNS = 100
 
 
 def tracking_map(
@@ -27,7 +27,7 @@ def tracking_map(
     entering = (observer.By @ plant.Df - t @ plant.Bf) @ cw
     if not entering.size:
         return np.zeros(entering.shape)
-    exact = _with_digits_to_spare(observer.Az, phi, entering) if entering.size <= MOST_UNKNOWNS else None
+    exact = _with_digits_to_spare(observer.Az, phi, entering) if entering.size <= MOST_RATIONAL_UNKNOWNS else None
     return np.asarray(solve_sylvester(observer.Az, -phi, -entering)) if exact is None else exact
 
 
@@ -37,7 +37,7 @@ def _with_digits_to_spare(a: FloatArray, phi: FloatArray, entering: FloatArray) 
 
     order, count = entering.shape
     whole, right = np.kron(a, np.eye(count)), np.kron(np.eye(order), phi.T)
-    with flint.ctx.workprec(BITS):
+    with flint.ctx.workprec(EXPONENTIAL_BITS):
         own, model, known = (arb_matrix(np.asarray(part)) for part in (whole, right, entering.reshape(-1, 1)))
         try:
             found = (model - own).solve(known)

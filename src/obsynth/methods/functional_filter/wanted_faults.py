@@ -5,9 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from obsynth.errors import SpecError
+from obsynth.methods.method import OPTIONS_PATH
 from obsynth.plants.descriptor import DescriptorSystem
-
-_PATH = "method.options"
 
 
 def chosen_faults(faults: Any, plant: DescriptorSystem) -> list[int]:
@@ -18,7 +17,7 @@ def chosen_faults(faults: Any, plant: DescriptorSystem) -> list[int]:
     if unknown or len(set(listed)) < len(listed):
         what = f"{', '.join(map(repr, unknown))}: no such fault" if unknown else "a fault is named twice"
         there = ", ".join(plant.fault_names) or "none"
-        raise SpecError(f"{what}; there are: {there}.", path=f"{_PATH}.faults")
+        raise SpecError(f"{what}; there are: {there}.", path=f"{OPTIONS_PATH}.faults")
     return sorted(plant.fault_names.index(name) for name in listed)
 
 
@@ -38,6 +37,6 @@ def residual_sets(residuals: Any, plant: DescriptorSystem) -> list[list[int]] | 
         raise SpecError(
             f"residuals is {residuals!r}: give detect, isolate, or lists of faults to see; there are: "
             f"{', '.join(plant.fault_names) or 'none'}.",
-            path=f"{_PATH}.residuals",
+            path=f"{OPTIONS_PATH}.residuals",
         )
     return [sorted(plant.fault_names.index(name) for name in entry) for entry in sets]

@@ -1,176 +1,241 @@
-"""A bank of guaranteed tests: one for each fault, blind to all others, or for the smallest group that can be told."""
+"""A bank of guaranteed tests: one row for each fault, blind to all others, or to all but the smallest group.
+
+What is shipped is one observer and one certificate; each test is cut out of them again and checked as if it were alone.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from html import escape
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from itertools import combinations
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from obsynth.errors import PreconditionError, SpecError
-from obsynth.files.tables import html_table, text_table
-from obsynth.methods.guaranteed_test.result import GuaranteedTest, guaranteed_test
-from obsynth.numerics.arguments import require_kind
+from obsynth.methods.guaranteed_test.checks import checks
+from obsynth.methods.guaranteed_test.conditions import samples_decided_on
+from obsynth.methods.guaranteed_test.options import Asked
+from obsynth.methods.guaranteed_test.problem import problem_of, window_as_designed
+from obsynth.methods.guaranteed_test.proofs import Repaired, proved_ray, proved_threshold, repaired_multipliers
+from obsynth.methods.guaranteed_test.windows import courses_of
+from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.results.checks import Check, lower_bound_check, upper_bound_check
+from obsynth.results.design import Certificate, ObserverDesign
 
-#: Options that the bank itself chooses.
-_OWN = ("fault", "free", "name")
+SOURCE = "each test alone, cut out of the bank"
+#: What a certificate of a bank has a row of for each test, as wide as the widest.
+BY_TEST = ("multipliers", "multiplier_radius", "witness", "witness_radius", "rounding")
+#: Which faults an alarm of each test may mean; and the thresholds pair by pair, with what proves them.
+GROUPS, PAIRS, PAIR_MULTIPLIERS, PAIR_RADIUS = "groups", "pairs", "pair_multipliers", "pair_radius"
 
 
-@dataclass(frozen=True, eq=False)
-class GuaranteedBank:
-    """Tests that isolate; made by `guaranteed_bank`.
+def blind_to(asked: Any, plant: DescriptorSystem, fault: int, group: Sequence[int]) -> Any:
+    """Return the options of the test of a fault that is blind to all faults outside of a group."""
+    names = plant.fault_names
+    free = [name for k, name in enumerate(names) if k != fault and k not in group]
+    return replace(asked, isolate=False, fault=names[fault], free=free)
 
-    Parameters
-    ----------
-    tests : tuple of GuaranteedTest
-        One for each fault that some test tells.
-    groups : tuple of tuple of str
-        By test: an alarm means that at least one of these faults is not zero; one fault where it is isolated.
-    pairs : mapping of tuple of str to float
-        Threshold of the test of the first fault that is blind to the second alone, whatever other faults are zero;
-        infinite where there is none.
-    refused : mapping of str to str
-        By fault: why no test is blind to all others, in words.
-    """
 
-    tests: tuple[GuaranteedTest, ...]
-    groups: tuple[tuple[str, ...], ...]
-    pairs: Mapping[tuple[str, str], float]
-    refused: Mapping[str, str]
+def blind_to_one(asked: Any, plant: DescriptorSystem, fault: int, other: int) -> Any:
+    """Return the options of the test of a fault that is blind to one other alone."""
+    names = plant.fault_names
+    return replace(asked, isolate=False, fault=names[fault], free=[names[other]])
 
-    @property
-    def isolates(self) -> bool:
-        """Whether every fault has a test of its own."""
-        return not self.refused
 
-    def alarms(self, y: ArrayLike, u: ArrayLike | None = None) -> dict[str, np.ndarray]:
-        """Return from which row on each test alarms over a record: truths ``(steps,)`` by fault or group in words.
+def proved_hidden(plant: DescriptorSystem, asked: Any) -> bool:
+    """Whether numbers that satisfy every equation exactly hide the fault: there is no test with these options."""
+    problem = problem_of(plant, asked)
+    lag = asked.lag or 0
+    return proved_ray(problem.window(samples_decided_on(problem, asked, lag), lag=lag)) is not None
 
-        Parameters
-        ----------
-        y : array_like
-            Outputs ``(steps, ny)``.
-        u : array_like, optional
-            Known inputs ``(steps, nu)``.
 
-        Raises
-        ------
-        SpecError
-            Shapes do not fit, or a sample is not finite.
-        """
-        outputs, found = np.asarray(y, dtype=np.float64), {}
-        inputs = None if u is None else np.asarray(u, dtype=np.float64)
-        for test, group in zip(self.tests, self.groups, strict=True):
-            rows = test.residual(test.linear[1].run(outputs, inputs))
-            passed = np.abs(np.nan_to_num(rows)) > test.threshold + test.slack(outputs, inputs)
-            found[f"{test.fault}: {' or '.join(group)}" if len(group) > 1 else test.fault] = np.maximum.accumulate(
-                passed
+def joined(parts: Sequence[LinearObserver], names: tuple[str, ...]) -> LinearObserver:
+    """Return observers of one row each as one, their rows as residuals; shorter windows begin with zeros."""
+    count, length = len(parts), max(part.order for part in parts)
+
+    def stacked(name: str) -> FloatArray:
+        blocks = [np.pad(getattr(part, name), ((0, length - part.order), (0, 0))) for part in parts]
+        return np.vstack(blocks)
+
+    first = np.zeros((1, length))
+    first[0, :1] = 1.0
+    return replace(
+        parts[0],
+        Az=np.asarray(np.kron(np.eye(count), np.eye(length, k=1)), dtype=np.float64),
+        Bu=stacked("Bu"),
+        By=stacked("By"),
+        Cz=np.asarray(np.kron(np.eye(count), first), dtype=np.float64),
+        Du=np.vstack([part.Du for part in parts]),
+        Dy=np.vstack([part.Dy for part in parts]),
+        fault_names=(),
+        fault_delays=(),
+        residual_names=names,
+    )
+
+
+def is_bank(design: ObserverDesign) -> bool:
+    """Whether a design is a bank."""
+    return design.options.get("isolate") is True
+
+
+def groups_of(design: ObserverDesign) -> tuple[tuple[int, ...], ...]:
+    """Return by test the numbers of the faults, its own among them, of which an alarm means that one is there."""
+    return tuple(tuple(np.flatnonzero(row).tolist()) for row in design.certificate.matrices[GROUPS])
+
+
+def tests_of(design: ObserverDesign, read: Callable[[Mapping[str, Any]], Any]) -> tuple[ObserverDesign, ...]:
+    """Return the tests of a bank, each as a design of its own; ``read`` returns options that are checked."""
+    plant, observer = design.linear
+    asked, certificate = read(design.options), design.certificate
+    found = []
+    for fault, group in enumerate(groups_of(design)):
+        own = blind_to(asked, plant, fault, group)
+        window = window_as_designed(plant, own)
+        cut = {"witness": len(window.bar), "witness_radius": len(window.bar)}
+        matrices = {
+            name: certificate.matrices[name][fault][: cut.get(name)] for name in BY_TEST if name in certificate.matrices
+        }
+        if not np.any(matrices.get("witness", 0.0)):
+            matrices = {name: value for name, value in matrices.items() if not name.startswith("witness")}
+        length = len(window.weights(matrices["multipliers"].ravel())[0]) - 1
+        name, whole = plant.fault_names[fault], observer.order // plant.nf
+        ending = f"[{name}]"
+        claims = {key.removesuffix(ending): value for key, value in certificate.claims.items() if key.endswith(ending)}
+        table = certificate.matrices["trade_off"]
+        found.append(
+            design.replace(
+                name=f"test of {name}",
+                options={field: getattr(own, field) for field in design.options},
+                gains={},
+                observer=_cut(observer, window, fault, whole, length),
+                certificate=Certificate({**matrices, "trade_off": table[:, [0, fault + 1]]}, claims),
+                notes=(),
             )
-        return found
-
-    def rows(self) -> tuple[tuple[str, ...], ...]:
-        """Return the table as texts: the header, then a row for each test."""
-        faults = sorted({first for first, _ in self.pairs})
-        header = ("test of", "an alarm means", "threshold", "surely found", *(f"blind to {name}" for name in faults))
-        found = []
-        for test, group in zip(self.tests, self.groups, strict=True):
-            pairs = [self.pairs.get((test.fault, other), np.nan) for other in faults]
-            found.append((
-                test.fault, " or ".join(group), f"{test.threshold:.4g}", f"{test.surely_found:.4g}",
-                *("-" if np.isnan(size) else "impossible" if np.isinf(size) else f"{size:.4g}" for size in pairs),
-            ))  # fmt: skip
-        return (header, *found)
-
-    def __str__(self) -> str:
-        return "\n".join([*text_table(self.rows(), left=2), *(f"{k}: {why}" for k, why in self.refused.items())])
-
-    def _repr_html_(self) -> str:
-        return html_table(self.rows()) + "".join(f"<p>{escape(f'{k}: {w}')}</p>" for k, w in self.refused.items())
+        )
+    return tuple(found)
 
 
-def guaranteed_bank(plant: DescriptorSystem, faults: Sequence[str] | None = None, **options: Any) -> GuaranteedBank:
-    """Design tests that isolate faults without ever being wrong, as long as the bounds hold.
-
-    Each test is blind to all other faults, so that its alarm means that its own fault is not zero.  Where blindness is
-    impossible, it is blind to as many as can be: its alarm then means one of the smallest group that can be told.
-
-    Parameters
-    ----------
-    plant : DescriptorSystem
-        Discrete time.
-    faults : sequence of str, optional
-        Faults to isolate; all by default.
-    **options
-        Those of `guaranteed_test`, but for ``fault``, ``free`` and ``name``.
-
-    Returns
-    -------
-    GuaranteedBank
-        With the thresholds pair by pair.
-
-    Raises
-    ------
-    SpecError
-        An option is malformed, or a fault unknown.
-    PreconditionError
-        Not even the group of all faults can be told from none.
-    """
-    require_kind(plant, DescriptorSystem, "plant", "a DescriptorSystem")
-    wrong = [name for name in _OWN if name in options]
-    if wrong:
-        raise SpecError(f"{', '.join(wrong)}: the bank chooses this itself.", path=wrong[0])
-    asked = plant.fault_names if faults is None else tuple(faults)
-    unknown = [str(name) for name in asked if name not in plant.fault_names]
-    if unknown:
-        raise SpecError(f"There is no fault {', '.join(unknown)}: {', '.join(plant.fault_names)}.", path="faults")
-    tests, groups, refused = [], [], {}
-    for fault in asked:
-        others = [name for name in plant.fault_names if name != fault]
-        test, group, why = _smallest(plant, fault, others, options)
-        tests.append(test)
-        groups.append(group)
-        if why:
-            refused[fault] = why
-    pairs = {
-        (fault, other): _threshold(plant, fault, [other], options)
-        for fault in asked for other in plant.fault_names if other != fault
-    }  # fmt: skip
-    return GuaranteedBank(tuple(tests), tuple(groups), pairs, refused)
+def _cut(observer: LinearObserver, window: Any, fault: int, whole: int, length: int) -> LinearObserver:
+    """Return the row of one test with its own registers, named as the test alone has it."""
+    at, own = slice(fault * whole, fault * whole + length), [fault]
+    estimated = window.question.course != "step"
+    name = (window.plant.fault_names[fault],)
+    delay = length + 1 - window.question.samples
+    return replace(
+        observer,
+        Az=observer.Az[at, at],
+        Bu=observer.Bu[at],
+        By=observer.By[at],
+        Cz=observer.Cz[own, at],
+        Du=observer.Du[own],
+        Dy=observer.Dy[own],
+        fault_names=name if estimated else (),
+        fault_delays=(window.question.lag + delay,) if estimated else (),
+        residual_names=() if estimated else name,
+    )
 
 
-def _smallest(
-    plant: DescriptorSystem, fault: str, others: list[str], options: Mapping[str, Any]
-) -> tuple[GuaranteedTest, tuple[str, ...], str]:
-    """Return the test of a fault with the smallest group that its alarm stands for, and why there is no smaller one."""
-    first: PreconditionError | None = None
-    for size in range(len(others) + 1):
-        best: tuple[GuaranteedTest, tuple[str, ...]] | None = None
-        for with_it in combinations(others, size):
-            try:
-                test = guaranteed_test(
-                    plant,
-                    fault,
-                    free=[name for name in others if name not in with_it],
-                    name=f"test of {fault}",
-                    **options,
-                )
-            except PreconditionError as error:
-                first = first or error
-                continue
-            if best is None or test.threshold < best[0].threshold:
-                best = test, (fault, *with_it)
-        if best is not None:
-            return *best, "" if first is None else str(first)
-    raise first if first is not None else PreconditionError(f"No test tells {fault}.", condition="fault told")
-
-
-def _threshold(plant: DescriptorSystem, fault: str, free: list[str], options: Mapping[str, Any]) -> float:
+def bank_checks(design: ObserverDesign, read: Callable[[Mapping[str, Any]], Any]) -> Iterator[Check]:
+    """Yield the rows of every test, and those of what makes them a bank."""
+    plant, observer = design.linear
     try:
-        return guaranteed_test(plant, fault, free=free, **options).threshold
-    except PreconditionError:
-        return np.inf
+        tests, reason = tests_of(design, read), ""
+        fits = len(tests) == plant.nf and observer.residual_names == plant.fault_names
+        fits = fits and all(fault in group for fault, group in enumerate(groups_of(design)))
+        faults = {name.partition("[")[2].rstrip("]") for name in design.certificate.claims}
+        fits = fits and faults == set(plant.fault_names)
+    # A file that was changed may hold anything: what cannot be cut is no bank.
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError, RuntimeError) as error:
+        tests, fits, reason = (), False, str(error)
+    yield upper_bound_check(
+        "bank", "there is one test for each fault", float(not fits), 0.0, source="certificate", detail=reason
+    )
+    if not fits:
+        return
+    again = joined([test.linear[1] for test in tests], plant.fault_names)
+    same = all(
+        np.array_equal(value, getattr(observer, name)) if isinstance(value, np.ndarray)
+        else value == getattr(observer, name)
+        for name, value in again.as_dict().items()
+    )  # fmt: skip
+    yield upper_bound_check(
+        "joined", "what runs is the rows of all tests side by side, and nothing else", float(not same), 0.0,
+        source="shipped realisation",
+    )  # fmt: skip
+    for test in tests:
+        for row in checks(test, read):
+            yield replace(row, name=f"{row.name}[{test.options['fault']}]")
+    asked = read(design.options)
+    yield from _smallest_groups(design, asked)
+    yield from _pairs(design, asked)
+
+
+def hidden_by(design: ObserverDesign, read: Callable[[Mapping[str, Any]], Any], fault: int) -> dict[str, FloatArray]:
+    """Return courses that hide a fault from every test of a group that is smaller by one; none where it is isolated."""
+    plant, group = design.linear[0], groups_of(design)[fault]
+    if len(group) == 1:
+        return {}
+    others = [other for other in range(plant.nf) if other != fault]
+    own = blind_to(read(design.options), plant, fault, others[: len(group) - 2])
+    problem = problem_of(plant, own)
+    window = problem.window(samples_decided_on(problem, own, own.lag or 0), lag=own.lag or 0)
+    point = proved_ray(window)
+    return {} if point is None else courses_of(window, point)
+
+
+def _smallest_groups(design: ObserverDesign, asked: Asked) -> Iterator[Check]:
+    plant = design.linear[0]
+    for fault, group in enumerate(groups_of(design)):
+        if len(group) == 1:
+            continue
+        others = [other for other in range(plant.nf) if other != fault]
+        smaller = [set(chosen) for chosen in combinations(others, len(group) - 2)]
+        left = sum(not proved_hidden(plant, blind_to(asked, plant, fault, sorted(chosen))) for chosen in smaller)
+        name = plant.fault_names[fault]
+        yield upper_bound_check(
+            f"smallest group[{name}]",
+            f"no test of {name} is blind to more faults: others then hide it, by numbers that satisfy every equation "
+            "exactly",
+            float(left),
+            0.0,
+            source=SOURCE,
+            kind="proved",
+            detail="groups that are smaller by one and not refuted",
+        )
+
+
+def pairs_of(plant: DescriptorSystem) -> tuple[tuple[int, int], ...]:
+    """Return all pairs of a fault and another, in the order of the certificate."""
+    return tuple((one, other) for one in range(plant.nf) for other in range(plant.nf) if one != other)
+
+
+def _pairs(design: ObserverDesign, asked: Asked) -> Iterator[Check]:
+    """Yield the row on the table pair by pair; of two faults it is that of the tests themselves."""
+    plant, shipped = design.linear[0], design.certificate.matrices
+    pairs, wrong = pairs_of(plant), []
+    table = shipped.get(PAIRS)
+    fits = table is not None and table.shape == (plant.nf, plant.nf)
+    for place, (one, other) in enumerate(pairs if fits and table is not None else ()):
+        own = blind_to_one(asked, plant, one, other)
+        size = float(table[one, other]) if table is not None else np.nan
+        if np.isinf(size):
+            holds = proved_hidden(plant, own)
+        else:
+            window = window_as_designed(plant, own)
+            test = Repaired(shipped[PAIR_MULTIPLIERS][place], shipped[PAIR_RADIUS][place])
+            exact = repaired_multipliers(window, test.values, refine=False, exact_zero=size == 0.0, among=test.radius)
+            holds = exact is not None and bool(np.all(exact.radius <= test.radius))
+            holds = holds and proved_threshold(window, test, exact_zero=size == 0.0) <= size
+        if not holds:
+            wrong.append(f"{plant.fault_names[one]} blind to {plant.fault_names[other]}")
+    yield lower_bound_check(
+        "pairs",
+        "thresholds pair by pair, and the pairs without a test, hold",
+        float(len(pairs) - len(wrong)) if fits else np.nan,
+        float(len(pairs)),
+        source=SOURCE,
+        kind="proved",
+        detail=f"wrong: {', '.join(wrong)}" if wrong else "",
+    )

@@ -17,6 +17,7 @@ from obsynth.methods.guaranteed_test.proofs import (
     repaired_multipliers,
     repaired_point,
 )
+from obsynth.methods.guaranteed_test.tolerant import MEAN_ROOM, mean_over_record, part_beside
 from obsynth.methods.guaranteed_test.windows import Window
 from obsynth.numerics.arrays import FloatArray
 from obsynth.proofs.balls import UNIT_ROUNDOFF
@@ -51,7 +52,14 @@ def checks(design: ObserverDesign, read: Callable[[Mapping[str, Any]], Asked]) -
     }
     if "witness" in shipped or "witness_radius" in shipped:
         sizes |= {"witness": len(window.bar), "witness_radius": len(window.bar)}
+    nx, count = window.plant.nx, 0
+    if design.linear[1].state_names or {"state_tracking", "record"} & set(shipped):
+        count = len(shipped.get("state_tracking", np.zeros((0, nx))))
+        steps = len(shipped.get("record", np.zeros((0, 0))))
+        sizes |= {"state_tracking": count * nx, "state_rows": nx**2}
+        sizes |= {"record": max(steps, window.question.samples) * (window.plant.nu + window.plant.ny)}
     wrong = [name for name, size in sizes.items() if not _fits(shipped.get(name), size, signed="radius" not in name)]
+    wrong += [] if len(design.linear[1].state_names) in (0, nx) else ["states"]
     yield upper_bound_check(
         "certificate",
         "multipliers and witness fit the window of the options",
@@ -65,6 +73,8 @@ def checks(design: ObserverDesign, read: Callable[[Mapping[str, Any]], Asked]) -
     test = Repaired(_flat(shipped["multipliers"]), _flat(shipped["multiplier_radius"]))
     yield from _of_the_test(design, window, test)
     yield from _of_the_least(design, window)
+    if "mean_threshold" in design.certificate.claims:
+        yield _over_tolerances(design, window, test)
     delay = delay_in_samples(window, window.weights(test.values)[2]) * window.plant.dt
     claimed = float(design.certificate.claims.get("delay", np.nan))
     yield upper_bound_check(
@@ -128,7 +138,10 @@ def _of_the_test(design: ObserverDesign, window: Window, test: Repaired) -> Iter
         kind="proved",
     )
     on_y, on_u, delay = window.weights(test.values)
-    implied = observer_of(window, on_y, on_u, delay)
+    tracking = design.certificate.matrices.get("state_tracking")
+    # The observer beside the test may be any: its error is bounded by what it is.
+    beside = None if tracking is None else part_beside(observer, min(len(tracking), observer.order))
+    implied = observer_of(window, on_y, on_u, delay, beside)
     rounding = rounding_of(window, test.values, test.radius)
     yield upper_bound_check(
         "weights",
@@ -148,6 +161,24 @@ def _of_the_test(design: ObserverDesign, window: Window, test: Repaired) -> Iter
         1.0 + SAME,
         source=SOURCE,
         kind="computed",
+    )
+
+
+def _over_tolerances(design: ObserverDesign, window: Window, test: Repaired) -> Check:
+    shipped, found, reason = design.certificate.matrices, np.nan, ""
+    try:
+        T, T0, record = (shipped[name] for name in ("state_tracking", "state_rows", "record"))
+        found = mean_over_record(window, design.linear[1], test.values, T, T0, record)
+    except (ObsynthError, KeyError, ValueError, IndexError) as error:
+        reason = str(error)
+    return upper_bound_check(
+        "mean threshold",
+        "mean over the shipped record of what the residual never passes without a fault, whatever the constants are "
+        f"in their tolerances; to {MEAN_ROOM:.0%}, as each processor has its own bound",
+        found,
+        float(design.certificate.claims["mean_threshold"]) * (1.0 + MEAN_ROOM),
+        source="the observer's error over the box of the constants",
+        detail=reason,
     )
 
 
@@ -202,6 +233,9 @@ def _of_the_least(design: ObserverDesign, window: Window) -> Iterator[Check]:
     yield lower_bound_check(
         "least",
         "no function of these samples has a threshold below this: a fault of twice this size, and none, give "
+        "the same samples within all bounds"
+        if window.twice_is_hidden
+        else "no function of these samples tells the fault within less: a fault of this size, and its opposite, give "
         "the same samples within all bounds",
         found,
         float(least),

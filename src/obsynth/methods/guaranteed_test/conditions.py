@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from obsynth.analysis.conditions import Condition
+from obsynth.methods.guaranteed_test.condensed import Condensed
 from obsynth.methods.guaranteed_test.options import Asked
 from obsynth.methods.guaranteed_test.problem import Problem, missing_bounds, problem_of
 from obsynth.methods.guaranteed_test.proofs import proved_ray, repaired_multipliers
@@ -28,7 +31,7 @@ def conditions(plant: DescriptorSystem, asked: Asked, *, with_windows: bool = Tr
         SOURCE,
         "" if plant.dt > 0.0 else "the plant is continuous: sample it (transform: sample_time, obsynth.discretise).",
     )
-    named = asked.fault is not None or plant.nf == 1
+    named = plant.nf > 0 if asked.isolate else asked.fault is not None or plant.nf == 1
     listed = ", ".join(plant.fault_names)
     fault = Condition(
         "fault named",
@@ -52,7 +55,15 @@ def conditions(plant: DescriptorSystem, asked: Asked, *, with_windows: bool = Tr
     first = (discrete, fault, stated)
     if not all(condition.holds for condition in first) or not with_windows:
         return first
+    if asked.isolate:
+        return (*first, *(_alone(plant, replace(asked, isolate=False, fault=name)) for name in plant.fault_names))
     return (*first, told(problem_of(plant, asked), asked)[0])
+
+
+def _alone(plant: DescriptorSystem, asked: Asked) -> Condition:
+    """Return the condition that a fault is told where no other is there: some group of a bank then tells it."""
+    asked = replace(asked, free="none")
+    return told(problem_of(plant, asked), asked)[0]
 
 
 def told(problem: Problem, asked: Asked) -> tuple[Condition, int]:
@@ -61,7 +72,7 @@ def told(problem: Problem, asked: Asked) -> tuple[Condition, int]:
     if problem.question.course == "any" and asked.lag is None:
         lags = list(range(problem.plant.nx + 2))
     for lag in lags:
-        most = _samples(problem, asked, lag)
+        most = samples_decided_on(problem, asked, lag)
         least = max(problem.before, lag) + 2
         # A test on fewer samples is one on more: short windows are decided in no time.
         doubled = [least * 2**k for k in range(most.bit_length())]
@@ -72,7 +83,7 @@ def told(problem: Problem, asked: Asked) -> tuple[Condition, int]:
     return _condition(problem, window, False, _why(problem, asked, window)), lags[-1]
 
 
-def _samples(problem: Problem, asked: Asked, lag: int) -> int:
+def samples_decided_on(problem: Problem, asked: Asked, lag: int) -> int:
     """Return the samples on which it is decided."""
     enough = problem.enough(lag)
     if asked.samples != "auto":
@@ -92,6 +103,9 @@ def _has_test(window: Window) -> bool:
 
 def least_multipliers(window: Window) -> FloatArray | None:
     """Return multipliers that see theta with weight one and no free column; ``None`` where least squares have none."""
+    condensed = Condensed.of(window)
+    if condensed is not None:
+        return condensed.least_weights()
     rows, columns = window.scales
     told = np.flatnonzero(window.free | (np.arange(len(window.bar)) == 0))
     matrix = np.ldexp(np.ldexp(window.matrix[:, told].toarray(), columns[told]), rows[:, None]).T
@@ -129,7 +143,7 @@ def _why(problem: Problem, asked: Asked, window: Window) -> str:
     if found is None:
         return (
             f"no weights of {samples} samples see {fault} and nothing free, but a course that hides it could not be "
-            "proved: this is at the edge of double precision."
+            "proved: this is at the edge of double precision. Bounds of the states (state_bounds), however wide, help."
         )
     text = f"{hidden(window, found)} (proved for {samples} samples: every equation holds exactly)."
     lag = window.question.lag

@@ -1,50 +1,222 @@
-"""The least interval of a fault for the very samples of one window, each end proved by multipliers of its own."""
+"""What the very samples of a window tell: the least interval of the fault, or the least test without missing samples.
+
+Both are linear programmes, solved by HiGHS from the basis of the window without data, so that a row is the same
+wherever a run begins.  Only what is then proved of their multipliers counts: whatever multipliers see the fault with
+weight one and nothing free, it lies within ``T(mu)`` of ``mu' b``.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
-from functools import lru_cache
+from typing import Any, Self
 
 import numpy as np
 
-from obsynth.errors import SolverError
-from obsynth.methods.guaranteed_test.problem import rounding_of
-from obsynth.methods.guaranteed_test.programs import largest_hidden_fault
-from obsynth.methods.guaranteed_test.proofs import proved_threshold, repaired_multipliers
+from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
+from obsynth.methods.guaranteed_test.problem import rounding_of, window_as_designed
+from obsynth.methods.guaranteed_test.programs import TOLERANCE
+from obsynth.methods.guaranteed_test.proofs import Repaired, Square, proved_threshold, repaired_multipliers
+from obsynth.methods.guaranteed_test.tolerant import rows_before
 from obsynth.methods.guaranteed_test.windows import Window, window_of
 from obsynth.numerics.arrays import FloatArray
+from obsynth.proofs.balls import UNIT_ROUNDOFF, gamma, rounded_up
+from obsynth.results.design import ObserverDesign
 
-#: Windows that are kept without the equations whose inputs are not known yet.
-KEPT_WINDOWS = 4
-
-
-def least_interval(window: Window, delay: int, y: FloatArray, u: FloatArray) -> tuple[float, float]:
-    """Return both ends for ``y, u (samples + delay, ...)``; infinite where nothing is proved.
-
-    Whatever multipliers see the fault with weight one and nothing free: it lies within ``T(mu)`` of ``mu' b``.
-    """
-    if window.question.closing > delay:
-        window = _until(window, delay)
-    right = window.data(y[: window.question.samples], u)
-    largest = np.abs(np.hstack([u, y])).max(axis=0, initial=0.0)
-    ends = []
-    for sign in (-1.0, 1.0):
-        try:
-            found = largest_hidden_fault(window, right, sign=sign)
-        except SolverError:
-            # What a solver says of a window proves nothing: the fixed test holds.
-            ends.append(sign * np.inf)
-            continue
-        exact = None if found.multipliers is None else repaired_multipliers(window, found.multipliers, refine=True)
-        if exact is None:
-            ends.append(sign * np.inf)
-            continue
-        width = proved_threshold(window, exact) + float(rounding_of(window, exact.values, exact.radius) @ largest)
-        ends.append(float(exact.values @ right) + sign * width)
-    return ends[0], ends[1]
+#: Patterns of missing rows whose programmes are kept: those of a gap that moves through a window.
+KEPT_PATTERNS = 256
+#: Where nothing satisfies a window to the tightest tolerance it is tried with this one: only proofs count.
+LOOSE = 1e-7
+#: A ray that refutes a window is added so many times to a test, which it moves as far as one likes.
+TIMES_OF_A_RAY = 1e3
 
 
-@lru_cache(KEPT_WINDOWS)
-def _until(window: Window, delay: int) -> Window:
-    """Return a window without the equations after its last known input."""
-    return window_of(window.plant, window.bounds, replace(window.question, closing=delay))
+def lacking(window: Window, rows: np.ndarray) -> Window:
+    """Return a window some rows of which say nothing: each has a free column of its own, which no test may see."""
+    columns = len(window.bar)
+    return replace(
+        window,
+        labels=(*window.labels, *(("missing", None, int(row)) for row in rows)),
+        bar=np.append(window.bar, np.full(len(rows), np.inf)),
+        group=np.append(window.group, np.full(len(rows), -1)),
+        i=np.append(window.i, rows),
+        j=np.append(window.j, columns + np.arange(len(rows))),
+        value=np.append(window.value, np.ones(len(rows))),
+        times=np.append(window.times, np.ones(len(rows), dtype=np.int64)),
+    )
+
+
+def known_rows(window: Window, y: FloatArray, u: FloatArray) -> tuple[FloatArray, np.ndarray]:
+    """Return the right sides of a window, zero where a missing sample (NaN) enters, and the numbers of those rows."""
+    plant, at = window.plant, window.outputs_at
+    without = np.isnan(u)
+    lost = np.zeros(window.rows, dtype=bool)
+    lost[:at] = (without[: window.equations] @ (plant.B.T != 0.0)).ravel()
+    measured = np.isnan(y) | (without[: len(y)] @ (plant.D.T != 0.0))
+    lost[at : at + measured.size] = measured.ravel()
+    right = window.data(np.nan_to_num(y), np.nan_to_num(u))
+    return np.where(lost, 0.0, right), np.flatnonzero(lost)
+
+
+class Programmes:
+    """The programmes of a test: one for each pattern of missing rows, made when it is first met."""
+
+    def __init__(self, window: Window, delay: int) -> None:
+        if window.question.closing > delay:
+            # What follows the last known input is not known when the row is told.
+            window = window_of(window.plant, window.bounds, replace(window.question, closing=delay))
+        self.window, self.delay = window, delay
+        self._kept: dict[bytes, _Programme] = {}
+
+    @classmethod
+    def of(cls, design: ObserverDesign) -> Self:
+        """Return the programmes of a single test."""
+        window = window_as_designed(design.linear[0], GuaranteedTestMethod.of(design.options))
+        return cls(window, rows_before(design) + 1 - window.question.samples)
+
+    def __reduce__(self) -> Any:
+        # HiGHS stays where it is: programmes are made again.
+        return Programmes, (self.window, self.delay)
+
+    def _programme(self, y: FloatArray, u: FloatArray) -> tuple[_Programme, FloatArray, FloatArray]:
+        """Return the programme, the right sides, and the largest known signals ``(nu + ny,)``."""
+        outputs = np.array(y)
+        # After the last sample of the window only inputs count.
+        right, lost = known_rows(self.window, outputs[: self.window.question.samples], u)
+        key = lost.tobytes()
+        if key not in self._kept:
+            if len(self._kept) == KEPT_PATTERNS:
+                del self._kept[next(iter(self._kept))]
+            self._kept[key] = _Programme(lacking(self.window, lost) if lost.size else self.window)
+        known = np.nan_to_num(np.abs(np.hstack([u, outputs])))
+        return self._kept[key], right, known.max(axis=0, initial=0.0)
+
+    def interval(self, y: FloatArray, u: FloatArray) -> tuple[float, float]:
+        """Return both ends for ``y, u (samples + delay, ...)``, NaN where missing; infinite where nothing is proved."""
+        programme, right, largest = self._programme(y, u)
+        return programme.end(right, largest, -1.0), programme.end(right, largest, 1.0)
+
+    def refuting(self, y: FloatArray, u: FloatArray) -> list[FloatArray]:
+        """Return multipliers that show that nothing explains these samples without the fault, the best ones first."""
+        programme, right, _ = self._programme(y, u)
+        tests = [
+            programme.test,
+            *(programme.proved(answer) for s in (1.0, -1.0) for answer in programme.answers(right, s)),
+        ]
+        found = [(abs(float(test.values @ right)) / (width or 1.0), test.values) for test, width in filter(None, tests)]
+        best = max((share for share, _ in found), default=0.0)
+        return [values for share, values in found if share == best and share > 1.0]
+
+    def least_test(self, y: FloatArray, u: FloatArray) -> tuple[float, float]:
+        """Return residual and threshold of the least test of what is there; NaN and infinite where none is proved."""
+        programme, right, largest = self._programme(y, u)
+        if programme.test is None:
+            return np.nan, np.inf
+        test, threshold = programme.test
+        rounding = rounding_of(programme.window, test.values, test.radius)
+        return float(test.values @ right), threshold + float(rounding @ largest)
+
+
+class _Programme:
+    """The programmes of one window: with fixed matrices, for changing right sides."""
+
+    def __init__(self, window: Window) -> None:
+        self.window = window
+        matrix = window.matrix
+        told = np.flatnonzero(window.free | (np.arange(len(window.bar)) == 0))
+        rows, _ = window.scales
+        self.told, self.bounded = matrix[:, told].T.tocsr(), matrix[:, window.bounded].T.tocsr()
+        self.told_sizes, self.bounded_sizes = abs(self.told), abs(self.bounded)
+        self.wanted = np.eye(1, len(told)).ravel()
+        # Entries that are products with a whole number have been rounded once.
+        self.share = gamma(window.rows + 8) + 2.0 * UNIT_ROUNDOFF
+        dense = self.told.toarray()
+        self.square = Square.of(dense, 2.0 * UNIT_ROUNDOFF * np.abs(dense), np.ldexp(1.0, rows), rows)
+        self.highs, self.bases, self.known = _highs(window), {}, np.zeros(window.rows)
+        self.test: tuple[Repaired, float] | None = None
+        at_rest = np.zeros(window.rows)
+        for sign in (1.0, -1.0):
+            found = [self.proved(multipliers) for multipliers in self.answers(at_rest, sign)]
+            self.bases[sign] = self.highs.getBasis()
+            self.test = self.test or next((one for one in found if one is not None), None)
+
+    def answers(self, right: FloatArray, sign: float) -> Iterator[FloatArray]:
+        """Yield multipliers for the largest (``sign`` -1: least) fault, as HiGHS gives them; none where it has none."""
+        import highspy
+
+        rows, _ = self.window.scales
+        known = np.ldexp(right, rows)
+        # One by one: older versions of HiGHS take no more at once.
+        for row in np.flatnonzero(known != self.known).tolist():
+            self.highs.changeRowBounds(row, known[row], known[row])
+        self.known = known
+        self.highs.changeColCost(0, -sign)
+        for tolerance in (TOLERANCE, LOOSE):
+            self.highs.setOptionValue("primal_feasibility_tolerance", tolerance)
+            if sign in self.bases:
+                self.highs.setBasis(self.bases[sign])
+            self.highs.run()
+            status = self.highs.getModelStatus()
+            if status == highspy.HighsModelStatus.kOptimal:
+                multipliers = np.ldexp(np.asarray(self.highs.getSolution().row_dual), rows)
+                scale = float((self.told[[0]] @ multipliers)[0])
+                if abs(scale) > 0.0:
+                    yield multipliers / scale
+                return
+            if status == highspy.HighsModelStatus.kInfeasible and self.test is not None:
+                # It says that nothing explains the window: its ray, if it proves that, moves the test out of the way.
+                _, found, ray = self.highs.getDualRay()
+                direction = np.ldexp(np.asarray(ray), rows) if found else np.zeros(1)
+                size = float(np.max(np.abs(direction), initial=0.0))
+                if size > 0.0:
+                    direction *= TIMES_OF_A_RAY * float(np.max(np.abs(self.test[0].values))) / size
+                    yield self.test[0].values - sign * np.copysign(1.0, float(direction @ right)) * direction
+
+    def proved(self, multipliers: FloatArray) -> tuple[Repaired, float] | None:
+        """Return multipliers with the distance to exact ones, and what bounds can do to these."""
+        if self.square is None or not self.square.contraction < 1.0:
+            found = repaired_multipliers(self.window, multipliers, refine=True)
+            return None if found is None else (found, proved_threshold(self.window, found))
+        values = np.array(multipliers)
+        values[self.square.chosen] += self.square.step(self.wanted - self.told @ values)
+        left = np.abs(self.wanted - self.told @ values)
+        left = rounded_up(left + self.share * (self.told_sizes @ np.abs(values) + self.wanted), 4)
+        radius = np.zeros(len(values))
+        radius[self.square.chosen] = self.square.bounded_step(left)
+        sizes = self.bounded_sizes @ rounded_up(self.share * np.abs(values) + radius, 2)
+        seen = np.abs(self.bounded @ values) + rounded_up(sizes, self.window.rows)
+        total = float(rounded_up(self.window.bar[self.window.bounded] @ seen, len(seen) + 4))
+        return (Repaired(values, radius), total) if np.isfinite(total) else None
+
+    def end(self, right: FloatArray, largest: FloatArray, sign: float) -> float:
+        """Return the upper (``sign`` 1) or lower end of the fault for these right sides; infinite without a proof."""
+        tests = [self.test, *map(self.proved, self.answers(right, sign))]
+        ends = [sign * np.inf]
+        for test, width in (found for found in tests if found is not None):
+            rounding = float(rounding_of(self.window, test.values, test.radius) @ largest)
+            ends.append(float(test.values @ right) + sign * (width + rounding))
+        return sign * min(sign * end for end in ends)
+
+
+def _highs(window: Window) -> Any:
+    """Return HiGHS with the equations of a window, scaled by powers of two."""
+    import highspy
+    from scipy.sparse import diags_array
+
+    rows, columns = window.scales
+    matrix = (diags_array(np.ldexp(1.0, rows)) @ window.matrix @ diags_array(np.ldexp(1.0, columns))).tocsc()
+    ends = np.ldexp(window.bar, -columns)
+    model = highspy.HighsLp()
+    model.num_row_, model.num_col_ = matrix.shape
+    model.col_cost_, model.col_lower_, model.col_upper_ = np.zeros(len(ends)), -ends, ends
+    model.row_lower_ = model.row_upper_ = np.zeros(window.rows)
+    model.a_matrix_.format_ = highspy.MatrixFormat.kColwise
+    model.a_matrix_.start_, model.a_matrix_.index_ = matrix.indptr, matrix.indices
+    model.a_matrix_.value_ = matrix.data
+    found = highspy.Highs()  # type: ignore[no-untyped-call]
+    found.silent()
+    for name in ("primal_feasibility_tolerance", "dual_feasibility_tolerance"):
+        found.setOptionValue(name, TOLERANCE)
+    found.setOptionValue("threads", 1)
+    found.passModel(model)
+    return found

@@ -6,6 +6,8 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+import numpy as np
+
 from obsynth.analysis.conditions import Condition
 from obsynth.methods.guaranteed_test.options import Asked
 from obsynth.methods.method import ClaimMeaning, Method, PlantKind
@@ -16,9 +18,14 @@ from obsynth.verification.error_system import ErrorModel
 
 CLAIMS = {
     "threshold": ClaimMeaning("", "never passed without the fault, in the fault's unit", "threshold"),
-    "least": ClaimMeaning("", "no function of these samples has a smaller threshold without false alarms", "least"),
+    "least": ClaimMeaning("", "no function of these samples tells the fault within less", "least"),
     "surely_found": ClaimMeaning("", "a fault of this size and course surely alarms", "surely found"),
     "delay": ClaimMeaning("s", "after which it does so at the latest", "delay"),
+    "mean_threshold": ClaimMeaning(
+        "",
+        "mean over the shipped record of the threshold that holds for all constants in their tolerances",
+        "mean threshold",
+    ),
 }
 
 
@@ -60,7 +67,9 @@ class GuaranteedTestMethod(Asked, Method):
     fault_rate : float, optional
         Largest change of the fault from sample to sample.
     state_bounds, initial_bounds : mapping of str to float, optional
-        Largest absolute value of states, at every sample or at the first of the window; none by default.
+        Largest absolute value of states, at every sample or at the first of the window; none by default.  With
+        ``state_bounds`` what is claimed as ``least`` is about intervals: a fault of that size and its opposite give the
+        same samples.  Twice it need not look like none, as the states may have no such course within their bounds.
     free : "others", "none" or sequence of str, optional
         Faults that may do anything besides: the test is blind to them, so that its alarm isolates.
     free_course : {"any", "constant"}, optional
@@ -68,13 +77,28 @@ class GuaranteedTestMethod(Asked, Method):
     norm : {"box", "ellipsoid"}, optional
         Whether each component has its bound, or disturbances and noise of a sample lie in ellipsoids with these half
         axes.
+    scenario : Scenario, optional
+        For plants whose constants have tolerances: what they are expected to do, its faults left out.  An observer of
+        the state then runs beside the test, the threshold over the tolerances follows the signals
+        (``online_monitor(design, constants=plant)``), and weights and samples make its mean over the scenario least.
+    isolate : bool, optional
+        A bank: one row for each fault, blind to all others.  Where that is impossible, the alarm of a row means one of
+        the smallest group that can be told, which is proved.  Without ``fault`` and ``free``.
+    exact : bool, optional
+        On data: the least interval of the fault for the very samples of each row, by two linear programmes, in place
+        of the fixed threshold; each end is proved.  It finds faults that the fixed test does not.  Where no course of
+        the fault explains a window, such as that in which it begins, there is an alarm and no interval.
+    missing : {"wait", "solve"}, optional
+        On data, after a missing sample: no verdict until the window is complete again, or that of the least threshold
+        without the rows that are missing, solved and proved for each window.
     name : str, optional
         Name of the design.
 
     Returns
     -------
-    ObserverDesign
-        Its row is the residual (``step``) or the estimate of the fault, which lies within the threshold of it.
+    GuaranteedTest
+        An `ObserverDesign`.  Its row is the residual (``step``, ``isolate``) or the estimate of the fault, which lies
+        within the threshold of it.
 
     Raises
     ------
@@ -83,7 +107,7 @@ class GuaranteedTestMethod(Asked, Method):
     PreconditionError
         No window tells the fault: what hides it is shown, by numbers that satisfy every equation exactly.
     SolverError
-        No usable answer: nothing is known.
+        No usable answer: the result is inconclusive.
     VerificationError
         The shipped realisation fails a check.
 
@@ -98,8 +122,11 @@ class GuaranteedTestMethod(Asked, Method):
     summary: ClassVar[str] = "a test of one fault whose threshold no other test on these samples can beat"
     source: ClassVar[str] = "ours, by duality of linear programmes"
     claims: ClassVar[Mapping[str, ClaimMeaning]] = CLAIMS
+    over_scenario: ClassVar[str] = "guaranteed tests over tolerances"
     witnesses: ClassVar[frozenset[str]] = frozenset(
         {"multipliers", "multiplier_radius", "witness", "witness_radius", "rounding", "trade_off"}
+        | {"state_tracking", "state_rows", "record"}
+        | {"groups", "pairs", "pair_multipliers", "pair_radius"}
     )
 
     def conflicts(self) -> Iterator[str]:
@@ -114,6 +141,11 @@ class GuaranteedTestMethod(Asked, Method):
             yield f"after is for course step, not {self.course}: give samples."
         if self.lag and self.course in ("step", "constant"):
             yield f"lag is for courses any, ramp and rate: a {self.course} is told of all its samples."
+        if self.isolate and (self.fault is not None or self.free != "others"):
+            yield "isolate makes a test for each fault: leave fault and free out."
+        for name, asked in (("exact", self.exact), ("missing solve", self.missing == "solve")):
+            if asked and self.norm != "box":
+                yield f"{name} is for norm box: in ellipsoids the programmes of a row are no linear ones."
         if self.samples == "auto":
             return
         least = self.before if self.course == "step" else (self.lag or 0)
@@ -133,6 +165,10 @@ class GuaranteedTestMethod(Asked, Method):
 
     def synthesise(self, plant: DescriptorSystem, *, progress: Callable[[str], None]) -> Any:
         """Return weights, observer and certificate, not yet verified."""
+        if self.isolate:
+            from obsynth.methods.guaranteed_test.bank_synthesis import synthesise_bank
+
+            return synthesise_bank(plant, self, progress=progress)
         from obsynth.methods.guaranteed_test.synthesis import synthesise
 
         return synthesise(plant, self, progress=progress)
@@ -140,10 +176,11 @@ class GuaranteedTestMethod(Asked, Method):
     @classmethod
     def checks(cls, design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
         """Yield a row for each claim, from the plant and the shipped numbers alone."""
+        from obsynth.methods.guaranteed_test.bank import bank_checks, is_bank
         from obsynth.methods.guaranteed_test.checks import checks
 
         del printed_digits
-        return checks(design, cls.of)
+        return (bank_checks if is_bank(design) else checks)(design, cls.of)
 
     @classmethod
     def has_error_model(cls, design: ObserverDesign) -> bool:
@@ -153,11 +190,22 @@ class GuaranteedTestMethod(Asked, Method):
     @classmethod
     def error_model(cls, design: ObserverDesign) -> ErrorModel | None:
         """Return what the registers follow: the multipliers of one equation each; without a fault the row is zero."""
+        from obsynth.methods.guaranteed_test.bank import is_bank, tests_of
         from obsynth.methods.guaranteed_test.problem import window_as_designed
+        from obsynth.methods.guaranteed_test.tolerant import tracked
 
         if not cls.has_error_model(design):
             return None
         plant, observer = design.linear
-        multipliers = design.certificate.matrices["multipliers"].ravel()
-        T, T0 = window_as_designed(plant, cls.of(design.options)).followed(multipliers)
-        return ErrorModel(plant, observer, T, T0)
+        if is_bank(design):
+            own = [model for test in tests_of(design, cls.of) if (model := cls.error_model(test)) is not None]
+            registers = observer.order // len(own)
+            T = np.vstack([np.pad(model.T, ((0, registers - len(model.T)), (0, 0))) for model in own])
+            T0 = np.vstack([np.zeros((1, plant.nx)) if model.T0 is None else model.T0 for model in own])
+            return ErrorModel(plant, observer, T, T0)
+        shipped = design.certificate.matrices
+        window = window_as_designed(plant, cls.of(design.options))
+        if "state_tracking" not in shipped:
+            return ErrorModel(plant, observer, *window.followed(shipped["multipliers"].ravel()))
+        both = tracked(window, shipped["multipliers"].ravel(), shipped["state_tracking"], shipped["state_rows"])
+        return ErrorModel(plant, observer, *both)

@@ -30,3 +30,6 @@ class Asked:
     free: Annotated[Any, WrittenAs("free faults")] = "others"
     free_course: Literal["any", "constant"] = "any"
     norm: Literal["box", "ellipsoid"] = "box"
+    isolate: bool = False
+    exact: bool = False
+    missing: Literal["wait", "solve"] = "wait"

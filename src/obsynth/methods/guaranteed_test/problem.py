@@ -10,6 +10,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.methods.guaranteed_test.options import Asked
+from obsynth.methods.guaranteed_test.tolerant import side_by_side
 from obsynth.methods.guaranteed_test.windows import Bounds, Question, Window, window_of
 from obsynth.numerics.arguments import is_finite_number
 from obsynth.numerics.arrays import FloatArray
@@ -189,6 +190,12 @@ def _by_name(given: Any, names: tuple[str, ...], option: str, *, every: bool, mi
         parts += [f"missing: {', '.join(lacking)}"] if lacking else []
         raise SpecError(f"{option} must name {', '.join(names) or 'nothing'}; {'; '.join(parts)}.", path=path)
     for name, value in by_name.items():
+        if isinstance(value, (list, tuple)):
+            raise SpecError(
+                f"{option} of {name} is {value!r}: one bound holds on both sides of the operating point; for another "
+                "interval take the larger end, or move that to its middle if the plant can rest there.",
+                path=path,
+            )
         if not (is_finite_number(value) and value >= 0.0):
             raise SpecError(f"{option} of {name} is {value!r}: give a finite number, 0 or more.", path=path)
     return np.array([float(by_name.get(name, missing)) for name in names])
@@ -203,15 +210,20 @@ def delay_in_samples(window: Window, delay: int) -> int:
     return (question.lag if question.course == "any" else question.samples - 1) + delay
 
 
-def observer_of(window: Window, on_y: FloatArray, on_u: FloatArray, delay: int) -> LinearObserver:
-    """Return the weights (newest first) as a linear observer with one register for each sample but the last."""
+def observer_of(
+    window: Window, on_y: FloatArray, on_u: FloatArray, delay: int, beside: LinearObserver | None = None
+) -> LinearObserver:
+    """Return the weights (newest first) as a linear observer with one register for each sample but the last.
+
+    ``beside``: an observer of the state, which runs along where constants have tolerances.
+    """
     plant, count = window.plant, len(on_y) - 1
     name = (plant.fault_names[window.question.fault],)
     estimated = window.question.course != "step"
     late = (window.question.lag + delay,) if estimated else ()
     first = np.zeros((1, count))
     first[0, :1] = 1.0
-    return LinearObserver(
+    test = LinearObserver(
         Az=np.eye(count, k=1),
         Bu=on_u[1:],
         By=on_y[1:],
@@ -227,6 +239,7 @@ def observer_of(window: Window, on_y: FloatArray, on_u: FloatArray, delay: int) 
         state_delays=(),
         fault_delays=late,
     )
+    return test if beside is None else side_by_side(test, beside)
 
 
 def rounding_of(window: Window, multipliers: FloatArray, radius: FloatArray) -> FloatArray:

@@ -4,6 +4,7 @@ proved."""
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -13,6 +14,16 @@ from obsynth.numerics.arrays import FloatArray
 
 #: Tightest tolerance that HiGHS takes.
 TOLERANCE = 1e-10
+_TIGHT = {"primal_feasibility_tolerance": TOLERANCE, "dual_feasibility_tolerance": TOLERANCE}
+#: What is asked of HiGHS in turn: its tightest answer; one without presolve; what it has of its own accord, which large
+#: networks need; an interior point.
+ATTEMPTS: tuple[tuple[str, dict[str, Any]], ...] = (
+    ("highs", _TIGHT),
+    ("highs", {**_TIGHT, "presolve": False}),
+    ("highs", {}),
+    ("highs-ipm", {}),
+    ("highs-ipm", {"presolve": False}),
+)
 #: Statuses of `scipy.optimize.linprog`.
 SOLVED, UNBOUNDED = 0, 3
 
@@ -40,17 +51,17 @@ def largest_hidden_fault(window: Window, right: FloatArray | None = None, *, sig
     ends = np.ldexp(window.bar, -columns)
     known = np.zeros(window.rows) if right is None else np.ldexp(right, rows)
 
-    given = {"A_eq": matrix.tocsr(), "b_eq": known, "bounds": np.stack([-ends, ends], axis=1), "method": "highs"}
-    options = {"primal_feasibility_tolerance": TOLERANCE, "dual_feasibility_tolerance": TOLERANCE}
-    found = linprog(cost, options=options, **given)
-    if found.status not in (SOLVED, UNBOUNDED):
-        found = linprog(cost, options={**options, "presolve": False}, **given)
+    given = {"A_eq": matrix.tocsr(), "b_eq": known, "bounds": np.stack([-ends, ends], axis=1)}
+    for method, options in ATTEMPTS:
+        found = linprog(cost, method=method, options=options, **given)
+        if found.status in (SOLVED, UNBOUNDED):
+            break
     if found.status == UNBOUNDED:
         return Optimum(np.inf * sign)
     if found.status != SOLVED:
         raise SolverError(
             f"HiGHS has no answer for the linear programme of {window.question.samples} samples (status "
-            f"{found.status}): nothing is known. "
+            f"{found.status}): the result is inconclusive. "
             "Fewer samples, or signals in units in which they are near one, may help."
         )
     multipliers = np.ldexp(-sign * np.asarray(found.eqlin.marginals), rows)
@@ -84,7 +95,7 @@ def _in_ellipsoids(window: Window) -> Optimum:
     if problem.status in ("unbounded", "unbounded_inaccurate"):
         return Optimum(np.inf)
     if x.value is None or equations.dual_value is None:
-        raise SolverError(f"Clarabel has no answer ({problem.status}): nothing is known.")
+        raise SolverError(f"Clarabel has no answer ({problem.status}): the result is inconclusive.")
     multipliers = np.ldexp(np.asarray(equations.dual_value).ravel(), rows)
     scale = float(window.matrix[:, [0]].toarray().ravel() @ multipliers)
     point = np.ldexp(np.asarray(x.value), columns)

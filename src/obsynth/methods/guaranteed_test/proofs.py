@@ -6,6 +6,7 @@ of the equations with a proved inverse then tells how far the exact solution lie
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
@@ -13,6 +14,7 @@ from typing import Any
 import numpy as np
 from flint import arb, arb_mat, ctx, fmpq, fmpq_mat
 
+from obsynth.methods.guaranteed_test.condensed import Condensed
 from obsynth.methods.guaranteed_test.windows import Window
 from obsynth.numerics.arrays import FloatArray
 from obsynth.proofs.balls import UNIT_ROUNDOFF, Ball, rounded_up
@@ -81,6 +83,52 @@ def rows_of(window: Window, point: FloatArray) -> list[Fraction]:
     return _sums(_entries(window), Whole.of(point), window.j, window.i, window.rows)
 
 
+def columns_of_exact(window: Window, multipliers: Sequence[Fraction]) -> list[Fraction]:
+    """Return the matrix transposed times multipliers that are fractions, exactly ``(columns,)``."""
+    entries, found = _entries(window), [Fraction(0)] * len(window.bar)
+    one = Fraction(2) ** entries.exponent
+    for row, column, entry in zip(window.i.tolist(), window.j.tolist(), entries.values.tolist(), strict=True):
+        if multipliers[row]:
+            found[column] += multipliers[row] * entry
+    return [value * one for value in found]
+
+
+def exact_right_sides(window: Window, y: FloatArray, u: FloatArray) -> list[Fraction]:
+    """Return the right sides of a window of samples, exactly: ``B u`` and ``y - D u``."""
+    plant, found = window.plant, [Fraction(0)] * window.rows
+
+    def times(row: FloatArray, known: FloatArray) -> Fraction:
+        return sum(
+            (Fraction(float(a)) * Fraction(float(b)) for a, b in zip(row, known, strict=True)), start=Fraction(0)
+        )
+
+    for k in range(window.equations):
+        for r in range(plant.nx):
+            found[k * plant.nx + r] = times(plant.B[r], u[k])
+    for k in range(window.question.samples):
+        for r in range(plant.ny):
+            place = window.outputs_at + k * plant.ny + r
+            found[place] = Fraction(float(y[k, r])) - times(plant.D[r], u[k])
+    return found
+
+
+def exact_multipliers(window: Window, multipliers: FloatArray) -> list[Fraction] | None:
+    """Return fractions next to multipliers that see no free column at all; ``None`` where none are found."""
+    told = np.flatnonzero(window.free)
+    seen = columns_of(window, multipliers)
+    rows, _ = window.scales
+    sizes = np.ldexp(np.abs(multipliers), -rows)
+    weight = np.ldexp(np.maximum(sizes, LEAST_WEIGHT * float(np.max(sizes, initial=0.0))), rows)
+    dense, _ = _dense(window, told)
+    corrected = _rational_step(dense.T, weight, [-seen[column] for column in told])
+    if corrected is None:
+        return None
+    found = [Fraction(float(value)) for value in multipliers]
+    for place, step in zip(*corrected, strict=True):
+        found[place] += step
+    return found
+
+
 def up(value: Fraction) -> float:
     """Return a double that is not below a rational number."""
     found = float(value)
@@ -93,7 +141,7 @@ def down(value: Fraction) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class _Square:
+class Square:
     """A square part of equations ``K v = r``, scaled by powers of two, with an approximate inverse."""
 
     chosen: np.ndarray
@@ -104,7 +152,7 @@ class _Square:
     part: Ball
 
     @classmethod
-    def of(cls, matrix: FloatArray, radius: FloatArray, weight: FloatArray, units: np.ndarray) -> _Square | None:
+    def of(cls, matrix: FloatArray, radius: FloatArray, weight: FloatArray, units: np.ndarray) -> Square | None:
         """Choose columns of ``matrix (m, n)``, the heavier the better; ``None`` where rows depend on each other.
 
         What is proved is scaled by ``units (n,)``, exponents that depend on the window alone.
@@ -146,16 +194,18 @@ class _Square:
 
     def proved_step(self, right: list[Fraction]) -> FloatArray | None:
         """Return bounds of the exact correction ``(chosen,)``; ``None`` where nothing is proved."""
-        sizes = np.array([up(abs(value)) for value in right])
-        scaled = np.ldexp(sizes, self.rows)
         if self.contraction < 1.0:
-            magnitude = Ball.exact(np.abs(self.inverse)) @ Ball.exact(scaled[:, None])
-            first = magnitude.magnitude.ravel()
-            rest = self.contraction / (1.0 - self.contraction) * float(np.max(first, initial=0.0))
-            return np.asarray(np.ldexp(rounded_up(first + rest, 8), self.columns))
+            return self.bounded_step(np.array([up(abs(value)) for value in right]))
         if len(right) > MOST_ROWS_IN_BALLS or self.part.radius.any():
             return None
         return self._in_balls(right)
+
+    def bounded_step(self, sizes: FloatArray) -> FloatArray:
+        """Return the same for a right side of at most these sizes, where the contraction is below one."""
+        magnitude = Ball.exact(np.abs(self.inverse)) @ Ball.exact(np.ldexp(sizes, self.rows)[:, None])
+        first = magnitude.magnitude.ravel()
+        rest = self.contraction / (1.0 - self.contraction) * float(np.max(first, initial=0.0))
+        return np.asarray(np.ldexp(rounded_up(first + rest, 8), self.columns))
 
     def _in_balls(self, right: list[Fraction]) -> FloatArray | None:
         before = ctx.prec
@@ -213,6 +263,11 @@ def repaired_multipliers(
     ``exact_zero``: no bounded column is seen either.  ``refine``: move them to the nearest doubles first.
     ``among``: only those with a positive number there differ from the exact ones.
     """
+    condensed = None if exact_zero else Condensed.of(window)
+    if condensed is not None:
+        found = condensed.multipliers(multipliers, refine=refine, among=among)
+        if found is not None:
+            return Repaired(*found)
     _, told = _multiplier_system(window, exact_zero=exact_zero)
     wanted = [Fraction(int(column == 0)) for column in told]
 
@@ -237,6 +292,11 @@ def repaired_point(
     if refine:
         near = bounded & (bar - np.abs(values) < AT_BOUND * bar)
         values[near] = np.copysign(bar[near], values[near])
+    condensed = Condensed.of(window)
+    if condensed is not None:
+        found = condensed.point(values)
+        if found is not None:
+            return Repaired(*found) if refine else Repaired(values, _distances(*found, values))
     _, columns = window.scales
     sizes = np.ldexp(np.abs(values), -columns)
     room = np.ldexp(np.maximum(1.0, sizes), columns)
@@ -252,6 +312,11 @@ def repaired_point(
     return _repaired(matrix, radius, (weight, columns), values, missing, refine=refine)
 
 
+def _distances(found: FloatArray, distance: FloatArray, values: FloatArray) -> FloatArray:
+    """Return how far values are from what lies within a distance of others."""
+    return np.where(distance > 0.0, rounded_up(np.abs(found - values) + distance, 3), 0.0)
+
+
 def _repaired(
     matrix: FloatArray,
     radius: FloatArray,
@@ -263,9 +328,10 @@ def _repaired(
 ) -> Repaired | None:
     """Return values next to an exact solution; ``heavy``: weights by which entries are chosen, and their units."""
     weight, units = heavy
-    square = _Square.of(matrix, radius, weight, units)
+    square = Square.of(matrix, radius, weight, units)
     if square is None:
         return _in_rationals(matrix, weight, values, missing, refine=refine)
+    given = values.copy()
     if refine:
         left = np.inf
         for _ in range(REFINEMENTS):
@@ -279,13 +345,16 @@ def _repaired(
         values[sizes < ROUNDED * float(np.max(sizes, initial=0.0))] = 0.0
     bound = square.proved_step(missing(values))
     if bound is None:
-        return None
+        # Rows may depend on each other though rounding hides it; such a part has led values astray.
+        return _in_rationals(matrix, weight, given, missing, refine=refine)
     distance = np.zeros(len(values))
     # What is chosen is seen by its radius, though it may be exact.
     distance[square.chosen] = np.maximum(bound, np.finfo(np.float64).tiny)
     return Repaired(values, distance)
 
 
+#: Most rows for which a course that hides a fault is looked for: all of them at once.
+MOST_ROWS_FOR_A_RAY = 2500
 #: Most rows for which equations that depend on each other are solved in rationals.
 MOST_ROWS_IN_RATIONALS = 400
 
@@ -294,6 +363,23 @@ def _in_rationals(
     matrix: FloatArray, weight: FloatArray, values: FloatArray, missing: Any, *, refine: bool
 ) -> Repaired | None:
     """Return the same where rows depend on each other: a largest square part solved exactly, the others looked at."""
+    corrected = _rational_step(matrix, weight, missing(values))
+    if corrected is None:
+        return None
+    columns, correction = corrected
+    moved = [Fraction(float(values[c])) + d for c, d in zip(columns, correction, strict=True)]
+    if refine:
+        values[columns] = [float(value) for value in moved]
+    distance = np.zeros(len(values))
+    away = [up(abs(v - Fraction(float(values[c])))) for v, c in zip(moved, columns, strict=True)]
+    distance[columns] = np.maximum(away, np.finfo(np.float64).tiny)
+    return Repaired(values, distance)
+
+
+def _rational_step(
+    matrix: FloatArray, weight: FloatArray, exact: list[Fraction]
+) -> tuple[list[int], list[Fraction]] | None:
+    """Return which columns ``matrix step = exact`` is solved by, and the step; ``None`` where there is none."""
     from scipy.linalg import qr
 
     if len(matrix) > MOST_ROWS_IN_RATIONALS:
@@ -307,7 +393,6 @@ def _in_rationals(
     rows = np.sort(by_row[:rank])
     _, by_column = qr(scaled[rows], mode="r", pivoting=True)
     columns = np.sort(by_column[:rank])
-    exact = missing(values)
     part = fmpq_mat(rank, rank, [_rational(float(value)) for value in matrix[np.ix_(rows, columns)].ravel()])
     right = fmpq_mat(rank, 1, [fmpq(exact[row].numerator, exact[row].denominator) for row in rows])
     try:
@@ -322,13 +407,7 @@ def _in_rationals(
         )
         if seen != exact[row]:
             return None
-    moved = [Fraction(float(values[c])) + d for c, d in zip(columns, correction, strict=True)]
-    if refine:
-        values[columns] = [float(value) for value in moved]
-    distance = np.zeros(len(values))
-    away = [up(abs(v - Fraction(float(values[c])))) for v, c in zip(moved, columns, strict=True)]
-    distance[columns] = np.maximum(away, np.finfo(np.float64).tiny)
-    return Repaired(values, distance)
+    return columns.tolist(), correction
 
 
 def _solved(part: Any, right: Any) -> Any:
@@ -382,6 +461,8 @@ def proved_ray(window: Window) -> FloatArray | None:
 
     There is then no test on these samples.  ``None`` where none is found, or none is proved.
     """
+    if window.rows > MOST_ROWS_FOR_A_RAY:
+        return None
     told = np.flatnonzero(window.free)
     _, columns = window.scales
     rows, _ = window.scales

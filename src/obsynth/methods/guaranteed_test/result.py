@@ -1,4 +1,4 @@
-"""The result of a guaranteed test, the function that designs it, and the bank of tests that isolates."""
+"""The result of a guaranteed test, and the function that designs it."""
 
 from __future__ import annotations
 
@@ -8,12 +8,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from obsynth.analysis.transformations.recovery import Transformation
 from obsynth.errors import SpecError
 from obsynth.extensions import extension
 from obsynth.methods.designing import design
 from obsynth.methods.functions import design_function
 from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
 from obsynth.methods.guaranteed_test.problem import window_as_designed
+from obsynth.methods.guaranteed_test.tolerant import rows_before
+from obsynth.methods.guaranteed_test.windows import courses_of
 from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.estimates import Estimates
@@ -31,6 +34,8 @@ class GuaranteedTest(ObserverDesign):
     ----------
     name, method, plant, options, gains, observer, certificate, solver, notes, recovery, report, source, file_digest
         As of `ObserverDesign`.
+    input_delay : int
+        The same.
     """
 
     @classmethod
@@ -53,9 +58,53 @@ class GuaranteedTest(ObserverDesign):
         return cls(**{field.name: getattr(design, field.name) for field in fields(ObserverDesign)})
 
     @property
+    def tests(self) -> tuple[GuaranteedTest, ...]:
+        """The tests of a bank (``isolate``), one for each fault, each as a design of its own; or this one alone."""
+        from obsynth.methods.guaranteed_test.bank import is_bank, tests_of
+
+        if not is_bank(self):
+            return (self,)
+        return tuple(GuaranteedTest.of(test) for test in tests_of(self, GuaranteedTestMethod.of))
+
+    @property
+    def groups(self) -> tuple[tuple[str, ...], ...]:
+        """By test: an alarm means that one of these faults is there; one fault where it is isolated.
+
+        Of a test that is blind to nothing (``free`` none) these are all faults, and one that is blind to all others
+        isolates.
+        """
+        from obsynth.methods.guaranteed_test.bank import groups_of, is_bank
+        from obsynth.methods.guaranteed_test.problem import free_faults
+
+        names = self.linear[0].fault_names
+        if is_bank(self):
+            return tuple(tuple(names[k] for k in group) for group in groups_of(self))
+        own = names.index(self.fault)
+        free = free_faults(self.linear[0], self.options["free"], own)
+        return (tuple(names[k] for k in range(len(names)) if k not in free),)
+
+    @property
+    def pairs(self) -> dict[tuple[str, str], float]:
+        """Of a bank: the threshold of a test of the first fault that is blind to the second alone.
+
+        Infinite where there is none, which is proved: the second then hides the first.
+        """
+        names, table = self.linear[0].fault_names, self.certificate.matrices.get("pairs", np.zeros((0, 0)))
+        both = [(i, j) for i in range(len(table)) for j in range(len(table)) if i != j]
+        return {(names[i], names[j]): float(table[i, j]) for i, j in both}
+
+    @property
     def fault(self) -> str:
         """The fault that is looked for."""
-        return str(self.options["fault"])
+        return str(self._single("fault").options["fault"])
+
+    def _single(self, what: str) -> GuaranteedTest:
+        """Return this test; raise `SpecError` for a bank, whose tests have that each."""
+        if self.options.get("isolate"):
+            raise SpecError(
+                f"{self.name!r} is a bank: each of its tests has {what} of its own (tests).", path="isolate"
+            )
+        return self
 
     @property
     def samples(self) -> int:
@@ -65,22 +114,22 @@ class GuaranteedTest(ObserverDesign):
     @property
     def threshold(self) -> float:
         """What the residual never passes without the fault, in the fault's unit; proved."""
-        return float(self.certificate.claims["threshold"])
+        return float(self._single("a threshold").certificate.claims["threshold"])
 
     @property
     def least(self) -> float:
         """The threshold below which no function of these samples has one; proved.  NaN where that is not known."""
-        return float(self.certificate.claims.get("least", np.nan))
+        return float(self._single("a least threshold").certificate.claims.get("least", np.nan))
 
     @property
     def surely_found(self) -> float:
         """The size from which a fault of the course surely alarms, in the fault's unit."""
-        return float(self.certificate.claims["surely_found"])
+        return float(self._single("a size").certificate.claims["surely_found"])
 
     @property
     def delay(self) -> float:
         """Seconds after which it does so at the latest."""
-        return float(self.certificate.claims["delay"])
+        return float(self._single("a delay").certificate.claims["delay"])
 
     @property
     def trade_off(self) -> FloatArray:
@@ -88,27 +137,30 @@ class GuaranteedTest(ObserverDesign):
 
         By linear programmes; that of the samples chosen is proved.
         """
-        return self.certificate.matrices["trade_off"]
+        return self._single("a table").certificate.matrices["trade_off"]
 
-    @property
-    def hidden_course(self) -> dict[str, FloatArray]:
-        """The witness, signals by name over the window: with them a fault of the size ``least`` looks like none.
+    def hidden_course(self, fault: str | None = None) -> dict[str, FloatArray]:
+        """Return signals by name over the window with which a fault looks like none.
 
-        Twice that fault with these signals, and no fault with their opposites, give the same samples.
+        Of a test the witness: its fault, of the size ``least``, with these disturbances, and all their opposites give
+        the same samples; without bounds of states so do twice that fault and none.  Of a bank the courses of other
+        faults, with states, that hide a fault exactly from any test of a smaller group; none where it is isolated.
+
+        Parameters
+        ----------
+        fault : str, optional
+            Of a bank: which one; the first by default.
         """
-        found: dict[str, FloatArray] = {}
+        from obsynth.methods.guaranteed_test.bank import hidden_by, is_bank
+
+        if is_bank(self):
+            names = self.linear[0].fault_names
+            number = names.index(names[0] if fault is None else fault)
+            return hidden_by(self, GuaranteedTestMethod.of, number)
         point = self.certificate.matrices.get("witness")
         if point is None:
-            return found
-        plant = self.linear[0]
-        window = window_as_designed(plant, GuaranteedTestMethod.of(self.options))
-        length = max(window.equations + 1, self.samples)
-        names = {"x": plant.state_names, "d": plant.disturbance_names, "f": plant.fault_names}
-        for label, value in zip(window.labels, point.ravel(), strict=True):
-            if label[0] in names:
-                course = found.setdefault(names[label[0]][label[2]], np.zeros(length))
-                course[slice(None) if label[1] is None else label[1]] = value
-        return found
+            return {}
+        return courses_of(window_as_designed(self.linear[0], GuaranteedTestMethod.of(self.options)), point.ravel())
 
     def slack(self, y: FloatArray, u: FloatArray | None = None) -> FloatArray:
         """Return what rounding may add to each row of a run ``(steps,)``, to be added to the threshold.
@@ -119,7 +171,8 @@ class GuaranteedTest(ObserverDesign):
             Outputs ``(steps, ny)`` and known inputs ``(steps, nu)``.
         """
         known = np.abs(y) if u is None else np.hstack([np.abs(u), np.abs(y)])
-        size = np.maximum.accumulate(known, axis=0) @ self.certificate.matrices["rounding"].ravel()
+        rounding = self._single("its own rounding").certificate.matrices["rounding"]
+        size = np.maximum.accumulate(known, axis=0) @ rounding.ravel()
         return np.asarray(size)
 
     def interval(self, estimates: Estimates) -> tuple[FloatArray, FloatArray]:
@@ -142,8 +195,9 @@ class GuaranteedTest(ObserverDesign):
         estimates : Estimates
             What the observer said over a record, from its start.
         """
+        self._single("a residual")
         row = np.hstack([estimates.faults, estimates.residuals])[..., 0].astype(np.float64)
-        row[: self.linear[1].order] = np.nan
+        row[: rows_before(self)] = np.nan
         return row
 
     def alarms(self, estimates: Estimates) -> np.ndarray:
@@ -174,19 +228,18 @@ class GuaranteedTest(ObserverDesign):
         low, high : FloatArray
             NaN before the window is full.
         """
-        from obsynth.methods.guaranteed_test.exact import least_interval
+        from obsynth.methods.guaranteed_test.exact import Programmes
 
-        plant, observer = self.linear
+        plant, observer = self._single("an interval").linear
         inputs = np.zeros((len(y), plant.nu)) if u is None else np.asarray(u, dtype=np.float64)
         outputs = np.asarray(y, dtype=np.float64)
         low, high = (np.array(end) for end in self.interval(observer.run(outputs, inputs)))
         slack = self.slack(outputs, inputs)
         low, high = low - slack, high + slack
-        window = window_as_designed(plant, GuaranteedTestMethod.of(self.options))
-        length = observer.order + 1
-        for k in range(observer.order, len(outputs)):
+        length, programmes = rows_before(self) + 1, Programmes.of(self)
+        for k in range(length - 1, len(outputs)):
             rows = slice(k + 1 - length, k + 1)
-            found = least_interval(window, length - self.samples, outputs[rows], inputs[rows])
+            found = programmes.interval(outputs[rows], inputs[rows])
             low[k], high[k] = max(low[k], found[0]), min(high[k], found[1])
         return low, high
 
@@ -209,6 +262,13 @@ class GuaranteedTest(ObserverDesign):
 
 def guaranteed_test(plant: Any, fault: str | None = None, **options: Any) -> GuaranteedTest:
     """Design a guaranteed test; the docstring is that of the method."""
+    own = plant.plant if isinstance(plant, Transformation) else plant
+    if options.get("scenario") is not None and getattr(own, "uncertainty", None) is None:
+        raise SpecError(
+            "scenario is for plants whose constants have tolerances: it weighs what they do. State some "
+            "(obsynth.uncertain_system), or leave it out.",
+            path="scenario",
+        )
     return GuaranteedTest.of(design(plant, GuaranteedTestMethod.id, fault=fault, **options))
 
 

@@ -9,7 +9,7 @@ size of the fault.  Every entry is kept as a double times a whole number, so tha
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +22,8 @@ from obsynth.plants.descriptor import DescriptorSystem
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
+#: Entries below this power of two times the largest of their row or column do not count in its scale.
+MOST_SPREAD = 30
 #: Rounds of scaling rows and free columns by powers of two.
 SCALING_ROUNDS = 4
 
@@ -61,7 +63,7 @@ class Question:
     closing: int = 0
 
 
-class _Builder:
+class Builder:
     """Collects columns and entries."""
 
     def __init__(self) -> None:
@@ -102,10 +104,34 @@ class Window:
     value: FloatArray
     times: np.ndarray
 
+    def with_columns(self, more: Builder) -> Window:
+        """Return the same rows with more columns."""
+        i, j, value, times = (np.concatenate(parts) for parts in zip(*more.parts, strict=True))
+        return replace(
+            self,
+            labels=(*self.labels, *more.labels),
+            bar=np.concatenate([self.bar, more.bar]),
+            group=np.concatenate([self.group, more.group]),
+            i=np.concatenate([self.i, i]),
+            j=np.concatenate([self.j, j + len(self.labels)]),
+            value=np.concatenate([self.value, value]),
+            times=np.concatenate([self.times, times]),
+        )
+
     @property
     def outputs_at(self) -> int:
         """First row of the outputs."""
         return self.equations * self.plant.nx
+
+    @property
+    def twice_is_hidden(self) -> bool:
+        """Whether twice the fault of a witness and none give the same samples, not only the fault and its opposite.
+
+        For that the states must be free to follow what the disturbances do without the fault: bounds may cut that off,
+        as may equations without dynamics those of the first sample.
+        """
+        at_first = self.equations == self.question.samples - 1 or np.isinf(self.bounds.first).all()
+        return bool(at_first and np.isinf(self.bounds.state).all())
 
     @cached_property
     def free(self) -> np.ndarray:
@@ -178,9 +204,37 @@ class Window:
         return right
 
 
+def courses_of(window: Window, point: FloatArray) -> dict[str, FloatArray]:
+    """Return states, disturbances and faults of a point ``(columns,)`` over the samples of a window, by name."""
+    plant, question = window.plant, window.question
+    length = max(window.equations + 1, question.samples)
+    names = {"x": plant.state_names, "d": plant.disturbance_names, "f": plant.fault_names}
+    found: dict[str, FloatArray] = {}
+    own = np.zeros(length)
+    own[question.before :] = point[0]
+    found[plant.fault_names[question.fault]] = own
+    for label, value in zip(window.labels, point, strict=True):
+        if label[0] in names:
+            course = found.setdefault(names[label[0]][label[2]], np.zeros(length))
+            course[slice(None) if label[1] is None else label[1]] = value
+        elif label[0] == "slope":
+            own += value * (np.arange(length) - (question.samples - 1 - question.lag))
+        elif label[0] == "change of f":
+            target = question.samples - 1 - question.lag
+            own[label[1] :] += value if label[1] > target else 0.0
+            own[: label[1]] -= value if label[1] <= target else 0.0
+    if question.course == "any":
+        # Column 0 is the sample that is told, the others have columns of their own.
+        target = question.samples - 1 - question.lag
+        own[np.arange(length) == target] = point[0]
+        told = {label[1] for label in window.labels if label[0] == "f" and label[2] == question.fault}
+        own[[k for k in range(length) if k != target and k not in told]] = 0.0
+    return found
+
+
 def window_of(plant: DescriptorSystem, bounds: Bounds, question: Question) -> Window:
     """Return the stacked equations of a question."""
-    builder, samples = _Builder(), question.samples
+    builder, samples = Builder(), question.samples
     regular = decide_rank(plant.E).full
     equations = samples - 1 if regular else samples + question.closing
     nx, ny = plant.nx, plant.ny
@@ -233,7 +287,7 @@ def window_of(plant: DescriptorSystem, bounds: Bounds, question: Question) -> Wi
 
 
 def _disturbances(
-    plant: DescriptorSystem, bounds: Bounds, question: Question, builder: _Builder, both: Any, span: range, rows: int
+    plant: DescriptorSystem, bounds: Bounds, question: Question, builder: Builder, both: Any, span: range, rows: int
 ) -> int:
     """Enter the disturbances; return the number of rows."""
     acting = [i for i in range(plant.nd) if bounds.disturbance[i] > 0.0]
@@ -255,7 +309,7 @@ def _disturbances(
     return rows
 
 
-def _course(plant: DescriptorSystem, question: Question, builder: _Builder, both: Any, span: range) -> None:
+def _course(plant: DescriptorSystem, question: Question, builder: Builder, both: Any, span: range) -> None:
     """Enter the fault that is looked for."""
     state, output = plant.Bf[:, [question.fault]], plant.Df[:, [question.fault]]
     target = question.samples - 1 - question.lag
@@ -289,6 +343,8 @@ def _exponent(values: FloatArray) -> np.ndarray:
 def _middle(exponents: np.ndarray, at: np.ndarray, count: int) -> np.ndarray:
     """Return for each place the middle between the largest and the least exponent there; 0 where there is none."""
     low, high = np.full(count, np.iinfo(np.int64).max), np.full(count, np.iinfo(np.int64).min)
-    np.minimum.at(low, at, exponents)
     np.maximum.at(high, at, exponents)
+    # What is much smaller, such as what far states of a network do within a sample, does not count.
+    large = exponents >= high[at] - MOST_SPREAD
+    np.minimum.at(low, at[large], exponents[large])
     return np.where(low <= high, (low // 2 + high // 2), 0)

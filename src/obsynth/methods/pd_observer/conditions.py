@@ -27,15 +27,13 @@ from obsynth.analysis.plant_units import PlantUnits, sized_plant
 from obsynth.analysis.structure import analyse_structure
 from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
 from obsynth.analysis.transformations.recovery import Transformation
-from obsynth.analysis.zeros import equilibrated_at, leading_names, system_pencil
+from obsynth.analysis.zeros import MOST_NAMES, equilibrated_at, leading_names, system_pencil
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.pencils import pencil_structure
-from obsynth.numerics.ranks import decide_rank, equilibrate
+from obsynth.numerics.ranks import decide_rank, equilibrate, rank_in_any_units
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.exact_arithmetic import holds_computed
 
-#: At most this many signals are named in a failed condition.
-MOST_NAMES = 4
 _SOURCE = "Filasova et al., eqs. (1), (2)"
 
 
@@ -165,15 +163,20 @@ def _full_rank(
     """Return the condition that blocks of the plant make up a matrix of full column rank, decided in its own units."""
     units, terms = PlantUnits.of(plant).rounded(), sized_plant(plant)
 
+    def blocks(part: DescriptorSystem) -> FloatArray:
+        return np.block([[getattr(part, key) for key in row] for row in layout])
+
     def whole(part: DescriptorSystem) -> FloatArray:
-        scaled = units.scaled_plant(part)
-        return np.block([[getattr(scaled, key) for key in row] for row in layout])
+        return blocks(units.scaled_plant(part))
 
     matrix, exact = whole(plant), None
     if numbers is not None:
         exact = numbers.rank(numbers.blocks([[numbers.matrix(key) for key in row] for row in layout]))
     share = np.inf if terms is None else least_share(matrix, whole(terms))
-    decision = settled_rank(decide_rank(matrix, expected=matrix.shape[1]), exact, share)
+    if exact is None:
+        decision = rank_in_any_units(matrix, blocks(plant))
+    else:
+        decision = settled_rank(decide_rank(matrix, expected=matrix.shape[1]), exact, share)
     remedy, signals = failure(matrix)
     found = rank_condition(name, decision, remedy, source="Filasova et al., eq. (3)", signals=signals)
     return found.in_doubt(rank_doubt(plant, units, decision, layout), plant) if decision.means == "unclear" else found

@@ -22,7 +22,7 @@ from obsynth.methods.conic import lmi
 from obsynth.numerics.arrays import FloatArray
 
 #: How far inside the cone the inequalities must hold, with ``P3 + P3' >= 2 I`` as the scale.
-MARGIN = 1e-3
+PD_MARGIN = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +43,6 @@ class PdTask:
     process: FloatArray  # (n, nw)
     sensor: FloatArray  # (ny, nw)
     sensor_rate: FloatArray  # (ny, nw), of the noise's derivative
-    has_derivative: bool = True  # False for L = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,12 +67,12 @@ def solve(task: PdTask, *, solver: str) -> PdSolution:
     """Return the gains of least size that meet the task."""
     n, ny = task.plants[0][1].shape[1], task.plants[0][1].shape[0]
     p3 = lmi.symmetric_variable(n) if task.theorem == 2 else lmi.matrix_variable(n, n)
-    z = lmi.matrix_variable(n, ny) if task.has_derivative else np.zeros((n, ny))
+    z = lmi.matrix_variable(n, ny)
     found = _Variables(p3, lmi.matrix_variable(n, ny), z)
     own = [lmi.symmetric_variable(n) for _ in task.plants]
     constraints = [lmi.at_least(p3 + p3.T, 2.0)]
     for (a, c), p in zip(task.plants, own, strict=True):
-        constraints += [lmi.at_least(p, MARGIN), lmi.at_most(_stability(task, found, a, c, p), -MARGIN)]
+        constraints += [lmi.at_least(p, PD_MARGIN), lmi.at_most(_stability(task, found, a, c, p), -PD_MARGIN)]
     constraints += _further(task, found)
     size = lmi.frobenius_norm(found.Y, found.Z) + lmi.frobenius_norm(p3)
     record = lmi.minimise(size, constraints, what=f"a PD observer by Theorem {task.theorem}", solver=solver)
@@ -117,7 +116,7 @@ def _further(task: PdTask, found: _Variables) -> list[Any]:
         centre, radius = task.disk
         p = lmi.symmetric_variable(len(a))
         blocks = _blocks(task, found, moving, c, p, (centre**2 - radius**2, centre, 1.0))
-        constraints += [lmi.at_least(p, MARGIN), lmi.at_most(lmi.symmetric_blocks(blocks), -MARGIN)]
+        constraints += [lmi.at_least(p, PD_MARGIN), lmi.at_most(lmi.symmetric_blocks(blocks), -PD_MARGIN)]
     if task.gain_bound is not None:
         # P3' P3 >= P3 + P3' - I, so that [Y Z][Y Z]' <= r^2 (P3 + P3' - I) bounds the norm of [J L] by r.
         constraints.append(_bounded(task, found, proportional, task.gain_bound))
@@ -151,4 +150,4 @@ def _gain(task: PdTask, found: _Variables, moving: Any, c: FloatArray, row: Any,
     stability[0][0] = stability[0][0] + theta * (task.shown.T @ task.shown)
     inputs = row.shape[0]
     blocks = [*stability, [row, task.delta * row, -(level**2) * theta * np.eye(inputs)]]
-    return [lmi.at_least(p, MARGIN), lmi.at_most(lmi.symmetric_blocks(blocks), -MARGIN)]
+    return [lmi.at_least(p, PD_MARGIN), lmi.at_most(lmi.symmetric_blocks(blocks), -PD_MARGIN)]

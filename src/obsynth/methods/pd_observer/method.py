@@ -19,12 +19,10 @@ from obsynth.results.checks import Check
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.error_system import ErrorModel
 
-#: Engines for stability and a decay rate alone.
-ENGINES_OF_STABILITY = ("reduced-lmi", "riccati")
-#: Up to so many unknown states "auto" takes the first (a second or two); up to so many it tries the second where the
-#: third does not serve.
+#: Up to so many unknown states "auto" takes the inequality (a second or two); up to so many it tries it where the
+#: closed form does not serve (a minute or two).
 MOST_STATES_FOR_LMI = 20
-MOST_STATES_FOR_REDUCED_LMI = 50
+MOST_STATES_FOR_SPARE_LMI = 50
 
 CLAIMS = {
     "theorem": ClaimMeaning("", "theorem whose inequality is proved", "LMI"),
@@ -79,15 +77,11 @@ class PdObserver(Method):
         G ``(nf, nf)`` of (25), nonsingular: the loop integrates ``G (M e + N e')``, and the design is for it.
     adaptation_range : array_like, optional, dimensionless
         ``[low, high]``: one design that is stable for every ``G = g I`` with g in this range.
-    delta_scan : array_like, optional, seconds
-        Values of delta to try as well; what they give is in ``design.solver["delta_scan"]`` and in the report.
-    engine : {"auto", "lmi", "reduced-lmi", "riccati"}, optional
-        How the gains are found.  ``"lmi"`` solves the inequality of the theorem for the smallest gains.
-        ``"reduced-lmi"`` solves it without Y and Z, for a reduced-order observer of the states that the outputs do not
-        show, and puts gains with L = 0 around it in closed form.  ``"riccati"`` takes gains with L = 0 from a Riccati
-        equation, and their certificate from a Lyapunov equation.  The last two give stability and a decay rate alone.
-        ``"auto"`` takes the first up to 20 unknown states, or where more is asked, and the last above.  The result's
-        ``solver["engine"]`` says which ran.
+    engine : {"auto", "lmi", "riccati"}, optional
+        How the gains are found.  ``"lmi"`` solves the inequality of the theorem for the smallest gains.  ``"riccati"``
+        takes gains with L = 0 from a Riccati equation, and their certificate from a Lyapunov equation: for stability
+        and a decay rate alone.  ``"auto"`` takes the first up to 20 unknown states, or where more is asked, and the
+        second above.  The result's ``solver["engine"]`` says which ran.
     solver : str, optional
         Semidefinite solver: any of ``cvxpy.installed_solvers()`` that does semidefinite programmes.
     solver_options : mapping, optional
@@ -144,6 +138,10 @@ class PdObserver(Method):
     witnesses: ClassVar[frozenset[str]] = frozenset({"P1", "P3", "P_rate", "P_noise", "P1_low", "P1_high"})
     imposed: ClassVar[frozenset[str]] = frozenset({"decay"})
     purposes: ClassVar[frozenset[Purpose]] = frozenset({"faults"})
+    gone: ClassVar[Mapping[str, str]] = {
+        "delta_scan": "a scan is a sweep: obsynth sweep --system SPEC --set 'delta=[0.1, 1]', or obsynth.sweep(plant, "
+        "{'delta': [0.1, 1]}, method='pd-observer')."
+    }
 
     theorem: Literal[1, 2] = 1
     delta: Positive | None = None
@@ -154,8 +152,7 @@ class PdObserver(Method):
     noise_gain: Positive | None = None
     adaptation_gain: Annotated[Any, WrittenAs("matrix")] = None
     adaptation_range: Annotated[Any, WrittenAs("pair")] = None
-    delta_scan: Annotated[Any, WrittenAs("positive numbers")] = None
-    engine: Literal["auto", "lmi", "reduced-lmi", "riccati"] = "auto"
+    engine: Literal["auto", "lmi", "riccati"] = "auto"
     solver: SolverName = "CLARABEL"
     solver_options: SolverOptions = None
     constraints: OwnConstraints = None
@@ -164,7 +161,7 @@ class PdObserver(Method):
 
     def conflicts(self) -> Iterator[str]:
         """Yield a sentence for each rule across options, or for lists of numbers, that is broken."""
-        if self.engine in ENGINES_OF_STABILITY and self.further:
+        if self.engine == "riccati" and self.further:
             yield (
                 f"engine {self.engine!r} gives stability and a decay rate alone: take engine 'lmi', or leave out "
                 f"{', '.join(self.further)}."
@@ -173,26 +170,22 @@ class PdObserver(Method):
         if self.objective is not None and not callable(self.objective):
             yield f"objective is {shown(self.objective)}: give a function of the variables."
         beside = ("disk", "gain_bound", "fault_rate_gain", "noise_gain", "adaptation_gain", "adaptation_range")
-        yield from own_term_conflicts(self, beside=(*beside, "delta_scan"), engines=ENGINES_OF_STABILITY)
+        yield from own_term_conflicts(self, beside=beside, engines=("riccati",))
         others = ("disk", "gain_bound", "fault_rate_gain", "noise_gain", "adaptation_gain")
         clash = [name for name in others if getattr(self, name) is not None]
         if self.adaptation_range is not None and clash:
             yield f"adaptation_range cannot be combined with {', '.join(clash)}."
 
     def _broken_lists(self) -> Iterator[str]:
-        wanted = {"disk": 2, "adaptation_range": 2, "delta_scan": None}
-        found = {name: _numbers(getattr(self, name), count) for name, count in wanted.items()}
+        found = {name: _pair(getattr(self, name)) for name in ("disk", "adaptation_range")}
         for name, numbers in found.items():
             if getattr(self, name) is not None and numbers is None:
-                count = wanted[name] or "one number or more"
-                yield f"{name} is {getattr(self, name)!r}: give a list of {count}{' numbers' if wanted[name] else ''}."
-        disk, low_high, scanned = found["disk"], found["adaptation_range"], found["delta_scan"]
+                yield f"{name} is {getattr(self, name)!r}: give a list of 2 numbers."
+        disk, low_high = found["disk"], found["adaptation_range"]
         if disk is not None and not disk[1] > max(-disk[0], 0.0):
             yield f"disk is {disk}: give [c, r] for |s + c| < r, with r > 0 and part of the disk left of the axis."
         if low_high is not None and not 0.0 < low_high[0] < low_high[1]:
             yield f"adaptation_range is {low_high}: give [low, high] with 0 < low < high."
-        if scanned is not None and not all(value > 0.0 for value in scanned):
-            yield f"delta_scan is {scanned}: give positive numbers of seconds."
 
     @property
     def further(self) -> tuple[str, ...]:
@@ -205,8 +198,8 @@ class PdObserver(Method):
         if self.further or self.engine == "lmi" or (self.engine == "auto" and states <= MOST_STATES_FOR_LMI):
             return ("lmi",) if self.further else ("lmi", "riccati")
         if self.engine == "auto":
-            return ("riccati", "reduced-lmi") if states <= MOST_STATES_FOR_REDUCED_LMI else ("riccati",)
-        return (self.engine,) if self.engine == "riccati" else (self.engine, "riccati")
+            return ("riccati", "lmi") if states <= MOST_STATES_FOR_SPARE_LMI else ("riccati",)
+        return ("riccati",)
 
     @property
     def disk_numbers(self) -> tuple[float, float] | None:
@@ -260,13 +253,12 @@ class PdObserver(Method):
         )
 
 
-def _numbers(value: Any, count: int | None) -> tuple[float, ...] | None:
-    """Return a list of numbers as floats; ``None`` where it is none, or not of this length."""
+def _pair(value: Any) -> tuple[float, ...] | None:
+    """Return a list of two numbers as floats; ``None`` where it is none."""
     if value is None:
         return None
     try:
         row = as_matrix(np.atleast_2d(np.asarray(value)), "option")
     except (SpecError, ValueError):
         return None
-    fits = row.shape[0] == 1 and row.size > 0 and (count is None or row.size == count)
-    return tuple(map(float, row[0])) if fits else None
+    return tuple(map(float, row[0])) if row.shape == (1, 2) else None

@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-import numpy as np
 from numpy.typing import ArrayLike
 
-from obsynth.analysis.transformations.recovery import Transformation, linear_plant
 from obsynth.errors import SpecError, VerificationError
 from obsynth.methods.designing import design_from_gains, failed_rows
-from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.results.delta_scan import DeltaScan
 from obsynth.results.design import ObserverDesign
 
 
@@ -58,58 +52,3 @@ def apply_adaptation_gain(design: ObserverDesign, adaptation_gain: ArrayLike) ->
             report=changed.report,
         )
     return changed.replace(recovery=design.recovery)
-
-
-def pd_delta_scan(
-    plant: DescriptorSystem | Transformation,
-    delta: ArrayLike,
-    *,
-    theorem: int = 1,
-    decay: float = 0.0,
-    solver: str = "CLARABEL",
-) -> DeltaScan:
-    """Design a PD observer for each delta, and compare decay, gains and noise.
-
-    Parameters
-    ----------
-    plant : DescriptorSystem or Transformation
-        As for `pd_observer`: ``A (nx, nx)``, ``C (ny, nx)``, ``Bf (nx, nf)``.
-    delta : array_like, seconds
-        Values ``(k,)`` to try.
-    theorem : {1, 2}, optional
-        As for `pd_observer`.
-    decay : float, optional, 1/seconds
-        Decay rate imposed for all of them.
-    solver : {"CLARABEL", "SCS"}, optional
-        Semidefinite solver.
-
-    Returns
-    -------
-    DeltaScan
-        One row per delta, measured on the true error system.
-
-    Raises
-    ------
-    SpecError
-        An option is out of range.
-    PreconditionError
-        No such observer exists for this plant.
-
-    References
-    ----------
-    .. [Filasova] Application of descriptor approaches in design of PD observer-based actuator fault estimation,
-       Theorems 1 and 2.
-    """
-    from obsynth.analysis.conditions import require_all
-    from obsynth.methods.conic.lmi import chosen_solver
-    from obsynth.methods.pd_observer.conditions import explicit_form, pd_observer_conditions
-    from obsynth.methods.pd_observer.method import PdObserver
-    from obsynth.methods.pd_observer.synthesis import scan_delta
-
-    given: dict[str, Any] = {"theorem": theorem, "decay": decay, "delta_scan": delta, "solver": solver}
-    asked = PdObserver(**given)
-    chosen_solver(asked.solver, None)
-    plant = linear_plant(plant)
-    require_all(pd_observer_conditions(plant))
-    form = explicit_form(plant)
-    return scan_delta(plant if form is None else form.plant, asked, np.ravel(np.asarray(delta)), decay=float(decay))

@@ -6,73 +6,230 @@ what is minimised, ``||[Y Z]||_F + ||P3||_F`` with ``P3 + P3' >= 2 I``, keeps so
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
+from itertools import islice
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.analysis.conditions import require_all
+from obsynth.analysis.plant_units import FAR_UNITS, PlantUnits
+from obsynth.analysis.structure import analyse_structure
 from obsynth.errors import InfeasibleError, SolverError
-from obsynth.extensions import extension
 from obsynth.methods.conic.lmi import chosen_solver
-from obsynth.methods.method import Synthesis
+from obsynth.methods.method import WARN_AMPLIFICATION, Synthesis
 from obsynth.methods.own_terms import own_terms
+from obsynth.methods.pd_observer.closed_form import closed_form
 from obsynth.methods.pd_observer.conditions import explicit_form, pd_observer_conditions
-from obsynth.methods.pd_observer.gain_search import design_gains, gains_for
-from obsynth.methods.pd_observer.gains import PdGains
+from obsynth.methods.pd_observer.gains import PdGains, certified
+from obsynth.methods.pd_observer.inequalities import PdSolution, PdTask, solve
+from obsynth.methods.pd_observer.limits import default_delta, fastest_mode, require_possible
 from obsynth.methods.pd_observer.method import PdObserver
-from obsynth.methods.pd_observer.realisation import (
-    PdErrorSystem,
-    with_faults_as_states,
-    with_sensor_noise,
-)
+from obsynth.methods.pd_observer.realisation import with_faults_as_states, with_sensor_noise
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.continuous import spectral_abscissa
+from obsynth.numerics.scaling import balancing_factors
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.results.delta_scan import DeltaScan
 from obsynth.results.design import Certificate
 
-
-def scan_delta(plant: DescriptorSystem, asked: PdObserver, deltas: NDArray[np.float64], *, decay: float) -> DeltaScan:
-    """Return what each delta gives; where it gives nothing, the reason."""
-    columns = [_measured(plant, asked, float(delta), decay) for delta in deltas]
-    numbers = np.array([numbers for numbers, _ in columns], dtype=np.float64).reshape(len(columns), -1)
-    measured = dict(zip(DeltaScan.quantities(), (np.asarray(deltas, dtype=np.float64), *numbers.T), strict=True))
-    return DeltaScan.from_dict({**measured, "failures": [text for _, text in columns]})
-
-
-def _measured(plant: DescriptorSystem, asked: PdObserver, delta: float, decay: float) -> tuple[list[float], str]:
-    try:
-        gains = gains_for(plant, replace(asked, delta=delta, decay=decay), decay=decay)
-    except (InfeasibleError, SolverError) as error:
-        return [float("nan")] * (len(DeltaScan.quantities()) - 1), str(error)
-    return _quantities(plant, gains), ""
+#: The unit of time is the power of two nearest to this many times the inverse of the plant's fastest mode, where the
+#: objective weighs J and L as it does for a plant with modes of a few 1/s in seconds.
+TIME_UNITS = 10.0
+#: By default errors should decay at least at this fraction of the plant's fastest mode.
+DECAY_SHARE = 0.1
+#: When the gains that this takes are out of proportion, less is tried.
+DECAY_RETRIES = (1.0, 0.3, 0.1, 0.03)
+#: Gains may grow by this factor for the sake of the default decay rate.
+DECAY_PRICE = 100.0
+#: With more unknown states the least of these rates comes first, in one set of units, and the first failure is the end.
+MANY_UNKNOWN_STATES = 100
+#: By default a decay rate is never closer to that of an unobservable mode, which nothing moves.
+HIDDEN_SHARE = 0.5
 
 
-def _quantities(plant: DescriptorSystem, gains: PdGains) -> list[float]:
-    errors = PdErrorSystem.of(with_faults_as_states(with_sensor_noise(plant)), gains.observer, plant.nx)
-    return [
-        -gains.abscissa,
-        gains.size,
-        errors.fault_norm(errors.rate).value,
-        errors.fault_norm(errors.noise).value,
-        float(np.linalg.norm(errors.noise[1][plant.nx :], 2)),
-        spectral_abscissa(plant.A - gains.J[: plant.nx] @ plant.C),
-    ]
+def design_gains(plant: DescriptorSystem, asked: PdObserver) -> tuple[PdGains, list[Mapping[str, Any]]]:
+    """Return the gains to ship and the records of all solver runs."""
+    plain = gains_for(plant, asked, decay=0.0 if asked.decay is None else float(asked.decay))
+    records = [plain.record]
+    slowest = max((mode.real for mode in analyse_structure(plant).unobservable_modes), default=-np.inf)
+    target = float(min(DECAY_SHARE * fastest_mode(plant.A), -HIDDEN_SHARE * slowest))
+    if asked.decay is not None or asked.disk is not None or plain.abscissa <= -target:
+        return plain, records
+    if plant.nx + plant.nf > MANY_UNKNOWN_STATES:
+        return _faster_at_little_cost(plant, asked, plain, target), records
+    for share in DECAY_RETRIES:
+        if share * target <= -plain.abscissa:
+            break
+        try:
+            faster = gains_for(plant, asked, decay=share * target)
+        except SolverError as error:
+            records.append(error.record)
+            continue
+        except InfeasibleError:
+            continue  # nobody asked for this rate
+        records.append(faster.record)
+        if faster.size <= DECAY_PRICE * plain.size:
+            return faster, records
+    return plain, records
 
 
-#: Gains from sensor noise to a fault estimate above this are worth a note.
-WARN_AMPLIFICATION = 50.0
+def _faster_at_little_cost(plant: DescriptorSystem, asked: PdObserver, plain: PdGains, target: float) -> PdGains:
+    """Return gains that decay as fast as their size allows, for many states: from the least rate upwards."""
+    found = plain
+    for share in sorted(DECAY_RETRIES):
+        if share * target <= -plain.abscissa:
+            continue
+        try:
+            found = gains_for(plant, asked, decay=share * target, most=DECAY_PRICE * plain.size)
+        except (SolverError, InfeasibleError):
+            break  # nobody asked for this rate
+    return found
+
+
+def gains_for(plant: DescriptorSystem, asked: PdObserver, *, decay: float, most: float | None = None) -> PdGains:
+    """Return gains of the first coordinates whose answer is proved; with a bound ``most``, of the first alone."""
+    delta = default_delta(plant, asked, decay)
+    require_possible(plant, asked, delta=delta, decay=decay)
+    failure = SolverError(
+        "The gains that the solver returned could not be proved to be stable: the result is inconclusive."
+    )
+    engine, *spare = asked.engines_for(plant.nx + plant.nf)
+    for name in (engine, *spare):
+        for states, outputs in islice(_units(plant, asked, balanced_first=name != "lmi"), None if most is None else 1):
+            try:
+                found = _solved(plant, asked, name, delta, decay, states, outputs, most)
+            except SolverError as error:
+                # What the spare engine meets says less than why it was needed.
+                failure = error if name == engine else failure
+                continue
+            if found is not None and found.proved:
+                return replace(found, engine=name)
+    raise SolverError(
+        f"{failure} {_advice(asked)}", record={**failure.record, "delta": delta, "decay": decay}
+    ) from failure
+
+
+def _advice(asked: PdObserver) -> str:
+    wishes = ("decay", "disk", "gain_bound", "fault_rate_gain", "noise_gain", "adaptation_gain", "adaptation_range")
+    given = [name for name in wishes if getattr(asked, name) is not None]
+    if not given:
+        return "Rescale the plant, or try another delta or solver."
+    return f"Gains exist without {', '.join(given)}: ask for less there, or try another delta."
+
+
+def _units(
+    plant: DescriptorSystem, asked: PdObserver, *, balanced_first: bool
+) -> Iterable[tuple[FloatArray, FloatArray]]:
+    """Return units of augmented states and outputs: the user's, balancing ones, those with the plant near one."""
+    found = [*_candidate_units(plant, asked)]
+    if asked.gain_bound is not None:
+        return found
+    units = PlantUnits.of(plant).rounded()
+    natural = np.concatenate([units.states, units.faults]), 1.0 / units.outputs
+    users, *others = found
+    if units.spread > FAR_UNITS:
+        return [users, natural, *others]
+    # A Riccati equation has no objective that would weigh gains in the user's units.
+    if balanced_first and len(others) == 2:
+        return [others[0], users, others[1], natural]
+    return [users, *others, natural]
+
+
+def _candidate_units(plant: DescriptorSystem, asked: PdObserver) -> Iterator[tuple[FloatArray, FloatArray]]:
+    n, ny = plant.nx + plant.nf, plant.ny
+    yield np.ones(n), np.ones(ny)
+    if asked.gain_bound is not None:
+        return  # it is a bound in the user's units
+    augmented = with_faults_as_states(plant, _inner_gain(plant, asked))
+    system = np.zeros((n + ny, n + ny))
+    system[:n, :n], system[n:, :n] = augmented.A, augmented.C
+    factors = balancing_factors(system)
+    if np.any(factors != 1.0):
+        yield factors[:n], factors[n:]
+    sizes = np.abs(np.vstack([augmented.A, augmented.C]))
+    columns = np.exp2(-np.round(np.log2(np.maximum(np.max(sizes, axis=0), np.finfo(np.float64).tiny))))
+    rows = np.max(np.abs(augmented.C) * columns, axis=1)
+    yield columns, np.exp2(np.round(np.log2(np.where(rows > 0.0, rows, 1.0))))
+
+
+def _inner_gain(plant: DescriptorSystem, asked: PdObserver) -> FloatArray | None:
+    """Return the G to design with; a bound on the gains is on those in the loop, in the fault's own coordinates."""
+    return None if asked.gain_bound is not None else asked.gain_matrix(plant.nf)
+
+
+def _solved(
+    plant: DescriptorSystem,
+    asked: PdObserver,
+    engine: str,
+    delta: float,
+    decay: float,
+    states: FloatArray,
+    outputs: FloatArray,
+    most: float | None = None,
+) -> PdGains | None:
+    """Return the gains found in the given units, with a proved certificate where there is one."""
+    unit = float(np.exp2(np.round(np.log2(TIME_UNITS / fastest_mode(plant.A)))))
+    task = _task(plant, asked, delta, decay, states, outputs, unit)
+    if engine == "riccati":
+        found, used = closed_form(task, free_delta=asked.delta is None, once=most is not None)
+        delta = delta if used == task.delta else used * unit
+    else:
+        found = solve(task, solver=asked.solver)
+    g = _inner_gain(plant, asked)
+    loop = np.eye(len(states))
+    if g is not None:
+        loop[plant.nx :, plant.nx :] = g
+    back = np.linalg.inv(loop)
+    gain_j, gain_l = (loop @ (states[:, None] * part / outputs) for part in (found.J / unit, found.L))
+    if most is not None and not float(np.linalg.norm(np.hstack([gain_j, gain_l]), 2)) <= most:
+        raise SolverError("The gains are out of proportion for a rate that nobody asked for.", record=found.record)
+    p3, *p1 = (back.T @ (matrix / states[:, None] / states) @ back for matrix in (found.P3, *found.P1))
+    return certified(plant, asked, PdSolution(gain_j, gain_l, tuple(p1), p3, found.record), delta=delta, decay=decay)
+
+
+def _task(
+    plant: DescriptorSystem,
+    asked: PdObserver,
+    delta: float,
+    decay: float,
+    states: FloatArray,
+    outputs: FloatArray,
+    unit: float,
+) -> PdTask:
+    nx, nf = plant.nx, plant.nf
+    g = _inner_gain(plant, asked)
+    ends = asked.range_numbers
+    gains = [g] if ends is None else [end * np.eye(nf) for end in ends]
+    plants = [with_faults_as_states(plant, gain) for gain in gains]
+    noisy = with_sensor_noise(plant)
+    shown, rate = np.zeros((nf, nx + nf)), np.zeros((nx + nf, nf))
+    shown[:, nx:], rate[nx:] = np.eye(nf) if g is None else g, np.eye(nf) if g is None else np.linalg.inv(g)
+    padded = np.vstack([noisy.Bw, np.zeros((nf, noisy.nw))])
+    return PdTask(
+        plants=tuple((unit * p.A * states / states[:, None], p.C * states / outputs[:, None]) for p in plants),
+        theorem=asked.theorem,
+        delta=delta / unit,
+        decay=decay * unit,
+        disk=None if asked.disk_numbers is None else (asked.disk_numbers[0] * unit, asked.disk_numbers[1] * unit),
+        gain_bound=asked.gain_bound,
+        gain_unit=1.0 / unit,
+        rate_gain=asked.fault_rate_gain,
+        noise_gain=asked.noise_gain,
+        rate=unit * rate / states[:, None],
+        shown=shown * states,
+        process=unit * padded / states[:, None],
+        sensor=noisy.Dw / outputs[:, None],
+        sensor_rate=unit * noisy.Dw / outputs[:, None],
+    )
 
 
 def synthesise(plant: DescriptorSystem, asked: PdObserver, *, progress: Callable[[str], None]) -> Synthesis:
     """Design the observer; see `obsynth.pd_observer` for the options, results and errors."""
     solver_of = chosen_solver(asked.solver, asked.solver_options)
     if own_terms(asked) or asked.region is not None:
-        own: Synthesis = extension("PD observer by its inequality")(plant, asked, progress=progress)
-        return own
+        from obsynth.conditions.own_terms import pd_by_inequality
+
+        return pd_by_inequality(plant, asked, progress=progress)
     asked = replace(asked, solver=solver_of)
     progress("checking the existence conditions")
     require_all(pd_observer_conditions(plant))
@@ -81,11 +238,6 @@ def synthesise(plant: DescriptorSystem, asked: PdObserver, *, progress: Callable
     g = asked.gain_matrix(work.nf)
     progress("solving the matrix inequalities")
     gains, records = design_gains(work, asked)
-    solver: dict[str, Any] = {"engine": gains.engine, "runs": records}
-    if asked.delta_scan is not None:
-        progress("scanning delta")
-        scan = scan_delta(work, asked, np.ravel(asked.delta_scan), decay=gains.decay)
-        solver["delta_scan"] = scan.as_dict()
     shipped = asked.range_numbers and min(max(1.0, asked.range_numbers[0]), asked.range_numbers[1])
     loop = shipped * np.eye(work.nf) if shipped else g
     return Synthesis(
@@ -93,7 +245,7 @@ def synthesise(plant: DescriptorSystem, asked: PdObserver, *, progress: Callable
         listed_gains(work, gains.J, gains.L, loop),
         gains.observer,
         _certificate(asked, gains),
-        solver,
+        {"engine": gains.engine, "runs": records},
         notes(work, asked, gains),
         transformation=form,
     )
@@ -107,7 +259,6 @@ def _resolved(asked: PdObserver, gains: PdGains, g: FloatArray | None) -> dict[s
         "disk": None if asked.disk_numbers is None else list(asked.disk_numbers),
         "adaptation_gain": None if g is None else g.tolist(),
         "adaptation_range": None if asked.range_numbers is None else list(asked.range_numbers),
-        "delta_scan": None if asked.delta_scan is None else np.ravel(asked.delta_scan).tolist(),
     }
 
 
@@ -153,21 +304,18 @@ def notes(plant: DescriptorSystem, asked: PdObserver, gains: PdGains) -> tuple[s
     return (*found, *_noise_notes(plant, gains))
 
 
-_ENGINES = {"lmi": "the whole inequality", "reduced-lmi": "the smaller inequality", "riccati": "a Riccati equation"}
+_CLOSED_FORM = "a Riccati equation (engine 'riccati'), with L = 0 and N = 0."
 
 
 def _engine_notes(asked: PdObserver, gains: PdGains, states: int) -> list[str]:
     wanted = asked.engines_for(states)[0]
     if gains.engine != wanted:
         return [
-            f"The engine {wanted!r} failed: these gains come from {_ENGINES[gains.engine]} (engine {gains.engine!r}), "
-            "with L = 0 and N = 0."
+            f"The engine {wanted!r} failed: these gains come from "
+            + ("the inequality (engine 'lmi')." if gains.engine == "lmi" else _CLOSED_FORM)
         ]
     if asked.engine == "auto" and wanted != "lmi":
-        return [
-            f"With {states} unknown states the gains come from {_ENGINES[wanted]} (engine {wanted!r}), with L = 0 and "
-            "N = 0; engine 'lmi' may find smaller ones."
-        ]
+        return [f"With {states} unknown states the gains come from {_CLOSED_FORM} Engine 'lmi' may find smaller ones."]
     return []
 
 

@@ -22,7 +22,7 @@ from obsynth.numerics.spectra import SAME_POLE, decay_rates, spectrum_error
 STARTS, FEW_STARTS, LARGE = 8, 2, 20
 #: Longest run of the search, and how often it is taken up again from where it ended, with eigenvectors of unit length,
 #: as long as the logarithm of the objective falls by more than this.
-MOST_STEPS, RESTARTS, LEAST_PROGRESS = 400, 8, 1e-3
+MOST_SEARCH_STEPS, RESTARTS, LEAST_PROGRESS = 400, 8, 1e-3
 #: First steps of a search for good conditioning, and how many of the starts that are ahead after these go on.
 FIRST_STEPS, FINALISTS = 40, 3
 #: Seed of the starts: the same question gives the same gains.
@@ -184,7 +184,7 @@ class _Sylvester:
         return float(np.log(value)), np.asarray(gradient / value).ravel()
 
     def minimised(
-        self, start: FloatArray, *, steps: int = MOST_STEPS, restarts: int = RESTARTS
+        self, start: FloatArray, *, steps: int = MOST_SEARCH_STEPS, restarts: int = RESTARTS
     ) -> tuple[float, FloatArray] | None:
         """Return the least value found and its G; ``None`` when the equation is singular from the start."""
         from scipy.optimize import minimize

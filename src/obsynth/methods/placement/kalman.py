@@ -15,12 +15,12 @@ from obsynth.numerics.doubling import continuous_riccati_solution, doubled_ricca
 from obsynth.numerics.spectra import abscissa, decay_rates, eigenvalues, noise_covariance
 
 #: Times the Riccati equation is solved, each time in the coordinates of the last solution, which improve it.
-ROUNDS = 2
+KALMAN_ROUNDS = 2
 #: From so many states on the Riccati equation is solved by doubling first.
-MANY_STATES = 40
+MOST_STATES_FOR_PENCILS = 40
 #: A rate that cannot be had at once is gone to in steps of this factor, from one that is at most so many below.
 RATE_FACTOR = 4.0
-MOST_STEPS = 12
+MOST_RATE_STEPS = 12
 #: Steps are shortened down to this factor.
 LEAST_FACTOR = 1.2
 
@@ -45,7 +45,7 @@ class KalmanProblem:
         if best is not None or not persistent:
             return best
         rate, steps = decay, 0
-        while best is None and steps <= MOST_STEPS:
+        while best is None and steps <= MOST_RATE_STEPS:
             rate, steps = rate / RATE_FACTOR, steps + 1
             best, change = self.solved(rate, plain)
         factor = RATE_FACTOR
@@ -71,7 +71,7 @@ class KalmanProblem:
         rest = 0.5 * (rest + rest.T)
         bound = float(np.exp(-decay * self.dt)) if self.dt > 0.0 else -decay
         best: FloatArray | None = None
-        for _ in range(ROUNDS):
+        for _ in range(KALMAN_ROUNDS):
             found = _filtered(free, self.C, rest, measured, (bound, self.dt), change)
             if found is None:
                 break
@@ -113,7 +113,9 @@ def _filtered(
             moved, noise = inverse @ f @ change, inverse @ driven @ inverse.T
             moved = moved / bound if dt > 0.0 else moved - bound * np.eye(len(f))
             noise = 0.5 * (noise + noise.T)
-            for equation in (_by_doubling, _by_the_library) if len(f) >= MANY_STATES else (_by_the_library,):
+            for equation in (
+                (_by_doubling, _by_the_library) if len(f) >= MOST_STATES_FOR_PENCILS else (_by_the_library,)
+            ):
                 found, covariance = equation(moved, c @ change, noise, measured, dt)
                 gain = change @ (bound * found if dt > 0.0 else found)
                 values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
@@ -164,7 +166,7 @@ SILENT = 1e-8
 #: Deviations that differ by more than this share from one choice of states to another are rounding.
 SAME_DEVIATION = 0.1
 #: Halvings of the default rate before the quietest filter is taken as it is.
-MOST_HALVINGS = 40
+MOST_RATE_HALVINGS = 40
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,7 +202,7 @@ def compromise(problem: KalmanProblem, rate: float) -> Compromise | None:
 
     high = rate
     slowest = float(np.min(decay_rates(eigenvalues(problem.F - plain @ problem.C), problem.dt), initial=np.inf))
-    for _ in range(MOST_HALVINGS):
+    for _ in range(MOST_RATE_HALVINGS):
         found = attempt(high)
         if found is not None:
             best = found

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from obsynth.analysis.zeros import is_outside
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, HIDDEN_MODE_TOLERANCE, RANK_TOLERANCE
@@ -49,8 +50,11 @@ class ObservableSplit:
         return np.asarray((matrix * self.units) @ self.basis[:, : self.order])
 
 
-def observable_split(f: FloatArray, c: FloatArray, fixed_modes: ComplexArray) -> ObservableSplit:
-    """Split the pair ``(F, C)`` at its fixed modes; ``f (n, n)``, ``c (ny, n)``."""
+def observable_split(f: FloatArray, c: FloatArray, fixed_modes: ComplexArray, *, dt: float) -> ObservableSplit:
+    """Split the pair ``(F, C)`` at its fixed modes; ``f (n, n)``, ``c (ny, n)``.
+
+    A stable mode that is fixed by the zeros of the plant's pencil, but that the pair shows, is left where it shows: it
+    decays with or without a gain.  An unstable one cannot be left, and is refused."""
     n = f.shape[0]
     units = _balancing(f, c)
     work_f, work_c, basis = f * units / units[:, None], c * units, np.eye(n)
@@ -62,7 +66,10 @@ def observable_split(f: FloatArray, c: FloatArray, fixed_modes: ComplexArray) ->
         cluster = [other for other in waiting if abs(other - value) <= SAME_MODE * max(1.0, abs(value))]
         kernel = _hidden_directions(work_f[:seen, :seen], work_c[:, :seen], sum(cluster) / len(cluster), size)
         found = kernel.shape[1] // (2 if value.imag > 0.0 else 1)
-        if found == 0 or found > len(cluster):
+        if found == 0 and not any(is_outside(other, dt) for other in cluster):
+            waiting = [other for other in waiting if other not in cluster]
+            continue
+        if found == 0 or (found > len(cluster) and is_outside(value, dt)):
             raise PreconditionError(
                 f"By the zeros of plant and fault model {value:.6g} is a fixed mode, but the pair (U A, C) shows it: "
                 "double precision cannot tell. Lower the order of the fault model, or rescale the plant.",

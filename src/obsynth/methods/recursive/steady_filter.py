@@ -18,14 +18,15 @@ from obsynth.numerics.least_squares_step import least_squares_step, rank_reveali
 from obsynth.numerics.norms import spectral_radius
 from obsynth.numerics.pencils import finite_zeros
 from obsynth.numerics.ranks import BOUNDARY_TOLERANCE, CANCELLATION_TOLERANCE, covariance_factor, decide_rank
+from obsynth.observers.recursive.gain_schedule import MOST_STEPS
 from obsynth.observers.recursive.step_model import stacked_noise
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 
 #: The solution must satisfy its equation to this share of its size: half the digits.
 RICCATI_TOLERANCE = 1e-8
-#: Steps of the recursion after which its gains must be stable, and Newton steps that follow (each doubles the digits).
-MOST_STEPS, MOST_NEWTON_STEPS = 20_000, 50
+#: Newton steps after the recursion: each doubles the digits.
+MOST_NEWTON_STEPS = 50
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
+from obsynth.analysis.plant_units import PlantUnits
 from obsynth.analysis.time_varying import WARN_CONDITION, HorizonRanks, horizon_ranks
 from obsynth.analysis.zeros import leading_names
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.methods.method import Synthesis
 from obsynth.methods.recursive.conditions import detectability_condition
 from obsynth.methods.recursive.steady_filter import reached_condition
+from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import covariance_factor
 from obsynth.observers.recursive.gain_schedule_summary import (
     STEPS_TO_CONTRACT,
@@ -52,8 +54,12 @@ def recursive_synthesis(plant: TimeVaryingDescriptorSystem, options: Mapping[str
     """Return observer, gains, claims and notes."""
     observer = observer_from_options(plant, options)
     ranks = horizon_ranks(plant, early=observer.early_constraints)
-    facts = gain_schedule_summary(observer)
-    _require_contraction(observer, facts, options)
+    facts, given, missing = gain_schedule_summary(observer), options, _missing_noise(options)
+    if missing and not _contracts(facts) and plant.ne == plant.nx and _has_steady_state(observer):
+        options = {**options, **_identities(plant, options)}
+        observer = observer_from_options(plant, options)
+        facts = gain_schedule_summary(observer)
+    _require_contraction(observer, facts, given)
     claims = {
         "condition": ranks.condition,
         "condition_k": float(ranks.condition_k),
@@ -71,9 +77,30 @@ def recursive_synthesis(plant: TimeVaryingDescriptorSystem, options: Mapping[str
         {"L": facts.L, "K": facts.K},
         observer,
         Certificate({}, claims),
-        notes=tuple(_notes(observer, ranks, facts, options)),
+        notes=tuple(_notes(observer, ranks, facts, missing, own_units=options is not given)),
         plant=plant,
     )
+
+
+def _missing_noise(options: Mapping[str, Any]) -> list[str]:
+    """Return which covariances of noise were not stated."""
+    return [name for name in ("Q", "R") if options[name] is None]
+
+
+def _contracts(facts: GainScheduleSummary) -> bool:
+    """Whether errors die out along the horizon, or the horizon is too short to tell."""
+    return facts.steps < STEPS_TO_CONTRACT or facts.contraction < 1.0
+
+
+def _identities(plant: TimeVaryingDescriptorSystem, options: Mapping[str, Any]) -> dict[str, FloatArray]:
+    """Return the covariances that are not given as identities in units in which a time-invariant plant is near one."""
+    still = DescriptorSystem(
+        plant.E.at(1), plant.A.at(0), C=plant.C.at(1), Bf=plant.Phi.at(0), Df=plant.Psi.at(0), dt=plant.dt or 1.0
+    )
+    units = PlantUnits.of(still).rounded()
+    found = {"Q": 1.0 / units.equations, "R": 1.0 / units.outputs, "initial_covariance": units.states}
+    found["initial_parameter_covariance"] = units.faults
+    return {name: np.diag(size**2) for name, size in found.items() if name in options and options[name] is None}
 
 
 def _has_steady_state(observer: RecursiveObserver) -> bool:
@@ -86,7 +113,7 @@ def _has_steady_state(observer: RecursiveObserver) -> bool:
 
 def _require_contraction(observer: RecursiveObserver, facts: GainScheduleSummary, options: Mapping[str, Any]) -> None:
     """Raise `PreconditionError` where errors do not die out along the horizon."""
-    if facts.steps < STEPS_TO_CONTRACT or facts.contraction < 1.0:
+    if _contracts(facts):
         return
     names = leading_names(facts.survivors, observer.state_names)
     kept = (
@@ -95,7 +122,7 @@ def _require_contraction(observer: RecursiveObserver, facts: GainScheduleSummary
         else "grows without bound"
     )
     if _has_steady_state(observer):
-        identity = [name for name in ("Q", "R") if options[name] is None]
+        identity = _missing_noise(options)
         given = f" {' and '.join(identity)} taken as the identity weigh this plant in its units." if identity else ""
         raise PreconditionError(
             "Unclear: the horizon does not tell whether errors die out fast enough. The outputs show every "
@@ -104,6 +131,7 @@ def _require_contraction(observer: RecursiveObserver, facts: GainScheduleSummary
             "outputs, or take units in which entries are near one.",
             condition="contraction",
             signals=names,
+            unclear=True,
         )
     raise PreconditionError(
         f"Errors do not die out: over {facts.steps} steps the product of L_k A_k {kept}, in "
@@ -116,11 +144,19 @@ def _require_contraction(observer: RecursiveObserver, facts: GainScheduleSummary
 
 
 def _notes(
-    observer: RecursiveObserver, ranks: HorizonRanks, facts: GainScheduleSummary, options: Mapping[str, Any]
+    observer: RecursiveObserver,
+    ranks: HorizonRanks,
+    facts: GainScheduleSummary,
+    missing: Sequence[str],
+    *,
+    own_units: bool,
 ) -> Iterator[str]:
-    missing = [name for name in ("Q", "R") if options[name] is None]
     if missing:
-        yield f"No noise is stated: {' and '.join(missing)} taken as the identity, which sets gains and deviations."
+        units = ", in units in which the plant is near one (in those given errors do not die out along the horizon)"
+        yield (
+            f"No noise is stated: {' and '.join(missing)} taken as the identity{units if own_units else ''}, which "
+            "sets gains and deviations."
+        )
     if ranks.condition > WARN_CONDITION:
         yield (
             f"H_k has the condition number {ranks.condition:.3g} at k = {ranks.condition_k}: about "

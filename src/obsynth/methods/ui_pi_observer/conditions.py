@@ -48,6 +48,7 @@ from obsynth.analysis.transformations.elimination import (
 )
 from obsynth.analysis.transformations.recovery import StateRecovery, Transformation
 from obsynth.analysis.zeros import (
+    MOST_NAMES,
     Zero,
     is_outside,
     leading_names,
@@ -59,7 +60,6 @@ from obsynth.analysis.zeros import (
 from obsynth.errors import PreconditionError
 from obsynth.methods.ui_pi_observer.augmented_plant import AugmentedPlant
 from obsynth.methods.ui_pi_observer.pencils import (
-    MOST_NAMES,
     equilibrated,
     exact_drops,
     exact_loss,
@@ -90,7 +90,13 @@ def model_conditions(
     found = []
     for value in sorted(unstable, key=lambda value: (value.real, value.imag)):
         lost = exact_loss(given, courses, units.eigenvalue(value))
-        condition, decision = _model_condition(plant, model, value, units, lost, sizes)
+        pencil = _ModelPencil.of(plant, model, value, sizes)
+        decision = pencil.decision(lost)
+        if lost is None and not decision.full:
+            # Of a plant of many parts its own units drift apart; rounding is as small in those that were given.
+            as_given = _ModelPencil.of(given, courses, units.eigenvalue(value), None).decision(None)
+            decision = max(decision, as_given, key=lambda found: found.rank)
+        condition = _model_condition(pencil, decision, plant, value, units)
         if decision.means == "unclear":
             point = units.eigenvalue(value)
             other = f"hides a fault that follows its model at {number(point)}, and no observer estimates it"
@@ -144,15 +150,8 @@ class _ModelPencil:
 
 
 def _model_condition(
-    plant: DescriptorSystem,
-    model: Exosystem,
-    value: complex,
-    units: PlantUnits,
-    lost: int | None,
-    sizes: DescriptorSystem | None,
-) -> tuple[Condition, RankDecision]:
-    pencil = _ModelPencil.of(plant, model, value, sizes)
-    decision = pencil.decision(lost)
+    pencil: _ModelPencil, decision: RankDecision, plant: DescriptorSystem, value: complex, units: PlantUnits
+) -> Condition:
     scaled, columns, courses = pencil.scaled, pencil.columns, pencil.courses
     inputs, direct, width = pencil.inputs, pencil.direct, courses.shape[1]
     own = units.eigenvalue(value)
@@ -182,7 +181,7 @@ def _model_condition(
         detail,
         mode=None if decision.full else own,
         signals=signals,
-    ), decision
+    )
 
 
 def _model_doubt(
@@ -652,6 +651,19 @@ def _zero_failure(
     return replace(found, mode=value, signals=(*states, *disturbances))
 
 
+def _shown_as_given(plant: DescriptorSystem, courses: Exosystem, units: PlantUnits, drop: complex) -> bool:
+    """Whether the units of the plant as given show a mode that is not stable, where its own hide it.
+
+    Along a plant of parts that hardly touch its own units drift apart, and rounding hides what they make small."""
+    if not is_outside(drop, 1.0 if units.discrete else 0.0):
+        return False
+    augmented, (inputs, direct) = AugmentedPlant.of(plant, courses), independent_disturbances(plant)
+    below = np.vstack([inputs, np.zeros((courses.order, inputs.shape[1]))])
+    point = units.eigenvalue(drop)
+    matrix = np.block([[point * augmented.E - augmented.A, -below], [augmented.C.astype(complex), direct]])
+    return decide_rank(equilibrated(matrix)[0], expected=matrix.shape[1], equilibrated=False).full
+
+
 def _fixed_modes(
     given: DescriptorSystem, courses: Exosystem, plant: DescriptorSystem, model: Exosystem, units: PlantUnits
 ) -> tuple[ComplexArray, Condition]:
@@ -675,6 +687,8 @@ def _fixed_modes(
             return zeros, lost_in_rounding(given, courses, units, point, augmented.order)
     else:
         drops = system_zeros(*pencil, nx=augmented.order).values
+        if exact is None:
+            drops = np.array([value for value in drops if not _shown_as_given(given, courses, units, complex(value))])
         zeros = units.eigenvalues(drops)
         # Rounding scatters a multiple mode around its mean.  (D2) and (D3) exclude an unstable one: it is none at all.
         bound = 1.0 if plant.dt > 0.0 else 0.0

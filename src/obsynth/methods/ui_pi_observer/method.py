@@ -10,7 +10,7 @@ import numpy as np
 
 from obsynth.analysis.conditions import Condition
 from obsynth.errors import SpecError
-from obsynth.methods.method import ClaimMeaning, Method, PlantKind, Purpose, Synthesis
+from obsynth.methods.method import OPTIONS_PATH, ClaimMeaning, Method, PlantKind, Purpose, Synthesis
 from obsynth.methods.own_terms import OwnConstraints, SolverName, SolverOptions, own_term_conflicts
 from obsynth.numerics.arguments import NonNegative, Positive, WrittenAs, problem_with, shown
 from obsynth.numerics.spectra import decay_rates
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from obsynth.methods.placement.region import Region
     from obsynth.methods.ui_pi_observer.placement_problem import NoiseWeights
 
-_PATH = "method.options"
 #: What to make of the freedom that poles leave.
 OBJECTIVES = ("conditioning", "gain")
 
@@ -177,7 +176,9 @@ class UiPiObserver(Method):
         if self.region is None:
             return None
         if not isinstance(self.region, Mapping):
-            raise SpecError(f"region is {self.region!r}: give decay, radius, damping by name.", path=f"{_PATH}.region")
+            raise SpecError(
+                f"region is {self.region!r}: give decay, radius, damping by name.", path=f"{OPTIONS_PATH}.region"
+            )
         return Region.of({key: value for key, value in self.region.items() if value is not None}, dt)
 
     def checked_noise(self, output_names: Sequence[str]) -> NoiseWeights:
@@ -188,7 +189,7 @@ class UiPiObserver(Method):
             return NoiseWeights()
         if not isinstance(self.noise, Mapping):
             message = f"noise is {self.noise!r}: give measurement, process, fault by name."
-            raise SpecError(message, path=f"{_PATH}.noise")
+            raise SpecError(message, path=f"{OPTIONS_PATH}.noise")
         given = {key: value for key, value in self.noise.items() if value is not None}
         problems = [f"unknown key {key!r}." for key in given if key not in ("measurement", "process", "fault")]
         sizes = {key: given[key] for key in ("process", "fault") if key in given}
@@ -211,7 +212,7 @@ class UiPiObserver(Method):
         if any(problem_with(value, "measurement", Positive) for value in values):
             problems.append("measurement must be positive standard deviations: one number, a list, or by output.")
         if problems:
-            raise SpecError("Option noise of ui-pi-observer:", path=f"{_PATH}.noise", problems=problems)
+            raise SpecError("Option noise of ui-pi-observer:", path=f"{OPTIONS_PATH}.noise", problems=problems)
         return NoiseWeights(**given)
 
     def slowest_asked(self, dt: float) -> float | None:

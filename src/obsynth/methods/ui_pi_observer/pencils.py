@@ -19,8 +19,6 @@ from obsynth.plants.fault_models import Exosystem
 if TYPE_CHECKING:
     from flint import fmpz_poly
 
-#: At most this many signals of a kind are named in a failed condition.
-MOST_NAMES = 4
 #: An imaginary part below this share of an eigenvalue is not shown: it would not change its printed digits.
 UNSEEN = 5e-7
 #: Degree of the minimal polynomial of an eigenvalue, times columns of the pencil, above which its rank there is left

@@ -100,7 +100,7 @@ def placement_problem(
         # Another U may have other unobservable modes than the plant's pencil.
         n = len(f)
         fixed_modes = finite_zeros(np.vstack([np.eye(n), np.zeros((len(c), n))]), np.vstack([f, c])).values
-    split = observable_split(f, c, fixed_modes)
+    split = observable_split(f, c, fixed_modes, dt=scaled.dt)
     return PlacementProblem(scaled, model, units, decoupled, u, d, f, c, free, split, _own_rate(scaled, split.F))
 
 
@@ -166,7 +166,7 @@ def _own_rate(plant: DescriptorSystem, f: FloatArray) -> float:
 #: How strongly states are driven by default, beside fault models: a plant is better known than the course of a fault.
 PROCESS_SHARE = 0.1
 #: Noise on innovations that have none of their own, relative to the outputs' noise.
-BACKGROUND_NOISE = 0.1
+INNOVATION_NOISE = 0.1
 
 
 @dataclass(frozen=True)
@@ -207,7 +207,7 @@ def kalman_problem(problem: PlacementProblem, weights: NoiseWeights) -> KalmanPr
         B=split.lower(entering),
         D=measured,
         drive=split.basis[:, : split.order].T @ np.diag(per_step * size * strength),
-        background=BACKGROUND_NOISE * size * np.eye(len(problem.C)),
+        background=INNOVATION_NOISE * size * np.eye(len(problem.C)),
         estimates=split.shown(faults),
         dt=plant.dt,
     )

@@ -16,7 +16,6 @@ import numpy as np
 
 from obsynth.analysis.zeros import is_outside
 from obsynth.errors import PreconditionError, SolverError
-from obsynth.extensions import extension
 from obsynth.methods.conic.lmi import chosen_solver
 from obsynth.methods.method import Synthesis
 from obsynth.methods.own_terms import own_terms
@@ -83,8 +82,9 @@ def synthesise(plant: DescriptorSystem, asked: UiPiObserver, *, progress: Callab
     """Design the observer; see `obsynth.ui_pi_observer` for the options, results and errors."""
     solver = chosen_solver(asked.solver, asked.solver_options)
     if own_terms(asked):
-        own: Synthesis = extension("UI-PI observer by its inequality")(plant, asked, progress=progress)
-        return own
+        from obsynth.conditions.own_terms import ui_pi_by_inequality
+
+        return ui_pi_by_inequality(plant, asked, progress=progress)
     asked = replace(asked, solver=solver)
     model = exosystem(asked.fault_model, plant.fault_names, plant.dt)
     region = asked.checked_region(plant.dt)

@@ -68,7 +68,7 @@ def observer_struct(steps: Steps, name: str) -> Iterator[str]:
     graph, model, timing = steps.graph, steps.settings.model, steps.settings.timing
     inner = name if timing.is_plain else f"{name}_memory"
     yield from (f"struct {inner} {{", f"    double memory[{graph.memory.size}];", f"    double u[{max(model.nu, 1)}];")
-    yield "    /* number of the next sample; outliers of each output in a row, and at all; resets so far */"
+    yield "    /* number of the next sample; outliers of each output in a row (negative: below) and at all; resets */"
     yield from ("    long k;", f"    int in_a_row[{model.ny}];", f"    int refused[{model.ny}];", "    int resets;")
     yield from ("    int watched;", f"    double surprises[{2 * RESET_WINDOW}];", "};")
     if not timing.is_plain:

@@ -12,6 +12,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import is_finite_number, require_kind
+from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import first_order_hold
 from obsynth.numerics.spectra import abscissa
 from obsynth.observers.linear.observer import LinearObserver
@@ -139,8 +140,18 @@ def transient(observer: LinearObserver) -> float:
         return math.inf
     samples = math.ceil(math.log(FORGOTTEN) / math.log(slowest)) if slowest > 0.0 else 0
     return observer.dt * (
-        max(samples, observer.order) + max((*observer.state_delays, *observer.fault_delays), default=0)
+        max(samples, _steps_remembered(observer.Az)) + max((*observer.state_delays, *observer.fault_delays), default=0)
     )
+
+
+def _steps_remembered(Az: FloatArray) -> int:
+    """Return the number of states; where these are registers that pass samples on, the longest chain of them."""
+    if np.tril(Az).any():
+        return len(Az)
+    passes, reached, steps = Az != 0.0, np.ones(len(Az), dtype=bool), 0
+    while reached.any():
+        reached, steps = np.asarray(passes @ reached), steps + 1
+    return steps
 
 
 def checked_warm_up(asked: float | None, default: float) -> float:

@@ -44,7 +44,7 @@ DERIVATIVE_TOLERANCE = 1e-6
 TRIALS = 48
 #: So many where those seem to refute the covariances.
 MORE_TRIALS = 240
-STEPS = 40
+TRIAL_STEPS = 40
 SEED = 20130206
 #: A mean of normalised squares may be off by this factor: covariances of a nonlinear plant are first-order ones.  Less
 #: than this is left to the information in the row.
@@ -286,8 +286,8 @@ def _consistency_rows(design: ObserverDesign, shipped: DAEObserver) -> Iterator[
             bool(_ratio(mean) <= CONSISTENCY_FACTOR),
             "recomputed, Monte Carlo with a fixed seed",
             "computed",
-            f"mean of {errors.size} runs of {STEPS} steps at nominal inputs; by chance alone, with exact covariances, "
-            f"it lies within {low:.3f} to {high:.3f} in 95 % of such samples",
+            f"mean of {errors.size} runs of {TRIAL_STEPS} steps at nominal inputs; by chance alone, with exact "
+            f"covariances, it lies within {low:.3f} to {high:.3f} in 95 % of such samples",
             "estimated",
             (low, high),
         )
@@ -306,17 +306,17 @@ def _trials(
         covariance_factor(stated.initial_parameter_covariance, "initial_parameter_covariance"),
         covariance_factor(stated.initial_covariance, "initial_covariance"),
     ]
-    u = np.tile(stated.model.nominal_input, (STEPS + 1, 1))
+    u = np.tile(stated.model.nominal_input, (TRIAL_STEPS + 1, 1))
     walk = np.zeros((stated.model.nq, stated.model.nq))
     if stated.form != "forgetting":
         walk = covariance_factor(stated.random_walk, "random_walk")
     parameters, outputs = [], []
     for trial in trials:
         theta = stated.initial_parameters + roots[0] @ rng.standard_normal(stated.model.nq)
-        path = np.tile(theta, (STEPS + 1, 1))
+        path = np.tile(theta, (TRIAL_STEPS + 1, 1))
         if walk.any():
             # Where a walk is stated, the parameters walk.
-            path[1:] += np.cumsum(rng.standard_normal((STEPS, stated.model.nq)) @ walk.T, axis=0)
+            path[1:] += np.cumsum(rng.standard_normal((TRIAL_STEPS, stated.model.nq)) @ walk.T, axis=0)
         path = np.clip(path, stated.lower, stated.upper)
         parameters.append(path[-1])
         start = stated.initial_state + roots[1] @ rng.standard_normal(stated.model.nx)

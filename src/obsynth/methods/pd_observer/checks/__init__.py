@@ -23,10 +23,9 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.checks import Check, information, lower_bound_check, upper_bound_check
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.error_system import ErrorModel
-from obsynth.verification.identities import equality, relative_tolerance, residual, tracking_identities, worst
+from obsynth.verification.identities import ALIKE, equality, relative_tolerance, residual, tracking_identities, worst
 from obsynth.verification.plant import condition_rows, plant_information
 
-_ALIKE = ("input_names", "output_names", "state_names", "fault_names", "dt")
 _IDENTITIES = {
     "dynamics": ("unbiased: dynamics", "Az + By C = A, with the faults as states", "Filasova et al., eq. (29)"),
     "inputs": ("unbiased: inputs", "Bu + By D = B", "Filasova et al., eq. (4)"),
@@ -79,7 +78,7 @@ def _fits(plant: DescriptorSystem, observer: LinearObserver) -> bool:
         and not plant.is_discrete
         and observer.order == plant.nx + plant.nf
         and observer.residual_names == plant.output_names
-        and all(getattr(observer, name) == getattr(plant, name) for name in _ALIKE)
+        and all(getattr(observer, name) == getattr(plant, name) for name in ALIKE)
         and not any((*observer.state_delays, *observer.fault_delays))
     )
 

@@ -26,7 +26,7 @@ from obsynth.results.checks import Check, information, upper_bound_check
 from obsynth.verification.identities import EQUALITY_TOLERANCE
 
 #: Of more states nothing is proved: work goes with their cube, and bounds grow with them.
-MOST_STATES = 100
+MOST_PROVED_STATES = 100
 
 _SOURCE = "Moussa Ali, Zhang 2013"
 
@@ -45,7 +45,7 @@ class HorizonProof:
 
 def horizon_proof(stated: RecursiveObserver, shipped: RecursiveObserver, steps: int) -> HorizonProof | None:
     """Return what can be proved of the first steps of a shipped observer on the stated plant; `None` for nothing."""
-    if stated.plant.nx > MOST_STATES or _kind(stated) != _kind(shipped):
+    if stated.plant.nx > MOST_PROVED_STATES or _kind(stated) != _kind(shipped):
         return None  # the rows on what fits say so
     plain, joint = _without_walk(stated), None
     found = _followed(plain, _without_walk(shipped), steps)

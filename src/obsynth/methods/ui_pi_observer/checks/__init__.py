@@ -21,13 +21,12 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.fault_models import Exosystem
 from obsynth.results.checks import Check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
-from obsynth.verification.identities import Residual, equality, relative_tolerance, residual
+from obsynth.verification.identities import ALIKE, Residual, equality, relative_tolerance, residual
 from obsynth.verification.plant import condition_rows, plant_information
 
 #: Estimates at a frequency may miss by this much, relative to terms that pass through the inverse of ``sI - Az``.
 DECOUPLING_TOLERANCE = 1e-8
 _PAPER = "Share Pasand, eq. (19)"
-_ALIKE = ("input_names", "output_names", "state_names", "fault_names", "dt")
 _MATRICES = ("tracking", "Phi", "Cw", "poles", "stability")
 
 
@@ -100,7 +99,7 @@ def _fits(design: ObserverDesign) -> bool:
     return bool(
         all(matrices[name].shape == shape and np.all(np.isfinite(matrices[name])) for name, shape in shapes.items())
         and observer.order == plant.nx + order
-        and all(getattr(observer, name) == getattr(plant, name) for name in _ALIKE)
+        and all(getattr(observer, name) == getattr(plant, name) for name in ALIKE)
         and all(delay == 0 for delay in (*observer.state_delays, *observer.fault_delays))
     )
 

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 #: A fault estimate counts as faithful up to the frequency where it misses by this share of the fault.
 FAITHFUL = 0.1
 #: A step counts as settled within this share, after this many time constants of the slowest pole.
-SETTLED, TIME_CONSTANTS = 0.02, 4.0
+SETTLING_BAND, TIME_CONSTANTS = 0.02, 4.0
 #: Eigenvalues of a fault model closer to constant courses than this, relative to the model's size, are constants.
 CONSTANT = 1e-9
 
@@ -188,8 +188,8 @@ def _undershoot(plant: DescriptorSystem, zero: complex, slowest: float) -> str:
     if (plant.dt > 0.0 and zero.real <= 1.0) or rate <= 0.0:
         return ""
     settling = TIME_CONSTANTS / slowest
-    least = (1.0 - SETTLED) / np.expm1(rate * settling)
+    least = (1.0 - SETTLING_BAND) / np.expm1(rate * settling)
     return (
-        f"inverse response: a step fault that is settled to {SETTLED:.0%} after {settling:.3g} s first shows at least "
-        f"{least:.3g} of its size in the wrong direction"
+        f"inverse response: a step fault that is settled to {SETTLING_BAND:.0%} after {settling:.3g} s first shows at "
+        f"least {least:.3g} of its size in the wrong direction"
     )

@@ -79,6 +79,7 @@ static int robust(const struct observer *state, const double *u, const double *y
     double mean[NY];
     double deviation[NY];
     int far[NY];
+    int side[NY];
     int failed, any = 0;
     int i;
     copy(heard, y, NY);
@@ -96,8 +97,12 @@ static int robust(const struct observer *state, const double *u, const double *y
         int huge = fabs(y[i]) > OVERFLOW_LIMIT;
         double pulled = mean[i] + OUTLIER_LIMIT * deviation[i] * (y[i] > mean[i] ? 1.0 : -1.0);
         far[i] = fabs(y[i] - mean[i]) > OUTLIER_LIMIT * deviation[i] || huge;
+        side[i] = far[i] ? (y[i] < mean[i] ? -1 : 1) : 0;
         if (GATE) {
-            far[i] = far[i] && (state->in_a_row[i] < LONGEST_REFUSAL || huge);
+            /* A wrong sample stands alone; of a sensor, or a plant, that has moved the next is on the same side. */
+            int before = state->in_a_row[i];
+            int alone = side[i] * before <= 0 && before < LONGEST_REFUSAL && -before < LONGEST_REFUSAL;
+            far[i] = far[i] && (alone || huge);
         }
         if (far[i]) {
             heard[i] = !GATE && isfinite(pulled) ? pulled : NAN;
@@ -118,7 +123,8 @@ static int robust(const struct observer *state, const double *u, const double *y
     }
     for (i = 0; i < NY; i++) {
         if (!isnan(y[i])) {
-            after->in_a_row[i] = far[i] ? state->in_a_row[i] + 1 : 0;
+            int before = state->in_a_row[i];
+            after->in_a_row[i] = side[i] * ((before < 0 ? -before : before) + 1);
         }
         after->refused[i] = state->refused[i] + far[i];
     }

@@ -1,0 +1,154 @@
+"""The alarm of a guaranteed test, proved by one number for each equation of its window.
+
+Each equation of the window is multiplied by its number, and all are added up.  States and free faults then cancel, to
+the last digit; what is left says that a sum of disturbances and noise is a number which bounds do not allow.  The
+numbers are fractions, so that nothing is rounded: an auditor needs no solver, and no trust in one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+
+from obsynth.errors import SpecError
+from obsynth.experiments.assumptions import Log
+from obsynth.methods.guaranteed_test.exact import Programmes
+from obsynth.methods.guaranteed_test.proofs import (
+    columns_of_exact,
+    down,
+    exact_multipliers,
+    exact_right_sides,
+    up,
+)
+from obsynth.methods.guaranteed_test.result import GuaranteedTest
+from obsynth.methods.guaranteed_test.windows import Window
+from obsynth.numerics.arrays import FloatArray
+from obsynth.plants.constants import MOST_LISTED, shown
+from obsynth.proofs.balls import rounded_up
+from obsynth.results.certificate_files import SHOWN_DIGITS
+from obsynth.results.design import ObserverDesign
+
+
+@dataclass(frozen=True, eq=False)
+class Multipliers:
+    """What proves that the last rows of a record are not without a fault of a group; ``rows`` of them."""
+
+    test: str
+    values: tuple[Fraction, ...]
+    margin: float
+    rows: int
+
+
+def refuse_bounds(given: Mapping[str, Any]) -> None:
+    """Raise `SpecError` where bounds are given: those of the design count."""
+    stated = [name for name, value in given.items() if value]
+    if stated:
+        raise SpecError(
+            f"{', '.join(stated)} cannot be given for a guaranteed test: what is proved rests on the bounds of its "
+            "design. Design it again with others.",
+            path=stated[0],
+        )
+
+
+def rows_of_test(test: GuaranteedTest) -> int:
+    """Return the rows that a test looks at."""
+    return test.linear[1].order + 1 - len(test.certificate.matrices.get("state_tracking", ()))
+
+
+def refuted(design: ObserverDesign, u: FloatArray, y: FloatArray) -> Multipliers | None:
+    """Return the proof with the largest margin of any test of a design, for the end of a record; ``None``: none."""
+    best: Multipliers | None = None
+    for test in GuaranteedTest.of(design).tests:
+        rows = rows_of_test(test)
+        if len(y) < rows:
+            continue
+        programmes = Programmes.of(test)
+        for guess in programmes.refuting(y[-rows:], u[-rows:]):
+            values = exact_multipliers(programmes.window, guess)
+            margin = np.nan if values is None else margin_of(programmes.window, values, y[-rows:], u[-rows:])
+            if values is not None and margin > 0.0 and (best is None or margin > best.margin):
+                best = Multipliers(test.fault, tuple(values), margin, rows)
+    return best
+
+
+def margin_of(window: Window, values: list[Fraction], y: FloatArray, u: FloatArray) -> float:
+    """Return by which share all bounds would have to be exceeded, at least; NaN where a free column is seen.
+
+    All sums are exact, and the share is rounded down.
+    """
+    seen = columns_of_exact(window, values)
+    if any(seen[j] for j in np.flatnonzero(window.free).tolist()):
+        return np.nan
+    right = exact_right_sides(window, y, u)
+    total = abs(sum((value * side for value, side in zip(values, right, strict=True)), start=Fraction(0)))
+    bounded = np.flatnonzero(window.bounded).tolist()
+    parts = [Fraction(float(window.bar[j])) * abs(seen[j]) for j in bounded]
+    allowed = sum(parts, start=Fraction(0))
+    if window.question.ellipsoid:
+        sizes, groups = np.array([up(part) for part in parts]), window.group[bounded]
+        norms = [float(np.sqrt(np.sum(sizes[groups == group] ** 2))) for group in np.unique(groups[groups >= 0])]
+        norms += sizes[groups < 0].tolist()
+        allowed = Fraction(float(rounded_up(np.array(sum(norms)), 2 * len(sizes) + 8)))
+    if allowed == 0:
+        # No disturbance and no noise at all: the rounding of the samples themselves would be a proof.
+        return 0.0
+    return down(total / allowed - 1)
+
+
+def statement_of(test: GuaranteedTest, group: tuple[str, ...], row: int, log: Log | None, gain_set: str) -> str:
+    """Return what a proof says, with everything it rests on."""
+    window = Programmes.of(test).window
+    plant, question = window.plant, window.question
+    source = "a record" if log is None else f"{log.name} (sha256 {log.sha256[:SHOWN_DIGITS]})"
+    others = [plant.fault_names[k] for k in question.free]
+    besides = f", whatever {' and '.join(others)} does" if others else ""
+    one = " or ".join(group)
+    return (
+        f"Proved: no course of {_assumed(window)} explains rows {row - rows_of_test(test) + 1} to {row} of {source} "
+        f"without {one}{besides}: {one} is there, or a model that is not exact. Gain set {gain_set[:SHOWN_DIGITS]}."
+    )
+
+
+def _assumed(window: Window) -> str:
+    """Return the bounds that a proof rests on, in words."""
+    plant, bounds = window.plant, window.bounds
+    noise = np.abs(bounds.noise_output) @ bounds.noise
+    parts = [
+        _listed(plant.disturbance_names, bounds.disturbance, plant.units, "within", "disturbances"),
+        _listed(plant.output_names, noise, plant.units, "noise of", "sensors"),
+        "process noise within its bounds" if bounds.noise_state.any() else "",
+        _listed(plant.state_names, bounds.state, plant.units, "within", "states"),
+        _listed(plant.state_names, bounds.first, plant.units, "at first within", "states"),
+        "" if window.question.disturbance == "jump" else f"disturbances that are {window.question.disturbance}",
+    ]
+    told = [part for part in parts if part]
+    return ", ".join(told) if told else "anything but faults"
+
+
+def _listed(names: tuple[str, ...], sizes: FloatArray, units: Mapping[str, str], word: str, kind: str) -> str:
+    known = [(name, size) for name, size in zip(names, sizes.tolist(), strict=True) if np.isfinite(size) and size > 0.0]
+    if len(known) > MOST_LISTED:
+        return f"{len(known)} {kind} {word} their bounds"
+    if word == "noise of":
+        return ", ".join(f"noise of {name} within {shown(float(f'{s:.6g}'), units.get(name, ''))}" for name, s in known)
+    return ", ".join(f"{name} {word} {shown(size, units.get(name, ''))}" for name, size in known)
+
+
+def written(found: Multipliers) -> dict[str, Any]:
+    """Return the numbers as plain data: fractions in words that Python's ``Fraction`` reads."""
+    return {"test": found.test, "multipliers": [str(value) for value in found.values], "margin": found.margin}
+
+
+def checked(design: ObserverDesign, body: Mapping[str, Any], u: FloatArray, y: FloatArray) -> Iterator[Any]:
+    """Yield the test of a certificate, the group of faults, and the margin that is proved again."""
+    whole = GuaranteedTest.of(design)
+    place = [test.fault for test in whole.tests].index(body["test"])
+    test = whole.tests[place]
+    window = Programmes.of(test).window
+    values = [Fraction(text) for text in body["multipliers"]]
+    fits = len(values) == window.rows and len(y) == len(u) == rows_of_test(test)
+    yield test, whole.groups[place], margin_of(window, values, y, u) if fits else np.nan

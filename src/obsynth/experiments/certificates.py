@@ -1,0 +1,167 @@
+"""Certificates of any kind verified to the end of what they rest on, without a solver."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from obsynth.errors import ObsynthError, SpecError
+from obsynth.experiments.alarm_proof import KIND as ALARM
+from obsynth.experiments.alarm_proof import gain_set_row, verify_alarm
+from obsynth.experiments.assumptions import Log, file_digest
+from obsynth.experiments.tolerance_study import study_statement, tolerance_study
+from obsynth.extensions import extension
+from obsynth.files.inputs import read_json
+from obsynth.results.calibration_files import KIND as CALIBRATION
+from obsynth.results.calibration_files import verify_calibration
+from obsynth.results.certificate_files import (
+    COMPARISON,
+    RESULT_VERSION,
+    RESULTS,
+    ROBUSTNESS,
+    STUDY,
+    body_of,
+    differences,
+    opened,
+)
+from obsynth.results.checks import Check, VerificationReport, information, upper_bound_check
+from obsynth.results.design import ObserverDesign
+from obsynth.results.gain_sets import loaded
+from obsynth.simulation.scenario import scenario_from
+from obsynth.tolerances.result import robustness_statement
+from obsynth.tolerances.robustness import robustness
+
+#: A file may ask for no more runs than this: whoever wrote it does not wait for them.
+MOST_RUNS = 100_000
+_SOURCE = "the certificate, computed again from its gain sets"
+#: Figures, the sentence made again, and what else differs.
+Again = tuple[dict[str, Any], str, list[str]]
+
+
+def kind_of_file(path: Path) -> str:
+    """Return what a file that obsynth wrote says it is; empty where it says nothing."""
+    try:
+        with path.open("rb") as stream:
+            found = re.match(rb'\s*\{\s*"kind":\s*"([a-z ]+)"', stream.read(_HEAD_BYTES))
+    except OSError:
+        return ""
+    return "" if found is None else found.group(1).decode()
+
+
+#: Bytes in which a file says its kind.
+_HEAD_BYTES = 200
+
+
+def verify_certificate(path: str | Path, *, data: str | Path | None = None) -> VerificationReport:
+    """Check a certificate of any kind, to the end of what it rests on, without a solver.
+
+    Parameters
+    ----------
+    path : str or Path
+        What ``save`` of `AlarmProof`, `Robustness`, `ToleranceStudy` or `Comparison` wrote, or a calibration file.
+    data : str or Path, optional
+        The log that an alarm or a comparison names; without it, what was read from the log is assumed.
+
+    Returns
+    -------
+    VerificationReport
+        It fails, by name, where a gain set inside fails, or a figure, the sentence or the log is another one.
+
+    Raises
+    ------
+    SpecError
+        The file is no certificate (gain sets are read by `load`), or ``data`` does not belong to its kind.
+    """
+    kind = kind_of_file(Path(path))
+    if data is not None and kind not in (ALARM, COMPARISON):
+        raise SpecError("data is for the certificates of alarms and comparisons.", path="data")
+    if kind == ALARM:
+        return verify_alarm(path, data=data)
+    return verify_calibration(path) if kind == CALIBRATION else _verified_result(path, data)
+
+
+def designs_inside(path: Path) -> list[ObserverDesign]:
+    """Return the designs inside a certificate."""
+    body = read_json(path)["certificate"]
+    inside = body.get("gain_sets") or {"gain set": body["gain_set"]}
+    return [loaded(json.dumps(one).encode(), f"the {name}") for name, one in inside.items()]
+
+
+def _verified_result(path: str | Path, data: str | Path | None) -> VerificationReport:
+    again = "make it again"
+    kind, body, intact = opened(Path(path), RESULTS, RESULT_VERSION, "certificate of a result", again)
+    rows = [_row("digest", "the file is as it was written", [] if intact else ["sha256"])]
+    try:
+        for row in _rows(kind, body, None if data is None else Path(data)):
+            rows.append(row)  # those before an error stay
+    except (ObsynthError, LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
+        rows.append(_row("contents", "the certificate can be read and computed again", [str(error) or repr(error)]))
+    return VerificationReport.of(rows)
+
+
+def _rows(kind: str, body: dict[str, Any], log_file: Path | None) -> Iterator[Check]:
+    stored = body_of(body)
+    if not float(stored["asked"].get("runs", 0)) <= MOST_RUNS:
+        raise SpecError(f"it asks for more than {MOST_RUNS} runs", path="runs")
+    designs = {
+        name: loaded(json.dumps(inside).encode(), f"the gain set {name!r}")
+        for name, inside in body["gain_sets"].items()
+    }
+    for name, design in designs.items():
+        label = "gain set" if kind != COMPARISON else f"gain set of {name}"
+        yield gain_set_row(design, body["gain_sets"][name]["sha256"], label)
+    log = None if stored["log"] is None else Log.from_dict(stored["log"])
+    if log is not None or log_file is not None:
+        yield _log_row(log, log_file)
+    result, statement, wrong = _AGAIN[kind]({**stored, "gain_sets": body["gain_sets"]}, designs, log_file)
+    if kind == COMPARISON:
+        yield _row("plant", "every gain set is for the plant of the comparison", wrong)
+        yield information(
+            "other methods", "methods that are not in the table do not exist for this plant: assumed, as nothing is "
+            "designed again", float(len(designs)), source=_SOURCE, status="assumed",
+        )  # fmt: skip
+    yield _row("figures", "every figure is found again", differences(stored["result"], result))
+    yield _row("statement", statement, [] if statement == stored["statement"] else ["another sentence is stored"])
+
+
+def _log_row(log: Log | None, file: Path | None) -> Check:
+    if log is not None and file is None:
+        return information(
+            "log", f"errors are those on {log.name}, sha256 {log.sha256}: assumed, as the log was not given (--data)",
+            float("nan"), source=_SOURCE, status="assumed",
+        )  # fmt: skip
+    same = log is not None and file is not None and file_digest(file) == log.sha256
+    return _row("log", "the log that is given is the one that the certificate names", [] if same else ["digest"])
+
+
+def _robustness(body: Mapping[str, Any], designs: Mapping[str, ObserverDesign], _: Path | None) -> Again:
+    design = designs["design"]
+    digest = body["gain_sets"]["design"]["sha256"]
+    return robustness(design).claims(), robustness_statement(body["result"], design, digest), []
+
+
+def _study(body: Mapping[str, Any], designs: Mapping[str, ObserverDesign], _: Path | None) -> Again:
+    asked = dict(body["asked"])
+    found = tolerance_study(designs["design"], scenario_from(asked.pop("scenario")), **asked)
+    digest = body["gain_sets"]["design"]["sha256"]
+    return found.as_dict(), study_statement(body["result"], found.asked, digest), []
+
+
+def _comparison(body: Mapping[str, Any], designs: Mapping[str, ObserverDesign], log: Path | None) -> Again:
+    found: Again = extension("comparison again")(body, designs, log)
+    return found
+
+
+_AGAIN: Mapping[str, Callable[[Mapping[str, Any], Mapping[str, ObserverDesign], Path | None], Again]] = {
+    ROBUSTNESS: _robustness,
+    STUDY: _study,
+    COMPARISON: _comparison,
+}
+
+
+def _row(name: str, claim: str, wrong: list[str]) -> Check:
+    detail = f"wrong: {', '.join(wrong)}" if wrong else ""
+    return upper_bound_check(name, claim, float(len(wrong)), 0.0, source=_SOURCE, detail=detail)

@@ -1,0 +1,162 @@
+
+/* The monitor that was learned from rows without faults: whitening, Hotelling's T2, exponentially weighted means, and
+ * likelihood ratios of steps and ramps of any age. Sizes and tables stand before this text. */
+
+static void monitor_reset(PREFIX_monitor *m)
+{
+    int i, j;
+    for (i = 0; i < ORDER; i++) {
+        for (j = 0; j < CHANNELS; j++) {
+            m->past[i * CHANNELS + j] = monitor_mean[0][j];
+        }
+    }
+    for (i = 0; i < OLDEST * CHANNELS; i++) {
+        m->white[i] = 0;
+    }
+    for (i = 0; i < MEANS * CHANNELS; i++) {
+        m->means[i] = 0;
+    }
+    m->at = 0;
+    m->taken = 0;
+    m->statistic = NAN;
+    m->alarm = m->event = m->quiet = 0;
+    m->fault = -1;
+}
+
+/* Take a row of what is watched; `x` is NULL for one that is as predicted, which adds no evidence. */
+static void monitor_add(PREFIX_monitor *m, const REAL *x)
+{
+    REAL predicted[CHANNELS];
+    REAL *e;
+    int i, j, k;
+    for (i = 0; i < CHANNELS; i++) {
+        REAL sum = 0;
+        for (k = 0; k < ORDER; k++) {
+            for (j = 0; j < CHANNELS; j++) {
+                sum += monitor_A[k * CHANNELS + i][j] * m->past[k * CHANNELS + j];
+            }
+        }
+        predicted[i] = monitor_offset[0][i] + sum;
+    }
+    m->at = (m->at + 1) % OLDEST;
+    e = m->white + m->at * CHANNELS;
+    for (i = 0; i < CHANNELS; i++) {
+        e[i] = 0;
+        for (j = 0; x != NULL && j < CHANNELS; j++) {
+            e[i] += monitor_whitener[i][j] * (x[j] - predicted[j]);
+        }
+    }
+    for (k = 0; k < MEANS; k++) {
+        for (i = 0; i < CHANNELS; i++) {
+            REAL *mean = m->means + k * CHANNELS + i;
+            *mean = (1 - monitor_shares[0][k]) * *mean + monitor_shares[0][k] * e[i];
+        }
+    }
+    for (i = ORDER * CHANNELS - 1; i >= CHANNELS; i--) {
+        m->past[i] = m->past[i - CHANNELS];
+    }
+    for (i = 0; ORDER > 0 && i < CHANNELS; i++) {
+        m->past[i] = x != NULL ? x[i] : predicted[i];
+    }
+}
+
+static REAL square(const REAL *x)
+{
+    REAL sum = 0;
+    int i;
+    for (i = 0; i < CHANNELS; i++) {
+        sum += x[i] * x[i];
+    }
+    return sum;
+}
+
+/* The largest likelihood ratio over all ages of one step or ramp. */
+static REAL likelihood_ratio(const PREFIX_monitor *m, int shape)
+{
+    REAL flat = 0;
+    REAL rising = 0;
+    REAL weighted = 0;
+    REAL largest = 0;
+    int back = 0;
+    int age, i, j;
+    for (age = 0; age < AGES; age++) {
+        REAL fit;
+        for (; back < monitor_ages[age]; back++) {
+            const REAL *e = m->white + (m->at - back + OLDEST) % OLDEST * CHANNELS;
+            REAL slope = 0;
+            for (i = 0; i < CHANNELS; i++) {
+                flat += monitor_flat[shape][i] * e[i];
+                slope += monitor_slopes[shape][i] * e[i];
+            }
+            rising += slope;
+            weighted += (REAL)back * slope;
+        }
+        fit = flat + (REAL)(monitor_ages[age] - 1) * rising - weighted;
+        for (j = 0; j < ORDER && j < monitor_ages[age]; j++) {
+            const REAL *e = m->white + (m->at - (monitor_ages[age] - 1 - j) + OLDEST) % OLDEST * CHANNELS;
+            for (i = 0; i < CHANNELS; i++) {
+                fit += monitor_early[shape * (ORDER + 1) + j][i] * e[i];
+            }
+        }
+        fit = fit * fit * monitor_weights[shape][age];
+        if (!(fit <= largest)) {
+            largest = isnan(fit) ? (REAL)HUGE_VAL : fit;
+        }
+    }
+    return largest;
+}
+
+/* Take a row: fault estimates, then residuals. */
+static void monitor_take(PREFIX_monitor *m, const REAL *shown, int deciding)
+{
+    REAL x[CHANNELS];
+    REAL ratio, statistic;
+    REAL best = -1;
+    int which = 0;
+    int known, i;
+    m->taken += m->taken <= MONITOR_SETTLING;
+    known = deciding && m->taken > MONITOR_SETTLING;
+    for (i = 0; i < CHANNELS; i++) {
+        x[i] = shown[monitor_places[i]];
+        known = known && isfinite(x[i]);
+    }
+    monitor_add(m, known ? x : NULL);
+    m->statistic = NAN;
+    m->alarm = 0;
+    m->fault = -1;
+    if (known) {
+        statistic = square(m->white + m->at * CHANNELS) / monitor_levels[0][0];
+        for (i = 0; i < MEANS; i++) {
+            ratio = square(m->means + i * CHANNELS) * monitor_sizes[0][i] / monitor_levels[0][1 + i];
+            statistic = ratio <= statistic ? statistic : ratio;
+        }
+        for (i = 0; i < SHAPES; i++) {
+            ratio = likelihood_ratio(m, i);
+            if (ratio > best) {
+                best = ratio;
+                which = i;
+            }
+            ratio /= monitor_levels[0][1 + MEANS + i];
+            statistic = ratio <= statistic ? statistic : ratio;
+        }
+        m->statistic = isnan(statistic) ? (REAL)HUGE_VAL : statistic;
+        m->alarm = m->statistic > 1;
+    }
+    if (m->alarm) {
+        m->fault = monitor_told[which % (SHAPES / 2)];
+        if (m->fault < 0) {
+            best = -1;
+            for (i = 0; i < MONITOR_FAULTS; i++) {
+                ratio = ABS(shown[i] - monitor_centres[0][i]) / monitor_scales[0][i];
+                if (ratio > best) {
+                    best = ratio;
+                    m->fault = i;
+                }
+            }
+        }
+        m->event = 1;
+        m->quiet = 0;
+    } else if (m->event && ++m->quiet >= MONITOR_HOLD) {
+        m->event = 0;
+    }
+}

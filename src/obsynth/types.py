@@ -1,0 +1,50 @@
+"""Types of what obsynth's functions return and take, for annotations: ``obsynth.types.Simulation``."""
+
+from importlib import import_module
+from typing import Any
+
+#: By the module that holds it, imported when a name is first used.
+_NAMES = {
+    "analysis.diagnosis.decoupled": "DecoupledPlant",
+    "analysis.diagnosis.verdicts": "Diagnosis FaultDiagnosis StructuredResidual",
+    "analysis.dae_structure": "Identifiability",
+    "calibration.diagnostics": "Validation",
+    "calibration.result": "CalibratedBox Calibration",
+    "calibration.validity": "Validity",
+    "comparison.result": "ComparedMethod FaultComparison",
+    "comparison.sensor_sets": "SensorSet SensorSets",
+    "data.alarm_events": "AlarmEvent",
+    "data.run": "DataRun",
+    "experiments.alarm_proof": "AlarmProof",
+    "experiments.monitors.learned": "LearnedThresholds",
+    "experiments.monitors.monitor": "Detection Monitor",
+    "experiments.monte_carlo": "Evaluation Interval",
+    "experiments.tolerance_study": "ToleranceStudy",
+    "experiments.simulation": "Simulation",
+    "methods.fault_figures": "FaultFigures",
+    "methods.detection_filter.public": "DetectionFilter",
+    "methods.recursive.steady_filter": "SteadyState",
+    "observers.alarms": "Alarm Decision",
+    "observers.estimates": "Estimates",
+    "observers.running": "RunningObserver",
+    "plants.constants": "Constant ConstantsBox",
+    "plants.uncertainty": "Uncertainty",
+    "results.checks": "Check",
+    "simulation.signals": "Trajectory",
+    "sweeps.fleet": "Fleet FleetRun",
+    "sweeps.sweep": "Sweep SweepResult",
+    "tolerances.result": "Robustness",
+}
+_HOMES = {name: f"obsynth.{module}" for module, names in _NAMES.items() for name in names.split()}
+
+__all__ = sorted(_HOMES)
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'obsynth.types' has no attribute {name!r}")
+    return getattr(import_module(_HOMES[name]), name)
+
+
+def __dir__() -> list[str]:
+    return list(__all__)

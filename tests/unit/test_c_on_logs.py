@@ -1,0 +1,266 @@
+"""Every shipped design as C, in one program: on a log with blanks it says what `obsynth run` says, row by row."""
+
+from __future__ import annotations
+
+import ctypes
+import shutil
+import subprocess
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import obsynth
+from obsynth.experiments.monitors.learned import LearnedThresholds, watched_names
+from obsynth.experiments.monitors.learned_levels import Statistics
+from obsynth.exporting.c_source import c_identifier
+from obsynth.numerics.autoregression import Autoregression
+from obsynth.observers.dae.observer import DAEObserver
+from obsynth.results.checks import VerificationReport
+from obsynth.results.gain_sets import gain_set_digest
+from obsynth.spec import load_spec
+
+ROOT = Path(__file__).parents[2]
+COMPILER = shutil.which("cc")
+pytestmark = pytest.mark.skipif(COMPILER is None, reason="no C compiler")
+FLAGS = ["-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", "-O0", "-ffp-contract=off", "-shared", "-fPIC"]
+#: All that can be exported: not the time-varying filter, whose gains change, nor one that says there is none;
+#: guaranteed tests have C of their own (test_guaranteed_c); the adaptive observer of smib takes ten seconds to settle,
+#: and a small one stands for it in test_export_recursive.
+LINEAR = (
+    "bicycle/spec", "drive/spec", "filasova/spec", "ieee14/spec", "kundur/spec", "kundur/spec_fault_filter",
+    "motor/sampled", "motor/spec", "sharepasand/spec", "smib/functional", "smib/pd_observer", "smib/spec", "tanks/spec",
+    "wang2015/spec",
+)  # fmt: skip
+NONLINEAR = ("diode_circuit/spec", "moussaali2013_dae/spec", "pendulum/spec", "threetank/spec")
+ROWS, WARM_UP, SAMPLE_TIME = 260, 20, 0.01
+#: Rows and columns (of outputs, then of inputs) that are missing: in the warm-up, cells, whole rows, and inputs.
+MISSING = ((3, 0), (60, 0), *((row, None) for row in range(90, 97)), (131, -1), (170, 0), (172, 0), (200, None))
+
+RUN = """
+void run_NAME(const double *in, double *out, int rows)
+{
+    static NAME_state state;
+    int k, i;
+    NAME_reset(&state);
+    for (i = 0; i < NAME_WATCHED_UPPER; i++) {
+        if (i + 1 < NAME_WATCHED_UPPER) state.level[i] = in[i];
+    }
+    state.warm_up = in[NAME_WATCHED_UPPER];
+    in += NAME_WATCHED_UPPER + 1;
+    for (k = 0; k < rows; k++) {
+        double *row = out + k * WIDTH;
+        int failed;
+        FOUND
+        failed = CALL;
+        row[LAST] = failed; row[LAST + 1] = state.status; row[LAST + 2] = state.any_alarm;
+        row[LAST + 3] = state.monitor.statistic; row[LAST + 4] = state.monitor.fault;
+        COPY
+        in += TAKEN;
+    }
+}
+"""
+
+
+def told(design: obsynth.ObserverDesign) -> LearnedThresholds:
+    """Return thresholds as if they had been learned: an autoregression of order 2 of up to two columns."""
+    names = watched_names(design)
+    columns = tuple(dict.fromkeys((names[0], names[-1])))
+    m, nf = len(columns), len(design.observer.fault_names)
+    A = np.array([0.5 * np.eye(m) + 0.1, -0.2 * np.eye(m)])
+    model = Autoregression(np.full(m, 0.02), A, 3.0 * np.eye(m) - 0.5)
+    signatures = np.vstack([np.eye(m), np.ones(m)])
+    statistics = Statistics(model, signatures, (*columns, f"fault {design.observer.fault_names[-1]}" if nf else "both"))
+    levels = np.linspace(8.0, 20.0, len(statistics.names))
+    dt = design.observer.dt or SAMPLE_TIME
+    return LearnedThresholds(columns, statistics, levels, 500.0, 1000, 500, dt, np.zeros(nf), np.ones(nf),
+                             gain_set_digest(design), settling=0 if m == 1 else 30)  # fmt: skip
+
+
+def designed(name: str) -> obsynth.ObserverDesign:
+    spec = load_spec(ROOT / "designs" / f"{name}.yaml")
+    return obsynth.design(spec.plant, spec.method, name=spec.name, **dict(spec.options))
+
+
+def log_of(design: obsynth.ObserverDesign) -> pd.DataFrame:
+    """Return signals that move, with offsets and what is missing, in the units of the plant."""
+    rng, plant = np.random.default_rng(5), design.plant
+    nu, ny = len(plant.input_names), len(plant.output_names)
+    dt = design.observer.dt or SAMPLE_TIME
+    if isinstance(design.observer, DAEObserver):
+        u = np.tile(plant.nominal_input, (ROWS, 1)).reshape(ROWS, nu) * (1.0 + 0.01 * rng.standard_normal((ROWS, nu)))
+        y = np.array(obsynth.simulate_dae(plant, u, dt=dt, R=design.observer.R, seed=1).outputs)
+        deviations = np.sqrt(np.diag(np.atleast_2d(design.observer.R)))
+        y[150:, 0] += 4.0 * deviations[0]
+        # Outliers: of one sensor, and of all of them, which leaves nothing of a row.
+        y[120, -1] += 60.0 * deviations[-1]
+        y[140] += 60.0 * deviations
+    else:
+        moved = np.cumsum(rng.standard_normal((ROWS, nu + ny)), axis=0) * 0.05 + 0.1 * rng.standard_normal((ROWS, 1))
+        point = [plant.operating_point.get(name, 0.0) for name in (*plant.input_names, *plant.output_names)]
+        u, y = np.split(moved + point, [nu], axis=1)
+    for row, column in MISSING:
+        if column is None:
+            y[row] = np.nan
+        elif column == 0:
+            y[row, 0] = np.nan
+        elif nu:
+            u[row, -1] = np.nan
+    scales = [getattr(plant, "scales", {}).get(name, 1.0) for name in (*plant.input_names, *plant.output_names)]
+    names = [*plant.input_names, *plant.output_names]
+    table = pd.DataFrame(np.hstack([u, y]) / scales, columns=names)
+    table.insert(0, "time", np.arange(ROWS) * dt)
+    return table
+
+
+def harness(design: obsynth.ObserverDesign, name: str) -> tuple[str, int]:
+    """Return the function that runs a design in C over a log, and the numbers of a row that it writes."""
+    observer = design.observer
+    nu, ny = len(design.plant.input_names), len(design.plant.output_names)
+    nx, nf = len(observer.state_names), len(observer.fault_names)
+    nonlinear = isinstance(observer, DAEObserver)
+    nr = ny if nonlinear else len(observer.residual_names)
+    given = [text for text, count in (("in", nu), (f"in + {nu}", ny)) if count]
+    last = (2 * nx + 2 * nf if nonlinear else nx + nf) + nr
+    found, copied = "", ""
+    if nonlinear:
+        call = f"{name}_step(&state, {', '.join([*given, '&found'])})"
+        found = f"static {name}_estimates found;"
+        place = 0
+        for field, count in (("states", nx), ("faults", nf), ("state_deviations", nx), ("fault_deviations", nf),
+                             ("residuals", nr)):  # fmt: skip
+            copied += f"for (i = 0; i < {count}; i++) row[{place} + i] = found.{field}[i];\n"
+            place += count
+    else:
+        outputs = (("row", nx), (f"row + {nx}", nf), (f"row + {nx + nf}", nr))
+        call = f"{name}_take(&state, {', '.join([*given, *(text for text, count in outputs if count)])})"
+    parts = {"NAME_WATCHED_UPPER": f"{name.upper()}_WATCHED", "NAME": name, "WIDTH": str(last + 5), "FOUND": found,
+             "CALL": call, "LAST": str(last), "COPY": copied, "TAKEN": str(nu + ny)}  # fmt: skip
+    text = RUN
+    for word, value in parts.items():
+        text = text.replace(word, value)
+    return text, last + 5
+
+
+@pytest.fixture(scope="module")
+def shipped(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
+    """All designs in one library, compiled with warnings as errors; they are not verified here."""
+    folder = tmp_path_factory.mktemp("c")
+    patch = pytest.MonkeyPatch()
+    holds = SimpleNamespace(passed=True, failures=(), checks=())
+    patch.setattr("obsynth.methods.designing.verify", lambda design, **_: holds)
+    designs = {name: designed(name).replace(report=VerificationReport()) for name in (*LINEAR, *NONLINEAR)}
+    widths, runs, sources = {}, [], []
+    for name, design in designs.items():
+        continuous = design.observer.dt == 0.0
+        monitor = obsynth.online_monitor(design, "learned", normal=told(design))
+        stem = c_identifier(name)
+        sources += obsynth.export(
+            design, folder / f"{stem}.c", sample_time=SAMPLE_TIME if continuous else None, monitor=monitor
+        )
+        text, widths[name] = harness(design, stem)
+        runs.append(f'#include "{stem}.h"\n{text}')
+    patch.undo()
+    (folder / "all.c").write_text("\n".join(runs))
+    files = [str(file) for file in (*sources, folder / "all.c") if file.suffix == ".c"]
+    command = [str(COMPILER), *FLAGS, *files, "-o", str(folder / "all.so"), "-lm"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[:4000]
+    return SimpleNamespace(designs=designs, widths=widths, code=ctypes.CDLL(str(folder / "all.so")), folder=folder)
+
+
+def test_headers_say_what_a_controller_needs(shipped: SimpleNamespace) -> None:
+    """Units, names of columns, the operating point, alarms, the monitor, the status of verification, and C++."""
+    tanks = (shipped.folder / "threetank_spec.h").read_text()
+    assert 'extern "C"' in tanks
+    assert '/* faults[0]: "fhat[leak]", "V^0.5/s" */' in tanks
+    assert '/* state_deviations[0]: "sd xhat[h1]", "V" */' in tanks
+    assert '/* "alarm[0]: fhat[leak]" */' in tanks.replace(
+        '/* alarm[0]: "fhat[leak]" */', '/* "alarm[0]: fhat[leak]" */'
+    )
+    assert "learned from 1000 rows without faults" in tanks
+    assert "UNVERIFIED: no check was made" in tanks
+    cc = shutil.which("g++")
+    if cc is not None:
+        text = "\n".join(f'#include "{c_identifier(name)}.h"' for name in shipped.designs)
+        (shipped.folder / "all.cpp").write_text(text + "\nint main() { return 0; }\n")
+        subprocess.run([cc, "-Wall", "-Werror", "-fsyntax-only", str(shipped.folder / "all.cpp")], check=True)
+
+
+@pytest.mark.parametrize("name", [*LINEAR, *NONLINEAR])
+def test_c_says_what_a_run_says(shipped: SimpleNamespace, name: str) -> None:
+    design, log = shipped.designs[name], log_of(shipped.designs[name])
+    dt = design.observer.dt or SAMPLE_TIME
+    monitor = obsynth.online_monitor(design, "learned", normal=told(design), unverified=True)
+    nonlinear = isinstance(design.observer, DAEObserver)
+    names = [f"fhat[{f}]" for f in design.observer.fault_names]
+    names += [f"r[{r}]" for r in (design.plant.output_names if nonlinear else design.observer.residual_names)]
+    levels = dict.fromkeys(names, 0.3)
+    run = obsynth.run_on_data(
+        design, log, thresholds=levels, monitor=monitor, warm_up=WARM_UP * dt, recovered="none"
+    ).table
+    scales = getattr(design.plant, "scales", {})
+    scaled = log.to_numpy()[:, 1:] * [scales.get(column, 1.0) for column in log.columns[1:]]
+    count = len(names) + nonlinear + 1
+    head = [0.3] * len(names) + [0.0] * (count - len(names)) + [WARM_UP * dt]
+    given, out = np.concatenate([head, scaled.ravel()]), np.full((ROWS, shipped.widths[name]), np.inf)
+    pointer = ctypes.POINTER(ctypes.c_double)
+    function = getattr(shipped.code, f"run_{c_identifier(name)}")
+    function(given.ctypes.data_as(pointer), out.ctypes.data_as(pointer), ROWS)
+    columns = [column for column in run.columns if column.startswith(("xhat[", "fhat[", "sd ", "r["))]
+    wanted, found = run[columns].to_numpy(float), out[:, : len(columns)]
+    np.testing.assert_array_equal(np.isnan(found), np.isnan(wanted))
+    sizes = np.maximum(np.nanmax(np.abs(wanted), axis=0), 1e-9)
+    assert np.nanmax(np.abs(found - wanted) / sizes) <= (1e-10 if nonlinear else 1e-12)
+    statuses = np.array(["ok", "warm-up", "gap", "recovering", "partial"])[out[:, -4].astype(int)]
+    assert statuses.tolist() == run.status.tolist()
+    assert {"ok", "gap"} <= set(statuses)
+    inputs = scaled[:, : len(design.plant.input_names)]
+    returned = np.isnan(inputs).any(axis=1) if nonlinear else run.status == "gap"
+    np.testing.assert_array_equal(out[:, -5] != 0.0, returned)
+    np.testing.assert_array_equal(out[:, -3] != 0.0, run.alarm != "")
+    statistic = run.statistic.to_numpy(float)
+    np.testing.assert_array_equal(np.isnan(out[:, -2]), np.isnan(statistic))
+    np.testing.assert_allclose(out[:, -2], statistic, rtol=1e-9 if nonlinear else 1e-12)
+    faults = design.observer.fault_names
+    isolated = [faults[int(i)] if i >= 0 else "" for i in out[:, -1]]
+    shown = [text.partition("learned: ")[2].split(";")[0] for text in run.alarm]
+    assert isolated == shown
+
+
+def test_floats_keep_the_bound_that_their_header_states(shipped: SimpleNamespace, tmp_path: Path) -> None:
+    """Against doubles, for signals within one unit; and the bound is not idle."""
+    design = shipped.designs["wang2015/spec"]
+    found = {}
+    for precision, kind in (("double", ctypes.c_double), ("float", ctypes.c_float)):
+        stem = f"wang_{precision}"
+        monitor = obsynth.online_monitor(design, "learned", normal=told(design))
+        source, header = obsynth.export(design, tmp_path / f"{stem}.c", precision=precision, monitor=monitor)
+        nu, ny = len(design.observer.input_names), len(design.observer.output_names)
+        rows = len(design.observer.row_names)
+        nx, nf = len(design.observer.state_names), len(design.observer.fault_names)
+        real = "double" if precision == "double" else "float"
+        call = f"{stem}_step(&state, in, in + {nu}, out, out + {nx}, out + {nx + nf})"
+        (tmp_path / f"{stem}_run.c").write_text(
+            f'#include "{stem}.h"\nvoid run(const {real} *in, {real} *out, int rows) {{ static {stem}_state state;\n'
+            f"{stem}_reset(&state); while (rows-- > 0) {{ {call}; in += {nu + ny}; out += {rows}; }} }}\n"
+        )
+        library = tmp_path / f"{stem}.so"
+        files = [str(source), str(tmp_path / f"{stem}_run.c")]
+        subprocess.run([str(COMPILER), *FLAGS, "-Wdouble-promotion", *files, "-o", str(library)], check=True)
+        signals = np.random.default_rng(0).uniform(-1.0, 1.0, (2_000, nu + ny)).astype(np.float32).astype(kind)
+        said, pointer = np.zeros((2_000, rows), kind), ctypes.POINTER(kind)
+        ctypes.CDLL(str(library)).run(signals.ctypes.data_as(pointer), said.ctypes.data_as(pointer), 2_000)
+        found[precision] = said
+        text = header.read_text()
+    stated = text.partition("for n units): ")[2].partition('"')[0].split(", ")
+    bounds = np.array([float(part.rpartition(" ")[2]) for part in stated])
+    errors = np.abs(found["float"] - found["double"]).max(axis=0)
+    assert (errors <= bounds).all()
+    assert (errors >= 1e-3 * bounds).all()
+    with pytest.raises(obsynth.SpecError, match="precision"):
+        obsynth.export(shipped.designs["pendulum/spec"], tmp_path / "a.c", precision="float")
+    with pytest.raises(obsynth.SpecError, match="precision"):
+        obsynth.export(design, tmp_path / "a.npz", precision="float")
