@@ -227,7 +227,7 @@ class Condensed:
         for k in able.tolist():
             row = int(np.flatnonzero(bounds.noise_output[:, k])[0])
             best.setdefault(row, k)
-        return np.array([best[row] for row in range(ny)]) if len(best) == ny else np.zeros(0, dtype=int)
+        return np.array([best[row] for row in range(ny)]) if len(best) == ny else np.zeros(0, dtype=np.int64)
 
     @cached_property
     def _absorbing(self) -> np.ndarray | None:

@@ -103,7 +103,7 @@ def with_tolerances(window: Window, beside: Beside) -> Window:
     """Return a window with a bounded column for each thing that tolerances do, in the mean over the record."""
     affine, builder = beside.affine, Builder()
     length = max(window.equations + 1, window.question.samples)
-    starts = np.unique(np.linspace(*settled(len(beside.record), length), MOST_WINDOWS).astype(int))
+    starts = np.unique(np.linspace(*settled(len(beside.record), length), MOST_WINDOWS).astype(np.int64))
     nu = window.plant.nu
     spans = 1.0 + np.abs(affine.offsets)
 
