@@ -239,7 +239,8 @@ SCHEMA = [
     Case(
         "unknown solver",
         put("method", "options", "solver", "MOSEK"),
-        "method.options.solver: there is no solver 'MOSEK' that does semidefinite programmes; installed are: auto",
+        "method.options.solver: there is no solver 'MOSEK' that does semidefinite programmes; installed are: ",
+        more=("CLARABEL",),
     ),
     Case(
         "unknown search",
