@@ -170,15 +170,16 @@ class TestParameters:
 
 
 def test_errors_that_die_out_beyond_the_horizon_are_unclear_not_impossible() -> None:
-    # Every state shows, exactly; the identity is a Q and R that hardly weigh x4 in these units.
+    # Every state shows, exactly; as identities, Q and R hardly weigh x4 in these units.
     plant = obsynth.DescriptorSystem(
         np.diag([0.001, 0.1, 0.01, 1.0]),
         [[0.00025, -0.5, -25.0, 2.5e-07], [0, -0.05, -2.5, -2.5e-08], [0, 0, 0.0075, 2.5e-11], [0, 0, 0, -1.0]],
         C=[[-0.002, -2.0, -100.0, 2e-06], [-1e-07, 0.0002, 0.02, 2e-10]],
         Bf=[[1e-05], [2e-06], [-1e-09], [0.0]], dt=0.5,
     )  # fmt: skip
-    with pytest.raises(obsynth.PreconditionError, match=r"^Unclear: .*Q and R taken as the identity"):
-        obsynth.adaptive_observer(plant)
+    with pytest.raises(obsynth.PreconditionError, match=r"^Unclear: .* State Q and R in the units of") as caught:
+        obsynth.adaptive_observer(plant, Q=np.eye(4), R=np.eye(2))
+    assert (caught.value.unclear, caught.value.signals) == (True, ("x4",))
     # Weighed in its own units it is designed.
     states, outputs = np.array([1.0, 1e-3, 1e-5, 1e3]), np.array([5e2, 1e7])
     weighed = obsynth.adaptive_observer(
