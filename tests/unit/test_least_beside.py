@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import io
 import json
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
 import obsynth
 from obsynth.cli.main import main
 from obsynth.comparison.least_thresholds import design_beside_least, in_words
+from obsynth.report.scenarios import comparison_report
 
 DRIVE = Path(__file__).parents[2] / "designs/drive/spec.yaml"
 
@@ -34,6 +37,12 @@ def test_compare_and_evaluate_say_how_far_from_the_least_each_method_is(capsys: 
     assert 1.0 <= fault.bound / fault.least < 2.0
     header, row = found.rows()
     assert row[header.index("x least")] == f"{fault.bound / fault.least:.3g}"
+    # No number is cut on a terminal of eighty columns.
+    printed = io.StringIO()
+    comparison_report(found, console=Console(file=printed, width=80))
+    for name in ("deviation", "gain from d", "bound", "x least", "rms"):
+        assert f"  {name}" in printed.getvalue()
+        assert f" {row[header.index(name)]}" in printed.getvalue()
     assert main(["evaluate", "--system", str(DRIVE), "--runs", "2", "--quiet"]) == 0
     assert "times the least that any test with its delay can have" in " ".join(capsys.readouterr().out.split())
 

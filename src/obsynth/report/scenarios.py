@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -94,18 +95,24 @@ def _interval(item: Interval) -> str:
 
 #: Columns left out where the console is narrower than so many characters.
 NARROW = 130
-_LESS = ("order", "s to 50 %", "peak", "bias", "s to alarm", "smallest", "ms")
+_LESS = ("order", "s to 50 %", "at horizon", "peak", "bias", "s to alarm", "smallest", "ms")
+#: Columns of names, and how wide they are there: eighty columns less six of numbers.
+_NAMES = ("method", "fault")
+_NAME_WIDTH = 11
 
 
 def comparison_report(found: Comparison, *, console: Console, file: Path | None = None) -> None:
     """Print what was compared, the table, the refusals and the recommendation."""
     header, *rows = found.rows()
-    kept = [i for i, name in enumerate(header) if console.width >= NARROW or name not in _LESS]
+    wide = console.width >= NARROW
+    kept = [i for i, name in enumerate(header) if wide or name not in _LESS]
     table = headed_table(*(header[i] for i in kept))
-    for column in table.columns:
-        column.overflow = "fold"
+    # Only names break, and at their hyphens and blanks: a number that is cut is another number.
+    for column, i in zip(table.columns, kept, strict=True):
+        column.no_wrap = header[i] not in _NAMES
     for row in rows:
-        table.add_row(*(Text(row[i]) for i in kept))
+        texts = [row[i] if wide or header[i] not in _NAMES else fill(row[i], _NAME_WIDTH) for i in kept]
+        table.add_row(*map(Text, texts))
     console.print(Text(found.setting))
     if rows:
         print_section(console, "", table)
