@@ -108,7 +108,7 @@ def test_rank_answers_agree_with_the_decoupled_plant() -> None:
 
 
 def test_rank_answers_on_a_network_agree_with_the_decoupled_plant() -> None:
-    # Kundur's 196 variables: 80 random pairs of all 19,110.
+    # Kundur's 196 variables: 80 random pairs of all 19,110. The count is that of exact arithmetic modulo 2**31 - 1.
     plant = load_spec(DESIGNS / "kundur" / "spec_fault_filter.yaml").transformation.source.dense()
     bare = plant.replace(
         C=np.zeros((0, plant.nx)), D=None, Dd=None, Df=None, Dw=None, output_names=[], units={}, scales={},

@@ -20,8 +20,8 @@ from obsynth.analysis.diagnosis.exact import Questions
 from obsynth.analysis.diagnosis.explanations import Sensor, with_sensors
 from obsynth.analysis.diagnosis.fault_columns import others
 from obsynth.analysis.diagnosis.reduction import PencilUnits
-from obsynth.numerics.arrays import SMALLEST, ComplexArray
-from obsynth.numerics.ranks import RANK_TOLERANCE
+from obsynth.numerics.arrays import SMALLEST, ComplexArray, FloatArray
+from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, RANK_TOLERANCE
 from obsynth.plants.descriptor import DescriptorSystem
 
 #: Points without meaning, in units of the plant's own time scale.
@@ -53,8 +53,11 @@ class SensorResponses:
             values = np.linalg.svd(pencil, compute_uv=False) if pencil.size else np.ones(1)
             if values[-1] <= RANK_TOLERANCE * values[0]:
                 return None
-            states = units.columns[:, None] * np.linalg.solve(pencil, units.rows[:, None] * inputs)
-            table = c @ states + direct
+            states, terms = _solution(pencil, units.rows[:, None] * inputs)
+            table = c @ (units.columns[:, None] * states) + direct
+            terms = np.abs(c) @ (units.columns[:, None] * terms) + np.abs(direct)
+            # What a sensor does not see would be rounding, and that as large as any response once rows have one size.
+            table = np.where(np.abs(table) > CANCELLATION_TOLERANCE * terms, table, 0.0)
             for axis in (1, 0):
                 sizes = np.linalg.norm(table, axis=axis, keepdims=True)
                 table = table / np.where(sizes > 0.0, sizes, 1.0)
@@ -76,6 +79,19 @@ class SensorResponses:
             size = np.linalg.norm(goal, axis=1)
             found = np.maximum(found, np.where(size > 0.0, rest / np.where(size > 0.0, size, 1.0), 0.0))
         return np.where(found > SHOWN, found, 0.0)
+
+
+def _solution(matrix: ComplexArray | FloatArray, right: FloatArray) -> tuple[ComplexArray, FloatArray]:
+    """Return a solution, refined once, and the sizes of the terms of each entry: ``|M^-1| (|M| |x| + |b|)``.
+
+    An entry errs by a few roundings of its own terms then, whatever units rows and columns have ([Higham2002]_, 12.2).
+
+    .. [Higham2002] N. J. Higham, Accuracy and Stability of Numerical Algorithms, 2nd ed., SIAM, 2002.
+    """
+    found = np.linalg.solve(matrix, np.hstack([right, np.eye(len(matrix))]))
+    x, inverse = found[:, : right.shape[1]], found[:, right.shape[1] :]
+    x = x + inverse @ (right - matrix @ x)
+    return x, np.abs(inverse) @ (np.abs(matrix) @ np.abs(x) + np.abs(right))
 
 
 def _outside(span: ComplexArray, vector: ComplexArray) -> NDArray[np.float64]:
