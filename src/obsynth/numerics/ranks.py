@@ -54,8 +54,6 @@ NEGLIGIBLE_SHARE = 1e-12
 DIRECTION_SHARE = 1e-9
 #: A zero nearer than this to the point at which a constant fault stands is that point.
 REST_TOLERANCE = 1e-6
-#: Singular values of a constant's directions below this share of the largest are rounding of its derivatives.
-ACTING_TOLERANCE = 1e-6
 #: Singular values of a constant's effect below this share count as zero; what is left out goes into the remainder.
 EFFECT_RANK_SHARE = 1e-12
 #: Singular values below this share of the largest are zero: the sensitivities carry rounding of 1e-16 times the
