@@ -107,7 +107,9 @@ def test_what_acts_is_taken(folder: Path, line: str) -> None:
 def test_what_python_would_ignore_is_refused(folder: Path) -> None:
     design = obsynth.load("g.json")
     plant = design.plant
-    with pytest.raises(obsynth.SpecError, match="written as C"):
+    with pytest.raises(
+        obsynth.SpecError, match="learned monitors and levels of outputs, not this monitor: write it as C"
+    ):
         obsynth.export(design, "o.fmu", monitor=obsynth.online_monitor(design, noise_bound=3.0))
     scenario = obsynth.Scenario(horizon=3.0)
     for wrong in (

@@ -147,7 +147,10 @@ def export(
 
         require_kind(design, ObserverDesign, "design", "an ObserverDesign, such as obsynth.load(path)")
         if monitor is not None and learned is None:
-            raise SpecError("An FMU holds learned monitors and levels of outputs: others are for .c.", path="monitor")
+            raise SpecError(
+                "An FMU holds learned monitors and levels of outputs, not this monitor: write it as C (.c).",
+                path="monitor",
+            )
         return (
             write_fmu(
                 design,
