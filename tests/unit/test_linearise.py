@@ -213,8 +213,8 @@ def test_a_spec_is_linearised_where_it_says_and_with_its_noise(tmp_path, capsys)
 @pytest.mark.parametrize(
     ("more", "told"),
     [
-        ("  sensor_noise: {gauge: 0.01}\n", "plant.sensor_noise is for the linear model"),
         ("  process_noise: {scales: 0.01}\n" + AT_FOUR, "scales"),
+        ("  process_noise: {scales: 0.01}\n", "process_noise has no signal named 'scales'"),
         ("  sensor_noise: {gauge: -0.01}\n" + AT_FOUR, "sensor_noise"),
         ("  sensor_noise: {level gauge: 0.01}\n" + AT_FOUR, "level gauge"),
     ],
@@ -224,3 +224,12 @@ def test_noise_that_fits_nothing_is_refused(tmp_path, more, told):
     path.write_text(TANK + more)
     with pytest.raises(SpecError, match=told):
         load_spec(path)
+
+
+def test_white_noise_of_a_plant_that_is_not_linearised_becomes_variances_of_its_method(tmp_path):
+    path = tmp_path / "tank.yaml"
+    stated = "  sensor_noise: {gauge: 0.01}\n  process_noise: {balance: 0.002}\n"
+    path.write_text(TANK + stated + "method: {id: dae-adaptive-observer, options: {dt: 4.0}}\n")
+    options = load_spec(path).options
+    assert options["R"] == {"gauge": pytest.approx(1e-4)}
+    assert options["Q"] == {"balance": pytest.approx(0.002**2 / 4.0)}

@@ -91,7 +91,7 @@ def with_noise(
     loads = {name: stated_number(value, f"walks.{name}") for name, value in (walks or {}).items()}
     if isinstance(plant, DAEModel):
         model = _of_equations(plant, noises, offsets, loads)
-        drives = {} if process_noise is None else dict(process_noise)
+        drives = _intensities_by_equation(plant, process_noise)
         if dt is None:
             return model, _intensities(plant, noises, offsets, loads, drives)
         return model, _options(model, noises, offsets, loads, drives, dt, integration)
@@ -99,6 +99,15 @@ def with_noise(
         made, options = _of_matrices(plant.plant, noises, offsets, loads)
         return plant.then(made), options
     return _of_matrices(plant, noises, offsets, loads)
+
+
+def _intensities_by_equation(model: DAEModel, given: Mapping[str, float] | None) -> dict[str, float]:
+    """Return the intensity of white noise by equation."""
+    for name, value in (given or {}).items():
+        index_of(name, model.equation_names, what="process_noise")
+        if not is_finite_number(value) or not value > 0.0:
+            raise SpecError(f"process_noise.{name} is {value!r}: give an intensity above 0.", path="process_noise")
+    return {name: float(value) for name, value in (given or {}).items()}
 
 
 def _offsets(given: Any, names: Sequence[str], noises: Mapping[str, SensorNoise]) -> dict[str, tuple[float, float]]:
@@ -287,12 +296,7 @@ def _options(
     integration: str,
 ) -> dict[str, Any]:
     """Return Q per step, R and the first covariance by name, as far as the noise is stated."""
-    Q, first = {}, {}
-    for name, value in process_noise.items():
-        index_of(name, model.equation_names, what="process_noise")
-        if not is_finite_number(value) or not value > 0.0:
-            raise SpecError(f"process_noise.{name} is {value!r}: give an intensity above 0.", path="process_noise")
-        Q[name] = float(value) ** 2 / dt
+    Q, first = {name: value**2 / dt for name, value in process_noise.items()}, {}
     for name, noise in noises.items():
         if noise.correlation:
             Q[noise_state(name)] = process_variance(noise.deviation**2, noise.correlation, dt, integration)
