@@ -97,6 +97,9 @@ def log_of(design: obsynth.ObserverDesign) -> pd.DataFrame:
         # Outliers: of one sensor, and of all of them, which leaves nothing of a row.
         y[120, -1] += 60.0 * deviations[-1]
         y[140] += 60.0 * deviations
+        # Below, which is left out as well; and several above, of which the second and those after it are believed.
+        y[125, -1] -= 60.0 * deviations[-1]
+        y[210:213, 0] += 60.0 * deviations[0]
     else:
         moved = np.cumsum(rng.standard_normal((ROWS, nu + ny)), axis=0) * 0.05 + 0.1 * rng.standard_normal((ROWS, 1))
         point = [plant.operating_point.get(name, 0.0) for name in (*plant.input_names, *plant.output_names)]

@@ -31,8 +31,9 @@ static int is_due(long k, int i)
 #endif
 }
 
-/* What a row is: inputs that nobody measured, and outputs that were missing or left out, make it another one. */
-static int status_of(PREFIX_state *s, const double *seen, int inputs_known, int is_first)
+/* What a row is: inputs that nobody measured, and outputs that were missing or left out (more of them are `refused`
+   than before the row), make it another one. */
+static int status_of(PREFIX_state *s, const double *seen, const int *refused, int inputs_known, int is_first)
 {
     int known = 0;
     int all = 1;
@@ -42,7 +43,7 @@ static int status_of(PREFIX_state *s, const double *seen, int inputs_known, int 
         s->from = s->time;
     }
     for (i = 0; i < NY; i++) {
-        int is_refused = GATE && latest_of(&s->running)->in_a_row[i] > 0;
+        int is_refused = GATE && latest_of(&s->running)->refused[i] > refused[i];
         int is_heard = !is_due(latest_of(&s->running)->k - 1, i) || (!isnan(seen[i]) && !is_refused);
         known = known || is_heard;
         all = all && is_heard;
@@ -66,6 +67,7 @@ int PREFIX_step(PREFIX_state *s, ARGUMENTSconst double y[NY], PREFIX_estimates *
     double said[ROW];
     double shown[UPPER_WATCHED];
     const double *after;
+    int refused[NY];
     int inputs_known = 1;
     int is_first = !s->is_started;
     int is_deciding, i, failed;
@@ -81,6 +83,7 @@ int PREFIX_step(PREFIX_state *s, ARGUMENTSconst double y[NY], PREFIX_estimates *
     for (i = 0; i < NY; i++) {
         seen[i] = isfinite(y[i]) ? y[i] : NAN;
         none[i] = NAN;
+        refused[i] = latest_of(&s->running)->refused[i];
     }
     failed = advance(&s->running, used, seen, heard, said);
     if (failed && !is_first) {
@@ -112,7 +115,7 @@ int PREFIX_step(PREFIX_state *s, ARGUMENTSconst double y[NY], PREFIX_estimates *
     s->time = (double)s->k * UPPER_DT;
     s->k++;
     copy(s->u, used, LENGTH(NU));
-    s->status = status_of(s, seen, inputs_known, is_first);
+    s->status = status_of(s, seen, refused, inputs_known, is_first);
     is_deciding = s->status == UPPER_OK || s->status == UPPER_PARTIAL;
     after = latest_of(&s->running)->memory;
     copy(estimates->states, after + AT_POSTERIOR, NX);
