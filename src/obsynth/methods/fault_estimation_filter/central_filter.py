@@ -473,7 +473,7 @@ def least_noise_filter(problem: GainProblem) -> Injection | None:
 
 
 def noise_weighted_filters(
-    problem: GainProblem, gain: float, *, reaches: Callable[[Injection], bool]
+    problem: GainProblem, gain: float, *, reaches: Callable[[Injection], bool], artificial: float = NOISES[0]
 ) -> Iterator[Injection]:
     """Yield central filters that promise a gain of at most ``gain``, for which the noise counts as much as it can.
 
@@ -491,7 +491,7 @@ def noise_weighted_filters(
         best = None
         while low < high:
             middle = (low + high) // 2
-            found = central_injection(_with_noise(work, weights[middle]), factor * gain, noise=NOISES[0])
+            found = central_injection(_with_noise(work, weights[middle]), factor * gain, noise=artificial)
             if found is not None and (factor == 1.0 or reaches(found)):
                 best, low = found, middle + 1
             else:
@@ -499,6 +499,21 @@ def noise_weighted_filters(
         if best is not None:
             yield best
             last = low - 1
+
+
+def noise_weighted_filters_within(
+    normalised: NormalisedProblem, gain: float, *, reaches: Callable[[Injection], bool]
+) -> Iterator[Injection]:
+    """Yield `noise_weighted_filters` of the problem before normalisation, found in its coordinates.
+
+    Far below the gain of the starting filter the artificial noise would in others be all that counts."""
+
+    def reached(found: Injection) -> bool:
+        return reaches(normalised.restore(found))
+
+    level = gain / normalised.gain
+    for found in noise_weighted_filters(normalised.problem, level, reaches=reached, artificial=min(NOISES)):
+        yield normalised.restore(found)
 
 
 def _with_noise(problem: GainProblem, weight: float) -> GainProblem:

@@ -44,6 +44,7 @@ from obsynth.methods.fault_estimation_filter.central_filter import (
     least_level,
     least_noise_filter,
     noise_weighted_filters,
+    noise_weighted_filters_within,
     search_by_bisection,
     search_least_gain,
 )
@@ -256,6 +257,8 @@ def small_gain_design(
         candidates.append(quick)
         central += fast
     else:
+        if goal.noisy and not any(map(goal.is_fast, central)):
+            central += [item for item in noise_weighted_filters_within(fresh, gain, reaches=goal.met) if goal.met(item)]
         central = [item for item in central if goal.is_fast(item)] or central
         candidates += [_towards(goal, min(central, key=goal.cost), target)] if central else []
     records.append({"what": "small gains", "solver": "central filter", "status": f"{len(central)} filters"})
