@@ -14,6 +14,7 @@ from obsynth.calibration.logs import refused
 from obsynth.calibration.problem import Problem
 from obsynth.numerics.arrays import SMALLEST, FloatArray
 from obsynth.plants.dae.functions import Compiled
+from obsynth.plants.noise_model import offset_state
 
 BoolArray = NDArray[np.bool_]
 #: Rounds in which the sensors' weights are estimated again; the first is robust against single wrong values.
@@ -226,23 +227,21 @@ def _require_explained(problem: Problem, left: FloatArray, judged: BoolArray) ->
 
 def _require_levels(problem: Problem, fit: Fit, simulated: FloatArray, judged: BoolArray) -> None:
     """Refuse a single sensor in other units: the best fit leaves nearly all of it, on another level altogether."""
-    y = problem.y
-    if not problem.plant.has_levels:
-        # Deviations from an operating point have no level, but a size.
-        simulated, y = simulated - simulated.mean(axis=0), y - np.nanmean(y, axis=0)
+    names = problem.output_names
+    # Deviations from an operating point have no level, but a size; a free offset stands for any level.
+    level = np.array([problem.plant.has_levels and offset_state(n) not in problem.plant.state_names for n in names])
+    y = problem.y - np.where(level, 0.0, np.nanmean(problem.y, axis=0))
+    simulated = simulated - np.where(level, 0.0, simulated.mean(axis=0))
     levels = np.sqrt(np.nanmean(simulated**2, axis=0)) / np.maximum(np.sqrt(np.nanmean(y**2, axis=0)), SMALLEST)
     far = (levels > OTHER_LEVEL) | (levels < 1.0 / OTHER_LEVEL)
     far &= fit.deviations > UNEXPLAINED * np.nanstd(y, axis=0)
-    far &= judged & (problem.plant.has_levels | _shares(problem, fit.deviations)[1])
+    far &= judged & (level | _shares(problem, fit.deviations)[1])
     if far.any():
-        names = [name for name, wrong in zip(problem.output_names, far, strict=True) if wrong]
-        told = ", ".join(
-            f"{problem.output_names[i]}: {1.0 / levels[i]:.3g} times what the model says" for i in np.flatnonzero(far)
-        )
+        told = ", ".join(f"{names[i]}: {1.0 / levels[i]:.3g} times what the model says" for i in np.flatnonzero(far))
         raise refused(
             "explains-nothing",
             f"The model cannot follow the log: {told}. Check units and scales (a factor of 1000?).",
-            signals=names,
+            signals=[names[i] for i in np.flatnonzero(far)],
         )
 
 
