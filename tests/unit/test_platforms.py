@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,6 @@ from obsynth.numerics.sparse_factor import residual_in_twice_the_digits
 
 ROOT = Path(__file__).parents[2]
 SOURCE = ROOT / "src" / "obsynth"
-TREES = {file: ast.parse(file.read_text(encoding="utf-8")) for file in sorted(SOURCE.rglob("*.py"))}
 #: Modules of Unix alone.
 UNIX = {"fcntl", "grp", "pty", "pwd", "resource", "termios", "tty"}
 #: What only some systems have in `os` and `signal`; by getattr, or with hasattr before, they may be asked for.
@@ -25,6 +25,11 @@ UNIX_NAMES = {
 }  # fmt: skip
 #: Types that are of other sizes elsewhere; on Windows and on Apple's ARM a long double is a double.
 SIZES = {"longdouble", "clongdouble", "float96", "float128", "complex256", "int_", "uint", "long", "ulong"}
+
+
+@cache
+def trees() -> dict[Path, ast.AST]:
+    return {file: ast.parse(file.read_text(encoding="utf-8")) for file in sorted(SOURCE.rglob("*.py"))}
 
 
 def calls(tree: ast.AST) -> Iterator[tuple[ast.Call, str]]:
@@ -100,7 +105,7 @@ def processes(tree: ast.AST) -> Iterator[str]:
 
 @pytest.mark.parametrize("rule", [text_files, unix_alone, other_sizes, processes], ids=lambda rule: rule.__name__)
 def test_src_holds_nothing_that_differs(rule: Callable[[ast.AST], Iterator[str]]) -> None:
-    found = [f"{file.relative_to(SOURCE)}:{told}" for file, tree in TREES.items() for told in rule(tree)]
+    found = [f"{file.relative_to(SOURCE)}:{told}" for file, tree in trees().items() for told in rule(tree)]
     assert not found, "\n".join(found)
 
 
