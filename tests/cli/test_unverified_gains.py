@@ -120,3 +120,23 @@ def test_proved_never_stands_beside_fails(folder: Path, capsys: pytest.CaptureFi
     assert "never forget" in page
     assert "time constant -" not in page
     assert not re.search(r"FAILS\s+(\(?proved)", page)
+
+
+def test_a_file_that_has_changed_is_verified_afresh(folder: Path) -> None:
+    """Under the same name, after it was found to hold: with other gains, and with a single number changed."""
+    from obsynth.results.gain_sets import digest_of
+
+    words = ["export", "--gains", "wrong.gains.json", "--to", "out.npz", "--force"]
+    obsynth.fault_estimation_filter(failing().plant).save("wrong.gains.json")
+    good = Path("wrong.gains.json").read_bytes()
+    assert [main(words), main(words)] == [0, 0]
+    failing().save("wrong.gains.json")
+    assert main(words) == 6
+    content = json.loads(good)
+    stored = content["design"]["observer"]["Az"]["data"]
+    stored[0] *= 1.0 + 1e-6
+    content["sha256"] = digest_of(content["design"])
+    Path("wrong.gains.json").write_text(json.dumps(content))
+    assert main(words) == 6
+    Path("wrong.gains.json").write_bytes(good)
+    assert main(words) == 0

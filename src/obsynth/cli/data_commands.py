@@ -21,7 +21,7 @@ from obsynth.cli.data_run import (
     run_of,
     summary_of_run,
 )
-from obsynth.cli.output import answer, gains_to_hand_on, output_file, print_json
+from obsynth.cli.output import answer, gains_to_hand_on, output_file, print_json, verified_again
 from obsynth.errors import SpecError, VerificationError
 from obsynth.files.outputs import FileKind, require_distinct, write_atomically
 
@@ -147,23 +147,19 @@ def run_prove_alarm(options: argparse.Namespace) -> int:
 
 def run_report(options: argparse.Namespace) -> int:
     """Run ``report``: gain set in, verified again, one HTML page out."""
-    from obsynth.methods.verifying import verify
-    from obsynth.results.gain_sets import load
-
     require_distinct({"--gains": options.gains, "--system": options.system, "--out": options.out})
     if options.out.suffix.lower() == ".json":
         return _run_robustness(options)
     if options.data is None:
         own = ("gains", "unverified", "system", "out", "force", "json")
         refuse_given(options, [name for name in vars(options) if name not in own], "a log: give --data")
-    design = load(options.gains)
     from obsynth.report.page import PAGE, html_report
     from obsynth.spec import load_spec
 
     scenario = None if options.system is None else required_scenario(load_spec(options.system))
     system = None if options.system is None else str(options.system)
     output_file(options.out, PAGE, options)
-    report = verify(design)
+    design, report = verified_again(options.gains)
     design = design if report.passed else design.replace(report=report)
     run, watched = None, None
     if options.data is not None:

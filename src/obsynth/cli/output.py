@@ -17,6 +17,7 @@ from obsynth.files.outputs import FileKind, check_output, check_replaceable
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from obsynth.results.checks import VerificationReport
     from obsynth.results.design import ObserverDesign
 
 
@@ -61,15 +62,21 @@ def print_json(data: Any, *, is_plain: bool = False) -> None:
     print(json.dumps(data if is_plain else plain(data), indent=1, allow_nan=False))
 
 
-def gains_to_hand_on(path: Path, *, unverified: bool) -> tuple[ObserverDesign, str]:
-    """Return a saved design verified again, and the mark of one that fails; `VerificationError` unless that is wanted.
-    A file's digest is no signature, and its report may be edited like all else: only a new one counts."""
-    from obsynth.methods.handing_on import require_verified, unverified_mark
+def verified_again(path: Path) -> tuple[ObserverDesign, VerificationReport]:
+    """Return a saved design, and what its verification says now."""
     from obsynth.methods.verifying import verify
     from obsynth.results.gain_sets import load
 
     design = load(path)
-    report = verify(design)
+    return design, verify(design)
+
+
+def gains_to_hand_on(path: Path, *, unverified: bool) -> tuple[ObserverDesign, str]:
+    """Return a saved design verified again, and the mark of one that fails; `VerificationError` unless that is wanted.
+    A file's digest is no signature, and its report may be edited like all else: only a new one counts."""
+    from obsynth.methods.handing_on import require_verified, unverified_mark
+
+    design, report = verified_again(path)
     mark = unverified_mark(report)
     if not mark:
         return design, ""
