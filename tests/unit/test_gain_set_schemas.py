@@ -56,6 +56,8 @@ def test_elimination_sampling_and_recovery_are_done_again(smib):
     assert "plant as written" in failures(smib.replace(source=PlantSource(written.replace(A=a), 0.02)))
     assert "plant as written" in failures(smib.replace(source=PlantSource(written, 0.021)))
     assert "plant as written" in failures(smib.replace(source=PlantSource(written, None)))
+    exact = dataclasses.replace(smib.plant.exact, computed=not smib.plant.exact.computed)
+    assert "plant as written" in failures(smib.replace(plant=smib.plant.replace(exact=exact)))
     recovery = smib.recovery
     moved = np.array(recovery.from_state)
     row = next(i for i, name in enumerate(recovery.names) if name not in smib.plant.state_names and moved[i].any())

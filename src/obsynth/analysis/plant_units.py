@@ -16,7 +16,6 @@ from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.numerics.scaling import LogBalance
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.fault_models import Exosystem
-from obsynth.plants.origin import origin_of
 
 #: Given units in which the natural factors differ by more than this are no units to design in.
 FAR_UNITS = 256.0
@@ -166,8 +165,8 @@ def _units_of(plant: DescriptorSystem) -> PlantUnits:
 
 def sized_plant(plant: DescriptorSystem) -> DescriptorSystem | None:
     """Return the plant with the sizes of the terms of its entries in their place; ``None`` where there are none."""
-    origin = origin_of(plant)
-    return None if origin is None or origin.sizes is None else plant.replace(**origin.sizes)
+    exact = plant.exact
+    return None if exact is None or exact.sizes is None else plant.replace(**exact.sizes)
 
 
 def _inverse_sizes(*parts: FloatArray) -> FloatArray:

@@ -11,7 +11,6 @@ from obsynth.methods.registry import REGISTRY, method_class
 from obsynth.numerics.libraries import failed_computations, one_thread_if_small
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.results.checks import VerificationReport
-from obsynth.results.plant_source import remembering
 from obsynth.verification.claims import before_the_mean, closed_claims, mean_noise_rows
 from obsynth.verification.error_system import error_model_row
 from obsynth.verification.plant import derivation_rows
@@ -53,7 +52,6 @@ def verify(design: ObserverDesign, *, printed_digits: int | None = None) -> Veri
     method = method_class(design.method)
     # A corrupted design may overflow; what is not a number fails its check, so no warning is needed.
     with np.errstate(all="ignore"), failed_computations(), one_thread_if_small(design.plant.nx):
-        remembering(design.plant, design.source)
         shipped, (design, mean_rows) = design, before_the_mean(design) if method.averaged else (design, ())
         rows = (*mean_rows, *method.checks(design, printed_digits))
         tracked = isinstance(design.observer, LinearObserver) and method.has_error_model(design)

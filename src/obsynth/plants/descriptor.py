@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.numerics.sparse import as_sparse_matrix, dense, is_sparse, same_matrix
-from obsynth.plants.origin import carry_origin
+from obsynth.plants.exact_numbers import DECISIVE, ExactNumbers, carry_source
 from obsynth.plants.uncertainty import UNCERTAIN_MATRICES, Uncertainty, uncertainty_of
 from obsynth.plants.validation import (
     COUNTED_BY,
@@ -287,6 +287,9 @@ class DescriptorSystem:
         Standard deviation of the noise of named outputs, per sample: adds a column to ``Dw`` for each.
     uncertainty : Uncertainty, optional
         Constants with tolerances in the matrices, see `obsynth.uncertain_system`.
+    exact : ExactNumbers, optional
+        Rational numbers that the matrices were rounded from, on which existence is decided; elimination and sampling
+        give them, and `as_dict` has them as data.
 
     Raises
     ------
@@ -323,6 +326,7 @@ class DescriptorSystem:
     scales: Mapping[str, float]
     units: Mapping[str, str]
     uncertainty: Uncertainty | None
+    exact: ExactNumbers | None
 
     def __init__(
         self,
@@ -350,6 +354,7 @@ class DescriptorSystem:
         units: Mapping[str, str] | None = None,
         sensor_noise: Mapping[str, float] | None = None,
         uncertainty: Uncertainty | Mapping[str, Any] | None = None,
+        exact: ExactNumbers | Mapping[str, Any] | None = None,
     ) -> None:
         if A is None:
             raise SpecError("A is missing: give the matrix (nx, nx) of the dynamics.", path="A")
@@ -366,8 +371,11 @@ class DescriptorSystem:
             asked, names, dt=dt, operating_point=operating_point, scales=scales, units=units, sensor_noise=sensor_noise
         )
         values["uncertainty"] = uncertainty_of(uncertainty)
+        values["exact"] = ExactNumbers.from_dict(exact) if isinstance(exact, Mapping) else exact
         for field, value in values.items():
             object.__setattr__(self, field, read_only(value) if isinstance(value, np.ndarray) else value)
+        if self.exact is not None and self.exact is not exact:
+            self.exact.require_of(self)
 
     @property
     def nx(self) -> int:
@@ -422,23 +430,24 @@ class DescriptorSystem:
         return self.dt > 0.0
 
     def as_dict(self) -> dict[str, Any]:
-        """Return every field, as the constructor takes it; `uncertainty` only where there is one."""
-        found = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "uncertainty"}
-        return found if self.uncertainty is None else {**found, "uncertainty": self.uncertainty.as_dict()}
+        """Return every field, as the constructor takes it; `uncertainty` and `exact` only where there are such."""
+        found = {field.name: getattr(self, field.name) for field in fields(self)}
+        records = {name: found.pop(name) for name in ("uncertainty", "exact")}
+        return found | {name: record.as_dict() for name, record in records.items() if record is not None}
 
     def replace(self, **changes: Any) -> DescriptorSystem:
         """Return a plant with some fields changed, checked again as a whole.
 
-        Tolerances are those of the matrices as they were: with a change of one of these they are left behind, and
-        whatever would use them refuses (``uncertainty=None`` says that the model is exact).  Units and other labels of
-        signals that are gone, such as those of ``disturbance_names=None``, go with them.
+        Tolerances and exact numbers are those of the matrices as they were: with a change of one of these they are
+        left behind, and whatever would use tolerances refuses (``uncertainty=None`` says that the model is exact).
+        Units and other labels of signals that are gone, such as those of ``disturbance_names=None``, go with them.
 
         Parameters
         ----------
         **changes
             Any argument of the constructor.
         """
-        kept = self.as_dict()
+        kept = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "exact"}
         gone = {name for field in SIGNAL_NAMES if field in changes for name in getattr(self, field)}
         gone -= {name for field in SIGNAL_NAMES for name in (changes[field] or () if field in changes else kept[field])}
         for label in ("operating_point", "scales", "units"):
@@ -453,7 +462,11 @@ class DescriptorSystem:
             if moved or self.dt != new.dt:
                 what = f"{', '.join(moved or ['dt'])} {'were' if len(moved) > 1 else 'was'} changed"
                 object.__setattr__(new, "uncertainty", self.uncertainty.left_behind(what))
-        return carry_origin(self, new)
+        carry_source(self, new)
+        same = self.dt == new.dt and all(same_matrix(getattr(self, name), getattr(new, name)) for name in DECISIVE)
+        if same and "exact" not in changes:
+            object.__setattr__(new, "exact", self.exact)
+        return new
 
     def __repr__(self) -> str:
         time = f"dt={self.dt:g} s" if self.is_discrete else "continuous"

@@ -3,24 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from obsynth.errors import ObsynthError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.origin import DECISIVE, origin_of, with_origin
 
 if TYPE_CHECKING:
     from obsynth.analysis.transformations.recovery import Transformation
 
 #: Larger plants are not stored: their elimination is checked where it is done.
 MOST_STORED_STATES = 500
-#: Most states of a plant behind which there are exact numbers.
-MOST_EXACT = 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +41,7 @@ class PlantSource:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the source as data: matrices by their entries that are not zero."""
-        values = {field.name: getattr(self.plant, field.name) for field in fields(self.plant)}
+        values = self.plant.as_dict()
         values.pop("uncertainty", None)
         matrices = {name: _entries(value) for name, value in values.items() if isinstance(value, np.ndarray)}
         others = {name: value for name, value in values.items() if name not in matrices}
@@ -81,18 +77,3 @@ def source_of(plant: Any) -> PlantSource | None:
     if made is None or type(made[0]) is not DescriptorSystem or made[0].nx > MOST_STORED_STATES:
         return None
     return PlantSource(made[0], made[1])
-
-
-def remembering(plant: Any, source: PlantSource | None) -> None:
-    """Note on a plant that was read from a file the exact numbers behind it, where its source still gives it."""
-    if source is None or type(plant) is not DescriptorSystem or origin_of(plant) is not None:
-        return
-    if source.plant.nx > MOST_EXACT:
-        return
-    try:
-        found = source.derived().plant
-    except ObsynthError:
-        return
-    same = all(np.array_equal(getattr(found, name), getattr(plant, name)) for name in DECISIVE)
-    if same and found.dt == plant.dt:
-        with_origin(plant, origin_of(found))

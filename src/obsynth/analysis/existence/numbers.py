@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from obsynth.analysis.existence.rational import PlantNumbers, SystemFacts, WrittenNumbers
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.origin import DECISIVE, origin_of
+from obsynth.plants.exact_numbers import DECISIVE
 
 if TYPE_CHECKING:
     from flint import fmpq_mat
@@ -211,8 +211,8 @@ def numbers_of(plant: DescriptorSystem) -> PlantNumbers | None:
     """Return the numbers on which existence is decided; ``None`` where it is decided in floating point."""
     if not _EXACTLY.get() or plant.nx > EXACT_STATES:
         return None
-    origin, cleaned = origin_of(plant), _CLEANED.get()
-    if cleaned is not None and origin is not None and origin.uncleaned is not None:
+    exact, cleaned = plant.exact, _CLEANED.get()
+    if cleaned is not None and exact is not None and exact.uncleaned is not None:
         cleaned.append(plant)
     return _numbers_of(_Content.of(plant), _UNCLEANED.get())
 
@@ -227,9 +227,8 @@ class _Content:
     @classmethod
     def of(cls, plant: DescriptorSystem) -> _Content:
         plant = plant.dense()
-        origin = origin_of(plant)
         numbers = (getattr(plant, name) for name in DECISIVE)
-        made = None if origin is None else (origin.sample_time, origin.computed)
+        made = None if plant.exact is None else plant.exact.content
         return cls(plant, (plant.dt, made, *((matrix.shape, matrix.tobytes()) for matrix in numbers)))
 
     def __hash__(self) -> int:
@@ -245,17 +244,17 @@ def _numbers_of(content: _Content, uncleaned: bool) -> PlantNumbers | None:
     plant = content.plant
     from obsynth.proofs.exact_arithmetic import holds_computed, rational_matrix, written_matrix
 
-    origin = origin_of(plant)
-    if origin is not None:
-        rows = origin.uncleaned if uncleaned and origin.uncleaned is not None else origin.exact
+    if plant.exact is not None:
+        known = plant.exact.before_cleaning() if uncleaned else plant.exact
+        rows = known.matrices
         states = len(rows["A"])
         sizes = {"E": states, "A": states, "C": states, "Bf": plant.nf, "Df": plant.nf, "Bd": plant.nd, "Dd": plant.nd}
         exact = {name: rational_matrix(rows[name], sizes[name]) for name in DECISIVE}
-        if origin.sample_time is None:
-            written = WrittenNumbers(exact, plant.is_discrete, computed=origin.computed)
-            return written if states <= (COMPUTED_STATES if origin.computed else EXACT_STATES) else None
-        sampled = sampled_numbers(exact, origin.sample_time) if states <= SAMPLED_STATES else None
-        return None if sampled is None else replace(sampled, computed=origin.computed)
+        if known.sample_time is None:
+            written = WrittenNumbers(exact, plant.is_discrete, computed=known.computed)
+            return written if states <= (COMPUTED_STATES if known.computed else EXACT_STATES) else None
+        sampled = sampled_numbers(exact, known.sample_time) if states <= SAMPLED_STATES else None
+        return None if sampled is None else replace(sampled, computed=known.computed)
     computed = any(holds_computed(getattr(plant, name)) for name in DECISIVE)
     if computed and plant.nx > COMPUTED_STATES:
         return None

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from obsynth.analysis.existence.numbers import uncleaned
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.exact_numbers import DECISIVE, ExactNumbers
 from obsynth.plants.fault_models import Exosystem
-from obsynth.plants.origin import DECISIVE, PlantOrigin, origin_of, with_origin
 from obsynth.proofs.exact_arithmetic import written_fraction
 
 #: At most so many changes are listed.
@@ -87,7 +87,7 @@ class Witness:
                 exact[change.matrix][change.row, change.column] = change.after
         doubles = {name: nearest(matrix) for name, matrix in exact.items()}
         rows = {name: tuple(map(tuple, matrix.tolist())) for name, matrix in exact.items()}
-        return with_origin(plant.replace(**doubles), PlantOrigin(rows))
+        return plant.replace(**doubles, exact=ExactNumbers(rows))
 
     def model(self, model: Exosystem) -> Exosystem:
         """Return the changed fault model, rounded."""
@@ -120,24 +120,20 @@ class Unclear:
 
 
 def _kind(plant: DescriptorSystem) -> str:
-    origin = origin_of(plant)
-    if origin is None:
+    exact = plant.exact
+    if exact is None:
         return "plant"
-    if origin.sample_time is not None:
+    if exact.sample_time is not None:
         return "sampled plant"
-    return "plant without its algebraic states" if plant.nx < origin.states else "plant"
+    return "plant without its algebraic states" if plant.nx < exact.states else "plant"
 
 
 def rational_matrices(plant: DescriptorSystem) -> dict[str, Rational]:
     """Return the decisive matrices of a plant in its own coordinates, as written, or as they were rounded."""
-    origin = origin_of(plant)
-    if origin is not None and origin.sample_time is None and origin.uncleaned is not None and uncleaned():
-        return {name: as_array(origin.uncleaned[name], getattr(plant, name).shape) for name in DECISIVE}
-    if origin is not None and origin.sample_time is None:
-        exact = {name: as_array(origin.exact[name], getattr(plant, name).shape) for name in DECISIVE}
-        # Dynamic states that are combinations of those given were changed to others since.
-        if all(np.array_equal(nearest(exact[name]), getattr(plant, name)) for name in DECISIVE):
-            return exact
+    exact = plant.exact
+    if exact is not None and exact.sample_time is None and exact.own:
+        rows = (exact.before_cleaning() if uncleaned() else exact).matrices
+        return {name: as_array(rows[name], getattr(plant, name).shape) for name in DECISIVE}
     return {name: rational(getattr(plant, name)) for name in DECISIVE}
 
 

@@ -24,7 +24,7 @@ from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, rounding_rank
 from obsynth.numerics.scaling import equilibrate_pencil, power_of_two_below
 from obsynth.numerics.sparse import is_sparse
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.origin import note_source, with_origin
+from obsynth.plants.exact_numbers import note_source
 from obsynth.plants.uncertainty import ELIMINATED
 from obsynth.proofs.exact_arithmetic import holds_computed
 
@@ -158,7 +158,7 @@ def eliminated_exactly(plant: DescriptorSystem, basis: FloatArray | None = None)
     if not whole and basis is None:
         basis = _coordinates(plant, count)[1]
     matrices, states, sizes = rounded_once(exact, plant, None if whole else basis)
-    new = with_states(plant, names, E=None, **matrices)
+    new = with_states(plant, names, E=None, **matrices, exact=exact.numbers(sizes, own=whole))
     recovery = StateRecovery(
         plant.state_names,
         states["A"],
@@ -169,7 +169,7 @@ def eliminated_exactly(plant: DescriptorSystem, basis: FloatArray | None = None)
         np.eye(plant.nw),
         state_point(plant),
     )
-    return Transformation(plant, with_origin(new, exact.origin(sizes)), _description(plant, count), recovery)
+    return Transformation(plant, new, _description(plant, count), recovery)
 
 
 def dynamic_coordinates(plant: DescriptorSystem) -> FloatArray | None:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,7 +16,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import zero_order_hold
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.origin import DECISIVE, PlantOrigin, origin_of
+from obsynth.plants.exact_numbers import DECISIVE, ExactNumbers
 
 if TYPE_CHECKING:
     from flint import fmpq_mat
@@ -42,8 +41,8 @@ class ExactElimination:
     sizes: Mapping[str, FloatArray]  # of ``matrices``, the sums of the sizes of all terms
     uncleaned: Mapping[str, fmpq_mat] | None = None  # ``matrices`` before what may be rounding was set to zero
 
-    def origin(self, sizes: Mapping[str, FloatArray]) -> PlantOrigin:
-        """Return what the reduced plant remembers of it, with the sizes of the terms in its own coordinates."""
+    def numbers(self, sizes: Mapping[str, FloatArray], *, own: bool) -> ExactNumbers:
+        """Return those of the reduced plant, with the sizes of the terms in its coordinates; ``own``: these ones."""
         from obsynth.proofs.exact_arithmetic import fractions_of, identity
 
         found: dict[str, fmpq_mat] = {"E": identity(len(self.pivots)), **self.matrices}
@@ -51,8 +50,9 @@ class ExactElimination:
         known = all(np.all(np.isfinite(part)) for part in kept.values())
         exact = {name: fractions_of(found[name]) for name in DECISIVE}
         before = None if self.uncleaned is None else {"E": found["E"], **self.uncleaned}
-        return PlantOrigin(
+        return ExactNumbers(
             exact,
+            own=own,
             computed=self.computed,
             sizes=kept if known else None,
             states=int(self.recovery["A"].nrows()),
@@ -64,7 +64,7 @@ def exact_elimination(plant: DescriptorSystem) -> ExactElimination | None:
     """Return the elimination; ``None`` for too many states, or where no state can be eliminated so."""
     from obsynth.proofs.exact_arithmetic import holds_computed
 
-    if plant.nx > MOST_STATES_EXACTLY or origin_of(plant) is not None:
+    if plant.nx > MOST_STATES_EXACTLY or plant.exact is not None:
         return None
     computed = any(holds_computed(getattr(plant, name)) for name in ("E", "A", "C", *_SIGNALS, *_DIRECT))
     found = _eliminated(plant, clean=computed)
@@ -247,18 +247,16 @@ def _split(matrix: fmpq_mat, widths: list[int]) -> list[fmpq_mat]:
     return found
 
 
-def sampled_origin(smooth: DescriptorSystem, sample_time: float) -> PlantOrigin:
-    """Return what a plant that is sampled from one with ``E = I`` remembers."""
+def sampled_exact_numbers(smooth: DescriptorSystem, sample_time: float) -> ExactNumbers:
+    """Return the exact numbers behind a plant that is sampled from one with ``E = I``."""
     from obsynth.proofs.exact_arithmetic import holds_computed, written_fraction, written_rows
 
-    origin = origin_of(smooth)
-    exact: Mapping[str, tuple[tuple[Fraction, ...], ...]] = (
-        origin.exact if origin is not None else {name: written_rows(getattr(smooth, name)) for name in DECISIVE}
-    )
-    computed = origin.computed if origin else any(holds_computed(getattr(smooth, name)) for name in DECISIVE)
-    sizes = None if origin is None or origin.sizes is None else _sampled_sizes(smooth, origin.sizes, sample_time)
-    uncleaned = None if origin is None else origin.uncleaned
-    return PlantOrigin(exact, written_fraction(sample_time), computed, sizes, uncleaned=uncleaned)
+    step, known = written_fraction(sample_time), smooth.exact
+    if known is None:
+        computed = any(holds_computed(getattr(smooth, name)) for name in DECISIVE)
+        return ExactNumbers({name: written_rows(getattr(smooth, name)) for name in DECISIVE}, step, computed=computed)
+    sizes = None if known.sizes is None else _sampled_sizes(smooth, known.sizes, sample_time)
+    return replace(known, sample_time=step, sizes=sizes, states=0)
 
 
 def _sampled_sizes(

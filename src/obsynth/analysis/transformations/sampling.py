@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from obsynth.analysis.transformations.elimination import columns_of, eliminate_algebraic_states
-from obsynth.analysis.transformations.exact_elimination import MOST_STATES_EXACTLY, sampled_origin
+from obsynth.analysis.transformations.exact_elimination import MOST_STATES_EXACTLY, sampled_exact_numbers
 from obsynth.analysis.transformations.recovery import Transformation, unchanged_states
 from obsynth.analysis.zeros import fault_zeros
 from obsynth.errors import PreconditionError, SpecError
@@ -19,7 +19,7 @@ from obsynth.numerics.ranks import CANCELLATION_TOLERANCE
 from obsynth.numerics.scaling import balanced_matrix, power_of_two_below
 from obsynth.numerics.sparse import dense
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.origin import note_source, with_origin
+from obsynth.plants.exact_numbers import note_source
 from obsynth.plants.uncertainty import SAMPLED
 
 #: Fault zeros of a sampled plant between this radius and 1 make the fault estimate ring for long.
@@ -84,8 +84,8 @@ def discretise(plant: DescriptorSystem | Transformation, sample_time: float) -> 
     Bw = np.hstack([factor, np.zeros((smooth.nx, len(kept)))])
     Dw = np.hstack([np.zeros((smooth.ny, factor.shape[1])), smooth.Dw[:, direct]])
     changes = {"A": transition, "B": B, "Bf": Bf, "Bd": Bd, "Bw": Bw, "Dw": Dw}
-    sampled = smooth.replace(**changes, dt=float(sample_time), noise_names=noise_names)
-    sampled = with_origin(sampled, sampled_origin(smooth, sample_time)) if smooth.nx <= MOST_STATES_EXACTLY else sampled
+    exact = sampled_exact_numbers(smooth, sample_time) if smooth.nx <= MOST_STATES_EXACTLY else None
+    sampled = smooth.replace(**changes, dt=float(sample_time), noise_names=noise_names, exact=exact)
     noise_kept = np.hstack([np.zeros((smooth.nw, factor.shape[1])), np.eye(smooth.nw)[:, direct]])
     recovery = unchanged_states(smooth, sampled, from_state=np.eye(smooth.nx), noise_kept=noise_kept)
     description = f"sampled every {sample_time:g} s (zero-order hold)"

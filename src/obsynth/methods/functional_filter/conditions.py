@@ -21,7 +21,6 @@ from obsynth.analysis.plant_units import PlantUnits
 from obsynth.methods.functional_filter.wanted_faults import chosen_faults, residual_sets
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.fault_models import Exosystem, exosystem
-from obsynth.plants.origin import origin_of
 
 _SOURCE = "left null space of [A - sE, Bd, Bf; C, Dd, Df]"
 
@@ -100,7 +99,7 @@ def _may_show(asked: Question, point: complex | None = None) -> bool:
     if not asked.clear:
         return True
     plant = asked.source
-    if plant.nx + plant.nd + plant.nf > COMPUTED_STATES or origin_of(plant) is not None:
+    if plant.nx + plant.nd + plant.nf > COMPUTED_STATES or plant.exact is not None:
         return False
     exact = question(plant, asked.removed, asked.number, True)
     return exact.visible if point is None else exact.shows_at(point)

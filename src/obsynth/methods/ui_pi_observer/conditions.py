@@ -77,7 +77,6 @@ from obsynth.numerics.ranks import RANK_TOLERANCE, RankDecision, decide_rank
 from obsynth.numerics.scaling import equilibrate_pencil
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.fault_models import Exosystem
-from obsynth.plants.origin import origin_of
 
 
 def model_conditions(
@@ -374,7 +373,7 @@ def _eliminated(plant: DescriptorSystem) -> Transformation:
     if found is not None:
         return found
     found = eliminate_algebraic_states(plant)
-    if origin_of(found.plant) is not None:
+    if found.plant.exact is not None:
         return found
     exact = units.rounded()
     found = eliminate_algebraic_states(exact.scaled_plant(plant))
@@ -415,7 +414,7 @@ def _in_given_units(found: Transformation, plant: DescriptorSystem, units: Plant
 def _without_rounding(transformation: Transformation) -> Transformation:
     """Set to zero what elimination left of a direct effect that is none: a rank decision would take it for one."""
     plant = transformation.plant
-    if origin_of(plant) is not None:
+    if plant.exact is not None:
         return transformation  # rounded once: what is zero is zero
     # What may be rounding must have no say in the units in which it is judged.
     units = PlantUnits.of(plant.replace(Dd=np.zeros_like(plant.Dd), Df=np.zeros_like(plant.Df)))
