@@ -6,6 +6,7 @@ space of the whole.  The pencil must come balanced; balancing again on the way w
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +18,8 @@ from obsynth.numerics.scaling import LogBalance, equilibrate_pencil, power_of_tw
 
 #: Pencils of more columns are of plants of many parts, whose couplings outnumber what each part is made of.
 BY_LEAST_SQUARES = 40
+#: Columns that LAPACK turns at once: its room is so many times the columns.
+BLOCK = 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,16 +118,7 @@ def _without_zeros(
         decision = rank_from(values, expected=min(c.shape), scale=size)
         decisions.append(decision)
         hidden = basis[decision.rank :].T
-    while hidden.shape[1]:
-        span = np.linalg.qr(e @ hidden)[0]
-        leaving = a @ hidden
-        leaving = leaving - span @ (span.T @ leaving)
-        _, values, basis = full_svd(leaving)
-        decision = rank_from(values, expected=hidden.shape[1], scale=size)
-        decisions.append(decision)
-        if decision.rank == 0:
-            break
-        hidden = np.linalg.qr(hidden @ basis[decision.rank :].T)[0]
+    hidden = _invariant(e, a, hidden, size, decisions)
     count = hidden.shape[1]
     if count == 0:
         nothing = np.zeros((0, 0))
@@ -143,6 +137,48 @@ def _without_zeros(
         zero @ a @ hidden,
         tuple(decisions),
     )
+
+
+def _invariant(
+    e: FloatArray, a: FloatArray, hidden: FloatArray, size: float, decisions: list[RankDecision]
+) -> FloatArray:
+    """Return the largest part V of a space ``(k, h)``, orthonormal, with ``a V`` within ``e V``.
+
+    In coordinates of the space and of ``e V`` only what leaves is factored; each step turns both by reflections."""
+    from scipy.linalg.lapack import dgeqrf, dormqr
+
+    count = hidden.shape[1]
+    rows, square = np.linalg.qr(e @ hidden, mode="complete")
+    turned = rows.T @ (a @ hidden)
+    moving, staying, leaving = square[:count], turned[:count], turned[count:]
+    while count:
+        left, values, right = np.linalg.svd(leaving, full_matrices=False)
+        # What has no row of its own is zero but for the rounding of what it is the rest of.
+        shown = values if len(leaving) >= count else np.append(values, np.finfo(np.float64).eps * size)
+        decision = rank_from(shown, expected=count, scale=size)
+        decisions.append(decision)
+        rank, count = decision.rank, count - decision.rank
+        if rank == 0:
+            break
+        turn = _reflection(right[:rank].T)
+        hidden, moving, staying = (turn(part)[:, rank:] for part in (hidden, moving, staying))
+        kept = turn(left[:, rank:].T @ leaving)[:, rank:]
+        if count:
+            packed, factors, _, _ = dgeqrf(moving)
+            moving, staying = np.triu(packed[:count]), dormqr("L", "T", packed, factors, staying, BLOCK * count)[0]
+        leaving, staying = np.vstack([kept, staying[count:]]), staying[:count]
+    return hidden
+
+
+def _reflection(basis: FloatArray) -> Callable[[FloatArray], FloatArray]:
+    """Return what turns rows so that the span of an orthonormal basis ``(n, r)`` comes first (block reflector)."""
+    count = basis.shape[1]
+    left, values, right = np.linalg.svd(basis[:count])
+    # [Schreiber, Parlett 1988]: the polar factor's sign that nothing cancels with.
+    across = basis.copy()
+    across[:count] += left @ right
+    inner = right.T @ ((right @ across.T) / (1.0 + values)[:, None])
+    return lambda matrix: matrix - (matrix @ across) @ inner
 
 
 def finite_values(left: LeftPart) -> ComplexArray:

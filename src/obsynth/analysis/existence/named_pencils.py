@@ -9,7 +9,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from math import isqrt
+from functools import cached_property
+from math import isqrt, lcm
 
 import numpy as np
 
@@ -57,15 +58,33 @@ class NamedPencil:
         terms = None if self.terms is None else self.terms.T
         return NamedPencil(self.A.T, self.E.T, self.owners.T, self.columns, self.rows, terms)
 
+    @cached_property
+    def _doubles(self) -> tuple[FloatArray, FloatArray]:
+        """A and E, rounded."""
+        return nearest(self.A), nearest(self.E)
+
+    @cached_property
+    def _whole(self) -> tuple[_WholeRows, _WholeRows]:
+        """A and E in whole numbers."""
+        return _WholeRows.of(self.A), _WholeRows.of(self.E)
+
+    @cached_property
+    def _weights(self) -> FloatArray:
+        """How much rather an entry is changed than others ``(m, n)``, zero for those that are no data."""
+        names = [0.0 if owner is None else STRUCTURE if owner[0] == "E" else 1.0 for owner in self.owners.ravel()]
+        known: FloatArray = np.where(self.A != 0, KNOWN_ENTRY, 1.0) * np.reshape(names, self.A.shape)
+        return known
+
     def witness(
         self, tolerance: float, point: complex | None = None, *, dt: float | None = None, last: bool = False
     ) -> Witness | None:
         """Return a plant for which this loses column rank at a point: within the tolerance, or the nearest one found.
         With ``dt`` the point may move, but not become stable.  ``last``: the last column is to depend on the others."""
         at = 0j if point is None else complex(point)
-        matrix = nearest(self.A) - (at if at.imag else at.real) * nearest(self.E)
+        a, e = self._doubles
+        matrix = a - (at if at.imag else at.real) * e
         # Of the terms, not of what is left of them: at a point that rounding has moved off a mode that is nothing.
-        sizes = (np.abs(nearest(self.A)) if self.terms is None else self.terms) + abs(at) * np.abs(nearest(self.E))
+        sizes = (np.abs(a) if self.terms is None else self.terms) + abs(at) * np.abs(e)
         scaled = self.rows[:, None] * sizes * self.columns
         pencil = equilibrate_pencil(np.zeros_like(scaled), scaled)
         rows, columns = self.rows * pencil.rows, self.columns * pencil.columns
@@ -89,7 +108,8 @@ class NamedPencil:
 
     def last_share(self, point: complex) -> float:
         """Return how much of the last column no combination of the others makes, beside the terms it is made of."""
-        matrix = nearest(self.A) - (point if point.imag else point.real) * nearest(self.E)
+        a, e = self._doubles
+        matrix = a - (point if point.imag else point.real) * e
         whole = self.rows[:, None] * matrix * self.columns
         sizes = np.abs(whole) if self.terms is None else self.rows[:, None] * self.terms * self.columns
         left, values, _ = np.linalg.svd(whole[:, :-1], full_matrices=False)
@@ -105,10 +125,10 @@ class NamedPencil:
         scale = rational(columns)
         real, imaginary = vector[0] * scale, vector[1] * scale
         # (A - s E) v, s = a + b j.
-        of_e = (self.E @ real, self.E @ imaginary)
+        (of_a, of_e) = ([matrix.times(part) for part in (real, imaginary)] for matrix in self._whole)
         rest = (
-            self.A @ real - point[0] * of_e[0] + point[1] * of_e[1],
-            self.A @ imaginary - point[0] * of_e[1] - point[1] * of_e[0],
+            of_a[0] - point[0] * of_e[0] + point[1] * of_e[1],
+            of_a[1] - point[0] * of_e[1] - point[1] * of_e[0],
         )
         weights = np.asarray(vector[0] + 0.0, dtype=float) + 1j * np.asarray(vector[1] + 0.0, dtype=float)
         found, size = list[EntryChange](), 0.0
@@ -128,8 +148,7 @@ class NamedPencil:
         self, i: int, rest: tuple[Fraction, Fraction], vector: tuple[Rational, Rational], weights: ComplexArray
     ) -> list[tuple[int, Fraction]] | None:
         """Return changes of one row or two entries of it that make its product with the vector zero."""
-        own = np.array([0.0 if owner is None else STRUCTURE if owner[0] == "E" else 1.0 for owner in self.owners[i]])
-        known = np.where([value != 0 for value in self.A[i]], KNOWN_ENTRY, 1.0) * own
+        known = self._weights[i]
         scores = known * np.abs(weights)
         j = int(np.argmax(scores))
         if scores[j] == 0.0:
@@ -147,6 +166,35 @@ class NamedPencil:
             (j, -(rest[0] * imaginary[k] - rest[1] * real[k]) / area),
             (k, -(rest[1] * real[j] - rest[0] * imaginary[j]) / area),
         ]
+
+
+@dataclass(frozen=True, eq=False)
+class _WholeRows:
+    """A rational matrix ``(m, n)`` in whole numbers, each row over its own denominator."""
+
+    numerators: Rational
+    denominators: list[int]
+
+    @classmethod
+    def of(cls, matrix: Rational) -> _WholeRows:
+        rows = [_whole_numbers(row) for row in matrix.tolist()]
+        return cls(_objects([row for row, _ in rows], matrix.shape), [denominator for _, denominator in rows])
+
+    def times(self, vector: Rational) -> Rational:
+        """Return the product with a rational vector ``(n,)``."""
+        whole, common = _whole_numbers(vector.tolist())
+        products = zip(self.numerators @ _objects(whole, vector.shape), self.denominators, strict=True)
+        return as_array([[Fraction(value, common * own) for value, own in products]], (len(self.denominators),))
+
+
+def _objects(numbers: Sequence[object], shape: tuple[int, ...]) -> Rational:
+    return np.array(numbers, dtype=object).reshape(shape)
+
+
+def _whole_numbers(values: Sequence[Fraction]) -> tuple[list[int], int]:
+    """Return rational numbers as whole ones over one denominator."""
+    common = lcm(*(value.denominator for value in values))
+    return [value.numerator * (common // value.denominator) for value in values], common
 
 
 def _rounded(vector: ComplexArray | FloatArray, digits: int) -> tuple[Rational, Rational]:
