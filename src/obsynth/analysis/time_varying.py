@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from obsynth.analysis.transformations.recovery import Transformation
 from obsynth.errors import SpecError
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import FloatArray, remembered
 from obsynth.numerics.ranks import RankDecision, decide_rank
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
@@ -71,6 +71,19 @@ def early_rows(plant: TimeVaryingDescriptorSystem, *, early: bool) -> IntArray:
 
 def horizon_ranks(plant: TimeVaryingDescriptorSystem, *, early: bool = False) -> HorizonRanks:
     """Return rank and condition of H_k along the horizon."""
+    known = _ranks_of(plant)
+    if early not in known:
+        known[early] = _horizon_ranks(plant, early=early)
+    return known[early]
+
+
+@remembered
+def _ranks_of(_plant: TimeVaryingDescriptorSystem) -> dict[bool, HorizonRanks]:
+    """Return the cache of the ranks of a plant, with early constraints or not."""
+    return {}
+
+
+def _horizon_ranks(plant: TimeVaryingDescriptorSystem, *, early: bool) -> HorizonRanks:
     late = early_rows(plant, early=early)
     steps = plant.horizon or STEPS_WITHOUT_HORIZON
     if plant.E.is_constant and plant.C.is_constant and (plant.A.is_constant or not late.size):

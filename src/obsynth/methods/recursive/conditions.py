@@ -45,7 +45,7 @@ from obsynth.analysis.time_varying import (
 )
 from obsynth.analysis.zeros import are_outside, leading_names
 from obsynth.errors import SpecError
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import FloatArray, remembered
 from obsynth.numerics.least_squares_step import OUTGROWN, least_squares_step, rank_revealing_step
 from obsynth.numerics.pencils import finite_zeros
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, NAMED_SHARE, RANK_TOLERANCE, RankDecision, decide_rank
@@ -174,7 +174,10 @@ def identifiability_condition(
 ) -> Condition:
     """Return the condition that outputs tell the parameters from each other and from the state."""
     still = all(matrix.is_constant for matrix in (plant.E, plant.A, plant.C, plant.Phi, plant.Psi))
-    decision, kernel = _steady(plant) if still else _along(plant, early=early)
+    known = _traces_of(plant)
+    if early not in known:
+        known[early] = _steady(plant) if still else _along(plant, early=early)
+    decision, kernel = known[early]
     if still and constant is not None:
         decision = constant.settled_traces(decision)
     wanted = "rank [A - E, Phi; C, Psi]" if still else "rank of the traces of all parameters"
@@ -189,6 +192,12 @@ def identifiability_condition(
     if constant is None or decision.means != "unclear":
         return found
     return found.in_doubt(constant.traces_doubt(decision), constant.plant)
+
+
+@remembered
+def _traces_of(_plant: TimeVaryingDescriptorSystem) -> dict[bool, tuple[RankDecision, _Kernel]]:
+    """Return the cache of the traces of a plant's parameters, with early constraints or not."""
+    return {}
 
 
 def _explained(kernel: _Kernel, names: tuple[str, ...], plant: TimeVaryingDescriptorSystem) -> str:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from itertools import chain
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -87,6 +87,26 @@ def gain_steps(
             )
             learn, forget = theta_gain @ seen, np.eye(nq) - theta_gain @ regressor
         yield GainStep(step, gain, parity, G, Upsilon, factor, learn, forget, parameters.spread)
+
+
+#: Gains of the steps of an observer: `gain_steps`, or what remembers them.
+Gains: TypeAlias = Callable[[RecursiveObserver, int], Iterable[GainStep]]
+#: Numbers of gains that are kept for a second look, of twenty megabytes.
+MOST_KEPT = 2**21
+
+
+def gains_once() -> Gains:
+    """Return `gain_steps` for several that look at the same gains, which are computed once if they are few numbers."""
+    known: dict[tuple[RecursiveObserver, int], list[GainStep]] = {}
+
+    def gains(observer: RecursiveObserver, steps: int) -> Iterable[GainStep]:
+        if steps * (observer.plant.nx + observer.plant.nq) * (observer.plant.ne + observer.plant.ny) > MOST_KEPT:
+            return gain_steps(observer, steps)
+        if (observer, steps) not in known:
+            known[observer, steps] = list(gain_steps(observer, steps))
+        return known[observer, steps]
+
+    return gains
 
 
 def run_batch(observer: RecursiveObserver, y: ArrayLike, u: ArrayLike | None = None) -> Estimates:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -13,7 +13,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.norms import spectral_radius
 from obsynth.numerics.ranks import BOUNDARY_TOLERANCE
 from obsynth.observers.recursive.estimates import excitation_levels
-from obsynth.observers.recursive.gain_schedule import gain_steps
+from obsynth.observers.recursive.gain_schedule import Gains, gain_steps
 from obsynth.observers.recursive.observer import RecursiveObserver
 
 #: Errors that shrank below this are gone; the product starts anew from there, so that it does not underflow.
@@ -66,19 +66,17 @@ def looked_at(observer: RecursiveObserver) -> int:
     return max(steps - 1, 1) if observer.early_constraints else steps
 
 
-def gain_schedule_summary(observer: RecursiveObserver) -> GainScheduleSummary:
+def gain_schedule_summary(observer: RecursiveObserver, *, gains: Gains = gain_steps) -> GainScheduleSummary:
     """Return what the gains along the horizon say."""
     steps = looked_at(observer)
     learning = observer.adaptation is not None
     random_walk = observer.form == "random-walk"
     # Of a walk, the state filter and the regressors are those of the model without the walk.
-    plain = observer
-    if observer.adaptation is not None and random_walk:
-        plain = replace(observer, adaptation=replace(observer.adaptation, form="innovation", forgetting=1.0))
+    plain = observer.without_walk
     whole = steps + int(observer.early_constraints)
     product, regressors, last = ErrorProduct(observer.plant.nx, _first_end(observer, whole)), [], None
     kept: Contraction | None = None
-    for found in gain_steps(plain, steps):
+    for found in gains(plain, steps):
         last, kept = found, None
         regressors.append(found.G)
         product.move(found.gain[:, : len(found.step.A)] @ found.step.A)
@@ -93,7 +91,7 @@ def gain_schedule_summary(observer: RecursiveObserver) -> GainScheduleSummary:
     levels = excitation_levels(regressors, window)[window - 1 :]
     deviations, state_deviations = _lengths(last.spread), _lengths(last.factor)
     if random_walk:
-        *_, end = gain_steps(observer, steps)
+        *_, end = gains(observer, steps)
         lengths = _lengths(end.factor)
         state_deviations, deviations = lengths[: observer.plant.nx], lengths[observer.plant.nx :]
     return GainScheduleSummary(

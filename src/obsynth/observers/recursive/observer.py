@@ -6,6 +6,7 @@ A recursive observer from a plant and plain options: used to design one, and to 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -65,6 +66,13 @@ class RecursiveObserver(RecursiveSettings, StepObserver[RecursiveState, RawEstim
     def recursion(self) -> Recursion:
         """What follows from the observer alone, made when it is first needed."""
         return Recursion(self)
+
+    @cached_property
+    def without_walk(self) -> RecursiveObserver:
+        """The observer whose state filter is that of the model without a walk of the parameters."""
+        if self.adaptation is None or self.form != "random-walk":
+            return self
+        return replace(self, adaptation=replace(self.adaptation, form="innovation", forgetting=1.0))
 
     @property
     def _steps(self) -> Recursion:

@@ -23,6 +23,7 @@ from obsynth.methods.recursive.checks.steady_state import steady_rows
 from obsynth.methods.recursive.conditions import recursive_conditions
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.dae.observer import DAEObserver
+from obsynth.observers.recursive.gain_schedule import gains_once
 from obsynth.observers.recursive.gain_schedule_summary import (
     STEPS_TO_CONTRACT,
     GainScheduleSummary,
@@ -117,8 +118,8 @@ def _dynamic_rows(
     design: ObserverDesign, observer: RecursiveObserver, stated: RecursiveObserver, *, same: bool
 ) -> Iterator[Check]:
     """Yield the rows on what the observer does; ``same`` says that its matrices are those that are stated."""
-    ranks = horizon_ranks(observer.plant, early=observer.early_constraints)
-    facts = gain_schedule_summary(observer)
+    ranks, gains = horizon_ranks(observer.plant, early=observer.early_constraints), gains_once()
+    facts = gain_schedule_summary(observer, gains=gains)
     yield information(
         "condition of H",
         "largest condition number of [E_k; C_k]",
@@ -148,7 +149,7 @@ def _dynamic_rows(
             detail=said,
         )
     # Where both hold the same matrices, they need not be computed twice.
-    proof = horizon_proof(observer if same else stated, observer, looked_at(observer))
+    proof = horizon_proof(observer if same else stated, observer, looked_at(observer), gains=gains)
     yield _contraction_row(facts, proof)
     if proof is not None:
         yield bias_row(proof, ranks.condition)

@@ -7,7 +7,7 @@ the last term is rounding ("unbiased"), products of ``L_k A`` shrink ("contracti
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import chain, repeat
 
 import numpy as np
@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.scaling import balance_by_least_squares
-from obsynth.observers.recursive.gain_schedule import GainStep, gain_steps
+from obsynth.observers.recursive.gain_schedule import Gains, GainStep, gain_steps
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.recursive.step_model import EarlyConstraintSteps, StepMatrices
 from obsynth.proofs.balls import Ball, rounded_up
@@ -43,14 +43,16 @@ class HorizonProof:
     last: GainStep  # the gains of the last step
 
 
-def horizon_proof(stated: RecursiveObserver, shipped: RecursiveObserver, steps: int) -> HorizonProof | None:
+def horizon_proof(
+    stated: RecursiveObserver, shipped: RecursiveObserver, steps: int, *, gains: Gains = gain_steps
+) -> HorizonProof | None:
     """Return what can be proved of the first steps of a shipped observer on the stated plant; `None` for nothing."""
     if stated.plant.nx > MOST_PROVED_STATES or _kind(stated) != _kind(shipped):
         return None  # the rows on what fits say so
-    plain, joint = _without_walk(stated), None
-    found = _followed(plain, _without_walk(shipped), steps)
+    joint = None
+    found = _followed(stated.without_walk, shipped.without_walk, steps, gains)
     if stated.adaptation is not None and stated.adaptation.form == "random-walk":
-        joint = _followed(stated, shipped, steps)
+        joint = _followed(stated, shipped, steps, gains)
     mean, span = _mean_factor(found, found.last.factor)
     nq = 0 if shipped.adaptation is None else shipped.plant.nq
     whole = joint.errors if joint is not None else found.joint
@@ -66,13 +68,6 @@ def _kind(observer: RecursiveObserver) -> tuple[object, ...]:
     return observer.early_constraints, form, plant.nx, plant.ne, plant.ny, plant.nq
 
 
-def _without_walk(observer: RecursiveObserver) -> RecursiveObserver:
-    """Return the observer whose state filter is that of the model without a walk of the parameters."""
-    if observer.adaptation is None or observer.adaptation.form != "random-walk":
-        return observer
-    return replace(observer, adaptation=replace(observer.adaptation, form="innovation", forgetting=1.0))
-
-
 @dataclass(frozen=True, eq=False)
 class _Followed:
     """Products of so many steps each (``lengths``), of the states and of states with parameters."""
@@ -85,7 +80,7 @@ class _Followed:
     last: GainStep
 
 
-def _followed(stated: RecursiveObserver, shipped: RecursiveObserver, steps: int) -> _Followed:
+def _followed(stated: RecursiveObserver, shipped: RecursiveObserver, steps: int, gains: Gains) -> _Followed:
     """Follow the gains of a shipped observer on the matrices of the stated plant."""
     units = natural_units(stated)
     bias = 0.0
@@ -94,7 +89,7 @@ def _followed(stated: RecursiveObserver, shipped: RecursiveObserver, steps: int)
     lengths: list[int] = []
     waiting: list[tuple[StepMatrices, GainStep]] = []
     last: GainStep | None = None
-    for step, found in zip(_true_steps(stated, shipped, steps), gain_steps(shipped, steps), strict=False):
+    for step, found in zip(_true_steps(stated, shipped, steps), gains(shipped, steps), strict=False):
         step = found.step if step is None else step
         # Steps of another size (corrections of x(0)) are stacks of their own.
         if len(waiting) == AT_ONCE or (waiting and _sizes(*waiting[0]) != _sizes(step, found)):
