@@ -10,8 +10,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import FloatArray, remembered
 from obsynth.numerics.scaling import Scaling, balance_by_least_squares
+from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.checks import Check, upper_bound_check
 from obsynth.verification.error_system import ErrorModel
 
@@ -138,16 +139,21 @@ def equality(name: str, claim: str, found: Residual, source: str, *, bound: floa
 
 def tracking_identities(model: ErrorModel) -> dict[str, Identity]:
     """Return the identities that make the observer unbiased without faults and disturbances."""
-    plant = model.plant
-    # A state in small units must not hide behind one in large units.
-    found = _tracking_identities(model, balance_by_least_squares(plant.E, plant.A, outputs=[plant.C]))
-    # States that do not touch each other have sizes beside each other only by what drives both.
-    driven = balance_by_least_squares(plant.E, plant.A, inputs=[plant.B, plant.Bf, plant.Bd], outputs=[plant.C])
-    others = _tracking_identities(model, driven)
+    found, others = (_tracking_identities(model, scaling) for scaling in _balances(model.plant))
     return {
         name: identity if identity.units is None else replace(identity, also=replace(others[name], rough=ROUGHLY))
         for name, identity in found.items()
     }
+
+
+@remembered
+def _balances(plant: DescriptorSystem) -> tuple[Scaling, Scaling]:
+    """Return the sizes of a plant's states without what drives them, and with it."""
+    # A state in small units must not hide behind one in large units.
+    alone = balance_by_least_squares(plant.E, plant.A, outputs=[plant.C])
+    # States that do not touch each other have sizes beside each other only by what drives both.
+    driven = balance_by_least_squares(plant.E, plant.A, inputs=[plant.B, plant.Bf, plant.Bd], outputs=[plant.C])
+    return alone, driven
 
 
 def _tracking_identities(model: ErrorModel, scaling: Scaling) -> dict[str, Identity]:
