@@ -27,6 +27,7 @@ _NAMES = {
     "observers.alarms": "Alarm Decision",
     "observers.estimates": "Estimates",
     "observers.running": "RunningObserver",
+    "observers.windows": "WindowObserver",
     "plants.constants": "Constant ConstantsBox",
     "plants.uncertainty": "Uncertainty",
     "results.checks": "Check",

@@ -28,6 +28,7 @@ from obsynth.observers.alarms import Alarm as Alarm
 from obsynth.observers.alarms import Decision as Decision
 from obsynth.observers.estimates import Estimates as Estimates
 from obsynth.observers.running import RunningObserver as RunningObserver
+from obsynth.observers.windows import WindowObserver as WindowObserver
 from obsynth.plants.constants import Constant as Constant
 from obsynth.plants.constants import ConstantsBox as ConstantsBox
 from obsynth.plants.uncertainty import Uncertainty as Uncertainty

@@ -20,6 +20,7 @@ from obsynth.experiments.monitors.guaranteed import is_guaranteed
 from obsynth.methods.guaranteed_test.result import GuaranteedTest
 from obsynth.numerics.arguments import is_whole, require_kind, require_mapping
 from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.windows import WindowObserver
 from obsynth.results.design import ObserverDesign
 
 
@@ -90,6 +91,12 @@ def prove_alarm(
         require_mapping(value, name)
     if not is_whole(row) or row < 2:
         raise SpecError(f"row is {row!r}: give the number of a row, 2 or more.", path="row")
+    if isinstance(design.observer, WindowObserver):
+        raise SpecError(
+            "prove-alarm is for plants with constant matrices: of this test obsynth verify proves the threshold of "
+            "each row.",
+            path="observer",
+        )
     own = max(map(rows_of_test, GuaranteedTest.of(design).tests)) if is_guaranteed(design) else None
     if own is not None and window not in (WINDOW, own):
         raise SpecError(f"window is {window}: the window of this test has {own} samples.", path="window")

@@ -19,6 +19,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import first_order_hold
 from obsynth.observers.linear.derived import transient
 from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.windows import WindowObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
 
@@ -465,6 +466,12 @@ def engine_of(
     if gap is not None:
         raise SpecError(SAMPLED_GAP, path="gap")
     # What most logs do not need is loaded only where it is used: a run starts in a fraction of a second.
+    if isinstance(design.observer, WindowObserver):
+        from obsynth.data.window_log import WindowEngine
+
+        if outliers not in (None, "none"):
+            raise SpecError("outliers is for recursive and nonlinear designs: leave it out.", path="outliers")
+        return WindowEngine(design, design.observer, warm_up=warm_up)
     from obsynth.data.step_log import SteppingEngine
 
     return SteppingEngine(design, warm_up=warm_up, outliers=outliers)

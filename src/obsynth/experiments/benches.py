@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.numerics.continuous import driven, first_order_hold
 from obsynth.numerics.ranks import covariance_factor
@@ -17,6 +18,7 @@ from obsynth.observers.linear.derived import sample_observer
 from obsynth.observers.linear.observer import LinearObserver, split_rows
 from obsynth.observers.recursive.gain_schedule import run_batch
 from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.observers.windows import WindowObserver
 from obsynth.plants.sequences import MatrixSequence
 from obsynth.plants.validation import index_of
 from obsynth.results.design import ObserverDesign
@@ -243,6 +245,12 @@ def bench_of(design: ObserverDesign, scenario: Scenario) -> Bench:
     """Return a design and a scenario, ready to run."""
     if isinstance(design.observer, LinearObserver):
         return make_bench(design, scenario)
+    if isinstance(design.observer, WindowObserver):
+        raise SpecError(
+            f"Design {design.name!r} is a test whose weights change with k: there is no bench for it. Simulate the "
+            "plant (obsynth.simulate(plant, scenario)) and run the test on the outputs (design.observer.run).",
+            path="observer",
+        )
     observer: RecursiveObserver | DAEObserver
     if isinstance(design.observer, DAEObserver):
         observer = design.observer

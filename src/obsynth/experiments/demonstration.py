@@ -9,6 +9,7 @@ from obsynth.numerics.spectra import decay_rates, eigenvalues
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.observers.windows import WindowObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.profiles import Step
@@ -29,7 +30,7 @@ def demonstration_scenario(design: ObserverDesign) -> Scenario | None:
     observer = design.observer
     if isinstance(observer, LinearObserver):
         return _of_linear(design.linear[0], observer) if observer.fault_names else None
-    return _of_recursive(observer)
+    return None if isinstance(observer, WindowObserver) else _of_recursive(observer)
 
 
 def _of_linear(plant: DescriptorSystem, observer: LinearObserver) -> Scenario:

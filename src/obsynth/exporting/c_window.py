@@ -11,6 +11,7 @@ from obsynth.methods.guaranteed_test.bank import groups_of, is_bank
 from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
 from obsynth.methods.guaranteed_test.result import GuaranteedTest
 from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.windows import WindowObserver
 from obsynth.results.design import ObserverDesign
 
 
@@ -18,6 +19,13 @@ def require_fixed(design: ObserverDesign) -> None:
     """Raise `SpecError` for tests that solve programmes at each row, which no export holds."""
     if design.method != GuaranteedTestMethod.id:
         return
+    if isinstance(design.observer, WindowObserver):
+        raise SpecError(
+            f"Design {design.name!r} is for a plant that changes with k: its weights change from row to row, which no "
+            "export holds. Run it with obsynth run, or with observer.step; gains and thresholds by row are in the gain "
+            "set.",
+            path="observer",
+        )
     for name, asked in (("exact", design.options.get("exact")), ("missing", design.options.get("missing") == "solve")):
         if asked:
             raise SpecError(

@@ -19,6 +19,7 @@ from obsynth.numerics.regions import LMIRegion
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.observers.windows import WindowObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.fault_models import FaultModel
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
@@ -54,7 +55,7 @@ class Synthesis:
 
     options: Mapping[str, Any]
     gains: Mapping[str, FloatArray]
-    observer: LinearObserver | RecursiveObserver | DAEObserver
+    observer: LinearObserver | RecursiveObserver | DAEObserver | WindowObserver
     certificate: Certificate
     solver: Mapping[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()

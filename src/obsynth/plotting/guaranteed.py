@@ -43,16 +43,16 @@ def plot_least_thresholds(design: ObserverDesign, *, axes: Axes | None = None) -
         The design is by another method.
     """
     found = GuaranteedTest.of(design)
-    plant = found.linear[0]
+    plant = found.plant
     (panel,) = new_panels(None if axes is None else [axes], 1, size=(WIDTH, 1.6 * PANEL_HEIGHT))
     table = found.trade_off[np.isfinite(found.trade_off[:, 1])]
     before = int(found.options["before"]) if found.options["course"] == "step" else 0
-    seconds = (table[:, 0] - 1 - before) * plant.dt
+    seconds = (table[:, 0] - 1 - before) * found.observer.dt
     unit = plant.units.get(found.fault, "")
     panel.plot(seconds, table[:, 1], color="black", marker="o", markersize=4, label="least threshold of any test")
     panel.fill_between(seconds, 0.0, table[:, 1], color="0.9", label="no test without false alarms goes here")
     panel.plot(
-        (found.samples - 1 - before) * plant.dt,
+        (found.samples - 1 - before) * found.observer.dt,
         found.threshold,
         marker="s",
         markersize=9,
@@ -100,10 +100,10 @@ def plot_intervals(design: ObserverDesign, estimates: Estimates, *, axes: Axes |
         The design is by another method.
     """
     found = GuaranteedTest.of(design)
-    plant = found.linear[0]
+    plant = found.plant
     (panel,) = new_panels(None if axes is None else [axes], 1, size=(WIDTH, 1.6 * PANEL_HEIGHT))
     low, high = found.interval(estimates)
-    seconds = np.arange(len(low)) * plant.dt
+    seconds = np.arange(len(low)) * found.observer.dt
     panel.fill_between(seconds, low, high, color="0.85", label="interval")
     panel.plot(seconds, found.residual(estimates), color="black", linewidth=1.0, label="residual")
     panel.axhline(0.0, color="0.4", linewidth=0.8)
@@ -141,11 +141,12 @@ def plot_hidden_course(design: ObserverDesign, *, fault: str | None = None, axes
         The design is by another method, or nothing hides the fault.
     """
     found = GuaranteedTest.of(design)
-    plant, courses = found.linear[0], found.hidden_course(fault)
+    plant, courses = found.plant, found.hidden_course(fault)
     if not courses:
         raise SpecError("Nothing hides this fault: there is no course to draw.", path="fault")
     (panel,) = new_panels(None if axes is None else [axes], 1, size=(WIDTH, 1.6 * PANEL_HEIGHT))
-    styles = {name: "-" for name in plant.fault_names} | {name: "--" for name in plant.disturbance_names}
+    styles = dict.fromkeys(courses, "--")
+    styles |= dict.fromkeys(plant.state_names, ":") | dict.fromkeys(found.fault_names, "-")
     sizes = {name: float(np.max(np.abs(course))) for name, course in courses.items()}
     largest = max(sizes.values())
     shown = [name for name in courses if sizes[name] > ROUNDED * largest]
@@ -153,7 +154,7 @@ def plot_hidden_course(design: ObserverDesign, *, fault: str | None = None, axes
     for name in sorted(shown, key=lambda name: ("-", "--", ":").index(styles.get(name, ":"))):
         style, unit = styles.get(name, ":"), plant.units.get(name, "")
         panel.plot(
-            np.arange(len(courses[name])) * plant.dt,
+            np.arange(len(courses[name])) * found.observer.dt,
             courses[name] / sizes[name],
             style,
             # What acts on a sampled plant is held between samples.

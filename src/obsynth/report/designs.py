@@ -20,6 +20,7 @@ from obsynth.methods.functional_filter.rates import DelayCurve, delay_curve, set
 from obsynth.methods.registry import REGISTRY, method_class
 from obsynth.observers.linear.derived import sample_observer
 from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.windows import WindowObserver
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
@@ -183,6 +184,9 @@ def fault_estimates(design: ObserverDesign, gains: FaultGains | None) -> tuple[t
         value = deviations.get(f"noise in fhat[{name}]")
         return missing if value is None else f"{number(value)} {units.get(name, '')}".strip()
 
+    if isinstance(observer, WindowObserver):
+        late = zip(observer.fault_names, observer.fault_delays, strict=True)
+        return ("fault", "delay", "delay in s"), [(name, str(k), number(k * observer.dt)) for name, k in late]
     if gains is None or not isinstance(plant, DescriptorSystem):
         when = "after the nominal run" if isinstance(plant, DAEModel) else "at the end of the horizon"
         return ("parameter", f"deviation {when}"), [(name, deviation(name, "-")) for name in observer.fault_names]

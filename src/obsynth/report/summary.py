@@ -17,6 +17,7 @@ from obsynth.analysis.structure import questions
 from obsynth.files.tables import html_table
 from obsynth.methods.registry import REGISTRY, method_class
 from obsynth.observers.linear.derived import FORGOTTEN, transient
+from obsynth.observers.windows import WindowObserver
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
@@ -176,6 +177,8 @@ def _promise(design: ObserverDesign) -> Iterator[tuple[str, str]]:
 
 def _slowest(design: ObserverDesign) -> str:
     """Return how long the observer remembers its start."""
+    if isinstance(design.observer, WindowObserver):
+        return f"the last {design.observer.samples} samples count, and nothing before them"
     if isinstance(design.plant, DescriptorSystem):
         seconds = transient(design.linear[1])
         if not math.isfinite(seconds):
@@ -204,7 +207,8 @@ def _assumptions(design: ObserverDesign) -> Iterator[str]:
         some = uncertain is not None and bool(uncertain.box.names)
         yield "an exact model, but in thresholds over its tolerances" if some else "an exact model"
     else:
-        yield "a model with the stated noise"
+        bounded = isinstance(design.observer, WindowObserver)
+        yield f"a model with the stated {'bounds' if bounded else 'noise'}"
     model = design.options.get("fault_model")
     if isinstance(model, str):
         yield f"faults like the model '{model}'"

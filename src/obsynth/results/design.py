@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from obsynth.analysis.transformations.recovery import StateRecovery
     from obsynth.observers.dae.observer import DAEObserver
     from obsynth.observers.recursive.observer import RecursiveObserver
+    from obsynth.observers.windows import WindowObserver
     from obsynth.plants.dae.model import DAEModel
     from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 
@@ -90,7 +91,7 @@ class ObserverDesign:
     plant: DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel
     options: Mapping[str, Any]
     gains: Mapping[str, FloatArray]
-    observer: LinearObserver | RecursiveObserver | DAEObserver
+    observer: LinearObserver | RecursiveObserver | DAEObserver | WindowObserver
     certificate: Certificate
     solver: Mapping[str, Any]
     notes: tuple[str, ...] = ()

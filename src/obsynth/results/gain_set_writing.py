@@ -35,7 +35,7 @@ GAIN_SET = FileKind(
     ending=".gains.json",
 )
 #: Tags of kinds of designs; linear time-invariant ones have none.
-KINDS = (None, "recursive", "dae")
+KINDS = (None, "recursive", "dae", "window")
 #: From so many numbers on, which are more than a megabyte as text, the arrays of a gain set are a binary member.
 MANY_NUMBERS = 50_000
 DOCUMENT, ARRAYS = "gain_set.json", "arrays.npz"
@@ -119,6 +119,11 @@ def types_of(kind: str | None) -> tuple[Any, Any]:
         from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 
         return TimeVaryingDescriptorSystem, RecursiveObserver
+    if kind == "window":
+        from obsynth.observers.windows import WindowObserver
+        from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+
+        return TimeVaryingDescriptorSystem, WindowObserver
     if kind == "dae":
         from obsynth.observers.dae.observer import DAEObserver
         from obsynth.plants.dae.model import DAEModel

@@ -21,6 +21,7 @@ from obsynth.methods.guaranteed_test.problem import window_as_designed
 from obsynth.methods.guaranteed_test.result import GuaranteedTest
 from obsynth.methods.guaranteed_test.tolerant import noisy_as_bounded, rows_before
 from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.windows import WindowObserver
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.scenario import Scenario
 from obsynth.tolerances.robustness import with_tolerances
@@ -50,6 +51,13 @@ def _checked(
             path=stated[0],
         )
     test = GuaranteedTest.of(design)
+    if isinstance(test.observer, WindowObserver):
+        if constants is not None or initial_set is not None:
+            raise SpecError(
+                "A test of a plant that changes with k is for an exact model from any start: leave this out.",
+                path="constants" if constants is not None else "initial_set",
+            )
+        return test
     if (test.options.get("exact") or is_bank(test)) and (constants is not None or initial_set is not None):
         raise SpecError(
             f"{'isolate' if is_bank(test) else 'exact'} is for an exact model: design the test without it for a "
@@ -96,6 +104,12 @@ def record_monitor(
 ) -> Monitor:
     """Return the monitor of records as long as a scenario."""
     test = _checked(design, kind, constants, initial_set, given)
+    if isinstance(test.observer, WindowObserver):
+        raise SpecError(
+            "A test whose weights change with k is watched on data: use obsynth.online_monitor, or alarms() and "
+            "limits() of the test on what its observer says.",
+            path="design",
+        )
     bench = make_bench(design, scenario)
     runs = bench.run([scenario.seed])
     observer, tests = test.linear[1], test.tests
@@ -265,9 +279,64 @@ class GuaranteedRule(Rule):
         return [*self._limits.tolist(), float(self._exact), float(self._solve)]
 
 
+class VaryingState(NamedTuple):
+    """The state of `VaryingRule`."""
+
+    k: int  # of the next row
+    largest: FloatArray
+
+
+class VaryingRule(Rule):
+    """The test of each row of a plant that changes with k: its size against the threshold of the row."""
+
+    GUARANTEES = True
+    # Rows are counted, whatever is missing in them.
+    takes_gaps = True
+
+    def __init__(self, design: GuaranteedTest, observer: WindowObserver) -> None:
+        shipped = design.certificate.matrices
+        self._limits, self._rounding = shipped["thresholds"].ravel(), shipped["rounding"]
+        self._observer = observer
+
+    def init(self) -> VaryingState:
+        """Return the state before the first sample."""
+        return VaryingState(0, np.zeros(self._rounding.shape[1]))
+
+    def step(self, state: VaryingState, sample: Sample) -> tuple[VaryingState, Judged]:
+        """Return statistic and threshold; NaN where the row has no verdict."""
+        said: Any = sample.said
+        known = np.concatenate([said.inputs, said.outputs])
+        after = VaryingState(state.k + 1, np.fmax(state.largest, np.abs(known)))
+        which = self._observer.programme_at(state.k)
+        if which < 0:
+            return after, Judged(np.nan, np.nan)
+        threshold = float(self._limits[which] + self._rounding[which] @ after.largest)
+        return after, Judged(float(abs(said.faults_and_residuals[0])), threshold, 0)
+
+    def restart(self, state: VaryingState, skipped: int = 0) -> VaryingState:
+        """Count the rows that are missing: those of the window before them have no verdict."""
+        return state._replace(k=state.k + skipped)
+
+    def options(self) -> list[float]:
+        """Return the limits."""
+        return [*self._limits.tolist()]
+
+
 def data_monitor(design: ObserverDesign, kind: str, *, constants: Any, initial_set: Any, **given: Any) -> Monitor:
     """Return the monitor of data of any length; with constants or a start its threshold follows the signals."""
     test = _checked(design, kind, constants, initial_set, given)
+    if isinstance(test.observer, WindowObserver):
+        own = test.observer
+        rule_by_row = VaryingRule(test, own)
+        return Monitor(
+            kind,
+            f"{_statement(test)}; each row has its own threshold",
+            rule_by_row,
+            residuals=len(own.residual_names),
+            fault_names=own.fault_names,
+            fault_scales=np.ones(len(own.fault_names)),
+            groups=test.groups,
+        )
     observer = test.linear[1]
     statement = _statement(test)
     rule: Rule = GuaranteedRule(test)

@@ -58,7 +58,7 @@ def checks(design: ObserverDesign, read: Callable[[Mapping[str, Any]], Asked]) -
         steps = len(shipped.get("record", np.zeros((0, 0))))
         sizes |= {"state_tracking": count * nx, "state_rows": nx**2}
         sizes |= {"record": max(steps, window.question.samples) * (window.plant.nu + window.plant.ny)}
-    wrong = [name for name, size in sizes.items() if not _fits(shipped.get(name), size, signed="radius" not in name)]
+    wrong = [name for name, size in sizes.items() if not fits(shipped.get(name), size, signed="radius" not in name)]
     wrong += [] if len(design.linear[1].state_names) in (0, nx) else ["states"]
     yield upper_bound_check(
         "certificate",
@@ -90,13 +90,14 @@ def _flat(matrix: FloatArray) -> FloatArray:
     return np.asarray(matrix, dtype=np.float64).ravel()
 
 
-def _fits(matrix: FloatArray | None, size: int, *, signed: bool) -> bool:
+def fits(matrix: FloatArray | None, size: int, *, signed: bool) -> bool:
+    """Whether a matrix is there, of so many finite numbers, none of them negative but for ``signed``."""
     if matrix is None or matrix.size != size or not np.isfinite(matrix).all():
         return False
     return signed or bool(np.all(matrix >= 0.0))
 
 
-def _excess(found: Repaired | None, radius: FloatArray) -> float:
+def excess(found: Repaired | None, radius: FloatArray) -> float:
     """Return the largest ratio of what is proved to what is shipped; NaN where nothing is proved."""
     if found is None:
         return np.nan
@@ -113,7 +114,7 @@ def _of_the_test(design: ObserverDesign, window: Window, test: Repaired) -> Iter
         "multipliers",
         "exact multipliers that see the fault with weight one and nothing free lie within the shipped "
         "distance of the shipped ones",
-        _excess(exact, test.radius),
+        excess(exact, test.radius),
         1.0,
         source=SOURCE,
         kind="proved",
@@ -188,13 +189,20 @@ SAME = 1e-12
 ROUNDINGS = 4.0
 
 
+def known_room(window: Window, multipliers: FloatArray) -> float:
+    """Return how far weights of known inputs may be from those that the multipliers say, by the order of sums."""
+    nx, ne, _, ny = window.model.sizes
+    equations = np.abs(multipliers[: window.outputs_at]).reshape(window.equations, ne)
+    outputs = np.abs(multipliers[window.outputs_at :][: window.question.samples * ny])
+    sizes = [part @ np.abs(window.model.inputs(k)) for k, part in enumerate(equations)]
+    size = float(np.max(sizes, initial=0.0))
+    size += float(np.max(outputs.reshape(-1, ny) @ np.abs(window.model.D), initial=0.0))
+    return ROUNDINGS * (nx + ny) * UNIT_ROUNDOFF * size
+
+
 def _misfit(shipped: object, implied: object, window: Window, multipliers: FloatArray) -> float:
-    plant, worst = window.plant, 0.0
-    equations = np.abs(multipliers[: window.outputs_at]).reshape(window.equations, plant.nx)
-    outputs = np.abs(multipliers[window.outputs_at :][: window.question.samples * plant.ny])
-    size = float(np.max(equations @ np.abs(plant.B), initial=0.0))
-    size += float(np.max(outputs.reshape(-1, plant.ny) @ np.abs(plant.D), initial=0.0))
-    room = {"Bu": size, "Du": size}
+    worst = 0.0
+    allowed = {"Bu": known_room(window, multipliers), "Du": known_room(window, multipliers)}
     for name, wanted in implied.as_dict().items():  # type: ignore[attr-defined]
         given = getattr(shipped, name)
         if not isinstance(wanted, np.ndarray):
@@ -202,9 +210,8 @@ def _misfit(shipped: object, implied: object, window: Window, multipliers: Float
         elif given.shape != wanted.shape:
             worst = np.inf
         elif given.size:
-            away = float(np.max(np.abs(given - wanted)))
-            allowed = ROUNDINGS * (plant.nx + plant.ny) * UNIT_ROUNDOFF * room.get(name, 0.0)
-            worst = max(worst, 0.0 if away == 0.0 else away / allowed if allowed > 0.0 else np.inf)
+            away, room = float(np.max(np.abs(given - wanted))), allowed.get(name, 0.0)
+            worst = max(worst, 0.0 if away == 0.0 else away / room if room > 0.0 else np.inf)
     return worst
 
 
@@ -224,7 +231,7 @@ def _of_the_least(design: ObserverDesign, window: Window) -> Iterator[Check]:
             "witness",
             "a course of the fault that satisfies every equation exactly lies within the shipped distance "
             "of the shipped one",
-            _excess(exact, witness.radius),
+            excess(exact, witness.radius),
             1.0,
             source=SOURCE,
             kind="proved",

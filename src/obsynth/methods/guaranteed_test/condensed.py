@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from flint import arb, arb_mat, ctx
 
-from obsynth.methods.guaranteed_test.windows import Window
+from obsynth.methods.guaranteed_test.windows import Constant, Window
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import decide_rank
 
@@ -62,12 +62,14 @@ class Condensed:
     @classmethod
     def of(cls, window: Window) -> Condensed | None:
         """Return it, or ``None`` where the window is small or has not this structure."""
+        if window.rows < FEWEST_ROWS or not isinstance(window.model, Constant):
+            return None
         plant, samples = window.plant, window.question.samples
         bounds = window.bounds
         # Products of entries and whole numbers would be rounded.
         whole = window.rows == window.outputs_at + samples * plant.ny and np.abs(window.times).max(initial=1) == 1
         unbounded = bool(np.isinf(bounds.state).all() and np.isinf(bounds.first).all())
-        if window.rows < FEWEST_ROWS or not whole or not unbounded or window.equations != samples - 1:
+        if not whole or not unbounded or window.equations != samples - 1:
             return None
         return cls(window) if plant.nx and decide_rank(plant.E).full else None
 

@@ -78,9 +78,9 @@ def told(problem: Problem, asked: Asked) -> tuple[Condition, int]:
         doubled = [least * 2**k for k in range(most.bit_length())]
         for samples in (*(tried for tried in doubled if tried < most), most):
             window = problem.window(samples, lag=lag)
-            if _has_test(window):
-                return _condition(problem, window, True, ""), lag
-    return _condition(problem, window, False, _why(problem, asked, window)), lags[-1]
+            if has_test(window):
+                return told_condition(window, True, ""), lag
+    return told_condition(window, False, _why(problem, asked, window)), lags[-1]
 
 
 def samples_decided_on(problem: Problem, asked: Asked, lag: int) -> int:
@@ -93,7 +93,7 @@ def samples_decided_on(problem: Problem, asked: Asked, lag: int) -> int:
     return enough
 
 
-def _has_test(window: Window) -> bool:
+def has_test(window: Window) -> bool:
     """Whether exact multipliers see the fault and no free column."""
     multipliers = least_multipliers(window)
     if multipliers is None:
@@ -121,8 +121,9 @@ def least_multipliers(window: Window) -> FloatArray | None:
 SEEN = 1e-6
 
 
-def _condition(problem: Problem, window: Window, holds: bool, detail: str) -> Condition:
-    fault = problem.plant.fault_names[problem.question.fault]
+def told_condition(window: Window, holds: bool, detail: str) -> Condition:
+    """Return the condition that a window tells the fault, in words."""
+    fault = window.model.fault_names[window.question.fault]
     return Condition(
         "fault told",
         f"{fault} changes samples as nothing free does",
@@ -149,18 +150,18 @@ def _why(problem: Problem, asked: Asked, window: Window) -> str:
     lag = window.question.lag
     if problem.question.course == "any" and asked.lag is not None:
         for more in range(lag + 1, problem.plant.nx + 2):
-            if _has_test(problem.window(max(samples, problem.enough(more)), lag=more)):
+            if has_test(problem.window(max(samples, problem.enough(more)), lag=more)):
                 return f"{text} The least lag for which there is a test is {more}."
     if asked.samples != "auto" and samples < problem.enough(lag):
         for more in range(samples + 1, problem.enough(lag) + 1):
-            if _has_test(problem.window(more, lag=lag)):
+            if has_test(problem.window(more, lag=lag)):
                 return f"{text} The least number of samples for which there is a test is {more}."
     return text
 
 
 def hidden(window: Window, point: FloatArray) -> str:
     """Return which signals together look like nothing."""
-    plant, question = window.plant, window.question
+    plant, question = window.model, window.question
     fault = plant.fault_names[question.fault]
     largest = float(np.max(np.abs(point)))
     others = []

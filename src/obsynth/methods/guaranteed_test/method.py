@@ -12,6 +12,7 @@ from obsynth.analysis.conditions import Condition
 from obsynth.methods.guaranteed_test.options import Asked
 from obsynth.methods.method import ClaimMeaning, Method, PlantKind
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.results.checks import Check
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.error_system import ErrorModel
@@ -39,9 +40,11 @@ class GuaranteedTestMethod(Asked, Method):
 
     Parameters
     ----------
-    plant : DescriptorSystem or Transformation
+    plant : DescriptorSystem, TimeVaryingDescriptorSystem or Transformation
         Discrete time (``transform: sample_time``), any index; ``C (ny, nx)``, ``Bf (nx, nf)``, ``Bd (nx, nd)``; ``D``,
-        ``Df``, ``Dd``, ``Bw``, ``Dw`` allowed.
+        ``Df``, ``Dd``, ``Bw``, ``Dw`` allowed.  Of one that changes with k each row has a test of its own, and
+        parameters are faults: that of k acts on the way to sample k + 1.  ``mu1``, ``mu2``, ... are its disturbances,
+        one in each equation; what is claimed is of the worst row that has a test, and ``limits`` tells each.
     fault : str, optional
         The fault that is looked for; may be left out where there is one only.
     samples : int or "auto", optional
@@ -59,7 +62,8 @@ class GuaranteedTestMethod(Asked, Method):
     disturbance_bounds : float or mapping of str to float
         Largest absolute value of every disturbance.
     noise_bound : float or mapping of str to float
-        Deviations that no component of the stated noise exceeds; or, by output, the bound of its noise.
+        Deviations that no component of the stated noise exceeds; or, by output, the bound of its noise (plants that
+        change with k: always by output).
     disturbance : {"jump", "held", "rate"}, optional
         Disturbances change at will from sample to sample, not at all over the window, or by ``disturbance_rate``.
     disturbance_rate : float or mapping of str to float, optional
@@ -117,8 +121,8 @@ class GuaranteedTestMethod(Asked, Method):
     """
 
     id: ClassVar[str] = "guaranteed-test"
-    plants: ClassVar[tuple[PlantKind, ...]] = ("time-invariant",)
-    time: ClassVar[str] = "discrete"
+    plants: ClassVar[tuple[PlantKind, ...]] = ("time-invariant", "time-varying")
+    time: ClassVar[str] = "discrete, time-varying"
     summary: ClassVar[str] = "a test of one fault whose threshold no other test on these samples can beat"
     source: ClassVar[str] = "ours, by duality of linear programmes"
     claims: ClassVar[Mapping[str, ClaimMeaning]] = CLAIMS
@@ -127,6 +131,7 @@ class GuaranteedTestMethod(Asked, Method):
         {"multipliers", "multiplier_radius", "witness", "witness_radius", "rounding", "trade_off"}
         | {"state_tracking", "state_rows", "record"}
         | {"groups", "pairs", "pair_multipliers", "pair_radius"}
+        | {"thresholds", "leasts", "programmes"}
     )
 
     def conflicts(self) -> Iterator[str]:
@@ -157,14 +162,26 @@ class GuaranteedTestMethod(Asked, Method):
         if self.after is not None and self.samples != self.before + self.after:
             yield f"samples is {self.samples}, but before + after is {self.before + self.after}: leave one out."
 
-    def existence(self, plant: DescriptorSystem, *, exactly: bool = True) -> tuple[Condition, ...]:
+    def existence(
+        self, plant: DescriptorSystem | TimeVaryingDescriptorSystem, *, exactly: bool = True
+    ) -> tuple[Condition, ...]:
         """Return the existence conditions: bounds are stated, and something tells the fault."""
+        if isinstance(plant, TimeVaryingDescriptorSystem):
+            from obsynth.methods.guaranteed_test.varying_synthesis import varying_conditions
+
+            return varying_conditions(plant, self)
         from obsynth.methods.guaranteed_test.conditions import conditions
 
         return conditions(plant, self)
 
-    def synthesise(self, plant: DescriptorSystem, *, progress: Callable[[str], None]) -> Any:
+    def synthesise(
+        self, plant: DescriptorSystem | TimeVaryingDescriptorSystem, *, progress: Callable[[str], None]
+    ) -> Any:
         """Return weights, observer and certificate, not yet verified."""
+        if isinstance(plant, TimeVaryingDescriptorSystem):
+            from obsynth.methods.guaranteed_test.varying_synthesis import synthesise_varying
+
+            return synthesise_varying(plant, self, progress=progress)
         if self.isolate:
             from obsynth.methods.guaranteed_test.bank_synthesis import synthesise_bank
 
@@ -180,11 +197,17 @@ class GuaranteedTestMethod(Asked, Method):
         from obsynth.methods.guaranteed_test.checks import checks
 
         del printed_digits
+        if isinstance(design.plant, TimeVaryingDescriptorSystem):
+            from obsynth.methods.guaranteed_test.varying_checks import varying_checks
+
+            return varying_checks(design, cls.of)
         return (bank_checks if is_bank(design) else checks)(design, cls.of)
 
     @classmethod
     def has_error_model(cls, design: ObserverDesign) -> bool:
         """Whether the registers follow the state whatever it is: not where bounds of states are used."""
+        if isinstance(design.plant, TimeVaryingDescriptorSystem):
+            return False
         return not any(design.options.get(name) for name in ("state_bounds", "initial_bounds"))
 
     @classmethod

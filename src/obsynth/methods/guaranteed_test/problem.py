@@ -72,15 +72,15 @@ class Problem:
 def problem_of(plant: DescriptorSystem, asked: Asked) -> Problem:
     """Return what is asked of a plant; raise `SpecError` for unknown signals, missing bounds and courses that do not
     fit."""
-    fault = fault_of(plant, asked.fault)
-    free = free_faults(plant, asked.free, fault)
+    fault = fault_of(plant.fault_names, asked.fault)
+    free = free_faults(plant.fault_names, asked.free, fault)
     before = asked.before if asked.course == "step" else 0
     regular = decide_rank(plant.E).full
     index = 0 if regular else ExactPencil.written(plant.E, plant.A).index
     closing = 0 if index is None else max(index - 1, 0)
     rates = np.zeros(0)
     if asked.disturbance == "rate":
-        rates = _by_name(asked.disturbance_rate, plant.disturbance_names, "disturbance_rate", every=True)
+        rates = by_name(asked.disturbance_rate, plant.disturbance_names, "disturbance_rate", every=True)
     question = Question(
         fault,
         asked.course,
@@ -104,27 +104,29 @@ def window_as_designed(plant: DescriptorSystem, asked: Asked) -> Window:
     return replace(problem, question=replace(problem.question, lag=asked.lag or 0)).window(int(asked.samples))
 
 
-def fault_of(plant: DescriptorSystem, name: str | None) -> int:
+def fault_of(names: tuple[str, ...], name: str | None) -> int:
     """Return the number of the fault that is looked for."""
-    names = plant.fault_names
     if name is None and len(names) == 1:
         return 0
     if name is None or name not in names:
         given = "No fault is named" if name is None else f"There is no fault {name!r}"
-        listed = f"name one of {', '.join(names)}" if names else "the plant has none (Bf, Df)"
+        listed = (
+            f"name one of {', '.join(names)}"
+            if names
+            else "the plant has none (Bf, Df; of one that changes with k Phi, Psi)"
+        )
         raise SpecError(f"{given}: {listed}.", path="method.options.fault")
     return names.index(name)
 
 
-def free_faults(plant: DescriptorSystem, given: Any, fault: int) -> tuple[int, ...]:
+def free_faults(names: tuple[str, ...], given: Any, fault: int) -> tuple[int, ...]:
     """Return the numbers of the faults that may do anything besides."""
-    names = plant.fault_names
     if isinstance(given, str) and given not in names:
         if given not in ("others", "none"):
             raise SpecError(
                 f"free is {given!r}: use others, none, or a list of {', '.join(names)}.", path="method.options.free"
             )
-        return tuple(k for k in range(plant.nf) if k != fault) if given == "others" else ()
+        return tuple(k for k in range(len(names)) if k != fault) if given == "others" else ()
     listed = [given] if isinstance(given, str) else list(given or ())
     wrong = [str(name) for name in listed if name not in names or names.index(name) == fault]
     if wrong:
@@ -157,10 +159,10 @@ def bounds_of(plant: DescriptorSystem, asked: Asked) -> Bounds:
     if lacking:
         first = lacking[0].partition(":")[0]
         raise SpecError("A guaranteed test needs bounds.", path=f"method.options.{first}", problems=lacking)
-    disturbance = _by_name(asked.disturbance_bounds, plant.disturbance_names, "disturbance_bounds", every=False)
+    disturbance = by_name(asked.disturbance_bounds, plant.disturbance_names, "disturbance_bounds", every=False)
     if isinstance(asked.noise_bound, Mapping):
         output = np.eye(plant.ny)
-        noise = _by_name(asked.noise_bound, plant.output_names, "noise_bound", every=True)
+        noise = by_name(asked.noise_bound, plant.output_names, "noise_bound", every=True)
         state, kept = np.zeros((plant.nx, plant.ny)), np.any(plant.Bw != 0.0, axis=0)
         if kept.any():
             raise SpecError(
@@ -169,13 +171,13 @@ def bounds_of(plant: DescriptorSystem, asked: Asked) -> Bounds:
             )
     else:
         state, output = plant.Bw, plant.Dw
-        noise = _by_name(asked.noise_bound, plant.noise_names, "noise_bound", every=False)
-    always = _by_name(asked.state_bounds, plant.state_names, "state_bounds", every=False, missing=np.inf)
-    at_first = _by_name(asked.initial_bounds, plant.state_names, "initial_bounds", every=False, missing=np.inf)
+        noise = by_name(asked.noise_bound, plant.noise_names, "noise_bound", every=False)
+    always = by_name(asked.state_bounds, plant.state_names, "state_bounds", every=False, missing=np.inf)
+    at_first = by_name(asked.initial_bounds, plant.state_names, "initial_bounds", every=False, missing=np.inf)
     return Bounds(disturbance, state, output, noise, always, at_first)
 
 
-def _by_name(given: Any, names: tuple[str, ...], option: str, *, every: bool, missing: float = 0.0) -> FloatArray:
+def by_name(given: Any, names: tuple[str, ...], option: str, *, every: bool, missing: float = 0.0) -> FloatArray:
     """Return a number, 0 or more, for each name, from one number for all or a mapping."""
     path = f"method.options.{option}"
     if given is None:
@@ -244,10 +246,6 @@ def observer_of(
 
 def rounding_of(window: Window, multipliers: FloatArray, radius: FloatArray) -> FloatArray:
     """Return what shipped weights may err for known signals of at most one ``(nu + ny,)``; the threshold lacks it."""
-    plant, at, samples = window.plant, window.outputs_at, window.question.samples
-    share = (len(multipliers) + plant.nu + plant.ny + plant.nx + 8) * UNIT_ROUNDOFF
-    sizes = (radius + share * np.abs(multipliers)) * SUM_ROOM
-    equations = sizes[:at].reshape(window.equations, plant.nx).sum(axis=0)
-    outputs = sizes[at : at + samples * plant.ny].reshape(samples, plant.ny).sum(axis=0)
-    on_inputs = np.abs(plant.B).T @ equations + np.abs(plant.D).T @ outputs
-    return np.concatenate([on_inputs, outputs])
+    nx, _, nu, ny = window.model.sizes
+    share = (len(multipliers) + nu + ny + nx + 8) * UNIT_ROUNDOFF
+    return window.known_sizes((radius + share * np.abs(multipliers)) * SUM_ROOM)

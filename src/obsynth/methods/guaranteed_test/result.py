@@ -16,10 +16,15 @@ from obsynth.methods.functions import design_function
 from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
 from obsynth.methods.guaranteed_test.problem import window_as_designed
 from obsynth.methods.guaranteed_test.tolerant import rows_before
+from obsynth.methods.guaranteed_test.varying import programmes_as_designed
 from obsynth.methods.guaranteed_test.windows import courses_of
 from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.estimates import Estimates
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.windows import WindowObserver
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.results.design import ObserverDesign
 
 if TYPE_CHECKING:
@@ -76,11 +81,11 @@ class GuaranteedTest(ObserverDesign):
         from obsynth.methods.guaranteed_test.bank import groups_of, is_bank
         from obsynth.methods.guaranteed_test.problem import free_faults
 
-        names = self.linear[0].fault_names
+        names = self.fault_names
         if is_bank(self):
             return tuple(tuple(names[k] for k in group) for group in groups_of(self))
         own = names.index(self.fault)
-        free = free_faults(self.linear[0], self.options["free"], own)
+        free = free_faults(names, self.options["free"], own)
         return (tuple(names[k] for k in range(len(names)) if k not in free),)
 
     @property
@@ -92,6 +97,20 @@ class GuaranteedTest(ObserverDesign):
         names, table = self.linear[0].fault_names, self.certificate.matrices.get("pairs", np.zeros((0, 0)))
         both = [(i, j) for i in range(len(table)) for j in range(len(table)) if i != j]
         return {(names[i], names[j]): float(table[i, j]) for i, j in both}
+
+    @property
+    def fault_names(self) -> tuple[str, ...]:
+        """The faults of the plant: of one that changes with k its parameters."""
+        if isinstance(self.plant, DescriptorSystem):
+            return self.plant.fault_names
+        return self._varying_plant.parameter_names
+
+    @property
+    def _varying_plant(self) -> TimeVaryingDescriptorSystem:
+        """The plant of a test whose weights change with k."""
+        if not isinstance(self.plant, TimeVaryingDescriptorSystem):
+            raise SpecError(f"{self.name!r} is for a plant with constant matrices.", path="plant")
+        return self.plant
 
     @property
     def fault(self) -> str:
@@ -157,6 +176,8 @@ class GuaranteedTest(ObserverDesign):
             names = self.linear[0].fault_names
             number = names.index(names[0] if fault is None else fault)
             return hidden_by(self, GuaranteedTestMethod.of, number)
+        if isinstance(self.observer, WindowObserver):
+            return self._hidden_at_worst()
         point = self.certificate.matrices.get("witness")
         if point is None:
             return {}
@@ -172,8 +193,25 @@ class GuaranteedTest(ObserverDesign):
         """
         known = np.abs(y) if u is None else np.hstack([np.abs(u), np.abs(y)])
         rounding = self._single("its own rounding").certificate.matrices["rounding"]
-        size = np.maximum.accumulate(known, axis=0) @ rounding.ravel()
-        return np.asarray(size)
+        # Samples that are missing are in no window that has a verdict.
+        largest = np.maximum.accumulate(np.nan_to_num(known), axis=0)
+        if isinstance(self.observer, WindowObserver):
+            programmes = [self.observer.programme_at(k) for k in range(len(known))]
+            return np.asarray(np.sum(largest * rounding[programmes], axis=1))
+        return np.asarray(largest @ rounding.ravel())
+
+    def limits(self, rows: int) -> FloatArray:
+        """Return the threshold of each row of a record ``(rows,)``: of a plant that changes with k each has its own.
+
+        Parameters
+        ----------
+        rows : int
+            Of the record, the first at k = 0.  Where there is no verdict the threshold is infinite.
+        """
+        if not isinstance(self.observer, WindowObserver):
+            return np.full(rows, self.threshold)
+        found = np.append(self.certificate.matrices["thresholds"].ravel(), np.inf)
+        return np.asarray(found[[self.observer.programme_at(k) for k in range(rows)]])
 
     def interval(self, estimates: Estimates) -> tuple[FloatArray, FloatArray]:
         """Return the ends between which the fault lies at each row, ``(steps,)`` each; NaN where none is known.
@@ -185,7 +223,8 @@ class GuaranteedTest(ObserverDesign):
             a ``step`` it holds at the row at which the step is ``after`` samples old.
         """
         row = self.residual(estimates)
-        return row - self.threshold, row + self.threshold
+        limits = self.limits(len(row))
+        return row - limits, row + limits
 
     def residual(self, estimates: Estimates) -> FloatArray:
         """Return the residual of each row of a record ``(steps,)``; NaN before the window is full.
@@ -197,7 +236,8 @@ class GuaranteedTest(ObserverDesign):
         """
         self._single("a residual")
         row = np.hstack([estimates.faults, estimates.residuals])[..., 0].astype(np.float64)
-        row[: rows_before(self)] = np.nan
+        if isinstance(self.observer, LinearObserver):
+            row[: rows_before(self)] = np.nan
         return row
 
     def alarms(self, estimates: Estimates) -> np.ndarray:
@@ -209,7 +249,7 @@ class GuaranteedTest(ObserverDesign):
             What the observer said over a record, from its start.
         """
         row = np.nan_to_num(self.residual(estimates))
-        return np.maximum.accumulate(np.abs(row) > self.threshold)
+        return np.maximum.accumulate(np.abs(row) > self.limits(len(row)))
 
     def exact_interval(self, y: FloatArray, u: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
         """Return the ends of the least interval in which the fault lies at each row, ``(steps,)`` each.
@@ -230,7 +270,12 @@ class GuaranteedTest(ObserverDesign):
         """
         from obsynth.methods.guaranteed_test.exact import Programmes
 
-        plant, observer = self._single("an interval").linear
+        if isinstance(self._single("an interval").observer, WindowObserver):
+            raise SpecError(
+                f"{self.name!r} is for a plant that changes with k: it has the fixed test of each row (interval).",
+                path="exact",
+            )
+        plant, observer = self.linear
         inputs = np.zeros((len(y), plant.nu)) if u is None else np.asarray(u, dtype=np.float64)
         outputs = np.asarray(y, dtype=np.float64)
         low, high = (np.array(end) for end in self.interval(observer.run(outputs, inputs)))
@@ -242,6 +287,17 @@ class GuaranteedTest(ObserverDesign):
             found = programmes.interval(outputs[rows], inputs[rows])
             low[k], high[k] = max(low[k], found[0]), min(high[k], found[1])
         return low, high
+
+    def _hidden_at_worst(self) -> dict[str, FloatArray]:
+        """Return the witness of the row with the largest of the least thresholds."""
+        shipped = self.certificate.matrices
+        leasts = shipped["leasts"].ravel()
+        if np.isnan(self.least) or self.least == 0.0:
+            return {}
+        _, programmes = programmes_as_designed(self._varying_plant, GuaranteedTestMethod.of(self.options))
+        place = int(np.flatnonzero(leasts == self.least)[0])
+        window = programmes.windows[place]
+        return courses_of(window, shipped["witness"][place][: len(window.bar)])
 
     def plot(self, axes: Axes | None = None) -> Axes:
         """Plot the least threshold against the samples of the window.

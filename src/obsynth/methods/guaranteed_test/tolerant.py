@@ -16,6 +16,7 @@ from obsynth.extensions import extension
 from obsynth.methods.guaranteed_test.windows import Builder, Window
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.windows import WindowObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
 
@@ -148,6 +149,8 @@ def with_tolerances(window: Window, beside: Beside) -> Window:
 
 def rows_before(design: ObserverDesign) -> int:
     """Return how many rows of a record come before the first verdict of a test: the registers of its window."""
+    if isinstance(design.observer, WindowObserver):
+        return design.observer.samples
     return design.linear[1].order - len(design.certificate.matrices.get("state_tracking", ()))
 
 

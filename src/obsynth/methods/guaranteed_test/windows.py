@@ -11,10 +11,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
+from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import decide_rank
 from obsynth.plants.descriptor import DescriptorSystem
@@ -63,6 +64,84 @@ class Question:
     closing: int = 0
 
 
+class Model(Protocol):
+    """The matrices of a plant over a window, by the sample of the window, 0 first."""
+
+    D: FloatArray
+    state_names: tuple[str, ...]
+    disturbance_names: tuple[str, ...]
+    fault_names: tuple[str, ...]
+    #: Whether E leads from each state to the next.
+    regular: bool
+    #: Samples by which the faults of an equation are later than it.
+    later: int
+
+    @property
+    def sizes(self) -> tuple[int, int, int, int]:
+        """Numbers of states, equations of a sample, known inputs and outputs."""
+        ...
+
+    def equations(self, question: Question) -> int:
+        """Return for how many k there are equations."""
+        ...
+
+    def at(self, k: int) -> tuple[FloatArray, FloatArray]:
+        """Return what multiplies the states after and before equation k."""
+        ...
+
+    def seen(self, k: int) -> FloatArray:
+        """Return what multiplies the state in the outputs of sample k."""
+        ...
+
+    def acting(self, kind: str, which: np.ndarray, k: int) -> tuple[int, FloatArray, FloatArray]:
+        """Return what columns of faults, disturbances or noise (``f``, ``d``, ``w``) of sample k do: the number of the
+        equation that they enter, what they do there, and what they do to the outputs."""
+        ...
+
+    def inputs(self, k: int) -> FloatArray:
+        """Return what known inputs do in equation k."""
+        ...
+
+
+class Constant:
+    """The same matrices at each sample."""
+
+    later = 0
+
+    def __init__(self, plant: DescriptorSystem, bounds: Bounds) -> None:
+        self.plant, self.D = plant, plant.D
+        self.state_names, self.fault_names = plant.state_names, plant.fault_names
+        self.disturbance_names = plant.disturbance_names
+        self.sizes = (plant.nx, plant.nx, plant.nu, plant.ny)
+        self.regular = decide_rank(plant.E).full
+        self._matrices = {
+            "f": (plant.Bf, plant.Df),
+            "d": (plant.Bd, plant.Dd),
+            "w": (bounds.noise_state, bounds.noise_output),
+        }
+
+    def equations(self, question: Question) -> int:
+        """Return for how many k there are equations."""
+        return question.samples - 1 if self.regular else question.samples + question.closing
+
+    def at(self, k: int) -> tuple[FloatArray, FloatArray]:
+        """Return what multiplies the states after and before equation k."""
+        return self.plant.E, self.plant.A
+
+    def seen(self, k: int) -> FloatArray:
+        """Return what multiplies the state in the outputs of sample k."""
+        return self.plant.C
+
+    def acting(self, kind: str, which: np.ndarray, k: int) -> tuple[int, FloatArray, FloatArray]:
+        """Return what columns of a kind do at sample k."""
+        state, output = self._matrices[kind]
+        return k, state[:, which], output[:, which]
+
+    def inputs(self, k: int) -> FloatArray:
+        """Return what known inputs do in equation k."""
+        return self.plant.B
+
+
 class Builder:
     """Collects columns and entries."""
 
@@ -91,7 +170,7 @@ class Builder:
 class Window:
     """The stacked equations of a question; column 0 is theta."""
 
-    plant: DescriptorSystem
+    model: Model
     bounds: Bounds
     question: Question
     rows: int
@@ -119,9 +198,16 @@ class Window:
         )
 
     @property
+    def plant(self) -> DescriptorSystem:
+        """The plant of a window whose matrices do not change."""
+        if not isinstance(self.model, Constant):
+            raise SpecError("This question is for plants whose matrices do not change with k.", path="plant")
+        return self.model.plant
+
+    @property
     def outputs_at(self) -> int:
         """First row of the outputs."""
-        return self.equations * self.plant.nx
+        return self.equations * self.model.sizes[1]
 
     @property
     def twice_is_hidden(self) -> bool:
@@ -130,7 +216,7 @@ class Window:
         For that the states must be free to follow what the disturbances do without the fault: bounds may cut that off,
         as may equations without dynamics those of the first sample.
         """
-        at_first = self.equations == self.question.samples - 1 or np.isinf(self.bounds.first).all()
+        at_first = self.model.regular or np.isinf(self.bounds.first).all()
         return bool(at_first and np.isinf(self.bounds.state).all())
 
     @cached_property
@@ -169,19 +255,31 @@ class Window:
 
         ``multipliers (rows,)``: the test is their product with the right sides, at the last sample that has a weight.
         """
-        plant, question = self.plant, self.question
+        model, question = self.model, self.question
+        _, ne, nu, ny = model.sizes
         length = max(self.equations, question.samples)
-        on_y, on_u = np.zeros((length, plant.ny)), np.zeros((length, plant.nu))
-        per_sample = multipliers[self.outputs_at : self.outputs_at + question.samples * plant.ny]
-        on_y[: question.samples] = per_sample.reshape(-1, plant.ny)
-        equations = multipliers[: self.outputs_at].reshape(self.equations, plant.nx)
-        on_u[: self.equations] += equations @ plant.B
-        on_u -= on_y @ plant.D
+        on_y, on_u = np.zeros((length, ny)), np.zeros((length, nu))
+        per_sample = multipliers[self.outputs_at : self.outputs_at + question.samples * ny]
+        on_y[: question.samples] = per_sample.reshape(-1, ny)
+        equations = multipliers[: self.outputs_at].reshape(self.equations, ne)
+        for k, part in enumerate(equations):
+            on_u[k] += part @ model.inputs(k)
+        on_u -= on_y @ model.D
         # The equations after the last sample that are used have known inputs, and a state that they lead to.
         later = np.flatnonzero(equations[question.samples :].any(axis=1))
         delay = int(later[-1]) + 1 if later.size else 0
         kept = question.samples + delay
         return on_y[:kept][::-1].copy(), on_u[:kept][::-1].copy(), delay
+
+    def known_sizes(self, sizes: FloatArray) -> FloatArray:
+        """Return what errors of multipliers of at most these sizes ``(rows,)`` do to known signals of one
+        ``(nu + ny,)``."""
+        model, at, samples = self.model, self.outputs_at, self.question.samples
+        _, ne, nu, ny = model.sizes
+        outputs = sizes[at : at + samples * ny].reshape(samples, ny).sum(axis=0)
+        equations = enumerate(sizes[:at].reshape(self.equations, ne))
+        on_inputs = sum((np.abs(model.inputs(k)).T @ part for k, part in equations), start=np.zeros(nu))
+        return np.concatenate([on_inputs + np.abs(model.D).T @ outputs, outputs])
 
     def followed(self, multipliers: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return T ``(registers, nx)`` and T0 ``(1, nx)``: without a fault each register holds ``T E x``.
@@ -206,13 +304,13 @@ class Window:
 
 def courses_of(window: Window, point: FloatArray) -> dict[str, FloatArray]:
     """Return states, disturbances and faults of a point ``(columns,)`` over the samples of a window, by name."""
-    plant, question = window.plant, window.question
+    model, question = window.model, window.question
     length = max(window.equations + 1, question.samples)
-    names = {"x": plant.state_names, "d": plant.disturbance_names, "f": plant.fault_names}
+    names = {"x": model.state_names, "d": model.disturbance_names, "f": model.fault_names}
     found: dict[str, FloatArray] = {}
     own = np.zeros(length)
     own[question.before :] = point[0]
-    found[plant.fault_names[question.fault]] = own
+    found[model.fault_names[question.fault]] = own
     for label, value in zip(window.labels, point, strict=True):
         if label[0] in names:
             course = found.setdefault(names[label[0]][label[2]], np.zeros(length))
@@ -233,48 +331,53 @@ def courses_of(window: Window, point: FloatArray) -> dict[str, FloatArray]:
 
 
 def window_of(plant: DescriptorSystem, bounds: Bounds, question: Question) -> Window:
-    """Return the stacked equations of a question."""
+    """Return the stacked equations of a question about a plant whose matrices do not change."""
+    return stacked(Constant(plant, bounds), bounds, question)
+
+
+def stacked(model: Model, bounds: Bounds, question: Question) -> Window:
+    """Return the stacked equations of a question about a model of a window."""
     builder, samples = Builder(), question.samples
-    regular = decide_rank(plant.E).full
-    equations = samples - 1 if regular else samples + question.closing
-    nx, ny = plant.nx, plant.ny
-    rows = equations * nx + samples * ny
+    equations = model.equations(question)
+    nx, ne, _, ny = model.sizes
+    rows = equations * ne + samples * ny
     builder.columns([("theta",)], [np.inf])
 
-    def both(k: int, state: FloatArray, output: FloatArray, column: int, times: int = 1) -> None:
-        """Enter what acts at sample k in both kinds of rows."""
-        if k < equations:
-            builder.put(k * nx, -state, column, times)
+    def acting(kind: str, which: np.ndarray, k: int, column: int, times: int = 1) -> None:
+        """Enter columns that act at sample k, in both kinds of rows."""
+        equation, state, output = model.acting(kind, which, k)
+        if 0 <= equation < equations:
+            builder.put(equation * ne, -state, column, times)
         if k < samples:
-            builder.put(equations * nx + k * ny, output, column, times)
+            builder.put(equations * ne + k * ny, output, column, times)
 
     first = builder.columns(
         [("x", k, i) for k in range(equations + 1) for i in range(nx)],
         np.concatenate([np.minimum(bounds.state, bounds.first), *[bounds.state] * equations]),
     )
     for k in range(equations):
-        builder.put(k * nx, plant.E, first + (k + 1) * nx)
-        builder.put(k * nx, -plant.A, first + k * nx)
+        after, before = model.at(k)
+        builder.put(k * ne, after, first + (k + 1) * nx)
+        builder.put(k * ne, -before, first + k * nx)
     for k in range(samples):
-        builder.put(equations * nx + k * ny, plant.C, first + k * nx)
-    span = range(max(equations, samples))
+        builder.put(equations * ne + k * ny, model.seen(k), first + k * nx)
+    span = range(max(equations + model.later, samples))
     moving = np.flatnonzero(bounds.noise > 0.0)
-    for k in span:
+    for k in range(max(equations, samples)):
         if moving.size:
             column = builder.columns([("w", k, int(i)) for i in moving], bounds.noise[moving], 2 * k)
-            both(k, bounds.noise_state[:, moving], bounds.noise_output[:, moving], column)
-    rows = _disturbances(plant, bounds, question, builder, both, span, rows)
-    _course(plant, question, builder, both, span)
+            acting("w", moving, k, column)
+    rows = _disturbances(bounds, question, builder, acting, range(max(equations, samples)), rows)
+    _course(question, builder, acting, span)
     for fault in question.free:
-        state, output = plant.Bf[:, [fault]], plant.Df[:, [fault]]
         column = -1
         for k in span:
             if question.free_course == "any" or column < 0:
                 column = builder.columns([("f", k if question.free_course == "any" else None, fault)], [np.inf])
-            both(k, state, output, column)
+            acting("f", np.array([fault]), k, column)
     whole = [np.concatenate(parts) for parts in zip(*builder.parts, strict=True)]
     return Window(
-        plant,
+        model,
         bounds,
         question,
         rows,
@@ -286,20 +389,17 @@ def window_of(plant: DescriptorSystem, bounds: Bounds, question: Question) -> Wi
     )
 
 
-def _disturbances(
-    plant: DescriptorSystem, bounds: Bounds, question: Question, builder: Builder, both: Any, span: range, rows: int
-) -> int:
+def _disturbances(bounds: Bounds, question: Question, builder: Builder, acting: Any, span: range, rows: int) -> int:
     """Enter the disturbances; return the number of rows."""
-    acting = [i for i in range(plant.nd) if bounds.disturbance[i] > 0.0]
     one = np.ones((1, 1))
-    for i in acting:
-        state, output, bar = plant.Bd[:, [i]], plant.Dd[:, [i]], bounds.disturbance[i]
+    for i in np.flatnonzero(bounds.disturbance > 0.0).tolist():
+        which, bar = np.array([i]), bounds.disturbance[i]
         column = before = -1
         for k in span:
             if question.disturbance != "held" or column < 0:
                 label = ("d", None if question.disturbance == "held" else k, i)
                 column = builder.columns([label], [bar], 2 * k + 1 if question.disturbance == "jump" else -1)
-            both(k, state, output, column)
+            acting("d", which, k, column)
             if question.disturbance == "rate" and before >= 0:
                 change = builder.columns([("change of d", k, i)], [question.disturbance_rate[i]])
                 for place, times in ((column, 1), (before, -1), (change, -1)):
@@ -309,30 +409,31 @@ def _disturbances(
     return rows
 
 
-def _course(plant: DescriptorSystem, question: Question, builder: Builder, both: Any, span: range) -> None:
+def _course(question: Question, builder: Builder, acting: Any, span: range) -> None:
     """Enter the fault that is looked for."""
-    state, output = plant.Bf[:, [question.fault]], plant.Df[:, [question.fault]]
+    which = np.array([question.fault])
     target = question.samples - 1 - question.lag
     if question.course in ("constant", "step"):
         for k in span:
             if k >= question.before or question.course == "constant":
-                both(k, state, output, 0)
+                acting("f", which, k, 0)
     elif question.course == "ramp":
         slope = builder.columns([("slope", None, question.fault)], [np.inf])
         for k in span:
-            both(k, state, output, 0)
-            both(k, state, output, slope, k - target)
+            acting("f", which, k, 0)
+            acting("f", which, k, slope, k - target)
     elif question.course == "any":
         for k in span:
-            both(k, state, output, 0 if k == target else builder.columns([("f", k, question.fault)], [np.inf]))
+            column = 0 if k == target else builder.columns([("f", k, question.fault)], [np.inf])
+            acting("f", which, k, column)
     else:
         for k in span:
-            both(k, state, output, 0)
+            acting("f", which, k, 0)
         for k in span[1:]:
             change = builder.columns([("change of f", k, question.fault)], [question.fault_rate])
             later = range(k, len(span)) if k > target else range(k)
             for there in later:
-                both(there, state, output, change, 1 if k > target else -1)
+                acting("f", which, there, change, 1 if k > target else -1)
 
 
 def _exponent(values: FloatArray) -> np.ndarray:
