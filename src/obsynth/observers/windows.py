@@ -106,14 +106,26 @@ class WindowObserver:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
-        """Return the observer that `as_dict` described."""
+        """Return the observer that `as_dict` described.
+
+        Parameters
+        ----------
+        data : mapping
+            Every field by name; lists stand for tuples.
+        """
         values: dict[str, Any] = {
             key: tuple(value) if isinstance(value, list) else value for key, value in data.items()
         }
         return cls(**values)
 
     def programme_at(self, k: int) -> int:
-        """Return the number of the weights at a row; -1 where there is no sum."""
+        """Return the number of the weights at a row; -1 where there is no sum.
+
+        Parameters
+        ----------
+        k : int
+            Number of the row.
+        """
         place = k - self.samples
         if place < 0:
             return -1
@@ -125,7 +137,15 @@ class WindowObserver:
         return WindowState(0, np.full((self.samples - 1, width), np.nan))
 
     def skip(self, state: WindowState, count: int) -> WindowState:
-        """Return the state after so many samples that are missing."""
+        """Return the state after samples that are missing.
+
+        Parameters
+        ----------
+        state : WindowState
+            Before them.
+        count : int
+            How many they are.
+        """
         recent = np.array(state.recent)
         lost = min(count, len(recent))
         if lost:
@@ -133,8 +153,15 @@ class WindowObserver:
         return WindowState(state.k + count, recent)
 
     def advance(self, state: WindowState, y: FloatArray, u: FloatArray) -> tuple[WindowState, float]:
-        """Return the state after a sample and the sum at it: NaN where a sample of the window is missing, or where
-        there is no sum (``y (ny,)``, ``u (nu,)``, NaN where missing)."""
+        """Return the state after a sample and the sum at it, NaN where its window is not complete or there is no sum.
+
+        Parameters
+        ----------
+        state : WindowState
+            Before the sample.
+        y, u : FloatArray
+            ``(ny,)`` and ``(nu,)``, NaN where missing.
+        """
         require_horizon(self.horizon, state.k + 1, early=False)
         window = np.vstack([state.recent, np.concatenate([u, y])])
         which = self.programme_at(state.k)
