@@ -102,7 +102,7 @@ def estimates(observer: LinearObserver, u: FloatArray, outputs: FloatArray) -> F
     rows, y, known = observer.fault_rows, outputs.swapaxes(0, 1), u.swapaxes(0, 1)
     z = driven(observer.Az, np.zeros(observer.order), y @ observer.By.T + known @ observer.Bu.T)
     with np.errstate(over="ignore", invalid="ignore"):
-        found = z @ observer.Cz[rows].T + y @ observer.Dy[rows].T + known @ observer.Du[rows].T
+        found = z @ observer.Cz[rows].T + y @ observer.Dy[rows].T + known @ observer.Du[rows].T + observer.added[rows]
     return np.ascontiguousarray(found.swapaxes(0, 1))
 
 

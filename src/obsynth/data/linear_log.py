@@ -255,7 +255,7 @@ class DataObserver(Engine):
                     z = transition @ z + constant @ before + ramp @ (v - before)
                     before = v
                 states[k] = z
-                rows[k] = observer.Cz @ z + self.d @ v
+                rows[k] = observer.Cz @ z + self.d @ v + observer.added
                 if sampled:
                     z = observer.Az @ z + self.b @ v
         after = np.vstack([states[1:], z]) if sampled else states
@@ -289,7 +289,7 @@ class DataObserver(Engine):
         if self.observer.dt == 0.0:
             self._flow(seconds, v)
         z = _running(self.z)
-        self.row = np.asarray(self.observer.Cz @ z + self.d @ v)
+        self.row = np.asarray(self.observer.Cz @ z + self.d @ v + self.observer.added)
         self.measured = v
         faults = self._faults_in(self.row)
         self.seen = self.row[self.observer.state_rows] if self.partial is None else self.partial.state(z, v, faults)
@@ -399,7 +399,7 @@ class DataObserver(Engine):
             self.left = transition @ self.left + constant * told
         else:
             self.left = self.observer.Az @ self.left + self.b * told
-        row = np.asarray(self.observer.Cz @ self.z + self.d @ v)
+        row = np.asarray(self.observer.Cz @ self.z + self.d @ v + self.observer.added)
         self._taken(v)
         row[self.observer.fault_rows] = self.fault[self.told_faults]
         row[self.observer.residual_rows] = np.nan

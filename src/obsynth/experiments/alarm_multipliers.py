@@ -117,9 +117,11 @@ def _assumed(window: Window) -> str:
     """Return the bounds that a proof rests on, in words."""
     plant, bounds = window.plant, window.bounds
     noise = np.abs(bounds.noise_output) @ bounds.noise
+    d_middle = bounds.disturbance_middle
+    v_middle = None if bounds.noise_middle is None else bounds.noise_output @ bounds.noise_middle
     parts = [
-        _listed(plant.disturbance_names, bounds.disturbance, plant.units, "within", "disturbances"),
-        _listed(plant.output_names, noise, plant.units, "noise of", "sensors"),
+        _listed(plant.disturbance_names, bounds.disturbance, plant.units, "within", "disturbances", d_middle),
+        _listed(plant.output_names, noise, plant.units, "noise of", "sensors", v_middle),
         "process noise within its bounds" if bounds.noise_state.any() else "",
         _listed(plant.state_names, bounds.state, plant.units, "within", "states"),
         _listed(plant.state_names, bounds.first, plant.units, "at first within", "states"),
@@ -129,13 +131,34 @@ def _assumed(window: Window) -> str:
     return ", ".join(told) if told else "anything but faults"
 
 
-def _listed(names: tuple[str, ...], sizes: FloatArray, units: Mapping[str, str], word: str, kind: str) -> str:
-    known = [(name, size) for name, size in zip(names, sizes.tolist(), strict=True) if np.isfinite(size) and size > 0.0]
+def _listed(
+    names: tuple[str, ...],
+    sizes: FloatArray,
+    units: Mapping[str, str],
+    word: str,
+    kind: str,
+    middles: FloatArray | None = None,
+) -> str:
+    about = np.zeros(len(sizes)) if middles is None else middles
+    known = [
+        (name, size, middle)
+        for name, size, middle in zip(names, sizes.tolist(), about.tolist(), strict=True)
+        if np.isfinite(size) and (size > 0.0 or middle)
+    ]
     if len(known) > MOST_LISTED:
         return f"{len(known)} {kind} {word} their bounds"
-    if word == "noise of":
-        return ", ".join(f"noise of {name} within {shown(float(f'{s:.6g}'), units.get(name, ''))}" for name, s in known)
-    return ", ".join(f"{name} {word} {shown(size, units.get(name, ''))}" for name, size in known)
+    return ", ".join(_told(name, size, middle, units.get(name, ""), word) for name, size, middle in known)
+
+
+def _told(name: str, size: float, middle: float, unit: str, word: str) -> str:
+    noise = word == "noise of"
+    if middle:
+        # Ends are told as they were given, which half width and middle are to some digits.
+        low, high = (float(f"{end:.12g}") for end in (middle - size, middle + size))
+        within = f"{shown(low)} to {shown(high, unit)}"
+    else:
+        within = shown(float(f"{size:.6g}") if noise else size, unit)
+    return f"noise of {name} within {within}" if noise else f"{name} {word} {within}"
 
 
 def written(found: Multipliers) -> dict[str, Any]:

@@ -129,7 +129,7 @@ class LinearBench(Bench):
         system = self.observer
         start = self.observer_start - np.concatenate([inputs[0], outputs[0]], axis=1) @ self.observer_ramp.T
         z = driven(system.Az, start, inputs @ system.Bu.T + outputs @ system.By.T)
-        return np.asarray(z @ system.Cz.T + inputs @ system.Du.T + outputs @ system.Dy.T)
+        return np.asarray(z @ system.Cz.T + inputs @ system.Du.T + outputs @ system.Dy.T + system.added)
 
 
 def make_bench(design: ObserverDesign, scenario: Scenario) -> LinearBench:

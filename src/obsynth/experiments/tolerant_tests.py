@@ -61,6 +61,12 @@ def _beside(
         raise PreconditionError(
             f"{'isolate' if asked.isolate else 'exact'} is for an exact model.", condition="tolerances"
         )
+    if list(problem_of(plant, asked).bounds.middles):
+        raise PreconditionError(
+            "Bounds [low, high] and tolerances do not go together: what constants make of the middle is not known. "
+            "Give the larger end.",
+            condition="tolerances",
+        )
     progress("designing the observer of the state beside the test")
     own = design(plant, BESIDE)
     affine = affine_plant(plant)

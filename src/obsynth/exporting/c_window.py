@@ -15,7 +15,7 @@ from obsynth.observers.windows import WindowObserver
 from obsynth.results.design import ObserverDesign
 
 
-def require_fixed(design: ObserverDesign) -> None:
+def require_fixed(design: ObserverDesign, suffix: str) -> None:
     """Raise `SpecError` for tests that solve programmes at each row, which no export holds."""
     if design.method != GuaranteedTestMethod.id:
         return
@@ -26,6 +26,8 @@ def require_fixed(design: ObserverDesign) -> None:
             "set.",
             path="observer",
         )
+    if not is_window(design) or suffix != ".c":
+        _require_about_zero(design)
     for name, asked in (("exact", design.options.get("exact")), ("missing", design.options.get("missing") == "solve")):
         if asked:
             raise SpecError(
@@ -34,6 +36,16 @@ def require_fixed(design: ObserverDesign) -> None:
                 "exported.",
                 path=name,
             )
+
+
+def _require_about_zero(design: ObserverDesign) -> None:
+    """Raise `SpecError` for bounds that do not lie about zero, in formats that have no place for their middle."""
+    if design.linear[1].constant is not None:
+        raise SpecError(
+            f"Design {design.name!r} has bounds that do not lie about zero, so that its row has a constant part, which "
+            "is exported as C (.c) only, without tolerances.",
+            path="disturbance_bounds",
+        )
 
 
 def is_window(design: ObserverDesign) -> bool:
@@ -51,6 +63,7 @@ def window_c_texts(found: Realisation, prefix: str, header: str) -> tuple[str, s
     tables = {
         "weights": _weights(found, count, length),
         "limits": np.array([[one.threshold for one in test.tests]]),
+        "constants": observer.added[None],
         "rounding": np.array([one.certificate.matrices["rounding"].ravel() for one in test.tests]),
     }
     taken = ([f"const double u[{nu}]"] if nu else []) + [f"const double y[{ny}]"]
@@ -146,7 +159,7 @@ COPY_U    for (i = NU; i < WIDTH; i++) {
         }
     }
     for (k = 0; k < TESTS; k++) {
-        double sum = 0.0, threshold = limits[0][k];
+        double sum = constants[0][k], threshold = limits[0][k];
         for (i = 0; i < WIDTH; i++) {
             threshold += rounding[k][i] * state->largest[i];
         }

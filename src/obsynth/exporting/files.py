@@ -133,7 +133,7 @@ def export(
         raise SpecError(f"{target} has an unknown suffix: use one of {', '.join(SUFFIXES)}.", path=str(target))
     if isinstance(design, ObserverDesign):
         require_verified(design, unverified=unverified)
-        require_fixed(design)
+        require_fixed(design, suffix)
     if isinstance(design, ObserverDesign) and isinstance(design.observer, RecursiveObserver):
         require_plain(design.observer, "An export")
     if precision is not None and suffix != ".c":

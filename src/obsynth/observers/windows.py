@@ -45,6 +45,8 @@ class WindowObserver:
         What the sum is: the estimate of a fault, or a residual.
     fault_delays : tuple of int
         Samples by which the estimate lags.
+    constants : FloatArray
+        ``(programmes,)``: added to the sums.
 
     Raises
     ------
@@ -62,6 +64,7 @@ class WindowObserver:
     fault_names: tuple[str, ...]
     residual_names: tuple[str, ...]
     fault_delays: tuple[int, ...]
+    constants: FloatArray
     state_names = ()
     state_delays = ()
 
@@ -83,12 +86,16 @@ class WindowObserver:
                 f"and {rows} rows are needed.",
                 path="weights",
             )
+        constants = np.asarray(self.constants, dtype=np.float64).ravel()
+        if len(constants) != len(weights) or not np.isfinite(constants).all():
+            raise SpecError(f"The observer needs {len(weights)} finite constants.", path="constants")
         if np.any(programmes >= len(weights)) or len(self.fault_names) + len(self.residual_names) != 1:
             raise SpecError("The observer names weights that it does not have, or not one signal.", path="programmes")
         if len(self.fault_delays) != len(self.fault_names):
             raise SpecError("The observer needs one delay for its fault.", path="delays")
         object.__setattr__(self, "weights", read_only(weights))
         object.__setattr__(self, "programmes", read_only(programmes))
+        object.__setattr__(self, "constants", read_only(constants))
 
     @property
     def order(self) -> int:
@@ -167,7 +174,7 @@ class WindowObserver:
         which = self.programme_at(state.k)
         value = np.nan
         if which >= 0:
-            value = float(self.weights[which] @ window[::-1].ravel())
+            value = float(self.weights[which] @ window[::-1].ravel() + self.constants[which])
         return WindowState(state.k + 1, window[1:]), value
 
     def step(self, state: WindowState, y: ArrayLike, u: ArrayLike = ()) -> tuple[WindowState, Estimates]:

@@ -185,8 +185,8 @@ def fault_estimates(design: ObserverDesign, gains: FaultGains | None) -> tuple[t
         return missing if value is None else f"{number(value)} {units.get(name, '')}".strip()
 
     if isinstance(observer, WindowObserver):
-        late = zip(observer.fault_names, observer.fault_delays, strict=True)
-        return ("fault", "delay", "delay in s"), [(name, str(k), number(k * observer.dt)) for name, k in late]
+        delayed = zip(observer.fault_names, observer.fault_delays, strict=True)
+        return ("fault", "delay", "delay in s"), [(name, str(k), number(k * observer.dt)) for name, k in delayed]
     if gains is None or not isinstance(plant, DescriptorSystem):
         when = "after the nominal run" if isinstance(plant, DAEModel) else "at the end of the horizon"
         return ("parameter", f"deviation {when}"), [(name, deviation(name, "-")) for name in observer.fault_names]

@@ -266,6 +266,8 @@ class ObserverDesign:
 
 def _from_inputs_and_outputs(observer: LinearObserver) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return A, B, C and D from ``[u; y]`` to the rows of the observer."""
+    if observer.constant is not None:
+        raise SpecError("The observer adds a constant to its rows, which this form has no place for.", path="observer")
     import numpy as np
 
     return (

@@ -223,7 +223,7 @@ KINDS: Mapping[str, Any] = {
     "pole region": PoleRegion | None,
     "noise weights": NoiseSection | None,
     "named covariance": Positive | Matrix | dict[Text, NonNegative] | None,
-    "named bounds": NonNegative | dict[Text, NonNegative] | None,
+    "named bounds": NonNegative | dict[Text, NonNegative | Range] | None,
     "samples": Literal["auto"] | Count,
     "free faults": Text | list[Text] | None,
     "named numbers": Positive | dict[Text, Positive] | None,

@@ -72,6 +72,7 @@ def joined(parts: Sequence[LinearObserver], names: tuple[str, ...]) -> LinearObs
         fault_names=(),
         fault_delays=(),
         residual_names=names,
+        constant=np.concatenate([part.added for part in parts]),
     )
 
 
@@ -134,6 +135,7 @@ def _cut(observer: LinearObserver, window: Any, fault: int, whole: int, length: 
         fault_names=name if estimated else (),
         fault_delays=(window.question.lag + delay,) if estimated else (),
         residual_names=() if estimated else name,
+        constant=observer.added[own],
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -138,11 +139,10 @@ def _of_the_test(design: ObserverDesign, window: Window, test: Repaired) -> Iter
         source=SOURCE,
         kind="proved",
     )
-    on_y, on_u, delay = window.weights(test.values)
     tracking = design.certificate.matrices.get("state_tracking")
     # The observer beside the test may be any: its error is bounded by what it is.
     beside = None if tracking is None else part_beside(observer, min(len(tracking), observer.order))
-    implied = observer_of(window, on_y, on_u, delay, beside)
+    implied = observer_of(window, test.values, beside)
     rounding = rounding_of(window, test.values, test.radius)
     yield upper_bound_check(
         "weights",
@@ -203,8 +203,11 @@ def known_room(window: Window, multipliers: FloatArray) -> float:
 def _misfit(shipped: object, implied: object, window: Window, multipliers: FloatArray) -> float:
     worst = 0.0
     allowed = {"Bu": known_room(window, multipliers), "Du": known_room(window, multipliers)}
-    for name, wanted in implied.as_dict().items():  # type: ignore[attr-defined]
-        given = getattr(shipped, name)
+    for part in fields(implied):  # type: ignore[arg-type]
+        name, wanted, given = part.name, getattr(implied, part.name), getattr(shipped, part.name)
+        if (wanted is None) != (given is None):
+            worst = np.inf
+            continue
         if not isinstance(wanted, np.ndarray):
             worst = worst if given == wanted else np.inf
         elif given.shape != wanted.shape:

@@ -114,7 +114,8 @@ class Programmes:
             return np.nan, np.inf
         test, threshold = programme.test
         rounding = rounding_of(programme.window, test.values, test.radius)
-        return float(test.values @ right), threshold + float(rounding @ largest)
+        rounding_of_middles = programme.window.standing_room(test.values, test.radius)
+        return float(test.values @ right), threshold + float(rounding @ largest) + rounding_of_middles
 
 
 class _Programme:
@@ -194,6 +195,7 @@ class _Programme:
         ends = [sign * np.inf]
         for test, width in (found for found in tests if found is not None):
             rounding = float(rounding_of(self.window, test.values, test.radius) @ largest)
+            rounding += self.window.standing_room(test.values, test.radius)
             ends.append(float(test.values @ right) + sign * (width + rounding))
         return sign * min(sign * end for end in ends)
 
@@ -213,7 +215,15 @@ def _highs(window: Window) -> Any:
     model.a_matrix_.format_ = highspy.MatrixFormat.kColwise
     model.a_matrix_.start_, model.a_matrix_.index_ = matrix.indptr, matrix.indices
     model.a_matrix_.value_ = matrix.data
-    found = highspy.Highs()  # type: ignore[no-untyped-call]
+
+    class Silent(highspy.Highs):
+        """HiGHS without a word: its newer versions print one where callbacks are enabled, while it is made."""
+
+        def enableCallbacks(self) -> None:
+            self.silent()
+            super().enableCallbacks()  # type: ignore[no-untyped-call]
+
+    found = Silent()  # type: ignore[no-untyped-call]
     found.silent()
     for name in ("primal_feasibility_tolerance", "dual_feasibility_tolerance"):
         found.setOptionValue(name, TOLERANCE)

@@ -59,11 +59,12 @@ class GuaranteedTestMethod(Asked, Method):
         least for which there is a test, otherwise 0.
     before, after : int, optional, samples
         Of a step: healthy samples before it, and samples from it on, which is another way to say ``samples``.
-    disturbance_bounds : float or mapping of str to float
-        Largest absolute value of every disturbance.
-    noise_bound : float or mapping of str to float
-        Deviations that no component of the stated noise exceeds; or, by output, the bound of its noise (plants that
-        change with k: always by output).
+    disturbance_bounds : float or mapping of str to float or [low, high]
+        Largest absolute value of every disturbance, or by name the interval in which it stays: its middle is then a
+        known constant, and half its width counts.
+    noise_bound : float or mapping of str to float or [low, high]
+        Deviations that no component of the stated noise exceeds; or, by output, the bound or the interval of its noise
+        (plants that change with k: always by output).
     disturbance : {"jump", "held", "rate"}, optional
         Disturbances change at will from sample to sample, not at all over the window, or by ``disturbance_rate``.
     disturbance_rate : float or mapping of str to float, optional

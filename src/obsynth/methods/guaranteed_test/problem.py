@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from fractions import Fraction
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,6 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import decide_rank
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.proofs.balls import UNIT_ROUNDOFF
 from obsynth.proofs.exact_pencils import ExactPencil
 
 #: What each course covers, and what not.
@@ -35,8 +35,6 @@ LADDER = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)
 MOST_STATES = 2500
 #: The least number of samples whose threshold is within this share of the last one's is taken.
 WITHIN = 0.05
-#: Room for the sums that bound what rounding does to a running test.
-SUM_ROOM = 1.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,10 +157,11 @@ def bounds_of(plant: DescriptorSystem, asked: Asked) -> Bounds:
     if lacking:
         first = lacking[0].partition(":")[0]
         raise SpecError("A guaranteed test needs bounds.", path=f"method.options.{first}", problems=lacking)
-    disturbance = by_name(asked.disturbance_bounds, plant.disturbance_names, "disturbance_bounds", every=False)
+    names, middle = plant.disturbance_names, np.zeros(plant.nw)
+    disturbance, disturbance_middle = between(asked.disturbance_bounds, names, "disturbance_bounds", every=False)
     if isinstance(asked.noise_bound, Mapping):
         output = np.eye(plant.ny)
-        noise = by_name(asked.noise_bound, plant.output_names, "noise_bound", every=True)
+        noise, middle = between(asked.noise_bound, plant.output_names, "noise_bound", every=True)
         state, kept = np.zeros((plant.nx, plant.ny)), np.any(plant.Bw != 0.0, axis=0)
         if kept.any():
             raise SpecError(
@@ -174,7 +173,36 @@ def bounds_of(plant: DescriptorSystem, asked: Asked) -> Bounds:
         noise = by_name(asked.noise_bound, plant.noise_names, "noise_bound", every=False)
     always = by_name(asked.state_bounds, plant.state_names, "state_bounds", every=False, missing=np.inf)
     at_first = by_name(asked.initial_bounds, plant.state_names, "initial_bounds", every=False, missing=np.inf)
-    return Bounds(disturbance, state, output, noise, always, at_first)
+    return Bounds(disturbance, state, output, noise, always, at_first, disturbance_middle, middle)
+
+
+def between(given: Any, names: tuple[str, ...], option: str, *, every: bool) -> tuple[FloatArray, FloatArray]:
+    """Return half widths, rounded up, and middles of bounds that are numbers, or ``[low, high]`` by name."""
+    path = f"method.options.{option}"
+    low, high = {}, {}
+    for name, value in given.items() if isinstance(given, Mapping) else ():
+        if not isinstance(value, (list, tuple, np.ndarray)):
+            continue
+        if len(value) != 2 or not all(map(is_finite_number, value)) or not value[0] <= value[1]:
+            raise SpecError(
+                f"{option} of {name} is {value!r}: give one number, or two finite ones, [low, high], low first.",
+                path=path,
+            )
+        low[name], high[name] = float(value[0]), float(value[1])
+    plain = {name: 0.0 if name in low else value for name, value in given.items()} if low else given
+    half, middle = by_name(plain, names, option, every=every), np.zeros(len(names))
+    for place, name in enumerate(names):
+        if name in low:
+            middle[place] = 0.5 * low[name] + 0.5 * high[name]
+            ends = [abs(Fraction(end) - Fraction(middle[place])) for end in (low[name], high[name])]
+            half[place] = rounded_outward(max(ends))
+    return half, middle
+
+
+def rounded_outward(value: Fraction) -> float:
+    """Return a double that is not below a rational number."""
+    found = float(value)
+    return found if Fraction(found) >= value else float(np.nextafter(found, np.inf))
 
 
 def by_name(given: Any, names: tuple[str, ...], option: str, *, every: bool, missing: float = 0.0) -> FloatArray:
@@ -194,8 +222,8 @@ def by_name(given: Any, names: tuple[str, ...], option: str, *, every: bool, mis
     for name, value in by_name.items():
         if isinstance(value, (list, tuple)):
             raise SpecError(
-                f"{option} of {name} is {value!r}: one bound holds on both sides of the operating point; for another "
-                "interval take the larger end, or move that to its middle if the plant can rest there.",
+                f"{option} of {name} is {value!r}: one bound holds on both sides of the operating point: take the "
+                "larger end.",
                 path=path,
             )
         if not (is_finite_number(value) and value >= 0.0):
@@ -212,13 +240,12 @@ def delay_in_samples(window: Window, delay: int) -> int:
     return (question.lag if question.course == "any" else question.samples - 1) + delay
 
 
-def observer_of(
-    window: Window, on_y: FloatArray, on_u: FloatArray, delay: int, beside: LinearObserver | None = None
-) -> LinearObserver:
-    """Return the weights (newest first) as a linear observer with one register for each sample but the last.
+def observer_of(window: Window, multipliers: FloatArray, beside: LinearObserver | None = None) -> LinearObserver:
+    """Return the weights of multipliers as a linear observer with one register for each sample but the last.
 
     ``beside``: an observer of the state, which runs along where constants have tolerances.
     """
+    on_y, on_u, delay = window.weights(multipliers)
     plant, count = window.plant, len(on_y) - 1
     name = (plant.fault_names[window.question.fault],)
     estimated = window.question.course != "step"
@@ -240,12 +267,11 @@ def observer_of(
         residual_names=() if estimated else name,
         state_delays=(),
         fault_delays=late,
+        constant=np.array([window.constant(multipliers)]),
     )
     return test if beside is None else side_by_side(test, beside)
 
 
 def rounding_of(window: Window, multipliers: FloatArray, radius: FloatArray) -> FloatArray:
     """Return what shipped weights may err for known signals of at most one ``(nu + ny,)``; the threshold lacks it."""
-    nx, _, nu, ny = window.model.sizes
-    share = (len(multipliers) + nu + ny + nx + 8) * UNIT_ROUNDOFF
-    return window.known_sizes((radius + share * np.abs(multipliers)) * SUM_ROOM)
+    return window.known_sizes(window.errors(multipliers, radius))

@@ -109,6 +109,8 @@ def exact_right_sides(window: Window, y: FloatArray, u: FloatArray) -> list[Frac
         for r in range(plant.ny):
             place = window.outputs_at + k * plant.ny + r
             found[place] = Fraction(float(y[k, r])) - times(plant.D[r], u[k])
+    if window.standing:
+        found = [side - middle for side, middle in zip(found, window.standing, strict=True)]
     return found
 
 
@@ -423,15 +425,16 @@ def proved_threshold(window: Window, repaired: Repaired, *, exact_zero: bool = F
     """Return what the test never passes without a fault: an upper bound of ``sum bar |M_s' mu|``."""
     if exact_zero:
         return 0.0
+    standing = Fraction(window.standing_room(repaired.values, repaired.radius))
     seen = columns_of(window, repaired.values)
     away = _absolute(window, repaired.radius)
     bounded = np.flatnonzero(window.bounded)
     parts = [Fraction(float(window.bar[j])) * (abs(seen[j]) + away[j]) for j in bounded]
     if not window.question.ellipsoid:
-        return up(sum(parts, start=Fraction(0)))
+        return up(sum(parts, start=standing))
     sizes, groups = np.array([up(part) for part in parts]), window.group[bounded]
     norms = [float(np.sqrt(np.sum(sizes[groups == group] ** 2))) for group in np.unique(groups[groups >= 0])]
-    norms += sizes[groups < 0].tolist()
+    norms += [*sizes[groups < 0].tolist(), up(standing)]
     return float(rounded_up(np.array(sum(norms)), 2 * len(sizes) + 8))
 
 

@@ -125,7 +125,7 @@ def proved_test(window: Window, found: Optimum) -> Shipped:
     rows, columns = window.scales
     # What all bounds together could do to these weights.
     able = float(np.abs(window.matrix[:, window.bounded]).T @ np.abs(found.multipliers) @ window.bar[window.bounded])
-    if found.size <= ZERO * able:
+    if found.size <= ZERO * able and not window.standing:
         exact = repaired_multipliers(window, found.multipliers, refine=True, exact_zero=True)
         if exact is not None:
             return Shipped(exact.with_room(rows), 0.0, None, 0.0)
@@ -146,7 +146,7 @@ def _synthesis(
     problem: Problem, asked: Asked, window: Window, shipped: Shipped, table: FloatArray, beside: Beside | None
 ) -> Synthesis:
     on_y, on_u, delay = window.weights(shipped.test.values)
-    observer = observer_of(window, on_y, on_u, delay, None if beside is None else beside.observer)
+    observer = observer_of(window, shipped.test.values, None if beside is None else beside.observer)
     question, plant = window.question, problem.plant
     matrices = {
         "multipliers": shipped.test.values,

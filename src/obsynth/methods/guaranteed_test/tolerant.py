@@ -72,6 +72,7 @@ def side_by_side(test: LinearObserver, beside: LinearObserver) -> LinearObserver
         Dy=np.vstack([beside.Dy[:n], test.Dy]),
         state_names=beside.state_names,
         state_delays=beside.state_delays,
+        constant=np.concatenate([np.zeros(n), test.added]),
     )
 
 
@@ -89,6 +90,7 @@ def part_beside(both: LinearObserver, order: int) -> LinearObserver:
         fault_names=(),
         fault_delays=(),
         residual_names=(),
+        constant=None,
     )
 
 

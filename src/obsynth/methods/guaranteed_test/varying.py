@@ -17,7 +17,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.methods.guaranteed_test.options import Asked
-from obsynth.methods.guaranteed_test.problem import LADDER, MOST_STATES, by_name, fault_of, free_faults
+from obsynth.methods.guaranteed_test.problem import LADDER, MOST_STATES, between, by_name, fault_of, free_faults
 from obsynth.methods.guaranteed_test.windows import Bounds, Question, Window, stacked
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import decide_rank
@@ -173,13 +173,17 @@ def varying_problem(plant: TimeVaryingDescriptorSystem, asked: Asked) -> Varying
     rates = np.zeros(0)
     if asked.disturbance == "rate":
         rates = by_name(asked.disturbance_rate, names, "disturbance_rate", every=True)
+    disturbance, disturbance_middle = between(asked.disturbance_bounds, names, "disturbance_bounds", every=True)
+    noise, noise_middle = between(asked.noise_bound, plant.output_names, "noise_bound", every=True)
     bounds = Bounds(
-        by_name(asked.disturbance_bounds, names, "disturbance_bounds", every=True),
+        disturbance,
         np.zeros((plant.ne, plant.ny)),
         np.eye(plant.ny),
-        by_name(asked.noise_bound, plant.output_names, "noise_bound", every=True),
+        noise,
         by_name(asked.state_bounds, plant.state_names, "state_bounds", every=False, missing=np.inf),
         by_name(asked.initial_bounds, plant.state_names, "initial_bounds", every=False, missing=np.inf),
+        disturbance_middle,
+        noise_middle,
     )
     before = asked.before if asked.course == "step" else 0
     question = Question(
@@ -259,6 +263,10 @@ def observer_of_rows(
         on_y, on_u, _ = window.weights(values)
         both = np.hstack([on_u, on_y]).ravel()
         weights.append(both if has_test else np.zeros_like(both))
+    constants = [
+        window.constant(values) if has_test else 0.0
+        for window, values, has_test in zip(programmes.windows, multipliers, told, strict=True)
+    ]
     estimated = question.course != "step"
     name = (plant.parameter_names[question.fault],)
     return WindowObserver(
@@ -272,6 +280,7 @@ def observer_of_rows(
         fault_names=name if estimated else (),
         residual_names=() if estimated else name,
         fault_delays=(question.lag,) if estimated else (),
+        constants=np.array(constants),
     )
 
 

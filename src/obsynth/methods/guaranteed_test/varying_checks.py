@@ -180,6 +180,8 @@ def _of_what_runs(
         elif name == "programmes":
             # Rows whose programme has a test may be left without a verdict.
             worst = worst if np.array_equal(given, kept) else np.inf
+        elif name == "constants":
+            worst = worst if np.array_equal(given, wanted) else np.inf
         elif given != wanted:
             worst = np.inf
     yield upper_bound_check(

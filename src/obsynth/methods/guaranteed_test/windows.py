@@ -9,7 +9,9 @@ size of the fault.  Every entry is kept as a double times a whole number, so tha
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from fractions import Fraction
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -19,6 +21,7 @@ from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import decide_rank
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.proofs.balls import UNIT_ROUNDOFF
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -27,14 +30,18 @@ if TYPE_CHECKING:
 MOST_SPREAD = 30
 #: Rounds of scaling rows and free columns by powers of two.
 SCALING_ROUNDS = 4
+#: Room for the sums that bound what rounding does to a running test.
+SUM_ROOM = 1.01
 
 
 @dataclass(frozen=True, eq=False)
 class Bounds:
     """What keeps its bounds: disturbances, columns of noise, states.
 
-    ``disturbance (nd,)``; ``noise_state (nx, n)``, ``noise_output (ny, n)`` and ``noise (n,)``: noise columns and their
-    bounds; ``state`` and ``first`` ``(nx,)``: of the states at every and at the first sample, infinite without any.
+    All of them half widths.  ``disturbance (nd,)``; ``noise_state (nx, n)``, ``noise_output (ny, n)`` and
+    ``noise (n,)``: noise columns and their bounds; ``state`` and ``first`` ``(nx,)``: of the states at every and at the
+    first sample, infinite without any.
+    ``disturbance_middle (nd,)``, ``noise_middle (n,)``: the middles of their bounds, zero where not given.
     """
 
     disturbance: FloatArray
@@ -43,6 +50,16 @@ class Bounds:
     noise: FloatArray
     state: FloatArray
     first: FloatArray
+    disturbance_middle: FloatArray | None = None
+    noise_middle: FloatArray | None = None
+
+    @property
+    def middles(self) -> Iterator[tuple[str, int, float]]:
+        """Kind, number and middle of what does not move about zero."""
+        for kind, given in (("d", self.disturbance_middle), ("w", self.noise_middle)):
+            for i, value in enumerate(() if given is None else given.tolist()):
+                if value:
+                    yield kind, i, value
 
 
 @dataclass(frozen=True, eq=False)
@@ -250,6 +267,38 @@ class Window:
             columns = np.where(self.bounded, columns, moved)
         return rows, columns
 
+    @cached_property
+    def standing(self) -> tuple[Fraction, ...]:
+        """What the middles of all bounds put into each row, exactly ``(rows,)``; empty where they are zero."""
+        middles = list(self.bounds.middles)
+        if not middles:
+            return ()
+        found = [Fraction(0)] * self.rows
+        _, ne, _, ny = self.model.sizes
+        for kind, i, middle in middles:
+            exact = Fraction(middle)
+            for k in range(max(self.equations, self.question.samples)):
+                equation, state, output = self.model.acting(kind, np.array([i]), k)
+                if 0 <= equation < self.equations:
+                    for row in np.flatnonzero(state[:, 0]).tolist():
+                        found[equation * ne + row] -= exact * Fraction(float(state[row, 0]))
+                if k < self.question.samples:
+                    for row in np.flatnonzero(output[:, 0]).tolist():
+                        found[self.outputs_at + k * ny + row] += exact * Fraction(float(output[row, 0]))
+        return tuple(found)
+
+    @cached_property
+    def moved(self) -> FloatArray:
+        """The same, rounded ``(rows,)``; zeros where all middles are zero."""
+        return np.array([float(value) for value in self.standing]) if self.standing else np.zeros(self.rows)
+
+    def constant(self, multipliers: FloatArray) -> float:
+        """Return what a test adds for the middles of the bounds: the double next to it."""
+        if not self.standing:
+            return 0.0
+        known = zip(multipliers.tolist(), self.standing, strict=True)
+        return -float(sum((Fraction(value) * side for value, side in known if value and side), start=Fraction(0)))
+
     def weights(self, multipliers: FloatArray) -> tuple[FloatArray, FloatArray, int]:
         """Return the weights of outputs and known inputs, newest sample first ``(n, ny)``, ``(n, nu)``, and the delay.
 
@@ -270,6 +319,18 @@ class Window:
         delay = int(later[-1]) + 1 if later.size else 0
         kept = question.samples + delay
         return on_y[:kept][::-1].copy(), on_u[:kept][::-1].copy(), delay
+
+    def errors(self, multipliers: FloatArray, radius: FloatArray) -> FloatArray:
+        """Return what shipped multipliers and sums of their products may err, in each row ``(rows,)``."""
+        nx, _, nu, ny = self.model.sizes
+        share = (len(multipliers) + nu + ny + nx + 8) * UNIT_ROUNDOFF
+        return np.asarray((radius + share * np.abs(multipliers)) * SUM_ROOM)
+
+    def standing_room(self, multipliers: FloatArray, radius: FloatArray) -> float:
+        """Return what these may err for the middles of the bounds: it is in the threshold."""
+        if not self.standing:
+            return 0.0
+        return float(self.errors(multipliers, radius) @ np.abs(self.moved)) * SUM_ROOM
 
     def known_sizes(self, sizes: FloatArray) -> FloatArray:
         """Return what errors of multipliers of at most these sizes ``(rows,)`` do to known signals of one
@@ -299,7 +360,7 @@ class Window:
         right[: self.outputs_at] = (u[: self.equations] @ plant.B.T).ravel()
         known = y - u[: len(y)] @ plant.D.T
         right[self.outputs_at : self.outputs_at + known.size] = known.ravel()
-        return right
+        return right - self.moved if self.standing else right
 
 
 def courses_of(window: Window, point: FloatArray) -> dict[str, FloatArray]:

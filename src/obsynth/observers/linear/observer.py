@@ -48,6 +48,8 @@ class LinearObserver:
         The signals that are estimated, in order.
     state_delays, fault_delays : tuple of int
         Samples by which each estimate lags: at time k it is the estimate of the signal at ``k - delay``.
+    constant : array_like, optional
+        ``(nx + nf + nr,)``: added to the rows; of tests whose bounds lie on different sides of zero.
 
     Raises
     ------
@@ -69,6 +71,7 @@ class LinearObserver:
     residual_names: tuple[str, ...]
     state_delays: tuple[int, ...]
     fault_delays: tuple[int, ...]
+    constant: FloatArray | None = None
 
     def __post_init__(self) -> None:
         for field in NAME_FIELDS:
@@ -82,6 +85,11 @@ class LinearObserver:
             if matrix.shape != shape:
                 raise SpecError(f"{name} of the observer is {matrix.shape}, but {shape} is needed.", path=name)
             object.__setattr__(self, name, read_only(matrix))
+        if self.constant is not None:
+            added = as_matrix(np.atleast_2d(self.constant), "constant")[0]
+            if added.shape != (rows,):
+                raise SpecError(f"constant of the observer is {added.shape}, but {(rows,)} is needed.", path="constant")
+            object.__setattr__(self, "constant", read_only(added) if added.any() else None)
         if not (math.isfinite(self.dt) and self.dt >= 0.0):
             raise SpecError(f"dt of the observer is {self.dt}: give seconds, or 0 for continuous time.", path="dt")
         for names, delays in ((self.state_names, self.state_delays), (self.fault_names, self.fault_delays)):
@@ -117,7 +125,15 @@ class LinearObserver:
 
     def as_dict(self) -> dict[str, Any]:
         """Return every field, as the constructor takes it."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
+        known = {field.name: getattr(self, field.name) for field in fields(self)}
+        if self.constant is None:
+            del known["constant"]
+        return known
+
+    @cached_property
+    def added(self) -> FloatArray:
+        """What is added to the rows ``(nx + nf + nr,)``."""
+        return np.zeros(len(self.Cz)) if self.constant is None else self.constant
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> LinearObserver:
@@ -174,7 +190,7 @@ class LinearObserver:
         y, u : FloatArray
             ``(ny,)`` and ``(nu,)``, finite.
         """
-        row = self.Cz @ state.z + self.Du @ u + self.Dy @ y
+        row = self.Cz @ state.z + self.Du @ u + self.Dy @ y + self.added
         return LinearState(self.Az @ state.z + self.Bu @ u + self.By @ y), np.asarray(row)
 
     def step(self, state: LinearState, y: ArrayLike, u: ArrayLike = ()) -> tuple[LinearState, Estimates]:
@@ -212,7 +228,7 @@ class LinearObserver:
         taken[:count] = start[:count]
         for age, (on_u, on_y) in enumerate(zip(self.Bu, self.By, strict=True), start=1):
             taken[age:] += u[:-age] @ on_u + y[:-age] @ on_y
-        return np.asarray(np.outer(taken, self.Cz[:, 0]) + u @ self.Du.T + y @ self.Dy.T)
+        return np.asarray(np.outer(taken, self.Cz[:, 0]) + u @ self.Du.T + y @ self.Dy.T + self.added)
 
     def run(self, y: ArrayLike, u: ArrayLike | None = None, *, initial_state: ArrayLike | None = None) -> Estimates:
         """Run over a whole record of a discrete-time observer.
