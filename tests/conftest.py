@@ -1,6 +1,7 @@
-"""What all tests share: how many of the plants drawn at random a run looks at, and which tests other machines run.
+"""What all tests share: how many of the cases drawn at random a run looks at, and which tests other machines run.
 
-`.ci/run` takes the tests marked ``numerics`` once more with other processors' kernels and with the oldest dependencies.
+`.ci/run` takes the tests marked ``sampled`` once more with all their cases (``--whole``), and those marked ``numerics``
+with other processors' kernels and with the oldest dependencies.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ NUMERIC = frozenset({
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
-        "--whole", action="store_true", help="all random plants of the property tests, not every fourth (ten minutes)"
+        "--whole", action="store_true", help="all random cases of the tests marked sampled, not every fourth"
     )
 
 
@@ -46,6 +47,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if item.path.name in NUMERIC:
             item.add_marker(pytest.mark.numerics)
+        if "share" in getattr(item, "fixturenames", ()):
+            item.add_marker(pytest.mark.sampled)
 
 
 @pytest.fixture(scope="session")

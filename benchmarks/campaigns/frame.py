@@ -2,7 +2,7 @@
 
 A campaign is a module of this folder with ``CASES`` (how many), ``LIMIT`` (seconds, for one case) and
 ``case(seed) -> Outcome``; its docstring is the text of its table.  Every case follows from its seed alone, so that any
-share of a campaign can be run, in any order: the tests take one case in ``SHARE``.
+share of a campaign can be run, in any order: CI takes one case in ``SHARE``, the tests every fourth of these.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import ModuleType
 
-#: The tests run one case in this many.
+#: CI runs one case in this many.
 SHARE = 50
 #: Modules of this folder that are no campaigns.
 _FRAME = {"__init__", "__main__", "frame"}
@@ -54,7 +54,7 @@ def load_campaign(name: str) -> ModuleType:
 
 
 def share_of(campaign: ModuleType) -> range:
-    """Return the seeds of the share that the tests run."""
+    """Return the seeds of the share that CI runs."""
     return range(0, campaign.CASES, SHARE)
 
 
