@@ -7,12 +7,14 @@ from __future__ import annotations
 
 import re
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import jupytext
 import nbformat
 import pytest
+from jupyter_client.manager import KernelManager, start_new_kernel
 from nbclient import NotebookClient
 
 import obsynth
@@ -54,15 +56,51 @@ def test_the_run_belongs_to_the_source(source: Path) -> None:
     assert problems_in_outputs(run) == []
 
 
+@pytest.fixture(scope="module")
+def kernel() -> Iterator[KernelManager]:
+    """One process for all notebooks: most of the time of a new one is the loading of libraries."""
+    manager, client = start_new_kernel(kernel_name="python3")
+    client.stop_channels()
+    yield manager
+    manager.shutdown_kernel(now=True)
+
+
+def begin_anew(kernel: KernelManager, folder: Path) -> None:
+    """Forget all names and counts, and go to a folder."""
+    client = kernel.client()
+    client.start_channels()
+    client.wait_for_ready(timeout=60)
+    code = f"__import__('os').chdir({str(folder)!r}); get_ipython().reset(new_session=True)"
+    done = client.execute_interactive(code, store_history=False, timeout=60)
+    client.stop_channels()
+    assert done["content"]["status"] == "ok"
+
+
+def run_in(kernel: KernelManager, notebook: Any, folder: Path) -> Any:
+    begin_anew(kernel, folder)
+    client = NotebookClient(notebook, km=kernel, timeout=300)
+    try:
+        return client.execute()
+    finally:
+        client.kc.stop_channels()
+
+
+def test_names_of_one_notebook_are_gone_in_the_next(kernel: KernelManager, tmp_path: Path) -> None:
+    cells = ["import os; left = os.getcwd(); print(left)", "print('left' in globals(), 'os' in globals())"]
+    first, second = (nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(cell)]) for cell in cells)
+    assert run_in(kernel, first, tmp_path).cells[0].outputs[0].text == f"{tmp_path}\n"
+    (cell,) = run_in(kernel, second, tmp_path).cells
+    assert (cell.execution_count, cell.outputs[0].text) == (1, "False False\n")
+
+
 @EACH
-def test_it_runs_from_scratch(source: Path, tmp_path: Path) -> None:
+def test_it_runs_from_scratch(source: Path, kernel: KernelManager, tmp_path: Path) -> None:
     """In a copy of the two folders it may use, so that nothing else is needed and nothing is written here."""
     shutil.copytree(ROOT / "designs", tmp_path / "designs")
     folder = tmp_path / "notebooks"
     folder.mkdir()
     notebook = jupytext.read(source)
-    resources = {"metadata": {"path": str(folder)}}
-    done = NotebookClient(notebook, timeout=300, kernel_name="python3", resources=resources).execute()
+    done = run_in(kernel, notebook, folder)
     assert problems_in_outputs(done) == []
     kinds = {output.output_type for cell in done.cells for output in cell.get("outputs", [])}
     assert {"stream", "display_data"} <= kinds
