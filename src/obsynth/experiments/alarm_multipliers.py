@@ -24,6 +24,7 @@ from obsynth.methods.guaranteed_test.proofs import (
     exact_right_sides,
     up,
 )
+from obsynth.methods.guaranteed_test.regions import while_inside
 from obsynth.methods.guaranteed_test.result import GuaranteedTest
 from obsynth.methods.guaranteed_test.windows import Window
 from obsynth.numerics.arrays import FloatArray
@@ -109,7 +110,8 @@ def statement_of(test: GuaranteedTest, group: tuple[str, ...], row: int, log: Lo
     one = " or ".join(group)
     return (
         f"Proved: no course of {_assumed(window)} explains rows {row - rows_of_test(test) + 1} to {row} of {source} "
-        f"without {one}{besides}: {one} is there, or a model that is not exact. Gain set {gain_set[:SHOWN_DIGITS]}."
+        f"without {one}{besides}{while_inside(test)}: {one} is there, or a model that is not exact. "
+        f"Gain set {gain_set[:SHOWN_DIGITS]}."
     )
 
 

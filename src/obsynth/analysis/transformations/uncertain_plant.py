@@ -89,7 +89,7 @@ def moving_family(plant: DescriptorSystem, box: ConstantsBox, basis: FloatArray 
     if uncertain is None:
         return AffineMatrix.exact(plant.A, 0)
     written = as_written(plant, uncertain)
-    return _reduced(written, uncertain.affine(written, box), basis)["A"]
+    return reduced_matrices(written, uncertain.affine(written, box), basis)["A"]
 
 
 def reduced_family(
@@ -103,10 +103,10 @@ def reduced_family(
     matrices, values = uncertain.affine(written, box), None
     if not inverted:
         values = uncertain.filled(written, {name: item.nominal for name, item in box.constants.items()})["E"]
-    first = _reduced(written, matrices, None, values)
+    first = reduced_matrices(written, matrices, None, values)
     basis = untouched_coordinates(first)
     same = np.array_equal(basis, np.eye(len(basis)))
-    return (first if same else _reduced(written, matrices, basis, values)), basis
+    return (first if same else reduced_matrices(written, matrices, basis, values)), basis
 
 
 def moving_basis(plant: DescriptorSystem, box: ConstantsBox) -> FloatArray:
@@ -115,7 +115,7 @@ def moving_basis(plant: DescriptorSystem, box: ConstantsBox) -> FloatArray:
     if uncertain is None:
         return np.eye(plant.nx)
     written = as_written(plant, uncertain)
-    return untouched_coordinates(_reduced(written, uncertain.affine(written, box), None))
+    return untouched_coordinates(reduced_matrices(written, uncertain.affine(written, box), None))
 
 
 def untouched_states(columns: FloatArray, sizes: FloatArray) -> list[int]:
@@ -175,7 +175,7 @@ def _split(whole: AffineMatrix, like: Mapping[str, AffineMatrix], names: tuple[s
     return {name: whole[:, ends[i] : ends[i + 1]] for i, name in enumerate(names)}
 
 
-def _reduced(
+def reduced_matrices(
     written: Mapping[str, FloatArray],
     matrices: Mapping[str, AffineMatrix],
     basis: FloatArray | None,

@@ -18,6 +18,7 @@ from obsynth.methods.guaranteed_test.bank import is_bank
 from obsynth.methods.guaranteed_test.exact import Programmes
 from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
 from obsynth.methods.guaranteed_test.problem import window_as_designed
+from obsynth.methods.guaranteed_test.regions import while_inside
 from obsynth.methods.guaranteed_test.result import GuaranteedTest
 from obsynth.methods.guaranteed_test.tolerant import noisy_as_bounded, rows_before
 from obsynth.numerics.arrays import FloatArray
@@ -85,7 +86,7 @@ def _statement(test: GuaranteedTest) -> str:
     course = test.options["course"]
     said = "; ".join(_promise(one, group) for one, group in zip(test.tests, test.groups, strict=True))
     ending = "; each row has the least interval for its own samples" if test.options.get("exact") else ""
-    return f"{said}, for the course {course}{ending}; for an exact model"
+    return f"{said}, for the course {course}{ending}; for an exact model{while_inside(test)}"
 
 
 def _promise(test: GuaranteedTest, group: tuple[str, ...]) -> str:

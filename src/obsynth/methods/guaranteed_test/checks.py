@@ -18,6 +18,7 @@ from obsynth.methods.guaranteed_test.proofs import (
     repaired_multipliers,
     repaired_point,
 )
+from obsynth.methods.guaranteed_test.regions import remainder_check, while_inside
 from obsynth.methods.guaranteed_test.tolerant import MEAN_ROOM, mean_over_record, part_beside
 from obsynth.methods.guaranteed_test.windows import Window
 from obsynth.numerics.arrays import FloatArray
@@ -45,6 +46,8 @@ def checks(design: ObserverDesign, read: Callable[[Mapping[str, Any]], Asked]) -
     )
     if window is None:
         return
+    if design.options.get("model") is not None:
+        yield remainder_check(design, read)
     shipped = design.certificate.matrices
     sizes = {
         "multipliers": window.rows,
@@ -123,7 +126,7 @@ def _of_the_test(design: ObserverDesign, window: Window, test: Repaired) -> Iter
     )
     yield upper_bound_check(
         "threshold",
-        "without the fault the residual never passes this",
+        f"without the fault the residual never passes this{while_inside(design)}",
         proved_threshold(window, test, exact_zero=zero),
         threshold,
         source=SOURCE,

@@ -9,8 +9,10 @@ from typing import Any, ClassVar
 import numpy as np
 
 from obsynth.analysis.conditions import Condition
+from obsynth.errors import SpecError
 from obsynth.methods.guaranteed_test.options import Asked
 from obsynth.methods.method import ClaimMeaning, Method, PlantKind
+from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.results.checks import Check
@@ -40,7 +42,7 @@ class GuaranteedTestMethod(Asked, Method):
 
     Parameters
     ----------
-    plant : DescriptorSystem, TimeVaryingDescriptorSystem or Transformation
+    plant : DescriptorSystem, TimeVaryingDescriptorSystem, DAEModel or Transformation
         Discrete time (``transform: sample_time``), any index; ``C (ny, nx)``, ``Bf (nx, nf)``, ``Bd (nx, nd)``; ``D``,
         ``Df``, ``Dd``, ``Bw``, ``Dw`` allowed.  Of one that changes with k each row has a test of its own, and
         parameters are faults: that of k acts on the way to sample k + 1.  ``mu1``, ``mu2``, ... are its disturbances,
@@ -96,6 +98,16 @@ class GuaranteedTestMethod(Asked, Method):
     missing : {"wait", "solve"}, optional
         On data, after a missing sample: no verdict until the window is complete again, or that of the least threshold
         without the rows that are missing, solved and proved for each window.
+    region : mapping of str to [low, high], optional
+        Of a nonlinear plant, in units: where each state, input, fault and unknown input stays, between samples too.
+        What its linear model leaves out there is bounded and counts as a disturbance, so that ``threshold`` holds for
+        the nonlinear plant in this region; ``least`` is not claimed.
+    sample_time : float, optional, seconds
+        Of a nonlinear plant: between samples.
+    given : mapping of str to float, optional
+        Of a nonlinear plant: what is known of the equilibrium at which it is linearised, as `linearise` takes it.
+    model : mapping, optional
+        In the options of a finished design: the nonlinear plant.  Leave it out.
     name : str, optional
         Name of the design.
 
@@ -122,7 +134,7 @@ class GuaranteedTestMethod(Asked, Method):
     """
 
     id: ClassVar[str] = "guaranteed-test"
-    plants: ClassVar[tuple[PlantKind, ...]] = ("time-invariant", "time-varying")
+    plants: ClassVar[tuple[PlantKind, ...]] = ("time-invariant", "time-varying", "nonlinear")
     time: ClassVar[str] = "discrete, time-varying"
     summary: ClassVar[str] = "a test of one fault whose threshold no other test on these samples can beat"
     source: ClassVar[str] = "ours, by duality of linear programmes"
@@ -164,9 +176,13 @@ class GuaranteedTestMethod(Asked, Method):
             yield f"samples is {self.samples}, but before + after is {self.before + self.after}: leave one out."
 
     def existence(
-        self, plant: DescriptorSystem | TimeVaryingDescriptorSystem, *, exactly: bool = True
+        self, plant: DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel, *, exactly: bool = True
     ) -> tuple[Condition, ...]:
         """Return the existence conditions: bounds are stated, and something tells the fault."""
+        if isinstance(plant, DAEModel):
+            from obsynth.methods.guaranteed_test.nonlinear import nonlinear_conditions
+
+            return nonlinear_conditions(plant, self)
         if isinstance(plant, TimeVaryingDescriptorSystem):
             from obsynth.methods.guaranteed_test.varying_synthesis import varying_conditions
 
@@ -176,9 +192,16 @@ class GuaranteedTestMethod(Asked, Method):
         return conditions(plant, self)
 
     def synthesise(
-        self, plant: DescriptorSystem | TimeVaryingDescriptorSystem, *, progress: Callable[[str], None]
+        self, plant: DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel, *, progress: Callable[[str], None]
     ) -> Any:
         """Return weights, observer and certificate, not yet verified."""
+        if isinstance(plant, DAEModel):
+            from obsynth.methods.guaranteed_test.nonlinear import synthesise_nonlinear
+
+            return synthesise_nonlinear(plant, self, progress=progress)
+        for option in ("region", "sample_time", "given", "model"):
+            if getattr(self, option) is not None:
+                raise SpecError(f"{option} is for nonlinear plants: leave it out.", path=f"method.options.{option}")
         if isinstance(plant, TimeVaryingDescriptorSystem):
             from obsynth.methods.guaranteed_test.varying_synthesis import synthesise_varying
 

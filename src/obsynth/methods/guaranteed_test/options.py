@@ -33,3 +33,7 @@ class Asked:
     isolate: bool = False
     exact: bool = False
     missing: Literal["wait", "solve"] = "wait"
+    region: Annotated[Any, WrittenAs("named pairs")] = None
+    sample_time: Positive | None = None
+    given: Annotated[Any, WrittenAs("named vector")] = None
+    model: Annotated[Any, WrittenAs("function")] = None

@@ -105,7 +105,7 @@ def _from_texts(model: DAEFields, equations: Mapping[str, str]) -> DAESymbols:
         known |= {name: column[i] for i, name in enumerate(names)}
     for name, text in model.definitions.items():
         known[name] = _text_value(text, known, f"definitions.{name}")
-    parsed = {name: _equation(text, f"equations.{name}") for name, text in equations.items()}
+    parsed = {name: equation_of(text, f"equations.{name}") for name, text in equations.items()}
     stored: dict[str, Any] = {}
     for name, expression in parsed.items():
         for key, inner in expression.rates.items():
@@ -133,7 +133,7 @@ def _parsed(text: str, path: str, *, rates: bool = False) -> Expression:
         raise SpecError(f"{path}: {error}", path=path) from error
 
 
-def _equation(text: str, path: str) -> Expression:
+def equation_of(text: str, path: str) -> Expression:
     """Parse ``left = right``, or an expression that is zero."""
     sides = _EQUALS.split(text, maxsplit=1)
     for side in sides:
