@@ -193,7 +193,7 @@ class TestExponentialsOfManyStates:
         inner, moved = Ball.exact(a) @ energy, found @ b
         left = inner + inner.T - moved @ moved.T + b @ b.T
         assert np.all(np.abs(left.midpoint) <= left.radius)
-        monkeypatch.setattr(products, "MOST_STATES_FOR_BALLS", n)
+        monkeypatch.setattr(products, "FEW_STATES_FOR_BALLS", n)
         sharp = products.exponential(a, time)
         assert np.all(np.abs(found.midpoint - sharp.midpoint) <= found.radius + sharp.radius)
         assert np.max(sharp.radius) < np.max(found.radius) <= 1e-7 * np.max(np.abs(found.midpoint))

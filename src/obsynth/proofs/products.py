@@ -26,8 +26,10 @@ from obsynth.proofs.extended_balls import arb_matrix
 
 #: Digits in which exponentials are formed, in bits.
 EXPONENTIAL_BITS = 160
-#: With more states double precision comes first, where its radius is below this share of the largest entry.
+#: With more states double precision comes first, where its radius is below this share of the largest entry; with
+#: few, where python-flint takes no second, it must be as good as nothing.
 MOST_STATES_FOR_BALLS, LARGEST_SHARE = 60, 1e-7
+FEW_STATES_FOR_BALLS, LARGEST_SHARE_OF_FEW = 8, 1e-12
 #: Norm of the shortest interval's exponent, and orders of the Taylor polynomials: what is left is below 1e-18.
 SHORT, ORDER, ENERGY_ORDER = 2.0**-4, 10, 12
 
@@ -37,7 +39,7 @@ def exponential(matrix: FloatArray, time: float) -> Ball:
     n = len(matrix)
     if not n:
         return Ball.exact(np.zeros((0, 0)))
-    if n > MOST_STATES_FOR_BALLS and (found := _Doubling(matrix, time).exponential()) is not None:
+    if n > FEW_STATES_FOR_BALLS and (found := _Doubling(matrix, time).exponential()) is not None:
         return found
     with flint.ctx.workprec(EXPONENTIAL_BITS):
         return as_ball((arb_matrix(matrix) * flint.arb(float(time))).exp())
@@ -46,7 +48,7 @@ def exponential(matrix: FloatArray, time: float) -> Ball:
 def energy(a: FloatArray, b: FloatArray, time: float) -> Ball:
     r"""Return a ball that holds ``\int_0^t e^{A s} B B' e^{A' s} ds`` (Van Loan), for ``A (n, n)``, ``B (n, m)``."""
     n = len(a)
-    if n > MOST_STATES_FOR_BALLS and (found := _Doubling(a, time).energy(b)) is not None:
+    if n > FEW_STATES_FOR_BALLS and (found := _Doubling(a, time).energy(b)) is not None:
         return found
     with flint.ctx.workprec(2 * EXPONENTIAL_BITS):
         whole = arb_matrix(np.block([[-a, np.zeros((n, n))], [np.zeros((n, n)), a.T]]))
@@ -61,7 +63,8 @@ def energy(a: FloatArray, b: FloatArray, time: float) -> Ball:
 
 
 def _is_sharp(ball: Ball) -> bool:
-    return bool(np.max(ball.radius) <= LARGEST_SHARE * np.max(np.abs(ball.midpoint)))
+    share = LARGEST_SHARE if len(ball.midpoint) > MOST_STATES_FOR_BALLS else LARGEST_SHARE_OF_FEW
+    return bool(np.max(ball.radius) <= share * np.max(np.abs(ball.midpoint)))
 
 
 class _Doubling:

@@ -39,6 +39,13 @@ class PlantSource:
             return eliminate_algebraic_states(self.plant)
         return discretise(self.plant, self.sample_time)
 
+    @cached_property
+    def smooth(self) -> DescriptorSystem:
+        """The plant without its algebraic states, before it is sampled; made once for all checks."""
+        from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
+
+        return eliminate_algebraic_states(self.plant).plant
+
     def as_dict(self) -> dict[str, Any]:
         """Return the source as data: matrices by their entries that are not zero."""
         values = self.plant.as_dict()

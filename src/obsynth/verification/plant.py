@@ -137,7 +137,7 @@ def derivation_rows(design: ObserverDesign, model: ErrorModel) -> Iterator[Check
             kind="equality",
         )
     if source.sample_time is not None and observer.fault_names:
-        yield from _sampling_rows(source.plant, source.sample_time, plant, observer, model)
+        yield from _sampling_rows(source.smooth, source.sample_time, plant, observer, model)
 
 
 def _difference(first: object, second: object, names: tuple[str, ...]) -> float:
@@ -157,7 +157,7 @@ def _difference(first: object, second: object, names: tuple[str, ...]) -> float:
 
 
 def _sampling_rows(
-    written: DescriptorSystem, dt: float, plant: DescriptorSystem, observer: LinearObserver, model: ErrorModel
+    smooth: DescriptorSystem, dt: float, plant: DescriptorSystem, observer: LinearObserver, model: ErrorModel
 ) -> Iterator[Check]:
     """Yield what the hold has to do with gains and delays, and the gain over disturbances of any course."""
     delays = ", ".join(f"{delay}" for delay in observer.fault_delays)
@@ -171,9 +171,6 @@ def _sampling_rows(
     )
     if not plant.nd:
         return
-    from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
-
-    smooth = eliminate_algebraic_states(written).plant
     t = model.own
     rows = observer.fault_rows
     direct = observer.Dy[rows] @ plant.Dd

@@ -15,10 +15,11 @@ from obsynth.analysis.diagnosis.explanations import hidden_motion
 from obsynth.analysis.diagnosis.fault_columns import Question, dc_point
 from obsynth.analysis.existence.distance import ROUNDING_LEVEL
 from obsynth.analysis.existence.named_pencils import NamedPencil, named_pencil, unclear
-from obsynth.analysis.existence.numbers import COMPUTED_STATES
+from obsynth.analysis.existence.numbers import COMPUTED_STATES, decides_exactly, uncleaned
 from obsynth.analysis.existence.verdicts import DECIDER
 from obsynth.analysis.plant_units import PlantUnits
 from obsynth.methods.functional_filter.wanted_faults import chosen_faults, residual_sets
+from obsynth.numerics.arrays import remembered
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.fault_models import Exosystem, exosystem
 
@@ -50,10 +51,25 @@ def conditions(
     )
 
 
+@remembered
+def _known(_plant: DescriptorSystem) -> dict[tuple[object, ...], tuple[Condition, ...]]:
+    """Return the cache of the conditions of a plant's faults: synthesis and verification ask for them."""
+    return {}
+
+
 def fault_conditions(
     plant: DescriptorSystem, model: Exosystem, fault: int, exactly: bool | None = None
 ) -> tuple[Condition, ...]:
     """Return whether one fault can be estimated, free of the unknown inputs and of every other fault."""
+    poles = tuple(model_points(model, fault))
+    key = (fault, exactly, decides_exactly(), uncleaned(), poles, model.descriptions[fault])
+    known = _known(plant)
+    if key not in known:
+        known[key] = _decided(plant, model, fault, exactly)
+    return known[key]
+
+
+def _decided(plant: DescriptorSystem, model: Exosystem, fault: int, exactly: bool | None) -> tuple[Condition, ...]:
     name = plant.fault_names[fault]
     asked = question(plant, [j for j in range(plant.nf) if j != fault], fault, exactly)
     rest = dc_point(plant.dt)

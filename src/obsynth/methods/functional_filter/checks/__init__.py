@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 
@@ -11,7 +10,7 @@ from obsynth.methods.functional_filter.conditions import conditions
 from obsynth.methods.functional_filter.tracking import estimate_deviations, wanted_faults
 from obsynth.methods.functional_filter.wanted_faults import residual_sets
 from obsynth.methods.ui_pi_observer.augmented_plant import shipped_model
-from obsynth.methods.ui_pi_observer.checks.decoupling import decoupling_norm
+from obsynth.methods.ui_pi_observer.checks.decoupling import decoupling_norms
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.scaling import balance_by_least_squares
 from obsynth.observers.linear.observer import LinearObserver
@@ -29,31 +28,28 @@ LEAK_TOLERANCE = 1e-7
 def leak_rows(design: ObserverDesign) -> Iterator[Check]:
     """Yield the measured leaks: of d into everything, of other faults into each estimate or set of residuals."""
     plant, observer = design.linear
-    if plant.nd:
-        yield _leak_row("unknown inputs", "the unknown inputs reach neither estimates nor residuals", plant, observer)
-    for name, rows, blind in _blind_to(design):
-        if not blind:
-            continue
-        columns = [plant.fault_names.index(fault) for fault in blind]
-        other = plant.replace(
-            Bd=np.hstack([plant.Bd, plant.Bf[:, columns]]),
-            Dd=np.hstack([plant.Dd, plant.Df[:, columns]]),
-            disturbance_names=[*plant.disturbance_names, *(f"fault {fault}" for fault in blind)],
-        )
-        claim = f"neither unknown inputs nor {', '.join(blind)} reach it, whatever their course"
-        yield _leak_row(f"free of others: {name}", claim, other, _only(observer, rows))
-
-
-def _leak_row(name: str, claim: str, plant: DescriptorSystem, observer: LinearObserver) -> Check:
-    found = decoupling_norm(plant, observer)
-    return upper_bound_check(
-        name,
-        claim,
-        found.relative,
-        LEAK_TOLERANCE,
-        source="measured on the plant, without T and T0",
-        detail=f"relative to the terms; worst at {found.frequency:.3g} rad/s",
+    groups = [("unknown inputs", list(range(len(observer.Cz))), list[str]())] if plant.nd else []
+    groups += [(f"free of others: {name}", rows, blind) for name, rows, blind in _blind_to(design) if blind]
+    if not groups:
+        return
+    every = plant.replace(
+        Bd=np.hstack([plant.Bd, plant.Bf]),
+        Dd=np.hstack([plant.Dd, plant.Df]),
+        disturbance_names=[*plant.disturbance_names, *(f"fault {fault}" for fault in plant.fault_names)],
     )
+    known = range(plant.nd)
+    inputs = [[*known, *(plant.nd + plant.fault_names.index(fault) for fault in blind)] for _, _, blind in groups]
+    norms = decoupling_norms(every, observer, [(rows, of) for (_, rows, _), of in zip(groups, inputs, strict=True)])
+    for (name, _, blind), found in zip(groups, norms, strict=True):
+        claim = f"neither unknown inputs nor {', '.join(blind)} reach it, whatever their course"
+        yield upper_bound_check(
+            name,
+            claim if blind else "the unknown inputs reach neither estimates nor residuals",
+            found.relative,
+            LEAK_TOLERANCE,
+            source="measured on the plant, without T and T0",
+            detail=f"relative to the terms; worst at {found.frequency:.3g} rad/s",
+        )
 
 
 def _blind_to(design: ObserverDesign) -> Iterator[tuple[str, list[int], list[str]]]:
@@ -71,19 +67,6 @@ def _blind_to(design: ObserverDesign) -> Iterator[tuple[str, list[int], list[str
         label = f"{' '.join(seen)}: "
         rows = [row for row, name in enumerate(observer.residual_names) if len(sets) == 1 or name.startswith(label)]
         yield label.rstrip(": "), rows, [name for name in plant.fault_names if name not in seen]
-
-
-def _only(observer: LinearObserver, rows: list[int]) -> LinearObserver:
-    """Return the observer with some of its rows, as residuals: a fault estimate that must vanish is one."""
-    return replace(
-        observer,
-        Cz=observer.Cz[rows],
-        Du=observer.Du[rows],
-        Dy=observer.Dy[rows],
-        fault_names=(),
-        fault_delays=(),
-        residual_names=tuple(f"row {row + 1}" for row in rows),
-    )
 
 
 #: The regulator equation may miss by this much, relative to its terms: its solution is no part of the gains.

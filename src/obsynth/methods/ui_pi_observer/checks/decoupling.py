@@ -6,6 +6,7 @@ plant is regular or not.  Through ``y = C x + Dd d`` and the realisation they gi
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,6 +27,8 @@ GRID_REACH = 30.0
 FAR_FROM_SINGULAR = 1e3 * RANK_TOLERANCE
 #: A signal below this share of what a trajectory of unit size could make of it is held not to be moved.
 UNMOVED = 1e-4
+#: Columns that LAPACK turns at once: its room is so many times the columns.
+BLOCK = 64
 
 
 @dataclass(frozen=True)
@@ -35,6 +38,15 @@ class DecouplingNorm:
     relative: float  # error of an estimate over the terms it is computed from
     fault_gain: float  # error of a fault estimate for unit (x, d) in scaled units
     frequency: float  # where, rad/s
+
+    def worse(self, found: tuple[float, float] | None, frequency: float) -> DecouplingNorm:
+        """Return the larger of this and the relative error and that of a fault at a frequency; ``None`` at a pole."""
+        if found is None:
+            return DecouplingNorm(np.inf, np.inf, frequency) if np.isfinite(self.relative) else self
+        relative, fault = found
+        if not relative <= self.relative:
+            return DecouplingNorm(relative, max(fault, self.fault_gain), frequency)
+        return DecouplingNorm(self.relative, max(fault, self.fault_gain), self.frequency)
 
 
 def frequency_grid(observer: LinearObserver) -> FloatArray:
@@ -51,48 +63,79 @@ def frequency_grid(observer: LinearObserver) -> FloatArray:
 
 def decoupling_norm(plant: DescriptorSystem, observer: LinearObserver) -> DecouplingNorm:
     """Return how much of any unknown input reaches the estimates of states (if any), faults and residuals."""
+    return decoupling_norms(plant, observer, [(range(len(observer.Cz)), range(plant.nd))])[0]
+
+
+def decoupling_norms(
+    plant: DescriptorSystem, observer: LinearObserver, groups: Sequence[tuple[Sequence[int], Sequence[int]]]
+) -> list[DecouplingNorm]:
+    """Return, for each group of rows and unknown inputs, how much of the inputs reaches those rows.
+
+    The trajectories of all inputs are found once at each frequency: those of some are the combinations without the
+    others.
+    """
     if not all(np.all(np.isfinite(part)) for part in (observer.Az, observer.By, observer.Cz, observer.Dy)):
-        return DecouplingNorm(float("nan"), float("nan"), float("nan"))
+        return [DecouplingNorm(float("nan"), float("nan"), float("nan"))] * len(groups)
     frequencies = frequency_grid(observer)
     units = PlantUnits.of(plant).rounded()
     scaled = units.scaled_plant(plant)
     points = boundary_points(frequencies * (1.0 if units.discrete else units.time), scaled.dt)
-    pencils = [np.hstack([point * scaled.E - scaled.A, -scaled.Bd]) for point in points]
-    moved = [trajectories_at(pencil) for pencil in pencils]
+    moved = [trajectories_of(scaled, point, [inputs for _, inputs in groups]) for point in points]
     # How many trajectories there are at almost every frequency: where there seem to be more, rounding hides the rest.
-    count = min(nullity for _, nullity in moved)
-    worst = DecouplingNorm(0.0, 0.0, 0.0)
-    if count == 0:
-        return worst
+    counts = [min(at[place].shape[1] for at in moved) for place in range(len(groups))]
+    found = [DecouplingNorm(0.0, 0.0, 0.0) for _ in groups]
     shipped = _Shipped.of(observer, units)
-    for frequency, point, (basis, _) in zip(frequencies, points, moved, strict=True):
-        found = shipped.misses(scaled, point, basis[:, -count:])
-        if found is None:
-            return DecouplingNorm(float("inf"), float("inf"), float(frequency))
-        relative, fault = found
-        if not relative <= worst.relative:
-            worst = DecouplingNorm(relative, max(fault, worst.fault_gain), float(frequency))
-        elif fault > worst.fault_gain:
-            worst = DecouplingNorm(worst.relative, fault, worst.frequency)
-    return worst
+    for frequency, point, bases in zip(frequencies, points, moved, strict=True):
+        passing = shipped.at(scaled, point)
+        for place, (rows, inputs) in enumerate(groups):
+            if counts[place] == 0:
+                continue
+            basis = bases[place][:, -counts[place] :]
+            found[place] = found[place].worse(
+                None if passing is None else passing.misses(basis, rows, inputs), float(frequency)
+            )
+    return found
 
 
-def trajectories_at(pencil: ComplexArray) -> tuple[ComplexArray, int]:
-    """Return right singular vectors ``(n, n)``, least value last, and how many are null, scaled by powers of two."""
-    from scipy.linalg.lapack import ztrcon
+def trajectories_of(plant: DescriptorSystem, point: complex, groups: Sequence[Sequence[int]]) -> list[ComplexArray]:
+    """Return the trajectories ``(nx + inputs, count)`` at a point for some groups of unknown inputs, of unit norm."""
+    pencil, nx = np.hstack([point * plant.E - plant.A, -plant.Bd]), plant.nx
+    whole, columns, sure = _null_space(pencil)
+    found = []
+    for inputs in groups:
+        own = [*range(nx), *(nx + np.array(inputs, dtype=int))]
+        absent = np.delete(whole, own, axis=0)
+        if len(absent):
+            _, values, right = np.linalg.svd(absent)
+            # Independent as they are, the others can be left out; or the null space is looked for by itself.
+            if sure and len(values) == len(absent) and values[-1] > FAR_FROM_SINGULAR:
+                basis = (whole @ right[len(absent) :].conj().T)[own] * columns[own, None]
+            else:
+                basis, scales, _ = _null_space(pencil[:, own])
+                basis = scales[:, None] * basis
+        else:
+            basis = whole * columns[:, None]
+        found.append(basis / np.linalg.norm(basis, axis=0))
+    return found
+
+
+def _null_space(pencil: ComplexArray) -> tuple[ComplexArray, FloatArray, bool]:
+    """Return a basis ``(n, count)`` of the null space, orthonormal, the least singular value last, in columns scaled
+    by powers of two, with these, and whether the equations are independent beyond doubt."""
+    from scipy.linalg.lapack import zgeqrf, ztrcon, zunmqr
 
     scaled, columns = equilibrated(pencil)
-    equations = len(scaled)
+    equations, count = scaled.shape
     # Of independent equations a tenth of the work gives the same null space; the condition is estimated to a small
     # factor, and only for pencils far from the tolerance.
-    turned, triangle = np.linalg.qr(scaled.conj().T, mode="complete")
-    if 0 < equations < scaled.shape[1] and ztrcon(triangle[:equations])[0] > FAR_FROM_SINGULAR:
-        vectors, rank = columns[:, None] * turned, equations
-    else:
-        _, values, right = np.linalg.svd(scaled)
-        rank = int(np.sum(values > RANK_TOLERANCE * values[0]))
-        vectors = columns[:, None] * right.conj().T
-    return vectors / np.linalg.norm(vectors, axis=0), vectors.shape[1] - rank
+    if 0 < equations < count:
+        packed, factors, _, _ = zgeqrf(scaled.conj().T)
+        if ztrcon(packed[:equations])[0] > FAR_FROM_SINGULAR:
+            last = np.eye(count, dtype=np.complex128)[:, equations:]
+            return zunmqr("L", "N", packed, factors, last, BLOCK * last.shape[1])[0], columns, True
+    _, values, right = np.linalg.svd(scaled)
+    rank = int(np.sum(values > RANK_TOLERANCE * values[0]))
+    return right[rank:].conj().T, columns, False
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,23 +169,40 @@ class _Shipped:
         # The same holds for a residual, y - C xhat with xhat = z + D y.
         return cls(az, by, cz, dy, formed, np.abs(dy) + np.abs(cz[:, :nx]) @ offsets, observer.fault_rows, nx)
 
-    def misses(self, plant: DescriptorSystem, point: complex, trajectories: ComplexArray) -> tuple[float, float] | None:
-        """Return the largest relative error of an estimate and that of a fault; ``None`` at a pole."""
-        nx = self.tracked
-        x, d = trajectories[: plant.nx], trajectories[plant.nx :]
-        y = plant.C @ x + plant.Dd @ d
+    def at(self, plant: DescriptorSystem, point: complex) -> _Passing | None:
+        """Return what passes at a point; ``None`` at a pole."""
         try:
             resolvent = np.linalg.inv(point * np.eye(len(self.Az)) - self.Az)
         except np.linalg.LinAlgError:
             return None
-        error = self.Cz @ (resolvent @ (self.By @ y)) + self.Dy @ y
-        error[:nx] -= x[:nx]
         passed = np.abs(self.Cz) @ (np.abs(resolvent) @ self.formed) + self.direct
-        size = passed @ (np.abs(plant.C) @ np.abs(x) + np.abs(plant.Dd) @ np.abs(d))
-        size[:nx] += np.abs(x[:nx])
+        return _Passing(self, plant, self.Cz @ (resolvent @ self.By) + self.Dy, passed)
+
+
+@dataclass(frozen=True, eq=False)
+class _Passing:
+    """An observer at a point: what it makes of outputs, and of the sizes of their terms."""
+
+    shipped: _Shipped
+    plant: DescriptorSystem
+    through: ComplexArray
+    passed: FloatArray
+
+    def misses(self, trajectories: ComplexArray, rows: Sequence[int], inputs: Sequence[int]) -> tuple[float, float]:
+        """Return the largest relative error of an estimate in some rows, and that of a fault."""
+        plant, tracked = self.plant, self.shipped.tracked
+        dd, picked = plant.Dd[:, list(inputs)], list(rows)
+        states = np.array([row for row in picked if row < tracked], dtype=int)
+        x, d = trajectories[: plant.nx], trajectories[plant.nx :]
+        error = self.through[picked] @ (plant.C @ x + dd @ d)
+        error[: len(states)] -= x[states]
+        passed = self.passed[picked]
+        size = passed @ (np.abs(plant.C) @ np.abs(x) + np.abs(dd) @ np.abs(d))
+        size[: len(states)] += np.abs(x[states])
         # A signal that a trajectory does not move is rounding: it is judged by what trajectories of its size could do.
-        possible = passed @ (np.sum(np.abs(plant.C), axis=1) + np.sum(np.abs(plant.Dd), axis=1))
-        possible[:nx] += 1.0
-        rows = np.maximum(np.max(size, axis=1), UNMOVED * possible)
-        relative = float(np.max(np.max(np.abs(error), axis=1) / np.where(rows > 0.0, rows, 1.0), initial=0.0))
-        return relative, float(np.max(np.linalg.norm(error[self.faults], axis=1), initial=0.0))
+        possible = passed @ (np.sum(np.abs(plant.C), axis=1) + np.sum(np.abs(dd), axis=1))
+        possible[: len(states)] += 1.0
+        terms = np.maximum(np.max(size, axis=1), UNMOVED * possible)
+        relative = float(np.max(np.max(np.abs(error), axis=1) / np.where(terms > 0.0, terms, 1.0), initial=0.0))
+        faults = [place for place, row in enumerate(picked) if row in range(len(self.through))[self.shipped.faults]]
+        return relative, float(np.max(np.linalg.norm(error[faults], axis=1), initial=0.0))
