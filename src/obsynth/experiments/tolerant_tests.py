@@ -29,6 +29,11 @@ from obsynth.tolerances.exact_plant import Tracking, tracking_of
 BESIDE = "fault-estimation-filter"
 #: Samples of the scenario over which thresholds are compared, at most.
 MOST_SAMPLES = 500
+#: What a bank says of tolerances, and what to do instead.
+NOMINAL_BANK = (
+    "The thresholds are those of the nominal plant: tolerances are not in them. Design each test alone, with its "
+    "fault, the others free and this scenario, for thresholds over them."
+)
 
 
 def synthesise_over_tolerances(
@@ -37,9 +42,7 @@ def synthesise_over_tolerances(
     """Return the test whose threshold over the tolerances is least in the mean over a scenario without its faults."""
     if asked.isolate:
         found: Synthesis = asked.synthesise(plant, progress=progress)
-        return replace(
-            found, notes=(*found.notes, "The thresholds are those of the nominal plant: tolerances are not in them.")
-        )
+        return replace(found, notes=(*found.notes, NOMINAL_BANK))
     try:
         beside = _beside(asked, scenario, plant, progress)
     except ObsynthError as error:
@@ -57,9 +60,9 @@ def _beside(
             "Bounds of states and tolerances do not go together: leave state_bounds and initial_bounds out.",
             condition="tolerances",
         )
-    if asked.isolate or asked.exact:
+    if asked.exact:
         raise PreconditionError(
-            f"{'isolate' if asked.isolate else 'exact'} is for an exact model.", condition="tolerances"
+            "exact is for an exact model: leave it out for a threshold over the tolerances.", condition="tolerances"
         )
     if list(problem_of(plant, asked).bounds.middles):
         raise PreconditionError(

@@ -208,7 +208,9 @@ def _notes(
         words.append(
             f"Over the tolerances of the constants the threshold follows the signals ({mean:.4g} in the mean over the "
             "scenario, for which the weights are made); that of the nominal plant is never above it, and no function "
-            "of these samples has one below least over the tolerances either."
+            "of these samples has one below least over the tolerances either. What is surely found is that of the "
+            "nominal plant: over the tolerances a fault of twice the threshold of its row may be needed, and more "
+            "where they move what the fault does."
         )
     elif problem.plant.uncertainty is not None:
         words.append(
