@@ -11,7 +11,7 @@ import argparse
 import os
 import sys
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from importlib import import_module
 from pathlib import Path
@@ -611,23 +611,22 @@ VERBS = {
 }
 
 
-def obsynth_parser() -> argparse.ArgumentParser:
-    """Return the parser of ``obsynth``, with all its verbs."""
+def obsynth_parser(asked: Collection[str] | None = None) -> argparse.ArgumentParser:
+    """Return the parser of ``obsynth`` with all its verbs; only those among the words ``asked`` have arguments."""
     parser = _parser(
         "obsynth", "Observers and fault-estimation filters for descriptor systems: designed, proved again, and run."
     )
     verbs: Any = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for name, verb in VERBS.items():
-        _fill(
+        own = verbs.add_parser(
             name,
-            verbs.add_parser(
-                name,
-                help=verb.told,
-                description=verb.told,
-                epilog=verb.epilog,
-                formatter_class=argparse.RawDescriptionHelpFormatter if verb.epilog else argparse.HelpFormatter,
-            ),
+            help=verb.told,
+            description=verb.told,
+            epilog=verb.epilog,
+            formatter_class=argparse.RawDescriptionHelpFormatter if verb.epilog else argparse.HelpFormatter,
         )
+        if asked is None or name in asked:
+            _fill(name, own)
     return parser
 
 
@@ -722,7 +721,8 @@ def told_error(error: Exception) -> ObsynthError | None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``obsynth``."""
-    return _run(obsynth_parser(), arguments)
+    words = sys.argv[1:] if arguments is None else arguments
+    return _run(obsynth_parser(words), words)
 
 
 def design_command(arguments: Sequence[str] | None = None) -> int:

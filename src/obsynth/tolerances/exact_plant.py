@@ -126,6 +126,8 @@ MOST_VERTICES = 32
 MOST_GAIN_SAMPLES = 5_000
 #: What is left of a response when its sum ends.
 _GAIN_LEFT = 1e-6
+#: Samples that are taken at once.
+_GAIN_BLOCK = 50
 
 
 def vertex_gains(
@@ -184,13 +186,24 @@ def _peak_gain(
     total = np.abs(observer.Dy[shown] @ smooth.Dd).sum(axis=1)
     if np.max(np.abs(np.linalg.eigvals(a)), initial=0.0) >= 1.0:
         return np.full(len(c), np.inf)
-    column, size = b, float(np.abs(b).max(initial=0.0))
-    for _ in range(MOST_GAIN_SAMPLES):
-        total = total + np.abs(c @ column).sum(axis=1)
-        column = a @ column
-        if np.abs(column).max(initial=0.0) <= _GAIN_LEFT * size:
+    return np.asarray(total + _summed_response(a, b, c))
+
+
+def _summed_response(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
+    """Return the sums of ``abs(c a^k b)`` over k and the columns, until little of ``a^k b`` is left."""
+    powers = [np.eye(len(a))]
+    while len(powers) <= _GAIN_BLOCK:
+        powers.append(a @ powers[-1])
+    block, onwards = np.array(powers[:-1]), powers[-1]
+    column, left, total = b, _GAIN_LEFT * float(np.abs(b).max(initial=0.0)), np.zeros(len(c))
+    for _ in range(0, MOST_GAIN_SAMPLES, _GAIN_BLOCK):
+        moved = block @ column
+        sizes = np.abs(moved).max(axis=(1, 2), initial=0.0)
+        total = total + np.abs(c @ moved[: max(int(np.argmax(np.append(sizes <= left, True))), 1)]).sum(axis=(0, 2))
+        if np.any(sizes <= left):
             break
-    return np.asarray(total)
+        column = onwards @ column
+    return total
 
 
 def labels_of(observer: LinearObserver) -> tuple[str, ...]:

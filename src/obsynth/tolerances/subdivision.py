@@ -63,15 +63,15 @@ def subdivided(
     while todo:
         lower, upper = todo.pop()
         done += 1
-        middle = (lower + upper) / 2.0
-        if fails_at(exact_at(middle)):
-            return BoxVerdict("refuted", done, middle)
         try:
             part = build(lower, upper)
         except PreconditionError:
             part = None
         if part is not None and holds_on(part):
             continue
+        middle = (lower + upper) / 2.0
+        if fails_at(exact_at(middle)):
+            return BoxVerdict("refuted", done, middle)
         sizes = upper - lower if part is None else np.abs(part.parts).sum(axis=(1, 2))
         if done >= most or not sizes.any():
             return BoxVerdict("open", done)
