@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import pickle
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from dae_plants import exchanger, linear
 from obsynth import DAEModel, DAEObserver, SolverError, SpecError, dae_adaptive_observer, run_batch, simulate_dae
 from obsynth.plants.dae.functions import DAEFunctions
 from obsynth.plants.dae.step import ImplicitStep
+from obsynth.types import Estimates
 
 BALANCES = [(2e-4) ** 2, 75.0**2, 38.0**2, 0.0]  # 0.1 % of the flow, 0.5 % of the heat
 
@@ -138,6 +140,29 @@ def test_sample_by_sample_is_the_whole_record(form) -> None:
     rows = [running.step(y[k], u[k]) for k in range(60)]
     for name in ("states", "parameters", "nis", "excitation", "state_deviations"):
         assert np.concatenate([getattr(row, name) for row in rows]) == pytest.approx(getattr(whole, name), rel=1e-9)
+
+
+def test_one_sample_says_all_that_a_record_says_at_it() -> None:
+    y, u = record(30)
+    y = np.array(y)
+    y[7, 1] = np.nan
+    whole, running = observer(window=5).run(y, u), observer(window=5).start()
+    for k in range(len(y)):
+        one = running.step(y[k], u[k])
+        for field in dataclasses.fields(whole):
+            own, other = getattr(one, field.name), getattr(whole, field.name)
+            if field.name == "projection":
+                assert np.array_equal(own, other if k == 0 else np.zeros(4))
+            elif field.name.endswith(("_names", "_delays")) or field.name == "regressors":
+                assert np.array_equal(own, other), field.name
+            else:
+                np.testing.assert_allclose(own[0], other[k], rtol=1e-9, atol=1e-12, err_msg=field.name)
+                assert not own.flags.writeable
+    copied = pickle.loads(pickle.dumps(one))
+    assert type(copied) is Estimates
+    assert np.array_equal(copied.parameters, one.parameters)
+    with pytest.raises(AttributeError, match="'colour'"):
+        one.colour  # noqa: B018
 
 
 @pytest.mark.parametrize("form", ["forgetting", "random-walk", "augmented-kalman"])

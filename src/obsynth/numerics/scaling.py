@@ -222,10 +222,14 @@ class LogBalance:
         parts: list[list[float]] = [[-ridge * value] for value in found.tolist()]
         for term, weight in zip(self._terms, weights, strict=True):
             missed = -weight * term.logarithms(found)
-            for place, row in zip(range(term.rows.start, term.rows.stop), missed, strict=True):
-                parts[place].extend((term.row_sign * row).tolist())
-            for place, column in zip(range(term.columns.start, term.columns.stop), missed.T, strict=True):
-                parts[place].extend((term.column_sign * column).tolist())
+            # Lists of the whole matrix: one of each row and column takes most of its time in numpy's calls.
+            for place, row in zip(
+                range(term.rows.start, term.rows.stop), (term.row_sign * missed).tolist(), strict=True
+            ):
+                parts[place] += row
+            turned = (term.column_sign * missed.T).tolist()
+            for place, column in zip(range(term.columns.start, term.columns.stop), turned, strict=True):
+                parts[place] += column
             if term.common is not None:
                 parts[term.common].extend(missed.ravel().tolist())
         for unknown, exponent in self._wishes:

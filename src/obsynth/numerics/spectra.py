@@ -81,7 +81,9 @@ def abscissa(matrix: FloatArray, dt: float) -> float:
 
 def as_printed(matrix: FloatArray, digits: int) -> FloatArray:
     """Return each entry as it is when printed with so many significant digits."""
-    return np.asarray(np.char.mod(f"%.{digits - 1}e", matrix).astype(np.float64))
+    form, found, there = f"%.{digits - 1}e", np.zeros(matrix.shape), matrix != 0.0
+    found[there] = [float(form % value) for value in matrix[there].tolist()]
+    return found
 
 
 def digits_needed(matrix: FloatArray, dt: float) -> int:

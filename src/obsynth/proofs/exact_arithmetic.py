@@ -112,7 +112,8 @@ def written_rows(matrix: FloatArray) -> tuple[tuple[Fraction, ...], ...]:
 def _written(value: float) -> tuple[int, int]:
     """Return numerator and denominator, which may have common factors, of what a finite double was written as."""
     digits, power = _decimal(value)
-    if _count(digits) > LOSSLESS_DIGITS and _is_short(value):
+    # In the order of what they cost: digits that count are not more than all.
+    if len(digits) > LOSSLESS_DIGITS and _is_short(value) and _count(digits) > LOSSLESS_DIGITS:
         return value.as_integer_ratio()
     return (int(digits) * 10**power, 1) if power >= 0 else (int(digits), int(10**-power))
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -11,9 +12,9 @@ from numpy.typing import NDArray
 
 from obsynth.analysis.dae_structure import involved
 from obsynth.errors import SolverError
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.numerics.ranks import SINGULAR_CONDITION
-from obsynth.observers.estimates import Estimates
+from obsynth.observers.estimates import NOTHING, STEP_RESIDUAL, Estimates
 from obsynth.observers.running import named_estimates
 
 if TYPE_CHECKING:
@@ -116,11 +117,11 @@ class DAERow:
         rows = self.several
         if rows is not self:
             return rows.conditions
-        matrices, found = rows.part("scaled"), np.ones(len(rows.memory))
-        stepped = np.arange(self.k, self.k + len(matrices)) > 0
-        values = np.linalg.svd(matrices[stepped], compute_uv=False)
-        with np.errstate(divide="ignore"):
-            found[stepped] = values[:, 0] / values[:, -1]
+        found, begin = np.full(len(rows.memory), np.inf), int(self.k == 0)
+        found[:begin] = 1.0
+        values = np.linalg.svd(rows.part("scaled")[begin:], compute_uv=False)
+        least = values[:, -1]
+        np.divide(values[:, 0], least, out=found[begin:], where=least > 0.0)
         return found
 
     @property
@@ -142,20 +143,19 @@ class GatheredRows:
         if rows.k == 0:
             self.projection = rows.moved
         # Copies, so that what is not kept can go.
-        self.parts.append({name: np.array(value) for name, value in _columns(rows.several).items()})
+        several = rows.several
+        self.parts.append({name: np.array(of(several)) for name, of in _COLUMNS.items()})
 
     def add_regular(self, rows: DAERow) -> None:
         """Keep some rows, unless the matrix of (7) was singular to working precision in one of them."""
         self.add(rows)
         require_regular(self.observer, rows, self.parts[-1]["conditions"])
 
-    def estimates(self, informations: FloatArray | None = None) -> Estimates:
-        """Return what was gathered (``informations (any, nq, nq)``)."""
+    def estimates(self) -> Estimates:
+        """Return what was gathered."""
         first, *more = self.parts
         whole = {name: np.concatenate([part[name] for part in self.parts]) for name in first} if more else dict(first)
-        seen = whole["informations"]
-        levels = _excitation(self.observer, seen if informations is None else informations)
-        whole["excitation"] = levels[len(levels) - len(whole["nis"]) :]
+        whole["excitation"] = _excitation(self.observer, whole["informations"])
         received = ~np.isnan(whole["innovations"])
         received.setflags(write=False)
         return named_estimates(self.observer, **whole, projection=self.projection, received=received)
@@ -175,25 +175,56 @@ def require_regular(observer: DAESettings, rows: DAERow, conditions: FloatArray)
     )
 
 
-def _columns(rows: DAERow) -> dict[str, FloatArray]:
-    """Return what the estimates keep of some samples."""
-    return {
-        "states": rows.x,
-        "state_deviations": rows.state_deviations,
-        "state_covariances": rows.covariance,
-        "cross_covariances": rows.cross_covariance,
-        "faults": rows.theta,
-        "fault_covariances": rows.parameter_covariance,
-        "innovations": rows.innovation,
-        "innovation_covariances": rows.part("expected"),
-        "nis": rows.nis,
-        "nis_degrees": rows.seen.sum(axis=1).astype(np.float64),
-        "residuals": rows.part("residual"),
-        "conditions": rows.conditions,
-        "contraction": rows.contractions,
-        "informations": rows.information,
-        "scores": rows.score,
-    }
+#: What the estimates keep of some samples, by its name there.
+_COLUMNS: Mapping[str, Callable[[DAERow], FloatArray]] = {
+    "states": lambda rows: rows.x,
+    "state_deviations": lambda rows: rows.state_deviations,
+    "state_covariances": lambda rows: rows.covariance,
+    "cross_covariances": lambda rows: rows.cross_covariance,
+    "faults": lambda rows: rows.theta,
+    "fault_covariances": lambda rows: rows.parameter_covariance,
+    "innovations": lambda rows: rows.innovation,
+    "innovation_covariances": lambda rows: rows.part("expected"),
+    "nis": lambda rows: rows.nis,
+    "nis_degrees": lambda rows: rows.seen.sum(axis=1).astype(np.float64),
+    "residuals": lambda rows: rows.part("residual"),
+    "conditions": lambda rows: rows.conditions,
+    "contraction": lambda rows: rows.contractions,
+    "informations": lambda rows: rows.information,
+    "scores": lambda rows: rows.score,
+}
+
+
+class SampleEstimates(Estimates):
+    """The estimates of one sample: each array is made when it is first asked for, most are not."""
+
+    def __init__(self, observer: DAESettings, row: DAERow, informations: tuple[FloatArray, ...]) -> None:
+        """Keep the row, and the information (``(nq, nq)`` each) on the parameters of the latest samples."""
+        vars(self).update(
+            _observer=observer, _rows=row.several, _informations=informations,
+            residual_names=STEP_RESIDUAL, regressors=NOTHING,
+        )  # fmt: skip
+
+    def __getattr__(self, name: str) -> Any:
+        made: Any
+        if name in _COLUMNS:
+            made = read_only(_COLUMNS[name](self._rows))
+        elif name in ("state_names", "fault_names", "state_delays", "fault_delays"):
+            made = getattr(self._observer, name)
+        elif name == "excitation":
+            made = read_only(_excitation(self._observer, np.array(self._informations))[-1:])
+        elif name == "projection":
+            made = read_only(self._rows.moved)
+        elif name == "received":
+            made = ~np.isnan(self.innovations)
+            made.setflags(write=False)
+        else:
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+        vars(self)[name] = made
+        return made
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Estimates, tuple(getattr(self, field.name) for field in fields(Estimates))
 
 
 def _excitation(observer: DAESettings, informations: FloatArray) -> FloatArray:

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from obsynth.errors import SolverError, SpecError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.dae.c_code import DAELibrary
-from obsynth.observers.dae.estimates import DAERow, GatheredRows, require_regular
+from obsynth.observers.dae.estimates import DAERow, GatheredRows, SampleEstimates, require_regular
 from obsynth.observers.dae.settings import DAESettings
 from obsynth.observers.dae.step_graph import ObserverGraph
 from obsynth.observers.dae.steps import DAEState, Steps
@@ -150,7 +150,13 @@ class DAEObserver(DAESettings, StepObserver[DAEState, DAERow]):
         require_regular(self, row, row.conditions)
 
     def _sample(self, state: DAEState, y: ArrayLike, u: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        outputs = measured_record(np.atleast_2d(np.asarray(y)), self.model.ny)[0]
+        plain = type(y) is np.ndarray and y.dtype == np.float64 and y.shape == (self.model.ny,)
+        # What can be wrong with plain numbers is an infinity: it is told below.
+        outputs = (
+            np.asarray(y)
+            if plain and not np.isinf(y).any()
+            else measured_record(np.atleast_2d(np.asarray(y)), self.model.ny)[0]
+        )
         try:
             inputs = np.atleast_1d(np.asarray(u, dtype=np.float64))
         except (TypeError, ValueError):
@@ -161,9 +167,7 @@ class DAEObserver(DAESettings, StepObserver[DAEState, DAERow]):
         return outputs, inputs
 
     def _estimates(self, state: DAEState, row: DAERow) -> Estimates:
-        found = GatheredRows(self)
-        found.add(row)
-        return found.estimates(np.array(state.informations))
+        return SampleEstimates(self, row, state.informations)
 
     @property
     def graph(self) -> ObserverGraph:
