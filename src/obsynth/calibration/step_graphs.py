@@ -10,6 +10,7 @@ import subprocess
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -31,19 +32,26 @@ def compiled(functions: Sequence[Any]) -> list[Any]:
     command = compiler()
     if command is None:
         return list(functions)
+    generator = ca.CodeGenerator("calibration.c")
+    for function in functions:
+        generator.add(function)
+    try:
+        return list(_loaded(generator.dump(), tuple(function.name() for function in functions), (*command, *FLAGS)))
+    except subprocess.CalledProcessError:
+        return list(functions)
+
+
+@lru_cache(maxsize=16)
+def _loaded(code: str, names: tuple[str, ...], command: tuple[str, ...]) -> tuple[Any, ...]:
+    """Return functions of C code; the same code is compiled once."""
+    import casadi as ca
+
     with tempfile.TemporaryDirectory(prefix="obsynth-", ignore_cleanup_errors=True) as folder:
-        generator = ca.CodeGenerator("calibration.c")
-        for function in functions:
-            generator.add(function)
-        generator.generate(f"{folder}/")
         source, library = Path(folder) / "calibration.c", Path(folder) / "calibration.so"
-        done = subprocess.run(
-            [*command, *FLAGS, str(source), "-o", str(library), "-lm"], capture_output=True, check=False
-        )
-        if done.returncode != 0:
-            return list(functions)
+        source.write_text(code, encoding="utf-8", newline="\n")
+        subprocess.run([*command, str(source), "-o", str(library), "-lm"], capture_output=True, check=True)
         # What is loaded stays when the file is gone; Windows keeps the file.
-        return [ca.external(function.name(), str(library)) for function in functions]
+        return tuple(ca.external(name, str(library)) for name in names)
 
 
 #: Newton iterations of every step, from the last sample's state, and further ones where the residual is above `SOLVED`.

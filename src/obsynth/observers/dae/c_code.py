@@ -14,6 +14,7 @@ import shutil
 import subprocess
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
+from functools import lru_cache
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -249,6 +250,25 @@ def compiler() -> list[str] | None:
     return None if found is None else [found]
 
 
+@lru_cache(maxsize=16)
+def _loaded(code: str, command: tuple[str, ...]) -> ctypes.CDLL:
+    """Return C code as a library; the same code is compiled once."""
+    with tempfile.TemporaryDirectory(prefix="obsynth-", ignore_cleanup_errors=True) as folder:
+        source, library = Path(folder) / "observer.c", Path(folder) / "observer.so"
+        source.write_text(code, encoding="utf-8", newline="\n")
+        done = subprocess.run(
+            [*command, str(source), "-o", str(library), "-lm"],
+            capture_output=True,
+            encoding="utf-8",
+            errors="replace",
+            check=False,
+        )
+        if done.returncode != 0:
+            raise SpecError(f"The C compiler {command[0]!r} fails: {done.stderr.strip()[:500]}", path="compiled")
+        # It stays loaded when the file is gone; Windows keeps the file.
+        return ctypes.CDLL(str(library))
+
+
 class DAELibrary:
     """An observer in C."""
 
@@ -261,20 +281,7 @@ class DAELibrary:
                 "compiled=True out.",
                 path="compiled",
             )
-        with tempfile.TemporaryDirectory(prefix="obsynth-", ignore_cleanup_errors=True) as folder:
-            source, library = Path(folder) / "observer.c", Path(folder) / "observer.so"
-            source.write_text(record_code(steps), encoding="utf-8", newline="\n")
-            done = subprocess.run(
-                [*command, *FLAGS, str(source), "-o", str(library), "-lm"],
-                capture_output=True,
-                encoding="utf-8",
-                errors="replace",
-                check=False,
-            )
-            if done.returncode != 0:
-                raise SpecError(f"The C compiler {command[0]!r} fails: {done.stderr.strip()[:500]}", path="compiled")
-            # It stays loaded when the file is gone; Windows keeps the file.
-            self._library = ctypes.CDLL(str(library))
+        self._library = _loaded(record_code(steps), (*command, *FLAGS))
         pointer = ctypes.POINTER(ctypes.c_double)
         self._library.state_bytes.restype = ctypes.c_long
         self._library.start.argtypes = [ctypes.c_char_p]

@@ -103,7 +103,7 @@ def trajectories_of(plant: DescriptorSystem, point: complex, groups: Sequence[Se
     whole, columns, sure = _null_space(pencil)
     found = []
     for inputs in groups:
-        own = [*range(nx), *(nx + np.array(inputs, dtype=int))]
+        own = [*range(nx), *(nx + np.array(inputs, dtype=np.intp))]
         absent = np.delete(whole, own, axis=0)
         if len(absent):
             _, values, right = np.linalg.svd(absent)
@@ -192,7 +192,7 @@ class _Passing:
         """Return the largest relative error of an estimate in some rows, and that of a fault."""
         plant, tracked = self.plant, self.shipped.tracked
         dd, picked = plant.Dd[:, list(inputs)], list(rows)
-        states = np.array([row for row in picked if row < tracked], dtype=int)
+        states = np.array([row for row in picked if row < tracked], dtype=np.intp)
         x, d = trajectories[: plant.nx], trajectories[plant.nx :]
         error = self.through[picked] @ (plant.C @ x + dd @ d)
         error[: len(states)] -= x[states]
