@@ -158,6 +158,10 @@ class EarlyConstraintSteps(StepModel):
                 path="method.options.early_constraints",
             )
         self.others = np.setdiff1d(np.arange(self.plant.ne), self.rows)
+        self._constant: StepMatrices | None = None
+        self._noise: FloatArray | None = None
+        self._noise_is_constant = self.Q.is_constant and self.R.is_constant
+        self._is_constant = self._noise_is_constant and self.plant.is_time_invariant
 
     def _factors(self, k: int) -> tuple[FloatArray, FloatArray]:
         covariance = self.Q.at(k)
@@ -175,18 +179,26 @@ class EarlyConstraintSteps(StepModel):
 
     def at(self, k: int) -> StepMatrices:
         """Return the matrices of the step from k to k + 1."""
+        if self._constant is not None:
+            return self._constant
         plant, late, others = self.plant, self.rows, self.others
+        noise = self._noise
+        if noise is None:
+            outputs = stacked_noise(covariance_factor(self.R.at(k), f"R({k})"), self._factors(k + 1)[1])
+            noise = stacked_noise(self._factors(k)[0], outputs)
+            self._noise = noise if self._noise_is_constant else None
         H = np.vstack([plant.E.at(k + 1)[others], plant.C.at(k + 1), plant.A.at(k + 1)[late]])
-        outputs = stacked_noise(covariance_factor(self.R.at(k), f"R({k})"), self._factors(k + 1)[1])
-        return StepMatrices(
+        found = StepMatrices(
             np.asfortranarray(H),
             plant.A.at(k)[others],
             plant.B.at(k)[others],
             plant.Phi.at(k)[others],
             np.vstack([plant.Psi.at(k), plant.Phi.at(k + 1)[late]]),
             -plant.B.at(k + 1)[late],
-            stacked_noise(self._factors(k)[0], outputs),
+            noise,
         )
+        self._constant = found if self._is_constant else None
+        return found
 
     def first(self) -> StepMatrices:
         """Return the correction of x(0) by the algebraic equations of step 0."""
@@ -234,9 +246,16 @@ class WalkingEarlySteps(EarlyConstraintSteps):
 
     walk: FloatArray  # ``(nq, nq)``: square root of the covariance of one step of the walk
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._last: tuple[StepMatrices, StepMatrices] | None = None
+
     def at(self, k: int) -> StepMatrices:
-        """Return the matrices of the step from k to k + 1."""
-        return with_walking_parameters(super().at(k), self.walk, early=True)
+        """Return the matrices of the step from k to k + 1; the same object for the same step of the model."""
+        step, last = super().at(k), self._last
+        if last is None or last[0] is not step:
+            self._last = last = (step, with_walking_parameters(step, self.walk, early=True))
+        return last[1]
 
     def first(self) -> StepMatrices:
         """Return the correction of x(0) and theta(0) by the algebraic equations of step 0."""
