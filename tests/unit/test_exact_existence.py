@@ -17,7 +17,7 @@ from obsynth import (
     ui_pi_observer,
 )
 from obsynth.analysis.existence.numbers import numbers_of
-from obsynth.analysis.existence.verdicts import ROUNDING_LEVEL, settled_rank
+from obsynth.analysis.existence.statements import ROUNDING_LEVEL, settled_rank
 from obsynth.methods.designing import check
 from obsynth.methods.registry import method_class
 from obsynth.numerics.ranks import decide_rank

@@ -24,6 +24,7 @@ from obsynth import (
 )
 from obsynth.analysis.conditions import Condition
 from obsynth.analysis.existence import named_pencils
+from obsynth.analysis.existence.statements import Evaluator
 from obsynth.analysis.existence.witnesses import EntryChange, Unclear, Witness, rational_matrices
 from obsynth.methods.fault_estimation_filter.conditions import fault_filter_conditions
 from obsynth.methods.functional_filter.conditions import conditions as functional_conditions
@@ -212,7 +213,7 @@ def test_a_long_fault_model_has_a_witness_of_its_own() -> None:
     witness = failed.unclear.witness
     assert witness is not None
     assert "of Phi of the fault model" in failed.detail
-    drops = exact_drops(witness.plant(plant), witness.model(model))
+    drops = exact_drops(Evaluator(witness.plant(plant)), witness.model(model))
     assert drops is not None
     assert not drops.facts.full or drops.facts.outside
 

@@ -61,6 +61,16 @@ def is_doubted(conditions: Iterable[Condition]) -> bool:
     return bool(failed) and all(condition.unclear for condition in failed)
 
 
+def up_to_failure(conditions: Iterable[Condition]) -> tuple[Condition, ...]:
+    """Return conditions in order, up to the first that fails: those after it may rely on it, and are not asked for."""
+    found = list[Condition]()
+    for condition in conditions:
+        found.append(condition)
+        if not condition.holds:
+            break
+    return tuple(found)
+
+
 def require_all(conditions: Iterable[Condition]) -> None:
     """Raise `PreconditionError` for the first condition that fails."""
     for condition in conditions:

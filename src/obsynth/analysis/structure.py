@@ -9,7 +9,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from obsynth.analysis.existence.verdicts import hidden_modes
+from obsynth.analysis.existence.statements import Evaluator
 from obsynth.analysis.transformations.recovery import Transformation, linear_plant
 from obsynth.analysis.zeros import are_outside
 from obsynth.numerics.arrays import ComplexArray
@@ -80,7 +80,7 @@ def analyse_structure(plant: DescriptorSystem | Transformation) -> Structure:
     stable = pencil.regular and not unstable
     impulse_free = pencil.index is not None and pencil.index <= 1
 
-    hidden = hidden_modes(plant)
+    hidden = Evaluator(plant).hidden_modes()
     seen = hidden.normal_rank == plant.nx
 
     rank_e = decide_rank(E, expected=plant.nx)
@@ -105,10 +105,10 @@ def analyse_structure(plant: DescriptorSystem | Transformation) -> Structure:
         stable=stable,
         admissible=stable and impulse_free,
         observability_normal_rank=hidden.normal_rank,
-        unobservable_modes=hidden.modes,
-        undetectable_modes=hidden.undetectable,
-        finitely_observable=seen and not hidden.modes,
-        detectable=seen and not hidden.undetectable,
+        unobservable_modes=hidden.zeros,
+        undetectable_modes=hidden.outside,
+        finitely_observable=seen and not hidden.zeros,
+        detectable=seen and not hidden.outside,
         impulse_observable=impulse.full,
         causally_observable=causal.full,
         rank_of_E=rank_e,

@@ -163,16 +163,16 @@ def decide_rank(
     )
 
 
-def rank_in_any_units(first: FloatArray, second: FloatArray) -> RankDecision:
-    """Decide whether the columns of a matrix are independent by whichever of two scalings of it shows that better.
+def rank_in_any_units(first: FloatArray, second: FloatArray, *, expected: int) -> RankDecision:
+    """Decide whether a matrix has a rank by whichever of two scalings of it shows that better.
 
     Rounding of the entries is as small beside them in all units, so that no scaling makes a matrix look regular that
     is not; one whose units drift apart, as along a chain of parts that hardly touch, makes it look singular.
     """
-    found = decide_rank(first, expected=first.shape[1])
+    found = decide_rank(first, expected=expected)
     if found.full and found.clear:
         return found
-    other = decide_rank(second, expected=second.shape[1])
+    other = decide_rank(second, expected=expected)
     return max(found, other, key=lambda decision: (decision.rank, decision.smallest_kept))
 
 

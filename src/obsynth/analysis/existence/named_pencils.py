@@ -75,6 +75,11 @@ class NamedPencil:
         known: FloatArray = np.where(self.A != 0, KNOWN_ENTRY, 1.0) * np.reshape(names, self.A.shape)
         return known
 
+    def with_rows(self, rows: list[int]) -> NamedPencil:
+        """Return the same with some of its rows."""
+        terms = None if self.terms is None else self.terms[rows]
+        return NamedPencil(self.A[rows], self.E[rows], self.owners[rows], self.rows[rows], self.columns, terms)
+
     def witness(
         self, tolerance: float, point: complex | None = None, *, dt: float | None = None, last: bool = False
     ) -> Witness | None:

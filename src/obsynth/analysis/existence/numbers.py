@@ -5,19 +5,17 @@ Numbers of a plant that was sampled: enclosed to hundreds of digits.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from contextvars import ContextVar
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 from obsynth.analysis.existence.rational import PlantNumbers, SystemFacts, WrittenNumbers
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.exact_numbers import DECISIVE
 
 if TYPE_CHECKING:
-    from flint import fmpq_mat
+    from flint import fmpq_mat, fmpz_poly
 
     from obsynth.proofs.enclosed_pencils import EnclosedPencil, Rows
 
@@ -101,6 +99,10 @@ class SampledNumbers(PlantNumbers):
         """Return some columns."""
         return [[row[j] for j in columns] for row in matrix]
 
+    def rows(self, matrix: Rows, rows: Sequence[int]) -> Rows:
+        """Return some rows."""
+        return [matrix[i] for i in rows]
+
     def pencil(self, inputs: Rows, direct: Rows) -> EnclosedPencil:
         """Return ``[A - z, inputs; C, direct]``."""
         from obsynth.proofs.enclosed_pencils import EnclosedPencil
@@ -110,6 +112,14 @@ class SampledNumbers(PlantNumbers):
         outputs, extra = len(whole) - self.states, len(whole[0]) - self.states
         rest = zeros_matrix(self.states, extra), zeros_matrix(outputs, self.states), zeros_matrix(outputs, extra)
         return EnclosedPencil(blocks([[self.rational["E"], rest[0]], [rest[1], rest[2]]]), whole, self.bits)
+
+    def rank_at_root(self, inputs: Rows, direct: Rows, polynomial: fmpz_poly) -> int | None:
+        """Return the rank of ``[A - z, inputs; C, direct]`` at the root of a linear polynomial."""
+        from flint import arb, fmpq
+
+        if polynomial.degree() > 1:
+            return None
+        return self.pencil(inputs, direct).rank_at(arb(fmpq(-polynomial[0], polynomial[1])))
 
     def decided_system(self, inputs: Rows, direct: Rows) -> SystemFacts:
         """Decide facts on ``[A - z, inputs; C, direct]``."""
@@ -156,65 +166,10 @@ SAMPLED_STATES = 24
 #: Of computed data an exact answer says little more than floating point does, and takes longer.
 COMPUTED_STATES = 24
 
-Found = TypeVar("Found")
-
-_EXACTLY: ContextVar[bool] = ContextVar("existence is decided exactly", default=True)
-
-
-@contextmanager
-def decided(*, exactly: bool) -> Iterator[None]:
-    """Decide existence exactly, or in floating point: for what is only tried, such as sensors that might be added."""
-    token = _EXACTLY.set(exactly)
-    try:
-        yield
-    finally:
-        _EXACTLY.reset(token)
-
-
-def decides_exactly() -> bool:
-    """Whether existence is decided exactly where that can be done."""
-    return _EXACTLY.get()
-
-
-#: Whether numbers are asked for as they were before what elimination left by rounding was set to zero, and for which
-#: plants that was done.
-_UNCLEANED: ContextVar[bool] = ContextVar("numbers are not cleaned", default=False)
-_CLEANED: ContextVar[list[DescriptorSystem] | None] = ContextVar("plants whose numbers were cleaned", default=None)
-
-
-def reconsidered(
-    decide: Callable[[], Found], refused: Callable[[Found], bool], doubted: Callable[[Found], bool]
-) -> Found:
-    """Return a decision; a refusal that rests on what was taken for rounding gives way to the doubt without that."""
-    cleaned: list[DescriptorSystem] = []
-    token = _CLEANED.set(cleaned)
-    try:
-        found = decide()
-    finally:
-        _CLEANED.reset(token)
-    if not cleaned or not refused(found):
-        return found
-    again = _UNCLEANED.set(True)
-    try:
-        other = decide()
-    finally:
-        _UNCLEANED.reset(again)
-    return other if doubted(other) else found
-
-
-def uncleaned() -> bool:
-    """Whether numbers are asked for as they were before any were taken for rounding."""
-    return _UNCLEANED.get()
-
 
 def numbers_of(plant: DescriptorSystem) -> PlantNumbers | None:
     """Return the numbers on which existence is decided; ``None`` where it is decided in floating point."""
-    if not _EXACTLY.get() or plant.nx > EXACT_STATES:
-        return None
-    exact, cleaned = plant.exact, _CLEANED.get()
-    if cleaned is not None and exact is not None and exact.uncleaned is not None:
-        cleaned.append(plant)
-    return _numbers_of(_Content.of(plant), _UNCLEANED.get())
+    return None if plant.nx > EXACT_STATES else _numbers_of(_Content.of(plant))
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,12 +195,12 @@ class _Content:
 
 # Conditions, synthesis and verification ask for the same plant's several times; plants never change.
 @lru_cache(maxsize=8)
-def _numbers_of(content: _Content, uncleaned: bool) -> PlantNumbers | None:
+def _numbers_of(content: _Content) -> PlantNumbers | None:
     plant = content.plant
     from obsynth.proofs.exact_arithmetic import holds_computed, rational_matrix, written_matrix
 
     if plant.exact is not None:
-        known = plant.exact.before_cleaning() if uncleaned else plant.exact
+        known = plant.exact
         rows = known.matrices
         states = len(rows["A"])
         sizes = {"E": states, "A": states, "C": states, "Bf": plant.nf, "Df": plant.nf, "Bd": plant.nd, "Dd": plant.nd}

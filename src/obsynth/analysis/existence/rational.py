@@ -7,15 +7,21 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
+from obsynth.numerics.ranks import RankDecision
+
 if TYPE_CHECKING:
-    from flint import fmpq_mat
+    from flint import fmpq_mat, fmpz_poly
 
     from obsynth.proofs.exact_pencils import ExactPencil
+
+#: Degree of the minimal polynomial of an eigenvalue, times columns of the pencil, above which its rank there is left
+#: to floating point.
+MOST_COLUMNS = 400
 
 
 @dataclass(frozen=True, eq=False)
 class SystemFacts:
-    """What was decided about ``[A - s E, B; C, D]``, in rational arithmetic (``exact``) or to hundreds of digits."""
+    """What is known of ``[A - s E, B; C, D]``: from rational arithmetic (``exact``), to hundreds of digits, or not."""
 
     normal_rank: int
     columns: int
@@ -23,6 +29,7 @@ class SystemFacts:
     zeros: tuple[complex, ...]
     exact: bool
     computed: bool = False  # whether some of the data were computed in floating point
+    decisions: tuple[RankDecision, ...] = ()  # on the way, in floating point
 
     @property
     def full(self) -> bool:
@@ -64,8 +71,21 @@ class PlantNumbers(ABC):
         """Return some columns."""
 
     @abstractmethod
+    def rows(self, matrix: Any, rows: Sequence[int]) -> Any:
+        """Return some rows."""
+
+    @abstractmethod
+    def rank_at_root(self, inputs: Any, direct: Any, polynomial: fmpz_poly) -> int | None:
+        """Return the rank of ``[A - s E, inputs; C, direct]`` at the roots of an irreducible polynomial.
+        ``None``: left to floating point."""
+
+    @abstractmethod
     def decided_system(self, inputs: Any, direct: Any) -> SystemFacts:
         """Decide facts on ``[A - s E, inputs; C, direct]``."""
+
+    def columns(self, name: str, kept: Sequence[int] | None) -> Any:
+        """Return a matrix by its name, or some of its columns."""
+        return self.matrix(name) if kept is None else self.picked(self.matrix(name), kept)
 
     def system(self, inputs: Any, direct: Any) -> SystemFacts:
         """Return facts on ``[A - s E, inputs; C, direct]``; zeros only where the normal rank is full."""
@@ -182,11 +202,22 @@ class WrittenNumbers(PlantNumbers):
         rows = int(matrix.nrows())
         return fmpq_mat(rows, len(columns), [matrix[i, j] for i in range(rows) for j in columns])
 
+    def rows(self, matrix: fmpq_mat, rows: Sequence[int]) -> fmpq_mat:
+        """Return some rows."""
+        return self.picked(matrix.transpose(), [int(row) for row in rows]).transpose()
+
     def pencil(self, inputs: fmpq_mat, direct: fmpq_mat) -> ExactPencil:
         """Return ``[A - s E, inputs; C, direct]``."""
         from obsynth.proofs.exact_pencils import system_pencil
 
         return system_pencil(self.matrices["E"], self.matrices["A"], inputs, self.matrices["C"], direct)
+
+    def rank_at_root(self, inputs: fmpq_mat, direct: fmpq_mat, polynomial: fmpz_poly) -> int | None:
+        """Return the rank of ``[A - s E, inputs; C, direct]`` at the roots of an irreducible polynomial."""
+        pencil = self.pencil(inputs, direct)
+        if pencil.shape[1] * polynomial.degree() > MOST_COLUMNS:
+            return None
+        return pencil.rank_at_root(polynomial)
 
     def decided_system(self, inputs: fmpq_mat, direct: fmpq_mat) -> SystemFacts:
         """Decide facts on ``[A - s E, inputs; C, direct]``."""

@@ -10,7 +10,6 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.analysis.existence.numbers import uncleaned
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.exact_numbers import DECISIVE, ExactNumbers
@@ -132,8 +131,7 @@ def rational_matrices(plant: DescriptorSystem) -> dict[str, Rational]:
     """Return the decisive matrices of a plant in its own coordinates, as written, or as they were rounded."""
     exact = plant.exact
     if exact is not None and exact.sample_time is None and exact.own:
-        rows = (exact.before_cleaning() if uncleaned() else exact).matrices
-        return {name: as_array(rows[name], getattr(plant, name).shape) for name in DECISIVE}
+        return {name: as_array(exact.matrices[name], getattr(plant, name).shape) for name in DECISIVE}
     return {name: rational(getattr(plant, name)) for name in DECISIVE}
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from obsynth.analysis.conditions import Condition, rank_condition
-from obsynth.analysis.existence.verdicts import hidden_modes
+from obsynth.analysis.existence.statements import Evaluator
 from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import FloatArray
@@ -79,7 +79,7 @@ def conditions(plant: DescriptorSystem) -> tuple[Condition, ...]:
 
 
 def _detectable(plant: DescriptorSystem) -> Condition:
-    lost = hidden_modes(plant).undetectable
+    lost = Evaluator(plant.dense()).hidden_modes().outside
     detail = f"no output shows s = {complex(lost[0]):.4g}: measure more." if lost else "every mode shows, or dies out"
     mode = complex(lost[0]) if lost else None
     return Condition(

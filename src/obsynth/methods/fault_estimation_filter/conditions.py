@@ -9,39 +9,21 @@ combination of the others', and leaves what came before it invisible.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 from fractions import Fraction
 from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from obsynth.analysis.conditions import Condition, is_doubted, is_refused, rank_condition
-from obsynth.analysis.existence.distance import ROUNDING_LEVEL, least_share
+from obsynth.analysis.conditions import Condition, up_to_failure
+from obsynth.analysis.existence.distance import ROUNDING_LEVEL
 from obsynth.analysis.existence.named_pencils import DIGITS
-from obsynth.analysis.existence.numbers import decides_exactly, numbers_of, reconsidered
-from obsynth.analysis.existence.rational import PlantNumbers, WrittenNumbers
-from obsynth.analysis.existence.verdicts import (
-    DECIDER,
-    described_distance,
-    needed_gain,
-    rank_doubt,
-    settled_rank,
-    unclear_detail,
-    zero_doubt,
-    zero_verdict,
-)
+from obsynth.analysis.existence.numbers import numbers_of
+from obsynth.analysis.existence.rational import SystemFacts, WrittenNumbers
+from obsynth.analysis.existence.statements import DECIDER, Evaluator, FullRank, NoZeroOutside, reconsidered
 from obsynth.analysis.existence.witnesses import EntryChange, Unclear, Witness, rational_matrices
-from obsynth.analysis.plant_units import PlantUnits, sized_plant
-from obsynth.analysis.zeros import (
-    MOST_NAMES,
-    Zero,
-    fault_zeros,
-    hidden_direction,
-    leading_names,
-    system_pencil,
-    zero_at,
-)
+from obsynth.analysis.plant_units import PlantUnits
+from obsynth.analysis.zeros import MOST_NAMES, Zero, hidden_direction, leading_names, zero_at
 from obsynth.errors import PreconditionError
 from obsynth.methods.fault_estimation_filter.detectability_indexes import (
     REFUSE_CONDITION,
@@ -51,20 +33,19 @@ from obsynth.methods.fault_estimation_filter.detectability_indexes import (
     numbers_with_fault_states,
 )
 from obsynth.methods.fault_estimation_filter.prepared_plant import PreparedPlant, prepare, with_sensor_faults_as_states
-from obsynth.numerics.arrays import remembered
+from obsynth.numerics.arrays import FloatArray, remembered
 from obsynth.numerics.pencils import regularity
-from obsynth.numerics.ranks import decide_rank
 from obsynth.plants.descriptor import DescriptorSystem
 
 if TYPE_CHECKING:
     from flint import fmpq_mat
 
 
-def index_doubt(plant: DescriptorSystem, detectability: FaultDetectability) -> Unclear | None:
+def index_doubt(judge: Evaluator, detectability: FaultDetectability) -> Unclear | None:
     """Return why the rank of Upsilon is unclear; ``None`` where it is not."""
-    if not detectability.finite or not _is_in_doubt(plant, detectability):
+    if not detectability.finite or not _is_in_doubt(judge, detectability):
         return None
-    units, best = PlantUnits.of(plant).rounded(), None
+    plant, units, best = judge.plant, judge.units, None
     direction = _null_direction(detectability)
     for digits in DIGITS:
         found = _changed(plant, units, detectability.indexes, np.round(direction, digits))
@@ -76,7 +57,7 @@ def index_doubt(plant: DescriptorSystem, detectability: FaultDetectability) -> U
     return Unclear(max(ROUNDING_LEVEL, size), best, f"has rank Upsilon = {detectability.rank.expected - 1}", DECIDER)
 
 
-def _is_in_doubt(plant: DescriptorSystem, detectability: FaultDetectability) -> bool:
+def _is_in_doubt(judge: Evaluator, detectability: FaultDetectability) -> bool:
     """Whether the faults can be told apart on paper, but not in numbers."""
     rank = detectability.rank
     if rank.full or rank.means != "tolerance":
@@ -84,9 +65,9 @@ def _is_in_doubt(plant: DescriptorSystem, detectability: FaultDetectability) -> 
             rank.means == "tolerance" and detectability.condition_number > REFUSE_CONDITION
         )
     # Of computed data only floating point has spoken: what they were rounded to may say otherwise.
-    if numbers_of(plant) is None:
+    if judge.numbers is None:
         return False
-    found = _exact(plant)
+    found = _exact(judge.plant)
     if found is None:
         return False
     from obsynth.proofs.exact_arithmetic import blocks
@@ -98,7 +79,8 @@ def _is_in_doubt(plant: DescriptorSystem, detectability: FaultDetectability) -> 
 
 def _exact(plant: DescriptorSystem) -> tuple[fmpq_mat, fmpq_mat, fmpq_mat, fmpq_mat] | None:
     """Return ``T A``, C, ``T Bf`` and T of the plant as written, with its sensor faults as states."""
-    numbers = numbers_with_fault_states(Witness((), 0.0).plant(plant))
+    plant = Witness((), 0.0).plant(plant)
+    numbers = numbers_with_fault_states(plant, numbers_of(plant))
     t = nonsingular_t(numbers) if isinstance(numbers, WrittenNumbers) else None
     if t is None or not isinstance(numbers, WrittenNumbers):
         return None
@@ -189,45 +171,42 @@ def _decided(_plant: DescriptorSystem) -> dict[bool, tuple[Condition, ...]]:
     return {}
 
 
-def fault_filter_conditions(plant: DescriptorSystem) -> tuple[Condition, ...]:
+def fault_filter_conditions(plant: DescriptorSystem, *, exactly: bool = True) -> tuple[Condition, ...]:
     """Return the existence conditions of the fault-estimation filter, in order; the list ends at the first failure."""
-    return _decided(plant).get(decides_exactly()) or examine_fault_filter(plant)[0]
+    return _decided(plant).get(exactly) or examine_fault_filter(plant, exactly=exactly)[0]
 
 
-def examine_fault_filter(plant: DescriptorSystem) -> tuple[tuple[Condition, ...], PreparedPlant | None]:
+def examine_fault_filter(
+    plant: DescriptorSystem, *, exactly: bool = True
+) -> tuple[tuple[Condition, ...], PreparedPlant | None]:
     """Return the existence conditions, and the prepared plant on which the last of them were decided."""
-    dense = plant.dense()
-    found = reconsidered(
-        lambda: _examined(dense), lambda found: is_refused(found[0]), lambda found: is_doubted(found[0])
-    )
-    _decided(plant)[decides_exactly()] = found[0]
+    found = reconsidered(Evaluator(plant.dense(), exactly), _examined, lambda found: found[0])
+    _decided(plant)[exactly] = found[0]
     return found
 
 
-def _examined(plant: DescriptorSystem) -> tuple[tuple[Condition, ...], PreparedPlant | None]:
-    found, prepared = list[Condition](), list[PreparedPlant]()
-    for condition in _in_order(plant, prepared):
-        found.append(condition)
-        if not condition.holds:
-            break
-    return tuple(found), prepared[0] if prepared else None
+def _examined(judge: Evaluator) -> tuple[tuple[Condition, ...], PreparedPlant | None]:
+    prepared = list[PreparedPlant]()
+    found = up_to_failure(_in_order(judge, prepared))
+    return found, prepared[0] if prepared else None
 
 
-def _in_order(plant: DescriptorSystem, made: list[PreparedPlant]) -> Iterator[Condition]:
+def _in_order(judge: Evaluator, made: list[PreparedPlant]) -> Iterator[Condition]:
     """Yield the conditions, each group examined when it is asked for; the prepared plant is appended to ``made``."""
-    yield from _form_conditions(plant)
-    yield from _rank_conditions(plant)
-    prepared = prepare(plant)
+    plant = judge.plant
+    yield from _form_conditions(judge)
+    yield from _rank_conditions(judge)
+    prepared = prepare(plant, exactly=judge.exactly)
     made.append(prepared)
     *first, last = detectability_conditions(prepared.detectability, plant.fault_names, prepared.scaling.outputs)
     yield from first
-    doubt = None if last.holds else index_doubt(plant, prepared.detectability)
+    doubt = None if last.holds else index_doubt(judge, prepared.detectability)
     yield last if doubt is None else last.in_doubt(doubt, plant)
-    yield from _zero_conditions(plant)
+    yield _zero_condition(judge)
 
 
-def _form_conditions(plant: DescriptorSystem) -> list[Condition]:
-    numbers = numbers_of(plant)
+def _form_conditions(judge: Evaluator) -> list[Condition]:
+    plant, numbers = judge.plant, judge.numbers
     if numbers is not None:
         normal_rank = numbers.regular_rank
         regular = normal_rank == plant.nx
@@ -268,147 +247,73 @@ def _form_conditions(plant: DescriptorSystem) -> list[Condition]:
     ]
 
 
-def _rank_conditions(plant: DescriptorSystem) -> list[Condition]:
+def _rank_conditions(judge: Evaluator) -> Iterator[Condition]:
+    plant, source = judge.plant, "Wang 2015, below eq. (1)"
     enough = plant.nf <= plant.ny
-    first = Condition(
+    yield Condition(
         "nf <= ny",
         "no more faults than outputs (nf <= ny)",
         enough,
         float(plant.nf),
         float(plant.ny),
-        "Wang 2015, below eq. (1)",
+        source,
         "" if enough else f"{plant.nf} faults and {plant.ny} output(s). Measure more, or leave a fault out.",
         signals=() if enough else plant.fault_names,
     )
-    numbers = numbers_with_fault_states(plant)
-    ranks = [first, _fault_rank(plant, numbers)]
-    if not all(condition.holds for condition in ranks):
-        return ranks
+    alike = "some faults act nowhere, or in the same direction as others, and cannot be told apart."
+    acting = FullRank([["Bf"], ["Df"]])
+    yield judge.full_rank("rank F", acting, lambda _: (alike, _dependent_columns(plant)), source=source)
     try:
         work = with_sensor_faults_as_states(plant)
     except PreconditionError as error:
-        return [
-            *ranks,
-            Condition(
-                error.condition,
-                "sensor faults can be told from the states",
-                False,
-                np.nan,
-                np.nan,
-                "Wang 2015, eq. (2), with the fault as a state",
-                str(error),
-                signals=error.signals,
-            ),
-        ]
-    return [*ranks, *_output_ranks(work, plant.output_names, numbers)]
+        yield Condition(
+            error.condition,
+            "sensor faults can be told from the states",
+            False,
+            np.nan,
+            np.nan,
+            "Wang 2015, eq. (2), with the fault as a state",
+            str(error),
+            signals=error.signals,
+        )
+        return
+    # Sensor faults are states then, and their columns of Df stand beside C.
+    direct = {"Df": np.flatnonzero(plant.Df.any(axis=0)).tolist()}
+    outputs, states = FullRank([["C", "Df"]], direct, of_rows=True), FullRank([["E", None], ["C", "Df"]], direct)
+
+    def repeated(matrix: FloatArray) -> tuple[str, tuple[str, ...]]:
+        names = leading_names(np.linalg.svd(work.C)[0][:, -1], plant.output_names, most=MOST_NAMES)
+        return "some outputs repeat others: leave them out.", names
+
+    def unknown(matrix: FloatArray) -> tuple[str, tuple[str, ...]]:
+        names = leading_names(np.linalg.svd(matrix)[2][-1], work.state_names, most=MOST_NAMES)
+        told = (
+            "not every state is either dynamic or measured. Measure more, or eliminate the algebraic states first "
+            "(transform: {eliminate_algebraic_states: true} in a spec)."
+        )
+        return told, names
+
+    yield judge.full_rank("rank C", outputs, repeated, source=source)
+    yield judge.full_rank("rank [E; C]", states, unknown, source="Wang 2015, eq. (2)")
 
 
-def _fault_rank(plant: DescriptorSystem, numbers: PlantNumbers | None) -> Condition:
-    units, terms = PlantUnits.of(plant).rounded(), sized_plant(plant)
-    natural, sizes = units.scaled_plant(plant), None if terms is None else units.scaled_plant(terms)
-    columns = np.vstack([natural.Bf, natural.Df])
-    faults = settled_rank(
-        decide_rank(columns, expected=plant.nf),
-        # Faults that act on the outputs are columns of Bf too, once they are states.
-        None if numbers is None else numbers.rank(numbers.blocks([[numbers.matrix("Bf")]])),
-        np.inf if sizes is None else least_share(columns, np.vstack([sizes.Bf, sizes.Df])),
-    )
-    acting = rank_condition(
-        "rank F",
-        faults,
-        "some faults act nowhere, or in the same direction as others, and cannot be told apart.",
-        source="Wang 2015, below eq. (1)",
-        signals=_dependent_columns(plant),
-    )
-    if faults.means == "unclear":
-        acting = acting.in_doubt(rank_doubt(plant, units, faults, [["Bf"], ["Df"]]), plant)
-    return acting
+def _zero_condition(judge: Evaluator) -> Condition:
+    plant = judge.plant
 
+    def holding(facts: SystemFacts) -> Condition:
+        largest = max((abs(value) for value in facts.zeros), default=0.0)
+        largest_one = f", largest modulus {largest:.6g}" if facts.zeros else ""
+        return _fault_zeros(holds=True, value=largest, detail=f"{len(facts.zeros)} zero(s){largest_one}")
 
-def _output_ranks(
-    work: DescriptorSystem, output_names: tuple[str, ...], numbers: PlantNumbers | None
-) -> list[Condition]:
-    """Return the conditions on C and [E; C] of a plant whose sensor faults are states."""
-    units = PlantUnits.of(work).rounded()
-    natural = units.scaled_plant(work)
-    stacked = np.vstack([natural.E, natural.C])
-    outputs, states = decide_rank(natural.C, expected=work.ny), decide_rank(stacked, expected=work.nx)
-    if numbers is not None:
-        c = numbers.matrix("C")
-        outputs = settled_rank(outputs, numbers.rank(c))
-        states = settled_rank(states, numbers.rank(numbers.blocks([[numbers.matrix("E")], [c]])))
-    repeated = rank_condition(
-        "rank C",
-        outputs,
-        "some outputs repeat others: leave them out.",
-        source="Wang 2015, below eq. (1)",
-        signals=() if outputs.full else leading_names(np.linalg.svd(work.C)[0][:, -1], output_names, most=MOST_NAMES),
-    )
-    known = rank_condition(
-        "rank [E; C]",
-        states,
-        "not every state is either dynamic or measured. Measure more, or eliminate the algebraic states first "
-        "(transform: {eliminate_algebraic_states: true} in a spec).",
-        source="Wang 2015, eq. (2)",
-        signals=() if states.full else leading_names(np.linalg.svd(stacked)[2][-1], work.state_names, most=MOST_NAMES),
-    )
-    if outputs.means == "unclear":
-        repeated = repeated.in_doubt(rank_doubt(work, units, outputs, [["C"]], rows=True), work)
-    if states.means == "unclear":
-        known = known.in_doubt(rank_doubt(work, units, states, [["E"], ["C"]]), work)
-    return [repeated, known]
+    def lost(facts: SystemFacts) -> Condition:
+        if not facts.full:
+            names = hidden_direction(plant, missing=facts.columns - facts.normal_rank)[1]
+            detail = f"faults {', '.join(map(repr, names))} are together output-nulling: no output shows them."
+            return _fault_zeros(holds=False, value=np.inf, detail=detail, signals=names)
+        point = max(facts.outside, key=abs)
+        return _zero_failure(plant, zero_at(plant.E, plant.A, point, plant.Bf, plant.C, plant.Df))
 
-
-def _zero_conditions(plant: DescriptorSystem) -> list[Condition]:
-    numbers = numbers_of(plant)
-    if numbers is None:
-        return _zero_conditions_in_floating_point(plant)
-    facts = numbers.system(numbers.matrix("Bf"), numbers.matrix("Df"))
-    if not facts.full:
-        return [_never_shown(hidden_direction(plant, missing=facts.columns - facts.normal_rank)[1])]
-    wide_e, wide_a = system_pencil(plant.E, plant.A, plant.Bf, plant.C, plant.Df)
-    units = PlantUnits.of(plant).rounded()
-    terms, sizes = sized_plant(plant), None
-    if terms is not None:
-        sizes = units.scaled_pencil(wide_e, np.block([[terms.A, terms.Bf], [terms.C, terms.Df]]), units.faults)[1]
-    scaled = units.scaled_pencil(wide_e, wide_a, units.faults)
-    verdict = zero_verdict(facts, *scaled, nx=plant.nx, discrete=True, sizes=sizes)
-    facts = verdict.facts
-    if facts.outside:
-        point = facts.outside[0]
-        lost = _zero_failure(plant, zero_at(plant.E, plant.A, point, plant.Bf, plant.C, plant.Df))
-        gain = needed_gain(plant, units, point, inputs="Bf")
-        return [replace(lost, detail=f"{lost.detail} {gain}".rstrip())]
-    largest = max((abs(value) for value in facts.zeros), default=0.0)
-    if verdict.answer == "unclear":
-        detail = unclear_detail(verdict, "A filter")
-        doubt = zero_doubt(plant, units, verdict, [["A", "Bf"], ["C", "Df"]], what="filter")
-        outside = fault_zeros(plant).outside
-        lost = _fault_zeros(holds=False, value=largest, detail=detail)
-        if outside:
-            lost = _zero_failure(plant, max(outside, key=lambda zero: abs(zero.value)))
-            lost = replace(lost, detail=f"{detail} In floating point, {lost.detail}")
-        return [lost.in_doubt(doubt, plant)]
-    return [_all_inside(len(facts.zeros), largest, f"; {described_distance(verdict)}")]
-
-
-def _all_inside(count: int, largest: float, distance: str = "") -> Condition:
-    largest_one = f", largest modulus {largest:.6g}" if count else ""
-    return _fault_zeros(holds=True, value=largest, detail=f"{count} zero(s){largest_one}{distance}")
-
-
-def _never_shown(names: tuple[str, ...]) -> Condition:
-    detail = f"faults {', '.join(map(repr, names))} are together output-nulling: no output shows them."
-    return _fault_zeros(holds=False, value=np.inf, detail=detail, signals=names)
-
-
-def _zero_conditions_in_floating_point(plant: DescriptorSystem) -> list[Condition]:
-    zeros = fault_zeros(plant)
-    if not zeros.normal_rank_full:
-        return [_never_shown(zeros.hidden_faults)]
-    if zeros.outside:
-        return [_zero_failure(plant, max(zeros.outside, key=lambda zero: abs(zero.value)))]
-    return [_all_inside(len(zeros.zeros), float(max((abs(zero.value) for zero in zeros.zeros), default=0.0)))]
+    return judge.no_zero_outside(NoZeroOutside("Bf"), holding=holding, lost=lost, what="filter")
 
 
 def _zero_failure(plant: DescriptorSystem, zero: Zero) -> Condition:

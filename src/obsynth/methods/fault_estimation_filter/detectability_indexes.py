@@ -14,7 +14,7 @@ import numpy as np
 from obsynth.analysis.conditions import Condition
 from obsynth.analysis.existence.numbers import numbers_of
 from obsynth.analysis.existence.rational import PlantNumbers
-from obsynth.analysis.existence.verdicts import settled_rank
+from obsynth.analysis.existence.statements import settled_rank
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import DEAD_CHAIN_TOLERANCE, MARKOV_TOLERANCE, RankDecision, decide_rank
 from obsynth.plants.descriptor import DescriptorSystem
@@ -38,14 +38,13 @@ class ExactIndexes:
     rank: int
 
 
-def numbers_with_fault_states(plant: DescriptorSystem) -> PlantNumbers | None:
+def numbers_with_fault_states(plant: DescriptorSystem, numbers: PlantNumbers | None) -> PlantNumbers | None:
     """Return the numbers of a plant with its sensor faults appended as algebraic states."""
     from flint import fmpq_mat
 
     from obsynth.proofs.exact_arithmetic import blocks, identity, zeros_matrix
 
     chosen = [int(j) for j in np.flatnonzero(np.any(plant.Df != 0.0, axis=0))]
-    numbers = numbers_of(plant)
     if numbers is None or not chosen:
         return numbers
     nx, nf, count = plant.nx, plant.nf, len(chosen)
@@ -71,12 +70,12 @@ def exact_indexes(plant: DescriptorSystem) -> ExactIndexes | None:
     numbers = numbers_of(plant)
     if numbers is None or numbers.computed:
         return None  # a Markov parameter that is zero may have been computed as one that is not
-    found: ExactIndexes | None = numbers.remembered("indexes", lambda: _decided_indexes(plant))
+    found: ExactIndexes | None = numbers.remembered("indexes", lambda: _decided_indexes(plant, numbers))
     return found
 
 
-def _decided_indexes(plant: DescriptorSystem) -> ExactIndexes | None:
-    numbers = numbers_with_fault_states(plant)
+def _decided_indexes(plant: DescriptorSystem, known: PlantNumbers) -> ExactIndexes | None:
+    numbers = numbers_with_fault_states(plant, known)
     if numbers is None:
         return None
     t = nonsingular_t(numbers)

@@ -185,11 +185,9 @@ class FaultEstimationFilter(Method):
 
     def existence(self, plant: DescriptorSystem, *, exactly: bool = True) -> tuple[Condition, ...]:
         """Return the existence conditions, decided exactly or in floating point; the list ends at the first failure."""
-        from obsynth.analysis.existence.numbers import decided
         from obsynth.methods.fault_estimation_filter.conditions import fault_filter_conditions
 
-        with decided(exactly=exactly):
-            return fault_filter_conditions(plant)
+        return fault_filter_conditions(plant, exactly=exactly)
 
     @classmethod
     def from_gains(  # type: ignore[override]

@@ -15,8 +15,8 @@ from obsynth.analysis.diagnosis.explanations import hidden_motion
 from obsynth.analysis.diagnosis.fault_columns import Question, dc_point
 from obsynth.analysis.existence.distance import ROUNDING_LEVEL
 from obsynth.analysis.existence.named_pencils import NamedPencil, named_pencil, unclear
-from obsynth.analysis.existence.numbers import COMPUTED_STATES, decides_exactly, uncleaned
-from obsynth.analysis.existence.verdicts import DECIDER
+from obsynth.analysis.existence.numbers import COMPUTED_STATES
+from obsynth.analysis.existence.statements import DECIDER
 from obsynth.analysis.plant_units import PlantUnits
 from obsynth.methods.functional_filter.wanted_faults import chosen_faults, residual_sets
 from obsynth.numerics.arrays import remembered
@@ -62,7 +62,7 @@ def fault_conditions(
 ) -> tuple[Condition, ...]:
     """Return whether one fault can be estimated, free of the unknown inputs and of every other fault."""
     poles = tuple(model_points(model, fault))
-    key = (fault, exactly, decides_exactly(), uncleaned(), poles, model.descriptions[fault])
+    key = (fault, exactly, poles, model.descriptions[fault])
     known = _known(plant)
     if key not in known:
         known[key] = _decided(plant, model, fault, exactly)

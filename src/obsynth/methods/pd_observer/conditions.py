@@ -6,49 +6,35 @@ is, and at s = 0 rank condition (3) holds.  Observability of (A, C), which the p
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from obsynth.analysis.conditions import Condition, is_doubted, is_refused, rank_condition
-from obsynth.analysis.existence.distance import least_share
-from obsynth.analysis.existence.numbers import numbers_of, reconsidered
-from obsynth.analysis.existence.rational import PlantNumbers, WrittenNumbers
-from obsynth.analysis.existence.verdicts import (
-    needed_gain,
-    rank_doubt,
-    settled_rank,
-    verdict_condition,
-    zero_doubt,
-    zero_verdict,
-)
-from obsynth.analysis.plant_units import PlantUnits, sized_plant
-from obsynth.analysis.structure import analyse_structure
+from obsynth.analysis.conditions import Condition, up_to_failure
+from obsynth.analysis.existence.rational import SystemFacts, WrittenNumbers
+from obsynth.analysis.existence.statements import Evaluator, FullRank, NoZeroOutside, reconsidered
 from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
 from obsynth.analysis.transformations.recovery import Transformation
-from obsynth.analysis.zeros import MOST_NAMES, equilibrated_at, leading_names, system_pencil
+from obsynth.analysis.zeros import MOST_NAMES, equilibrated_at, leading_names
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.pencils import pencil_structure
-from obsynth.numerics.ranks import decide_rank, equilibrate, rank_in_any_units
+from obsynth.numerics.ranks import equilibrate
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.exact_arithmetic import holds_computed
 
 _SOURCE = "Filasova et al., eqs. (1), (2)"
 
 
-def pd_observer_conditions(plant: DescriptorSystem) -> tuple[Condition, ...]:
+def pd_observer_conditions(plant: DescriptorSystem, *, exactly: bool = True) -> tuple[Condition, ...]:
     """Return the existence conditions of the PD observer, in order; the list ends at the first failure."""
-
-    def decided() -> tuple[Condition, ...]:
-        found: list[Condition] = []
-        for condition in _all_conditions(plant):
-            found.append(condition)
-            if not condition.holds:
-                break
-        return tuple(found)
-
-    return reconsidered(decided, is_refused, is_doubted)
+    plant = plant.dense()
+    first = up_to_failure(_form_conditions(Evaluator(plant, exactly)))
+    if not all(condition.holds for condition in first):
+        return first
+    form = explicit_form(plant)
+    explicit = Evaluator(plant if form is None else form.plant, exactly)
+    return (*first, *reconsidered(explicit, lambda judge: up_to_failure(_explicit_conditions(judge)), tuple))
 
 
 def explicit_form(plant: DescriptorSystem) -> Transformation | None:
@@ -56,9 +42,9 @@ def explicit_form(plant: DescriptorSystem) -> Transformation | None:
     return None if np.array_equal(plant.E, np.eye(plant.nx)) else eliminate_algebraic_states(plant)
 
 
-def _all_conditions(plant: DescriptorSystem) -> Iterator[Condition]:
-    """Yield the conditions; each may rely on those before it."""
-    plant = plant.dense()
+def _form_conditions(judge: Evaluator) -> Iterator[Condition]:
+    """Yield the conditions on the plant as given; each may rely on those before it."""
+    plant = judge.plant
     yield _condition(
         "continuous time",
         "a continuous-time plant (dt = 0)",
@@ -78,7 +64,7 @@ def _all_conditions(plant: DescriptorSystem) -> Iterator[Condition]:
         _SOURCE,
         "none. Name the fault to estimate in Bf or Df.",
     )
-    normal_rank, index, dynamic = _form(plant)
+    normal_rank, index, dynamic = _form(judge)
     yield _condition(
         "regularity",
         "a regular pencil (det(A - sE) not identically zero)",
@@ -107,13 +93,11 @@ def _all_conditions(plant: DescriptorSystem) -> Iterator[Condition]:
         "ours: elimination of algebraic states",
         "none: every state is algebraic. Solve the equations directly.",
     )
-    form = explicit_form(plant)
-    yield from _explicit_conditions(plant if form is None else form.plant)
 
 
-def _form(plant: DescriptorSystem) -> tuple[int, int, int]:
+def _form(judge: Evaluator) -> tuple[int, int, int]:
     """Return normal rank, index (0 for a plant that is not regular) and the number of dynamic states."""
-    numbers = numbers_of(plant)
+    plant, numbers = judge.plant, judge.numbers
     if not isinstance(numbers, WrittenNumbers) or holds_computed(plant.E):
         pencil = pencil_structure(plant.E, plant.A)
         return pencil.normal_rank, pencil.index or 0, len(pencil.finite_eigenvalues)
@@ -122,15 +106,16 @@ def _form(plant: DescriptorSystem) -> tuple[int, int, int]:
     return plant.nx if index is not None else numbers.regular_rank, index or 0, dynamic
 
 
-def _explicit_conditions(plant: DescriptorSystem) -> Iterator[Condition]:
-    numbers = numbers_of(plant)
+def _explicit_conditions(judge: Evaluator) -> Iterator[Condition]:
+    """Yield the conditions on the plant without its algebraic states."""
+    plant, source = judge.plant, "Filasova et al., eq. (3)"
     yield _condition(
         "nf <= ny",
         "no more faults than outputs (nf <= ny)",
         plant.nf <= plant.ny,
         float(plant.nf),
         float(plant.ny),
-        "Filasova et al., eq. (3)",
+        source,
         f"{plant.nf} faults and {plant.ny} output(s). Measure more, or leave a fault out.",
         signals=plant.fault_names,
     )
@@ -147,39 +132,12 @@ def _explicit_conditions(plant: DescriptorSystem) -> Iterator[Condition]:
         )
         return told, names
 
-    yield _full_rank(plant, numbers, "rank F", [["Bf"], ["Df"]], alike)
-    yield _detectability_in_floating_point(plant) if numbers is None else _detectability(plant, numbers)
-    at_zero = _full_rank(plant, numbers, "rank [A F; C Df]", [["A", "Bf"], ["C", "Df"]], hidden)
+    yield judge.full_rank("rank F", FullRank([["Bf"], ["Df"]]), alike, source=source)
+    yield judge.no_zero_outside(
+        NoZeroOutside(), holding=_detectable, lost=lambda facts: _hidden_mode(plant, facts.outside), what="observer"
+    )
+    at_zero = judge.full_rank("rank [A F; C Df]", NoZeroOutside("Bf").at_zero, hidden, source=source)
     yield at_zero if at_zero.holds else replace(at_zero, mode=0j)
-
-
-def _full_rank(
-    plant: DescriptorSystem,
-    numbers: PlantNumbers | None,
-    name: str,
-    layout: list[list[str]],
-    failure: Callable[[FloatArray], tuple[str, tuple[str, ...]]],
-) -> Condition:
-    """Return the condition that blocks of the plant make up a matrix of full column rank, decided in its own units."""
-    units, terms = PlantUnits.of(plant).rounded(), sized_plant(plant)
-
-    def blocks(part: DescriptorSystem) -> FloatArray:
-        return np.block([[getattr(part, key) for key in row] for row in layout])
-
-    def whole(part: DescriptorSystem) -> FloatArray:
-        return blocks(units.scaled_plant(part))
-
-    matrix, exact = whole(plant), None
-    if numbers is not None:
-        exact = numbers.rank(numbers.blocks([[numbers.matrix(key) for key in row] for row in layout]))
-    share = np.inf if terms is None else least_share(matrix, whole(terms))
-    if exact is None:
-        decision = rank_in_any_units(matrix, blocks(plant))
-    else:
-        decision = settled_rank(decide_rank(matrix, expected=matrix.shape[1]), exact, share)
-    remedy, signals = failure(matrix)
-    found = rank_condition(name, decision, remedy, source="Filasova et al., eq. (3)", signals=signals)
-    return found.in_doubt(rank_doubt(plant, units, decision, layout), plant) if decision.means == "unclear" else found
 
 
 def _condition(
@@ -202,41 +160,8 @@ _CLAIM = "every mode that does not decay shows in the outputs ((A, C) detectable
 _NEEDED_FOR = "necessary and sufficient with (3); Filasova et al. suppose observability"
 
 
-def _detectability(plant: DescriptorSystem, numbers: PlantNumbers) -> Condition:
-    """Return the condition that every mode that does not decay shows in the outputs, decided exactly."""
-    none = np.zeros((plant.nx, 0))
-    facts = numbers.system(numbers.zeros(plant.nx, 0), numbers.zeros(plant.ny, 0))
-    wide_e, wide_a = system_pencil(plant.E, plant.A, none, plant.C, np.zeros((plant.ny, 0)))
-    units, terms = PlantUnits.of(plant).rounded(), sized_plant(plant)
-    sizes = None if terms is None else units.scaled_pencil(wide_e, np.vstack([terms.A, terms.C]))[1]
-    verdict = zero_verdict(facts, *units.scaled_pencil(wide_e, wide_a), nx=plant.nx, discrete=False, sizes=sizes)
-
-    def seen() -> list[complex]:
-        hidden = list(analyse_structure(plant).undetectable_modes)
-        return hidden or ([] if verdict.distance is None else [verdict.distance.point])
-
-    return verdict_condition(
-        verdict,
-        _detectable(verdict.facts.zeros),
-        plant,
-        what="An observer",
-        seen=seen,
-        lost=lambda zeros: _hidden_mode(plant, zeros),
-        gain=lambda mode: needed_gain(plant, units, mode),
-        doubt=lambda: zero_doubt(plant, units, verdict, [["A"], ["C"]], what="observer"),
-    )
-
-
-def _detectability_in_floating_point(plant: DescriptorSystem) -> Condition:
-    structure = analyse_structure(plant)
-    return (
-        _detectable(structure.unobservable_modes)
-        if structure.detectable
-        else _hidden_mode(plant, structure.undetectable_modes)
-    )
-
-
-def _detectable(modes: Sequence[complex]) -> Condition:
+def _detectable(facts: SystemFacts) -> Condition:
+    modes = facts.zeros
     slowest = f", slowest real part {max(mode.real for mode in modes):.6g}" if modes else ""
     detail = f"{len(modes)} unobservable mode(s){slowest}"
     return Condition("detectability", _CLAIM, True, 0.0, 0.0, _NEEDED_FOR, detail)

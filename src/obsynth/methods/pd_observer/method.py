@@ -221,11 +221,9 @@ class PdObserver(Method):
 
     def existence(self, plant: DescriptorSystem, *, exactly: bool = True) -> tuple[Condition, ...]:
         """Return the existence conditions, decided exactly or in floating point; the list ends at the first failure."""
-        from obsynth.analysis.existence.numbers import decided
         from obsynth.methods.pd_observer.conditions import pd_observer_conditions
 
-        with decided(exactly=exactly):
-            return pd_observer_conditions(plant)
+        return pd_observer_conditions(plant, exactly=exactly)
 
     @classmethod
     def from_gains(  # type: ignore[override]

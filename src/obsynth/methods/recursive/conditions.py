@@ -11,28 +11,14 @@ up to 64 states in rational arithmetic (24 of a sampled plant, in enclosures); p
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Any, NamedTuple
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from obsynth.analysis.conditions import Condition, rank_condition
-from obsynth.analysis.existence.distance import ROUNDING_LEVEL
-from obsynth.analysis.existence.named_pencils import NamedPencil, named_pencil, unclear
-from obsynth.analysis.existence.numbers import numbers_of
-from obsynth.analysis.existence.rational import PlantNumbers, WrittenNumbers
-from obsynth.analysis.existence.verdicts import (
-    DECIDER,
-    ZeroVerdict,
-    needed_gain,
-    settled_rank,
-    verdict_condition,
-    zero_doubt,
-    zero_verdict,
-)
-from obsynth.analysis.existence.witnesses import Unclear
-from obsynth.analysis.plant_units import PlantUnits
+from obsynth.analysis.existence.rational import SystemFacts
+from obsynth.analysis.existence.statements import Evaluator, FullRank, NoZeroOutside, settled_rank
 from obsynth.analysis.time_varying import (
     STEPS_WITHOUT_HORIZON,
     HorizonRanks,
@@ -54,107 +40,27 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 
 
-@dataclass(frozen=True, eq=False)
-class ConstantPlant:
-    """A plant with constant matrices, its parameters as faults, and the numbers on which existence is decided."""
-
-    plant: DescriptorSystem
-    numbers: PlantNumbers
-
-    @classmethod
-    def of(
-        cls, given: DescriptorSystem | TimeVaryingDescriptorSystem | object, varying: TimeVaryingDescriptorSystem
-    ) -> ConstantPlant | None:
-        """Return the plant; ``None`` where matrices change, are not square, or are too large to be decided exactly."""
-        still = all(part.is_constant for part in (varying.E, varying.A, varying.C, varying.Phi, varying.Psi))
-        if not still or varying.ne != varying.nx:
-            return None
-        if isinstance(given, DescriptorSystem):
-            plant = given.dense()
-        else:
-            plant = DescriptorSystem(
-                varying.E.at(1),
-                varying.A.at(0),
-                C=varying.C.at(1),
-                Bf=varying.Phi.at(0),
-                Df=varying.Psi.at(0),
-                dt=varying.dt,
-                state_names=varying.state_names,
-                output_names=varying.output_names,
-                fault_names=varying.parameter_names,
-            )
-        numbers = numbers_of(plant)
-        return None if numbers is None else cls(plant, numbers)
-
-    @cached_property
-    def units(self) -> PlantUnits:
-        """Units of the plant's own, as powers of two."""
-        return PlantUnits.of(self.plant).rounded()
-
-    @cached_property
-    def detectability(self) -> ZeroVerdict:
-        """Whether a mode that does not die out is hidden."""
-        plant, numbers = self.plant, self.numbers
-        facts = numbers.system(numbers.zeros(plant.nx, 0), numbers.zeros(plant.ny, 0))
-        tall_e, tall_a = np.vstack([plant.E, np.zeros_like(plant.C)]), np.vstack([plant.A, plant.C])
-        return zero_verdict(facts, *self.units.scaled_pencil(tall_e, tall_a), nx=plant.nx, discrete=True)
-
-    def settled_step(self, decision: RankDecision, late: IntArray) -> RankDecision:
-        """Decide the rank of E and C, and of the rows of A that are used one step early."""
-        e, a, c = (self.numbers.matrix(name) for name in "EAC")
-        parts = [[e], [c]]
-        if late.size:
-            parts.append([self._rows(a, late)])
-        return settled_rank(decision, self.numbers.rank(self.numbers.blocks(parts)))
-
-    def settled_traces(self, decision: RankDecision) -> RankDecision:
-        """Decide the rank of ``[A - E, Phi; C, Psi]``."""
-        from fractions import Fraction
-
-        from flint import arb
-
-        pencil: Any = self.numbers.pencil(self.numbers.matrix("Bf"), self.numbers.matrix("Df"))  # type: ignore[attr-defined]
-        one = Fraction(1) if isinstance(self.numbers, WrittenNumbers) else arb(1)
-        return settled_rank(decision, int(pencil.rank_at(one)))
-
-    def step_doubt(self, decision: RankDecision, late: IntArray) -> Unclear:
-        """Return why the first rank is unclear."""
-        layout = [["E"], ["C"], ["A"]] if late.size else [["E"], ["C"]]
-        named = named_pencil(self.plant, self.units, layout)
-        if late.size:
-            kept = [*range(self.plant.nx + self.plant.ny), *(self.plant.nx + self.plant.ny + late)]
-            terms = None if named.terms is None else named.terms[kept]
-            named = NamedPencil(
-                named.A[kept], named.E[kept], named.owners[kept], named.rows[kept], named.columns, terms
-            )
-        return unclear(
-            self.plant, named, tolerance=ROUNDING_LEVEL, other=f"has rank {decision.expected - 1}", decider=DECIDER
-        )
-
-    def traces_doubt(self, decision: RankDecision) -> Unclear:
-        """Return why the second rank is unclear."""
-        named = named_pencil(self.plant, self.units, [["A", "Bf"], ["C", "Df"]])
-        found = unclear(
-            self.plant,
-            named,
-            tolerance=ROUNDING_LEVEL,
-            point=1 + 0j,
-            other=f"has rank {decision.expected - 1}",
-            decider=DECIDER,
-        )
-        return replace(found, parameters=True)
-
-    def mode_doubt(self) -> Unclear:
-        """Return why it is unclear whether a mode is hidden."""
-        return zero_doubt(self.plant, self.units, self.detectability, [["A"], ["C"]], what="filter")
-
-    def _rows(self, matrix: Any, rows: IntArray) -> Any:
-        if not isinstance(self.numbers, WrittenNumbers):
-            return [matrix[i] for i in rows]
-        from flint import fmpq_mat
-
-        columns = int(matrix.ncols())
-        return fmpq_mat(len(rows), columns, [matrix[int(i), j] for i in rows for j in range(columns)])
+def constant_plant(
+    given: DescriptorSystem | TimeVaryingDescriptorSystem | object, varying: TimeVaryingDescriptorSystem
+) -> Evaluator | None:
+    """Return what decides about a plant, its parameters as faults; ``None`` where matrices change or are not square."""
+    still = all(part.is_constant for part in (varying.E, varying.A, varying.C, varying.Phi, varying.Psi))
+    if not still or varying.ne != varying.nx:
+        return None
+    if isinstance(given, DescriptorSystem):
+        return Evaluator(given.dense())
+    plant = DescriptorSystem(
+        varying.E.at(1),
+        varying.A.at(0),
+        C=varying.C.at(1),
+        Bf=varying.Phi.at(0),
+        Df=varying.Psi.at(0),
+        dt=varying.dt,
+        state_names=varying.state_names,
+        output_names=varying.output_names,
+        fault_names=varying.parameter_names,
+    )
+    return Evaluator(plant)
 
 
 _NAME = "identifiable parameters"
@@ -170,7 +76,7 @@ class _Kernel(NamedTuple):
 
 
 def identifiability_condition(
-    plant: TimeVaryingDescriptorSystem, *, early: bool = False, constant: ConstantPlant | None = None
+    plant: TimeVaryingDescriptorSystem, *, early: bool = False, constant: Evaluator | None = None
 ) -> Condition:
     """Return the condition that outputs tell the parameters from each other and from the state."""
     still = all(matrix.is_constant for matrix in (plant.E, plant.A, plant.C, plant.Phi, plant.Psi))
@@ -179,7 +85,7 @@ def identifiability_condition(
         known[early] = _steady(plant) if still else _along(plant, early=early)
     decision, kernel = known[early]
     if still and constant is not None:
-        decision = constant.settled_traces(decision)
+        decision = _settled_traces(constant, decision)
     wanted = "rank [A - E, Phi; C, Psi]" if still else "rank of the traces of all parameters"
     claim = f"{wanted} = {decision.expected}"
     value, bound = float(decision.rank), float(decision.expected)
@@ -191,7 +97,18 @@ def identifiability_condition(
     found = Condition(_NAME, claim, False, value, bound, _TRACES_SOURCE, detail, signals=names)
     if constant is None or decision.means != "unclear":
         return found
-    return found.in_doubt(constant.traces_doubt(decision), constant.plant)
+    doubt = constant.rank_doubt(NoZeroOutside("Bf").at_zero, decision, point=1 + 0j)
+    return found.in_doubt(replace(doubt, parameters=True), constant.plant)
+
+
+def _settled_traces(judge: Evaluator, decision: RankDecision) -> RankDecision:
+    """Decide the rank of ``[A - E, Phi; C, Psi]``."""
+    from flint import fmpz_poly
+
+    numbers = judge.numbers
+    if numbers is None:
+        return decision
+    return settled_rank(decision, numbers.rank_at_root(numbers.matrix("Bf"), numbers.matrix("Df"), fmpz_poly([-1, 1])))
 
 
 @remembered
@@ -309,7 +226,7 @@ def recursive_conditions(
         )
         return
     ranks = horizon_ranks(varying, early=early)
-    constant = ConstantPlant.of(plant, varying)
+    constant = constant_plant(plant, varying)
     known = _rank_of_steps(varying, ranks, early=early, constant=constant)
     yield known
     if not known.holds:
@@ -338,12 +255,13 @@ def recursive_conditions(
 
 
 def _rank_of_steps(
-    plant: TimeVaryingDescriptorSystem, ranks: HorizonRanks, *, early: bool, constant: ConstantPlant | None
+    plant: TimeVaryingDescriptorSystem, ranks: HorizonRanks, *, early: bool, constant: Evaluator | None
 ) -> Condition:
     """Return the condition that equations and outputs determine the state at every step."""
     name = "rank [E; C; algebraic rows of A]" if early else "rank [E; C]"
     late = early_rows(plant, early=early)
-    worst = ranks.worst if constant is None else constant.settled_step(ranks.worst, late)
+    said = FullRank([["E"], ["C"], ["A"]], last_rows=late.tolist()) if late.size else FullRank([["E"], ["C"]])
+    worst = ranks.worst if constant is None else constant.rank(said, ranks.worst)
     condition = rank_condition(name, worst, "", source=f"{_SOURCE}, A2")
     if constant is None and ranks.steps > 1:
         condition = replace(condition, detail=f"{condition.detail}, in floating point along the horizon")
@@ -371,7 +289,7 @@ def _rank_of_steps(
     found = replace(condition, detail=detail, signals=names)
     if constant is None or worst.means != "unclear":
         return found
-    return found.in_doubt(constant.step_doubt(worst, late), constant.plant)
+    return found.in_doubt(constant.rank_doubt(said, worst), constant.plant)
 
 
 _DETECTABLE = "Nikoukhah, Willsky, Levy 1992"
@@ -389,23 +307,18 @@ def detectability_condition(plant: TimeVaryingDescriptorSystem) -> Condition:
     return Condition("detectability", _detectable(plant), True, 0.0, 0.0, _DETECTABLE, _dying(len(zeros.values)))
 
 
-def _decided_detectability(constant: ConstantPlant) -> Condition:
+def _decided_detectability(judge: Evaluator) -> Condition:
     """Return the same, decided on the numbers of the plant as written."""
-    plant, verdict = constant.plant, constant.detectability
-    tall_e, tall_a = np.vstack([plant.E, np.zeros_like(plant.C)]), np.vstack([plant.A, plant.C])
-    holding = Condition(
-        "detectability", _detectable(plant), True, 0.0, 0.0, _DETECTABLE, _dying(len(verdict.facts.zeros))
-    )
-    return verdict_condition(
-        verdict,
-        holding,
-        plant,
-        what="A filter",
-        doubt=constant.mode_doubt,
-        lost=lambda zeros: _hidden_modes(plant, tall_e, tall_a, zeros or [1 + 0j]),
-        gain=lambda mode: needed_gain(plant, constant.units, mode),
-        seen=lambda: [1 + 0j if verdict.distance is None else verdict.distance.point],
-    )
+    plant = judge.plant
+    tall_e, tall_a = judge.pencil(NoZeroOutside())
+
+    def holding(facts: SystemFacts) -> Condition:
+        return Condition("detectability", _detectable(plant), True, 0.0, 0.0, _DETECTABLE, _dying(len(facts.zeros)))
+
+    def lost(facts: SystemFacts) -> Condition:
+        return _hidden_modes(plant, tall_e, tall_a, facts.outside or [1 + 0j])
+
+    return judge.no_zero_outside(NoZeroOutside(), holding=holding, lost=lost, what="filter")
 
 
 def _detectable(plant: TimeVaryingDescriptorSystem | DescriptorSystem) -> str:

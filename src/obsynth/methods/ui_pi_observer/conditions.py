@@ -23,24 +23,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.analysis.conditions import Condition, is_doubted, is_refused
+from obsynth.analysis.conditions import Condition
 from obsynth.analysis.existence.distance import ROUNDING_LEVEL, least_share, zeros_at_rounding_level
 from obsynth.analysis.existence.named_pencils import named_augmented, unclear
-from obsynth.analysis.existence.numbers import decides_exactly, numbers_of, reconsidered
 from obsynth.analysis.existence.rational import SystemFacts
-from obsynth.analysis.existence.verdicts import (
+from obsynth.analysis.existence.statements import (
     DECIDER,
+    Evaluator,
+    FullRank,
+    NoZeroOutside,
     believed,
-    in_own_time,
-    needed_gain,
-    rank_doubt,
+    reconsidered,
     settled_rank,
-    verdict_condition,
-    zero_doubt,
     zero_verdict,
 )
 from obsynth.analysis.existence.witnesses import Unclear
-from obsynth.analysis.plant_units import PlantUnits, sized_plant
+from obsynth.analysis.plant_units import PlantUnits
 from obsynth.analysis.transformations.elimination import (
     dynamic_coordinates,
     eliminate_algebraic_states,
@@ -80,15 +78,15 @@ from obsynth.plants.fault_models import Exosystem
 
 
 def model_conditions(
-    given: DescriptorSystem, courses: Exosystem, plant: DescriptorSystem, model: Exosystem, units: PlantUnits
+    judge: Evaluator, courses: Exosystem, plant: DescriptorSystem, model: Exosystem, units: PlantUnits
 ) -> list[Condition]:
     """Test (D3) at each unstable eigenvalue of the fault model, upper half plane only."""
-    terms = sized_plant(given)
+    given, terms = judge.plant, judge.terms
     sizes = None if terms is None else units.scaled_plant(terms)
     unstable = [complex(value) for value in model.eigenvalues if value.imag >= 0.0 and is_outside(value, plant.dt)]
     found = []
     for value in sorted(unstable, key=lambda value: (value.real, value.imag)):
-        lost = exact_loss(given, courses, units.eigenvalue(value))
+        lost = exact_loss(judge, courses, units.eigenvalue(value))
         pencil = _ModelPencil.of(plant, model, value, sizes)
         decision = pencil.decision(lost)
         if lost is None and not decision.full:
@@ -99,7 +97,7 @@ def model_conditions(
         if decision.means == "unclear":
             point = units.eigenvalue(value)
             other = f"hides a fault that follows its model at {number(point)}, and no observer estimates it"
-            condition = condition.in_doubt(_model_doubt(given, courses, units, point, other=other), given)
+            condition = condition.in_doubt(_model_doubt(judge, courses, units, point, other=other), given)
         found.append(condition)
         if not found[-1].holds:
             break
@@ -184,7 +182,7 @@ def _model_condition(
 
 
 def _model_doubt(
-    plant: DescriptorSystem,
+    judge: Evaluator,
     model: Exosystem,
     units: PlantUnits,
     value: complex,
@@ -196,7 +194,7 @@ def _model_doubt(
     moving: bool = False,
 ) -> Unclear:
     """Return why it is unclear whether plant and fault model hide something at a point, in the plant's own time."""
-    kept = kept_disturbances(plant, numbers_of(plant))
+    plant, kept = judge.plant, kept_disturbances(judge)
     named = named_augmented(plant, model, units, kept=kept, of_the_model=of_the_model)
     return unclear(
         plant, named, tolerance=tolerance, point=value, dt=plant.dt if moving else None, other=other, decider=decider
@@ -204,7 +202,7 @@ def _model_doubt(
 
 
 def order_conditions(
-    given: DescriptorSystem, courses: Exosystem, plant: DescriptorSystem, model: Exosystem, units: PlantUnits
+    judge: Evaluator, courses: Exosystem, plant: DescriptorSystem, model: Exosystem, units: PlantUnits
 ) -> list[Condition]:
     """Test that the fault model is not lost in rounding: at a zero z0 order n shows with about abs(z0)^(n + 1) only."""
     inputs, direct = np.hstack([plant.Bf, plant.Bd]), np.hstack([plant.Df, plant.Dd])
@@ -241,12 +239,12 @@ def order_conditions(
         mode=None if decision.full else point,
         signals=() if decision.full else plant.fault_names,
     )
-    return [found if decision.full else found.in_doubt(_order_doubt(given, courses, units, point), given)]
+    return [found if decision.full else found.in_doubt(_order_doubt(judge, courses, units, point), judge.plant)]
 
 
-def _order_doubt(plant: DescriptorSystem, model: Exosystem, units: PlantUnits, point: complex) -> Unclear:
+def _order_doubt(judge: Evaluator, model: Exosystem, units: PlantUnits, point: complex) -> Unclear:
     return _model_doubt(
-        plant,
+        judge,
         model,
         units,
         point,
@@ -258,9 +256,7 @@ def _order_doubt(plant: DescriptorSystem, model: Exosystem, units: PlantUnits, p
     )
 
 
-def lost_in_rounding(
-    plant: DescriptorSystem, model: Exosystem, units: PlantUnits, mode: complex, order: int
-) -> Condition:
+def lost_in_rounding(judge: Evaluator, model: Exosystem, units: PlantUnits, mode: complex, order: int) -> Condition:
     """Return the failing condition for a mode that seems fixed and unstable, against all other conditions."""
     found = Condition(
         "fault model in double precision",
@@ -272,9 +268,9 @@ def lost_in_rounding(
         f"plant and fault model (order {model.order}) seem to hide an unstable mode at {number(mode)}, which the "
         "conditions above exclude: in double precision the model is too long a chain. Lower its order.",
         mode=mode,
-        signals=plant.fault_names,
+        signals=judge.plant.fault_names,
     )
-    return found.in_doubt(_order_doubt(plant, model, units, mode), plant)
+    return found.in_doubt(_order_doubt(judge, model, units, mode), judge.plant)
 
 
 def _masking(scaled: NDArray[Any], plant: DescriptorSystem, width: int, shares: FloatArray) -> tuple[str, ...]:
@@ -294,75 +290,34 @@ _NOT_ELIMINATED = {
     "dynamic states": "no other states are left",
 }
 SOURCE = "Share Pasand, Lemma 4 (9.1), in a form without E#"
+#: The matrix of (D1).
+DECOUPLED = (("E", None, "Bd"), ("C", "Dd", None), (None, None, "Dd"))
 
 
-def decoupling_rank(plant: DescriptorSystem) -> RankDecision:
+def decoupling_rank(judge: Evaluator) -> RankDecision:
     """Decide (D1): ``rank [E 0 Bd; C Dd 0; 0 0 Dd]``, with what it must be."""
-    scaled, numbers = _scaled(plant), numbers_of(plant)
-    if numbers is None:
-        return decide_rank(_decoupling_matrix(scaled), expected=plant.nx + _rank(scaled.Dd) + disturbance_rank(plant))
-    bd, dd = numbers.matrix("Bd"), numbers.matrix("Dd")
-    nothing, square = numbers.zeros(plant.nx, plant.nd), numbers.zeros(plant.ny, plant.nd)
-    matrix = numbers.blocks(
-        [
-            [numbers.matrix("E"), nothing, bd],
-            [numbers.matrix("C"), dd, square],
-            [numbers.zeros(plant.ny, plant.nx), square, dd],
-        ]
-    )
-    expected = plant.nx + numbers.rank(dd) + disturbance_rank(plant)
-    decision, terms = decide_rank(_decoupling_matrix(scaled), expected=expected), sized_plant(plant)
-    if terms is None:
-        return settled_rank(decision, numbers.rank(matrix))
-    sizes = PlantUnits.of(plant).rounded().scaled_plant(terms)
-    share = least_share(_decoupling_matrix(scaled), _decoupling_matrix(sizes), rank=expected)
-    return settled_rank(decision, numbers.rank(matrix), share)
+    expected = judge.plant.nx + judge.rank_itself(FullRank([["Dd"]])) + disturbance_rank(judge)
+    return judge.rank(FullRank(DECOUPLED, rank=expected))
 
 
-def _scaled(plant: DescriptorSystem) -> DescriptorSystem:
-    return PlantUnits.of(plant).rounded().scaled_plant(plant)
-
-
-def _decoupling_matrix(plant: DescriptorSystem) -> FloatArray:
-    nx, ny, nd = plant.nx, plant.ny, plant.nd
-    matrix = np.zeros((nx + 2 * ny, nx + 2 * nd))
-    matrix[:nx, :nx], matrix[:nx, nx + nd :] = plant.E, plant.Bd
-    matrix[nx : nx + ny, :nx], matrix[nx : nx + ny, nx : nx + nd] = plant.C, plant.Dd
-    matrix[nx + ny :, nx + nd :] = plant.Dd
-    return matrix
-
-
-def disturbance_rank(plant: DescriptorSystem) -> int:
+def disturbance_rank(judge: Evaluator) -> int:
     """Return ``rank [Bd; Dd]``: repeated disturbances count once."""
-    numbers = numbers_of(plant)
-    if numbers is not None:
-        return numbers.rank(numbers.blocks([[numbers.matrix("Bd")], [numbers.matrix("Dd")]]))
-    scaled = _scaled(plant)
-    return _rank(np.vstack([scaled.Bd, scaled.Dd]))
+    return judge.rank_itself(FullRank([["Bd"], ["Dd"]]))
 
 
-def _rank(matrix: FloatArray) -> int:
-    return decide_rank(matrix).rank
-
-
-def decoupling_data(plant: DescriptorSystem) -> tuple[DescriptorSystem, Transformation | None, Condition]:
-    """Return the plant on which (D1) holds, if the algebraic states can be eliminated where it does not."""
-    written = decoupling_rank(plant)
-    said = f"rank {written.rank} of {written.expected}"
+def decoupling_data(judge: Evaluator) -> tuple[Transformation | None, str, str]:
+    """Return the elimination of the algebraic states that (D1) needs, where it does; what is said before and after."""
+    written = decoupling_rank(judge)
     if written.full:
-        return plant, None, _decoupling_condition(plant, written, written.describe())
+        return None, "", ""
     try:
-        transformation = _without_rounding(_eliminated(plant))
+        transformation = _without_rounding(_eliminated(judge.plant))
     except PreconditionError as error:
         why = _NOT_ELIMINATED.get(error.condition or "", "they cannot be solved for")
-        reason = f"{written.describe()}, and the algebraic states cannot be eliminated ({why})"
-        return plant, None, _decoupling_condition(plant, written, reason)
+        return None, "", f", and the algebraic states cannot be eliminated ({why})"
     if not transformation.description:
-        return plant, None, _decoupling_condition(plant, written, written.describe())
-    reduced = transformation.plant
-    again = decoupling_rank(reduced)
-    detail = f"{said} as written; {again.describe()} without the algebraic states"
-    return reduced, transformation, _decoupling_condition(reduced, again, detail)
+        return None, "", ""
+    return transformation, f"rank {written.rank} of {written.expected} as written; ", " without the algebraic states"
 
 
 def _eliminated(plant: DescriptorSystem) -> Transformation:
@@ -427,10 +382,11 @@ def _without_rounding(transformation: Transformation) -> Transformation:
     return replace(transformation, plant=plant.replace(**changes))
 
 
-def _decoupling_condition(plant: DescriptorSystem, decision: RankDecision, detail: str) -> Condition:
-    signals: tuple[str, ...] = ()
+def _decoupling_condition(judge: Evaluator, before: str, after: str) -> Condition:
+    plant, decision, signals = judge.plant, decoupling_rank(judge), tuple[str, ...]()
+    detail = f"{before}{decision.describe()}{after}"
     if not decision.full:
-        signals = _undecoupled(plant)
+        signals = _undecoupled(judge)
         detail += ": " + (
             f"the unknown input {', '.join(map(repr, signals))} moves states that no output shows at once, so nothing "
             "but a derivative of the outputs could remove it. Measure such a state, or leave the input out."
@@ -450,17 +406,16 @@ def _decoupling_condition(plant: DescriptorSystem, decision: RankDecision, detai
     if decision.means != "unclear":
         return found
     # Without direct parts, as almost always, the condition is that [E Bd; C 0] has full rank.
-    kept = kept_disturbances(plant, numbers_of(plant))
+    kept = kept_disturbances(judge)
     free = [j for j in kept if not plant.Dd[:, j].any()]
     seen = [j for j in kept if j not in free]
     layout: list[list[str | None]] = [["E", "Bd"], ["C", None]] if not seen else [["E", "Bd", None], ["C", None, "Dd"]]
-    doubt = rank_doubt(plant, PlantUnits.of(plant).rounded(), decision, layout, kept={"Bd": free, "Dd": seen})
-    return found.in_doubt(doubt, plant)
+    return found.in_doubt(judge.rank_doubt(FullRank(layout, {"Bd": free, "Dd": seen}), decision), plant)
 
 
-def _undecoupled(plant: DescriptorSystem) -> tuple[str, ...]:
+def _undecoupled(judge: Evaluator) -> tuple[str, ...]:
     """Return the unknown inputs that move what no output shows at once, or else the states in question."""
-    matrix = _decoupling_matrix(_scaled(plant))
+    plant, matrix = judge.plant, judge.arranged(FullRank(DECOUPLED), judge.natural)
     pencil = equilibrate_pencil(np.zeros_like(matrix), matrix)
     hidden = np.linalg.svd(pencil.A)[2][decide_rank(matrix).rank :].T
     # Of all null vectors the one that moves the states most: some are there only because disturbances repeat.
@@ -496,52 +451,62 @@ def _known(_plant: DescriptorSystem) -> dict[tuple[bool, *tuple[bytes, ...]], tu
 
 def existence_conditions(plant: DescriptorSystem, model: Exosystem) -> tuple[Condition, ...]:
     """Return the existence conditions of the unknown-input PI observer."""
-    return _known(plant).get(_key(model)) or existence(plant, model).conditions
+    return _known(plant).get(_key(model, exactly=True)) or existence(plant, model).conditions
 
 
-def existence(plant: DescriptorSystem, model: Exosystem) -> Existence:
+def existence(plant: DescriptorSystem, model: Exosystem, *, exactly: bool = True) -> Existence:
     """Return the existence conditions of the unknown-input PI observer, and the plant to design for."""
-    dense = plant.dense()
-    found = reconsidered(
-        lambda: _decided(dense, model),
-        lambda found: is_refused(found.conditions),
-        lambda found: is_doubted(found.conditions),
-    )
-    _known(plant)[_key(model)] = found.conditions
+    judge = Evaluator(plant.dense(), exactly)
+    found = reconsidered(judge, lambda judge: _decided(judge, model), lambda found: found.conditions)
+    _known(plant)[_key(model, exactly=exactly)] = found.conditions
     return found
 
 
-def _key(model: Exosystem) -> tuple[bool, *tuple[bytes, ...]]:
+def _key(model: Exosystem, *, exactly: bool) -> tuple[bool, *tuple[bytes, ...]]:
     """Return what the conditions depend on besides the plant: the numbers of the fault model, to the last digit."""
     parts = (model.Phi, model.Cw, model.eigenvalues)
     # A negative zero is a zero.
-    return decides_exactly(), *((np.asarray(part) + 0.0).tobytes() for part in parts)
+    return exactly, *((np.asarray(part) + 0.0).tobytes() for part in parts)
 
 
-def _decided(plant: DescriptorSystem, model: Exosystem) -> Existence:
-    nothing = np.zeros(0, dtype=np.complex128)
-    enough = _enough_outputs(plant)
+def _decided(judge: Evaluator, model: Exosystem) -> Existence:
+    enough = _enough_outputs(judge)
     if not enough.holds:
-        return Existence((enough,), plant, None, nothing)
-    working, transformation, solvable = decoupling_data(plant)
+        return Existence((enough,), judge.plant, None, np.zeros(0, dtype=np.complex128))
+    transformation, before, after = decoupling_data(judge)
+
+    def decide(judge: Evaluator) -> Existence:
+        # (D1) and the others fail independently: a user wants to know both.
+        first = [enough, _decoupling_condition(judge, before, after)]
+        return _decided_without_algebraic_states(judge, model, first, transformation)
+
+    if transformation is None:
+        return decide(judge)
+    return reconsidered(Evaluator(transformation.plant, judge.exactly), decide, lambda found: found.conditions)
+
+
+def _decided_without_algebraic_states(
+    judge: Evaluator, model: Exosystem, found: list[Condition], transformation: Transformation | None
+) -> Existence:
+    """Decide about a plant of which the first conditions were found."""
+    working, nothing = judge.plant, np.zeros(0, dtype=np.complex128)
     # Powers of two: what is exact in the data, such as a zero at the origin, stays exact.
     units = PlantUnits.of(working, model).rounded()
     scaled, courses = units.scaled_plant(working), units.scaled_model(model)
-    # (D1) and the others fail independently: a user wants to know both.
-    found = [enough, solvable, _zero_condition(working, scaled, units)]
+    found.append(_zero_condition(judge, scaled, units))
     if found[-1].holds:
-        found += model_conditions(working, model, scaled, courses, units)
+        found += model_conditions(judge, model, scaled, courses, units)
     if not all(condition.holds for condition in found):
         return Existence(tuple(found), working, transformation, nothing)
-    found += order_conditions(working, model, scaled, courses, units)
+    found += order_conditions(judge, model, scaled, courses, units)
     if not found[-1].holds:
         return Existence(tuple(found), working, transformation, nothing)
-    fixed, condition = _fixed_modes(working, model, scaled, courses, units)
+    fixed, condition = _fixed_modes(judge, model, scaled, courses, units)
     return Existence((*found, condition), working, transformation, fixed)
 
 
-def _enough_outputs(plant: DescriptorSystem) -> Condition:
-    rank = disturbance_rank(plant)
+def _enough_outputs(judge: Evaluator) -> Condition:
+    plant, rank = judge.plant, disturbance_rank(judge)
     holds = rank <= plant.ny
     return Condition(
         "nd <= ny",
@@ -560,47 +525,23 @@ _D2 = "rank [sE - A, -Bd; C, Dd] = nx + rank [Bd; Dd] on and outside the boundar
 _D2_SOURCE = "Share Pasand, Lemma 4 (9.2)"
 
 
-def _zero_condition(given: DescriptorSystem, plant: DescriptorSystem, units: PlantUnits) -> Condition:
+def _zero_condition(judge: Evaluator, plant: DescriptorSystem, units: PlantUnits) -> Condition:
     """Decide (D2) on the numbers of the plant as given, or in floating point on the scaled one."""
-    numbers = numbers_of(given)
-    if numbers is None:
+    if judge.numbers is None:
         return _zero_condition_in_floating_point(plant, units)
-    kept = kept_disturbances(given, numbers)
-    facts = numbers.system(numbers.picked(numbers.matrix("Bd"), kept), numbers.picked(numbers.matrix("Dd"), kept))
+    kept = kept_disturbances(judge)
     inputs, direct = plant.Bd[:, kept], plant.Dd[:, kept]
-    if not facts.full:
-        return _hidden_trajectories(facts.normal_rank, facts.columns)
-    wide_e, wide_a = system_pencil(plant.E, plant.A, inputs, plant.C, direct)
-    terms, sizes = sized_plant(given), None
-    if terms is not None:
-        terms = units.scaled_plant(terms)
-        sizes = np.block([[terms.A, terms.Bd[:, kept]], [terms.C, terms.Dd[:, kept]]])
-    verdict = zero_verdict(_timed(facts, units.rate), wide_e, wide_a, nx=plant.nx, discrete=plant.dt > 0.0, sizes=sizes)
-    holding = _zeros(True, facts.normal_rank, facts.columns, f"{len(verdict.facts.zeros)} stable zero(s)")
-    own = in_own_time(verdict, units.rate)
 
-    def lost(zeros: Sequence[complex]) -> Condition:
-        zero = zero_at(plant.E, plant.A, zeros[0], inputs, plant.C, direct)
-        return _zero_failure(plant, units, zero, inputs, direct)
+    def holding(facts: SystemFacts) -> Condition:
+        return _zeros(True, facts.normal_rank, facts.columns, f"{len(facts.zeros)} stable zero(s)")
 
-    def seen() -> list[complex]:
-        _, _, outside = zeros_of_system(plant.E, plant.A, inputs, plant.C, direct, dt=plant.dt)
-        return [_worst(outside, plant.dt).value] if outside else []
+    def lost(facts: SystemFacts) -> Condition:
+        if not facts.full:
+            return _hidden_trajectories(facts.normal_rank, facts.columns)
+        point = units.rate * max(facts.outside, key=lambda value: instability(value, plant.dt))
+        return _zero_failure(plant, units, zero_at(plant.E, plant.A, point, inputs, plant.C, direct), inputs, direct)
 
-    def doubt() -> Unclear:
-        kept_columns = {"Bd": kept, "Dd": kept}
-        return zero_doubt(given, units, own, [["A", "Bd"], ["C", "Dd"]], kept=kept_columns, what="observer")
-
-    return verdict_condition(
-        own,
-        holding,
-        given,
-        what="An observer",
-        lost=lost,
-        seen=seen,
-        doubt=doubt,
-        gain=lambda mode: needed_gain(given, units, mode, inputs="Bd" if given.nd else ""),
-    )
+    return judge.no_zero_outside(NoZeroOutside("Bd", kept), holding=holding, lost=lost, what="observer")
 
 
 def _zeros(holds: bool, value: float, bound: float, detail: str) -> Condition:
@@ -664,11 +605,11 @@ def _shown_as_given(plant: DescriptorSystem, courses: Exosystem, units: PlantUni
 
 
 def _fixed_modes(
-    given: DescriptorSystem, courses: Exosystem, plant: DescriptorSystem, model: Exosystem, units: PlantUnits
+    judge: Evaluator, courses: Exosystem, plant: DescriptorSystem, model: Exosystem, units: PlantUnits
 ) -> tuple[ComplexArray, Condition]:
     """Return the drops of the augmented pencil, exact where the numbers of the plant as given are known."""
-    augmented = AugmentedPlant.of(plant, model)
-    exact = exact_drops(given, courses)
+    augmented, given = AugmentedPlant.of(plant, model), judge.plant
+    exact = exact_drops(judge, courses)
     if exact is not None:
         inputs, direct = plant.Bd[:, exact.kept], plant.Dd[:, exact.kept]
     else:
@@ -683,7 +624,7 @@ def _fixed_modes(
         verdict = zero_verdict(facts, *pencil, nx=augmented.order, discrete=plant.dt > 0.0)
         if verdict.answer == "unclear" and verdict.distance is not None:
             point = units.eigenvalue(verdict.distance.point)
-            return zeros, lost_in_rounding(given, courses, units, point, augmented.order)
+            return zeros, lost_in_rounding(judge, courses, units, point, augmented.order)
     else:
         drops = system_zeros(*pencil, nx=augmented.order).values
         if exact is None:
@@ -695,7 +636,7 @@ def _fixed_modes(
         unstable = [mean for mean in means if instability(complex(mean), plant.dt) >= bound]
         if unstable:
             point = units.eigenvalue(complex(unstable[0]))
-            return zeros, lost_in_rounding(given, courses, units, point, augmented.order)
+            return zeros, lost_in_rounding(judge, courses, units, point, augmented.order)
     text = ", ".join(numbers(zeros))
     return zeros, Condition(
         "fixed modes",

@@ -241,11 +241,9 @@ class UiPiObserver(Method):
 
     def existence(self, plant: DescriptorSystem, *, exactly: bool = True) -> tuple[Condition, ...]:
         """Return the existence conditions, decided exactly or in floating point; several may fail."""
-        from obsynth.analysis.existence.numbers import decided
         from obsynth.methods.ui_pi_observer.conditions import existence
 
-        with decided(exactly=exactly):
-            return existence(plant, exosystem(self.fault_model, plant.fault_names, plant.dt)).conditions
+        return existence(plant, exosystem(self.fault_model, plant.fault_names, plant.dt), exactly=exactly).conditions
 
     @classmethod
     def from_gains(  # type: ignore[override]

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.analysis.existence.numbers import numbers_of
-from obsynth.analysis.existence.rational import PlantNumbers, SystemFacts, WrittenNumbers
+from obsynth.analysis.existence.rational import PlantNumbers, SystemFacts
+from obsynth.analysis.existence.statements import Evaluator
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import RANK_TOLERANCE, decide_rank
 from obsynth.numerics.scaling import equilibrate_pencil
@@ -21,9 +21,6 @@ if TYPE_CHECKING:
 
 #: An imaginary part below this share of an eigenvalue is not shown: it would not change its printed digits.
 UNSEEN = 5e-7
-#: Degree of the minimal polynomial of an eigenvalue, times columns of the pencil, above which its rank there is left
-#: to floating point.
-MOST_COLUMNS = 400
 
 
 def number(value: complex) -> str:
@@ -64,11 +61,12 @@ def in_disturbances(
     return np.abs(np.linalg.pinv(whole) @ (basis @ direction)) if whole.size else np.zeros(0)
 
 
-def kept_disturbances(plant: DescriptorSystem, numbers: PlantNumbers | None) -> list[int]:
+def kept_disturbances(judge: Evaluator) -> list[int]:
     """Return the unknown inputs that are no combinations of those before them; all where the numbers are not known."""
+    numbers, count = judge.numbers, judge.plant.nd
     if numbers is None:
-        return list(range(plant.nd))
-    return numbers.independent_columns(numbers.blocks([[numbers.matrix("Bd")], [numbers.matrix("Dd")]]), plant.nd)
+        return list(range(count))
+    return numbers.independent_columns(numbers.blocks([[numbers.matrix("Bd")], [numbers.matrix("Dd")]]), count)
 
 
 def kernel(matrix: NDArray[Any]) -> NDArray[Any]:
@@ -85,63 +83,48 @@ def equilibrated(matrix: NDArray[Any]) -> tuple[NDArray[Any], FloatArray]:
     return pencil.rows[:, None] * matrix * pencil.columns, pencil.columns
 
 
-class _ExactPencil(NamedTuple):
-    """The augmented pencil ``[Aa - s Ea, Bda; Ca, Dd]`` on the numbers as written, with the disturbances kept in it."""
-
-    numbers: PlantNumbers
-    Bd: Any
-    Dd: Any
-    kept: list[int]
-
-    @classmethod
-    def of(cls, numbers: PlantNumbers, plant: DescriptorSystem, model: Exosystem) -> _ExactPencil:
-        kept = kept_disturbances(plant, numbers)
-        bd, dd = (numbers.picked(numbers.matrix(name), kept) for name in ("Bd", "Dd"))
-        below = numbers.zeros(plant.nx + model.order, 0)
-        if kept:
-            below = numbers.blocks([[bd], [numbers.zeros(model.order, len(kept))]])
-        return cls(_augmented(numbers, plant, model), below, dd, kept)
-
-
 class ExactDrops(NamedTuple):
-    """Facts on the augmented pencil, and the disturbances that are kept in it."""
+    """Facts on the augmented pencil ``[Aa - s Ea, Bda; Ca, Dd]``, and the disturbances that are kept in it."""
 
     facts: SystemFacts
     kept: list[int]
 
 
-def exact_drops(plant: DescriptorSystem, model: Exosystem) -> ExactDrops | None:
+def _exact_pencil(
+    judge: Evaluator, numbers: PlantNumbers, model: Exosystem
+) -> tuple[PlantNumbers, Any, Any, list[int]]:
+    """Return the augmented plant on the numbers as written, Bda and Dd, and the disturbances kept in these."""
+    kept = kept_disturbances(judge)
+    bd, dd = (numbers.columns(name, kept) for name in ("Bd", "Dd"))
+    below = numbers.zeros(judge.plant.nx + model.order, 0)
+    if kept:
+        below = numbers.blocks([[bd], [numbers.zeros(model.order, len(kept))]])
+    return _augmented(numbers, judge.plant, model), below, dd, kept
+
+
+def exact_drops(judge: Evaluator, model: Exosystem) -> ExactDrops | None:
     """Return the drops of the augmented pencil; ``None`` for too many states."""
-    numbers = numbers_of(plant)
+    numbers = judge.numbers
     if numbers is None:
         return None
 
     def decided() -> ExactDrops:
-        pencil = _ExactPencil.of(numbers, plant, model)
-        return ExactDrops(pencil.numbers.system(pencil.Bd, pencil.Dd), pencil.kept)
+        whole, below, direct, kept = _exact_pencil(judge, numbers, model)
+        return ExactDrops(whole.system(below, direct), kept)
 
     key = ("drops", model.Phi.tobytes(), model.Cw.tobytes(), model.order)
     found: ExactDrops = numbers.remembered(key, decided)
     return found
 
 
-def exact_loss(plant: DescriptorSystem, model: Exosystem, value: complex) -> int | None:
+def exact_loss(judge: Evaluator, model: Exosystem, value: complex) -> int | None:
     """Return by how much (D3) falls short of its columns at an eigenvalue of Phi; ``None``: left to floating point."""
-    numbers = numbers_of(plant)
     factor = _factor_of(model, value)
-    if numbers is None or factor is None:
+    if judge.numbers is None or factor is None:
         return None
-    found = _ExactPencil.of(numbers, plant, model)
-    columns = plant.nx + model.order + len(found.kept)
-    is_written = isinstance(numbers, WrittenNumbers)
-    if columns * factor.degree() > MOST_COLUMNS if is_written else factor.degree() > 1:
-        return None
-    pencil: Any = found.numbers.pencil(found.Bd, found.Dd)  # type: ignore[attr-defined]
-    if is_written:
-        return columns - int(pencil.rank_at_root(factor))
-    from flint import arb, fmpq
-
-    return columns - int(pencil.rank_at(arb(fmpq(-factor[0], factor[1]))))
+    whole, below, direct, kept = _exact_pencil(judge, judge.numbers, model)
+    rank = whole.rank_at_root(below, direct, factor)
+    return None if rank is None else judge.plant.nx + model.order + len(kept) - rank
 
 
 def _augmented(numbers: PlantNumbers, plant: DescriptorSystem, model: Exosystem) -> PlantNumbers:

@@ -1,0 +1,394 @@
+"""Statements about a plant, and their answers: no (exactly), yes with its distance from another answer, and unclear.
+
+It is unclear where that distance is no more than what rounding of the data or of any gains can bridge.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, Literal, TypeVar
+
+import numpy as np
+
+from obsynth.analysis.conditions import Condition, is_doubted, is_refused, rank_condition
+from obsynth.analysis.existence.distance import (
+    ROUNDING_LEVEL,
+    Distance,
+    distance_to_loss,
+    least_share,
+    relative_singular_value,
+    zeros_at_rounding_level,
+)
+from obsynth.analysis.existence.named_pencils import named_pencil, unclear
+from obsynth.analysis.existence.numbers import numbers_of
+from obsynth.analysis.existence.rational import PlantNumbers, SystemFacts
+from obsynth.analysis.existence.witnesses import Unclear
+from obsynth.analysis.plant_units import PlantUnits, sized_plant
+from obsynth.analysis.zeros import are_outside, is_outside, system_zeros
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.pencils import finite_zeros
+from obsynth.numerics.ranks import NAMED_SHARE, RANK_TOLERANCE, RankDecision, decide_rank, rank_in_any_units
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.proofs.balls import UNIT_ROUNDOFF
+
+
+def settled_rank(decision: RankDecision, exact_rank: int | None, share: float = np.inf) -> RankDecision:
+    """Return a rank decision with the exact rank in place of that by a tolerance, or unclear.
+    ``share``: the least singular value beside the terms that the entries are sums of, where those are known."""
+    if exact_rank is None:
+        return decision
+    if exact_rank < decision.expected:
+        return replace(decision, rank=exact_rank, means="exact")
+    values = decision.singular_values
+    needed = decision.expected - 1
+    enough = decision.expected == 0 or (
+        len(values) > needed and values[needed] > ROUNDING_LEVEL * values[0] and share > ROUNDING_LEVEL
+    )
+    if enough:
+        return replace(decision, rank=decision.expected, means="exact", share=share)
+    return replace(decision, rank=min(decision.rank, decision.expected - 1), means="unclear", share=share)
+
+
+#: What decides what rounding of the data leaves open.
+DECIDER = "Data with more digits, or an output in which this shows more, would decide it."
+#: Computed data hold more than one rounding: below this distance a zero of theirs is one.
+COMPUTED = 1e-12
+#: Rounding scatters a multiple zero by up to this, relative to its size or one.
+SCATTER = 1e-2
+
+
+@dataclass(frozen=True)
+class ZeroVerdict:
+    """What is known of the zeros of a pencil outside the region of stability."""
+
+    answer: str  # no, yes or unclear
+    facts: SystemFacts
+    distance: Distance | None = None  # there unless the answer is no
+
+    @property
+    def means(self) -> str:
+        """How it was decided, in words."""
+        return (
+            "exactly, on the numbers as written" if self.facts.exact else "to hundreds of digits of the sampled plant"
+        )
+
+
+def zero_verdict(
+    facts: SystemFacts, E: FloatArray, A: FloatArray, *, nx: int, discrete: bool, sizes: FloatArray | None = None
+) -> ZeroVerdict:
+    """Return the answer for the pencil ``A - s E (m, n)`` of which the facts are known; ``sizes`` of the terms of A."""
+    facts = believed(facts, E, A, nx=nx)
+    if not facts.full or facts.outside:
+        return ZeroVerdict("no", facts)
+    distance = distance_to_loss(E, A, nx=nx, discrete=discrete, zeros=facts.zeros, sizes=sizes)
+    lost = _lost_in_computing(facts, E, A, nx=nx, discrete=discrete)
+    distance = min(distance, lost or distance, key=lambda found: found.value)
+    return ZeroVerdict("unclear" if distance.value <= ROUNDING_LEVEL or lost else "yes", facts, distance)
+
+
+def _lost_in_computing(facts: SystemFacts, E: FloatArray, A: FloatArray, *, nx: int, discrete: bool) -> Distance | None:
+    """Return a zero on or outside the boundary that computed data have but for their rounding; ``None`` without one."""
+    if not facts.computed:
+        return None
+    dt = 1.0 if discrete else 0.0
+    values = [*facts.zeros, *map(complex, system_zeros(E, A, nx=nx).values)]
+    found = [Distance(relative_singular_value(E, A, value, nx=nx), value) for value in values if is_outside(value, dt)]
+    best = min(found, key=lambda distance: distance.value, default=None)
+    return best if best is not None and best.value <= COMPUTED else None
+
+
+def believed(facts: SystemFacts, E: FloatArray, A: FloatArray, *, nx: int) -> SystemFacts:
+    """Return the facts without zeros that rounding of computed data has brought in from infinity."""
+    if not facts.computed or not facts.zeros:
+        return facts
+    found = system_zeros(E, A, nx=nx).values
+
+    def near(value: complex) -> bool:
+        return bool(np.any(np.abs(found - value) <= SCATTER * max(1.0, abs(value))))
+
+    zeros, outside = (tuple(filter(near, values)) for values in (facts.zeros, facts.outside))
+    return replace(facts, zeros=zeros, outside=outside)
+
+
+@dataclass(frozen=True)
+class FullRank:
+    """Blocks, the plant's matrices by name (``None``: zero), make up a matrix of full column rank."""
+
+    blocks: Sequence[Sequence[str | None]]
+    kept: Mapping[str, Sequence[int]] = field(default_factory=dict)  # columns of a matrix that are taken
+    last_rows: Sequence[int] | None = None  # those that are taken of the last row of blocks
+    of_rows: bool = False  # full row rank instead
+    rank: int | None = None  # what is to be had, where that is less
+
+
+@dataclass(frozen=True)
+class NoZeroOutside:
+    """``[A - s E, inputs; C, direct]`` keeps full column rank on and outside the boundary of stability."""
+
+    inputs: Literal["", "Bf", "Bd"] = ""
+    kept: Sequence[int] | None = None  # columns of these that are taken
+
+    @property
+    def at_zero(self) -> FullRank:
+        """That it has full column rank at s = 0."""
+        if not self.inputs:
+            return FullRank([["A"], ["C"]])
+        beside = (self.inputs, f"D{self.inputs[1:]}")
+        kept = {} if self.kept is None else dict.fromkeys(beside, self.kept)
+        return FullRank([["A", beside[0]], ["C", beside[1]]], kept)
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluator:
+    """Decides statements about one plant in rational arithmetic, in enclosures or in floating point, and says why."""
+
+    plant: DescriptorSystem
+    exactly: bool = True
+
+    @cached_property
+    def numbers(self) -> PlantNumbers | None:
+        """The numbers on which it is decided; ``None`` in floating point."""
+        return numbers_of(self.plant) if self.exactly else None
+
+    @cached_property
+    def units(self) -> PlantUnits:
+        """Units of the plant's own, as powers of two."""
+        return PlantUnits.of(self.plant).rounded()
+
+    @cached_property
+    def natural(self) -> DescriptorSystem:
+        """The plant in these units."""
+        return self.units.scaled_plant(self.plant)
+
+    @cached_property
+    def terms(self) -> DescriptorSystem | None:
+        """The plant with the sizes of the terms of its entries in their place; ``None`` where there are none."""
+        return sized_plant(self.plant)
+
+    def _sizes(self, said: FullRank) -> tuple[list[int], list[int]]:
+        """Return the heights of the rows of blocks, and their widths."""
+        names = [next(name for name in row if name) for row in said.blocks]
+        columns = [next(row[j] or "" for row in said.blocks if row[j]) for j in range(len(said.blocks[0]))]
+        widths = [len(said.kept[name]) if name in said.kept else getattr(self.plant, name).shape[1] for name in columns]
+        return [getattr(self.plant, name).shape[0] for name in names], widths
+
+    def arranged(self, said: FullRank, plant: DescriptorSystem) -> FloatArray:
+        """Return the blocks of a plant of the same size as a matrix."""
+
+        def block(name: str | None, height: int, width: int) -> FloatArray:
+            if name is None:
+                return np.zeros((height, width))
+            matrix: FloatArray = getattr(plant, name)
+            return matrix[:, list(said.kept[name])] if name in said.kept else matrix
+
+        heights, widths = self._sizes(said)
+        rows = [
+            np.hstack([block(name, height, width) for name, width in zip(row, widths, strict=True)])
+            for row, height in zip(said.blocks, heights, strict=True)
+        ]
+        rows[-1] = rows[-1] if said.last_rows is None else rows[-1][list(said.last_rows)]
+        return np.vstack(rows)
+
+    def exact_rank(self, said: FullRank) -> int | None:
+        """Return the rank on the numbers as written; ``None`` in floating point."""
+        numbers = self.numbers
+        if numbers is None:
+            return None
+
+        def block(name: str | None, height: int, width: int) -> Any:
+            if name is None:
+                return numbers.zeros(height, width)
+            return numbers.columns(name, said.kept.get(name))
+
+        heights, widths = self._sizes(said)
+        rows = [
+            [block(name, height, width) for name, width in zip(row, widths, strict=True)]
+            for row, height in zip(said.blocks, heights, strict=True)
+        ]
+        if said.last_rows is not None:
+            rows[-1] = [numbers.rows(part, said.last_rows) for part in rows[-1]]
+        return numbers.rank(numbers.blocks(rows))
+
+    def rank_itself(self, said: FullRank) -> int:
+        """Return the rank that blocks have."""
+        exact = self.exact_rank(said)
+        return decide_rank(self.arranged(said, self.natural)).rank if exact is None else exact
+
+    def rank(self, said: FullRank, known: RankDecision | None = None) -> RankDecision:
+        """Decide a rank; ``known``: what a tolerance says of it, where that was asked already."""
+        matrix, exact = self.arranged(said, self.natural), self.exact_rank(said)
+        expected = matrix.shape[0 if said.of_rows else 1] if said.rank is None else said.rank
+        if exact is None:
+            return known or rank_in_any_units(matrix, self.arranged(said, self.plant), expected=expected)
+        share = np.inf
+        if self.terms is not None and not said.of_rows:
+            share = least_share(matrix, self.arranged(said, self.units.scaled_plant(self.terms)), rank=expected)
+        return settled_rank(known or decide_rank(matrix, expected=expected), exact, share)
+
+    def full_rank(
+        self, name: str, said: FullRank, failure: Callable[[FloatArray], tuple[str, tuple[str, ...]]], *, source: str
+    ) -> Condition:
+        """Return the condition that a rank is full; ``failure(matrix)`` says what to do, and which signals it is."""
+        decision = self.rank(said)
+        remedy, signals = ("", ()) if decision.full else failure(self.arranged(said, self.natural))
+        found = rank_condition(name, decision, remedy, source=source, signals=signals)
+        return found.in_doubt(self.rank_doubt(said, decision), self.plant) if decision.means == "unclear" else found
+
+    def rank_doubt(self, said: FullRank, decision: RankDecision, point: complex | None = None) -> Unclear:
+        """Return why a rank is unclear, with ``A - point E`` for A."""
+        named = named_pencil(self.plant, self.units, said.blocks, kept=said.kept)
+        if said.last_rows is not None:
+            before = sum(self._sizes(said)[0][:-1])
+            named = named.with_rows([*range(before), *(before + int(row) for row in said.last_rows)])
+        return unclear(
+            self.plant,
+            named.transposed if said.of_rows else named,
+            tolerance=ROUNDING_LEVEL,
+            point=point,
+            other=f"has rank {decision.expected - 1}",
+            decider=DECIDER,
+        )
+
+    def pencil(self, said: NoZeroOutside) -> tuple[FloatArray, FloatArray]:
+        """Return the two matrices of a pencil ``A - s E``."""
+        whole = self.arranged(said.at_zero, self.plant)
+        moving = np.zeros_like(whole)
+        moving[: self.plant.nx, : self.plant.nx] = self.plant.E
+        return moving, whole
+
+    def seen(self, said: NoZeroOutside) -> SystemFacts:
+        """Return the facts on a pencil by floating point."""
+        pencil = self.pencil(said)
+        found = system_zeros(*pencil, nx=self.plant.nx) if said.inputs else finite_zeros(*pencil)
+        values = tuple(complex(value) for value in found.values)
+        marked = zip(values, are_outside(*pencil, found, self.plant.dt), strict=True)
+        outside = tuple(value for value, out in marked if out)
+        return SystemFacts(found.normal_rank, pencil[1].shape[1], outside, values, False, decisions=found.decisions)
+
+    def facts(self, said: NoZeroOutside) -> SystemFacts:
+        """Return the facts on a pencil."""
+        numbers, plant = self.numbers, self.plant
+        if numbers is None:
+            return self.seen(said)
+        if not said.inputs:
+            return numbers.system(numbers.zeros(plant.nx, 0), numbers.zeros(plant.ny, 0))
+        return numbers.system(*(numbers.columns(str(row[1]), said.kept) for row in said.at_zero.blocks))
+
+    def verdict(self, said: NoZeroOutside) -> ZeroVerdict:
+        """Decide where the zeros of a pencil are."""
+        facts, (E, A) = self.facts(said), self.pencil(said)
+        if self.numbers is None:
+            return ZeroVerdict("no" if facts.outside or not facts.full else "yes", facts)
+        scales = {"Bf": self.units.faults, "Bd": self.units.disturbances, "": np.zeros(0)}[said.inputs]
+        scales = scales if said.kept is None else scales[list(said.kept)]
+        sizes = None
+        if self.terms is not None:
+            sizes = self.units.scaled_pencil(E, self.arranged(said.at_zero, self.terms), scales)[1]
+        scaled = self.units.scaled_pencil(E, A, scales)
+        return zero_verdict(facts, *scaled, nx=self.plant.nx, discrete=self.plant.is_discrete, sizes=sizes)
+
+    def no_zero_outside(
+        self,
+        said: NoZeroOutside,
+        *,
+        holding: Callable[[SystemFacts], Condition],
+        lost: Callable[[SystemFacts], Condition],
+        what: str,
+    ) -> Condition:
+        """Return the condition that a pencil has no zero outside: where it holds, and what hides where it does not.
+        ``what`` would exist."""
+        verdict = self.verdict(said)
+        facts, distance = verdict.facts, verdict.distance
+        if verdict.answer == "no":
+            found = lost(facts)
+            gain = "" if found.mode is None or self.numbers is None else self._needed_gain(said, found.mode)
+            return replace(found, detail=f"{found.detail} {gain}".rstrip())
+        found = holding(facts)
+        if distance is None:
+            return found
+        if verdict.answer == "yes":
+            where = f"{distance.point.real:.4g}" if distance.point.imag == 0.0 else f"{distance.point:.4g}"
+            least = f"least singular value {distance.value:.2g} of the scaled pencil outside (near {where})"
+            return replace(found, detail=f"{found.detail}; {least}, {verdict.means}")
+        detail = (
+            f"{'An' if what[0] in 'aeiou' else 'A'} {what} exists for the numbers as written ({verdict.means}), but "
+            f"the least singular value of the scaled pencil outside is {distance.value:.1g}: rounding of the data, or "
+            "of any gains, is as large."
+        )
+        seen = self.seen(said).outside or (() if said.inputs else (distance.point,))
+        found = replace(found, holds=False, detail=detail)
+        if seen:
+            found = lost(replace(facts, outside=seen))
+            found = replace(found, detail=f"{detail} In floating point, {found.detail}")
+        return found.in_doubt(self._zero_doubt(said, distance, what), self.plant)
+
+    def _zero_doubt(self, said: NoZeroOutside, found: Distance, what: str) -> Unclear:
+        """Return why it is unclear whether a pencil has a zero outside."""
+        at_zero, point = said.at_zero, found.point
+        where = f"{point.real:.6g}" if point.imag == 0.0 else f"{point:.6g}"
+        return unclear(
+            self.plant,
+            named_pencil(self.plant, self.units, at_zero.blocks, kept=at_zero.kept),
+            tolerance=max(ROUNDING_LEVEL, found.value),
+            point=point,
+            dt=self.plant.dt,
+            other=f"has a zero at {where}, and no {what}",
+            decider=DECIDER,
+        )
+
+    def _needed_gain(self, said: NoZeroOutside, point: complex) -> str:
+        """Return which gain any observer would need, were the last digits of data off that hide something only
+        exactly.  Empty where no digits would help: with as many inputs as outputs a zero stays."""
+        plant, units, inputs = self.plant, self.units, said.inputs
+        entering = getattr(plant, inputs) if inputs else np.zeros((plant.nx, 0))
+        direct = getattr(plant, f"D{inputs[1:]}") if inputs else np.zeros((plant.ny, 0))
+        if plant.ny <= entering.shape[1]:
+            return ""
+        scales = {"Bf": units.faults, "Bd": units.disturbances, "": np.zeros(0)}[inputs]
+        columns = np.concatenate([units.states, scales])
+        rows = np.concatenate([units.equations, units.outputs])[:, None]
+        pencil = np.block([[plant.A - point * plant.E, entering], [plant.C, direct]])
+        scaled = np.linalg.svd(rows * pencil * columns)[2][-1].conj()
+        scaled = np.where(np.abs(scaled) > RANK_TOLERANCE, scaled, 0.0)
+        signals = np.abs(columns * scaled)
+        terms = np.max(np.abs(np.hstack([plant.C, direct])) * signals, axis=1, initial=0.0)
+        names = (*plant.state_names, *({"Bf": plant.fault_names, "Bd": plant.disturbance_names}.get(inputs, ())))
+        # What a fault moves is asked for by the fault; a mode by the state that moves most.
+        faults = np.arange(len(signals)) >= plant.nx if inputs == "Bf" else np.zeros(len(signals), dtype=bool)
+        shares = np.abs(scaled) * (faults if np.any(np.abs(scaled[faults]) > NAMED_SHARE) else ~faults)
+        wanted, shown = int(np.argmax(shares)), int(np.argmax(terms))
+        if terms[shown] == 0.0:
+            return "No output holds anything of it: no digits of the data would show it."
+        gain = signals[wanted] / (UNIT_ROUNDOFF * terms[shown])
+        return (
+            "This holds exactly, on the numbers as written: were their last digits off, any observer would need a "
+            f"gain of about {gain:.0e} from {plant.output_names[shown]!r} to {names[wanted]!r}."
+        )
+
+    def hidden_modes(self) -> SystemFacts:
+        """Return the facts on ``[A - s E; C]``, with the modes that only rounding of the data lets show."""
+        said, nx = NoZeroOutside(), self.plant.nx
+        seen, pencil = self.seen(said), self.pencil(said)
+        if self.numbers is None:
+            return seen
+        exact = believed(self.facts(said), *pencil, nx=nx)
+        nearly = zeros_at_rounding_level(*self.units.scaled_pencil(*pencil), seen.zeros, exact.zeros, nx=nx)
+        modes = sorted((*exact.zeros, *nearly), key=lambda value: (value.real, value.imag))
+        undetectable = (*exact.outside, *(value for value in nearly if value in seen.outside))
+        return replace(exact, zeros=tuple(modes), outside=undetectable)
+
+
+Found = TypeVar("Found")
+
+
+def reconsidered(
+    judge: Evaluator, decide: Callable[[Evaluator], Found], told: Callable[[Found], Sequence[Condition]]
+) -> Found:
+    """Return a decision; a refusal that rests on numbers taken for rounding gives way to the doubt without that."""
+    found, exact = decide(judge), judge.plant.exact
+    if judge.numbers is None or exact is None or exact.uncleaned is None or not is_refused(told(found)):
+        return found
+    other = decide(Evaluator(judge.plant.replace(exact=exact.before_cleaning())))
+    return other if is_doubted(told(other)) else found
