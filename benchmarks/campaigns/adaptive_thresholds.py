@@ -23,7 +23,8 @@ from benchmarks.campaigns.frame import Outcome
 from scipy.linalg import expm
 
 import obsynth
-from obsynth.experiments.alarm_proof import proved_alarm, verify_alarm
+from obsynth.data.alarm_certificates import verify_alarm
+from obsynth.experiments.alarm_proof import proved_alarm
 from obsynth.experiments.monitors.adaptive_monitor import adaptive_plan
 from obsynth.experiments.monitors.adaptive_record import record_columns
 from obsynth.spec import load_spec

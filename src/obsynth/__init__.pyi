@@ -12,11 +12,14 @@ from obsynth.analysis.transformations.sampling import discretise as discretise
 from obsynth.calibration.calibrating import calibrate as calibrate
 from obsynth.calibration.validating import validate as validate
 from obsynth.calibration.validity import validity as validity
+from obsynth.comparison.certificates import verify_certificate as verify_certificate
 from obsynth.comparison.comparing import compare as compare
 from obsynth.comparison.result import Comparison as Comparison
 from obsynth.comparison.sensor_sets import sensor_sets as sensor_sets
+from obsynth.data.alarm_certificates import verify_alarm as verify_alarm
 from obsynth.data.alarm_proof import prove_alarm as prove_alarm
 from obsynth.data.normal_rows import learn_thresholds as learn_thresholds
+from obsynth.data.online_monitor import online_monitor as online_monitor
 from obsynth.data.run import run_on_data as run_on_data
 from obsynth.data.smoothing import smooth as smooth
 from obsynth.errors import InfeasibleError as InfeasibleError
@@ -25,10 +28,7 @@ from obsynth.errors import PreconditionError as PreconditionError
 from obsynth.errors import SolverError as SolverError
 from obsynth.errors import SpecError as SpecError
 from obsynth.errors import VerificationError as VerificationError
-from obsynth.experiments.alarm_proof import verify_alarm as verify_alarm
-from obsynth.experiments.certificates import verify_certificate as verify_certificate
 from obsynth.experiments.monitors.learned import load_thresholds as load_thresholds
-from obsynth.experiments.monitors.online_monitor import online_monitor as online_monitor
 from obsynth.experiments.monitors.residual_monitor import monitor as monitor
 from obsynth.experiments.monte_carlo import evaluate as evaluate
 from obsynth.experiments.simulation import simulate as simulate

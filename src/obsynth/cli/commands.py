@@ -241,8 +241,8 @@ def run_sensors(options: argparse.Namespace) -> int:
 
 def run_verify(options: argparse.Namespace) -> int:
     """Run ``verify``: recheck any certificate, without a solver, to the end of what it rests on."""
+    from obsynth.comparison.certificates import kind_of_file, verify_certificate
     from obsynth.experiments.alarm_proof import KIND as ALARM
-    from obsynth.experiments.certificates import kind_of_file, verify_certificate
     from obsynth.results.calibration_files import KIND as CALIBRATION
     from obsynth.results.calibration_files import verify_calibration
     from obsynth.results.certificate_files import RESULTS
@@ -261,7 +261,7 @@ def run_verify(options: argparse.Namespace) -> int:
     else:
         report = verify_certificate(options.gains, data=options.data)
     if options.calibration is not None and report.passed:
-        from obsynth.experiments.certificates import designs_inside
+        from obsynth.comparison.certificates import designs_inside
 
         for design in designs_inside(options.gains):
             report = _with_calibration(report, design, options.calibration)

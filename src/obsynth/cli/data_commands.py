@@ -101,7 +101,7 @@ def run_export(options: argparse.Namespace) -> int:
         output_file(file, kind, options, option="--to")
     monitor = None
     if options.normal is not None:
-        from obsynth.experiments.monitors.online_monitor import online_monitor
+        from obsynth.data.online_monitor import online_monitor
 
         monitor = online_monitor(design, "learned", normal=options.normal, unverified=options.unverified)
     files = export(

@@ -174,7 +174,7 @@ def monitor_of(design: ObserverDesign, options: argparse.Namespace, *, has_scena
         of_monitors = (*(() if has_scenario else ("system",)), "sample_time", *monitor_names())
         refuse_given(options, of_monitors, "a monitor: say which one by --monitor")
         return None
-    from obsynth.experiments.monitors.online_monitor import online_monitor
+    from obsynth.data.online_monitor import online_monitor
     from obsynth.observers.linear.observer import LinearObserver
 
     if not isinstance(design.observer, LinearObserver):

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from obsynth.data.linear_log import engine_of
 from obsynth.errors import SpecError
-from obsynth.extensions import extension
 from obsynth.methods.handing_on import unverified_mark
 from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import FloatArray
@@ -123,7 +123,7 @@ class Realisation:
             return nothing
         if not set(observer.fault_names) <= set(plant.fault_names):
             return nothing
-        engine = extension("running design")(self.design.replace(plant=plant, observer=self.running))
+        engine = engine_of(self.design.replace(plant=plant, observer=self.running))
         model = engine.gap_model
         told = tuple(engine.told_faults)
         if model is None:

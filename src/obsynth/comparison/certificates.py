@@ -8,12 +8,12 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from obsynth.comparison.comparing import compared_again
+from obsynth.data.alarm_certificates import gain_set_row, verify_alarm
 from obsynth.errors import ObsynthError, SpecError
 from obsynth.experiments.alarm_proof import KIND as ALARM
-from obsynth.experiments.alarm_proof import gain_set_row, verify_alarm
 from obsynth.experiments.assumptions import Log, file_digest
 from obsynth.experiments.tolerance_study import study_statement, tolerance_study
-from obsynth.extensions import extension
 from obsynth.files.inputs import read_json
 from obsynth.results.calibration_files import KIND as CALIBRATION
 from obsynth.results.calibration_files import verify_calibration
@@ -150,15 +150,10 @@ def _study(body: Mapping[str, Any], designs: Mapping[str, ObserverDesign], _: Pa
     return found.as_dict(), study_statement(body["result"], found.asked, digest), []
 
 
-def _comparison(body: Mapping[str, Any], designs: Mapping[str, ObserverDesign], log: Path | None) -> Again:
-    found: Again = extension("comparison again")(body, designs, log)
-    return found
-
-
 _AGAIN: Mapping[str, Callable[[Mapping[str, Any], Mapping[str, ObserverDesign], Path | None], Again]] = {
     ROBUSTNESS: _robustness,
     STUDY: _study,
-    COMPARISON: _comparison,
+    COMPARISON: compared_again,
 }
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from obsynth.data.normal_rows import learn_thresholds
 from obsynth.errors import SpecError
 from obsynth.experiments.assumptions import Assumptions
 from obsynth.experiments.monitors.adaptive_monitor import (
@@ -26,7 +27,6 @@ from obsynth.experiments.monitors.residual_monitor import bounds_of, require_opt
 from obsynth.experiments.monitors.rules import ANY_LENGTH, NormRule, WhitenedRule, parameter_monitor
 from obsynth.experiments.monitors.thresholds import samples_of, scaled_inputs, unlimited_bound, unlimited_paper
 from obsynth.experiments.monitors.whitening import steady_mean, whitened
-from obsynth.extensions import extension
 from obsynth.methods.handing_on import require_verified
 from obsynth.numerics.arguments import is_finite_number, require_kind, require_mapping
 from obsynth.numerics.arrays import FloatArray
@@ -189,7 +189,7 @@ def _learned(design: ObserverDesign, normal: Any) -> Monitor:
     if isinstance(normal, (str, Path)) and Path(normal).suffix.lower() == ".json":
         normal = load_thresholds(normal)
     if not isinstance(normal, LearnedThresholds):
-        normal = extension("thresholds from a log")(design, normal)
+        normal = learn_thresholds(design, normal)
     return learned_monitor(design, normal)
 
 
