@@ -87,9 +87,9 @@ _NAMES = {
     "plants.time_varying": "TimeVaryingDescriptorSystem",
     "plants.uncertain_system": "uncertain_system",
     "report.page": "html_report",
-    "results.checks": "VerificationReport",
     "results.design": "Certificate ObserverDesign",
     "results.gain_sets": "load",
+    "results.verification_report": "VerificationReport",
     "simulation.dae": "simulate_dae",
     "simulation.linear": "simulate_time_varying",
     "simulation.profiles": "Drift Gaussian Intermittent LostEffectiveness Ramp Sine Step Stuck Uniform",
@@ -108,7 +108,6 @@ __all__ = sorted(_HOMES)
 provide(
     {
         "conditions of a design": "obsynth.conditions.shipped:conditions_of",
-        "checks as text": "obsynth.results.layout:report_text",
         "design summary": "obsynth.report.summary:summary",
         "picture of a guaranteed test": "obsynth.plotting.guaranteed:plot_least_thresholds",
         "table of a log": "obsynth.data.log_tables:log_table",

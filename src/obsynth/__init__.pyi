@@ -75,10 +75,10 @@ from obsynth.plants.fault_models import fault_model as fault_model
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem as TimeVaryingDescriptorSystem
 from obsynth.plants.uncertain_system import uncertain_system as uncertain_system
 from obsynth.report.page import html_report as html_report
-from obsynth.results.checks import VerificationReport as VerificationReport
 from obsynth.results.design import Certificate as Certificate
 from obsynth.results.design import ObserverDesign as ObserverDesign
 from obsynth.results.gain_sets import load as load
+from obsynth.results.verification_report import VerificationReport as VerificationReport
 from obsynth.simulation.dae import simulate_dae as simulate_dae
 from obsynth.simulation.linear import simulate_time_varying as simulate_time_varying
 from obsynth.simulation.profiles import Drift as Drift

@@ -18,8 +18,8 @@ from obsynth.files.outputs import write_atomically
 if TYPE_CHECKING:
     from obsynth.analysis.structure import Structure
     from obsynth.files.outputs import FileKind
-    from obsynth.results.checks import VerificationReport
     from obsynth.results.design import ObserverDesign
+    from obsynth.results.verification_report import VerificationReport
     from obsynth.spec import Spec
 
 
@@ -309,7 +309,7 @@ def _with_calibration(report: VerificationReport, design: ObserverDesign, path: 
     """Return a report with the row that the box of a design is that of a calibration file."""
     from obsynth.plants.descriptor import DescriptorSystem
     from obsynth.results.calibration_files import box_row
-    from obsynth.results.checks import VerificationReport
+    from obsynth.results.verification_report import VerificationReport
 
     uncertain = design.plant.uncertainty if isinstance(design.plant, DescriptorSystem) else None
     if uncertain is None:

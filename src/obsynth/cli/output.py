@@ -17,8 +17,8 @@ from obsynth.files.outputs import FileKind, check_output, check_replaceable
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from obsynth.results.checks import VerificationReport
     from obsynth.results.design import ObserverDesign
+    from obsynth.results.verification_report import VerificationReport
 
 
 _TITLES = {

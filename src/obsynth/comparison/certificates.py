@@ -27,9 +27,10 @@ from obsynth.results.certificate_files import (
     differences,
     opened,
 )
-from obsynth.results.checks import Check, VerificationReport, information, upper_bound_check
+from obsynth.results.checks import Check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import loaded
+from obsynth.results.verification_report import VerificationReport
 from obsynth.simulation.scenario import scenario_from
 from obsynth.tolerances.result import robustness_statement
 from obsynth.tolerances.robustness import robustness

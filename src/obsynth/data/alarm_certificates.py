@@ -21,9 +21,10 @@ from obsynth.methods.verifying import verify
 from obsynth.numerics.arguments import is_whole
 from obsynth.numerics.arrays import FloatArray
 from obsynth.results.certificate_files import SHOWN_DIGITS, opened
-from obsynth.results.checks import Check, VerificationReport, information
+from obsynth.results.checks import Check, information
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import loaded, restored
+from obsynth.results.verification_report import VerificationReport
 
 
 def verify_alarm(path: str | Path, *, data: str | Path | None = None) -> VerificationReport:

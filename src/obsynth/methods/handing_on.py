@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from obsynth.errors import VerificationError
-from obsynth.results.checks import VerificationReport
 from obsynth.results.design import ObserverDesign
+from obsynth.results.verification_report import VerificationReport
 
 #: Checks that a mark names; the others are counted.
 _MOST_NAMED = 4

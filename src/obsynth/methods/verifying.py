@@ -10,7 +10,7 @@ from obsynth.errors import SpecError
 from obsynth.methods.registry import REGISTRY, method_class
 from obsynth.numerics.libraries import failed_computations, one_thread_if_small
 from obsynth.observers.linear.observer import LinearObserver
-from obsynth.results.checks import VerificationReport
+from obsynth.results.verification_report import VerificationReport
 from obsynth.verification.claims import before_the_mean, closed_claims, mean_noise_rows
 from obsynth.verification.error_system import error_model_row
 from obsynth.verification.plant import derivation_rows

@@ -41,10 +41,11 @@ from obsynth.report.designs import (
 )
 from obsynth.report.pictures import pictures_of, stacked
 from obsynth.report.summary import summary
-from obsynth.results.checks import Check, CheckKind, Status, VerificationReport
+from obsynth.results.checks import Check, CheckKind, Status
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import gain_set_digest
 from obsynth.results.layout import headed_table, number, verdict, verdict_line, worth
+from obsynth.results.verification_report import VerificationReport
 from obsynth.simulation.scenario import Scenario
 
 #: Prefix of a check's name -> heading of its group; the others are about the shipped observer.

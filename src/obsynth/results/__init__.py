@@ -1,6 +1,7 @@
 """Results: the design, its report, and files of them."""
 
-from obsynth.results.checks import Check, VerificationReport
+from obsynth.results.checks import Check
 from obsynth.results.design import Certificate, ObserverDesign
+from obsynth.results.verification_report import VerificationReport
 
 __all__ = ["Certificate", "Check", "ObserverDesign", "VerificationReport"]

@@ -10,8 +10,9 @@ from typing import Any
 from obsynth.errors import SpecError
 from obsynth.files.inputs import read_json
 from obsynth.numerics.arguments import is_finite_number
-from obsynth.results.checks import Check, VerificationReport, information, upper_bound_check
+from obsynth.results.checks import Check, information, upper_bound_check
 from obsynth.results.gain_set_writing import digest_of, plain
+from obsynth.results.verification_report import VerificationReport
 
 KIND = "obsynth calibration"
 SCHEMA_VERSION = 1

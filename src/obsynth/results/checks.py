@@ -1,13 +1,11 @@
-"""A verification report and its rows: what is claimed, the number that was found, and whether it holds."""
+"""The rows of a verification report: what is claimed, the number that was found, and whether it holds."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, field
-from typing import Any, Literal
-
-from obsynth.extensions import extension
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
 
 CheckKind = Literal["proved", "equality", "computed", "condition", "information"]
 Status = Literal["proved", "computed twice", "estimated", "assumed"]
@@ -99,66 +97,3 @@ def all_hold(checks: Sequence[Check]) -> bool:
     """Return whether there is at least one real check and all of them hold."""
     verdicts = [check.passed for check in checks if check.kind != "information"]
     return bool(verdicts) and all(verdicts)
-
-
-@dataclass(frozen=True)
-class VerificationReport:
-    """All checks of one design; an empty report fails.
-
-    Parameters
-    ----------
-    checks : tuple of Check
-        The rows, in the order of the argument they make.
-    """
-
-    checks: tuple[Check, ...] = field(default_factory=tuple)
-
-    @classmethod
-    def of(cls, checks: Iterable[Check]) -> VerificationReport:
-        """Return a report.
-
-        Parameters
-        ----------
-        checks : iterable of Check
-            Its rows.
-        """
-        return cls(tuple(checks))
-
-    @property
-    def passed(self) -> bool:
-        """Whether there is at least one real check and all of them hold."""
-        return all_hold(self.checks)
-
-    @property
-    def failures(self) -> tuple[Check, ...]:
-        """The checks that do not hold."""
-        return tuple(check for check in self.checks if not check.passed)
-
-    def __getitem__(self, name: str) -> Check:
-        for check in self.checks:
-            if check.name == name:
-                return check
-        raise KeyError(f"no check named {name!r}; there are: {', '.join(c.name for c in self.checks)}")
-
-    def __str__(self) -> str:
-        """Return the table of the checks."""
-        return str(extension("checks as text")(self.checks))
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the report as plain data."""
-        rows = [asdict(check) for check in self.checks]
-        for row in rows:
-            if not row["unclear"]:
-                del row["unclear"]
-        return {"passed": self.passed, "checks": rows}
-
-    @classmethod
-    def from_dict(cls, data: dict[str, Any]) -> VerificationReport:
-        """Return the report that `as_dict` wrote.
-
-        Parameters
-        ----------
-        data : dict
-            With the key ``checks``.
-        """
-        return cls.of(Check(**row) for row in data["checks"])

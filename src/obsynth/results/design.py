@@ -14,9 +14,9 @@ from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.sensor_timing import LONGEST_DELAY
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.results.checks import VerificationReport
 from obsynth.results.gain_set_writing import save
 from obsynth.results.plant_source import PlantSource
+from obsynth.results.verification_report import VerificationReport
 
 if TYPE_CHECKING:
     import control

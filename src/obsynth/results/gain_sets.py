@@ -20,7 +20,6 @@ from obsynth.errors import SpecError
 from obsynth.files.inputs import input_file, json_data, read_json
 from obsynth.numerics.arguments import is_number
 from obsynth.numerics.arrays import FloatArray
-from obsynth.results.checks import VerificationReport
 from obsynth.results.design import Certificate, ObserverDesign
 from obsynth.results.gain_set_writing import (
     ARRAYS,
@@ -41,6 +40,7 @@ from obsynth.results.gain_set_writing import (
     types_of,
 )
 from obsynth.results.plant_source import PlantSource
+from obsynth.results.verification_report import VerificationReport
 
 __all__ = [
     "GAIN_SET",

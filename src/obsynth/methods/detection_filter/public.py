@@ -10,8 +10,8 @@ from obsynth.methods.designing import design
 from obsynth.methods.detection_filter.checks import TOGETHER
 from obsynth.methods.detection_filter.method import DetectionFilterMethod
 from obsynth.methods.functions import design_function
-from obsynth.results.checks import VerificationReport
 from obsynth.results.design import ObserverDesign
+from obsynth.results.verification_report import VerificationReport
 
 
 @dataclass(frozen=True, repr=False)

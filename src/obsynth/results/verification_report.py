@@ -1,0 +1,74 @@
+"""A verification report: its rows, and whether all of them hold."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from obsynth.results.checks import Check, all_hold
+
+
+@dataclass(frozen=True)
+class VerificationReport:
+    """All checks of one design; an empty report fails.
+
+    Parameters
+    ----------
+    checks : tuple of Check
+        The rows, in the order of the argument they make.
+    """
+
+    checks: tuple[Check, ...] = field(default_factory=tuple)
+
+    @classmethod
+    def of(cls, checks: Iterable[Check]) -> VerificationReport:
+        """Return a report.
+
+        Parameters
+        ----------
+        checks : iterable of Check
+            Its rows.
+        """
+        return cls(tuple(checks))
+
+    @property
+    def passed(self) -> bool:
+        """Whether there is at least one real check and all of them hold."""
+        return all_hold(self.checks)
+
+    @property
+    def failures(self) -> tuple[Check, ...]:
+        """The checks that do not hold."""
+        return tuple(check for check in self.checks if not check.passed)
+
+    def __getitem__(self, name: str) -> Check:
+        for check in self.checks:
+            if check.name == name:
+                return check
+        raise KeyError(f"no check named {name!r}; there are: {', '.join(c.name for c in self.checks)}")
+
+    def __str__(self) -> str:
+        """Return the table of the checks."""
+        from obsynth.results.layout import report_text
+
+        return report_text(self.checks)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the report as plain data."""
+        rows = [asdict(check) for check in self.checks]
+        for row in rows:
+            if not row["unclear"]:
+                del row["unclear"]
+        return {"passed": self.passed, "checks": rows}
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> VerificationReport:
+        """Return the report that `as_dict` wrote.
+
+        Parameters
+        ----------
+        data : dict
+            With the key ``checks``.
+        """
+        return cls.of(Check(**row) for row in data["checks"])
