@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from obsynth.data.linear_log import engine_of
+from obsynth.data.linear_log import DataObserver
 from obsynth.errors import SpecError
 from obsynth.methods.handing_on import unverified_mark
 from obsynth.numerics.arguments import require_kind
@@ -123,7 +123,7 @@ class Realisation:
             return nothing
         if not set(observer.fault_names) <= set(plant.fault_names):
             return nothing
-        engine = engine_of(self.design.replace(plant=plant, observer=self.running))
+        engine = DataObserver(self.design.replace(plant=plant, observer=self.running))
         model = engine.gap_model
         told = tuple(engine.told_faults)
         if model is None:
