@@ -143,7 +143,7 @@ class Realisation:
         tables |= {"model_C": moving.C, "model_D": moving.D, "model_Df": moving.Df, "model_into": model.into}
         if engine.partial is not None:
             tables |= {"source_D": plant.D, "source_Df": plant.Df, "model_solver": engine.partial.solver}
-        kept = engine.inputs.maxlen
+        kept = engine.inputs.maxlen or 0
         return GapTables(
             plant.nf, told, kept, moving.nx, len(engine.seen), True, engine.partial is not None, tables,
             *engine.usual_changes,
