@@ -78,6 +78,16 @@ def answers(asked, plant):
     return [(row.name, row.holds, row.unclear, row.detail) for row in asked.existence(plant)]
 
 
+def test_what_was_tried_in_floating_point_leaves_no_trace():
+    """A mode at zero that floating point puts at 1.2e-16: it was kept by whoever had asked first."""
+    g = drawn_plant("pd-observer", 353).given
+    first, second = (DescriptorSystem(g["E"], g["A"], C=g["C"], Bf=g["Bf"], Df=g["Df"]) for _ in range(2))
+    asked = method_class("pd-observer").of({})
+    tried = asked.existence(first, exactly=False)
+    assert [row.holds for row in tried] == [row.holds for row in asked.existence(first)]
+    assert analyse_structure(first).undetectable_modes == analyse_structure(second).undetectable_modes == (0,)
+
+
 def test_exact_numbers_of_another_plant_are_refused():
     whole = np.diag([1, 1, 0])
     reduced = eliminate_algebraic_states(DescriptorSystem(whole, A, C=C, Bf=SHOWN)).plant
