@@ -6,7 +6,6 @@ Why a log cannot be used, or a model not be fitted to it: errors with a code tha
 from __future__ import annotations
 
 import hashlib
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,8 +14,8 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from obsynth.data.log_tables import log_table, parsed_rows
 from obsynth.errors import PreconditionError, SpecError
-from obsynth.extensions import extension
 from obsynth.numerics.arrays import FloatArray, read_only
 
 if TYPE_CHECKING:
@@ -117,28 +116,6 @@ class Log:
         return replace(self, y=read_only(np.where(wrong, np.nan, self.y)), notes=tuple(notes))
 
 
-def parsed_rows(rows: str | slice | Sequence[int] | None, count: int) -> tuple[int, int]:
-    """Return first row and one past the last of ``"a:b"``, a slice or a pair, as Python counts."""
-    if isinstance(rows, str):
-        found = re.fullmatch(r"\s*(-?\d*)\s*:\s*(-?\d*)\s*", rows)
-        if found is None:
-            raise SpecError(f"rows is {rows!r}: give a:b, such as 0:56 for the first 56 rows.", path="rows")
-        rows = slice(*(int(text) if text else None for text in found.groups()))
-    elif isinstance(rows, Sequence):
-        if len(rows) != 2 or not all(isinstance(row, (int, np.integer)) for row in rows):
-            raise SpecError(f"rows is {list(rows)}: give the first row and one past the last.", path="rows")
-        rows = slice(int(rows[0]), int(rows[1]))
-    first, last, step = (rows or slice(None)).indices(count)
-    if step != 1 or last <= first:
-        asked = rows if isinstance(rows, slice) else slice(None)
-        told = ":".join("" if end is None else str(end) for end in (asked.start, asked.stop))
-        asked_for = f"rows {told} holds nothing" if told != ":" else "The log is empty"
-        raise SpecError(f"{asked_for}: the log has {count} rows.", path="rows")
-    if isinstance(rows, slice) and any(end is not None and abs(end) > count for end in (rows.start, rows.stop)):
-        raise SpecError(f"rows asks for {rows.start}:{rows.stop}, but the log has {count} rows.", path="rows")
-    return first, last
-
-
 def read_log(
     log: LogData,
     input_names: Sequence[str],
@@ -196,7 +173,7 @@ def read_log(
 def _table(log: Any, wanted: Sequence[str]) -> tuple[dict[str, Any], list[str], str]:
     """Return columns that are wanted, the time first, names of all columns, and where they come from."""
     if isinstance(log, str | Path) or (hasattr(log, "columns") and hasattr(log, "index")):
-        found, names = extension("table of a log")(log, wanted[1:], wanted[0])
+        found, names = log_table(log, wanted[1:], wanted[0])
         return found, names, Path(log).name if isinstance(log, str | Path) else ""
     if isinstance(log, Mapping):
         return {str(name): np.asarray(log[name]) for name in log}, list(map(str, log)), ""

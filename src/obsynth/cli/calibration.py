@@ -96,10 +96,10 @@ def run_linearise(options: argparse.Namespace) -> int:
 def run_calibrate(options: argparse.Namespace) -> int:
     """Run ``calibrate``: spec and log in, constants with their box and a verdict out."""
     from obsynth.calibration.calibrating import calibrate
+    from obsynth.calibration.spec_writing import calibrated_spec
     from obsynth.results.calibration_files import KIND, calibration_text
     from obsynth.results.gain_sets import plain
     from obsynth.spec.loader import load_plant
-    from obsynth.spec.writing import calibrated_spec
 
     with progress(quiet=options.quiet) as report_stage:
         report_stage(f"reading {options.system}")
@@ -130,7 +130,7 @@ def run_calibrate(options: argparse.Namespace) -> int:
 
 def _spec_file(options: argparse.Namespace) -> Path:
     """Return where the calibrated spec is written: beside the one that was read, whose files it names too."""
-    from obsynth.spec.writing import CALIBRATED_SPEC
+    from obsynth.calibration.spec_writing import CALIBRATED_SPEC
 
     target = output_file(options.write_spec, CALIBRATED_SPEC, options)
     if target.resolve().parent != options.system.resolve().parent:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import numpy as np
 from obsynth.data.signals import TIME, Signals, Stamps
 from obsynth.data.sources import CHUNK_ROWS, PACKAGES, TEXTS, check_suffix, chunks
 from obsynth.data.text_logs import header_of
+from obsynth.errors import SpecError
 from obsynth.files.inputs import input_file
 from obsynth.numerics.arrays import FloatArray
 
@@ -58,3 +60,25 @@ def _header(data: Any, wanted: Sequence[str]) -> list[str]:
         except (ValueError, OSError):  # the reader says what is wrong with it
             return list(wanted)
     return list(wanted)
+
+
+def parsed_rows(rows: str | slice | Sequence[int] | None, count: int) -> tuple[int, int]:
+    """Return first row and one past the last of ``"a:b"``, a slice or a pair, as Python counts."""
+    if isinstance(rows, str):
+        found = re.fullmatch(r"\s*(-?\d*)\s*:\s*(-?\d*)\s*", rows)
+        if found is None:
+            raise SpecError(f"rows is {rows!r}: give a:b, such as 0:56 for the first 56 rows.", path="rows")
+        rows = slice(*(int(text) if text else None for text in found.groups()))
+    elif isinstance(rows, Sequence):
+        if len(rows) != 2 or not all(isinstance(row, (int, np.integer)) for row in rows):
+            raise SpecError(f"rows is {list(rows)}: give the first row and one past the last.", path="rows")
+        rows = slice(int(rows[0]), int(rows[1]))
+    first, last, step = (rows or slice(None)).indices(count)
+    if step != 1 or last <= first:
+        asked = rows if isinstance(rows, slice) else slice(None)
+        told = ":".join("" if end is None else str(end) for end in (asked.start, asked.stop))
+        asked_for = f"rows {told} holds nothing" if told != ":" else "The log is empty"
+        raise SpecError(f"{asked_for}: the log has {count} rows.", path="rows")
+    if isinstance(rows, slice) and any(end is not None and abs(end) > count for end in (rows.start, rows.stop)):
+        raise SpecError(f"rows asks for {rows.start}:{rows.stop}, but the log has {count} rows.", path="rows")
+    return first, last

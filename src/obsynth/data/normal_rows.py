@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.calibration.logs import parsed_rows
 from obsynth.data.linear_log import engine_of
 from obsynth.data.log_estimator import DECIDING, STALE
+from obsynth.data.log_tables import parsed_rows
 from obsynth.data.signals import TIME, Signals, Stamps
 from obsynth.data.sources import CHUNK_ROWS, Data, chunks
 from obsynth.errors import SpecError
