@@ -328,6 +328,28 @@ def test_least_is_not_claimed_where_later_equations_may_say_more() -> None:
     assert any("not claimed" in note for note in found.notes)
 
 
+def test_windows_that_differ_in_what_known_inputs_do_are_not_one() -> None:
+    gains = np.array([1.0, 2.0, -1.0, 0.5, 3.0, 1.0])
+    plant = varying(A=[[1.0]], C=[[1.0]], B=gains[:, None, None], Phi=[[1.0]])
+    found = obsynth.guaranteed_test(plant, course="constant", samples=2, noise_bound=NOISE, disturbance_bounds=W)
+    u = np.random.default_rng(5).standard_normal((7, 1))
+    y = np.cumsum(np.concatenate([[0.0], gains * u[:6, 0]]))[:, None]
+    assert np.abs(found.residual(found.observer.run(y, u))[2:]).max() < 1e-12
+    assert len(found.certificate.matrices["thresholds"]) == 5  # a window has the gain of one step
+
+
+def test_least_knows_of_an_equation_far_behind_the_window() -> None:
+    # At k = 6 E vanishes: x(5) obeys an equation of its own, which says something of every window before it.
+    E = np.ones((9, 1, 1))
+    E[6] = 0.0
+    plant = varying(E=E, A=[[1.0]], C=[[1.0]], Phi=[[1.0]], horizon=8)
+    found = obsynth.guaranteed_test(plant, course="constant", samples=2, noise_bound=NOISE, disturbance_bounds=W)
+    shipped = found.certificate.matrices
+    least = dict(zip(range(2, 9), shipped["leasts"].ravel()[shipped["programmes"].ravel().astype(int)], strict=True))
+    assert [k for k, value in least.items() if np.isnan(value)] == [2, 3, 4]
+    assert found.report.passed
+
+
 GOOD: dict[str, Any] = {"course": "constant", "samples": 3, "noise_bound": NOISE, "disturbance_bounds": W}
 REFUSED: dict[str, tuple[dict[str, Any], dict[str, Any], type[Exception], str]] = {
     "deviations": ({}, {"noise_bound": 3}, obsynth.SpecError, "states no deviations"),
@@ -369,6 +391,10 @@ def test_what_is_for_constant_matrices_says_so(tmp_path: Path) -> None:
     for words, call in refused.items():
         with pytest.raises(obsynth.SpecError, match=words):
             call()
+    with pytest.raises(obsynth.SpecError, match="none is learned"):
+        obsynth.learn_thresholds(test, log())
+    with pytest.raises(obsynth.SpecError, match="states no covariance"):
+        obsynth.validate(test, log())
     assert not list(tmp_path.iterdir())
 
 
@@ -395,3 +421,5 @@ def test_the_command_line_designs_verifies_runs_and_reports(tmp_path: Path, caps
     assert "never passed without leak" in said
     assert main(["report", "--gains", str(gains), "--out", str(tmp_path / "page.html")]) == 0
     assert "Why no smaller one" in (tmp_path / "page.html").read_text()
+    with_log = ["report", "--gains", str(gains), "--data", str(tmp_path / "log.csv"), "--monitor", "pointwise"]
+    assert main([*with_log, "--out", str(tmp_path / "log.html")]) == 0

@@ -33,6 +33,7 @@ from obsynth.observers.estimates import Estimates
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.running import changed
+from obsynth.observers.windows import WindowObserver
 from obsynth.results.design import ObserverDesign
 
 
@@ -278,7 +279,7 @@ def validate(
 
 def states_innovations(design: ObserverDesign) -> bool:
     """Whether a design predicts its outputs with a covariance, which a log could contradict."""
-    return not isinstance(design.observer, LinearObserver)
+    return not isinstance(design.observer, (LinearObserver, WindowObserver))
 
 
 def _sensors(record: RecordedInnovations, names: Sequence[str]) -> dict[str, SensorValidation]:

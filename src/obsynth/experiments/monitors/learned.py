@@ -30,6 +30,7 @@ from obsynth.numerics.arguments import is_finite_number
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.numerics.autoregression import Autoregression, fitted_autoregression
 from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.windows import WindowObserver
 from obsynth.results.certificate_files import opened, sealed
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import digest_of, gain_set_digest, plain, restored
@@ -261,6 +262,12 @@ def _from_dict(data: Mapping[str, Any]) -> LearnedThresholds:
 def watched_names(design: ObserverDesign) -> tuple[str, ...]:
     """Return what may be watched of a design: fault estimates, then residuals (or innovations)."""
     observer = design.observer
+    if isinstance(observer, WindowObserver):
+        raise SpecError(
+            f"Design {design.name!r} is a test whose weights change with k: the threshold of each row is proved, and "
+            "none is learned (use the monitor pointwise).",
+            path="design",
+        )
     if isinstance(observer, LinearObserver):
         names = observer.row_names
         return (*names[observer.fault_rows], *names[observer.residual_rows])
