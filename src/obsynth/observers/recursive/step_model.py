@@ -159,6 +159,7 @@ class EarlyConstraintSteps(StepModel):
             )
         self.others = np.setdiff1d(np.arange(self.plant.ne), self.rows)
         self._constant: StepMatrices | None = None
+        self._correction: StepMatrices | None = None
         self._noise: FloatArray | None = None
         self._noise_is_constant = self.Q.is_constant and self.R.is_constant
         self._is_constant = self._noise_is_constant and self.plant.is_time_invariant
@@ -206,10 +207,12 @@ class EarlyConstraintSteps(StepModel):
 
     def correction(self, k: int) -> StepMatrices:
         """Return the correction of x(k) by the algebraic equations of step k: what is known is the 'equation'."""
+        if self._correction is not None:
+            return self._correction
         plant, late = self.plant, self.rows
         H = np.vstack([np.eye(plant.nx), plant.A.at(k)[late]])
         noise = stacked_noise(np.zeros((plant.nx, 0)), self._factors(k)[1])
-        return StepMatrices(
+        found = StepMatrices(
             H,
             np.eye(plant.nx),
             np.zeros((plant.nx, plant.nu)),
@@ -218,6 +221,8 @@ class EarlyConstraintSteps(StepModel):
             -plant.B.at(k)[late],
             noise,
         )
+        self._correction = found if self._is_constant else None
+        return found
 
 
 @dataclass
