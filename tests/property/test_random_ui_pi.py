@@ -129,9 +129,10 @@ def test_default_designs_see_no_disturbance(number: int, share: Share) -> None:
     assert len(refused) <= 1, refused
 
 
-def test_the_failing_condition_is_raised_with_its_mode_and_signals() -> None:
-    seen = Counter()
-    for seed in ALL:
+def test_the_failing_condition_is_raised_with_its_mode_and_signals(share: Share) -> None:
+    # Every third has all kinds, of which there are eight in turn.
+    seen, seeds = Counter(), share(ALL, 3)
+    for seed in seeds:
         case = random_case(seed)
         if case.kind not in ("masked", "fixed unstable", "undecouplable") or brute_force(case)[0]:
             continue
@@ -146,6 +147,7 @@ def test_the_failing_condition_is_raised_with_its_mode_and_signals() -> None:
             assert np.min(np.abs(np.linalg.eigvals(phi) - error.mode)) < 1e-4, seed
             assert "f1" in error.signals, seed
         assert error.signals, seed
-    assert seen["masked", "(D3"] >= 15
-    assert seen["fixed unstable", "(D2"] >= 30
-    assert seen["undecouplable", "(D1"] >= 15
+    part = len(seeds) / len(ALL)
+    assert seen["masked", "(D3"] >= 15 * part
+    assert seen["fixed unstable", "(D2"] >= 30 * part
+    assert seen["undecouplable", "(D1"] >= 15 * part
