@@ -168,6 +168,8 @@ def test_an_alarm_is_proved_about_the_middle(tmp_path: Path) -> None:
     proof = obsynth.prove_alarm(tank(), log, row=20)
     assert "inflow within 0.1 to 1.1" in proof.statement
     assert "noise of level 1 within 0 to 0.02" in proof.statement
+    about_zero = obsynth.prove_alarm(tank(shifted=False), record(3.0 * tank().threshold, shifted=False), row=20)
+    assert proof.margin == pytest.approx(about_zero.margin, rel=1e-6)
     target = proof.save(tmp_path / "alarm.json")
     assert main(["verify", str(target), "--data", str(log)]) == 0
     assert not obsynth.prove_alarm(tank(), record(), row=20).proved

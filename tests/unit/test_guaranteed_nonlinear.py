@@ -66,6 +66,16 @@ def test_the_remainder_is_that_of_the_root_and_a_little_more() -> None:
         assert found["remainder in gauge"] < 1e-12
 
 
+def test_what_an_output_shows_of_an_algebraic_state_has_its_remainder() -> None:
+    fields = {**FIELDS, "units": {**FIELDS["units"], "meter": "m3/s"}}
+    metered = obsynth.DAEModel(EQUATIONS, {"gauge": "level", "meter": "outflow"}, **fields)
+    found = bounded_model(metered, REGION, H, faults=["leak"], disturbances=["rain"]).bounds
+    most = max(abs(C * np.sqrt(x) - (1.0 + (x - 4.0) * C / 4.0)) for x in REGION["level"])
+    assert most <= found["remainder in meter"] <= 1.25 * most
+    test = obsynth.guaranteed_test(metered, **{**ASKED, "noise_bound": {"gauge": V, "meter": V}})
+    assert 0.0 < test.threshold <= test_of_tank().threshold * (1.0 + 1e-9)
+
+
 def test_between_samples_the_remainder_may_do_anything() -> None:
     # An oscillator whose remainder r enters the velocity: in a quarter of a turn it moves by r (1 - cos), less if held.
     model = obsynth.DAEModel(

@@ -305,6 +305,15 @@ def test_what_is_corrupted_fails_its_row(what: str) -> None:
     assert CORRUPTED[what] in {row.name for row in obsynth.verify(corrupted(what)).failures}
 
 
+def test_the_claim_is_of_the_worst_row_wherever_it_is() -> None:
+    test = integrator()  # the second of four windows needs most
+    for name, row in (("threshold", "threshold"), ("least", "least")):
+        factor = 0.999 if name == "threshold" else 1.001
+        claims = {**test.certificate.claims, name: factor * test.certificate.claims[name]}
+        report = obsynth.verify(test.replace(certificate=Certificate(test.certificate.matrices, claims)))
+        assert row in {check.name for check in report.failures}
+
+
 def test_matrices_of_another_shape_are_no_answer() -> None:
     test = random_test("step")
     for name in ("multipliers", "thresholds", "programmes", "witness_radius", "rounding"):
