@@ -195,3 +195,22 @@ def test_digest_row_and_margin_are_judged_by_themselves(design, tmp_path) -> Non
     content = json.loads(text)
     content["certificate"]["below"]["data"] = [0.0] * len(content["certificate"]["below"]["data"])
     assert "proof" in {check.name for check in obsynth.verify_alarm(resigned(content, tmp_path / "bad.json")).failures}
+
+
+def test_a_record_with_a_gap_proves_nothing(design) -> None:
+    """Between rows 19 and 21 anything may have happened: a start at row 1 says nothing of what comes after."""
+    u, y = record(design, 1, fault=0.2)
+    plant = design.plant
+    names = [*plant.input_names, *plant.output_names]
+    whole = pd.DataFrame(np.hstack([u, y]), columns=names).assign(time=plant.dt * np.arange(len(u)))
+    assert obsynth.prove_alarm(design, whole, 34, **options(design)).proved
+    with pytest.raises(obsynth.SpecError, match="Row 20 has a gap before it") as refused:
+        obsynth.prove_alarm(design, whole.drop(index=19), 33, **options(design))
+    assert refused.value.path == "data"
+    blank = whole.copy()
+    blank.loc[19, names[-1]] = np.nan
+    with pytest.raises(obsynth.SpecError, match="Row 20 has a gap before it or misses a sample"):
+        obsynth.prove_alarm(design, blank, 34, **options(design))
+    for row, words in ((1, "2 or more"), (51, "have 50 rows")):
+        with pytest.raises(obsynth.SpecError, match=words):
+            obsynth.prove_alarm(design, whole, row, **options(design))

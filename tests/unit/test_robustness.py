@@ -125,3 +125,38 @@ def test_a_radius_above_one_is_no_refusal() -> None:
     assert found.loop_radius > 1.0
     assert "largest tolerances" in dict(found.facts())
     assert "to blame" in dict(found.facts())
+
+
+def test_what_a_remainder_does_to_an_output_at_once_counts() -> None:
+    """c * c in 0 .. 0.25 beside 1 is all remainder: fhat = y - 0.5 y(k - 1) is off by 0.25 + 0.5 * 0.25 of x."""
+    plant = obsynth.uncertain_system(
+        {"A": [[0.5]], "C": [["1 + c * c"]], "Bf": [[1.0]], "dt": 1.0}, {"c": {"nominal": 0.0, "range": [-0.5, 0.5]}}
+    )
+    found = obsynth.robustness(obsynth.fault_estimation_filter(plant))
+    assert found.error_per_unit["fhat[f1]"]["x1"] >= 0.375
+    assert found.error_per_unit["fhat[f1]"]["x1"] == pytest.approx(0.375, rel=1e-9)
+
+
+def test_an_estimate_of_the_full_state_without_delay_is_needed() -> None:
+    """The fault reaches the output two samples later: a filter of states that lag has no bound over tolerances."""
+    plant = obsynth.uncertain_system(
+        {"A": [["0.5 * p", 0.0], [1.0, 0.3]], "C": [[0.0, 1.0]], "Bf": [[1.0], [0.0]], "dt": 1.0},
+        {"p": {"nominal": 1.0, "tolerance": "5 %"}},
+    )
+    late = obsynth.robustness(obsynth.fault_estimation_filter(plant))
+    assert (late.loop_radius, late.finite_for_ever) == (None, False)
+    assert "lags by some samples" in late.reason
+    assert "does not estimate the full state" in obsynth.robustness(obsynth.functional_filter(plant)).reason
+    with pytest.raises(PreconditionError, match="lags by some samples"):
+        obsynth.online_monitor(late.design, initial_set={"x1": 1.0, "x2": 1.0})
+
+
+def test_the_largest_common_tolerance_is_told_where_all_are_the_same_share() -> None:
+    plant = obsynth.uncertain_system(
+        {"A": [["0.5 * p", 0.1], [0.0, "0.3 * q"]], "C": np.eye(2), "Bf": [[1.0], [0.0]], "dt": 1.0},
+        {"p": {"nominal": 1.0, "tolerance": "5 %"}, "q": {"nominal": 1.0, "tolerance": "5 %"}},
+    )
+    design = obsynth.fault_estimation_filter(plant)
+    same = obsynth.robustness(design)
+    assert same.largest_tolerance == pytest.approx(0.05 * same.largest_factor)
+    assert obsynth.robustness(design, constants={"q": {"tolerance": "10 %"}}).largest_tolerance is None
