@@ -53,6 +53,7 @@ EVALUATE = f"evaluate --system {DRIVE} --quiet"
         )),
         *((f"{RUN} --monitor chi-square {option}", option.split()[0]) for option in (
             "--change 2", "--noise-bound 3", "--initial-error 1", "--initial x1=1", "--normal l.csv",
+            "--disturbance d=1",
         )),
         (f"{RUN} --monitor window --noise-bound 3 --false-alarms 0.1", "--false-alarms"),
         (f"{RUN} --monitor paper --window 3", "--window"),

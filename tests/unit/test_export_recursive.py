@@ -186,8 +186,8 @@ def test_a_nonlinear_design_is_refused(tmp_path):
         (lambda: obsynth.evaluate(None, None), "design is a NoneType"),
         (lambda: obsynth.online_monitor(designed("filter"), "nis", scenario=3), "scenario is a int"),
         (lambda: obsynth.online_monitor(designed("filter"), "nis", false_alarms="a"), "false_alarms is 'a'"),
-        (lambda: obsynth.online_monitor(designed("filter"), "nis", window="a"), "window is 'a'"),
-        (lambda: obsynth.online_monitor(designed("filter"), "nis", noise_bound="a"), "noise_bound is 'a'"),
+        (lambda: obsynth.online_monitor(designed("filter"), "nis", window=5), "window is for designs of another"),
+        (lambda: obsynth.online_monitor(designed("filter"), "nis", noise_bound=3.0), "noise_bound is for designs"),
         (lambda: obsynth.online_monitor(designed("walk"), "nis", nominal={"leak": "a"}), "nominal value of 'leak'"),
     ],
 )  # fmt: skip

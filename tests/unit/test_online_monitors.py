@@ -62,7 +62,7 @@ def test_shares_of_looks_sum_up_to_one_and_no_more():
 @pytest.mark.parametrize("kind", ["pointwise", "window", "paper"])
 def test_thresholds_are_those_of_a_record(kind, wang):
     design, scenario = wang
-    options = {"disturbance_bounds": {"w": 0.11}, "initial_error": 0.55, "window": 7}
+    options = {"disturbance_bounds": {"w": 0.11}, "initial_error": 0.55, "window": 7 if kind == "window" else None}
     whole = obsynth.monitor(design, scenario, kind, **options)
     run = obsynth.simulate(design, scenario.replace(observer_state=None))
     done = run_on_data(design, log_of(run), monitor=obsynth.online_monitor(design, kind, **options))
@@ -411,3 +411,29 @@ def test_a_monitor_belongs_to_its_design(wang, noisy):
     monitor = obsynth.online_monitor(ADAPTIVE, "nis")
     with pytest.raises(SpecError, match="another design"):
         run_on_data(FILTER, parameter_log(0), monitor=monitor)
+
+
+IDLE = {
+    "pointwise": {"window": 20, "false_alarms": 0.01, "change": 1.0, "gamma": 1.0, "nominal": {"p": 1.0}, "normal": 1},
+    "window": {"false_alarms": 0.1, "change": 2.0, "gamma": 1.0, "constants": {"a": "1 %"}, "initial_set": {"x1": 1.0}},
+    "paper": {"noise_bound": 3.0, "window": 5, "initial_set": {"x1": 1.0}},
+    "chi-square": {"noise_bound": 3.0, "disturbance_bounds": {"w": 1.0}, "initial_error": 1.0, "change": 1.0},
+    "cusum": {"noise_bound": 3.0, "disturbance_bounds": {"w": 1.0}, "gamma": 1.0, "normal": 1},
+    "learned": {"window": 5, "false_alarms": 0.1, "sample_time": 1.0, "scenario": obsynth.Scenario(horizon=3)},
+}
+
+
+@pytest.mark.parametrize("kind", IDLE)
+def test_options_of_another_kind_are_refused_by_name(kind, wang):
+    """Also where what is given is the default: whoever states it expects it to act."""
+    design, scenario = wang
+    own = {"normal": 1} if kind == "learned" else {}
+    for name, value in IDLE[kind].items():
+        with pytest.raises(obsynth.SpecError) as refused:
+            obsynth.online_monitor(design, kind, **own, **{name: value})
+        assert refused.value.path == name
+        assert "leave it out" in str(refused.value) or name == "nominal"
+        if kind != "learned" and name not in ("nominal", "normal"):
+            with pytest.raises(obsynth.SpecError, match=f"not for {kind}") as refused:
+                obsynth.monitor(design, scenario, kind, **{name: value})
+            assert refused.value.path == name

@@ -246,6 +246,8 @@ def test_monitors_go_with_their_designs(shifted, varying) -> None:
         obsynth.evaluate(shifted, obsynth.Scenario(horizon=5), runs=1, monitor=obsynth.monitor(linear, spec.scenario))
     with pytest.raises(SpecError, match="statistic"):
         obsynth.ParameterMonitor(statistic="nonsense")
+    with pytest.raises(obsynth.SpecError, match="change is for cusum, not for nis"):
+        obsynth.ParameterMonitor("nis", change=0.1)
 
 
 def test_benches_travel_to_other_processes(varying, nonlinear) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 from obsynth.cli.arguments import columns_of, refuse_given
 from obsynth.cli.output import output_file
 from obsynth.errors import SpecError
+from obsynth.experiments.monitors.options import LINEAR_OPTIONS, PARAMETER_OPTIONS
 from obsynth.files.inputs import protect, protect_stream
 
 if TYPE_CHECKING:
@@ -112,11 +113,13 @@ def own_tolerances(design: ObserverDesign, kind: str | None) -> Uncertainty | No
 
 
 def monitor_settings(design: ObserverDesign, options: argparse.Namespace) -> dict[str, Any]:
-    """Return what any monitor of a design is made of, by the names of the arguments of `obsynth.monitor`."""
+    """Return what the monitor of a design that is asked for is made of, by the names of the arguments of
+    `obsynth.monitor`."""
     from obsynth.observers.linear.observer import LinearObserver
 
-    refuse_other_kinds(options, LINEAR_SETTINGS if isinstance(design.observer, LinearObserver) else PARAMETER_SETTINGS)
-    return {
+    table = LINEAR_OPTIONS if isinstance(design.observer, LinearObserver) else PARAMETER_OPTIONS
+    refuse_other_kinds(options, table)
+    given = {
         "disturbance_bounds": numbers_of(options.disturbance),
         "noise_bound": options.noise_bound,
         "initial_error": options.initial_error,
@@ -125,44 +128,37 @@ def monitor_settings(design: ObserverDesign, options: argparse.Namespace) -> dic
         "change": options.change,
         "initial_set": ranges_of(options.initial) or None,
         "constants": own_tolerances(design, options.monitor),
-        "unverified": options.unverified,
     }
+    acting = table.get(options.monitor, ())
+    return {**{name: value for name, value in given.items() if name in acting}, "unverified": options.unverified}
 
 
-#: Settings that act, by kind of monitor: of linear designs, and of those that estimate parameters.
-LINEAR_SETTINGS: Mapping[str, tuple[str, ...]] = {
-    "pointwise": ("disturbance", "noise_bound", "initial_error", "initial"),
-    "window": ("disturbance", "noise_bound", "initial_error", "window"),
-    "paper": ("disturbance", "initial_error"),
-    "chi-square": ("disturbance", "window", "false_alarms"),
-    "cusum": ("disturbance", "window", "false_alarms", "change"),
-    "learned": ("normal",),
-}
-PARAMETER_SETTINGS: Mapping[str, tuple[str, ...]] = {
-    "chi-square": ("nominal", "false_alarms"),
-    "cusum": ("nominal", "false_alarms", "change"),
-    "glr": ("false_alarms",),
-    "nis": ("nominal", "false_alarms"),
-    "learned": ("normal",),
-}
+#: Arguments of the command line that are not called as the options that they give.
+_CALLED = {"disturbance_bounds": "disturbance", "initial_set": "initial"}
+#: Options that are no settings of monitors on the command line.
+_ELSEWHERE = ("scenario", "sample_time", "constants", "gamma")
+
+
+def _settings_of(names: Iterable[str]) -> list[str]:
+    """Return what options are called on the command line."""
+    return [_CALLED.get(name, name) for name in names if name not in _ELSEWHERE]
 
 
 def monitor_names() -> list[str]:
     """Return the names of all settings of monitors."""
-    return sorted(
-        {name for table in (LINEAR_SETTINGS, PARAMETER_SETTINGS) for names in table.values() for name in names}
-    )
+    tables = (LINEAR_OPTIONS, PARAMETER_OPTIONS)
+    return sorted({name for table in tables for names in table.values() for name in _settings_of(names)})
 
 
 def refuse_other_kinds(options: argparse.Namespace, table: Mapping[str, tuple[str, ...]]) -> None:
     """Refuse settings that do nothing for the kind of monitor that is asked for."""
-    used = table.get(options.monitor)
-    if used is None:
+    if options.monitor not in table:
         return  # who makes the monitor says which kinds there are
+    used = _settings_of(table[options.monitor])
     # The window of ``run --prove`` is that of the proof.
     proving = ("window",) if getattr(options, "prove", None) is not None else ()
     names = [name for name in monitor_names() if name not in (*used, *proving) and hasattr(options, name)]
-    kinds = {name: [kind for kind, own in table.items() if name in own] for name in names}
+    kinds = {name: [kind for kind, own in table.items() if name in _settings_of(own)] for name in names}
     for name, others in kinds.items():
         where = f"the monitor {' or '.join(others)}" if others else "designs of another kind"
         refuse_given(options, (name,), f"{where}, not for {options.monitor}")
@@ -177,10 +173,11 @@ def monitor_of(design: ObserverDesign, options: argparse.Namespace, *, has_scena
     from obsynth.data.online_monitor import online_monitor
     from obsynth.observers.linear.observer import LinearObserver
 
-    if not isinstance(design.observer, LinearObserver):
+    linear, scenario = isinstance(design.observer, LinearObserver), None
+    if not linear:
         refuse_given(options, ("sample_time", *(() if has_scenario else ("system",))), "monitors of linear designs")
-    scenario = None
-    if options.system is not None:
+    # Of other designs, and beside thresholds that were learned, a scenario is there for the pictures alone.
+    if options.system is not None and not (has_scenario and (not linear or options.monitor == "learned")):
         from obsynth.cli.commands import require_same_signals
         from obsynth.spec import load_spec
 

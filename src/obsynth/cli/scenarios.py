@@ -11,7 +11,6 @@ from obsynth.cli.arguments import columns_of, refuse_given
 from obsynth.cli.commands import designed_or_loaded, spec_output
 from obsynth.cli.data_commands import picture_kind, written_picture
 from obsynth.cli.data_run import (
-    PARAMETER_SETTINGS,
     monitor_names,
     monitor_settings,
     numbers_of,
@@ -21,6 +20,7 @@ from obsynth.cli.data_run import (
 from obsynth.cli.output import answer, output_file, progress, stdout_console
 from obsynth.cli.sweep import chosen_executor
 from obsynth.errors import PreconditionError, SpecError
+from obsynth.experiments.monitors.options import PARAMETER_OPTIONS
 from obsynth.files.inputs import protect
 from obsynth.files.outputs import FileKind, write_atomically
 from obsynth.results.certificate_files import RESULT_FILE
@@ -174,8 +174,9 @@ def _parameter_monitor(options: argparse.Namespace) -> ParameterMonitor:
     """Return the decision on parameters that is asked for."""
     from obsynth.observers.decisions import ParameterMonitor
 
-    refuse_other_kinds(options, PARAMETER_SETTINGS)
-    return ParameterMonitor(options.monitor, false_alarms=options.false_alarms, change=options.change)
+    refuse_other_kinds(options, {**PARAMETER_OPTIONS, "glr": ("false_alarms",)})
+    change = options.change if options.monitor == "cusum" else None
+    return ParameterMonitor(options.monitor, false_alarms=options.false_alarms, change=change)
 
 
 def _compared_delay(spec: Spec, options: argparse.Namespace) -> int:

@@ -22,6 +22,14 @@ from obsynth.experiments.monitors.adaptive_rule import AdaptiveRule
 from obsynth.experiments.monitors.guaranteed import data_monitor, is_guaranteed
 from obsynth.experiments.monitors.learned import LearnedThresholds, learned_monitor, load_thresholds
 from obsynth.experiments.monitors.monitor import KINDS, Monitor, Rule, statement_of
+from obsynth.experiments.monitors.options import (
+    CHANGE,
+    FALSE_ALARMS,
+    LINEAR_OPTIONS,
+    PARAMETER_OPTIONS,
+    WINDOW,
+    refuse_idle,
+)
 from obsynth.experiments.monitors.residual_model import ResidualModel, residual_model, watches_estimates
 from obsynth.experiments.monitors.residual_monitor import bounds_of, require_options
 from obsynth.experiments.monitors.rules import ANY_LENGTH, NormRule, WhitenedRule, parameter_monitor
@@ -53,9 +61,9 @@ def online_monitor(
     noise_bound: float | None = None,
     initial_error: float | None = None,
     gamma: float | None = None,
-    window: int = 20,
-    false_alarms: float = 0.01,
-    change: float = 1.0,
+    window: int | None = None,
+    false_alarms: float | None = None,
+    change: float | None = None,
     nominal: Mapping[str, float] | None = None,
     sample_time: float | None = None,
     constants: Any = None,
@@ -83,12 +91,13 @@ def online_monitor(
         Bound on the norm of the observer's error at the start, and after each gap; without one the bounds hold once it
         is forgotten.
     window : int, optional
-        Samples that ``window``, ``chi-square`` and ``cusum`` of linear designs look back.
+        Samples that ``window``, ``chi-square`` and ``cusum`` of linear designs look back; 20 by default.
     false_alarms : float, optional
-        For the statistical kinds: probability of a false alarm in a whole run, at most, however long it is.
+        For the statistical kinds: probability of a false alarm in a whole run, at most, however long it is; 0.01 by
+        default.
     change : float, optional
         For ``cusum``: shift it is tuned for, in standard deviations of the whitened residual (linear designs), or in
-        parameter units.
+        parameter units; 1 by default.
     nominal : mapping, optional
         Nominal value of parameters by name; those at the observer's start by default.
     sample_time : float, optional, seconds
@@ -117,7 +126,8 @@ def online_monitor(
     Raises
     ------
     SpecError
-        The kind does not go with the design, an option is out of range, or a signal has no bound or covariance.
+        The kind does not go with the design, an option is out of range or does nothing for this kind, or a signal has
+        no bound or covariance.
     PreconditionError
         No bound exists over the tolerances: the message says why.
     VerificationError
@@ -129,11 +139,22 @@ def online_monitor(
         require_kind(scenario, Scenario, "scenario", "an obsynth.Scenario")
     for name, given in (("disturbance_bounds", disturbance_bounds), ("nominal", nominal)):
         require_mapping(given, name)
+    recursive = isinstance(design.observer, (RecursiveObserver, DAEObserver))
+    refuse_idle(
+        PARAMETER_OPTIONS if recursive else LINEAR_OPTIONS,
+        kind,
+        {
+            "scenario": scenario, "disturbance_bounds": disturbance_bounds, "noise_bound": noise_bound,
+            "initial_error": initial_error, "gamma": gamma, "window": window, "false_alarms": false_alarms,
+            "change": change, "sample_time": sample_time, "constants": constants, "initial_set": initial_set,
+            "normal": normal,
+        },
+    )  # fmt: skip
+    window, false_alarms = WINDOW if window is None else window, FALSE_ALARMS if false_alarms is None else false_alarms
+    change = CHANGE if change is None else change
     require_options(noise_bound, initial_error, gamma, window, false_alarms, change, 0)
     if kind == "learned":
         return _learned(design, normal)
-    if normal is not None:
-        raise SpecError(f"normal is for the monitor 'learned', not for {kind!r}.", path="normal")
     if isinstance(design.observer, (RecursiveObserver, DAEObserver)):
         return parameter_monitor(design.observer, kind, nominal or {}, change, false_alarms)
     _require_linear_kind(kind, nominal)
@@ -148,7 +169,7 @@ def online_monitor(
             constants=constants,
             initial_set=initial_set,
         )
-    design, adaptive = tolerances_of(design, kind, constants, initial_set, initial_error)
+    design, adaptive = tolerances_of(design, constants, initial_set, initial_error)
     estimates = watches_estimates(design) and kind in ("pointwise", "window")
     model, dt = _endless_model(design, scenario, window, sample_time, estimates=estimates)
     _require_noise(model, noise_bound)

@@ -143,21 +143,23 @@ class ParameterMonitor:
     false_alarms : float, optional, dimensionless
         Probability of a false alarm in a whole run.
     change : float or tuple of float, optional
-        Change that ``cusum`` is tuned for, in parameter units.
+        Change that ``cusum`` is tuned for, in parameter units; 0.1 by default.
 
     Raises
     ------
     SpecError
-        The statistic is unknown.
+        The statistic is unknown, or a change is given for another one than ``cusum``.
     """
 
     statistic: str = "chi-square"
     nominal: tuple[float, ...] | None = None
     false_alarms: float = 0.01
-    change: float | tuple[float, ...] = 0.1
+    change: float | tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
         chosen(self.statistic, "statistic", STATISTICS)
+        if self.change is not None and self.statistic != "cusum":
+            raise SpecError(f"change is for cusum, not for {self.statistic}: leave it out.", path="change")
 
     def watch(self, observer: RecursiveObserver | DAEObserver, estimates: Estimates) -> Decision:
         """Return the decision on one run.
@@ -174,7 +176,7 @@ class ParameterMonitor:
         SpecError
             As for `obsynth.decide`.
         """
-        return decide(observer, estimates, **vars(self))
+        return decide(observer, estimates, **{name: value for name, value in vars(self).items() if value is not None})
 
 
 def _chi_square(

@@ -395,18 +395,15 @@ def adaptive_statement(plan: AdaptivePlan, assumed: Assumptions) -> str:
 
 def tolerances_of(
     design: ObserverDesign,
-    kind: str,
     constants: Any,
     initial_set: Mapping[str, Any] | None,
     initial_error: float | None,
 ) -> tuple[ObserverDesign, bool]:
     """Return the design with the tolerances asked for, and whether its threshold adapts to the signals."""
-    asked = [name for name, given in (("constants", constants), ("initial_set", initial_set)) if given is not None]
-    if asked and kind != "pointwise":
-        raise SpecError(f"{asked[0]} is for the pointwise monitor.", path=asked[0])
+    asked = constants is not None or initial_set is not None
     if initial_set is not None and initial_error is not None:
         raise SpecError("Give initial_set or initial_error, not both.", path="initial_set")
-    return with_tolerances(design, constants)[0], bool(asked)
+    return with_tolerances(design, constants)[0], asked
 
 
 def noisy_design(design: ObserverDesign, scenario: Scenario | None) -> ObserverDesign:

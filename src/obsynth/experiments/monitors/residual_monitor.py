@@ -19,6 +19,7 @@ from obsynth.experiments.monitors.adaptive_monitor import (
 )
 from obsynth.experiments.monitors.guaranteed import is_guaranteed, record_monitor
 from obsynth.experiments.monitors.monitor import KINDS, Monitor, Rule, statement_of
+from obsynth.experiments.monitors.options import CHANGE, FALSE_ALARMS, LINEAR_OPTIONS, WINDOW, refuse_idle
 from obsynth.experiments.monitors.residual_model import ResidualModel, residual_model, watches_estimates
 from obsynth.experiments.monitors.rules import NormRule, WhitenedRule
 from obsynth.experiments.monitors.thresholds import (
@@ -48,9 +49,9 @@ def monitor(
     noise_bound: float | None = None,
     initial_error: float | None = None,
     gamma: float | None = None,
-    window: int = 20,
-    false_alarms: float = 0.01,
-    change: float = 1.0,
+    window: int | None = None,
+    false_alarms: float | None = None,
+    change: float | None = None,
     isolation_delay: int = 0,
     constants: Any = None,
     initial_set: Mapping[str, Any] | None = None,
@@ -80,11 +81,11 @@ def monitor(
     gamma : float, optional
         For ``paper``: l2 gain from the disturbances to the residual; computed by default.
     window : int, optional
-        Samples that ``window``, ``chi-square`` and ``cusum`` look back.
+        Samples that ``window``, ``chi-square`` and ``cusum`` look back; 20 by default.
     false_alarms : float, optional
-        For ``chi-square`` and ``cusum``: probability of a false alarm in a whole run, at most.
+        For ``chi-square`` and ``cusum``: probability of a false alarm in a whole run, at most; 0.01 by default.
     change : float, optional
-        For ``cusum``: shift it is tuned for, in standard deviations of the whitened residual.
+        For ``cusum``: shift it is tuned for, in standard deviations of the whitened residual; 1 by default.
     isolation_delay : int, optional
         Samples from an alarm to the comparison of the fault estimates, where these answer later than the residual.
     constants, initial_set : mapping, optional
@@ -102,8 +103,8 @@ def monitor(
     Raises
     ------
     SpecError
-        A recursive design, an option out of range, a signal without a bound (or without a covariance), or a record that
-        is too short; the paper's threshold for a continuous design.
+        A recursive design, an option out of range or one that does nothing for this kind, a signal without a bound (or
+        without a covariance), or a record that is too short; the paper's threshold for a continuous design.
     VerificationError
         The report of the design fails.
 
@@ -122,6 +123,17 @@ def monitor(
     require_mapping(disturbance_bounds, "disturbance_bounds")
     if kind not in KINDS:
         raise SpecError(f"kind is {kind!r}: use one of {', '.join(KINDS)}.", path="kind")
+    refuse_idle(
+        LINEAR_OPTIONS,
+        kind,
+        {
+            "disturbance_bounds": disturbance_bounds, "noise_bound": noise_bound, "initial_error": initial_error,
+            "gamma": gamma, "window": window, "false_alarms": false_alarms, "change": change, "constants": constants,
+            "initial_set": initial_set,
+        },
+    )  # fmt: skip
+    window, false_alarms = WINDOW if window is None else window, FALSE_ALARMS if false_alarms is None else false_alarms
+    change = CHANGE if change is None else change
     require_options(noise_bound, initial_error, gamma, window, false_alarms, change, isolation_delay)
     if is_guaranteed(design):
         return record_monitor(
@@ -135,7 +147,7 @@ def monitor(
             constants=constants,
             initial_set=initial_set,
         )
-    design, adaptive = tolerances_of(design, kind, constants, initial_set, initial_error)
+    design, adaptive = tolerances_of(design, constants, initial_set, initial_error)
     estimates = watches_estimates(design) and kind in ("pointwise", "window")
     model = residual_model(design, scenario, estimates=estimates)
     start = 0.0 if adaptive else model.initial_error
