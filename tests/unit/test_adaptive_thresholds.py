@@ -183,7 +183,7 @@ def test_refusals_name_their_reason() -> None:
         obsynth.online_monitor(design, noise_bound=1.0, disturbance_bounds={"load": 0.1}, initial_set={"x9": 1.0})
     with pytest.raises(SpecError, match="stands in no matrix"):
         obsynth.online_monitor(design, constants={"spring": (1.0, 2.0)}, disturbance_bounds={"load": 0.1})
-    with pytest.raises(SpecError, match="is for the pointwise"):
+    with pytest.raises(SpecError, match="is for the monitor pointwise, not for window"):
         obsynth.online_monitor(design, "window", constants={"k": "1 %"})
     loud = obsynth.online_monitor(
         design, noise_bound=1.0, disturbance_bounds={"load": 0.1}, constants={name: "30 %" for name in ("J2", "k")}

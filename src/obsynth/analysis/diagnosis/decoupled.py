@@ -12,7 +12,8 @@ from obsynth.analysis.transformations.recovery import Transformation, linear_pla
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import ComplexArray, FloatArray, read_only
 from obsynth.numerics.libraries import on_one_thread_if_small
-from obsynth.numerics.ranks import CLEAR_GAP, RankDecision, product_but_rounding
+from obsynth.numerics.pencil_points import full_svd
+from obsynth.numerics.ranks import CLEAR_GAP, RankDecision, product_but_rounding, rank_from
 from obsynth.plants.descriptor import DescriptorSystem
 
 #: Entries of unit rows below this are rounding of the orthogonal transformations that made them.
@@ -188,7 +189,10 @@ def decoupled(plant: DescriptorSystem, removed: Sequence[int], kept: Sequence[in
         units.rows[:, None] * pencil_e * units.columns * units.time, units.rows[:, None] * pencil_a * units.columns
     )
     # Rows of the orthogonal reduction have unit length: what is below rounding is nothing.
-    rows = np.where(np.abs(found.left) > ROTATION_ROUNDING, found.left, 0.0) * units.rows
+    rows = np.where(np.abs(found.left) > ROTATION_ROUNDING, found.left, 0.0)
+    moving = units.rows[:nx, None] * plant.E * units.columns[:nx]
+    rows[found.order :, :nx] = _without_dynamics(rows[found.order :, :nx], moving)
+    rows = rows * units.rows
     faults = np.vstack([plant.Bf, plant.Df])[:, list(kept)]
     signals = np.block([[plant.B, np.zeros((nx, ny))], [plant.D, -np.eye(ny)]])
     sizes = np.linalg.norm(units.rows[:, None] * signals, axis=0)
@@ -222,6 +226,19 @@ def decoupled(plant: DescriptorSystem, removed: Sequence[int], kept: Sequence[in
         time=units.time,
         decisions=found.decisions,
     )
+
+
+def _without_dynamics(rows: FloatArray, e: FloatArray) -> FloatArray:
+    """Return combinations of equations that hold no derivative, ``rows E = 0``, without what rounding put into them.
+
+    Nothing at all is left of them where E is regular: a reduction of many steps leaves more than the rounding of one.
+    """
+    left, values, _ = full_svd(e)
+    rank = rank_from(values, expected=len(e)).rank
+    if rank == len(e):
+        return np.zeros_like(rows)
+    span = left[:, :rank]
+    return np.asarray(rows - (rows @ span) @ span.T)
 
 
 def _told(matrix: FloatArray) -> FloatArray:
