@@ -19,8 +19,13 @@ from obsynth.experiments.monitors.adaptive_record import thresholds_of_records
 COMPILER = shutil.which("cc") or shutil.which("gcc")
 
 
+def uneven() -> obsynth.DescriptorSystem:
+    """Return the drive with a stiffness that is nearer to one end of its range: the middle is not nominal."""
+    return obsynth.uncertain_system(drive(), {"k": {"range": [18.0, 24.0]}})
+
+
 @pytest.mark.skipif(COMPILER is None, reason="no C compiler")
-@pytest.mark.parametrize("make", [drive, wang])
+@pytest.mark.parametrize("make", [drive, wang, uneven])
 def test_c_gives_the_thresholds_of_python(tmp_path: Path, make) -> None:
     plant = make()
     design = obsynth.fault_estimation_filter(plant)

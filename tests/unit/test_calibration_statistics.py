@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from obsynth.calibration import noise_proposals
 from obsynth.calibration.diagnostics import (
     change_of_mean,
     consistency,
@@ -150,6 +151,22 @@ def test_correlations_are_sought_between_a_third_of_a_sample_and_the_length_of_t
     found = PlantWithNoise(inner, NoiseStates({"y": None}), log)
     assert found.bounds["correlation of y"] == pytest.approx((math.log(0.03), math.log(40.0)))
     assert found.values["correlation of y"] == pytest.approx(math.log(1.0))
+
+
+@pytest.mark.parametrize(("nats", "taken"), [(8.5, False), (9.5, True)])
+def test_a_state_for_coloured_noise_pays_for_two_numbers(monkeypatch, nats: float, taken: bool) -> None:
+    """Log(400) = 5.99 for both numbers together, and three nats that no explanation is below."""
+    known = SimpleNamespace(best=lambda problem: (100.0 - nats, known))
+    monkeypatch.setattr(noise_proposals, "_asking", lambda problem, fit: {("coloured", "y")})
+    monkeypatch.setattr(noise_proposals, "_like", lambda problem, new: new)
+    monkeypatch.setattr(noise_proposals, "_Known", SimpleNamespace(of=lambda problem, fit: known))
+    problem = SimpleNamespace(
+        output_names=("y",), plant=SimpleNamespace(unknown_inputs=()), log=SimpleNamespace(samples=400)
+    )
+    found, told = noise_proposals.proposed_states(
+        problem, SimpleNamespace(value=100.0), NoiseStates(), ("coloured",), lambda states: problem, lambda text: None
+    )
+    assert bool(found) == taken == bool(told)
 
 
 FILE = {

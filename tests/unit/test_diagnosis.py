@@ -9,8 +9,10 @@ import pytest
 from networks import random_network
 
 import obsynth
-from obsynth.analysis.diagnosis.decoupled import decoupled
+from obsynth.analysis.diagnosis.decoupled import decoupled, unknowns_pencil
 from obsynth.analysis.diagnosis.exact import Questions, question
+from obsynth.analysis.diagnosis.explanations import hidden_motion
+from obsynth.analysis.diagnosis.reduction import PencilUnits
 
 CASES = Path(__file__).parents[1] / "data" / "cases"
 
@@ -263,6 +265,8 @@ def test_what_holds_no_derivative_holds_none_to_the_last_digit() -> None:
     assert np.array_equal(plant.E, np.eye(plant.nx))
     assert len(found.C) == 26
     assert not found.rows[found.order :, : plant.nx].any()
+    left = found.rows / PencilUnits.of(*unknowns_pencil(plant, [1])).rows
+    assert np.all((left == 0.0) | (np.abs(left) > 1e-14))
     # Equations without derivatives stay where there are some: 0 = x1 + x2 - x3 is told by three sensors.
     given = obsynth.DescriptorSystem(
         np.diag([1.0, 2.0, 0.0]), [[0.5, 0.1, 0.0], [0.2, 0.3, 0.1], [1.0, 1.0, -1.0]], C=np.eye(3),
@@ -274,3 +278,13 @@ def test_what_holds_no_derivative_holds_none_to_the_last_digit() -> None:
     assert np.abs(own @ given.E).max() < 1e-15
     whole = own @ given.A + found.rows[found.order :, 3:] @ given.C
     assert whole == pytest.approx(found.C @ found.states, abs=1e-14)
+
+
+def test_no_motion_is_told_that_hides_nothing() -> None:
+    """x+ = 0.5 x + f + d: y = x shows the fault wherever d is absent, and d = -1 hides it, whatever its course is."""
+    given = {"A": [[0.5]], "C": [[1.0]], "Bf": [[1.0]], "dt": 1.0, "state_names": ["x"], "fault_names": ["f"]}
+    shown = obsynth.DescriptorSystem(None, **given)
+    hidden = obsynth.DescriptorSystem(None, **given, Bd=[[1.0]], disturbance_names=["d"])
+    for point in (1.0 + 0.0j, 2.0 + 0.0j):
+        assert hidden_motion(shown, 0, point, []) is None
+        assert hidden_motion(hidden, 0, point, []).values == {"d": pytest.approx(-1.0)}
