@@ -1,13 +1,13 @@
 """A calibrated design against an extended Kalman filter with walking faults, as a user writes it in 30 lines.
 
-    python benchmarks/against_ekf.py [--logs 6]
+    python benchmarks/against_ekf.py [--logs 6] [--seed 1000] [--plant servo]
 
 Three plants: an air-handling unit, a buck converter, a hydraulic servo.  Each is simulated independently
 (fourth-order steps, 20 in a sample), with constants 3 % off, noise of one sensor that is AR(.9), outliers in one row of
 200, blanks in one of 100.  Both filters get the spec's constants and the deviations of the sensors; each gets the walk
-of the faults that suits it best on one faulty log.  Ours then calibrates constants and noise on a normal log
-(`calibrate`, `with_noise`).  Both raise an alarm where a fault's estimate passes 1.3 times the largest of that log,
-from row 50 on.
+of the faults that suits it best on one faulty log.  Ours calibrates constants and noise on a normal log of 400 rows
+(`calibrate`, `with_noise`).  Both learn alarms from 4,000 other normal rows, at one false alarm in 3,500 rows: ours
+by `learn_thresholds`, the other one as the largest estimate of each fault there.
 """
 
 from __future__ import annotations
@@ -17,10 +17,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import pandas as pd
 
 import obsynth as ob
 
-ROWS, START, FAULT_AT, MARGIN, MISMATCH = 400, 50, 250, 1.3, 0.03
+ROWS, START, FAULT_AT, MISMATCH = 400, 50, 250, 0.03
+NORMAL_ROWS, EVERY = 4000, 3500
 #: Faults walk by their size over one of these in a row.
 WALKS = (10.0, 30.0, 100.0)
 
@@ -48,7 +50,7 @@ class Plant:
 
 def held(rng: np.random.Generator, low: float, high: float, rows: int) -> np.ndarray:
     """Return a signal that stays for a number of rows."""
-    return np.repeat(rng.uniform(low, high, ROWS // rows + 1), rows)[:ROWS]
+    return np.repeat(rng.uniform(low, high, NORMAL_ROWS // rows + 1), rows)[:NORMAL_ROWS]
 
 
 def air() -> Plant:
@@ -117,15 +119,17 @@ def servo() -> Plant:
 PLANTS = {"air handling": air, "buck": buck, "servo": servo}
 
 
-def simulated(plant: Plant, seed: int, faults: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def simulated(
+    plant: Plant, seed: int, faults: tuple[float, ...], rows: int = ROWS
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return inputs, outputs with all their flaws, and the faults of each row."""
     rng = np.random.default_rng(seed)
     off = np.random.default_rng(7)
     true = {name: value * (1 + MISMATCH * off.choice([-1, 1])) for name, value in plant.constants.items()}
-    u, f = plant.inputs(rng), np.zeros((ROWS, len(plant.sizes)))
+    u, f = plant.inputs(rng)[:rows], np.zeros((rows, len(plant.sizes)))
     f[FAULT_AT:] = faults
     x, y, e = plant.model.nominal_state.copy(), [], rng.standard_normal()
-    for k in range(ROWS):
+    for k in range(rows):
         for _ in range(20 if k else 0):
             h = plant.dt / 20
             a = plant.rates(x, u[k], f[k], true)
@@ -182,78 +186,113 @@ def users_filter(plant: Plant, u: np.ndarray, y: np.ndarray, walk: np.ndarray) -
     return np.array(found)
 
 
-def ours(plant: Plant, normal: tuple[np.ndarray, np.ndarray]) -> Callable[..., np.ndarray]:
-    """Return the calibrated observer as a function from inputs, outputs and walks to the faults' estimates."""
-    u, y = normal
-    model, names = plant.model, plant.model.output_names
-    log = {"time": plant.dt * np.arange(ROWS), **dict(zip(model.input_names, u.T, strict=True)),
-           **dict(zip(names, y.T, strict=True))}  # fmt: skip
-    bounds = {name: (0.8 * plant.constants[name], 1.25 * plant.constants[name]) for name in plant.unknown}
-    found = ob.calibrate(model, log, bounds, input_delay=0, starts=1, noisy=plant.noisy)
-    print(found, flush=True)
-    known = model.replace(constants={**model.constants, **found.nominal})
-    made = ob.with_noise(known, sensor_noise=found.sensor_noise, offset=found.offset)[0]
+def log_of(plant: Plant, u: np.ndarray, y: np.ndarray) -> pd.DataFrame:
+    """Return inputs and outputs as a log."""
+    names = [*plant.model.input_names, *plant.model.output_names]
+    return pd.DataFrame(np.column_stack([plant.dt * np.arange(len(y)), u, y]), columns=["time", *names])
 
-    def run(u, y, walk):
-        design = ob.dae_adaptive_observer(
+
+class Users:
+    """The user's filter with a walk, and levels that are the largest estimates of a normal log."""
+
+    def __init__(self, plant: Plant, walk: np.ndarray) -> None:
+        self.plant, self.walk, self.levels = plant, walk, np.full(len(walk), np.inf)
+
+    def learn(self, u: np.ndarray, y: np.ndarray) -> None:
+        """Take the levels from normal rows."""
+        self.levels = np.abs(users_filter(self.plant, u, y, self.walk))[START:].max(axis=0)
+
+    def run(self, u: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return estimates ``(n, nq)`` and alarms ``(n,)``."""
+        found = users_filter(self.plant, u, y, self.walk)
+        return found, (np.abs(found) > self.levels).any(axis=1)
+
+
+class Ours:
+    """A calibrated design with a walk, and learned thresholds."""
+
+    def __init__(self, plant: Plant, walk: np.ndarray, found: ob.types.Calibration) -> None:
+        model = plant.model
+        known = model.replace(constants={**model.constants, **found.nominal})
+        made = ob.with_noise(known, sensor_noise=found.sensor_noise, offset=found.offset)[0]
+        self.plant, self.monitor = plant, None
+        self.design = ob.dae_adaptive_observer(
             made, dt=plant.dt, Q=found.Q, R=found.R, integration=found.integration, form="augmented-kalman",
             random_walk=np.diag(walk), initial_covariance=dict(found.initial_covariance), outliers="gate",
+            outlier_limit=found.outlier_limit,
             initial_parameter_covariance=np.diag(np.array(plant.sizes) ** 2 / 100),
         )  # fmt: skip
-        return np.array(design.observer.run(y, u).parameters)
 
-    return run
+    def learn(self, u: np.ndarray, y: np.ndarray) -> None:
+        """Learn thresholds from normal rows."""
+        learned = ob.learn_thresholds(
+            self.design, log_of(self.plant, u, y), rows=f"{START}:", false_alarms=f"1 per {EVERY} rows"
+        )
+        print(learned.statement, flush=True)
+        self.monitor = ob.online_monitor(self.design, "learned", normal=learned)
+
+    def run(self, u: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return estimates ``(n, nq)`` and alarms ``(n,)``."""
+        table = ob.run_on_data(self.design, log_of(self.plant, u, y), monitor=self.monitor).table
+        found = table[[f"fhat[{name}]" for name in self.plant.model.parameter_names]].to_numpy()
+        return found, np.zeros(len(y), dtype=bool) if self.monitor is None else (table["alarm"] != "").to_numpy()
 
 
-def alarms(estimates: np.ndarray, levels: np.ndarray) -> tuple[bool, int]:
-    """Return whether there was an alarm before the fault, and rows from the fault to the first alarm."""
-    over = (np.abs(estimates) > levels).any(axis=1)
-    later = np.flatnonzero(over[FAULT_AT:])
-    return bool(over[START:FAULT_AT].any()), int(later[0]) if len(later) else ROWS - FAULT_AT
+def calibrated(plant: Plant, u: np.ndarray, y: np.ndarray) -> ob.types.Calibration:
+    """Return what a normal log says of the plant."""
+    bounds = {name: (0.8 * plant.constants[name], 1.25 * plant.constants[name]) for name in plant.unknown}
+    found = ob.calibrate(plant.model, log_of(plant, u, y), bounds, input_delay=0, starts=1, noisy=plant.noisy)
+    print(found, flush=True)
+    return found
 
 
-def suited(plant: Plant, run: Callable[..., np.ndarray]) -> Callable[..., np.ndarray]:
+def suited(plant: Plant, made: Callable[[np.ndarray], Users | Ours], seed: int) -> Users | Ours:
     """Return a filter with the walk of the faults that suits it best on one faulty log."""
-    u, y, f = simulated(plant, 50, plant.sizes)
-    walks = [(np.array(plant.sizes) / part) ** 2 for part in WALKS]
-    costs = [np.mean(((run(u, y, walk) - f)[START:] / plant.sizes) ** 2) for walk in walks]
-    best = walks[int(np.argmin(costs))]
-    return lambda u, y: run(u, y, best)
+    u, y, f = simulated(plant, seed, plant.sizes)
+    filters = [made((np.array(plant.sizes) / part) ** 2) for part in WALKS]
+    costs = [np.mean(((one.run(u, y)[0] - f)[START:] / plant.sizes) ** 2) for one in filters]
+    return filters[int(np.argmin(costs))]
+
+
+def compared(plant: Plant, name: str, seed: int, logs: int) -> list[str]:
+    """Return a row of the table for each fault; ``seed``: of the first log."""
+    normal = (0.0,) * len(plant.sizes)
+    found = calibrated(plant, *simulated(plant, seed, normal)[:2])
+    filters = [suited(plant, lambda walk: Ours(plant, walk, found), seed + 1),
+               suited(plant, lambda walk: Users(plant, walk), seed + 1)]  # fmt: skip
+    u, y, _ = simulated(plant, seed + 2, normal, NORMAL_ROWS)
+    for one in filters:
+        one.learn(u, y)
+    quiet = [0, 0]
+    for k in range(2 * logs):
+        u, y, _ = simulated(plant, seed + 100 + k, normal)
+        for i, one in enumerate(filters):
+            quiet[i] += not one.run(u, y)[1][START:].any()
+    rows = []
+    for j, fault in enumerate(plant.model.parameter_names):
+        squares, delays = np.zeros((2, logs)), np.zeros((2, logs))
+        for k in range(logs):
+            u, y, f = simulated(plant, seed + 200 + k, tuple(s * (i == j) for i, s in enumerate(plant.sizes)))
+            for i, one in enumerate(filters):
+                estimates, alarm = one.run(u, y)
+                squares[i, k] = np.mean((estimates - f)[START:, j] ** 2)
+                later = np.flatnonzero(alarm[FAULT_AT:])
+                delays[i, k] = later[0] if len(later) else ROWS - FAULT_AT
+        cells = [f"{value:.3g}" for value in (*np.sqrt(squares.mean(axis=1)), *delays.mean(axis=1))]
+        rows.append(f"| {name}, {fault} | {' | '.join(cells)} | {quiet[0]} of {2 * logs} | {quiet[1]} of {2 * logs} |")
+        print(rows[-1], flush=True)
+    return rows
 
 
 def main() -> None:
     """Print a row for each plant and fault."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--logs", type=int, default=6)
+    parser.add_argument("--seed", type=int, default=1000)
     parser.add_argument("--plant", choices=list(PLANTS), help="one of them (default: all)")
     options = parser.parse_args()
-    rows = []
-    for name in [options.plant] if options.plant else PLANTS:
-        plant = PLANTS[name]()
-        u, y, _ = simulated(plant, 0, (0.0,) * len(plant.sizes))
-        made = {"ours": ours(plant, (u, y)), "30 lines": lambda u, y, walk, p=plant: users_filter(p, u, y, walk)}
-        filters = {kind: suited(plant, run) for kind, run in made.items()}
-        levels = {kind: MARGIN * np.abs(run(u, y))[START:].max(axis=0) for kind, run in filters.items()}
-        quiet = {kind: 0 for kind in filters}
-        for seed in range(100, 100 + options.logs):
-            u, y, _ = simulated(plant, seed, (0.0,) * len(plant.sizes))
-            for kind, run in filters.items():
-                quiet[kind] += not (np.abs(run(u, y))[START:] > levels[kind]).any()
-        for i, fault in enumerate(plant.model.parameter_names):
-            told = {kind: ([], []) for kind in filters}
-            for seed in range(options.logs):
-                faults = tuple(size if j == i else 0.0 for j, size in enumerate(plant.sizes))
-                u, y, f = simulated(plant, seed + 1, faults)
-                for kind, run in filters.items():
-                    found = run(u, y)
-                    told[kind][0].append(np.mean((found - f)[START:, i] ** 2))
-                    told[kind][1].append(alarms(found, levels[kind])[1])
-            rms = {kind: float(np.sqrt(np.mean(part[0]))) for kind, part in told.items()}
-            delay = {kind: float(np.mean(part[1])) for kind, part in told.items()}
-            cells = [f"{part[kind]:.3g}" for part in (rms, delay) for kind in filters]
-            cells += [f"{quiet[kind]} of {options.logs}" for kind in filters]
-            rows.append(f"| {name}, {fault} | {' | '.join(cells)} |")
-            print(rows[-1], flush=True)
+    names = [options.plant] if options.plant else list(PLANTS)
+    rows = [row for name in names for row in compared(PLANTS[name](), name, options.seed, options.logs)]
     print(
         "| plant, fault | rms: ours | 30 lines | delay in rows: ours | 30 lines | normal logs quiet: ours | 30 lines |"
     )

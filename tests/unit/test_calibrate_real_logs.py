@@ -87,6 +87,9 @@ def test_a_sample_that_stands_out_is_named() -> None:
 
     found = calibrate(circuit(), circuit_log(vm=wrong), WIDE)
     assert said(found, "Samples of vm stand out by more than 6 deviations (row 77)")
+    # The gate of a design stands between the samples that are none and this one.
+    assert found.outlier_limit is not None
+    assert 6.0 < found.outlier_limit <= 12.0
 
 
 def test_a_sensor_of_another_sign_and_one_with_a_bias_are_named() -> None:

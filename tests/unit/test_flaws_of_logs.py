@@ -72,6 +72,34 @@ def test_a_state_of_a_filter_without_states_goes_on_as_if_it_had_not_been_saved(
     pd.testing.assert_frame_equal(whole, pd.concat([first, second], ignore_index=True))
 
 
+@pytest.mark.parametrize("method", METHODS[1:])
+@pytest.mark.parametrize("blank", [["a"], ["b"], ["a", "b"]])
+def test_what_is_measured_is_taken_beside_blank_cells_and_rows_decide_again_within_noise(
+    method: str, blank: list[str]
+) -> None:
+    plant, x, found = heated(), np.zeros(2), []
+    for k in range(160):
+        # A disturbance that the model of the plant does not know of while it stands in.
+        found.append([k * DT, math.sin(k / 9.0), *(plant.C @ x)])
+        x = plant.A @ x + plant.B @ [math.sin(k / 9.0)] + plant.Bf @ [0.5] + plant.Bd @ [0.3]
+    data = pd.DataFrame(found, columns=["time", "u", "a", "b"])
+    clean = obsynth.run_on_data(designed(method), data).table
+    data.loc[100:104, blank] = np.nan
+    holed = obsynth.run_on_data(designed(method), data).table
+    assert clean is not None
+    assert holed is not None
+    assert (holed.status == "gap").sum() == 5
+    after = holed.index > 104
+    # Before, every one of these rows was blind for a whole warm-up, of 32 and 50 rows.
+    assert (holed.status[after] == "recovering").sum() <= 25
+    away = np.abs(holed["fhat[f]"] - clean["fhat[f]"])
+    observer = designed(method).linear[1]
+    rng = np.random.default_rng(0)
+    noise = observer.run(0.01 * rng.standard_normal((4000, 2)), np.zeros((4000, 1))).faults[100:].std()
+    # What a gap leaves where rows decide again is below what the stated noise of 0.01 makes of the estimate.
+    assert away[after & (holed.status == "ok")].max() <= noise
+
+
 @functools.cache
 def drive() -> obsynth.ObserverDesign:
     spec = obsynth.load_spec("designs/drive/spec.yaml")

@@ -140,3 +140,70 @@ def test_what_makes_no_sense_is_refused(tmp_path: Path, monkeypatch: Any, capsys
     log(0).to_csv("log.csv", index=False)
     assert main(["run", "--gains", "gains.json", "--data", "log.csv", "--input-delay", "auto", "--out", "o.csv"]) == 2
     assert "calibrate" in capsys.readouterr().err
+
+
+CALIBRATED = """
+schema_version: 1
+name: tank
+plant:
+  kind: dae
+  states: {h: 1.0}
+  inputs: {u: 0.5}
+  parameters: {loss: 0.0}
+  constants: {c: 0.5}
+  equations:
+    balance: der(h) = u * (1 - loss) - c * h
+  outputs: {level: h}
+  sensor_noise: {level: 0.01}
+  LINEAR
+calibrate: {unknown: {c: [0.3, 0.9]}, log: log.csv, starts: 1, integration: radau, offset: {}}
+method: METHOD
+inputs: {delay: 0}
+"""
+
+
+def tank_log(path: Path, seed: int, *, delay: int, loss: float = 0.0, rows: int = 200) -> None:
+    """Write a log whose inputs act during the step that ends ``delay`` rows later, the loss from row 100 on."""
+    rng, h, found = np.random.default_rng(seed), 1.0, []
+    u = np.repeat(rng.uniform(0.3, 0.7, rows), 6)
+    for k in range(rows):
+        flow = u[20 + k - delay] * (1.0 - loss * (k >= 100))
+        # The exact solution of a step of half a second with c = 0.55.
+        h = flow / 0.55 + (h - flow / 0.55) * np.exp(-0.55 * 0.5) if k else h
+        found.append([0.5 * k, u[20 + k], h + 0.01 * rng.standard_normal()])
+    pd.DataFrame(found, columns=["time", "u", "level"]).to_csv(path, index=False)
+
+
+def test_a_delay_that_calibrate_finds_is_taken_by_every_command(tmp_path: Path, monkeypatch: Any) -> None:
+    monkeypatch.chdir(tmp_path)
+    method = (
+        "{id: dae-adaptive-observer, options: {dt: 0.5, Q: {balance: 1.0e-6}, R: {level: 1.0e-4}, "
+        "random_walk: {loss: 1.0e-7}, initial_parameter_covariance: {loss: 1.0e-5}}}"
+    )
+    Path("spec.yaml").write_text(CALIBRATED.replace("METHOD", method).replace("LINEAR", ""))
+    tank_log(Path("log.csv"), 0, delay=2)
+    tank_log(Path("normal.csv"), 3, delay=2)
+    tank_log(Path("faulty.csv"), 2, delay=2, loss=0.05)
+    # What the command line asks for, and what is found, takes the place of what the spec said.
+    calibrate = ["calibrate", "--system", "spec.yaml", "--write-spec", "found.yaml", "--input-delay", "auto"]
+    assert main([*calibrate, "--quiet"]) == 0
+    assert obsynth.load_spec("found.yaml").inputs == {"hold": "ends", "delay": 2}
+    assert main(["design", "--system", "found.yaml", "--output", "gains.json", "--quiet"]) == 0
+    assert obsynth.load("gains.json").input_delay == 2
+    assert main(["validate", "--gains", "gains.json", "--data", "normal.csv", "--quiet"]) == 0
+    assert main(["validate", "--gains", "gains.json", "--data", "normal.csv", "--input-delay", "0", "--quiet"]) == 6
+    assert main(["run", "--gains", "gains.json", "--data", "faulty.csv", "--out", "out.csv", "--quiet"]) == 0
+    loss = pd.read_csv("out.csv")["fhat[loss]"]
+    assert loss[180:].mean() == pytest.approx(0.05, abs=0.01)
+    assert loss[50:100].mean() == pytest.approx(0.0, abs=0.01)
+
+
+def test_a_delay_without_a_word_is_by_the_convention_of_the_plant_that_is_designed_for(tmp_path: Path) -> None:
+    linear = "transform: {linearise: {faults: [loss]}, sample_time: 0.5}"
+    text = CALIBRATED.replace("METHOD", "{id: fault-estimation-filter}").replace("LINEAR", linear)
+    for inputs, designed, written in (("{delay: 1}", 1, 2), ("{hold: ends, delay: 2}", 1, 2), ("{hold: begins}", 0, 1)):
+        (tmp_path / "spec.yaml").write_text(text.replace("inputs: {delay: 0}", f"inputs: {inputs}"))
+        spec = obsynth.load_spec(tmp_path / "spec.yaml")
+        # Both say the same of the log: a step that begins with a row ends with the next one.
+        assert spec.input_delay(spec.plant) == designed
+        assert spec.input_delay(spec.model) == written

@@ -429,8 +429,8 @@ def calibrate(
         Seconds between rows; the median of the stamps by default.
     input_delay : int or "auto", optional
         Rows by which the log's inputs act later than the convention says: ``u(k)`` during the step that ends at k, of
-        linear plants during the one that begins there.  ``"auto"`` takes 1 where the likelihood is clearly better: a
-        log that writes what is sent at k.
+        linear plants during the one that begins there.  ``"auto"`` takes the delay of which the likelihood is clearly
+        better, such as 1 of a log that writes what is sent at k: up to 3 are tried, and more while the last is best.
     method : {"innovations", "simulation"}, optional
         The second one stops at the fit of simulations, whose boxes are too small where its residuals are not white.
     integration : {"auto", "backward-euler", "radau"}, optional
@@ -641,7 +641,8 @@ class _Fitting:
             if found.fit is None:
                 break
             problem = found.problem
-            wrong = standing_out(np.where(np.isfinite(problem.y), found.fit.whitened, np.nan))
+            sizes = standing_out(np.where(np.isfinite(problem.y), found.fit.whitened, np.nan))
+            wrong = sizes > 0.0
             if not wrong.any():
                 break
             self.note("without samples that stand out")
@@ -652,7 +653,12 @@ class _Fitting:
                 for i, name in enumerate(names)
                 if wrong[:, i].any()
             ]
-            kept = replace(log, y=read_only(np.where(wrong, np.nan, problem.y)), notes=(*log.notes, *told))
+            kept = replace(
+                log,
+                y=read_only(np.where(wrong, np.nan, problem.y)),
+                notes=(*log.notes, *told),
+                least_outlier=min(log.least_outlier, float(sizes[wrong].min())),
+            )
             found = self.refitted(replace(found, problem=problem.with_log(kept)))
         return found
 

@@ -136,12 +136,13 @@ def wrong_samples(y: FloatArray) -> BoolArray:
     return found
 
 
-def standing_out(whitened: FloatArray) -> BoolArray:
-    """Return single whitened innovations ``(n, ny)`` that stand out of what most of their sensor are, as truth values.
+def standing_out(whitened: FloatArray) -> FloatArray:
+    """Return by how much single whitened innovations ``(n, ny)`` stand out of what most of their sensor are: in
+    deviations of these, zero where they do not.
 
     Those whose neighbours stand out too are no wrong samples, but something that happened.
     """
-    found = np.zeros(whitened.shape, dtype=bool)
+    found = np.zeros(whitened.shape)
     for i, column in enumerate(whitened.T):
         seen = np.isfinite(column)
         if seen.sum() < LEAST_ROWS:
@@ -149,9 +150,9 @@ def standing_out(whitened: FloatArray) -> BoolArray:
         usual = max(NORMAL_OF_MEDIAN * float(np.median(np.abs(column[seen]))), LEAST_USUAL)
         far = seen & (np.abs(column) > STANDS_OUT * usual)
         beside = np.concatenate([[False], far[:-1]]) | np.concatenate([far[1:], [False]])
-        found[:, i] = far & ~beside
-        if found[:, i].sum() > MOST_OUTLIERS * seen.sum():
-            found[:, i] = False
+        alone = far & ~beside
+        if alone.sum() <= MOST_OUTLIERS * seen.sum():
+            found[alone, i] = np.abs(column[alone]) / usual
     return found
 
 

@@ -20,10 +20,13 @@ from obsynth.plants.noise_model import WHITE_SHARE
 BoolArray = NDArray[np.bool_]
 #: Nats by which another timing of the inputs must be better to be taken: a likelihood ratio of about 150.
 TIMING_NATS = 5.0
+#: The same for another row of delay beyond the first: what a slow actuator does looks like some rows of delay too.
+FURTHER_NATS = 25.0
 #: A likeliest variance below this share of its upper limit counts as zero.
 ZERO_SHARE = 0.01
-#: Rows by which the inputs are tried later; only the positive one is ever taken.
-TRIED_DELAYS = (-1, 1)
+#: Rows by which the inputs are tried later, of which only positive ones are ever taken; more are tried while the last
+#: one is the best, up to so many.
+TRIED_DELAYS, MOST_DELAY = (-1, 1, 2, 3), 50
 #: Share of its deviation by which a constant may move if the steps were exact.
 TOLERATED_MOVE = 0.5
 #: A logarithm of a variance with less curvature is known to no more than a factor of three or so.
@@ -63,13 +66,25 @@ def chosen_timing(
     compared = problem.with_start(UNKNOWN_START**2 * problem.P0) if any_start else problem
     objective = Objective(compared, fits[0])
     value, z = objective.descent(objective.start(fits[0].t))
-    values = {0: value}
-    for delay in TRIED_DELAYS:
-        note(f"inputs {delay:+d} row")
+    values, waiting, start = {0: value}, [*TRIED_DELAYS], z
+    while waiting:
+        delay = waiting.pop(0)
+        if delay >= problem.log.samples:
+            break
+        note(f"inputs {delay:+d} row{'s' if abs(delay) > 1 else ''}")
         moved = Objective(compared.with_log(problem.log.shifted(delay)), fits[0])
-        values[delay] = moved.descent(z)[0]
+        found, at = moved.descent(z if abs(delay) == 1 else start)
+        if found < min(values.values()):
+            # What a timing that is far off makes of the constants is a bad start for the next one.
+            start = at
+            waiting += [delay + 1] if not waiting and delay < MOST_DELAY else []
+        values[delay] = found
     best = min(values.values())
-    delay = 1 if values[0] - values[1] > TIMING_NATS and values[1] == best else 0
+    # The least delay that none beats clearly; a log whose inputs would act before they are sent is only told.
+    nats = {rows: FURTHER_NATS if rows else TIMING_NATS for rows in values if rows >= 0}
+    delay = min((rows for rows, clear in nats.items() if values[rows] - best <= clear), default=0)
+    if values[delay] > values.get(-1, np.inf):
+        delay = 0
     losses = {rows: found - best for rows, found in sorted(values.items())}
     if delay:
         problem = problem.with_log(problem.log.shifted(delay))

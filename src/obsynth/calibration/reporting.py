@@ -87,6 +87,8 @@ AT_QUANTISATION = 1.5
 NOTED_NATS = 2.0
 #: A variance of a sensor above this share of what its signal has stands for the signal.
 SIGNAL_SHARE = 0.1
+#: The widest gate, in deviations: what passes it moves estimates by no more.
+LARGEST_LIMIT = 12.0
 #: A constant within this share of the bounds' width from one of them is at it.
 END_SHARE = 1e-6
 
@@ -178,6 +180,7 @@ def reported(
         *_noise_model(problem, found, Q, R),
         dict(zip(problem.plant.state_names, np.diag(problem.P0).tolist(), strict=True)),
         getattr(problem.plant, "inner", problem.plant).equation_names,
+        _outlier_limit(problem.log.least_outlier),
     )
 
 
@@ -280,6 +283,13 @@ def _fitted(
     ]
 
 
+def _outlier_limit(least: float) -> float | None:
+    """Return the limit of a gate between samples that are none and the least outlier; nothing without outliers."""
+    if not np.isfinite(least):
+        return None
+    return float(min(np.sqrt(STANDS_OUT * least), LARGEST_LIMIT))
+
+
 def _misfits(problem: Problem, start: Fit, whitened: FloatArray, R: dict[str, float]) -> list[str]:
     """Return sentences about sensors that the model does not follow, their mean, and single samples that stand out."""
     found = []
@@ -338,13 +348,13 @@ def _told(problem: Problem, R: dict[str, float], timing: Timing, error: Integrat
                 "truth than what a ramp makes of it."
             )
     if timing.delay and timing.losses:
-        found.append(
-            f"The inputs are taken {timing.delay} row later than the log writes them: better by "
-            f"{timing.losses[0]:.1f} nats."
-        )
-    elif timing.losses.get(0, 0.0) > NOTED_NATS:
-        rows = min(timing.losses, key=lambda delay: timing.losses[delay])
-        found.append(f"The inputs taken {rows:+d} row would be better by {timing.losses[0]:.1f} nats: see input_delay.")
+        rows = "1 row" if timing.delay == 1 else f"{timing.delay} rows"
+        gained = timing.losses[0] - timing.losses[timing.delay]
+        found.append(f"The inputs are taken {rows} later than the log writes them: better by {gained:.1f} nats.")
+    lost = timing.losses.get(timing.delay, 0.0)
+    if lost > NOTED_NATS:
+        least = min(timing.losses, key=lambda delay: timing.losses[delay])
+        found.append(f"The inputs taken {least:+d} row(s) would be better by {lost:.1f} nats: see input_delay.")
     if error is not None:
         what = "Radau is taken" if problem.integration == "radau" else "it is taken"
         told = f" and moves a constant by {error.moved:.2g} of its own" if error.moved else ""

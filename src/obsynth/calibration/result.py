@@ -160,6 +160,9 @@ class Calibration:
         Variances of the first states that were used.
     own_equations : tuple of str
         The equations of the plant as written: without those of noise, offsets and walks.
+    outlier_limit : float or None
+        Limit of a gate for outliers, in deviations, between the samples of this log that are none and its least
+        outlier (at most 12): a narrower one leaves out the onset of a fault. Nothing where there are no outliers.
     """
 
     nominal: Mapping[str, float]
@@ -193,6 +196,7 @@ class Calibration:
     walks: Mapping[str, float] = field(default_factory=dict)
     initial_covariance: Mapping[str, float] = field(default_factory=dict)
     own_equations: tuple[str, ...] = ()
+    outlier_limit: float | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -258,6 +262,7 @@ class Calibration:
             "offset": dict(self.offset),
             "walks": dict(self.walks),
             "initial_covariance": dict(self.initial_covariance),
+            "outlier_limit": self.outlier_limit,
             "covariance": self.covariance.tolist(),
             "correlation": self.correlation.tolist(),
             "undetermined": [dict(direction) for direction in self.undetermined],

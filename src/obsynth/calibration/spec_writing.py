@@ -69,8 +69,17 @@ def calibrated_spec(path: Path, found: Calibration, *, calibration: Path | None 
     told = {"unknown": {}, **(document.get("calibrate") or {}), "digest": found.box.digest}
     told |= {"input_delay": int(found.input_delay)}
     whole = {**document, "plant": plant, "method": {**method, "options": options}, "calibrate": told}
+    if document.get("inputs") is not None:
+        whole["inputs"] = _timing(plant, found, linear=linear)
     heading = f"# Calibrated by obsynth from {path.name} and {found.log['source'] or 'a log'}.\n"
     return heading + yaml_text(whole)
+
+
+def _timing(plant: Mapping[str, Any], found: Calibration, *, linear: bool) -> dict[str, Any]:
+    """Return when the inputs act as the calibration has them, whatever the spec or the command line said before."""
+    sampled = bool(plant.get("dt")) or bool((plant.get("transform") or {}).get("sample_time"))
+    hold = {"hold": "ends" if plant.get("kind") == "dae" else "begins"} if sampled or not linear else {}
+    return {**hold, "delay": int(found.input_delay)}
 
 
 def _set_constants(plant: dict[str, Any], found: Calibration, calibration: Path | None, *, with_ranges: bool) -> None:
@@ -132,6 +141,7 @@ def _nonlinear_options(found: Calibration) -> dict[str, Any]:
         "R": {name: float(value) for name, value in found.R.items()},
         "integration": found.integration,
         "initial_covariance": {name: float(value) for name, value in found.initial_covariance.items()},
+        **({} if found.outlier_limit is None else {"outliers": "gate", "outlier_limit": found.outlier_limit}),
     }
 
 

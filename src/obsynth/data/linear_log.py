@@ -9,7 +9,6 @@ from functools import lru_cache, partial
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.data.log_estimator import GAP, LONGEST_BRIDGE, OK, RECOVERING, WARM_UP, Engine, Row
 from obsynth.errors import ObsynthError, PreconditionError, SpecError
@@ -17,7 +16,7 @@ from obsynth.experiments.monitors.monitor import LinearSample
 from obsynth.numerics.arguments import is_finite_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import first_order_hold
-from obsynth.observers.linear.derived import transient
+from obsynth.observers.linear.derived import noise_variances, transient
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.windows import WindowObserver
 from obsynth.plants.descriptor import DescriptorSystem
@@ -28,7 +27,7 @@ KEPT_INTERVALS = 64
 #: Rows that are taken in one piece at most.
 PIECE = 4096
 #: A gap is over when what it can have left in fault estimates and residuals is below this share of their usual changes
-#: from row to row, which so many rows must have shown.
+#: from row to row, which so many rows must have shown, or below what the stated noise of the sensors makes of them.
 LEFT_SHARE, LEAST_SHOWN = 1.0, 20
 SAMPLED_GAP = "gap is for continuous-time designs: a sampled one knows which rows are missing."
 _Part = TypeVar("_Part")
@@ -161,6 +160,9 @@ class DataObserver(Engine):
         # Squares of changes of fault estimates and residuals from row to row, summed up, and how many there are.
         self.shown = slice(len(self.observer.state_names), None)
         self.changes, self.counted = np.zeros(len(self.observer.Cz[self.shown])), 0
+        # Variances that the stated noise of the sensors gives them.
+        noisy = self.observer.dt > 0.0 and self.observer.By.shape[1] == self.plant.ny
+        self.noise = noise_variances(self.observer, self.plant.Dw)[self.shown] if noisy else np.zeros_like(self.changes)
         # What a unit error of each input that was held, and of each output that the model told, has left in z.
         self.left, self.held = np.zeros(self.b.shape), np.zeros(self.nu)
         self.transient = transient(self.observer)
@@ -174,6 +176,14 @@ class DataObserver(Engine):
     def usual_changes(self) -> tuple[float, int]:
         """Share of usual changes that a gap may have left, and how many rows must have shown them."""
         return LEFT_SHARE, LEAST_SHOWN
+
+    def _usual(self) -> FloatArray | None:
+        """Return what a gap may have left in fault estimates and residuals; nothing where that is not known yet."""
+        shown = self.counted >= LEAST_SHOWN
+        if not shown and not self.noise.all():
+            return None
+        changes = self.changes / self.counted if shown else np.zeros_like(self.changes)
+        return np.asarray(np.sqrt(np.maximum(LEFT_SHARE**2 * changes, self.noise)))
 
     def step(self, time: float, values: FloatArray, row: int) -> Row:
         """Take one row of data."""
@@ -210,7 +220,7 @@ class DataObserver(Engine):
                     self.forgotten_at = time + max(self.warm_up, self.transient)
                 status = OK if time >= self.settled_at else self.phase
             else:
-                found, status = self._unmeasured(seconds, u, ~np.isfinite(values[: self.nu])), GAP
+                found, status = self._unmeasured(seconds, u, values), GAP
         if status == GAP:
             self.settled_at += since if self.phase == WARM_UP else 0.0
             return Row(GAP, found, missing)
@@ -319,7 +329,8 @@ class DataObserver(Engine):
         missed = np.abs(v[nu:] - gap_model.outputs(_running(self.model), v[:nu], self.fault))
         # An input that was held was off by no more than it has changed since.
         missed = np.concatenate([np.abs(v[:nu] - self.held), missed])
-        if self.counted < LEAST_SHOWN or not np.isfinite(self.left).all():
+        usual = self._usual()
+        if usual is None or not np.isfinite(self.left).all():
             return self.warm_up
         step = self.observer.dt or self.clock.longest
         if not step > 0.0:
@@ -329,7 +340,6 @@ class DataObserver(Engine):
             transition, constant, _ = self._hold(seconds or step)
             told = np.repeat([False, True], [nu, len(self.output_names)])
             a, left = self._hold(step)[0], transition @ left + constant * told
-        usual = LEFT_SHARE * np.sqrt(self.changes / self.counted)
         rows, waited = self.observer.Cz[self.shown], 0.0
         # The first row after a gap always counts as recovering.
         while waited < self.warm_up:
@@ -364,18 +374,19 @@ class DataObserver(Engine):
         if missing > LONGEST_BRIDGE:
             self._restart()
             return
+        nothing = np.full_like(self.v, np.nan)
         if self.observer.dt > 0.0:
             for _ in range(missing):
-                self._unmeasured(0.0, self.v[: self.nu], np.ones(self.nu, dtype=bool))
+                self._unmeasured(0.0, self.v[: self.nu], nothing)
             return
         begin, part = self.v[: self.nu].copy(), seconds / (missing + 1)
         for i in range(missing + 1):
             share = (i + 1) / (missing + 1)
-            self._unmeasured(part, begin + (u - begin) * share, np.ones(self.nu, dtype=bool))
+            self._unmeasured(part, begin + (u - begin) * share, nothing)
 
-    def _unmeasured(self, seconds: float, u: FloatArray, unsure: NDArray[np.bool_]) -> FloatArray:
-        """Let the plant model stand in for the sensors at one sample; return the estimates, faults held.
-        ``unsure (nu,)``: which inputs are held."""
+    def _unmeasured(self, seconds: float, u: FloatArray, values: FloatArray) -> FloatArray:
+        """Let the plant model stand in for what is missing in ``values (nu + ny,)`` of one sample; return the
+        estimates, faults held. ``u (nu,)``: the inputs, held where they are not known."""
         if self.z is None:
             return self._held()
         if self.gap_model is None:
@@ -388,9 +399,10 @@ class DataObserver(Engine):
                 self._propagate(seconds, u)
         else:
             self._propagate(seconds, u)
-        v = np.concatenate([u, self.gap_model.outputs(self.model, u, self.fault)])
-        told = np.concatenate([unsure, np.ones(len(self.output_names), dtype=bool)])
-        if (unsure & self.left[:, : self.nu].any(axis=0)).any():
+        # What is measured is taken; what is not, the model says.
+        told = ~np.isfinite(values)
+        v = np.where(told, np.concatenate([u, self.gap_model.outputs(self.model, u, self.fault)]), values)
+        if (told[: self.nu] & self.left[:, : self.nu].any(axis=0)).any():
             # What an input has done in more than one row is not known.
             self.left = np.full_like(self.left, np.nan)
         if self.observer.dt == 0.0:

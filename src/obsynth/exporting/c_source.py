@@ -188,7 +188,7 @@ def monitor_struct(alarms: Alarms, prefix: str) -> list[str]:
         f"    REAL past[{max(model.order * m, 1)}];",
         f"    REAL white[{max(AGES) * m}];",
         f"    REAL means[{len(FORGETTING) * m}];",
-        "    int at, quiet;",
+        "    int at, quiet, waiting;",
         "    long taken;",
         f"}} {prefix}_monitor;",
         "",
@@ -215,6 +215,7 @@ def monitor_source(alarms: Alarms, prefix: str) -> str:
         "MONITOR_FAULTS": len(found.scales),
         "MONITOR_SETTLING": found.settling,
         "MONITOR_HOLD": HOLD,
+        "MONITOR_WATCHED": sum(name.startswith(("fhat[", "r[")) for name in alarms.columns),
     }
     tables: dict[str, Any] = {
         "monitor_mean": model.mean[None],
@@ -392,7 +393,7 @@ def _step_text(found: Realisation, prefix: str, alarms: Alarms) -> str:
         "COPY_OUT": " ".join(f"copied({to}, {of}, {n});" for to, of, n in shown if n),
         "MONITOR_RESET": "monitor_reset(&s->monitor);" if learned else "",
         "MONITOR_STEP": (
-            f"monitor_take(&s->monitor, shown, s->status == {prefix.upper()}_OK);\n"
+            f"monitor_take(&s->monitor, shown, s->status == {prefix.upper()}_OK, -1);\n"
             "    shown[SHOWN_COUNT] = s->monitor.statistic;"
             if learned
             else ""

@@ -141,6 +141,7 @@ class Realisation:
             moves = (moving.A, moving.B, moving.Bf)
         tables = dict(zip(("model_A", "model_B", "model_F", "model_R"), moves, strict=False))
         tables |= {"model_C": moving.C, "model_D": moving.D, "model_Df": moving.Df, "model_into": model.into}
+        tables |= {"noise_variances": engine.noise[None]}
         if engine.partial is not None:
             tables |= {"source_D": plant.D, "source_Df": plant.Df, "model_solver": engine.partial.solver}
         kept = engine.inputs.maxlen or 0

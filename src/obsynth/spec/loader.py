@@ -633,16 +633,17 @@ class Spec:
     def input_delay(self, plant: Any) -> int | None:
         """Return rows by which a log's inputs act later than a plant takes them; ``None`` where the spec says nothing.
 
-        Nonlinear plants take the inputs of a row during the step that ends there, others during the one that begins.
+        Nonlinear plants take the inputs of a row during the step that ends there, others on samples during the one that
+        begins.  Without ``inputs.hold`` the delay is by the convention of the plant that is designed for.
 
         Parameters
         ----------
         plant : DescriptorSystem, TimeVaryingDescriptorSystem or DAEModel
             The one that takes the log.
         """
-        own = "ends" if isinstance(plant, DAEModel) else "begins"
+        own = _takes_inputs(plant)
         if self.inputs is not None:
-            hold = self.inputs["hold"] or own
+            hold = self.inputs["hold"] or _takes_inputs(self.plant)
             return int(self.inputs["delay"]) + (hold == "begins") - (own == "begins")
         found = (self.calibrate or {}).get("input_delay")
         if not isinstance(found, int):
@@ -650,6 +651,12 @@ class Spec:
         # What a calibration of a nonlinear plant found is by the convention of that plant.
         sampled = isinstance(plant, DescriptorSystem) and plant.is_discrete and self.model is not None
         return found - int(sampled)
+
+
+def _takes_inputs(plant: Any) -> str:
+    """Return when a plant takes the inputs of a row, by the words of ``inputs.hold``."""
+    nonlinear = isinstance(plant, DAEModel) or (isinstance(plant, DescriptorSystem) and not plant.is_discrete)
+    return "ends" if nonlinear else "begins"
 
 
 def load_model(path: str | Path) -> tuple[DAEModel, Spec | None]:

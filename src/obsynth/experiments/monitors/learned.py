@@ -394,11 +394,16 @@ class LearnedState(NamedTuple):
     means: FloatArray  # exponentially weighted, one row for each weight
     last: float | None = None
     taken: int = 0
+    waiting: int = 0  # rows until the last one in which something was missing is forgotten
 
 
 class LearnedRule(Rule):
     """The largest of all statistics in units of its level, row by row.  A row that is missing, or in which nothing may
-    be decided, is as the autoregression predicts it: it adds no evidence, and takes none away."""
+    be decided, is as the autoregression predicts it: it adds no evidence, and takes none away.
+
+    Where the gain follows what is measured (all but linear observers, which recover from a gap first), a missing sample
+    moves the estimates otherwise than was learned.  Nothing is decided in that row, and rows that are predicted from it
+    count by no more than the observer's own covariance, which has grown, makes of their innovation."""
 
     def __init__(self, learned: LearnedThresholds, names: Sequence[str], faults: Sequence[str] = ()) -> None:
         self.learned = learned
@@ -421,11 +426,19 @@ class LearnedRule(Rule):
             state = self._added(state, None)
         state = state._replace(last=sample.time, taken=state.taken + 1)
         found = watched_values(sample.residuals, sample.said)
-        if state.taken <= self.learned.settling or not sample.deciding:
-            found = None
-        if found is None or not np.isfinite(found[self._places]).all():
+        whole = found is not None and sample.deciding and bool(np.isfinite(found).all())
+        counts = whole and state.taken > self.learned.settling
+        most, varying = math.inf if counts else 0.0, isinstance(sample.said, Evidence)
+        if counts and state.waiting and isinstance(sample.said, Evidence):
+            most = float(np.linalg.norm(sample.said.innovation))
+        if not whole and varying:
+            state = state._replace(waiting=self._model.order + 1)
+        state = state._replace(waiting=max(state.waiting - 1, 0))
+        if found is None or not (whole or (varying and np.isfinite(found[self._places]).all())):
             return self._added(state, None), Judged(math.nan, math.nan)
-        state = self._added(state, found[self._places])
+        state = self._added(state, found[self._places], most)
+        if not counts:
+            return state, Judged(math.nan, math.nan)
         # Products of numbers that overflow have passed any level.
         with np.errstate(over="ignore", invalid="ignore"):
             ratios = ((self._templates @ state.white.ravel()) ** 2).reshape(-1, len(AGES)).max(axis=1)
@@ -447,14 +460,16 @@ class LearnedRule(Rule):
             return None
         return int(np.argmax(np.abs(found[:count] - self.learned.centres) / self.learned.scales))
 
-    def _added(self, state: LearnedState, x: FloatArray | None) -> LearnedState:
-        """Return the state after a row, or after one that is as predicted (`None`)."""
+    def _added(self, state: LearnedState, x: FloatArray | None, most: float = 0.0) -> LearnedState:
+        """Return the state after a row, or after one that is as predicted (`None`), of a norm of ``most`` at most."""
         model = self._model
         predicted = model.offset + sum(
             (a @ row for a, row in zip(model.A, state.past, strict=True)), np.zeros(model.channels)
         )
         with np.errstate(over="ignore", invalid="ignore"):
-            e = np.zeros(model.channels) if x is None else model.whitener @ (x - predicted)
+            e = np.zeros(model.channels) if x is None or not most else model.whitener @ (x - predicted)
+            size = float(np.linalg.norm(e))
+            e = e * (most / size) if size > most else e
         shares = np.array(FORGETTING)[:, None]
         past = np.vstack([predicted if x is None else x, state.past[:-1]]) if model.order else state.past
         means = (1.0 - shares) * state.means + shares * e

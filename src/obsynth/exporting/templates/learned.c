@@ -18,16 +18,18 @@ static void monitor_reset(PREFIX_monitor *m)
     }
     m->at = 0;
     m->taken = 0;
+    m->waiting = 0;
     m->statistic = NAN;
     m->alarm = m->event = m->quiet = 0;
     m->fault = -1;
 }
 
-/* Take a row of what is watched; `x` is NULL for one that is as predicted, which adds no evidence. */
-static void monitor_add(PREFIX_monitor *m, const REAL *x)
+/* Take a row of what is watched, whose evidence has a norm of `most` at most; `x` is NULL for one as predicted. */
+static void monitor_add(PREFIX_monitor *m, const REAL *x, REAL most)
 {
     REAL predicted[CHANNELS];
     REAL *e;
+    REAL size = 0;
     int i, j, k;
     for (i = 0; i < CHANNELS; i++) {
         REAL sum = 0;
@@ -42,9 +44,14 @@ static void monitor_add(PREFIX_monitor *m, const REAL *x)
     e = m->white + m->at * CHANNELS;
     for (i = 0; i < CHANNELS; i++) {
         e[i] = 0;
-        for (j = 0; x != NULL && j < CHANNELS; j++) {
+        for (j = 0; x != NULL && most > 0 && j < CHANNELS; j++) {
             e[i] += monitor_whitener[i][j] * (x[j] - predicted[j]);
         }
+        size += e[i] * e[i];
+    }
+    size = (REAL)sqrt(size);
+    for (i = 0; size > most && i < CHANNELS; i++) {
+        e[i] *= most / size;
     }
     for (k = 0; k < MEANS; k++) {
         for (i = 0; i < CHANNELS; i++) {
@@ -106,21 +113,37 @@ static REAL likelihood_ratio(const PREFIX_monitor *m, int shape)
     return largest;
 }
 
-/* Take a row: fault estimates, then residuals. */
-static void monitor_take(PREFIX_monitor *m, const REAL *shown, int deciding)
+/* Take a row: fault estimates, then residuals; `innovation`: its norm in the observer's own covariance, or
+ * less than zero where the gain does not follow what is measured. */
+static void monitor_take(PREFIX_monitor *m, const REAL *shown, int deciding, REAL innovation)
 {
     REAL x[CHANNELS];
     REAL ratio, statistic;
     REAL best = -1;
     int which = 0;
+    int is_said = 1;
+    int is_whole = deciding;
+    REAL most = (REAL)HUGE_VAL;
     int known, i;
     m->taken += m->taken <= MONITOR_SETTLING;
-    known = deciding && m->taken > MONITOR_SETTLING;
     for (i = 0; i < CHANNELS; i++) {
         x[i] = shown[monitor_places[i]];
-        known = known && isfinite(x[i]);
+        is_said = is_said && isfinite(x[i]);
     }
-    monitor_add(m, known ? x : NULL);
+    for (i = 0; i < MONITOR_WATCHED; i++) {
+        is_whole = is_whole && isfinite(shown[i]);
+    }
+    known = is_whole && m->taken > MONITOR_SETTLING;
+    /* Where the gain follows what is measured, a missing sample moves the estimates otherwise than was learned: rows
+     * that are predicted from that one count by no more than the observer's own covariance, which has grown, says. */
+    if (m->waiting > 0) {
+        most = innovation;
+    }
+    if (!is_whole && innovation >= 0) {
+        m->waiting = ORDER + 1;
+    }
+    m->waiting -= m->waiting > 0;
+    monitor_add(m, is_whole || (is_said && innovation >= 0) ? x : NULL, known ? most : 0);
     m->statistic = NAN;
     m->alarm = 0;
     m->fault = -1;

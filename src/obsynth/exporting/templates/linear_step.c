@@ -105,20 +105,26 @@ static double recovering(PREFIX_state *s, const REAL *v)
     REAL miss[LENGTH(V_COUNT)] = {0}, moved[LENGTH(Z_COUNT)] = {0}, usual[LENGTH(SHOWN_COUNT)] = {0}, sum[LENGTH(SHOWN_COUNT)] = {0};
     REAL states[LENGTH(STATE_COUNT)] = {0}, shown[LENGTH(SHOWN_COUNT)] = {0};
     double waited = 0;
-    int i, j;
+    int i, j, is_shown = s->counted >= LEAST_SHOWN;
 #if STRAIGHT
     REAL one[LENGTH(V_COUNT)] = {0};
 #endif
-    if (s->counted < LEAST_SHOWN || !s->inputs_known || !all_finite(s->left, Z_COUNT * V_COUNT)) {
+    for (i = 0; i < SHOWN_COUNT; i++) {
+        /* What fault estimates and residuals change by from sample to sample, or what the stated noise gives them. */
+        REAL noise = noise_variances[0][i];
+        usual[i] = is_shown ? LEFT_SHARE * LEFT_SHARE * s->changes[i] / (REAL)s->counted : 0;
+        usual[i] = usual[i] > noise ? usual[i] : noise;
+        if (!is_shown && !(noise > 0)) {
+            return s->warm_up;
+        }
+    }
+    if (!s->inputs_known || !all_finite(s->left, Z_COUNT * V_COUNT)) {
         return s->warm_up;
     }
     model_outputs(s->model, v, s->fault, miss + U_COUNT);
     /* An input that was held was off by no more than it has changed since. */
     for (i = 0; i < V_COUNT; i++) {
         miss[i] = ABS(v[i] - (i < U_COUNT ? s->held[i] : miss[i]));
-    }
-    for (i = 0; i < SHOWN_COUNT; i++) {
-        usual[i] = LEFT_SHARE * LEFT_SHARE * s->changes[i] / (REAL)s->counted;
     }
 #if STRAIGHT
     filled(one, 0, V_COUNT);
@@ -222,7 +228,7 @@ static int held(PREFIX_state *s, REAL *states, REAL *shown)
     return 1;
 }
 
-/* A sample with something missing: the model of the plant stands in for the sensors. */
+/* A sample with something missing: the model of the plant stands in for what is. Inputs are held already. */
 static int unmeasured(PREFIX_state *s, const REAL *u, const int *unsure, REAL *states, REAL *shown)
 {
 #if MODEL
@@ -251,6 +257,9 @@ static int unmeasured(PREFIX_state *s, const REAL *u, const int *unsure, REAL *s
     }
     copied(v, u, U_COUNT);
     model_outputs(s->model, u, s->fault, v + U_COUNT);
+    for (i = U_COUNT; i < V_COUNT; i++) {
+        v[i] = unsure[i] ? v[i] : u[i];
+    }
 #if STRAIGHT
     flowed(s, v);
 #endif
@@ -261,7 +270,7 @@ static int unmeasured(PREFIX_state *s, const REAL *u, const int *unsure, REAL *s
         static const REAL zero[LENGTH(V_COUNT)];
 #endif
         filled(one, 0, V_COUNT);
-        one[i] = i >= U_COUNT || unsure[i];
+        one[i] = unsure[i];
         if (i < U_COUNT && unsure[i] && any_left(s->left + i * Z_COUNT)) {
             /* What an input has done in more than one row is not known. */
             s->inputs_known = 0;
@@ -409,11 +418,11 @@ int PREFIX_step(STEP_ARGUMENTS)
     REAL shown[LENGTH(WATCHED_COUNT)] = {0};
     STATES_SCRATCH
     int i, missing;
-    int unsure[LENGTH(U_COUNT)] = {0};
+    int unsure[LENGTH(V_COUNT)] = {0};
     COPY_IN
     s->time = (double)s->k * UPPER_DT;
     s->k++;
-    for (i = 0; i < U_COUNT; i++) {
+    for (i = 0; i < V_COUNT; i++) {
         unsure[i] = !isfinite(v[i]);
     }
     missing = !all_finite(v, V_COUNT);

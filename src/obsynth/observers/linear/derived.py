@@ -154,6 +154,25 @@ def _steps_remembered(Az: FloatArray) -> int:
     return steps
 
 
+#: Squarings after which powers of a stable matrix are below rounding, whatever its modes.
+MOST_SQUARINGS = 64
+
+
+def noise_variances(observer: LinearObserver, noise: FloatArray) -> FloatArray:
+    """Return stationary variances of the rows ``(rows,)`` of a sampled observer whose outputs have white noise
+    ``noise (ny, any)`` of unit covariance; zero where there is none, or where they have no limit."""
+    into, through = observer.By @ noise, observer.Dy @ noise
+    covariance, power = into @ into.T, observer.Az
+    with np.errstate(all="ignore"):
+        for _ in range(MOST_SQUARINGS):
+            more = power @ covariance @ power.T
+            if not np.abs(more).max(initial=0.0) > np.finfo(float).eps * np.abs(covariance).max(initial=0.0):
+                break
+            covariance, power = covariance + more, power @ power
+        found = np.einsum("ij,jk,ik->i", observer.Cz, covariance, observer.Cz) + (through**2).sum(axis=1)
+    return np.where(np.isfinite(found), found, 0.0)
+
+
 def checked_warm_up(asked: float | None, default: float) -> float:
     """Return the warm-up in seconds."""
     if asked is None:
