@@ -17,7 +17,7 @@ from obsynth.analysis.existence.statements import Evaluator, FullRank, NoZeroOut
 from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
 from obsynth.analysis.transformations.recovery import Transformation
 from obsynth.analysis.zeros import MOST_NAMES, equilibrated_at, leading_names
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import FloatArray, remembered
 from obsynth.numerics.pencils import pencil_structure
 from obsynth.numerics.ranks import equilibrate
 from obsynth.plants.descriptor import DescriptorSystem
@@ -28,7 +28,19 @@ _SOURCE = "Filasova et al., eqs. (1), (2)"
 
 def pd_observer_conditions(plant: DescriptorSystem, *, exactly: bool = True) -> tuple[Condition, ...]:
     """Return the existence conditions of the PD observer, in order; the list ends at the first failure."""
-    plant = plant.dense()
+    known = _decided(plant)
+    if exactly not in known:
+        known[exactly] = _conditions(plant.dense(), exactly=exactly)
+    return known[exactly]
+
+
+@remembered
+def _decided(_plant: DescriptorSystem) -> dict[bool, tuple[Condition, ...]]:
+    """Return the cache of the conditions of a plant, decided exactly or not: synthesis and verification use it."""
+    return {}
+
+
+def _conditions(plant: DescriptorSystem, *, exactly: bool) -> tuple[Condition, ...]:
     first = up_to_failure(_form_conditions(Evaluator(plant, exactly)))
     if not all(condition.holds for condition in first):
         return first
