@@ -1,6 +1,6 @@
 """Whole networks: load, eliminate, design and verify; each case in a process of its own, with its memory.
 
-``python benchmarks/whole_networks.py [elimination | designs | many]``; the networks are those of
+``python benchmarks/whole_networks.py [elimination | designs | checks | many]``; the networks are those of
 ``benchmarks/networks.py``, whose reduced matrix is compared with LAPACK's.
 """
 
@@ -132,6 +132,48 @@ def designs(folder: Path, wanted: str = "") -> None:
         )  # fmt: skip
 
 
+_CHECK = """\
+import json, sys, time
+from dataclasses import replace
+from pathlib import Path
+sys.path.insert(0, sys.argv[1])
+from networks import random_network
+import obsynth
+network = random_network(int(sys.argv[2]), int(sys.argv[3]), int(sys.argv[4]))
+network = replace(network, faults=tuple(f"tm GENROU {k + 1}" for k in range(3)))
+reduced = obsynth.eliminate_algebraic_states(network.plant())
+sampled = obsynth.discretise(reduced, 0.02)
+begin = time.process_time()
+found = obsynth.check(sampled)
+lines = Path("/proc/self/status").read_text().splitlines()
+print(json.dumps({
+    "states": sampled.plant.nx, "check": time.process_time() - begin,
+    "exists": [method for method, report in found.items() if report.passed],
+    "MB": next(int(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM")),
+}))
+"""
+
+
+def checks() -> None:
+    """Every method's conditions on sampled networks with three faults, without making the network."""
+    print("| variables, states | seconds (median, worst) | MB (worst) | a design exists by |")
+    print("| --- | --- | --- | --- |")
+    for variables, states in ((700, 150), (1500, 290), (2400, 565)):
+        found = []
+        for seed in SEEDS:
+            arguments = [str(Path(__file__).parent), str(variables), str(states), str(seed)]
+            done = subprocess.run(
+                [sys.executable, "-c", _CHECK, *arguments], capture_output=True, text=True, check=True
+            )
+            found.append(json.loads(done.stdout.splitlines()[-1]))
+        seconds = sorted(item["check"] for item in found)
+        told = sorted({", ".join(item["exists"]) for item in found})
+        print(
+            f"| {variables}, {found[0]['states']} | {seconds[len(seconds) // 2]:.1f}, {seconds[-1]:.1f} "
+            f"| {max(item['MB'] for item in found):.0f} | {'; '.join(told)} |", flush=True,
+        )  # fmt: skip
+
+
 def many() -> None:
     """Two hundred designs here and on two processes: wall time, and whether the numbers are the same."""
     from concurrent.futures import ProcessPoolExecutor
@@ -168,5 +210,7 @@ if __name__ == "__main__":
             elimination(Path(name))
         elif section == "designs":
             designs(Path(name), *rest)
+        elif section == "checks":
+            checks()
         else:
             many()
