@@ -490,3 +490,22 @@ def test_a_comparison_replays_a_log_with_flaws(flaw: str) -> None:
     found = obsynth.compare(plant, scenario=scenario, runs=1, methods=["ui-pi-observer"], data=data)
     assert np.isfinite(found.methods[0].rms)
     assert found.methods[0].rms < 0.2
+
+
+def test_rows_after_a_missing_sample_count_by_no_more_than_the_observer_says() -> None:
+    from obsynth.experiments.monitors.monitor import Evidence, Sample
+
+    design, rng, data = recursive(), np.random.default_rng(8), log(fault=0.5, rows=300)
+    data[["a", "b"]] += 0.01 * rng.standard_normal((300, 2))
+    rule = obsynth.online_monitor(design, "learned", normal=obsynth.learn_thresholds(design, data)).rule
+    state, whole, nothing = rule.init(), np.zeros((1, 1)), np.zeros(1)
+    for k in range(200):
+        lost, far = k == 150, 50.0 if k in (151, 199) else 0.0
+        residuals = np.array([far, np.nan if lost else 0.0])
+        said = Evidence(np.zeros(1), whole, np.array([0.3, 0.4]), np.zeros((2, 1)), nothing, whole)
+        state, judged = rule.step(state, Sample(k * DT, residuals, np.zeros(1), said))
+        if k == 150:
+            assert math.isnan(judged.statistic)
+        if k == 151:
+            assert np.linalg.norm(state.white[-1]) <= 0.5 + 1e-12
+    assert np.linalg.norm(state.white[-1]) > 5.0
