@@ -161,3 +161,18 @@ def test_the_least_share_worked_by_hand() -> None:
     equation = {"E": np.diag([1.0, 0.0]), "A": [[0.5, 0.0], [1.0, -1.0]], "C": np.eye(2)}
     assert least_share(equation, [0.5, -0.5]) == pytest.approx(0.125, rel=1e-9)
     assert least_share(equation, [0.5, 0.5]) == pytest.approx(0.0, abs=1e-12)
+
+
+def test_rounding_of_many_inputs_is_within_the_remainder() -> None:
+    """One input of 1 and 799 of 2^-54: a sum in doubles may lose all of these, and the programme must not."""
+    given = obsynth.DescriptorSystem(None, [[0.5]], np.ones((1, 800)), C=[[1.0]], dt=1.0)
+    u = np.full((2, 800), 2.0**-54)
+    u[:, 0] = 1.0
+    data = WindowData(u, np.zeros((2, 1)), -np.ones((2, 1)), np.ones((2, 1)))
+    rows = window_programme(affine_plant(given), np.zeros(0), data).below
+    # The first two rows are x(1) - 0.5 x(0) = B u, from above and below, in units of powers of two.
+    above, below = (Fraction(side) * sign for side, sign in zip(rows.right[:2], (1, -1), strict=True))
+    unit = Fraction(float(rows.scales[1])) / Fraction(rows.values[0][rows.columns[0].index(1)])
+    exact = sum(map(Fraction, u[0].tolist()), start=Fraction(0))
+    assert below * unit <= exact <= above * unit
+    assert float(above * unit - below * unit) < 1e-12

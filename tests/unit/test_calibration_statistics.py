@@ -19,7 +19,8 @@ from obsynth.calibration.diagnostics import (
     wrong_samples,
 )
 from obsynth.calibration.explanations import explanations, regression_gain
-from obsynth.calibration.intervals import covariance_of, information, quantile
+from obsynth.calibration.intervals import covariance_of, information, profile_box, quantile
+from obsynth.calibration.maximum import Maximum
 from obsynth.calibration.noise_states import NoiseStates, PlantWithNoise
 from obsynth.results.calibration_files import box_row, calibration_text, read_calibration, verify_calibration
 
@@ -234,3 +235,32 @@ def test_a_box_is_that_of_its_calibration_file_entry_by_entry(tmp_path) -> None:
         {"calibration": "0" * 64}, {"digest": "cd" * 32}, {"level": 0.9}, {"constants": narrow}, {"constants": moved},
     ):  # fmt: skip
         assert not box_row(box(**other), file).passed
+
+
+class Quadratic:
+    """Half of ``z' H z`` of constants in widths of their bounds, between ends."""
+
+    bent, nt = False, 2
+
+    def __init__(self, hessian: np.ndarray, ends: np.ndarray) -> None:
+        widths = np.array([2.0, 0.3])
+        self.hessian, (self.low, self.high), self.avoided = hessian, ends / widths, np.zeros(2)
+        self.problem = SimpleNamespace(names=("a", "b"), widths=widths, low=ends[0], high=ends[1])
+
+    def __call__(self, z: np.ndarray) -> tuple[float, np.ndarray]:
+        return 0.5 * float(z @ self.hessian @ z), self.hessian @ z
+
+
+def test_a_box_ends_where_the_deviance_says_or_at_the_bound_that_was_given() -> None:
+    """The root of the deviance is |z| over its deviation: 2 is reached at 0.2 and 0.4 widths, with b led along."""
+    covariance = np.array([[0.01, 0.003], [0.003, 0.04]])
+    ends = np.array([[-2.0, -0.3], [2.0, 0.023]])
+    objective = Quadratic(np.linalg.inv(covariance), ends)
+    best = Maximum(np.zeros(2), 0.0, objective.hessian, np.zeros(2))
+    (low, high), (below, above) = profile_box(objective, best, 2.0, SimpleNamespace(undetermined=()))
+    assert (low.value, high.value) == pytest.approx((-0.4, 0.4), rel=0.03)
+    assert below.value == pytest.approx(-0.12, rel=0.03)
+    assert [side.is_open for side in (low, high, below)] == [False] * 3
+    # The bound itself, not what a division and a product leave of it.
+    assert above.is_open
+    assert above.value == 0.023 != 0.023 / 0.3 * 0.3

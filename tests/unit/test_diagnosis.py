@@ -13,6 +13,7 @@ from obsynth.analysis.diagnosis.decoupled import decoupled, unknowns_pencil
 from obsynth.analysis.diagnosis.exact import Questions, question
 from obsynth.analysis.diagnosis.explanations import hidden_motion
 from obsynth.analysis.diagnosis.reduction import PencilUnits
+from obsynth.numerics.ranks import TRACE_TOLERANCE
 
 CASES = Path(__file__).parents[1] / "data" / "cases"
 
@@ -288,3 +289,41 @@ def test_no_motion_is_told_that_hides_nothing() -> None:
     for point in (1.0 + 0.0j, 2.0 + 0.0j):
         assert hidden_motion(shown, 0, point, []) is None
         assert hidden_motion(hidden, 0, point, []).values == {"d": pytest.approx(-1.0)}
+
+
+def question_of(plant: obsynth.DescriptorSystem, *, exactly: bool):
+    return question(plant, [], 0, exactly)
+
+
+def test_a_fault_is_hidden_at_its_own_complex_zeros() -> None:
+    """(s^2 - s + 0.5) / s^3 has its zeros at 0.5 +- 0.5i, not at -0.5 +- 0.5i."""
+    plant = obsynth.DescriptorSystem(
+        None, [[0, 1, 0], [0, 0, 1], [0, 0, 0]], C=[[0.5, -1.0, 1.0]], Bf=[[0], [0], [1]], dt=1.0
+    )
+    for exactly in (True, False):
+        asked = question_of(plant, exactly=exactly)
+        assert not asked.shows_at(0.5 + 0.5j)
+        assert asked.shows_at(-0.5 + 0.5j)
+        assert asked.shows_at_rest  # at one: (1 - 1 + 0.5)
+
+
+def test_slow_zeros_of_a_sampled_plant_stay_inside_whatever_the_units_of_s_are() -> None:
+    """A zero at 0.02 is inside the unit circle, though balanced units make it 2; one at 1.5 of like poles is not."""
+    for zero, blocking, at_rest in ((2.0, 0, True), (150.0, 1, True), (100.0, 1, False)):
+        plant = obsynth.DescriptorSystem(None, [[0.0, 0.01], [0.0, 0.0]], C=[[-zero, 1.0]], Bf=[[0.0], [1.0]], dt=1.0)
+        for exactly in (True, False):
+            found = question_of(plant, exactly=exactly)
+            assert len(found.blocking) == blocking
+            assert found.shows_at_rest == at_rest
+            assert found.zeros == pytest.approx([0.01 * zero])
+
+
+def test_the_gap_of_a_question_knows_how_small_a_trace_is() -> None:
+    """Of a fault nearly along an unknown input little is left: that is less clear than every rank on the way."""
+    plant = obsynth.DescriptorSystem(
+        None, [[0.5, 0.1], [0.0, 0.2]], C=np.eye(2), Bf=[[0.0], [1.0]], Bd=[[1e-7], [1.0]], dt=1.0
+    )
+    found = question_of(plant, exactly=False)
+    assert found.leaves_trace
+    assert found.gap == pytest.approx(found.trace / TRACE_TOLERANCE)
+    assert found.gap < found.plant.thinnest.gap

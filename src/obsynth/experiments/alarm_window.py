@@ -21,12 +21,13 @@ from obsynth.experiments.monitors.adaptive_monitor import start_of
 from obsynth.experiments.monitors.adaptive_record import thresholds_of_records
 from obsynth.numerics.arguments import is_finite_number
 from obsynth.numerics.arrays import FloatArray
+from obsynth.proofs.balls import gamma
 from obsynth.results.design import ObserverDesign
 from obsynth.tolerances.exact_plant import tracking_of
 from obsynth.tolerances.robustness import structure_of
 
-#: What rounding may take from a computed right side, relative to its terms.
-SUM_ROUNDING = 1e-15
+#: Roundings of a computed right side beside those of its products and sums.
+MORE_ROUNDINGS = 8
 #: The largest value of t that is of interest, in bounds of the variables.
 LARGEST_RELAXATION = 1e3
 #: Bounds of the state are widened by this share: more than rounding can take from them.
@@ -190,6 +191,8 @@ class _Builder:
         self.dd = np.hstack([plant.Dd.center, plant.plant.Dw])
         moving = np.abs(plant.E.center) + plant.E.spread + plant.E.radius
         self.algebraic = moving.max(axis=1, initial=0.0) == 0.0
+        # A right side is computed: what rounding may have taken from it, relative to its terms, counts as remainder.
+        self.rounding = gamma(plant.B.shape[1] + MORE_ROUNDINGS)
         nd = plant.Bd.shape[1]
         self.loose = (plant.Bd.spread + plant.Bd.radius) @ bounds[:nd]
         self.seen = (plant.Dd.spread + plant.Dd.radius) @ bounds[:nd]
@@ -212,8 +215,7 @@ class _Builder:
             entries |= {at.constant(k, i): -float(plant.B.parts[i][r] @ data.u[k]) for i in range(at.p)}
             entries |= {at.disturbance(k, i): -self.bd[r, i] for i in range(at.nd)}
             right = float(plant.B.center[r] @ data.u[k])
-            # The right side is computed: what rounding may have taken from it counts as remainder.
-            loose += SUM_ROUNDING * float(plant.B.magnitude[r] @ np.abs(data.u[k]))
+            loose += self.rounding * float(plant.B.magnitude[r] @ np.abs(data.u[k]))
             if loose == 0.0:
                 self.equal.add(entries, right)
             else:
@@ -230,7 +232,7 @@ class _Builder:
             entries |= {at.constant(k, i): float(plant.D.parts[i][r] @ data.u[k]) for i in range(at.p)}
             right = float(data.y[k, r] - plant.D.center[r] @ data.u[k])
             loose = float(self.seen[r] + plant.C.radius[r] @ self.size[k] + plant.D.radius[r] @ np.abs(data.u[k]))
-            loose += SUM_ROUNDING * float(abs(data.y[k, r]) + plant.D.magnitude[r] @ np.abs(data.u[k]))
+            loose += self.rounding * float(abs(data.y[k, r]) + plant.D.magnitude[r] @ np.abs(data.u[k]))
             for sign in (1.0, -1.0):
                 row = {column: sign * value for column, value in entries.items()}
                 self.below.add(row, sign * right + loose, relaxed=True)
