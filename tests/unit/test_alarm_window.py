@@ -176,3 +176,16 @@ def test_rounding_of_many_inputs_is_within_the_remainder() -> None:
     exact = sum(map(Fraction, u[0].tolist()), start=Fraction(0))
     assert below * unit <= exact <= above * unit
     assert float(above * unit - below * unit) < 1e-12
+
+
+def test_a_constant_of_a_sensor_alone_explains_what_it_can() -> None:
+    """``y = q x`` with x = 1 and q in 0.72 .. 0.88: an output of 0.88 is explained, one of 0.95 is not."""
+    from obsynth.experiments.alarm_proof import solved
+
+    given = obsynth.uncertain_system(
+        {"A": [[0.5]], "C": [["q"]], "dt": 1.0}, {"q": {"nominal": 0.8, "tolerance": "10 %"}}
+    )
+    for y, explained in ((0.88, True), (0.72, True), (0.95, False)):
+        data = WindowData(np.zeros((1, 0)), np.array([[y]]), np.ones((1, 1)), np.ones((1, 1)))
+        programme = window_programme(affine_plant(given), np.zeros(0), data)
+        assert (float(programme.proved_least(*solved(programme))) <= 1e-9) == explained

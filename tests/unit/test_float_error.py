@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from obsynth.exporting.float_error import UNIT, float_bounds
-from obsynth.methods.guaranteed_test.proofs import down, up
+from obsynth.methods.guaranteed_test.proofs import down, exact_right_sides, up
 
 
 def one_state(pole: float, *, into: float, rise: float = 0.0) -> SimpleNamespace:
@@ -46,3 +46,17 @@ def test_fractions_become_doubles_on_the_safe_side() -> None:
         assert Fraction(down(value)) <= value <= Fraction(up(value))
         assert up(value) <= np.nextafter(float(value), np.inf)
     assert up(Fraction(3, 4)) == down(Fraction(3, 4)) == 0.75
+
+
+def test_right_sides_of_a_window_are_exact() -> None:
+    """``B u`` and ``y - D u``, of doubles that no double sums up: 0.1 + 3 * 0.7."""
+    plant = SimpleNamespace(B=np.array([[0.1, 3.0]]), D=np.array([[0.7, -0.3]]), nx=1, ny=1)
+    window = SimpleNamespace(
+        plant=plant, rows=3, equations=1, outputs_at=1, question=SimpleNamespace(samples=2), standing=()
+    )
+    u, y = np.array([[1.0, 0.7], [0.2, 5.0]]), np.array([[0.4], [0.9]])
+    exact = [[Fraction(float(value)) for value in row] for row in np.vstack([plant.B, plant.D, u])]
+    b, d, *known = exact
+    wanted = [b[0] * known[0][0] + b[1] * known[0][1]]
+    wanted += [Fraction(float(y[k, 0])) - d[0] * known[k][0] - d[1] * known[k][1] for k in range(2)]
+    assert exact_right_sides(window, y, u) == wanted
