@@ -182,7 +182,7 @@ def _slowest(design: ObserverDesign) -> str:
     if isinstance(design.plant, DescriptorSystem):
         seconds = transient(design.linear[1])
         if not math.isfinite(seconds):
-            return f"the start is never forgotten; observer of order {design.observer.order}"
+            return f"the initial-condition response does not decay; observer of order {design.observer.order}"
         return f"{100.0 * FORGOTTEN:g} % settling time {number(seconds)} s; observer of order {design.observer.order}"
     factor = design.certificate.claims.get("contraction", math.nan)
     return f"errors shrink to {number(100.0 * factor)} % per step on average; observer of order {design.observer.order}"
