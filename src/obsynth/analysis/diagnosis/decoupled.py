@@ -189,10 +189,10 @@ def decoupled(plant: DescriptorSystem, removed: Sequence[int], kept: Sequence[in
         units.rows[:, None] * pencil_e * units.columns * units.time, units.rows[:, None] * pencil_a * units.columns
     )
     # Rows of the orthogonal reduction have unit length: what is below rounding is nothing.
-    rows = np.where(np.abs(found.left) > ROTATION_ROUNDING, found.left, 0.0)
+    rows = np.array(found.left)
     moving = units.rows[:nx, None] * plant.E * units.columns[:nx]
     rows[found.order :, :nx] = _without_dynamics(rows[found.order :, :nx], moving)
-    rows = rows * units.rows
+    rows = np.where(np.abs(rows) > ROTATION_ROUNDING, rows, 0.0) * units.rows
     faults = np.vstack([plant.Bf, plant.Df])[:, list(kept)]
     signals = np.block([[plant.B, np.zeros((nx, ny))], [plant.D, -np.eye(ny)]])
     sizes = np.linalg.norm(units.rows[:, None] * signals, axis=0)
