@@ -31,6 +31,11 @@ class SystemFacts:
     computed: bool = False  # whether some of the data were computed in floating point
     decisions: tuple[RankDecision, ...] = ()  # on the way, in floating point
 
+    def timed(self, rate: float) -> SystemFacts:
+        """Return the same with eigenvalues multiplied by a rate, for a plant in another unit of time."""
+        zeros, outside = (tuple(value * rate for value in values) for values in (self.zeros, self.outside))
+        return replace(self, zeros=zeros, outside=outside)
+
     @property
     def full(self) -> bool:
         """Whether the normal rank is that of all columns."""

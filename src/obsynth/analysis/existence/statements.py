@@ -283,11 +283,23 @@ class Evaluator:
             return ZeroVerdict("no" if facts.outside or not facts.full else "yes", facts)
         scales = {"Bf": self.units.faults, "Bd": self.units.disturbances, "": np.zeros(0)}[said.inputs]
         scales = scales if said.kept is None else scales[list(said.kept)]
+        # Time has a unit too: how near a pencil is to losing rank must not hang on it.
+        rate = np.concatenate([np.full(self.plant.nx, self.units.rate), np.ones(self.plant.ny)])[:, None]
         sizes = None
         if self.terms is not None:
-            sizes = self.units.scaled_pencil(E, self.arranged(said.at_zero, self.terms), scales)[1]
-        scaled = self.units.scaled_pencil(E, A, scales)
-        return zero_verdict(facts, *scaled, nx=self.plant.nx, discrete=self.plant.is_discrete, sizes=sizes)
+            sizes = rate * self.units.scaled_pencil(E, self.arranged(said.at_zero, self.terms), scales)[1]
+        moving, whole = self.units.scaled_pencil(E, A, scales)
+        found = zero_verdict(
+            facts.timed(self.units.rate),
+            moving,
+            rate * whole,
+            nx=self.plant.nx,
+            discrete=self.plant.is_discrete,
+            sizes=sizes,
+        )
+        distance = found.distance
+        own = None if distance is None else Distance(distance.value, self.units.eigenvalue(distance.point))
+        return replace(found, facts=found.facts.timed(1.0 / self.units.rate), distance=own)
 
     def no_zero_outside(
         self,

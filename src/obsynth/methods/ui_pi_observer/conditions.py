@@ -552,12 +552,6 @@ def _worst(outside: Sequence[Zero], dt: float) -> Zero:
     return max(outside, key=lambda zero: instability(zero.value, dt))
 
 
-def _timed(facts: SystemFacts, rate: float) -> SystemFacts:
-    """Return facts in the time of the scaled plant."""
-    zeros, outside = (tuple(value * rate for value in values) for values in (facts.zeros, facts.outside))
-    return replace(facts, zeros=zeros, outside=outside)
-
-
 def _hidden_trajectories(rank: int, full: int) -> Condition:
     detail = f"normal rank {rank} of {full}: whole trajectories of the plant are output-nulling."
     return _zeros(False, rank, full, detail)
@@ -616,7 +610,7 @@ def _fixed_modes(
         inputs, direct = independent_disturbances(plant)
     below = np.vstack([inputs, np.zeros((model.order, inputs.shape[1]))])
     pencil = system_pencil(augmented.E, augmented.A, below, augmented.C, direct)
-    facts = None if exact is None else believed(_timed(exact.facts, units.rate), *pencil, nx=augmented.order)
+    facts = None if exact is None else believed(exact.facts.timed(units.rate), *pencil, nx=augmented.order)
     if facts is not None and facts.full and not facts.outside:
         # A mode that only rounding of the data moves is fixed as well.
         nearly = zeros_at_rounding_level(*pencil, finite_zeros(*pencil).values, facts.zeros, nx=augmented.order)
