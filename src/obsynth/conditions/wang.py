@@ -323,6 +323,9 @@ def h2_terms(
     """
     import cvxpy as cp
 
+    if not free.shape[1]:
+        # Older cvxpy has no variable without entries: an input that does nothing stands for none.
+        entering, free = np.zeros((len(entering), 1)), np.zeros((len(free), 1))
     data, k = found.data, free.shape[1]
     C = with_sensor_faults_as_states(plant).C
     Z = cp.Variable((k, k), symmetric=True, name="Z")

@@ -134,8 +134,9 @@ def names_as_they_are(panel: Axes) -> None:
 def legend_above(panel: Axes) -> None:
     """Put the legend above a panel, where it hides nothing: in as few lines as fit its width."""
     _, labels = panel.get_legend_handles_labels()
-    figure = panel.get_figure(root=True)
-    inches = panel.get_position().width * (WIDTH if figure is None else float(figure.get_figwidth()))
+    figure = panel.get_figure()
+    # Of a part of a figure the whole has the width.
+    inches = panel.get_position().width * (WIDTH if figure is None else float(figure.figure.get_figwidth()))
     columns = max(len(labels), 1)
     while columns > 1 and _letters(labels, columns) > inches * LETTERS_PER_INCH:
         columns -= 1

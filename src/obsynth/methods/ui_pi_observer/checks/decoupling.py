@@ -122,7 +122,7 @@ def trajectories_of(plant: DescriptorSystem, point: complex, groups: Sequence[Se
 def _null_space(pencil: ComplexArray) -> tuple[ComplexArray, FloatArray, bool]:
     """Return a basis ``(n, count)`` of the null space, orthonormal, the least singular value last, in columns scaled
     by powers of two, with these, and whether the equations are independent beyond doubt."""
-    from scipy.linalg.lapack import zgeqrf, ztrcon, zunmqr
+    from scipy.linalg.lapack import zgecon, zgeqrf, zunmqr
 
     scaled, columns = equilibrated(pencil)
     equations, count = scaled.shape
@@ -130,7 +130,9 @@ def _null_space(pencil: ComplexArray) -> tuple[ComplexArray, FloatArray, bool]:
     # factor, and only for pencils far from the tolerance.
     if 0 < equations < count:
         packed, factors, _, _ = zgeqrf(scaled.conj().T)
-        if ztrcon(packed[:equations])[0] > FAR_FROM_SINGULAR:
+        # A triangle is its own LU factor; LAPACK's estimate for triangles is not in the oldest SciPy.
+        triangle = np.triu(packed[:equations])
+        if zgecon(triangle, np.linalg.norm(triangle, 1))[0] > FAR_FROM_SINGULAR:
             last = np.eye(count, dtype=np.complex128)[:, equations:]
             return zunmqr("L", "N", packed, factors, last, BLOCK * last.shape[1])[0], columns, True
     _, values, right = np.linalg.svd(scaled)
