@@ -13,7 +13,14 @@ from obsynth.errors import SpecError
 from obsynth.numerics.arguments import is_whole, real_array, real_vector
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.observers.estimates import Estimates
-from obsynth.observers.records import NAME_FIELDS, measured_record, require_horizon, require_names, whole_record
+from obsynth.observers.records import (
+    NAME_FIELDS,
+    fields_from_data,
+    measured_record,
+    require_horizon,
+    require_names,
+    whole_record,
+)
 
 
 class WindowState(NamedTuple):
@@ -120,10 +127,7 @@ class WindowObserver:
         data : mapping
             Every field by name; lists stand for tuples.
         """
-        values: dict[str, Any] = {
-            key: tuple(value) if isinstance(value, list) else value for key, value in data.items()
-        }
-        return cls(**values)
+        return cls(**fields_from_data(data))
 
     def programme_at(self, k: int) -> int:
         """Return the number of the weights at a row; -1 where there is no sum.

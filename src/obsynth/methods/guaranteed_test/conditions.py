@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -32,32 +33,27 @@ def conditions(plant: DescriptorSystem, asked: Asked, *, with_windows: bool = Tr
         "" if plant.dt > 0.0 else "the plant is continuous: sample it (transform: sample_time, obsynth.discretise).",
     )
     named = plant.nf > 0 if asked.isolate else asked.fault is not None or plant.nf == 1
-    listed = ", ".join(plant.fault_names)
-    fault = Condition(
-        "fault named",
-        "one fault is looked for",
-        named,
-        float(plant.nf),
-        1.0,
-        SOURCE,
-        "" if named else (f"name one of {listed} (fault)." if plant.nf else "the plant has no fault (Bf, Df)."),
-    )
-    lacking = list(missing_bounds(plant, asked))
-    stated = Condition(
-        "bounds stated",
-        "disturbances and noise have bounds",
-        not lacking,
-        float(len(lacking)),
-        0.0,
-        SOURCE,
-        " ".join(lacking),
-    )
+    fault = fault_named(named, plant.fault_names, "the plant has no fault (Bf, Df).")
+    stated = bounds_stated(list(missing_bounds(plant, asked)))
     first = (discrete, fault, stated)
     if not all(condition.holds for condition in first) or not with_windows:
         return first
     if asked.isolate:
         return (*first, *(_alone(plant, replace(asked, isolate=False, fault=name)) for name in plant.fault_names))
     return (*first, told(problem_of(plant, asked), asked)[0])
+
+
+def fault_named(named: bool, names: Sequence[str], none: str) -> Condition:
+    """Return the condition that one fault is looked for; ``none`` says that the plant has none to choose from."""
+    advice = f"name one of {', '.join(names)} (fault)." if names else none
+    detail = "" if named else advice
+    return Condition("fault named", "one fault is looked for", named, float(len(names)), 1.0, SOURCE, detail)
+
+
+def bounds_stated(lacking: Sequence[str]) -> Condition:
+    """Return the condition that everything has a bound, from the sentences on what has none."""
+    claim, count = "disturbances and noise have bounds", float(len(lacking))
+    return Condition("bounds stated", claim, not lacking, count, 0.0, SOURCE, " ".join(lacking))
 
 
 def _alone(plant: DescriptorSystem, asked: Asked) -> Condition:

@@ -67,25 +67,21 @@ class Problem:
         return tuple(rung for rung in asked if self.shortest <= rung <= most) or (self.shortest,)
 
 
-def problem_of(plant: DescriptorSystem, asked: Asked) -> Problem:
-    """Return what is asked of a plant; raise `SpecError` for unknown signals, missing bounds and courses that do not
-    fit."""
-    fault = fault_of(plant.fault_names, asked.fault)
-    free = free_faults(plant.fault_names, asked.free, fault)
-    before = asked.before if asked.course == "step" else 0
-    regular = decide_rank(plant.E).full
-    index = 0 if regular else ExactPencil.written(plant.E, plant.A).index
-    closing = 0 if index is None else max(index - 1, 0)
+def question_of(
+    asked: Asked, fault_names: tuple[str, ...], disturbance_names: tuple[str, ...], *, closing: int = 0
+) -> Question:
+    """Return what is looked for, of one sample more than its course needs."""
+    fault, before = fault_of(fault_names, asked.fault), asked.before if asked.course == "step" else 0
     rates = np.zeros(0)
     if asked.disturbance == "rate":
-        rates = by_name(asked.disturbance_rate, plant.disturbance_names, "disturbance_rate", every=True)
-    question = Question(
+        rates = by_name(asked.disturbance_rate, disturbance_names, "disturbance_rate", every=True)
+    return Question(
         fault,
         asked.course,
         before + 1,
         asked.lag or 0,
         before,
-        free,
+        free_faults(fault_names, asked.free, fault),
         asked.free_course,
         asked.disturbance,
         rates,
@@ -93,7 +89,16 @@ def problem_of(plant: DescriptorSystem, asked: Asked) -> Problem:
         asked.norm == "ellipsoid",
         closing,
     )
-    return Problem(plant, bounds_of(plant, asked), question, before)
+
+
+def problem_of(plant: DescriptorSystem, asked: Asked) -> Problem:
+    """Return what is asked of a plant; raise `SpecError` for unknown signals, missing bounds and courses that do not
+    fit."""
+    regular = decide_rank(plant.E).full
+    index = 0 if regular else ExactPencil.written(plant.E, plant.A).index
+    closing = 0 if index is None else max(index - 1, 0)
+    question = question_of(asked, plant.fault_names, plant.disturbance_names, closing=closing)
+    return Problem(plant, bounds_of(plant, asked), question, question.before)
 
 
 def window_as_designed(plant: DescriptorSystem, asked: Asked) -> Window:

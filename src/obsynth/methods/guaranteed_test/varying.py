@@ -17,7 +17,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.methods.guaranteed_test.options import Asked
-from obsynth.methods.guaranteed_test.problem import LADDER, MOST_STATES, between, by_name, fault_of, free_faults
+from obsynth.methods.guaranteed_test.problem import LADDER, MOST_STATES, between, by_name, question_of
 from obsynth.methods.guaranteed_test.windows import Bounds, Question, Window, stacked
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import decide_rank
@@ -168,11 +168,8 @@ def varying_problem(plant: TimeVaryingDescriptorSystem, asked: Asked) -> Varying
     if lacking:
         first = lacking[0].partition(":")[0]
         raise SpecError("A guaranteed test needs bounds.", path=f"method.options.{first}", problems=lacking)
-    fault = fault_of(plant.parameter_names, asked.fault)
     names = disturbance_names(plant)
-    rates = np.zeros(0)
-    if asked.disturbance == "rate":
-        rates = by_name(asked.disturbance_rate, names, "disturbance_rate", every=True)
+    question = question_of(asked, plant.parameter_names, names)
     disturbance, disturbance_middle = between(asked.disturbance_bounds, names, "disturbance_bounds", every=True)
     noise, noise_middle = between(asked.noise_bound, plant.output_names, "noise_bound", every=True)
     bounds = Bounds(
@@ -184,20 +181,6 @@ def varying_problem(plant: TimeVaryingDescriptorSystem, asked: Asked) -> Varying
         by_name(asked.initial_bounds, plant.state_names, "initial_bounds", every=False, missing=np.inf),
         disturbance_middle,
         noise_middle,
-    )
-    before = asked.before if asked.course == "step" else 0
-    question = Question(
-        fault,
-        asked.course,
-        before + 1,
-        asked.lag or 0,
-        before,
-        free_faults(plant.parameter_names, asked.free, fault),
-        asked.free_course,
-        asked.disturbance,
-        rates,
-        float(asked.fault_rate or 0.0),
-        asked.norm == "ellipsoid",
     )
     return VaryingProblem(plant, bounds, question)
 

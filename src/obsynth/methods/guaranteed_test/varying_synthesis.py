@@ -10,7 +10,7 @@ import numpy as np
 
 from obsynth.analysis.conditions import Condition, require_all
 from obsynth.errors import SolverError, SpecError
-from obsynth.methods.guaranteed_test.conditions import SOURCE, has_test, hidden, told_condition
+from obsynth.methods.guaranteed_test.conditions import bounds_stated, fault_named, has_test, hidden, told_condition
 from obsynth.methods.guaranteed_test.options import Asked
 from obsynth.methods.guaranteed_test.problem import COURSES, WITHIN, delay_in_samples, rounding_of
 from obsynth.methods.guaranteed_test.programs import largest_hidden_fault
@@ -33,21 +33,10 @@ from obsynth.results.design import Certificate
 
 def varying_conditions(plant: TimeVaryingDescriptorSystem, asked: Asked) -> tuple[Condition, ...]:
     """Return the conditions: a fault is named, bounds are stated, some row has a window that tells the fault."""
-    listed = ", ".join(plant.parameter_names)
     named = asked.fault is not None or plant.nq == 1
-    detail = "" if named else f"name one of {listed} (fault)." if plant.nq else "the plant has no parameter (Phi, Psi)."
-    fault = Condition("fault named", "one fault is looked for", named, float(plant.nq), 1.0, SOURCE, detail)
-    lacking = list(missing_varying_bounds(plant, asked))
-    stated = Condition(
-        "bounds stated",
-        "disturbances and noise have bounds",
-        not lacking,
-        float(len(lacking)),
-        0.0,
-        SOURCE,
-        " ".join(lacking),
-    )
-    if not (named and not lacking):
+    fault = fault_named(named, plant.parameter_names, "the plant has no parameter (Phi, Psi).")
+    stated = bounds_stated(list(missing_varying_bounds(plant, asked)))
+    if not (fault.holds and stated.holds):
         return fault, stated
     return fault, stated, _told(varying_problem(plant, asked), asked)[0]
 

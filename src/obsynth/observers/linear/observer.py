@@ -15,7 +15,7 @@ from obsynth.errors import SpecError
 from obsynth.numerics.arguments import is_whole
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.observers.estimates import Estimates
-from obsynth.observers.records import NAME_FIELDS, checked_sample, require_names, whole_record
+from obsynth.observers.records import NAME_FIELDS, checked_sample, fields_from_data, require_names, whole_record
 from obsynth.observers.running import RunningObserver
 
 
@@ -144,11 +144,7 @@ class LinearObserver:
         data : mapping
             Every field by name; lists stand for tuples.
         """
-        # JSON has lists where we have tuples of names and delays.
-        values: dict[str, Any] = {
-            key: tuple(value) if isinstance(value, list) else value for key, value in data.items()
-        }
-        return cls(**values)
+        return cls(**fields_from_data(data))
 
     def init(self, initial_state: ArrayLike | None = None) -> LinearState:
         """Return the state before the first sample.
