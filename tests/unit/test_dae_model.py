@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from dae_plants import ROD, diode, exchanger, pendulum
 
-from obsynth import DAEModel, SpecError, identifiability
+from obsynth import DAEModel, SpecError, dae_adaptive_observer, identifiability
 from obsynth.analysis.dae_structure import index_report
 from obsynth.methods.designing import check
 from obsynth.plants.dae.functions import DAEFunctions
@@ -56,6 +56,30 @@ def test_what_is_wrong_is_named(changes, words) -> None:
     with pytest.raises(SpecError) as caught:
         small(**changes)
     assert [word for word in words if word not in str(caught.value)] == []
+
+
+@pytest.mark.parametrize("name", ["der(a)", "der( a )"])
+def test_an_equation_named_by_its_derivative_gives_that(name) -> None:
+    """Without '=' the text was an algebraic equation, which a design verified and no log could follow."""
+    whole = small()
+    for text in ("-c * a + b", "der(a) = -c * a + b", "-c * a + b - der(a)"):
+        found = small(equations={name: text, "holds": "b = go + 0.1 * a"})
+        rates, x = np.array([0.3, 0.0]), np.array([2.0, 1.5])
+        local = [
+            DAEFunctions(model, "backward-euler").residual_function(x, x - rates, [1.0], [0.5], 1.0)[0]
+            for model in (found, whole)
+        ]
+        assert abs(float(local[0][0])) == pytest.approx(abs(float(local[1][0])))
+        assert found.equation_names == (name, "holds")
+    # Under any other name a text without '=' is zero, as ever; a comparison is no '='.
+    assert small(equations={"moves": "der(a) + c * a - b", "holds": "b - go - a"}).equations["holds"] == "b - go - a"
+    chosen = small(equations={name: "where(a >= b, -c * a, b)", "holds": "b = go + 0.1 * a"})
+    assert chosen.equations[name] == "der(a) = where(a >= b, -c * a, b)"
+
+
+def test_a_variance_under_another_name_than_that_of_an_equation_is_refused_with_the_names() -> None:
+    with pytest.raises(SpecError, match="Q has no signal named 'x1'; there are: moves, holds"):
+        dae_adaptive_observer(small(), dt=1.0, Q={"x1": 1.0}, R=1.0)
 
 
 def test_an_if_on_a_state_is_refused_and_where_is_not() -> None:

@@ -187,6 +187,8 @@ def test_a_delay_that_calibrate_finds_is_taken_by_every_command(tmp_path: Path, 
     # What the command line asks for, and what is found, takes the place of what the spec said.
     calibrate = ["calibrate", "--system", "spec.yaml", "--write-spec", "found.yaml", "--input-delay", "auto"]
     assert main([*calibrate, "--quiet"]) == 0
+    # The file that --force replaces may be the spec alone.
+    assert main([*calibrate, "--quiet", "--force"]) == 0
     assert obsynth.load_spec("found.yaml").inputs == {"hold": "ends", "delay": 2}
     assert main(["design", "--system", "found.yaml", "--output", "gains.json", "--quiet"]) == 0
     assert obsynth.load("gains.json").input_delay == 2

@@ -756,7 +756,8 @@ def _options(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -
 
 def _require_written(options: argparse.Namespace) -> None:
     """Refuse ``--force`` where no file is written."""
-    places = [getattr(options, name) for name in ("output", "out", "to", "state", "prove") if hasattr(options, name)]
+    files = ("output", "out", "write_spec", "to", "state", "prove")
+    places = [getattr(options, name) for name in files if hasattr(options, name)]
     if getattr(options, "force", False) and options.verb != "design" and all(place in (None, "-") for place in places):
         raise SpecError("--force replaces a file, and none is written here: give --out.", path="--force")
 

@@ -12,7 +12,7 @@ from obsynth.errors import SpecError
 from obsynth.numerics.arguments import is_number, real_array, real_number
 from obsynth.numerics.arrays import FloatArray, as_matrix, unmasked
 from obsynth.plants.dae.checks import finite_vector
-from obsynth.plants.validation import index_of
+from obsynth.plants.validation import index_of, suggestion
 
 #: The fields of an observer that hold names.
 NAME_FIELDS = ("input_names", "output_names", "state_names", "fault_names", "residual_names")
@@ -116,6 +116,8 @@ def named_vector(value: Any, names: Sequence[str], default: FloatArray, what: st
         return finite_vector(value, names, default, what)
     vector = np.array(default)
     for name, entry in value.items():
+        if name not in names and not suggestion(name, names):
+            raise SpecError(f"{what} has no signal named {name!r}; there are: {', '.join(names)}.", path=what)
         vector[index_of(name, names, what=what)] = real_number(entry, f"{what}.{name}")
     return vector
 

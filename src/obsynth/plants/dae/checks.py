@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
@@ -12,11 +13,13 @@ from obsynth.errors import SpecError
 from obsynth.numerics.arguments import is_finite_number, real_array
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.expressions import CONSTANTS, DECIDING_WORDS, FUNCTIONS, FUNCTIONS_OF_TWO
-from obsynth.plants.dae.symbols import DAEFields, DAESymbols, symbols_of
+from obsynth.plants.dae.symbols import EQUALS, DAEFields, DAESymbols, symbols_of
 from obsynth.plants.validation import Problems, checked_names
 
 #: Names that mean something else in the language.
 RESERVED = frozenset({*CONSTANTS, *FUNCTIONS, *FUNCTIONS_OF_TWO, *DECIDING_WORDS, "der", "where"})
+#: An equation that is named by the derivative that it gives.
+_RATE = re.compile(r"der\(\w+\)")
 
 
 def checked_signals(values: Mapping[str, float] | None, what: str) -> dict[str, float]:
@@ -44,7 +47,15 @@ def checked_texts(texts: Mapping[str, str], what: str) -> dict[str, str]:
             raise SpecError(f"{what}.{name} must be a text, such as 'area * der(level) = inflow'.", path=what)
         if what == "definitions" and (not name.isidentifier() or name in RESERVED):
             raise SpecError(f"{what} names {name!r}: use letters, digits and '_'.", path=what)
-    return {name: str(text) for name, text in texts.items()}
+    found = {name: str(text) for name, text in texts.items()}
+    return {name: _whole_equation(name, text) for name, text in found.items()} if what == "equations" else found
+
+
+def _whole_equation(name: str, text: str) -> str:
+    """Return an equation; under the name ``der(x)`` a text without that and without '=' says what that is."""
+    rate = "".join(name.split())
+    alone = _RATE.fullmatch(rate) and not EQUALS.search(text) and rate not in "".join(text.split())
+    return f"{rate} = {text}" if alone else text
 
 
 def checked_equation_names(

@@ -39,9 +39,9 @@ class DAEModel(DAEFields):
     Parameters
     ----------
     equations : mapping of str to str, or callable
-        Name -> ``"left = right"`` (or an expression that is zero), as many as states; or a function
-        ``F(rates, x, u, theta)`` of lists that returns a list, written with numpy's functions (``where`` instead of
-        ``if``).
+        Name -> ``"left = right"`` (or an expression that is zero; under the name ``der(x)``: what that is), as many as
+        states; or a function ``F(rates, x, u, theta)`` of lists that returns a list, written with numpy's functions
+        (``where`` instead of ``if``).
     outputs : mapping of str to str, or callable
         Name -> expression of states and parameters; or a function ``h(x, theta)`` that returns a list.
     states : mapping of str to float

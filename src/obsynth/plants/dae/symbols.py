@@ -13,7 +13,7 @@ from obsynth.errors import SpecError
 from obsynth.numerics.expressions import Expression, parse_expression, step_function
 
 #: The sign between two sides, which is no part of a comparison.
-_EQUALS = re.compile("(?<![<>=])=(?!=)")
+EQUALS = re.compile("(?<![<>=])=(?!=)")
 Equations = Mapping[str, str] | Callable[..., Sequence[Any]]
 
 
@@ -135,7 +135,7 @@ def _parsed(text: str, path: str, *, rates: bool = False) -> Expression:
 
 def equation_of(text: str, path: str) -> Expression:
     """Parse ``left = right``, or an expression that is zero."""
-    sides = _EQUALS.split(text, maxsplit=1)
+    sides = EQUALS.split(text, maxsplit=1)
     for side in sides:
         _parsed(side.strip(), path, rates=True)
     whole = _parsed(f"({sides[0]}) - ({sides[1]})" if len(sides) > 1 else text, path, rates=True)
