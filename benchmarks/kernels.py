@@ -17,16 +17,21 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import asdict
+from itertools import zip_longest
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 ROOT = Path(__file__).parents[1]
 KERNELS = ("Haswell", "SkylakeX", "Nehalem", "Prescott")
 CAMPAIGNS = ("existence", "recursive_existence", "random_tolerances", "diagnosis")
 #: Runs beside those of the kernels: a second thread, with the first kernel.
 TWO_THREADS = "2 threads"
+#: How many other texts a table lists for a campaign and a machine.
+LISTED = 10
 
 
 def environment(machine: str) -> dict[str, str]:
@@ -67,6 +72,24 @@ def design_all(folder: Path, specs: Iterable[str]) -> None:
         print(json.dumps({"spec": spec, "code": code}), flush=True)
 
 
+def listen(campaign: ModuleType, designed: Callable[[Any], object], refused: Callable[[Exception], object]) -> None:
+    """Let functions see what the methods of a campaign answer."""
+
+    def heard(method: Callable[..., object]) -> Callable[..., object]:
+        def answered(*given: object, **options: object) -> object:
+            try:
+                design = method(*given, **options)
+            except Exception as error:
+                refused(error)
+                raise
+            designed(design)
+            return design
+
+        return answered
+
+    campaign._METHODS = {name: heard(method) for name, method in campaign._METHODS.items()}  # type: ignore[attr-defined]
+
+
 def design_random(folder: Path, first: int, cases: int) -> None:
     """Design the plants of the campaign on existence into a folder; a line of JSON for each."""
     from benchmarks.campaigns import existence
@@ -74,15 +97,7 @@ def design_random(folder: Path, first: int, cases: int) -> None:
     from obsynth import ObserverDesign
 
     kept: list[ObserverDesign] = []
-
-    def keeping(method: Callable[..., ObserverDesign]) -> Callable[..., ObserverDesign]:
-        def kept_design(*given: object, **options: object) -> ObserverDesign:
-            kept.append(method(*given, **options))
-            return kept[-1]
-
-        return kept_design
-
-    existence._METHODS = {name: keeping(method) for name, method in existence._METHODS.items()}
+    listen(existence, kept.append, lambda error: None)
     for seed in range(first, first + cases):
         kept.clear()
         outcome = existence.case(seed)
@@ -135,9 +150,14 @@ def run_cases(campaign: str, first: int, cases: int) -> None:
     from benchmarks.campaigns.frame import load_campaign, outcome_of
 
     module = load_campaign(campaign)
+    told: list[str] = []
+    if hasattr(module, "_METHODS"):
+        # What a person reads: the summary of a design, or the condition, mode and advice of a refusal.
+        listen(module, lambda design: told.append(str(design)), lambda error: told.append(str(error)))
     for seed in range(first, first + cases):
+        told.clear()
         outcome = outcome_of(module, seed)
-        print(json.dumps({"seed": seed, **asdict(outcome)}), flush=True)
+        print(json.dumps({"seed": seed, **asdict(outcome), "told": "\n".join(told)}), flush=True)
 
 
 def compare_campaigns(machines: Sequence[str], campaigns: Sequence[str], first: int, cases: int, journal: Path) -> str:
@@ -148,7 +168,7 @@ def compare_campaigns(machines: Sequence[str], campaigns: Sequence[str], first: 
             line = json.loads(text)
             known.setdefault((line.pop("campaign"), line.pop("machine")), {})[line["seed"]] = line
     rows = ["| campaign | cases | " + " | ".join(machines[1:]) + " |", "| --- | --- |" + " --- |" * (len(machines) - 1)]
-    listed = []
+    listed, changed = [], []
     for campaign in campaigns:
         for machine in machines:
             found = known.setdefault((campaign, machine), {})
@@ -164,20 +184,38 @@ def compare_campaigns(machines: Sequence[str], campaigns: Sequence[str], first: 
                     stream.flush()
         counts = []
         for machine in machines[1:]:
-            differing = [
-                seed for seed in range(first, first + cases)
-                if known[campaign, machines[0]][seed] != known[campaign, machine][seed]
-            ]  # fmt: skip
-            counts.append(str(len(differing)))
-            for seed in differing:
-                both = (known[campaign, which][seed] for which in (machines[0], machine))
-                told = (
-                    f"{line['group']}: {line['result']}{', ' + str(line['wrong']) if line['wrong'] else ''}"
-                    for line in both
-                )
-                listed.append(f"- {campaign}, seed {seed}: {machines[0]} {' / '.join(told)} {machine}")
+            pairs = [(known[campaign, machines[0]][seed], known[campaign, machine][seed])
+                     for seed in range(first, first + cases)]  # fmt: skip
+            differing = [pair for pair in pairs if outcome(pair[0]) != outcome(pair[1])]
+            listed += [
+                f"- {campaign}, seed {a['seed']}: {machines[0]} {answer(a)} / {answer(b)} {machine}"
+                for a, b in differing
+            ]
+            texts = [line for pair in pairs if pair not in differing for line in other_line(*pair)]
+            changed += [f"- {campaign}, {machine}: {line}" for line in texts[:LISTED]]
+            counts.append(f"{len(differing)}, {len(texts)} of text")
         rows.append(f"| {campaign} | {first} to {first + cases - 1} | " + " | ".join(counts) + " |")
-    return "\n".join([*rows, "", f"Differences: {len(listed)}.", *listed]) + "\n"
+    told = ["", f"Texts that differ (at most {LISTED} of each):", *changed] if changed else []
+    return "\n".join([*rows, "", f"Differences: {len(listed)}.", *listed, *told]) + "\n"
+
+
+def outcome(line: Mapping[str, object]) -> dict[str, object]:
+    """Return a case without what was told of it."""
+    return {key: value for key, value in line.items() if key != "told"}
+
+
+def answer(line: Mapping[str, object]) -> str:
+    """Return method, answer and what was wrong as text."""
+    return f"{line['group']}: {line['result']}{', ' + str(line['wrong']) if line['wrong'] else ''}"
+
+
+def other_line(first: Mapping[str, object], second: Mapping[str, object]) -> Iterator[str]:
+    """Yield the first line of two texts that is not the same, if there is one."""
+    texts = (str(line.get("told", "")).splitlines() for line in (first, second))
+    for one, other in zip_longest(*texts, fillvalue=""):
+        if one != other:
+            yield f"seed {first['seed']}: {one.strip()} / {other.strip()}"
+            return
 
 
 def main() -> int:

@@ -11,6 +11,7 @@ import pytest
 from corruption_tables import (
     assert_every_row_is_broken,
     assert_exactly_the_untrue_rows_fail,
+    assert_information_does_not_fail,
 )
 
 from obsynth import Certificate, DescriptorSystem, ObserverDesign, functional_filter
@@ -164,4 +165,8 @@ def test_exactly_the_untrue_rows_fail(case: str) -> None:
 
 
 def test_every_row_is_broken() -> None:
-    assert_every_row_is_broken(TABLE, *(good(name).report for name in DESIGNS))
+    assert_every_row_is_broken(TABLE, DESIGNS, good)
+
+
+def test_information_does_not_fail() -> None:
+    assert_information_does_not_fail(TABLE, good)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 
 import obsynth
 from obsynth.cli.main import main
+from obsynth.report.designs import design_warnings, followed_steps
 from obsynth.report.summary import summary
 
 DESIGNS = Path(__file__).parents[2] / "designs"
@@ -137,3 +139,40 @@ def test_matrices_of_another_time_are_asked_about(matrix, dt, words, tmp_path, m
     main(["check", "--system", "spec.yaml"])
     asked = capsys.readouterr().err
     assert (words in asked) if words else not asked
+
+
+def test_figures_of_a_step_end_where_an_unstable_plant_is_let_go():
+    # The plant doubles in a second and no input holds it: after some twenty samples its outputs are beyond all digits.
+    plant = obsynth.DescriptorSystem(
+        None, [[2.0, 0.0], [0.0, 0.5]], C=np.eye(2), Bf=[[1.0], [0.0]], Dw=0.1 * np.eye(2), dt=1.0
+    )
+    design = obsynth.fault_estimation_filter(plant)
+    (found,) = followed_steps(design).values()
+    assert found.horizon == pytest.approx(np.log(1e6) / np.log(2.0), abs=1.5)
+
+
+@pytest.mark.parametrize(
+    ("value", "told"),
+    [
+        (-2.4e-3, "0"),
+        (0.8834, "0.88"),
+        (-0.478, "-0.48"),
+        (-2.02e16, "more than 10 times"),
+        (np.nan, "more than 10 times"),
+    ],
+)
+def test_a_missed_step_is_told_to_the_digits_that_are_not_rounding(network, value, told):
+    (name, figures), *_ = followed_steps(network).items()
+    (text,) = design_warnings(network, {name: replace(figures, at_horizon=value)})
+    assert f"reads {told}" in text
+
+
+def test_a_fixed_pole_at_zero_is_zero():
+    # Rounding makes 1e-16 of it, another one on each processor.
+    turned = np.linalg.qr(np.random.default_rng(0).standard_normal((3, 3)))[0]
+    dynamics = np.array([[0.5, 0.0, 0.0], [0.2, 0.3, 0.0], [0.3, 0.1, 0.0]])
+    plant = obsynth.DescriptorSystem(
+        None, turned @ dynamics @ turned.T, C=np.eye(2, 3) @ turned.T, Bf=turned[:, :1], dt=1.0
+    )
+    notes = obsynth.ui_pi_observer(plant).notes
+    assert any(note.endswith("poles are fixed, whatever the gains: 0.") for note in notes)

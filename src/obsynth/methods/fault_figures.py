@@ -43,6 +43,8 @@ class FaultFigures:
         Time until the estimate of a unit step first shows 50 and 90 % of it; infinite where it never does.
     at_horizon, peak : float
         The estimate of a unit step at the horizon, and its largest absolute value before.
+    horizon : float, seconds
+        How long the step was followed: a shorter time where the plant is unstable and nothing holds it.
     deviation : float
         Standard deviation under the stated noise.
     leak : float
@@ -54,6 +56,7 @@ class FaultFigures:
     most: float
     at_horizon: float
     peak: float
+    horizon: float
     deviation: float
     leak: float
 
@@ -143,6 +146,7 @@ def _figures(
             _first(own >= NEARLY_ALL, plant.dt),
             float(own[-1]),
             float(np.max(np.abs(own))),
+            len(own) * plant.dt,
             float(np.sqrt(np.sum(noise[:, row] ** 2))),
             float(np.max(gains, initial=0.0)),
         )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass
 
 from rich.console import Console
 from rich.table import Table
@@ -206,14 +205,8 @@ def fault_estimates(design: ObserverDesign, gains: FaultGains | None) -> tuple[t
 
 #: Without a scenario steps are followed for so many settling times of the plant, at most so many samples.
 STEP_SETTLING_TIMES, MOST_STEP_SAMPLES = 30, 6000
-
-
-@dataclass(frozen=True)
-class Followed:
-    """Steps of the faults, followed for so many seconds: figures by fault, none where they could not be followed."""
-
-    figures: Mapping[str, FaultFigures]
-    seconds: float
+#: An estimate of a unit step beyond this is no estimate, and its size is that of rounding that has grown.
+FAR_FROM_ONE = 10.0
 
 
 def _estimating(design: ObserverDesign) -> tuple[DescriptorSystem, LinearObserver] | None:
@@ -228,40 +221,45 @@ def _estimating(design: ObserverDesign) -> tuple[DescriptorSystem, LinearObserve
     return (plant, observer) if observer.fault_names and set(observer.fault_names) <= set(plant.fault_names) else None
 
 
-def followed_steps(design: ObserverDesign, horizon: float | None = None) -> Followed:
-    """Return what becomes of a unit step of each fault of a linear design; ``horizon`` in s."""
-    nothing, pair = Followed({}, 0.0), _estimating(design)
+def followed_steps(design: ObserverDesign) -> Mapping[str, FaultFigures]:
+    """Return what becomes of a unit step of each fault of a linear design, by fault, none where they could not be
+    followed."""
+    pair = _estimating(design)
     if pair is None:
-        return nothing
+        return {}
     plant, observer = pair
     if (observer.Bu.shape[1], observer.By.shape[1]) != (plant.nu, plant.ny):
-        return nothing
+        return {}
     step = plant.dt if plant.dt > 0.0 else settling_time(plant) / SAMPLES
-    length = horizon if horizon is not None else STEP_SETTLING_TIMES * settling_time(plant)
+    length = STEP_SETTLING_TIMES * settling_time(plant)
     steps = int(min(max(length / step, 20), MOST_STEP_SAMPLES))
     try:
         sampled = on_the_clock(plant, step)
         clocked = observer if observer.dt > 0.0 else sample_observer(observer, step)
     except ObsynthError:
-        return nothing
-    return Followed({found.fault: found for found in fault_figures(sampled, clocked, steps)}, steps * step)
+        return {}
+    return {found.fault: found for found in fault_figures(sampled, clocked, steps)}
 
 
 def design_warnings(
-    design: ObserverDesign, horizon: float | None = None, *, told: Collection[str] = (), steps: Followed | None = None
+    design: ObserverDesign, steps: Mapping[str, FaultFigures], *, told: Collection[str] = ()
 ) -> tuple[str, ...]:
-    """Return what to know before trusting the fault estimates; ``horizon`` in s, ``steps`` from `followed_steps`."""
+    """Return what to know before trusting the fault estimates; ``steps`` from `followed_steps`."""
     pair = _estimating(design)
     if pair is None:
         return ()
-    found = followed_steps(design, horizon) if steps is None else steps
     missed = (
-        f"A unit step of {name} reads {figures.at_horizon:.3g} after {found.seconds:.3g} s: the estimate does not "
-        "reach it by then."
-        for name, figures in found.figures.items()
+        f"A unit step of {name} reads {_of_one(figures.at_horizon)} after {figures.horizon:.2g} s: the estimate does "
+        "not reach it by then."
+        for name, figures in steps.items()
         if not figures.reaches and name not in told
     )
     return (*_undetectable(*pair), *missed)
+
+
+def _of_one(value: float) -> str:
+    """Return the estimate of a unit step to the digits that are not rounding, whatever the design."""
+    return f"{round(value, 2) + 0.0:g}" if abs(value) <= FAR_FROM_ONE else f"more than {FAR_FROM_ONE:g} times as much"
 
 
 def _undetectable(plant: DescriptorSystem, observer: LinearObserver) -> Iterator[str]:

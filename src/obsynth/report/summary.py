@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import textwrap
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
@@ -15,6 +15,7 @@ from rich.text import Text
 
 from obsynth.analysis.structure import questions
 from obsynth.files.tables import html_table
+from obsynth.methods.fault_figures import FaultFigures
 from obsynth.methods.registry import REGISTRY, method_class
 from obsynth.observers.linear.derived import FORGOTTEN, transient
 from obsynth.observers.windows import WindowObserver
@@ -23,7 +24,7 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.plotting.frequency import FaultGains
 from obsynth.report.designs import (
-    Followed,
+    FAR_FROM_ONE,
     design_warnings,
     fault_estimates,
     followed_steps,
@@ -134,7 +135,7 @@ def print_summary(found: Summary, *, console: Console) -> None:
         console.print(Text(text, style=style), soft_wrap=True)
 
 
-def _facts(design: ObserverDesign, steps: Followed) -> Iterator[tuple[str, str]]:
+def _facts(design: ObserverDesign, steps: Mapping[str, FaultFigures]) -> Iterator[tuple[str, str]]:
     known = method_class(design.method) if design.method in REGISTRY else None
     yield "method", design.method + (f": {known.summary}" if known else "")
     yield "plant", _plant(design.plant)
@@ -183,18 +184,19 @@ def _slowest(design: ObserverDesign) -> str:
         seconds = transient(design.linear[1])
         if not math.isfinite(seconds):
             return f"the initial-condition response does not decay; observer of order {design.observer.order}"
-        return f"{100.0 * FORGOTTEN:g} % settling time {number(seconds)} s; observer of order {design.observer.order}"
+        settling = f"{100.0 * FORGOTTEN:g} % settling time {number(seconds, digits=2)} s"
+        return f"{settling}; observer of order {design.observer.order}"
     factor = design.certificate.claims.get("contraction", math.nan)
     return f"errors shrink to {number(100.0 * factor)} % per step on average; observer of order {design.observer.order}"
 
 
-def _speed(design: ObserverDesign, steps: Followed) -> Iterator[tuple[str, str]]:
+def _speed(design: ObserverDesign, steps: Mapping[str, FaultFigures]) -> Iterator[tuple[str, str]]:
     """Yield how soon the estimates show a step, where that is later than their delays say."""
-    if not steps.figures:
+    if not steps:
         return
     observer = design.linear[1]
     late = dict(zip(observer.fault_names, observer.fault_delays, strict=True))
-    reached = [(name, found.most) for name, found in steps.figures.items() if found.reaches]
+    reached = [(name, found.most) for name, found in steps.items() if found.reaches]
     told = [f"{name} {number(most, digits=4)} s" for name, most in reached if most > (late[name] + 0.5) * observer.dt]
     if told:
         more = f" and {len(told) - _MOST_FAULTS} more" if len(told) > _MOST_FAULTS else ""
@@ -217,7 +219,7 @@ def _assumptions(design: ObserverDesign) -> Iterator[str]:
         yield f"white noise on {noisy} of {design.plant.ny} sensors" if noisy else "no sensor noise stated"
 
 
-def _warnings(design: ObserverDesign, gains: FaultGains | None, steps: Followed) -> Iterator[str]:
+def _warnings(design: ObserverDesign, gains: FaultGains | None, steps: Mapping[str, FaultFigures]) -> Iterator[str]:
     """Yield what a user should not overlook: leaks that look like faults, steps that are not followed."""
     if isinstance(design.plant, DescriptorSystem):
         yield from questions(design.plant)
@@ -236,10 +238,10 @@ def _warnings(design: ObserverDesign, gains: FaultGains | None, steps: Followed)
                 )
         followed = float(gains.steady[i])
         if abs(followed - 1.0) > FOLLOWS:
-            share = number(100.0 * followed, digits=3)
+            share = f"{round(100.0 * followed)} %" if abs(followed) <= FAR_FROM_ONE else "many times the size"
             told.append(fault)
-            yield f"the estimate of {fault} does not follow a step: in the end it shows {share} % of it."
-    yield from design_warnings(design, told=told, steps=steps)
+            yield f"the estimate of {fault} does not follow a step: in the end it shows {share} of it."
+    yield from design_warnings(design, steps, told=told)
     for check in design.report.checks:
         if check.name.startswith("limit at "):
             yield f"{check.name}: {check.claim}."

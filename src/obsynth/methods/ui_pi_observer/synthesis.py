@@ -34,6 +34,7 @@ from obsynth.methods.ui_pi_observer.placement_problem import (
     placement_problem,
 )
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.ranks import NEGLIGIBLE_MODE
 from obsynth.numerics.spectra import decay_rates
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.fault_models import exosystem
@@ -53,8 +54,10 @@ def notes(
     if fixed.size:
         slow, least = asked.slowest_asked(dt), np.min(decay_rates(fixed, dt))
         behind = slow is not None and least < slow
+        # A pole at z = 0 comes out as rounding has it.
+        told = np.where(np.abs(fixed) > NEGLIGIBLE_MODE, fixed, 0.0) if dt > 0.0 else fixed
         yield (
-            f"{fixed.size} of {len(problem.F)} poles are fixed, whatever the gains: {', '.join(numbers(fixed))}"
+            f"{fixed.size} of {len(problem.F)} poles are fixed, whatever the gains: {', '.join(numbers(told))}"
             + (f"; the slowest decays at {least:.3g} 1/s, slower than asked." if behind else ".")
         )
     own, decay = problem.rate / problem.units.time, claims.get("decay")
