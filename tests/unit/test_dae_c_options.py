@@ -36,7 +36,8 @@ def tank_observer(form: str, options: dict):
 
 
 def leaking(design, samples: int = 150) -> tuple[np.ndarray, np.ndarray]:
-    """A leak that opens at k = 70, with single wrong samples of any size, gaps, and one sensor that steps."""
+    """A leak that opens at k = 70, with single wrong samples of any size, gaps, and one sensor that steps, where a
+    sample of 1e6 on the side of its onset and a blank one follow."""
     u = np.tile(design.plant.nominal_input, (samples, 1))
     leak = np.where(np.arange(samples) < 70, 0.0, 0.03)[:, None]
     y = np.array(simulate_dae(design.plant, u, dt=1.0, parameters=leak, R=design.observer.R, seed=3).outputs)
@@ -45,6 +46,7 @@ def leaking(design, samples: int = 150) -> tuple[np.ndarray, np.ndarray]:
     y[50:53] = np.nan
     y[60] = [np.nan, 1e200, 3.0]
     y[110:, 2] += 0.4
+    y[111, 2], y[112, 2] = 1e6, np.nan
     return y, u
 
 

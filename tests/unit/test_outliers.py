@@ -12,6 +12,7 @@ from test_validate import designed
 
 import obsynth
 from obsynth import SolverError, SpecError, run_on_data, simulate_dae
+from obsynth.observers.running import state_as_data, state_from_data
 
 
 def tank_log(samples=120, seed=2):
@@ -110,6 +111,58 @@ def test_samples_that_jump_from_side_to_side_are_left_out_one_by_one():
         sides.append(state.refused[0, 0])
     assert (sides[80], sides[81], sides[100], sides[101]) == (1.0, -2.0, -1.0, 0.0)
     assert state.refused[1].tolist() == [3.0, 0.0]
+
+
+def gate_counts(observer, y, u, *, saved_at: int | None = None):
+    """Samples of each sensor that are left out until each row; from a state that was saved before row ``saved_at``."""
+    state, counts = observer.init(), []
+    for k in range(len(y)):
+        if k == saved_at:
+            data = state_as_data(state)
+            assert np.asarray(data["refused"]).shape == (4, y.shape[1])
+            state = state_from_data(observer.init(), data)
+        state, row = observer.advance(state, y[k], u[k])
+        counts.append(state.refused[1])
+    return np.array(counts), row
+
+
+#: Onset of a fault of a sensor, in units of its step, and which of its first samples are left out.
+ONSETS = {
+    "step": ([1, 1, 1, 1], [1, 0, 0, 0]),
+    "ramp": ([1, 2, 3, 4], [1, 0, 0, 0]),
+    "square of time": ([1, 4, 9, 16], [1, 0, 0, 0]),
+    "wild second": ([1, 1e6, 1, 1], [1, 1, 1, 0]),
+    "wild third": ([1, 1, 1e6, 1], [1, 0, 1, 0]),
+    "wild first": ([1e6, 1, 1, 1], [1, 1, 0, 0]),
+    "wild on both sides": ([1, -1e6, 1e9, -1e3, 1], [1, 1, 1, 1, 1]),
+    "wild and wilder": ([1e3, 1e6, 1e9, 1e12, 1], [1, 1, 1, 1, 1]),
+    "blank between": ([1, np.nan, 1, 1], [1, 0, 0, 0]),
+    "no number of a sensor": ([1, 1e200, 1e300, 1], [1, 1, 1, 1]),
+}
+
+
+@pytest.mark.parametrize("name", ONSETS)
+@pytest.mark.parametrize("kind", ["recursive", "nonlinear"])
+def test_a_gate_believes_a_second_sample_as_far_off_as_the_first_and_no_wild_one(kind, name):
+    onset, lost = np.array(ONSETS[name][0], dtype=float), ONSETS[name][1]
+    if kind == "recursive":
+        design, (y, u), at = filter_design(outliers="gate"), filter_record(100), 80
+    else:
+        design, u, true = tank_log(80)
+        design, y, at = replace(design, observer=replace(design.observer, outliers="gate")), np.array(true.outputs), 60
+    # A second is ten deviations of the innovation: what the first samples that are believed leave is far no more.
+    size = 10.0 * design.observer.run(y[: at + 1], u[: at + 1]).innovations[20:, 0].std()
+    clean, _ = gate_counts(design.observer, y, u)
+    y[at : at + len(onset), 0] += size * onset
+    found, row = gate_counts(design.observer, y, u)
+    new = np.diff(found[at - 1 : at + len(onset), 0])
+    assert clean.sum() == 0.0
+    assert new.tolist() == lost
+    assert np.isfinite(row.x).all()
+    assert np.abs(row.x).max() < 10.0
+    resumed, again = gate_counts(design.observer, y, u, saved_at=at + 2)
+    assert np.array_equal(resumed, found)
+    assert np.array_equal(again.x, row.x)
 
 
 def test_run_leaves_outliers_out_by_default_and_counts_them(tmp_path):

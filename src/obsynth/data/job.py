@@ -263,7 +263,7 @@ class Job:
 
 
 KIND = "obsynth run state"
-SCHEMA_VERSION = 8
+SCHEMA_VERSION = 9
 STATE = FileKind("a saved state of obsynth", rb'\A\s*\{\s*"kind":\s*"obsynth run state"')
 #: Parts that are seconds, or nothing before the first row.
 _TIMES = frozenset({"last", "longest"})

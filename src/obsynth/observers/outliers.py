@@ -26,8 +26,11 @@ LIMITS = {"gate": 6.0, "huber": 3.0}
 #: What is larger has no square: it is no measurement, whatever the model says.
 OVERFLOW = 1e150
 #: Samples of one sensor in a row that are left out where their sides change; the second on one side is believed, and
-#: so are those that follow it there.
+#: so are those that follow it there, unless they are wild.
 LONGEST = 2
+#: How many times further off than the one before it a sample may be that is believed for it: at the onset of a fault
+#: that grows with the square of time the second is 4 times further off, and noise moves both.
+COMPARABLE = 5.0
 #: How many times further off than the limit a sample must be that nothing contradicts but the equations of the model;
 #: and what rounding makes of a prediction without noise.
 BLIND, ROUNDING = 10.0, 1e-6
@@ -50,9 +53,10 @@ def checked_limit(kind: str, limit: float | None) -> float:
 
 
 def no_refusals(outputs: int) -> FloatArray:
-    """Return the memory of outliers at a start, ``(2, ny)``: how many samples in a row of each sensor were far from
-    their prediction, negative where the last was below it, and how many were left out or pulled at all."""
-    return np.zeros((2, outputs))
+    """Return the memory of outliers at a start, ``(4, ny)``: how many samples in a row of each sensor were far from
+    their prediction, negative where the last was below it; how many were left out or pulled at all; and how far off, in
+    units of the sensor and with its sign, the latest of those in a row was that was left out, and that was believed."""
+    return np.zeros((4, outputs))
 
 
 def robust_advance(
@@ -78,28 +82,48 @@ def robust_advance(
                 mean, deviation = predicted_outputs(state, u)
                 far = np.abs(y - mean) > BLIND * limit * deviation + ROUNDING * (np.abs(y) + np.abs(mean).max())
         if passes and not far.any():
-            return after._replace(refused=np.stack([np.zeros(len(y)), state.refused[1]])), row
+            return after._replace(refused=_remembered(state.refused, y, far, far, y)), row
     except (SolverError, np.linalg.LinAlgError, ValueError):
         failed = True
     if not far.any():
         mean, deviation, far = _judged(limit, predicted, state, y, u)
-    sides, before = np.where(far, np.where(y < mean, -1.0, 1.0), 0.0), state.refused[0]
+    off, gone = np.where(far, y - mean, 0.0), far
     if kind == "gate":
-        # A wrong sample stands alone; of a sensor, or a plant, that has moved the next is on the same side.
-        far &= ((sides * before <= 0.0) & (np.abs(before) < LONGEST)) | (np.abs(y) > OVERFLOW)
-        heard = np.where(far, np.nan, y)
+        # A wrong sample stands alone; of a sensor, or a plant, that has moved the next is on the same side, as far off.
+        gone = far & (~_follows(state.refused, off) | (np.abs(y) > OVERFLOW))
+        heard = np.where(gone, np.nan, y)
     else:
         pulled = mean + limit * deviation * np.sign(y - mean)
-        heard = np.where(far, np.where(np.isfinite(pulled), pulled, np.nan), y)
+        heard = np.where(gone, np.where(np.isfinite(pulled), pulled, np.nan), y)
     try:
-        if failed or far.any():
+        if failed or gone.any():
             after, row = plain(state, heard, u)
     except (SolverError, np.linalg.LinAlgError, ValueError):
         # A sample that nothing predicts, and with which there is no step.
-        far = ~np.isnan(y)
+        gone = ~np.isnan(y)
         after, row = plain(state, np.full(len(y), np.nan), u)
-    counts = np.where(np.isnan(y), before, sides * (np.abs(before) + 1.0))
-    return after._replace(refused=np.stack([counts, state.refused[1] + far])), row
+    return after._replace(refused=_remembered(state.refused, y, far, gone, off)), row
+
+
+def _follows(refused: FloatArray, off: FloatArray) -> BoolArray:
+    """Return which samples ``off (ny,)`` their prediction go on with what was off before: with what was believed, or as
+    far as the one that was left out, on its side or after `LONGEST` of them on any."""
+    row, _, left, believed = refused
+    sizes, others = np.abs(off), np.abs(left)
+    with np.errstate(over="ignore"):
+        on = (off * np.sign(believed) > 0.0) & (sizes <= COMPARABLE * np.abs(believed))
+        like = (others > 0.0) & (sizes <= COMPARABLE * others) & (others <= COMPARABLE * sizes)
+    return np.asarray(on | like & ((off * np.sign(left) > 0.0) | (np.abs(row) >= LONGEST)))
+
+
+def _remembered(refused: FloatArray, y: FloatArray, far: BoolArray, gone: BoolArray, off: FloatArray) -> FloatArray:
+    """Return the memory of outliers after a sample, of which those that are ``far (ny,)`` are ``off`` by so much, and
+    some are ``gone``: left out or pulled. A missing sample leaves it as it was."""
+    row, total, left, believed = refused
+    counts = np.where(far, np.where(off < 0.0, -1.0, 1.0) * (np.abs(row) + 1.0), 0.0)
+    after = np.stack([counts, total + gone, *(np.where(far, np.where(which, off, old), 0.0)
+                      for which, old in ((gone, left), (~gone, believed)))])  # fmt: skip
+    return np.where(np.isnan(y) & np.array([[True], [False], [True], [True]]), refused, after)
 
 
 def _judged(

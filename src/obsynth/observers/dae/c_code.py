@@ -28,7 +28,7 @@ from obsynth.numerics.ranks import DEPENDENT_BOUND
 from obsynth.observers.dae.settings import initial_memory
 from obsynth.observers.dae.step_graph import ObserverGraph
 from obsynth.observers.dae.steps import PROJECTION_NOTICE, PROJECTION_SHARE, Steps
-from obsynth.observers.outliers import LONGEST, OVERFLOW, RESET_WINDOW, chi_square_limit
+from obsynth.observers.outliers import COMPARABLE, LONGEST, OVERFLOW, RESET_WINDOW, chi_square_limit
 from obsynth.plants.dae import step as implicit_step
 from obsynth.plants.dae.functions import DAEFunctions
 from obsynth.plants.dae.step import step_graph
@@ -69,8 +69,10 @@ def observer_struct(steps: Steps, name: str) -> Iterator[str]:
     graph, model, timing = steps.graph, steps.settings.model, steps.settings.timing
     inner = name if timing.is_plain else f"{name}_memory"
     yield from (f"struct {inner} {{", f"    double memory[{graph.memory.size}];", f"    double u[{max(model.nu, 1)}];")
-    yield "    /* number of the next sample; outliers of each output in a row (negative: below) and at all; resets */"
+    yield "    /* number of the next sample; outliers of each output in a row (negative: below) and at all; resets; how"
+    yield "       far off the latest in a row was that was left out, and that was believed */"
     yield from ("    long k;", f"    int in_a_row[{model.ny}];", f"    int refused[{model.ny}];", "    int resets;")
+    yield from (f"    double left_out[{model.ny}];", f"    double believed[{model.ny}];")
     yield from ("    int watched;", f"    double surprises[{2 * RESET_WINDOW}];", "};")
     if not timing.is_plain:
         rows = timing.longest + 1
@@ -162,6 +164,7 @@ def _option_constants(steps: Steps) -> list[str]:
         "OUTLIER_LIMIT": steps.limit if np.isfinite(steps.limit) else 0.0,
         "OVERFLOW_LIMIT": OVERFLOW,
         "LONGEST_REFUSAL": LONGEST,
+        "COMPARABLE": COMPARABLE,
         "RESETS": int(bool(settings.reset)),
         "RESET_WINDOW": RESET_WINDOW,
         "BOUNDS": len(ends),

@@ -31,7 +31,7 @@ class DAEState(NamedTuple):
     k: int  # the next sample
     u: FloatArray  # ``(nu,)``: the inputs of the sample before
     informations: tuple[FloatArray, ...]  # ``(nq, nq)`` each: on the parameters, of the latest samples
-    refused: FloatArray  # ``(2, ny)``: outliers in a row, and at all
+    refused: FloatArray  # ``(4, ny)``: what `no_refusals` says
     # ``(any, 2)``: normalised squares of the latest innovations, and their degrees of freedom, for resets
     surprises: FloatArray
     resets: int  # how many there were

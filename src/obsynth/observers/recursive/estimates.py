@@ -88,7 +88,7 @@ class RecursiveState(NamedTuple):
     # ``(any, 2)``: normalised squares of the latest innovations, and their degrees of freedom, for resets
     surprises: FloatArray
     resets: int  # how many there were
-    refused: FloatArray  # ``(2, ny)``: outliers in a row, and at all
+    refused: FloatArray  # ``(4, ny)``: what `no_refusals` says
 
 
 def recursive_estimates(

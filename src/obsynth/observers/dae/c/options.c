@@ -72,21 +72,48 @@ static int forecasted(const struct observer *state, const double *u, double *mea
     return call(forecast, inputs, 2, outputs, 2) == 0 ? 0 : 2;
 }
 
+/* Whether a sample goes on with what was off before: with what was believed, or as far as the one that was left out, on
+   its side or after LONGEST_REFUSAL of them on any. */
+static int follows(const struct observer *state, int i, double off)
+{
+    double size = fabs(off);
+    double left = state->left_out[i];
+    double believed = state->believed[i];
+    double other = fabs(left);
+    int in_a_row = state->in_a_row[i] < 0 ? -state->in_a_row[i] : state->in_a_row[i];
+    int on = (believed > 0.0 ? off : -off) > 0.0 && size <= COMPARABLE * fabs(believed);
+    int like = other > 0.0 && size <= COMPARABLE * other && other <= COMPARABLE * size;
+    return on || (like && ((left > 0.0 ? off : -off) > 0.0 || in_a_row >= LONGEST_REFUSAL));
+}
+
+/* Remember of a sample that is there how far off it was, and whether it was left out (or pulled). */
+static void remember(const struct observer *state, struct observer *after, int i, int is_far, int is_gone, double off)
+{
+    int in_a_row = state->in_a_row[i] < 0 ? -state->in_a_row[i] : state->in_a_row[i];
+    after->in_a_row[i] = is_far ? (off < 0.0 ? -1 : 1) * (in_a_row + 1) : 0;
+    after->left_out[i] = !is_far ? 0.0 : is_gone ? off : state->left_out[i];
+    after->believed[i] = !is_far ? 0.0 : is_gone ? state->believed[i] : off;
+    after->refused[i] = state->refused[i] + is_gone;
+}
+
 /* Take a step; where its innovation is too long, ask each sensor and take the step again without the outliers. */
 static int robust(const struct observer *state, const double *u, const double *y, double *heard, struct observer *after,
                   double *said)
 {
     double mean[NY];
     double deviation[NY];
+    double off[NY];
     int far[NY];
-    int side[NY];
+    int gone[NY];
     int failed, any = 0;
     int i;
     copy(heard, y, NY);
     failed = watched(state, u, y, after, said);
     if (!failed && said[AT_NIS] <= OUTLIER_LIMIT * OUTLIER_LIMIT) {
         for (i = 0; i < NY; i++) {
-            after->in_a_row[i] = 0;
+            if (!isnan(y[i])) {
+                remember(state, after, i, 0, 0, 0.0);
+            }
         }
         return 0;
     }
@@ -97,23 +124,19 @@ static int robust(const struct observer *state, const double *u, const double *y
         int huge = fabs(y[i]) > OVERFLOW_LIMIT;
         double pulled = mean[i] + OUTLIER_LIMIT * deviation[i] * (y[i] > mean[i] ? 1.0 : -1.0);
         far[i] = fabs(y[i] - mean[i]) > OUTLIER_LIMIT * deviation[i] || huge;
-        side[i] = far[i] ? (y[i] < mean[i] ? -1 : 1) : 0;
-        if (GATE) {
-            /* A wrong sample stands alone; of a sensor, or a plant, that has moved the next is on the same side. */
-            int before = state->in_a_row[i];
-            int alone = side[i] * before <= 0 && before < LONGEST_REFUSAL && -before < LONGEST_REFUSAL;
-            far[i] = far[i] && (alone || huge);
-        }
-        if (far[i]) {
+        off[i] = y[i] - mean[i];
+        /* A wrong sample stands alone; of a sensor, or a plant, that has moved the next is on the same side, as far off. */
+        gone[i] = far[i] && (!GATE || !follows(state, i, off[i]) || huge);
+        if (gone[i]) {
             heard[i] = !GATE && isfinite(pulled) ? pulled : NAN;
         }
-        any = any || far[i];
+        any = any || gone[i];
     }
     if (failed || any) {
         if (watched(state, u, heard, after, said) != 0) {
             /* A sample that nothing predicts, and with which there is no step. */
             for (i = 0; i < NY; i++) {
-                far[i] = !isnan(y[i]);
+                gone[i] = !isnan(y[i]);
                 heard[i] = NAN;
             }
             if (watched(state, u, heard, after, said) != 0) {
@@ -123,10 +146,8 @@ static int robust(const struct observer *state, const double *u, const double *y
     }
     for (i = 0; i < NY; i++) {
         if (!isnan(y[i])) {
-            int before = state->in_a_row[i];
-            after->in_a_row[i] = side[i] * ((before < 0 ? -before : before) + 1);
+            remember(state, after, i, far[i], gone[i], off[i]);
         }
-        after->refused[i] = state->refused[i] + far[i];
     }
     return 0;
 }
@@ -311,6 +332,8 @@ static void reset(struct observer *state)
     }
     for (i = 0; i < NY; i++) {
         state->in_a_row[i] = 0;
+        state->left_out[i] = 0.0;
+        state->believed[i] = 0.0;
         state->refused[i] = 0;
     }
     state->k = 0;
