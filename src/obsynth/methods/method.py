@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from importlib import import_module
-from typing import Any, ClassVar, Literal, Self, TypeAlias
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, TypeAlias
 
 import numpy as np
 
@@ -16,16 +16,18 @@ from obsynth.errors import SpecError
 from obsynth.numerics.arguments import field_types, problem_with
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.regions import LMIRegion
-from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.linear.observer import LinearObserver
-from obsynth.observers.recursive.observer import RecursiveObserver
-from obsynth.observers.windows import WindowObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.fault_models import FaultModel
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.results.checks import Check
 from obsynth.results.design import Certificate, ObserverDesign
 from obsynth.verification.error_system import ErrorModel
+
+if TYPE_CHECKING:
+    from obsynth.observers.dae.observer import DAEObserver
+    from obsynth.observers.recursive.observer import RecursiveObserver
+    from obsynth.observers.windows import WindowObserver
 
 PlantKind: TypeAlias = Literal["time-invariant", "time-varying", "nonlinear"]
 #: What the choice by default (`auto`) takes a method for.

@@ -73,7 +73,7 @@ def slow_equation(
     part: SlowPart, power: FloatArray, back: FloatArray, solution: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
     """Return p, g and h ``(s, s)`` of the equation in the lower order, all in C order; ``None`` where M is singular."""
-    from scipy.linalg.lapack import dgesv
+    from obsynth.numerics.lapack import dgesv
 
     u, rows = part
     matrix = solution.dot(back)
@@ -249,7 +249,7 @@ def _doubled_once(
 
 def _solved_in_place(matrix: FloatArray, rows: FloatArray) -> bool:
     """Replace ``rows (k, n)`` by ``rows @ inv(matrix)``, both in C order, uncopied; false where singular."""
-    from scipy.linalg.lapack import dgesv
+    from obsynth.numerics.lapack import dgesv
 
     _, _, found, failed = dgesv(matrix.T, rows.T, overwrite_a=1, overwrite_b=1)
     if not np.may_share_memory(found, rows):
@@ -300,7 +300,7 @@ def is_clearly_negative(left: FloatArray, b: FloatArray, p: FloatArray) -> bool:
 
 def is_positive(matrix: FloatArray) -> bool:
     """Return whether a Cholesky factorisation of a symmetric matrix runs to its end (computed, not proved)."""
-    from scipy.linalg.lapack import dpotrf
+    from obsynth.numerics.lapack import dpotrf
 
     factor, failed = dpotrf(matrix, lower=1, clean=0)
     return not failed and math.isfinite(factor.trace())

@@ -53,7 +53,7 @@ class Projection(NamedTuple):
 
 def projection_of(H: FloatArray, *, least: float = DEPENDENT_COLUMN) -> Projection | None:
     """Return the factorisation of ``H (rows, n)``, or ``None`` where its rank has to be decided."""
-    from scipy.linalg.lapack import dgeqrf, dormqr
+    from obsynth.numerics.lapack import dgeqrf, dormqr
 
     rows, n = H.shape
     if rows < n:
@@ -69,7 +69,7 @@ def projection_of(H: FloatArray, *, least: float = DEPENDENT_COLUMN) -> Projecti
 
 def noise_triangle(noise: FloatArray) -> FloatArray:
     """Return the triangular factor ``(rows, rows)`` of rotated noise ``(any, rows)``, for `projected_step`."""
-    from scipy.linalg.lapack import dgeqrf
+    from obsynth.numerics.lapack import dgeqrf
 
     rows = noise.shape[1]
     padded = np.zeros((max(len(noise), rows), rows), order="F")
@@ -85,7 +85,7 @@ def projected_step(
     ``known (rows, rows)``: triangular factor of more noise. Noise that outgrows double precision is left to the caller
     too.
     """
-    from scipy.linalg.lapack import dgeqrf, dtpqrt, dtrtrs
+    from obsynth.numerics.lapack import dgeqrf, dtpqrt, dtrtrs
 
     n = len(projection.head)
     rows, columns = data.shape

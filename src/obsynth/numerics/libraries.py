@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 import numpy as np
 
 from obsynth.errors import SolverError, SpecError
+from obsynth.numerics.lapack import library
 
 if TYPE_CHECKING:
     from threadpoolctl import ThreadpoolController
@@ -88,8 +89,7 @@ def one_thread_if_small(states: int) -> Iterator[None]:
         yield
         return
     try:
-        import scipy.linalg  # noqa: F401 - SciPy has a BLAS of its own, which must be loaded to be limited
-
+        library()  # SciPy has a BLAS of its own, which must be loaded to be limited
         with _libraries(len(sys.modules)).limit(limits=1, user_api="blas"):
             yield
     finally:

@@ -178,8 +178,7 @@ def _pencil_eigenvalues(right: FloatArray, left: FloatArray) -> tuple[ComplexArr
     With ``z = (1 + s) / (1 - s)`` ordinary ones, of ``(right + left)^-1 (right - left)``, where none is close to -1; or
     with ``-left``, -z and +1. The circle becomes the imaginary axis.
     """
-    from scipy.linalg import eigvals
-    from scipy.linalg.lapack import dgecon, dgetrf, dgetrs
+    from obsynth.numerics.lapack import dgecon, dgetrf, dgetrs, pencil_eigenvalues
 
     for sign in (1.0, -1.0):
         both = np.asarray_chkfinite(right + sign * left)
@@ -187,5 +186,5 @@ def _pencil_eigenvalues(right: FloatArray, left: FloatArray) -> tuple[ComplexArr
         if not failed and dgecon(factors, np.max(np.sum(np.abs(both), axis=0)))[0] > SAFE_CONDITION:
             s = np.linalg.eigvals(dgetrs(factors, pivots, right - sign * left)[0])
             return np.asarray(sign * (1.0 + s), dtype=np.complex128), np.asarray(1.0 - s, dtype=np.complex128)
-    alpha, beta = eigvals(right, left, homogeneous_eigvals=True)
-    return np.asarray(alpha), np.asarray(beta)
+    alpha, size = pencil_eigenvalues(right, left)
+    return alpha, size.astype(np.complex128)

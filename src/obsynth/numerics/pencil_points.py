@@ -141,7 +141,7 @@ class PencilPoints:
         return t, u, np.asarray(turned[columns:] @ u / sizes[0]), float(sizes[0] / sizes[-1] / sizes[-1])
 
     def _triangle(self, point: complex) -> NDArray[Any]:
-        from scipy.linalg.lapack import ztpqrt
+        from obsynth.numerics.lapack import ztpqrt
 
         schur = self._schur
         triangle = np.array(schur[0] if schur else self.A, order="F")

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.numerics.arrays import ComplexArray, FloatArray
+from obsynth.numerics.lapack import eigenvalues
 from obsynth.numerics.pencil_points import (
     Deflation,
     PencilPoints,
@@ -225,18 +226,16 @@ def _is_regular(E: FloatArray, right: Deflation) -> bool:
 
 def _eigenvalues(E: FloatArray, A: FloatArray) -> ComplexArray:
     """Return the eigenvalues of a square pencil with nonsingular ``E``, in exact conjugate pairs."""
-    from scipy.linalg import eigvals
-
     if not E.size:
         return _in_pairs(np.zeros(0, dtype=np.complex128))
     if len(E) >= STATES_FOR_INVERTED_E and (inverse := _safe_inverse(E)) is not None:
         return _in_pairs(np.asarray(np.linalg.eigvals(inverse @ A), dtype=np.complex128))
     try:
-        values = eigvals(A, E)
+        values = eigenvalues(A, E)
     except np.linalg.LinAlgError:
         # LAPACK's shifts may go round in circles on matrices of great symmetry: turned, the pencil has none.
         left, right = (np.linalg.qr(np.random.default_rng(seed).normal(size=E.shape))[0] for seed in (0, 1))
-        values = eigvals(left @ A @ right, left @ E @ right)
+        values = eigenvalues(left @ A @ right, left @ E @ right)
     return _in_pairs(np.asarray(values, dtype=np.complex128))
 
 

@@ -60,7 +60,7 @@ class EquilibratedPencil:
 def balancing_factors(matrix: FloatArray) -> FloatArray:
     """Return powers of two ``(n,)`` that balance a matrix ``(n, n)``: ``matrix * s / s[:, None]`` is balanced."""
     # Not by scipy's matrix_balance, which casts the factors to integers and warns where they are too large for that.
-    from scipy.linalg.lapack import dgebal
+    from obsynth.numerics.lapack import dgebal
 
     if not matrix.size:
         return np.ones(len(matrix))

@@ -206,7 +206,7 @@ def update(
     ``M+ = lambda M + (1 - lambda) M_reg + G'G``, ``Theta = M+^-1 G'``, ``theta+ = theta + Theta (v - G theta)``, ``P+ =
     (I - Theta G) P (I - Theta G)' + Theta W W' Theta'``; M_reg bounds ``M^-1`` against wind-up.
     """
-    from scipy.linalg.lapack import dgeqrf, dtrtrs
+    from obsynth.numerics.lapack import dgeqrf, dtrtrs
 
     q, gap = len(state.theta), v - G @ state.theta
     if q == 1:

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.methods.ui_pi_observer.checks.decoupling import frequency_grid
 from obsynth.methods.ui_pi_observer.pencils import equilibrated
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.norms import resolved, response
 from obsynth.numerics.pencils import pencil_structure
 from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.numerics.spectra import boundary_points
+from obsynth.observers.linear.derived import frequency_grid
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plotting.panels import WIDTH, new_panels, plain_decades, tidy

@@ -142,7 +142,7 @@ def _by_cholesky(ball: Ball, means: Means = "Cholesky") -> DefinitenessProof:
 
 def _smallest_eigenvalue(factor: FloatArray) -> float:
     """Return an estimate of the smallest eigenvalue of ``factor factor'``, from above, by inverse iteration."""
-    from scipy.linalg.lapack import dpotrs
+    from obsynth.numerics.lapack import dpotrs
 
     vector = np.ones(len(factor)) / np.sqrt(len(factor))
     # Signs that alternate where those of the factor do keep the start away from a right angle.

@@ -74,7 +74,10 @@ class Section(BaseModel):
     """A part of a document: strict types, no unknown keys, finite numbers."""
 
     # Options may be called model_...: older releases of pydantic keep that for themselves.
-    model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, frozen=True, protected_namespaces=())
+    # Validators are made at the first use: most sections are only ever parts of another one.
+    model_config = ConfigDict(
+        strict=True, extra="forbid", allow_inf_nan=False, frozen=True, protected_namespaces=(), defer_build=True
+    )
 
 
 Text = Annotated[str, Field(min_length=1)]

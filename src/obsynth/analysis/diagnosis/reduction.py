@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from obsynth.numerics.arrays import ComplexArray, FloatArray
+from obsynth.numerics.lapack import pencil_eigenvalues
 from obsynth.numerics.pencil_points import full_svd, largest_singular_value
 from obsynth.numerics.ranks import RankDecision, rank_from
 from obsynth.numerics.scaling import LogBalance, equilibrate_pencil, power_of_two_below
@@ -145,7 +146,7 @@ def _invariant(
     """Return the largest part V of a space ``(k, h)``, orthonormal, with ``a V`` within ``e V``.
 
     In coordinates of the space and of ``e V`` only what leaves is factored; each step turns both by reflections."""
-    from scipy.linalg.lapack import dgeqrf, dormqr
+    from obsynth.numerics.lapack import dgeqrf, dormqr
 
     count = hidden.shape[1]
     rows, square = np.linalg.qr(e @ hidden, mode="complete")
@@ -183,9 +184,7 @@ def _reflection(basis: FloatArray) -> Callable[[FloatArray], FloatArray]:
 
 def finite_values(left: LeftPart) -> ComplexArray:
     """Return the finite zeros that were taken out, complex, conjugate pairs exact."""
-    import scipy.linalg as sl
-
     if left.Ez.shape[0] == 0:
         return np.zeros(0, dtype=np.complex128)
-    alpha, beta = sl.eigvals(left.Az, left.Ez, homogeneous_eigvals=True)
+    alpha, beta = pencil_eigenvalues(left.Az, left.Ez)
     return np.asarray(alpha / beta, dtype=np.complex128)

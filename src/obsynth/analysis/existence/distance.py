@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.analysis.zeros import equilibrated_at
-from obsynth.numerics.arrays import ComplexArray, FloatArray
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.lapack import eigenvalues
 from obsynth.numerics.scaling import equilibrate_pencil
 
 #: Below this distance, relative to the data, rounding of the data is as large as what a unit fault moves: gains of its
@@ -119,14 +120,12 @@ def _to_boundary(value: complex, discrete: bool) -> complex:
 
 
 def _compressed_points(E: FloatArray, A: FloatArray, discrete: bool) -> list[complex]:
-    from scipy.linalg import eigvals
-
     rng, found = np.random.default_rng(1), list[complex]()
     for _ in range(COMPRESSIONS):
         left = rng.standard_normal((A.shape[1], A.shape[0]))
         # LAPACK gives up on a few pencils: their points are left out.
         try:
-            values: ComplexArray = eigvals(left @ A, left @ E)
+            values = eigenvalues(left @ A, left @ E)
         except np.linalg.LinAlgError:
             continue
         finite = values[np.abs(values) <= FASTEST * (1.0 if discrete else _typical_rate(E, A))]

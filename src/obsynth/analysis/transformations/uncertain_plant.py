@@ -135,7 +135,7 @@ def untouched_states(columns: FloatArray, sizes: FloatArray) -> list[int]:
 def untouched_coordinates(matrices: Mapping[str, AffineMatrix]) -> FloatArray:
     """Return ``V (n, n)``, with inverse ``2 I - V``: columns of E V, A V, C V that the constants do not touch, if any.
     States whose own equations the constants move most become relative to those that they move least."""
-    from scipy.linalg import qr
+    from obsynth.numerics.lapack import dgeqp3
 
     # What the constants multiply the state with, all rows of all of them.
     touched = np.vstack([matrices[name].parts.reshape(-1, matrices[name].shape[1]) for name in ("E", "A", "C")])
@@ -151,7 +151,7 @@ def untouched_coordinates(matrices: Mapping[str, AffineMatrix]) -> FloatArray:
     if rank == len(seen):
         return np.eye(n)
     weights = moved[seen] / max(float(moved.max()), np.finfo(np.float64).tiny) + UNTOUCHED_SHARE
-    pivots = seen[qr(basis[:, seen] * weights, pivoting=True, mode="r")[1][:rank]]
+    pivots = seen[dgeqp3(basis[:, seen] * weights)[1][:rank] - 1]
     free = [j for j in seen.tolist() if j not in set(pivots.tolist())]
     found = np.eye(n)
     inside = np.round(np.linalg.solve(basis[:, pivots], basis[:, free]), COORDINATE_DIGITS)

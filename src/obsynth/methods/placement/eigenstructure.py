@@ -146,7 +146,7 @@ class _Sylvester:
         return cls(triangular, rotation, b, target, shift, objective, gram)
 
     def states(self, g: FloatArray) -> FloatArray:
-        from scipy.linalg.lapack import dtrsyl
+        from obsynth.numerics.lapack import dtrsyl
 
         right = self.rotation.T @ (self.B @ g)
         x, scale, _ = dtrsyl(self.triangular, self.L, right, isgn=-1)
@@ -154,7 +154,7 @@ class _Sylvester:
 
     def adjoint(self, weight: FloatArray) -> FloatArray:
         """Return Y with ``A' Y - Y L' = weight``: the gradient of <weight, X> is ``B' Y``."""
-        from scipy.linalg.lapack import dtrsyl
+        from obsynth.numerics.lapack import dtrsyl
 
         y, scale, _ = dtrsyl(self.triangular, self.L, self.rotation.T @ weight, trana="T", tranb="T", isgn=-1)
         return np.asarray(self.rotation @ (y / scale))

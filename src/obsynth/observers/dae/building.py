@@ -14,6 +14,7 @@ import numpy as np
 from obsynth.analysis.dae_structure import Identifiability, IndexReport, identifiability, index_report
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.lapack import pencil_eigenvalues
 from obsynth.observers.dae.estimates import DAERow, GatheredRows
 from obsynth.observers.dae.observer import DAEObserver, advanced
 from obsynth.observers.records import named_bounds, named_covariance, named_vector
@@ -29,15 +30,12 @@ INFINITE = 1e8
 
 def largest_turn(model: DAEModel, dt: float) -> float:
     """Return by how many radians the fastest oscillation at the nominal point turns in a step."""
-    from scipy.linalg import eigvals
-
     local = local_equations(
         model, np.zeros(model.nx), model.nominal_state, model.nominal_input, model.nominal_parameters
     )
     if not local.is_defined:
         return 0.0
-    homogeneous = eigvals(-local.by_state * model.state_scales, local.E * model.state_scales, homogeneous_eigvals=True)
-    above, below = homogeneous
+    above, below = pencil_eigenvalues(-local.by_state * model.state_scales, local.E * model.state_scales)
     finite = np.abs(below) * INFINITE > np.abs(above) * dt
     turns = np.abs((above[finite] / below[finite]).imag) * dt
     return float(turns.max(initial=0.0))

@@ -1,4 +1,5 @@
-"""Observers made from a linear one: sampled, or with means of its fault estimates; and how long it remembers its start.
+"""Observers made from a linear one: sampled, or with means of its fault estimates; how long it remembers its start, and
+at which frequencies to look at it.
 
 Means of the last fault estimates of an observer: registers behind it, and the observer without them again.
 """
@@ -14,7 +15,7 @@ from obsynth.errors import SpecError
 from obsynth.numerics.arguments import is_finite_number, require_kind
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import first_order_hold
-from obsynth.numerics.spectra import abscissa
+from obsynth.numerics.spectra import abscissa, eigenvalues, speeds
 from obsynth.observers.linear.observer import LinearObserver
 
 
@@ -180,3 +181,20 @@ def checked_warm_up(asked: float | None, default: float) -> float:
     if not (is_finite_number(asked) and asked >= 0.0):
         raise SpecError(f"warm_up is {asked!r}: give seconds, 0 or more.", path="warm_up")
     return float(asked)
+
+
+#: Frequencies of the grid, and how far it reaches beyond the slowest and the fastest pole of the observer.
+GRID_POINTS = 61
+GRID_REACH = 30.0
+
+
+def frequency_grid(observer: LinearObserver) -> FloatArray:
+    """Return frequencies in rad/s around the poles of an observer, zero included; up to pi/dt in discrete time."""
+    found = speeds(eigenvalues(observer.Az), observer.dt) if observer.order else np.ones(1)
+    alive = found[np.isfinite(found) & (found > 0.0)]
+    low = float(np.min(alive, initial=1.0 if not alive.size else np.inf)) / GRID_REACH
+    high = float(np.max(alive, initial=1.0 if not alive.size else 0.0)) * GRID_REACH
+    if observer.dt > 0.0:
+        high = np.pi / observer.dt
+        low = min(low, high / GRID_REACH)
+    return np.concatenate([[0.0], np.geomspace(low, high, GRID_POINTS)])

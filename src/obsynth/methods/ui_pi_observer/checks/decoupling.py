@@ -16,13 +16,11 @@ from obsynth.methods.ui_pi_observer.pencils import equilibrated
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.numerics.scaling import balancing_factors
-from obsynth.numerics.spectra import boundary_points, eigenvalues, speeds
+from obsynth.numerics.spectra import boundary_points
+from obsynth.observers.linear.derived import frequency_grid
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 
-#: Frequencies of the grid, and how far it reaches beyond the slowest and the fastest pole of the observer.
-GRID_POINTS = 61
-GRID_REACH = 30.0
 #: Equations whose reciprocal condition is above this are independent to the tolerance of every rank.
 FAR_FROM_SINGULAR = 1e3 * RANK_TOLERANCE
 #: A signal below this share of what a trajectory of unit size could make of it is held not to be moved.
@@ -47,18 +45,6 @@ class DecouplingNorm:
         if not relative <= self.relative:
             return DecouplingNorm(relative, max(fault, self.fault_gain), frequency)
         return DecouplingNorm(self.relative, max(fault, self.fault_gain), self.frequency)
-
-
-def frequency_grid(observer: LinearObserver) -> FloatArray:
-    """Return frequencies in rad/s around the poles of an observer, zero included; up to pi/dt in discrete time."""
-    found = speeds(eigenvalues(observer.Az), observer.dt) if observer.order else np.ones(1)
-    alive = found[np.isfinite(found) & (found > 0.0)]
-    low = float(np.min(alive, initial=1.0 if not alive.size else np.inf)) / GRID_REACH
-    high = float(np.max(alive, initial=1.0 if not alive.size else 0.0)) * GRID_REACH
-    if observer.dt > 0.0:
-        high = np.pi / observer.dt
-        low = min(low, high / GRID_REACH)
-    return np.concatenate([[0.0], np.geomspace(low, high, GRID_POINTS)])
 
 
 def decoupling_norm(plant: DescriptorSystem, observer: LinearObserver) -> DecouplingNorm:
@@ -122,7 +108,7 @@ def trajectories_of(plant: DescriptorSystem, point: complex, groups: Sequence[Se
 def _null_space(pencil: ComplexArray) -> tuple[ComplexArray, FloatArray, bool]:
     """Return a basis ``(n, count)`` of the null space, orthonormal, the least singular value last, in columns scaled
     by powers of two, with these, and whether the equations are independent beyond doubt."""
-    from scipy.linalg.lapack import zgecon, zgeqrf, zunmqr
+    from obsynth.numerics.lapack import zgecon, zgeqrf, zunmqr
 
     scaled, columns = equilibrated(pencil)
     equations, count = scaled.shape

@@ -16,13 +16,13 @@ from numpy.typing import ArrayLike
 from obsynth.analysis.plant_units import PlantUnits
 from obsynth.analysis.zeros import invariant_zeros, is_outside, leading_names, system_pencil
 from obsynth.errors import SpecError
-from obsynth.methods.ui_pi_observer.checks.decoupling import frequency_grid
 from obsynth.methods.ui_pi_observer.pencils import number
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.norms import balanced_realisation, response
 from obsynth.numerics.pencils import finite_zeros
 from obsynth.numerics.ranks import NEGLIGIBLE_INPUT
 from obsynth.numerics.spectra import abscissa, boundary_points, decay_rates, eigenvalues
+from obsynth.observers.linear.derived import frequency_grid
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.fault_models import balanced_transition

@@ -1,0 +1,79 @@
+"""LAPACK's routines by name, and the eigenvalues of a pencil.
+
+They come from SciPy's extension module alone: ``scipy.linalg`` imports three hundred modules more, a fifth of the time
+of a first design.
+"""
+
+from __future__ import annotations
+
+import sys
+from functools import cache
+from importlib import import_module
+from importlib.machinery import PathFinder
+from importlib.util import module_from_spec
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from obsynth.numerics.arrays import ComplexArray, FloatArray
+
+#: Where SciPy keeps its LAPACK: the same object that ``scipy.linalg.lapack`` shows.
+_PACKAGE, _EXTENSION = "scipy.linalg", "scipy.linalg._flapack"
+
+
+@cache
+def library() -> ModuleType:
+    """Return the module of SciPy that has LAPACK's routines; its BLAS is loaded with it."""
+    if _PACKAGE not in sys.modules:
+        import scipy
+
+        spec = PathFinder.find_spec(_EXTENSION, [str(Path(scipy.__file__).parent / "linalg")])
+        if spec is not None and spec.loader is not None:
+            try:
+                found = module_from_spec(spec)
+                spec.loader.exec_module(found)
+            except ImportError:  # an installation whose extensions need their package first
+                return import_module("scipy.linalg.lapack")
+            return found
+    return import_module("scipy.linalg.lapack")
+
+
+def __getattr__(name: str) -> Any:
+    """Return a routine of LAPACK by its name, such as ``dgesv``; asked for once."""
+    if name.startswith("__"):
+        raise AttributeError(name)
+    routine = globals()[name] = getattr(library(), name)
+    return routine
+
+
+def pencil_eigenvalues(a: FloatArray, b: FloatArray) -> tuple[ComplexArray, FloatArray]:
+    """Return alpha and beta ``(n,)`` of the eigenvalues ``z = alpha / beta`` of ``a - z b``, beta >= 0.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        LAPACK's iteration does not converge.
+    ValueError
+        An entry is not finite.
+    """
+    a, b = np.asarray_chkfinite(a, dtype=np.float64), np.asarray_chkfinite(b, dtype=np.float64)
+    if not a.size:
+        return np.zeros(0, dtype=np.complex128), np.zeros(0)
+    dggev = library().dggev
+    size = int(dggev(a, b, lwork=-1)[-2][0])
+    real, imaginary, beta, _, _, _, info = dggev(a, b, compute_vl=0, compute_vr=0, lwork=size)
+    if info:
+        raise np.linalg.LinAlgError(f"generalised eigenvalues did not converge (dggev, info {info})")
+    return np.asarray(real + 1j * imaginary), np.asarray(beta)
+
+
+def eigenvalues(a: FloatArray, b: FloatArray) -> ComplexArray:
+    """Return the eigenvalues ``(n,)`` of ``a - z b``: infinite where b is singular alone, NaN where a is as well."""
+    alpha, beta = pencil_eigenvalues(a, b)
+    values = np.full(len(alpha), complex(np.inf), dtype=np.complex128)
+    values[(alpha == 0.0) & (beta == 0.0)] = np.nan
+    finite = beta != 0.0
+    values[finite] = alpha[finite] / beta[finite]
+    return values
