@@ -193,6 +193,8 @@ def reordered(plant: obsynth.DescriptorSystem, seed: int) -> obsynth.DescriptorS
 def records(*, small: bool) -> Iterator[Case]:
     """Yield Kalman filters beside a numpy loop over covariances, and a log beside the reading of it."""
     problem = Problem.of(20, 5, 3)
+    if small:
+        problem = replace(problem, y=problem.y[:200], u=problem.u[:200])
     observer, loop = observer_of(problem, adaptive=False), seconds(lambda: by_numpy(problem), 3)
     yield Case("Kalman run, 20 states", "numpy loop",
                [seconds(lambda: observer.run(problem.y, problem.u, compiled=False), 3)], loop)  # fmt: skip
@@ -233,8 +235,8 @@ def logs(*, small: bool) -> Iterator[Case]:
 
 def cases(seeds: Sequence[int], *, small: bool) -> Iterator[tuple[Case, int]]:
     """Yield each case with the peak memory of the process until there, MB."""
-    parts = (filters(seeds, small=small), verifications(small=small), commands(small=small), networks(seeds, small=small),
-             records(small=small), logs(small=small))  # fmt: skip
+    parts = (filters(seeds, small=small), verifications(small=small), commands(small=small),
+             networks(seeds, small=small), records(small=small), logs(small=small))  # fmt: skip
     for part in parts:
         for case in part:
             yield case, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024

@@ -24,10 +24,12 @@ def printed(monkeypatch, capfd):
         script = str(ROOT / "benchmarks" / f"{name}.py")
         monkeypatch.setattr(sys, "argv", [script, *arguments])
         capfd.readouterr()
+        code = None
         try:
             runpy.run_path(script, run_name="__main__")
         except SystemExit as end:
-            assert not end.code
+            code = end.code
+        assert not code
         return capfd.readouterr().out
 
     yield run
