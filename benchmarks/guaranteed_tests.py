@@ -1,7 +1,7 @@
 """Guaranteed tests: what the number of states and of samples costs, in processor seconds and memory, and each row.
 
 ``python benchmarks/guaranteed_tests.py`` prints the tables of the README; each case has a process of its own.
-``python benchmarks/guaranteed_tests.py --case NX N`` is one of them.
+``python benchmarks/guaranteed_tests.py --case NX N`` is one of them; ``--small`` runs two small ones in one process.
 """
 
 from __future__ import annotations
@@ -93,7 +93,11 @@ def main(arguments: list[str]) -> None:
         print(" | ".join(case(int(arguments[1]), int(arguments[2]))))
         return
     print(f"| {' | '.join(HEADER)} |\n|{' --- |' * len(HEADER)}")
-    for nx, samples in SMALL if "--small" in arguments else CASES:
+    if "--small" in arguments:
+        for nx, samples in SMALL:
+            print(f"| {' | '.join(case(nx, samples))} |", flush=True)
+        return
+    for nx, samples in CASES:
         command = [sys.executable, __file__, "--case", str(nx), str(samples)]
         try:
             done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=SECONDS)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -16,6 +16,21 @@ SOURCE = Path(obsynth.__file__).parent
 DRAWING = frozenset({"alpha", "color", "figsize", "height_ratios", "linewidth", "markersize", "width_ratios"})
 #: A number of this size or less, or of that size or more, is a tolerance; the quantiles are of the normal distribution.
 SMALL, LARGE, QUANTILES = 0.05, 1e5, (1.28, 1.645, 1.96, 2.33, 2.576)
+
+
+@pytest.fixture(scope="module")
+def modules() -> dict[Path, ast.Module]:
+    return {path: ast.parse(path.read_text()) for path in sorted(SOURCE.rglob("*.py"))}
+
+
+def found_in(
+    modules: dict[Path, ast.Module],
+    look: Callable[[ast.Module], Iterator[tuple[int, str]]],
+    left_out: Callable[[Path], bool],
+) -> dict[str, str]:
+    """Return what is found in the modules that are not left out, by file and line."""
+    return {f"{path.relative_to(SOURCE)}:{line}": text for path, tree in modules.items() if not left_out(path)
+            for line, text in look(tree)}  # fmt: skip
 
 
 def is_tolerance(node: ast.AST) -> bool:
@@ -33,25 +48,23 @@ def is_tolerance(node: ast.AST) -> bool:
 
 def in_place(tree: ast.Module) -> Iterator[tuple[int, str]]:
     """Yield line and text of tolerances that are typed in the body of a function."""
+    every = list(ast.walk(tree))
     drawn = {
-        inner
-        for node in ast.walk(tree)
-        if isinstance(node, ast.keyword) and node.arg in DRAWING
-        for inner in ast.walk(node)
+        inner for node in every if isinstance(node, ast.keyword) and node.arg in DRAWING for inner in ast.walk(node)
     }
-    for function in ast.walk(tree):
+    numbers = {node for node in every if is_tolerance(node)} - drawn
+    if not numbers:
+        return
+    for function in every:
         if isinstance(function, (ast.FunctionDef, ast.Lambda)):
             body = function.body if isinstance(function, ast.FunctionDef) else [function.body]
             for node in (inner for statement in body for inner in ast.walk(statement)):
-                if is_tolerance(node) and node not in drawn:
+                if node in numbers:
                     yield node.lineno, ast.unparse(node)
 
 
-def test_no_tolerance_is_typed_in_place() -> None:
-    files = [path for path in sorted(SOURCE.rglob("*.py")) if "plotting" not in path.parts]
-    found = {f"{path.relative_to(SOURCE)}:{line}": text for path in files
-             for line, text in in_place(ast.parse(path.read_text()))}  # fmt: skip
-    assert found == {}
+def test_no_tolerance_is_typed_in_place(modules: dict[Path, ast.Module]) -> None:
+    assert found_in(modules, in_place, lambda path: "plotting" in path.parts) == {}
 
 
 @pytest.mark.parametrize(
@@ -72,16 +85,17 @@ def decisions(tree: ast.Module) -> Iterator[tuple[int, str]]:
     """Yield where singular values, or eigenvalues of a symmetric matrix, are held against a constant of the module."""
     own = own_constants(tree)
     for function in (node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)):
+        inside = list(ast.walk(function))
         values = {
             name.id
-            for node in ast.walk(function)
+            for node in inside
             if isinstance(node, ast.Assign) and isinstance(node.value, ast.Call)
             and ast.unparse(node.value.func).rpartition(".")[2] in SPECTRA
             for target in node.targets
             for name in ast.walk(target)
             if isinstance(name, ast.Name)
         }  # fmt: skip
-        for node in (node for node in ast.walk(function) if isinstance(node, ast.Compare)):
+        for node in (node for node in inside if values and isinstance(node, ast.Compare)):
             names = {name.id for name in ast.walk(node) if isinstance(name, ast.Name)}
             if isinstance(node.left, ast.Name) and node.left.id in values and names & own:
                 yield node.lineno, ast.unparse(node)
@@ -91,10 +105,8 @@ def decisions(tree: ast.Module) -> Iterator[tuple[int, str]]:
 SPECTRA = ("svd", "svdvals", "eigh", "eigvalsh")
 
 
-def test_rank_and_sign_decisions_take_their_tolerance_from_one_module() -> None:
-    found = {f"{path.relative_to(SOURCE)}:{line}": text for path in sorted(SOURCE.rglob("*.py"))
-             if path != Path(ranks.__file__) for line, text in decisions(ast.parse(path.read_text()))}  # fmt: skip
-    assert found == {}
+def test_rank_and_sign_decisions_take_their_tolerance_from_one_module(modules: dict[Path, ast.Module]) -> None:
+    assert found_in(modules, decisions, lambda path: path == Path(ranks.__file__)) == {}
 
 
 def test_a_rank_decided_by_a_tolerance_of_the_module_is_found() -> None:
@@ -105,8 +117,8 @@ def test_a_rank_decided_by_a_tolerance_of_the_module_is_found() -> None:
     assert not list(decisions(ast.parse(text.replace("LEAST = 1e-9", "from obsynth.numerics.ranks import LEAST"))))
 
 
-def test_names_of_ranks_are_not_made_again() -> None:
+def test_names_of_ranks_are_not_made_again(modules: dict[Path, ast.Module]) -> None:
     theirs = {name for name in vars(ranks) if name.isupper()}
-    made = {path.name: theirs & own_constants(ast.parse(path.read_text())) for path in sorted(SOURCE.rglob("*.py"))
+    made = {path: theirs & own_constants(tree) for path, tree in modules.items()
             if path != Path(ranks.__file__)}  # fmt: skip
     assert {name: names for name, names in made.items() if names} == {}
