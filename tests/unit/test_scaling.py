@@ -1,11 +1,20 @@
 """Balancing by powers of two."""
 
+from fractions import Fraction
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from obsynth.numerics.scaling import balance_system, equilibrate_pencil, power_of_two_below
+from obsynth.numerics import scaling
+from obsynth.numerics.scaling import (
+    balance_by_least_squares,
+    balance_system,
+    doubled_sums,
+    equilibrate_pencil,
+    power_of_two_below,
+)
 
 PAPER_E = np.diag([1.0, 1.0, 1.0, 0.0])
 PAPER_A = np.array([[0.9, 0.005, -0.095, 0], [0.005, 0.995, 0.0997, 0], [0.095, -0.0997, 0.99, 0], [1, 0, 1, 1]])
@@ -114,3 +123,27 @@ def test_equilibrated_pencils_have_peaks_between_one_and_two(rng, rows, columns)
         assert np.all((largest == 0.0) | ((largest >= 1.0) & (largest < 2.0)))
     np.testing.assert_array_equal(E, before[0])
     np.testing.assert_array_equal(A, before[1])
+
+
+def test_sums_of_rows_have_twice_the_digits() -> None:
+    rng = np.random.default_rng(5)
+    parts = rng.normal(size=(37, 9)) * 10.0 ** rng.integers(-12, 12, size=(37, 9))
+    parts = np.vstack([parts, -parts[:36] * (1.0 + 1e-13)])
+    heads, tails = doubled_sums(parts)
+    for column, head, tail in zip(parts.T.tolist(), heads.tolist(), tails.tolist(), strict=True):
+        exact = sum(map(Fraction, column), Fraction(0))
+        # 73 terms in pairs: the error of the tails' own sums, each below eps^2 of all sizes.
+        allowed = 73 * Fraction(float(np.finfo(np.float64).eps)) ** 2 * sum(map(abs, map(Fraction, column)))
+        assert abs(Fraction(head) + Fraction(tail) - exact) <= allowed
+    assert [part.tolist() for part in doubled_sums(np.zeros((0, 2)))] == [[0.0, 0.0], [0.0, 0.0]]
+
+
+def test_many_unknowns_are_balanced_as_few_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(8)
+    e, a = (rng.normal(size=(9, 9)) * 10.0 ** rng.integers(-6, 6, size=(9, 1)) for _ in range(2))
+    b, c = rng.normal(size=(9, 2)), 1e5 * rng.normal(size=(3, 9))
+    few = balance_by_least_squares(e, a, inputs=[b], outputs=[c])
+    monkeypatch.setattr(scaling, "FEW_UNKNOWNS", 0)
+    many = balance_by_least_squares(e, a, inputs=[b], outputs=[c])
+    for name in ("equations", "states", "outputs"):
+        assert np.array_equal(getattr(few, name), getattr(many, name))

@@ -6,7 +6,7 @@ The unknowns only shift with the units of the data: up to the rounding of expone
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -175,6 +175,8 @@ HALF_SAY = 10.0
 REFINEMENTS = 3
 #: Passes in which small entries lose their say.
 PASSES = 3
+#: Up to so many unknowns lists of numbers are added up faster than arrays in pairs.
+FEW_UNKNOWNS = 80
 
 
 @dataclass(eq=False)
@@ -208,36 +210,36 @@ class LogBalance:
     def solve(self, *, passes: int = PASSES, ridge: float = RIDGE) -> FloatArray:
         """Return the exponents ``(count,)``, not rounded."""
         weights = [term.weights for term in self._terms]
-        normal, found = self._solved(weights, ridge)
+        solved, found = self._solved(weights, ridge)
         for _ in range(passes):
             weights = [term.weights * term.say(found) for term in self._terms]
-            normal, found = self._solved(weights, ridge)
+            solved, found = self._solved(weights, ridge)
         # What the entries leave open would be rounding over the ridge: of exact residuals nothing is left of it.
         for _ in range(REFINEMENTS):
-            found = found + np.linalg.solve(normal, self._missed(weights, found, ridge))
+            before, found = found, found + solved(self._missed(weights, found, ridge))
+            if np.array_equal(before, found):
+                break
         return np.asarray(found, dtype=np.float64)
 
     def _missed(self, weights: Sequence[FloatArray], found: FloatArray, ridge: float) -> FloatArray:
-        """Return what is left of the normal equations, each sum rounded once."""
-        parts: list[list[float]] = [[-ridge * value] for value in found.tolist()]
+        """Return what is left of the normal equations, each sum as if with twice the digits, or rounded once."""
+        sums = _Sums(self.count)
+        sums.add(slice(0, self.count), -ridge * found[:, None])
         for term, weight in zip(self._terms, weights, strict=True):
             missed = -weight * term.logarithms(found)
-            # Lists of the whole matrix: one of each row and column takes most of its time in numpy's calls.
-            for place, row in zip(
-                range(term.rows.start, term.rows.stop), (term.row_sign * missed).tolist(), strict=True
-            ):
-                parts[place] += row
-            turned = (term.column_sign * missed.T).tolist()
-            for place, column in zip(range(term.columns.start, term.columns.stop), turned, strict=True):
-                parts[place] += column
+            sums.add(term.rows, term.row_sign * missed)
+            sums.add(term.columns, (term.column_sign * missed).T)
             if term.common is not None:
-                parts[term.common].extend(missed.ravel().tolist())
+                sums.add(slice(term.common, term.common + 1), missed.reshape(1, -1))
         for unknown, exponent in self._wishes:
-            parts[unknown].append(WISH_WEIGHT * (exponent - float(found[unknown])))
-        return np.array([math.fsum(part) for part in parts])
+            wished = WISH_WEIGHT * (exponent - found[unknown : unknown + 1])
+            sums.add(slice(unknown, unknown + 1), wished[:, None])
+        return sums.total()
 
-    def _solved(self, weights: Sequence[FloatArray], ridge: float) -> tuple[FloatArray, FloatArray]:
-        """Return the normal matrix and the solution."""
+    def _solved(
+        self, weights: Sequence[FloatArray], ridge: float
+    ) -> tuple[Callable[[FloatArray], FloatArray], FloatArray]:
+        """Return what solves the normal equations for a right side, and the solution."""
         normal, right = ridge * np.eye(self.count), np.zeros(self.count)
         diagonal = np.einsum("ii->i", normal)
         for term, weight in zip(self._terms, weights, strict=True):
@@ -258,7 +260,62 @@ class LogBalance:
         for unknown, exponent in self._wishes:
             normal[unknown, unknown] += WISH_WEIGHT
             right[unknown] += WISH_WEIGHT * exponent
-        return normal, np.asarray(np.linalg.solve(normal, right), dtype=np.float64)
+        solved = _factored(normal)
+        return solved, solved(right)
+
+
+def _factored(matrix: FloatArray) -> Callable[[FloatArray], FloatArray]:
+    """Return what solves equations with a matrix ``(n, n)``, which is factored once."""
+    from obsynth.numerics.lapack import dgetrf, dgetrs
+
+    if not matrix.size:
+        return lambda right: right
+    factors, pivots, failed = dgetrf(np.asarray_chkfinite(matrix))
+    if failed:
+        raise np.linalg.LinAlgError("Singular matrix")
+    return lambda right: np.asarray(dgetrs(factors, pivots, right)[0], dtype=np.float64)
+
+
+class _Sums:
+    """Sums ``(count,)`` of many parts, far beyond double precision: rounded once where they are few."""
+
+    def __init__(self, count: int) -> None:
+        self.parts: list[list[float]] | None = [[] for _ in range(count)] if count <= FEW_UNKNOWNS else None
+        self.heads, self.tails = list[FloatArray](), np.zeros(count)
+
+    def add(self, place: slice, rows: FloatArray) -> None:
+        """Add to each place all entries of its row of a matrix ``(places, k)``."""
+        if self.parts is not None:
+            for part, row in zip(self.parts[place], rows.tolist(), strict=True):
+                part += row
+            return
+        head = np.zeros(len(self.tails))
+        head[place], tail = doubled_sums(rows.T)
+        self.heads.append(head)
+        self.tails[place] += tail
+
+    def total(self) -> FloatArray:
+        """Return the sums."""
+        if self.parts is not None:
+            return np.array([math.fsum(part) for part in self.parts])
+        head, tail = doubled_sums(np.array(self.heads))
+        return np.asarray(head + (tail + self.tails))
+
+
+def doubled_sums(parts: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the sums of rows ``(k, n)``, in pairs, and what rounding took from them: twice the digits together.
+
+    The error of a sum of two numbers is a double, which six operations give (Knuth's TwoSum).
+    """
+    tails = np.zeros(parts.shape[1:])
+    while len(parts) > 1:
+        half = len(parts) // 2
+        first, second = parts[:half], parts[half : 2 * half]
+        sums = first + second
+        back = sums - first
+        tails += np.sum((first - (sums - back)) + (second - back), axis=0)
+        parts = sums if 2 * half == len(parts) else np.concatenate([sums, parts[2 * half :]])
+    return (parts[0] if len(parts) else tails), tails
 
 
 def _in_turn(parts: FloatArray) -> FloatArray:
