@@ -13,7 +13,7 @@ import numpy as np
 
 from obsynth.analysis.transformations.recovery import StateRecovery
 from obsynth.data.alarm_events import NO_DECISION, AlarmLog
-from obsynth.data.log_estimator import DECIDING, STALE, Engine, Entry, LagBuffer, Row
+from obsynth.data.log_estimator import DECIDING, RECOVERING, STALE, Engine, Entry, LagBuffer, Row
 from obsynth.data.recovered import LATE, RecoveredStates
 from obsynth.data.signals import TIME, Signals, Stamps
 from obsynth.errors import SpecError
@@ -200,14 +200,18 @@ class Job:
             self.events.silent[row.status] += 1
             return [*([math.nan] * (0 if self.monitor is None else len(self.monitor.columns) + 2)), ""]
         deciding = row.status in DECIDING
-        above = [(name, abs(float(values[i])) / level) for name, i, level in self._levels if deciding]
+        above = [
+            (name, abs(float(values[i])) / grown)
+            for name, i, level in self._levels
+            if math.isfinite(grown := level + self._excess(row, i))
+        ]
         names = [name for name, evidence in above if evidence > 1.0]
         for name, evidence in above:
             if evidence > 1.0:
                 self.alarms.setdefault(name, time)
                 self.alarm_rows.setdefault(name, number)
         cells: list[Any] = []
-        undecided = not deciding
+        undecided = not deciding and not above
         if self.monitor is not None:
             deciding = deciding and (row.forgotten or not self.monitor.guarantees)
             residuals, faults = row.values[self._residuals], row.values[self._faults]
@@ -232,6 +236,14 @@ class Job:
         if undecided:
             self.events.silent[row.status if row.status not in DECIDING else NO_DECISION] += 1
         return [*cells, "; ".join(names)]
+
+    def _excess(self, row: Row, column: int) -> float:
+        """Return by how much more than its level a column must be for an alarm: infinite where nothing is decided."""
+        if row.status in DECIDING:
+            return 0.0
+        if row.status != RECOVERING or row.excess is None or column >= len(row.excess):
+            return math.inf
+        return float(row.excess[column])
 
     def _evidence(self, row: Row, deviations: FloatArray) -> Any:
         """Return what was learnt from a row; of one with missing samples, to who takes these, what there is."""

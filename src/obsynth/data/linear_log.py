@@ -165,6 +165,8 @@ class DataObserver(Engine):
         self.noise = noise_variances(self.observer, self.plant.Dw)[self.shown] if noisy else np.zeros_like(self.changes)
         # What a unit error of each input that was held, and of each output that the model told, has left in z.
         self.left, self.held = np.zeros(self.b.shape), np.zeros(self.nu)
+        # What the errors of the last gap have left in z, and what those of the gaps before it had in the columns.
+        self.excess, self.carried = np.zeros(self.b.shape), np.zeros(len(self.columns))
         self.transient = transient(self.observer)
         # Of every fault of the plant; those of which nothing is estimated are held to be absent.
         self.fault = np.zeros(self.plant.nf)
@@ -209,6 +211,8 @@ class DataObserver(Engine):
                 seconds = 0.0
             if good:
                 recovered = self.warm_up if self.model is None else self._recovering(seconds, values)
+                if self.model is None:
+                    self._advance_excess(seconds)
                 found = self._measured(seconds, values)
                 if self.model is not None:
                     self.model, self.left = None, np.zeros_like(self.left)
@@ -233,7 +237,25 @@ class DataObserver(Engine):
         if previous is not None and counts and not missing:
             self._count((found - previous)[None])
         sample = LinearSample(found, values[: self.nu], values[self.nu :], len(self.state_names))
-        return Row(status, found, missing, sample, time >= self.forgotten_at)
+        return Row(status, found, missing, sample, time >= self.forgotten_at, self._excess_in(status))
+
+    def _excess_in(self, status: str) -> FloatArray | None:
+        """Return what gaps can have left in the columns of a complete row, of one that is recovering."""
+        if status != RECOVERING:
+            self.excess, self.carried = np.zeros_like(self.excess), np.zeros_like(self.carried)
+            return None
+        found = self._shown_excess()
+        if self.observer.dt > 0.0:
+            self.excess = self.observer.Az @ self.excess
+        return found
+
+    def _shown_excess(self) -> FloatArray:
+        return np.asarray(self.carried + np.abs(self.observer.Cz @ self.excess).sum(axis=1))
+
+    def _advance_excess(self, seconds: float) -> None:
+        """Bring what a gap has left in a continuous observer to this row; in a sampled one it is there already."""
+        if self.observer.dt == 0.0 and seconds > 0.0 and self.excess.any():
+            self.excess = self._hold(seconds)[0] @ self.excess
 
     def steps(self, times: list[float], values: FloatArray, row: int) -> list[Row]:
         """Take rows of data: those that follow each other without a gap in one piece."""
@@ -289,11 +311,13 @@ class DataObserver(Engine):
         )
         self.inputs.extend(v[: self.nu] for v in values[max(count - (self.inputs.maxlen or count), 0) : count])
         settled, phase, forgotten = self.settled_at, self.phase, self.forgotten_at
-        nu, nx = self.nu, len(self.state_names)
-        return [
-            Row(OK if time >= settled else phase, row, 0, LinearSample(row, v[:nu], v[nu:], nx), time >= forgotten)
-            for time, row, v in zip(times[:count], rows[:count], values[:count], strict=True)
-        ]
+        nu, nx, found = self.nu, len(self.state_names), list[Row]()
+        for time, seconds, row, v in zip(times[:count], steps[:count], rows[:count], values[:count], strict=True):
+            status = OK if time >= settled else phase
+            self._advance_excess(seconds)
+            said = LinearSample(row, v[:nu], v[nu:], nx)
+            found.append(Row(status, row, 0, said, time >= forgotten, self._excess_in(status)))
+        return found
 
     def _measured(self, seconds: float, v: FloatArray) -> FloatArray:
         if self.observer.dt == 0.0:
@@ -329,17 +353,18 @@ class DataObserver(Engine):
         missed = np.abs(v[nu:] - gap_model.outputs(_running(self.model), v[:nu], self.fault))
         # An input that was held was off by no more than it has changed since.
         missed = np.concatenate([np.abs(v[:nu] - self.held), missed])
-        usual = self._usual()
-        if usual is None or not np.isfinite(self.left).all():
-            return self.warm_up
-        step = self.observer.dt or self.clock.longest
-        if not step > 0.0:
+        usual, step = self._usual(), self.observer.dt or self.clock.longest
+        if not (np.isfinite(self.left).all() and step > 0.0):
+            self.carried = np.full_like(self.carried, np.inf)
             return self.warm_up
         a, left = self.observer.Az, self.left
         if self.observer.dt == 0.0:
             transition, constant, _ = self._hold(seconds or step)
             told = np.repeat([False, True], [nu, len(self.output_names)])
             a, left = self._hold(step)[0], transition @ left + constant * told
+        self.excess = left * missed
+        if usual is None:
+            return self.warm_up
         rows, waited = self.observer.Cz[self.shown], 0.0
         # The first row after a gap always counts as recovering.
         while waited < self.warm_up:
@@ -393,6 +418,7 @@ class DataObserver(Engine):
             self._restart()
             return self._held()
         if self.model is None:
+            self.carried, self.excess = self._shown_excess(), np.zeros_like(self.excess)
             known = list(self.inputs) if self.observer.dt > 0.0 else []
             self.model, self.held = self.gap_model.start(self.seen, known, self.fault), self.v[: self.nu]
             if self.observer.dt == 0.0:
@@ -428,6 +454,7 @@ class DataObserver(Engine):
         self.z = self.model = None
         self.v = np.zeros_like(self.v)
         self.inputs.clear()
+        self.excess, self.carried = np.zeros_like(self.excess), np.zeros_like(self.carried)
         self.settled_at, self.phase = math.inf, WARM_UP
 
     def _held(self) -> FloatArray:
@@ -451,6 +478,8 @@ class DataObserver(Engine):
             "counted": self.counted,
             "left": self.left,
             "held": self.held,
+            "excess": self.excess,
+            "carried": self.carried,
         }
 
     def _resume_own(self, data: dict[str, Any]) -> None:
@@ -458,7 +487,7 @@ class DataObserver(Engine):
         self.fault, self.measured = data["fault"], data["measured"]
         self.seen, self.forgotten_at, self.begun = data["seen"], data["forgotten_at"], data["begun"]
         self.changes, self.counted, self.left = data["changes"], data["counted"], data["left"]
-        self.held = data["held"]
+        self.held, self.excess, self.carried = data["held"], data["excess"], data["carried"]
         self.inputs.clear()
         self.inputs.extend(data["inputs"])
 

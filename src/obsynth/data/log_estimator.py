@@ -52,6 +52,9 @@ class Row(NamedTuple):
     skipped: int = 0  # how many rows were missing before this one
     evidence: Evidence | LinearSample | None = None  # what was learnt from this row, for decisions
     forgotten: bool = True  # whether nothing is left of gaps: bounds that are never passed hold
+    # What a gap has left in each value of a row that is recovering, where the model missed by no more all through it
+    # than at its end; infinite where that is not known.
+    excess: FloatArray | None = None
 
 
 class Entry(NamedTuple):

@@ -113,7 +113,11 @@ def status_lines(prefix: str) -> list[str]:
     """Return the declaration of what a row is."""
     upper = prefix.upper()
     listed = ", ".join(f"{upper}_{name}" for name in STATUSES)
-    return [comment("What a row is: alarms are raised in rows that are OK or PARTIAL."), f"enum {{ {listed} }};"]
+    return [
+        comment("What a row is: alarms are raised in rows that are OK or PARTIAL, and where levels are passed by more"),
+        comment("than a gap can have left in rows that are RECOVERING."),
+        f"enum {{ {listed} }};",
+    ]
 
 
 def header_text(found: Realisation, prefix: str, alarms: Alarms) -> str:
@@ -262,6 +266,9 @@ def _state_struct(found: Realisation, prefix: str, alarms: Alarms) -> list[str]:
         "left": nz * (nu + ny),
         "held": nu,
         "changes": shown,
+        "excess": nz * (nu + ny),
+        "carried": shown,
+        "grown": shown,
     }
     watched = max(len(alarms.levels), 1)
     return [

@@ -109,16 +109,8 @@ static double recovering(PREFIX_state *s, const REAL *v)
 #if STRAIGHT
     REAL one[LENGTH(V_COUNT)] = {0};
 #endif
-    for (i = 0; i < SHOWN_COUNT; i++) {
-        /* What fault estimates and residuals change by from sample to sample, or what the stated noise gives them. */
-        REAL noise = noise_variances[0][i];
-        usual[i] = is_shown ? LEFT_SHARE * LEFT_SHARE * s->changes[i] / (REAL)s->counted : 0;
-        usual[i] = usual[i] > noise ? usual[i] : noise;
-        if (!is_shown && !(noise > 0)) {
-            return s->warm_up;
-        }
-    }
     if (!s->inputs_known || !all_finite(s->left, Z_COUNT * V_COUNT)) {
+        filled(s->carried, (REAL)INFINITY, SHOWN_COUNT);
         return s->warm_up;
     }
     model_outputs(s->model, v, s->fault, miss + U_COUNT);
@@ -135,6 +127,20 @@ static double recovering(PREFIX_state *s, const REAL *v)
         one[j] = 0;
     }
 #endif
+    for (j = 0; j < V_COUNT; j++) {
+        for (i = 0; i < Z_COUNT; i++) {
+            s->excess[j * Z_COUNT + i] = s->left[j * Z_COUNT + i] * miss[j];
+        }
+    }
+    for (i = 0; i < SHOWN_COUNT; i++) {
+        /* What fault estimates and residuals change by from sample to sample, or what the stated noise gives them. */
+        REAL noise = noise_variances[0][i];
+        usual[i] = is_shown ? LEFT_SHARE * LEFT_SHARE * s->changes[i] / (REAL)s->counted : 0;
+        usual[i] = usual[i] > noise ? usual[i] : noise;
+        if (!is_shown && !(noise > 0)) {
+            return s->warm_up;
+        }
+    }
     while (waited < s->warm_up) {
         int quiet = 1;
         waited += UPPER_DT;
@@ -156,6 +162,48 @@ static double recovering(PREFIX_state *s, const REAL *v)
     }
     return waited < s->warm_up ? waited : s->warm_up;
 }
+
+/* What gaps can have left in each output that is shown. */
+static void left_in(const PREFIX_state *s, REAL *grown)
+{
+    static const REAL zero[LENGTH(V_COUNT)];
+    REAL states[LENGTH(STATE_COUNT)] = {0}, shown[LENGTH(SHOWN_COUNT)] = {0};
+    int i, j;
+    copied(grown, s->carried, SHOWN_COUNT);
+    for (j = 0; j < V_COUNT; j++) {
+        say(s->excess + j * Z_COUNT, zero, zero, states, shown, shown + FAULT_COUNT);
+        for (i = 0; i < SHOWN_COUNT; i++) {
+            grown[i] += ABS(shown[i]);
+        }
+    }
+}
+
+/* The same a sample later. */
+static void later(PREFIX_state *s)
+{
+    static const REAL zero[LENGTH(V_COUNT)];
+    REAL moved[LENGTH(Z_COUNT)] = {0};
+    int j;
+    for (j = 0; j < V_COUNT; j++) {
+        next_of(s->excess + j * Z_COUNT, zero, zero, moved);
+        copied(s->excess + j * Z_COUNT, moved, Z_COUNT);
+    }
+}
+
+/* By how much more than their levels outputs must be for an alarm in this complete sample. */
+static void grow(PREFIX_state *s)
+{
+    if (s->status == UPPER_RECOVERING) {
+        left_in(s, s->grown);
+#if !STRAIGHT
+        later(s);
+#endif
+    } else {
+        filled(s->grown, 0, SHOWN_COUNT);
+        filled(s->carried, 0, SHOWN_COUNT);
+        filled(s->excess, 0, Z_COUNT * V_COUNT);
+    }
+}
 #endif
 
 static void restart(PREFIX_state *s)
@@ -165,6 +213,9 @@ static void restart(PREFIX_state *s)
     s->kept = 0;
     s->phase = UPPER_WARM_UP;
     filled(s->v, 0, V_COUNT);
+    filled(s->excess, 0, Z_COUNT * V_COUNT);
+    filled(s->carried, 0, SHOWN_COUNT);
+    filled(s->grown, 0, SHOWN_COUNT);
 }
 
 /* Take inputs and outputs as those of this sample. */
@@ -241,6 +292,9 @@ static int unmeasured(PREFIX_state *s, const REAL *u, const int *unsure, REAL *s
         s->from += UPPER_DT;
     }
     if (!s->is_gap) {
+        left_in(s, s->grown);
+        copied(s->carried, s->grown, SHOWN_COUNT);
+        filled(s->excess, 0, Z_COUNT * V_COUNT);
         copied(s->held, s->v, U_COUNT);
         filled(s->model, 0, MODEL_STATES);
         added(&model_into[0][0], MODEL_STATES, SEEN_COUNT, s->seen, s->model);
@@ -329,6 +383,11 @@ static int measured(PREFIX_state *s, const REAL *v, REAL *states, REAL *shown)
         if (was_gap) {
             waiting = recovering(s, v);
         }
+#if STRAIGHT
+        else {
+            later(s);
+        }
+#endif
 #endif
 #if STRAIGHT
         flowed(s, v);
@@ -377,6 +436,9 @@ static int measured(PREFIX_state *s, const REAL *v, REAL *states, REAL *shown)
     }
     waiting = s->phase == UPPER_RECOVERING ? s->waiting : s->warm_up;
     s->status = s->time >= s->from + waiting ? UPPER_OK : s->phase;
+#if MODEL
+    grow(s);
+#endif
     copied(s->fault, fault, PLANT_FAULTS);
     if (was_measured && (s->status == UPPER_OK || (s->status == UPPER_RECOVERING && s->counted < LEAST_SHOWN))) {
         for (i = 0; i < SHOWN_COUNT; i++) {
@@ -438,7 +500,10 @@ int PREFIX_step(STEP_ARGUMENTS)
     s->any_alarm = 0;
     for (i = 0; i < UPPER_WATCHED; i++) {
         REAL value = ABS(shown[watched[i]]);
-        s->alarm[i] = s->status == UPPER_OK && s->level[i] > 0 && value > s->level[i];
+        /* After a gap a level is passed where an output is beyond it by more than the gap can have left. */
+        REAL more = watched[i] < SHOWN_COUNT ? s->grown[watched[i]] : (REAL)INFINITY;
+        int is_known = s->status == UPPER_OK || (s->status == UPPER_RECOVERING && isfinite(more));
+        s->alarm[i] = is_known && s->level[i] > 0 && value > s->level[i] + (s->status == UPPER_OK ? 0 : more);
         s->any_alarm = s->any_alarm || s->alarm[i];
     }
     COPY_OUT
