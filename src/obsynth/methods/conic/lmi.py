@@ -89,25 +89,34 @@ def scalar_variable() -> Any:
 
 
 def symmetric_blocks(lower: Sequence[Sequence[Any]]) -> Any:
-    """Return the symmetric block matrix whose lower triangle of blocks is ``lower``; empty blocks are dropped."""
+    """Return a block matrix whose symmetric part has ``lower`` as its lower triangle of blocks; empty ones are dropped.
+
+    `at_least` and `at_most` ask something of the symmetric part: each block stands here once, since cvxpy works through
+    an expression as often as it is written.  For the same reason ``2 X`` does for ``X + X'`` on the diagonal.
+    """
     import cvxpy
 
     kept = [i for i, row in enumerate(lower) if row[i].shape[0] > 0]
-    rows = [[lower[i][j] if j <= i else lower[j][i].T for j in kept] for i in kept]
-    full = cvxpy.bmat(rows)
-    return 0.5 * (full + full.T)
+    return cvxpy.bmat(
+        [
+            [lower[i][j] if j == i else 2.0 * lower[i][j] if j < i else np.zeros(lower[j][i].shape[::-1]) for j in kept]
+            for i in kept
+        ]
+    )
 
 
 def at_least(expression: Any, margin: float = 0.0) -> Any:
-    """Return the constraint ``expression >= margin * I`` for a square matrix expression."""
-    symmetric = 0.5 * (expression + expression.T)
-    return symmetric >> margin * np.eye(expression.shape[0])
+    """Return the constraint that the symmetric part of a square matrix expression is ``>= margin * I``."""
+    return _symmetric_part(expression) >> margin * np.eye(expression.shape[0])
 
 
 def at_most(expression: Any, level: float) -> Any:
-    """Return the constraint ``expression <= level * I`` for a square matrix expression."""
-    symmetric = 0.5 * (expression + expression.T)
-    return symmetric << level * np.eye(expression.shape[0])
+    """Return the constraint that the symmetric part of a square matrix expression is ``<= level * I``."""
+    return _symmetric_part(expression) << level * np.eye(expression.shape[0])
+
+
+def _symmetric_part(expression: Any) -> Any:
+    return expression if expression.is_symmetric() else 0.5 * (expression + expression.T)
 
 
 def trace(expression: Any) -> Any:

@@ -70,7 +70,7 @@ def solve(task: PdTask, *, solver: str) -> PdSolution:
     z = lmi.matrix_variable(n, ny)
     found = _Variables(p3, lmi.matrix_variable(n, ny), z)
     own = [lmi.symmetric_variable(n) for _ in task.plants]
-    constraints = [lmi.at_least(p3 + p3.T, 2.0)]
+    constraints = [lmi.at_least(2.0 * p3, 2.0)]
     for (a, c), p in zip(task.plants, own, strict=True):
         constraints += [lmi.at_least(p, PD_MARGIN), lmi.at_most(_stability(task, found, a, c, p), -PD_MARGIN)]
     constraints += _further(task, found)
@@ -98,12 +98,13 @@ def _stability(task: PdTask, found: _Variables, a: FloatArray, c: FloatArray, p:
 
 
 def _blocks(task: PdTask, found: _Variables, moving: Any, c: FloatArray, p: Any, weights: tuple[float, ...]) -> Any:
-    """Return the lower triangle of blocks; ``moving`` is M and ``weights`` are (a, b, c) of the module's text."""
+    """Return the lower triangle of blocks; ``moving`` is M and ``weights`` are (a, b, c) of the module's text.
+
+    On the diagonal stands what has the symmetric part that is meant.
+    """
     still = found.P3.T + found.Z @ c
-    return [
-        [moving + moving.T + weights[0] * p],
-        [task.delta * moving - still.T + weights[1] * p, -task.delta * (still + still.T) + weights[2] * p],
-    ]
+    first, second, third = (weight * p if weight else np.zeros(p.shape) for weight in weights)
+    return [[2.0 * moving + first], [task.delta * moving - still.T + second, -2.0 * task.delta * still + third]]
 
 
 def _further(task: PdTask, found: _Variables) -> list[Any]:
@@ -135,7 +136,7 @@ def _bounded(task: PdTask, found: _Variables, proportional: Any, bound: float) -
     return lmi.at_least(
         lmi.symmetric_blocks(
             [
-                [found.P3 + found.P3.T - np.eye(n)],
+                [2.0 * found.P3 - np.eye(n)],
                 [task.gain_unit * proportional.T / bound, np.eye(ny)],
                 [found.Z.T / bound, np.zeros((ny, ny)), np.eye(ny)],
             ]
