@@ -48,6 +48,12 @@ def nudged(matrix: np.ndarray, row: int, column: int, by: float = 1e-6) -> np.nd
     return changed
 
 
+def scattered(shape: tuple[int, ...]) -> list[tuple[int, ...]]:
+    """Return the places of a matrix in an order drawn once: each share of them is spread over rows and columns."""
+    places = list(np.ndindex(shape))
+    return [places[i] for i in np.random.default_rng(1).permutation(len(places))]
+
+
 def with_observer(design: ObserverDesign, **changes: object) -> ObserverDesign:
     return design.replace(observer=dataclasses.replace(design.observer, **changes))
 

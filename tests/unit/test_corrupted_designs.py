@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from corruption_tables import (
     entry,
     failed,
     nudged,
+    scattered,
     with_certificate,
     with_observer,
     with_plant,
@@ -595,11 +596,9 @@ def test_good_claims_and_a_good_recovery_pass(name: str) -> None:
 
 @pytest.mark.parametrize("letter", ["T", "N", "L", "W", "Psi", "Upsilon", "R"])
 @pytest.mark.parametrize("name", PLANTS)
-def test_every_single_entry_of_the_gain_set_counts(name: str, letter: str) -> None:
-    rows, columns = good(name).gains[letter].shape
-    for row in range(rows):
-        for column in range(columns):
-            assert failed(gain_entry(letter, row, column)(good(name))), (row, column)
+def test_every_single_entry_of_the_gain_set_counts(name: str, letter: str, share: Callable[..., Any]) -> None:
+    for row, column in share(scattered(good(name).gains[letter].shape)):
+        assert failed(gain_entry(letter, row, column)(good(name))), (row, column)
 
 
 @pytest.mark.parametrize("case", TABLE)
@@ -624,23 +623,23 @@ CAUGHT_BY = {
 
 @pytest.mark.parametrize("matrix", CAUGHT_BY)
 @pytest.mark.parametrize("name", PLANTS)
-def test_every_single_entry_of_the_observer_counts(name: str, matrix: str) -> None:
+def test_every_single_entry_of_the_observer_counts(name: str, matrix: str, share: Callable[..., Any]) -> None:
     design = good(name)
     observer = design.observer
     parts = {"state": observer.state_rows, "fault": observer.fault_rows, "residual": observer.residual_rows}
     shape = getattr(observer, matrix).shape
     for part, causes in CAUGHT_BY[matrix].items():
-        for row in range(shape[0])[parts.get(part, slice(None))]:
-            for column in range(shape[1]):
-                found = failed(entry(matrix, row, column)(design))
-                assert found & causes, (row, column, found)
+        rows = range(shape[0])[parts.get(part, slice(None))]
+        for row, column in share([place for place in scattered(shape) if place[0] in rows], 5):
+            found = failed(entry(matrix, row, column)(design))
+            assert found & causes, (row, column, found)
 
 
 @pytest.mark.parametrize("matrix", ["E", "A", "B", "C", "D", "Bf", "Df"])
 @pytest.mark.parametrize("name", PLANTS)
 def test_every_single_entry_of_the_plant_counts(name: str, matrix: str, share: Callable[..., Any]) -> None:
     design = good(name)
-    for row, column in share(list(np.ndindex(getattr(design.plant, matrix).shape)), 2):
+    for row, column in share(scattered(getattr(design.plant, matrix).shape), 6):
         assert failed(plant_entry(matrix, row, column, 1e-6)(design)), (row, column)
 
 
@@ -657,7 +656,7 @@ def test_not_a_number_anywhere_is_refused_or_fails(name: str, share: Callable[..
                     with pytest.raises(SpecError):
                         change(design, **{field: changed})
     for key, matrix in design.certificate.matrices.items():
-        for row, column in share(list(np.ndindex(matrix.shape))):
+        for row, column in share(scattered(matrix.shape), 8):
             expected = {LEAST if key in WITNESSES else WITNESS_CLAIMS.get(key, FITS)}
             assert failed(certificate_entry(key, row, column, np.nan)(design)) == expected
     needed = {"state_lag": {FITS, CLAIMS}}
@@ -708,7 +707,7 @@ def test_units_of_the_states_do_not_hide_a_corruption(name: str, share: Callable
     powers = np.exp2(np.round(np.linspace(-14.0, 14.0, design.plant.nx)))
     assert failed(in_units(design, powers)) == set()
     for matrix in CAUGHT_BY:
-        for row, column in share(list(np.ndindex(getattr(design.observer, matrix).shape))):
+        for row, column in share(scattered(getattr(design.observer, matrix).shape), 12):
             corrupted = entry(matrix, row, column)(design)
             assert failed(in_units(corrupted, powers)) == failed(corrupted), (matrix, row, column)
 
@@ -766,30 +765,35 @@ class TestPrintedDigits:
     @pytest.mark.parametrize("letter", ["T", "N", "L", "W"])
     def test_any_wrong_digit_still_fails(self, letter: str, share: Callable[..., Any]) -> None:
         gain = np.round(good("paper").gains[letter], 4)
-        for row, column in share(list(np.ndindex(gain.shape)), 2):
+        for row, column in share(scattered(gain.shape), 6):
             for by in (0.05, -0.05):
                 wrong = self.rounded(**{letter: nudged(gain, row, column, by)})
                 assert failed(wrong, printed_digits=4), (row, column, by)
 
-    def unnoticed(self, letter: str, units: int) -> set[tuple[int, int]]:
-        """Entries that may be wrong by so many units of the last digit without any row failing."""
+    def unnoticed(self, letter: str, units: int, places: Sequence[tuple[int, int]]) -> set[tuple[int, int]]:
+        """Those of these entries that may be wrong by so many units of the last digit without any row failing."""
         gain = np.round(good("paper").gains[letter], 4)
         return {
             (row, column)
-            for row, column in np.ndindex(gain.shape)
+            for row, column in places
             for by in (units * 1e-4, -units * 1e-4)
             if not failed(self.rounded(**{letter: nudged(gain, row, column, by)}), printed_digits=4)
         }
 
     @pytest.mark.parametrize("letter", ["T", "N", "W"])
-    def test_ten_units_of_the_last_digit_fail(self, letter: str) -> None:
+    def test_ten_units_of_the_last_digit_fail(self, letter: str, share: Callable[..., Any]) -> None:
         """What rounding can do to each identity is known entry by entry: a wrong digit before the last one shows."""
-        assert self.unnoticed(letter, 10) == set()
+        places = share(scattered(good("paper").gains[letter].shape), 5)
+        assert self.unnoticed(letter, 10, places) == set()
 
-    def test_in_L_ten_units_fail_in_most_entries_and_twenty_in_all(self) -> None:
+    def test_in_L_ten_units_fail_in_most_entries_and_twenty_in_all(self, share: Callable[..., Any]) -> None:
         """In the rows of large gains, roundings of T at their worst would do as much as ten units of one entry of L."""
-        assert self.unnoticed("L", 10) == {(0, 0), (0, 1), (3, 0), (3, 1)}
-        assert self.unnoticed("L", 20) == set()
+        places = share(scattered(good("paper").gains["L"].shape), 3)
+        softened = {(0, 0), (0, 1), (3, 0), (3, 1)} & set(places)
+        assert softened
+        assert softened != set(places)
+        assert self.unnoticed("L", 10, places) == softened
+        assert self.unnoticed("L", 20, places) == set()
 
     def test_digits_do_not_soften_the_inequalities(self) -> None:
         lowered = gamma_just_below_the_norm(good("paper"))
