@@ -54,9 +54,23 @@ def test_what_was_found_reads_as_a_table_and_as_data(measured):
     assert measured.box.constants()["b1"]["nominal"] == measured.nominal["b1"]
 
 
-@pytest.mark.parametrize("end", [70, 80, 100])
-def test_a_leak_inside_the_rows_is_found(end):
-    found = calibrate(tanks(), LOG, BOUNDS, rows=f"0:{end}", initial_covariance=1e-4, input_delay=1, starts=1)
+def test_a_kink_of_the_model_at_the_maximum_spoils_no_box(measured):
+    """With a start between the pairs of levels the likelihood's slope jumps at its maximum (abs of a difference)."""
+    found = calibrate(tanks(), LOG, BOUNDS, rows="0:56", starts=1)
+    assert found.undetermined == ()
+    for name in BOUNDS:
+        width = measured.box.high[name] - measured.box.low[name]
+        assert abs(found.box.low[name] - measured.box.low[name]) < 0.1 * width
+        assert abs(found.box.high[name] - measured.box.high[name]) < 0.1 * width
+
+
+def test_a_leak_inside_the_rows_is_found(share):
+    for end in share((80, 70, 100)):
+        found_inside(f"0:{end}")
+
+
+def found_inside(rows):
+    found = calibrate(tanks(), LOG, BOUNDS, rows=rows, initial_covariance=1e-4, input_delay=1, starts=1)
     assert found.change in range(55, 60)
     assert any("not of one piece" in sentence for sentence in found.verdict)
 
@@ -226,7 +240,7 @@ OF_THE_DESIGN = {"noisy": ["mass", "energy", "cell"], "input_delay": 0, "starts"
 
 
 def test_five_constants_of_a_heat_exchanger_are_in_their_boxes():
-    model, log = exchanger_log(150, moving=True)
+    model, log = exchanger_log(90, moving=True)
     found = calibrate(model, log, EXCHANGER, **OF_THE_DESIGN)
     assert found.box.holds({"v1": 1.0, "v2": 1.0, "Cv": 1.936e-5, "phi": 1.0, "psi": 0.0})
     assert found.integration == "radau"
@@ -235,7 +249,7 @@ def test_five_constants_of_a_heat_exchanger_are_in_their_boxes():
 
 
 def test_inputs_that_stay_name_the_volumes_of_a_heat_exchanger():
-    model, log = exchanger_log(150, moving=False)
+    model, log = exchanger_log(90, moving=False)
     found = calibrate(model, log, EXCHANGER, **OF_THE_DESIGN)
     assert {name for direction in found.undetermined for name in direction} == {"v1", "v2"}
     assert {"v1", "v2"} <= {name for name, _ in found.box.open_sides} <= {"v1", "v2"}
