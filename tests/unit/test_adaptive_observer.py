@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 import pytest
 from paper_filter import PaperState, paper_step
@@ -187,7 +190,7 @@ class TestLearning:
 class TestWindUp:
     """Excitation that ends: what S does then."""
 
-    STEPS = 3000
+    STEPS = 2000
 
     def spread_without_excitation(self, guard: str) -> np.ndarray:
         plant = varying(Phi=[["exp(-k / 10)", 0], [0, "exp(-k / 10)"], [0, 0]], Psi=np.zeros((2, 2)))
@@ -295,16 +298,16 @@ class TestReset:
         found = np.array([running.raw_step(row, np.zeros(1)).parameters.theta for row in y])
         return found - theta, running.state.resets
 
-    def test_a_jump_is_followed_at_once(self) -> None:
+    def test_a_jump_is_followed_at_once(self, share: Callable[..., Any]) -> None:
         after = slice(self.CHANGE + 15, self.CHANGE + 60)
-        for seed in range(4):
+        for seed in share(range(4), 2):
             plain, none = self.errors(seed, jump=4.0)
             reset, count = self.errors(seed, jump=4.0, reset=1e-6)
             assert (none, count) == (0, 1)
             assert np.sqrt(np.mean(reset[after] ** 2)) < 0.3 * np.sqrt(np.mean(plain[after] ** 2))
 
-    def test_nothing_happens_without_a_jump(self) -> None:
-        for seed in range(10):
+    def test_nothing_happens_without_a_jump(self, share: Callable[..., Any]) -> None:
+        for seed in share(range(10)):
             plain, _ = self.errors(seed, jump=0.0)
             reset, count = self.errors(seed, jump=0.0, reset=1e-6)
             assert count == 0

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import functools
 import json
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -106,9 +108,9 @@ def test_a_heavy_tail_is_recognised() -> None:
 
 
 @pytest.mark.parametrize(("m", "memory"), [(1, 0.0), (1, 0.9), (2, 0.7)])
-def test_the_stated_rate_is_kept_out_of_sample(m: int, memory: float) -> None:
+def test_the_stated_rate_is_kept_out_of_sample(m: int, memory: float, share: Callable[..., Any]) -> None:
     every, rates = 500.0, []
-    for seed in range(4):
+    for seed in share(range(4), 2):
         rng = np.random.default_rng([seed, m])
         x, fresh = coloured(rng, 2_000, m, memory), coloured(rng, 50_000, m, memory)
         model = fitted_autoregression(x)
@@ -117,7 +119,7 @@ def test_the_stated_rate_is_kept_out_of_sample(m: int, memory: float) -> None:
         largest = (statistics.of_rows(model.whitened(fresh)[None]) / levels.own[:, None, None]).max(axis=0)
         rates.append(every * count_alarms(largest, levels.factor) / 50_000)
         assert rows_needed(model, every) <= 2_000
-    # Of 400 alarms: 5 % each; the reference has .56 to .84 on average for 2,000 rows.
+    # Of 400 alarms, or of 200: 5 or 7 %; the reference has .56 to .84 on average for 2,000 rows.
     assert 0.4 <= np.mean(rates) <= 1.0
     assert max(rates) <= 1.5
 
