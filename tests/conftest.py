@@ -52,6 +52,16 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.sampled)
 
 
+@pytest.fixture
+def taken_as_verified(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Designs are made without their verification: for tests of what runs, of which it would be most of the time."""
+    from obsynth.results.checks import upper_bound_check
+    from obsynth.results.verification_report import VerificationReport
+
+    row = upper_bound_check("not checked", "taken as verified by a test", 0.0, 1.0, source="tests")
+    monkeypatch.setattr("obsynth.methods.designing.verify", lambda _, **__: VerificationReport((row,)))
+
+
 @pytest.fixture(scope="session")
 def share(pytestconfig: pytest.Config) -> Callable[..., Sequence[Any]]:
     """Return the cases of a family that this run looks at: all with ``--whole``, else every fourth."""

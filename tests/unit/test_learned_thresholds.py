@@ -276,6 +276,7 @@ def test_too_few_rows_are_told() -> None:
         obsynth.learn_thresholds(heated(), log(400, 0) * [1.0, 0.0, 0.0, 0.0])
 
 
+@pytest.mark.usefixtures("taken_as_verified")
 def test_every_kind_of_design_learns() -> None:
     spec = obsynth.load_spec("designs/threetank/spec.yaml")
     design = obsynth.design(spec.plant, spec.method, **dict(spec.options))

@@ -13,6 +13,7 @@ import obsynth
 from obsynth import PreconditionError, SpecError, TimeVaryingDescriptorSystem, run_on_data
 from obsynth.spec import load_spec
 
+pytestmark = pytest.mark.usefixtures("taken_as_verified")
 ROOT = Path(__file__).parents[2]
 DT = 0.1
 POINT = np.array([10.0, 0.0])

@@ -44,6 +44,7 @@ def record(jump: float = 0.0, samples: int = 160):
     return true, u, path
 
 
+@pytest.mark.usefixtures("taken_as_verified")
 @pytest.mark.parametrize("form", ["forgetting", "random-walk", "augmented-kalman"])
 def test_a_reset_follows_a_jump_and_nothing_else(form):
     slow = {**OPTIONS, "form": form, "forgetting": 0.998}
@@ -64,6 +65,7 @@ def test_a_reset_follows_a_jump_and_nothing_else(form):
     assert found[1e-6, 0.0][1] == found[0.0, 1.0][1] == 0
 
 
+@pytest.mark.usefixtures("taken_as_verified")
 def test_records_batches_and_samples_reset_alike_and_the_c_refuses():
     from obsynth import run_batch
 
