@@ -5,8 +5,9 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from flint import fmpq, fmpq_mat, fmpz_poly
+from flint import fmpq, fmpq_mat, fmpq_poly, fmpz_mat, fmpz_poly
 
+from obsynth.proofs import exact_pencils
 from obsynth.proofs.exact_arithmetic import (
     blocks,
     is_computed,
@@ -14,6 +15,7 @@ from obsynth.proofs.exact_arithmetic import (
     nearest_doubles,
     null_basis,
     pivot_columns,
+    primitive,
     written_fraction,
     written_matrix,
 )
@@ -150,3 +152,40 @@ def test_powers_of_two_as_units_change_nothing():
     rows, columns = np.exp2([-13, 7, 12, -9]), np.exp2([11, -13, 3])
     scaled = ExactPencil.written(rows[:, None] * E * columns, rows[:, None] * A * columns)
     assert scaled.zero_polynomial == ExactPencil.written(E, A).zero_polynomial
+
+
+def unimodular(order, seed):
+    """Return an integer matrix of determinant one with entries of many digits."""
+    rng = random.Random(seed)
+    found = fmpz_mat(order, order, [int(i == j) for i in range(order) for j in range(order)])
+    for _ in range(3):
+        for lower in (True, False):
+            found *= fmpz_mat(order, order, [1 if i == j else rng.randrange(-999, 999) if (i > j) == lower else 0
+                                             for i in range(order) for j in range(order)])  # fmt: skip
+    return found
+
+
+@pytest.mark.parametrize(
+    "pairs",
+    [
+        [(0, 1), (1, 1), (-1, 1), (2, 1), (-2, 1), (3, 0)],  # zero at every integer that is tried first
+        [(0, 5), (0, 7), (10**40, 3), (-1, 10**30), (2, 0)],
+        [(2**61 - 1, 1), (1, 2**61 - 1), (2**61 - 1, 2**61 - 31), (4, 1)],  # primes that must be left out
+        [(7, 0), (5, 0), (1, 3)],
+    ],
+)
+def test_determinants_of_pencils_that_are_known(pairs):
+    order, degree = len(pairs), sum(slope != 0 for _, slope in pairs)
+    left, right = unimodular(order, 1), unimodular(order, 2)
+    constant, slope = (fmpz_mat(order, order, [pair[part] if i == j else 0 for i, pair in enumerate(pairs)
+                                               for j in range(order)]) for part in (0, 1))  # fmt: skip
+    expected = fmpz_poly([1])
+    for a, e in pairs:
+        expected *= fmpz_poly([a, -e])
+    found = exact_pencils._determinant(left * slope * right, left * constant * right, degree)
+    assert found == primitive(fmpq_poly(expected))
+
+
+def test_a_determinant_that_vanishes_everywhere_is_zero():
+    e, a = fmpz_mat([[1, 2], [2, 4]]), fmpz_mat([[3, 5], [6, 10]])
+    assert exact_pencils._determinant(e, a, 1) == fmpz_poly([0])

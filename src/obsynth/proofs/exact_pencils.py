@@ -12,10 +12,12 @@ from __future__ import annotations
 import random
 from dataclasses import dataclass
 from fractions import Fraction
-from functools import cached_property
+from functools import cache, cached_property
+from itertools import count
+from math import isqrt, prod
 
 import numpy as np
-from flint import fmpq, fmpq_mat, fmpq_poly, fmpz_mat, fmpz_poly, nmod_mat, nmod_poly
+from flint import fmpq, fmpq_mat, fmpq_poly, fmpz, fmpz_mat, fmpz_poly, nmod_mat, nmod_poly
 
 from obsynth.numerics.arrays import FloatArray
 from obsynth.proofs.exact_arithmetic import (
@@ -206,13 +208,54 @@ def _points(count: int) -> list[int]:
 
 
 def _determinant(e: fmpz_mat, a: fmpz_mat, degree: int) -> fmpz_poly:
-    """Return ``det(a - s e)``, of at most this degree, as a primitive polynomial, by Newton's divided differences."""
+    """Return ``det(a - s e)``, of at most this degree, as a primitive polynomial.
+
+    With ``s = s0 + t`` it is ``det(b) det(I - t b^-1 e)``, ``b = a - s0 e``: modulo primes a characteristic polynomial,
+    whose coefficients tell those over the integers as soon as the product of the primes is beyond twice their size.
+    """
+    shift = _regular_point(e, a, degree)
+    if shift is None:
+        return fmpz_poly([0])
+    start = _at(e, a, shift)
+    limit, product = 2 * _largest_coefficient(e, start), 1
+    found = [0] * (degree + 1)
+    for prime in map(_prime, count()):
+        if product > limit:
+            break
+        inner = nmod_mat(start, prime)
+        size = int(inner.det())
+        if size == 0:
+            continue
+        coefficients = inner.solve(nmod_mat(e, prime)).charpoly().coeffs()[::-1]
+        inverse = pow(product, -1, prime)
+        for k, coefficient in enumerate(coefficients[: degree + 1]):
+            found[k] += product * ((size * int(coefficient) - found[k]) * inverse % prime)
+        product *= prime
+    moved = fmpz_poly([value - product if 2 * value > product else value for value in found])
+    return primitive(fmpq_poly(moved(fmpz_poly([-shift, 1]))))
+
+
+def _regular_point(e: fmpz_mat, a: fmpz_mat, degree: int) -> int | None:
+    """Return an integer where ``det(a - s e)`` is not zero; ``None`` where it is zero at more than ``degree``."""
     points = _points(degree + 1)
-    differences = [fmpq(_at(e, a, point).det()) for point in points]
-    for order in range(1, degree + 1):
-        for k in range(degree, order - 1, -1):
-            differences[k] = (differences[k] - differences[k - 1]) / (points[k] - points[k - order])
-    found = fmpq_poly([differences[degree]])
-    for k in range(degree - 1, -1, -1):
-        found = found * fmpq_poly([-points[k], 1]) + fmpq_poly([differences[k]])
-    return primitive(found)
+    for point in points:
+        if int(nmod_mat(_at(e, a, point), _PRIMES[0]).det()):
+            return point
+    return next((point for point in points if _at(e, a, point).det() != 0), None)
+
+
+def _largest_coefficient(e: fmpz_mat, a: fmpz_mat) -> int:
+    """Return a bound on the coefficients of ``det(a - s e)``: on its size where s is of modulus one (Hadamard)."""
+    pairs = zip(a.tolist(), e.tolist(), strict=True)
+    rows = [[abs(int(x)) + abs(int(y)) for x, y in zip(*pair, strict=True)] for pair in pairs]
+    bounds = (prod(isqrt(sum(value * value for value in line)) + 1 for line in lines)
+              for lines in (rows, zip(*rows, strict=True)))  # fmt: skip
+    return min(bounds)
+
+
+@cache
+def _prime(k: int) -> int:
+    """Return the k-th prime down from 2^61; to be asked for in order."""
+    if k == 0:
+        return _PRIMES[0]
+    return next(value for value in count(_prime(k - 1) - 2, -2) if fmpz(value).is_prime())

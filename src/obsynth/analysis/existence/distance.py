@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from obsynth.analysis.zeros import equilibrated_at
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.lapack import eigenvalues
-from obsynth.numerics.scaling import equilibrate_pencil
+from obsynth.numerics.norms import MOST_ENTRIES_AT_ONCE
+from obsynth.numerics.scaling import equilibrate_pencil, power_of_two_below
 
 #: Below this distance, relative to the data, rounding of the data is as large as what a unit fault moves: gains of its
 #: inverse would be needed, which double precision drowns.
@@ -54,14 +55,11 @@ def distance_to_loss(
     candidates = [*_boundary(E, A, discrete), *(_to_boundary(zero, discrete) for zero in zeros)]
     if A.shape[0] > A.shape[1]:
         candidates += _compressed_points(E, A, discrete)
-    best = Distance(np.inf, 0j)
-    for point in candidates:
-        value = relative_singular_value(E, A, point, nx=nx)
-        if sizes is not None:
-            value = min(value, relative_singular_value(E, A, point, nx=nx, sizes=sizes))
-        if value < best.value:
-            best = Distance(value, point)
-    return best
+    values = relative_singular_values(E, A, candidates, nx=nx)
+    if sizes is not None:
+        values = np.minimum(values, relative_singular_values(E, A, candidates, nx=nx, sizes=sizes))
+    least = int(np.argmin(values))
+    return Distance(float(values[least]), candidates[least])
 
 
 def zeros_at_rounding_level(
@@ -80,14 +78,35 @@ def relative_singular_value(
     E: FloatArray, A: FloatArray, point: complex, *, nx: int, sizes: FloatArray | None = None
 ) -> float:
     """Return the least singular value at a point over the largest, in units that suit A, or ``sizes`` of its terms."""
-    pencil = equilibrated_at(E, A if sizes is None else sizes, point, nx=nx)
-    scaled = pencil.A if sizes is None else pencil.rows[:, None] * A * pencil.columns
-    matrix: NDArray[Any] = scaled - (point if point.imag else point.real) * pencil.E
-    values = np.linalg.svd(matrix, compute_uv=False)
-    if matrix.shape[0] < matrix.shape[1] or not values.size or values[0] == 0.0:
-        return 0.0 if matrix.shape[1] else np.inf
-    largest = values[0] if sizes is None else np.linalg.norm(pencil.A + abs(point) * np.abs(pencil.E), 2)
-    return float(values[-1] / largest)
+    return float(relative_singular_values(E, A, [point], nx=nx, sizes=sizes)[0])
+
+
+def relative_singular_values(
+    E: FloatArray, A: FloatArray, points: Sequence[complex], *, nx: int, sizes: FloatArray | None = None
+) -> FloatArray:
+    """Return `relative_singular_value` at some points: one scaling for all of a size, many matrices at once."""
+    found = np.full(len(points), 0.0 if A.shape[1] else np.inf)
+    if A.shape[0] < A.shape[1] or not A.size:
+        return found
+    groups: dict[tuple[float, bool], list[int]] = {}
+    for place, point in enumerate(points):
+        size = float(power_of_two_below(np.array(max(1.0, abs(point)))))
+        groups.setdefault((size, point.imag != 0.0), []).append(place)
+    at_once = max(1, MOST_ENTRIES_AT_ONCE // A.size)
+    for (size, turning), places in groups.items():
+        pencil = equilibrated_at(E, A if sizes is None else sizes, complex(size), nx=nx)
+        scaled = pencil.A if sizes is None else pencil.rows[:, None] * A * pencil.columns
+        for start in range(0, len(places), at_once):
+            some = places[start : start + at_once]
+            chosen = np.array([points[place] for place in some])[:, None, None]
+            matrices: NDArray[Any] = scaled - (chosen if turning else chosen.real) * pencil.E
+            values = np.linalg.svd(matrices, compute_uv=False)
+            largest = values[:, 0]
+            if sizes is not None:
+                largest = np.linalg.norm(pencil.A + np.abs(chosen) * np.abs(pencil.E), 2, axis=(1, 2))
+            seen = values[:, 0] > 0.0
+            found[some] = np.where(seen, values[:, -1] / np.where(seen, largest, 1.0), 0.0)
+    return found
 
 
 def least_share(matrix: NDArray[Any], sizes: FloatArray, *, rank: int | None = None) -> float:
