@@ -19,6 +19,7 @@ from obsynth.experiments.benches import make_bench
 from obsynth.experiments.monitors.residual_model import residual_model
 from obsynth.experiments.monitors.whitening import innovation_whitener, whitener_of, window_covariance
 from obsynth.experiments.monte_carlo import mean, share
+from obsynth.simulation.linear import make_stepper
 from obsynth.spec import load_spec
 
 DESIGNS = Path(__file__).parents[2] / "designs"
@@ -169,8 +170,9 @@ def test_bounds_hold_for_bounded_noise_whatever_it_is(kind: str, noisy) -> None:
     signs[:, ::2] = np.sign(np.sin(rng.uniform(0, np.pi, (1, runs // 2, 1)) * np.arange(steps)[:, None, None] + 0.1))
     signals[:, :, -1:] = 0.3 * signs
     noise = 2.0 * rng.choice([-1.0, 1.0], (steps, runs, 2))
-    _, outputs, _ = bench.stepper.run(signals, np.zeros_like(signals), noise)
-    rows = bench.observed(outputs, np.zeros((steps, runs, 0)))
+    stepper = make_stepper(design.plant, bench.drive, initial_state=bench.initial_state, stabilise=False)
+    _, outputs, _ = stepper.run(signals, np.zeros_like(signals), noise)
+    rows, _ = bench.observed(outputs, np.zeros((steps, runs, 0)))
     statistic = watched.statistic(rows[:, :, design.observer.residual_rows])
     assert np.all(statistic <= watched.threshold[:, None] * (1 + 1e-12))
     assert np.max(statistic / watched.threshold[:, None]) > 0.5

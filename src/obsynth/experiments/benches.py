@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import TypeAlias
 
 import numpy as np
 
@@ -63,8 +64,12 @@ class Runs:
         return tuple(split_rows(self.observer, self.rows[:, run]) for run in range(self.rows.shape[1]))
 
 
+#: States, outputs as measured, inputs, faults and disturbances of several runs, ``(steps, runs, signals)`` each.
+PlantRuns: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]
+
+
 @dataclass(frozen=True, eq=False)
-class Bench(ABC):
+class Bench:
     """A design and a scenario, ready to run; it can be sent to another process, with a model that is data."""
 
     drive: ScenarioSignals
@@ -73,10 +78,16 @@ class Bench(ABC):
     fault_signals: slice
     estimated: tuple[int, ...]  # which of the true faults are estimated
     notes: tuple[str, ...]
+    #: The plant alone, once for each seed.
+    simulated: Callable[[Sequence[int]], PlantRuns]
+    #: Rows of the observer from outputs and inputs of several runs, and its estimates where they say more than rows.
+    observed: Callable[[FloatArray, FloatArray], tuple[FloatArray, tuple[Estimates, ...]]]
 
-    @abstractmethod
     def run(self, seeds: Sequence[int]) -> Runs:
         """Run the plant and the observer, once for each seed."""
+        states, outputs, inputs, faults, disturbances = self.simulated(seeds)
+        rows, kept = self.observed(outputs, inputs)
+        return Runs(states, outputs, inputs, faults, disturbances, rows, self.observer, kept)
 
     @property
     def onset(self) -> int | None:
@@ -101,38 +112,7 @@ class Bench(ABC):
         return end(observer.state_rows, observer.state_delays), end(observer.fault_rows, observer.fault_delays)
 
 
-@dataclass(frozen=True, eq=False)
-class LinearBench(Bench):
-    """A linear design and a scenario; ``observer_ramp (nz, nu + ny)``: what a first sample adds to the kept state."""
-
-    observer: LinearObserver
-    stepper: Stepper
-    observer_start: FloatArray
-    observer_ramp: FloatArray
-    sizes: tuple[int, int, int]
-
-    def run(self, seeds: Sequence[int]) -> Runs:
-        """Run the plant and the observer, once for each seed."""
-        drawn, noise, sensor_noise = self.drive.drawn(seeds, self.stepper.noisy.shape[1])
-        left = self.drive.left[:, None, :] + drawn
-        difference = np.broadcast_to((self.drive.right - self.drive.left)[:, None, :], left.shape)
-        states, clean, fed = self.stepper.run(left, difference, noise)
-        inputs, faults, disturbances = np.split(left, np.cumsum(self.sizes)[:-1], axis=2)
-        if fed.shape[2]:
-            inputs = inputs + fed
-        outputs = self.drive.measured(clean + sensor_noise)
-        rows = self.observed(outputs, inputs)
-        return Runs(states, outputs, inputs, faults, disturbances, rows, self.observer)
-
-    def observed(self, outputs: FloatArray, inputs: FloatArray) -> FloatArray:
-        """Return what the observer says to ``outputs (steps, runs, ny)``, ``inputs (steps, runs, nu)``: its rows."""
-        system = self.observer
-        start = self.observer_start - np.concatenate([inputs[0], outputs[0]], axis=1) @ self.observer_ramp.T
-        z = driven(system.Az, start, inputs @ system.Bu.T + outputs @ system.By.T)
-        return np.asarray(z @ system.Cz.T + inputs @ system.Du.T + outputs @ system.Dy.T + system.added)
-
-
-def make_bench(design: ObserverDesign, scenario: Scenario) -> LinearBench:
+def make_bench(design: ObserverDesign, scenario: Scenario) -> Bench:
     """Return the bench of a linear design and a scenario."""
     plant, observer = design.linear
     drive = resolve(plant, scenario)
@@ -144,101 +124,39 @@ def make_bench(design: ObserverDesign, scenario: Scenario) -> LinearBench:
         ramp = first_order_hold(observer.Az, np.hstack([observer.Bu, observer.By]), drive.dt)[2]
         observer = sample_observer(observer, drive.dt)
     said = ((not plant.is_discrete, BETWEEN_SAMPLES), (stepper.feedback is not None, STABILISED))
-    return LinearBench(
+    return Bench(
         drive,
         observer,
         start,
         slice(plant.nu, plant.nu + plant.nf),
         tuple(index_of(name, plant.fault_names, what="The plant") for name in observer.fault_names),
         tuple(text for holds, text in said if holds),
-        stepper,
-        begin,
-        ramp,
-        (plant.nu, plant.nf, plant.nd),
+        partial(_linear_plant, drive, stepper, (plant.nu, plant.nu + plant.nf)),
+        partial(_linear_rows, observer, begin, ramp),
     )
 
 
-@dataclass(frozen=True, eq=False)
-class ParameterBench(Bench):
-    """A recursive or nonlinear design and a scenario; true ``inputs (steps, nu)`` and ``parameters (steps, nq)``."""
+def _linear_plant(drive: ScenarioSignals, stepper: Stepper, parts: tuple[int, int], seeds: Sequence[int]) -> PlantRuns:
+    """Run a linear plant; ``parts``: where faults and disturbances begin among its signals."""
+    drawn, noise, sensor_noise = drive.drawn(seeds, stepper.noisy.shape[1])
+    left = drive.left[:, None, :] + drawn
+    difference = np.broadcast_to((drive.right - drive.left)[:, None, :], left.shape)
+    states, clean, fed = stepper.run(left, difference, noise)
+    inputs, faults, disturbances = np.split(left, parts, axis=2)
+    if fed.shape[2]:
+        inputs = inputs + fed
+    return states, drive.measured(clean + sensor_noise), inputs, faults, disturbances
 
-    observer: RecursiveObserver | DAEObserver
-    inputs: FloatArray
-    parameters: FloatArray
 
-    def run(self, seeds: Sequence[int]) -> Runs:
-        """Run the plant and the observer, once for each seed."""
-        if isinstance(self.observer, DAEObserver):
-            return self._run_dae(self.observer, seeds)
-        return self._run_varying(self.observer, seeds)
-
-    def _run_varying(self, observer: RecursiveObserver, seeds: Sequence[int]) -> Runs:
-        steps = self.drive.steps
-        mu, nu = np.zeros((steps, len(seeds), observer.plant.ne)), np.zeros((steps - 1, len(seeds), observer.plant.ny))
-        process, sensing = _factors(observer.Q, steps), _factors(observer.R, steps - 1)
-        for run, seed in enumerate(seeds):
-            rng = np.random.default_rng(seed)
-            if self.drive.noise:
-                mu[:, run] = self.drive.noise * _drawn(process, rng)
-                nu[:, run] = self.drive.noise * _drawn(sensing, rng)
-            if self.drive.deviations.any():
-                nu[:, run] += self.drive.deviations * rng.standard_normal(nu[:, run].shape)
-        states, clean = varying_runs(
-            observer.plant,
-            parameters=self.parameters,
-            inputs=self.inputs,
-            initial_state=self.initial_state,
-            equation_noise=mu,
-            output_noise=nu,
-        )
-        outputs = np.moveaxis(observer.timing.arriving(np.moveaxis(self.drive.measured(clean), 1, 0)), 0, 1)
-        return self._runs(states, outputs, self._watched(observer, outputs))
-
-    def _watched(self, observer: RecursiveObserver, outputs: FloatArray) -> tuple[Estimates, ...]:
-        """Return the estimates of every run; gains and covariances depend on no data, unless the observer resets."""
-        runs = outputs.shape[1]
-        resets = observer.adaptation is not None and bool(observer.adaptation.reset)
-        if runs == 1 or resets or not observer.is_plain:
-            return tuple(observer.run(outputs[:, run], self.inputs, compiled=False) for run in range(runs))
-        first = observer.run(outputs[:, 0], self.inputs, compiled=False)
-        others = run_batch(observer, np.swapaxes(outputs[:, 1:], 0, 1), self.inputs)
-        width = first.innovations.shape[1]
-        found = [first]
-        for states, parameters, innovations in zip(others.states, others.faults, others.innovations, strict=True):
-            seen = read_only(innovations[:, :width])
-            nis = read_only(_squares(seen, first.regressors, parameters))
-            found.append(replace(first, states=states, faults=parameters, innovations=seen, nis=nis))
-        return tuple(found)
-
-    def _run_dae(self, observer: DAEObserver, seeds: Sequence[int]) -> Runs:
-        share = self.drive.noise**2
-        states, outputs, estimates = [], [], []
-        for seed in seeds:
-            truth = simulate_dae(
-                observer.model,
-                self.inputs,
-                dt=observer.dt,
-                parameters=self.parameters,
-                initial_state=self.initial_state,
-                Q=share * observer.Q if share else None,
-                R=share * observer.R + np.diag(self.drive.deviations**2),
-                seed=seed,
-            )
-            measured = observer.timing.arriving(self.drive.measured(truth.outputs[:, None])[:, 0])
-            states.append(truth.states)
-            outputs.append(measured)
-            estimates.append(observer.run(measured, self.inputs))
-        return self._runs(np.stack(states, axis=1), np.stack(outputs, axis=1), tuple(estimates))
-
-    def _runs(self, states: FloatArray, outputs: FloatArray, estimates: tuple[Estimates, ...]) -> Runs:
-        steps, runs = outputs.shape[:2]
-        inputs, parameters = (
-            np.broadcast_to(signal[:, None], (steps, runs, signal.shape[1]))
-            for signal in (self.inputs, self.parameters)
-        )
-        rows = np.stack([np.hstack([found.states, found.faults, found.residuals]) for found in estimates], axis=1)
-        none = np.zeros((steps, runs, 0))
-        return Runs(states, outputs, inputs, parameters, none, rows, self.observer, estimates)
+def _linear_rows(
+    observer: LinearObserver, begin: FloatArray, ramp: FloatArray, outputs: FloatArray, inputs: FloatArray
+) -> tuple[FloatArray, tuple[Estimates, ...]]:
+    """Return what a linear observer says to ``outputs (steps, runs, ny)``, ``inputs (steps, runs, nu)``: its rows.
+    ``ramp (nz, nu + ny)``: what a first sample adds to the state at the start."""
+    start = begin - np.concatenate([inputs[0], outputs[0]], axis=1) @ ramp.T
+    z = driven(observer.Az, start, inputs @ observer.Bu.T + outputs @ observer.By.T)
+    rows = z @ observer.Cz.T + inputs @ observer.Du.T + outputs @ observer.Dy.T + observer.added
+    return np.asarray(rows), ()
 
 
 def bench_of(design: ObserverDesign, scenario: Scenario) -> Bench:
@@ -252,12 +170,15 @@ def bench_of(design: ObserverDesign, scenario: Scenario) -> Bench:
             path="observer",
         )
     observer: RecursiveObserver | DAEObserver
+    simulated: Callable[..., PlantRuns]
+    watched: Callable[[FloatArray, FloatArray], tuple[Estimates, ...]]
     if isinstance(design.observer, DAEObserver):
         observer = design.observer
         model = observer.model
         drive = resolve_parameters(model, scenario, dt=observer.dt)
         start, inputs, theta = model.nominal_state, model.nominal_input, model.nominal_parameters
         note = "The plant was integrated by Radau IIA, with inputs constant during each step."
+        simulated, watched = partial(_dae_plant, observer), partial(_dae_estimates, observer)
     else:
         observer = design.recursive[1]
         adaptation = observer.adaptation
@@ -265,11 +186,121 @@ def bench_of(design: ObserverDesign, scenario: Scenario) -> Bench:
         start, inputs = observer.initial_state, np.zeros(observer.plant.nu)
         note = "The model begins with y(1): the first row of the outputs is empty."
         theta = np.zeros(observer.plant.nq) if adaptation is None else adaptation.initial_parameters
+        simulated, watched = partial(_varying_plant, observer), partial(_recursive_estimates, observer)
     names = observer.state_names
     begin = np.array([scenario.initial_state.get(name, value) for name, value in zip(names, start, strict=True)])
     nu, estimated = len(inputs), tuple(range(len(observer.fault_names)))
     true = inputs + drive.left[:, :nu], theta + drive.left[:, nu:]
-    return ParameterBench(drive, observer, begin, slice(nu, None), estimated, (note,), *true)
+    return Bench(
+        drive,
+        observer,
+        begin,
+        slice(nu, None),
+        estimated,
+        (note,),
+        partial(simulated, drive, begin, *true),
+        partial(_rows_of, watched),
+    )
+
+
+def _varying_plant(
+    observer: RecursiveObserver,
+    drive: ScenarioSignals,
+    begin: FloatArray,
+    inputs: FloatArray,
+    parameters: FloatArray,
+    seeds: Sequence[int],
+) -> PlantRuns:
+    steps = drive.steps
+    mu, nu = np.zeros((steps, len(seeds), observer.plant.ne)), np.zeros((steps - 1, len(seeds), observer.plant.ny))
+    process, sensing = _factors(observer.Q, steps), _factors(observer.R, steps - 1)
+    for run, seed in enumerate(seeds):
+        rng = np.random.default_rng(seed)
+        if drive.noise:
+            mu[:, run] = drive.noise * _drawn(process, rng)
+            nu[:, run] = drive.noise * _drawn(sensing, rng)
+        if drive.deviations.any():
+            nu[:, run] += drive.deviations * rng.standard_normal(nu[:, run].shape)
+    states, clean = varying_runs(
+        observer.plant,
+        parameters=parameters,
+        inputs=inputs,
+        initial_state=begin,
+        equation_noise=mu,
+        output_noise=nu,
+    )
+    return _with_parameters(observer, drive, states, clean, inputs, parameters)
+
+
+def _dae_plant(
+    observer: DAEObserver,
+    drive: ScenarioSignals,
+    begin: FloatArray,
+    inputs: FloatArray,
+    parameters: FloatArray,
+    seeds: Sequence[int],
+) -> PlantRuns:
+    share = drive.noise**2
+    runs = [
+        simulate_dae(
+            observer.model,
+            inputs,
+            dt=observer.dt,
+            parameters=parameters,
+            initial_state=begin,
+            Q=share * observer.Q if share else None,
+            R=share * observer.R + np.diag(drive.deviations**2),
+            seed=seed,
+        )
+        for seed in seeds
+    ]
+    states, clean = (np.stack([getattr(run, name) for run in runs], axis=1) for name in ("states", "outputs"))
+    return _with_parameters(observer, drive, states, clean, inputs, parameters)
+
+
+def _with_parameters(
+    observer: RecursiveObserver | DAEObserver,
+    drive: ScenarioSignals,
+    states: FloatArray,
+    clean: FloatArray,
+    inputs: FloatArray,
+    parameters: FloatArray,
+) -> PlantRuns:
+    """Return runs of a plant with parameters, with outputs as its sensors give them (``clean (steps, runs, ny)``)."""
+    outputs = np.moveaxis(observer.timing.arriving(np.moveaxis(drive.measured(clean), 1, 0)), 0, 1)
+    steps, runs = outputs.shape[:2]
+    shared = (np.broadcast_to(signal[:, None], (steps, runs, signal.shape[1])) for signal in (inputs, parameters))
+    return states, outputs, *shared, np.zeros((steps, runs, 0))  # type: ignore[return-value]
+
+
+def _rows_of(
+    watched: Callable[[FloatArray, FloatArray], tuple[Estimates, ...]], outputs: FloatArray, inputs: FloatArray
+) -> tuple[FloatArray, tuple[Estimates, ...]]:
+    """Return the rows and the estimates of an observer with parameters; all runs have the same inputs."""
+    estimates = watched(outputs, inputs[:, 0])
+    rows = np.stack([np.hstack([found.states, found.faults, found.residuals]) for found in estimates], axis=1)
+    return rows, estimates
+
+
+def _dae_estimates(observer: DAEObserver, outputs: FloatArray, inputs: FloatArray) -> tuple[Estimates, ...]:
+    return tuple(observer.run(outputs[:, run], inputs) for run in range(outputs.shape[1]))
+
+
+def _recursive_estimates(observer: RecursiveObserver, outputs: FloatArray, inputs: FloatArray) -> tuple[Estimates, ...]:
+    """Return the estimates of every run; gains and covariances depend on no data, unless the observer resets."""
+    runs = outputs.shape[1]
+    resets = observer.adaptation is not None and bool(observer.adaptation.reset)
+    if runs == 1 or resets or not observer.is_plain:
+        return tuple(observer.run(outputs[:, run], inputs, compiled=False) for run in range(runs))
+    first = observer.run(outputs[:, 0], inputs, compiled=False)
+    others = run_batch(observer, np.swapaxes(outputs[:, 1:], 0, 1), inputs)
+    width = first.innovations.shape[1]
+    found = [first]
+    for states, parameters, innovations in zip(others.states, others.faults, others.innovations, strict=True):
+        seen = read_only(innovations[:, :width])
+        nis = read_only(_squares(seen, first.regressors, parameters))
+        found.append(replace(first, states=states, faults=parameters, innovations=seen, nis=nis))
+    return tuple(found)
 
 
 def _factors(covariances: MatrixSequence, steps: int) -> FloatArray:

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.experiments.benches import Bench, LinearBench, Runs, bench_of, make_bench
+from obsynth.experiments.benches import Bench, Runs, bench_of, make_bench
 from obsynth.experiments.monitors.monitor import Monitor
 from obsynth.experiments.simulation import aligned_errors
 from obsynth.numerics.arguments import OpenUnitInterval, checked_value, require_kind, whole_number
@@ -19,6 +19,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.decisions import ParameterMonitor
 from obsynth.observers.estimates import Estimates
+from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.progress import RunsProgress, as_they_come, progress_of_runs
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.results.design import ObserverDesign
@@ -210,8 +211,8 @@ def evaluate(
     benches = [bench] if plants is None else _drawn_benches(design, scenario, plants)
     size = max(1, BATCH_SAMPLES // bench.drive.steps)
     # The first row of a plant with parameters is what was known before: no sample has been used.
-    states, faults = ((end or 0) if isinstance(bench, LinearBench) else 1 for end in bench.warm_ups())
-    names = design.linear[0].fault_names if isinstance(bench, LinearBench) else ()
+    states, faults = ((end or 0) if isinstance(bench.observer, LinearObserver) else 1 for end in bench.warm_ups())
+    names = design.linear[0].fault_names if isinstance(bench.observer, LinearObserver) else ()
     tasks = [
         _Task(one, monitor, (states, faults), tuple(seeds[i] for i in part[begin : begin + size]), names)
         for one, part in zip(benches, np.array_split(np.arange(runs), len(benches)), strict=True)
@@ -229,7 +230,7 @@ def evaluate(
 
 def _require_fit(bench: Bench, monitor: Monitor | ParameterMonitor | None, plants: int | None) -> None:
     """Raise `SpecError` where a monitor, or drawing plants, is not for such a design."""
-    if isinstance(bench, LinearBench):
+    if isinstance(bench.observer, LinearObserver):
         if isinstance(monitor, ParameterMonitor):
             raise SpecError("This design is linear: give monitor=obsynth.monitor(design, scenario).", path="monitor")
         return
@@ -255,7 +256,7 @@ def _drawn_benches(design: ObserverDesign, scenario: Scenario, plants: int) -> l
 
 def _judged_residuals(watched: Monitor, bench: Bench, runs: Runs, fault_names: tuple[str, ...]) -> FloatArray:
     """Return ``(3, runs)``: whether an alarm is false, when a fault is found, and whether another one is blamed."""
-    observer = cast(LinearBench, bench).observer
+    observer = cast(LinearObserver, bench.observer)
     begin = len(runs.rows) if bench.onset is None else bench.onset
     passed = watched.passed_in(runs, onset=begin)
     judged = np.full((3, passed.shape[1]), np.nan)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.experiments.assumptions import Assumptions
-from obsynth.experiments.benches import LinearBench, make_bench
+from obsynth.experiments.benches import Bench, make_bench
 from obsynth.experiments.monitors.adaptive_monitor import (
     EXACT,
     noisy_design,
@@ -32,6 +32,7 @@ from obsynth.experiments.monitors.whitening import settled, steady_mean, whitene
 from obsynth.methods.handing_on import require_verified
 from obsynth.numerics.arguments import is_finite_number, is_whole, require_kind, require_mapping
 from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.validation import index_of
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.scenario import Scenario
@@ -153,7 +154,8 @@ def monitor(
     start = 0.0 if adaptive else model.initial_error
     start = start if initial_error is None else float(initial_error)
     bounds, bench = bounds_of(design, model, disturbance_bounds), make_bench(design, scenario)
-    rows = bench.observer.fault_rows if estimates else bench.observer.residual_rows
+    observer = cast(LinearObserver, bench.observer)
+    rows = observer.fault_rows if estimates else observer.residual_rows
     rule: Rule
     if kind in ("chi-square", "cusum"):
         whitener, white = whitened(kind, model, window)
@@ -189,7 +191,7 @@ def monitor(
         kind,
         statement,
         rule,
-        residuals=len(bench.observer.residual_names),
+        residuals=len(observer.residual_names),
         fault_names=design.linear[1].fault_names,
         fault_scales=model.fault_scales(),
         horizon=model.steps,
@@ -258,13 +260,10 @@ def _statistical(
     return threshold
 
 
-def _floor(bench: LinearBench, scenario: Scenario, rows: slice) -> float:
+def _floor(bench: Bench, scenario: Scenario, rows: slice) -> float:
     """Return what rounding may add to the norm of the residual, from the size of what it is made of."""
-    runs = bench.run([scenario.seed])
-    size = (
-        np.abs(runs.outputs) @ np.abs(bench.observer.Dy[rows]).T
-        + np.abs(runs.inputs) @ np.abs(bench.observer.Du[rows]).T
-    )
+    runs, observer = bench.run([scenario.seed]), cast(LinearObserver, bench.observer)
+    size = np.abs(runs.outputs) @ np.abs(observer.Dy[rows]).T + np.abs(runs.inputs) @ np.abs(observer.Du[rows]).T
     return ROUNDING_SHARE * float(np.max(np.linalg.norm(size, axis=2)))
 
 
