@@ -15,7 +15,7 @@ import pandas as pd
 import pytest
 
 import obsynth
-from obsynth.data.linear_log import engine_of
+from obsynth.data.log_run import LogRun
 from obsynth.observers.dae.c_code import compiler
 
 METHODS = ("functional-filter", "ui-pi-observer", "fault-estimation-filter")
@@ -119,7 +119,7 @@ def test_levels_decide_at_once_after_a_gap_by_what_it_can_have_left(name: str) -
         holed = data.copy()
         for first in (400, 420, 600, 800):
             holed.loc[first : first + 2, blank] = np.nan
-        rows = engine_of(design).rows(holed["time"].tolist(), holed.iloc[:, 1:].to_numpy(), 1)
+        rows = LogRun(design).estimates(holed["time"].tolist(), holed.iloc[:, 1:].to_numpy())
         after = [k for k, row in enumerate(rows) if row.status == "recovering"]
         assert {403, 423, 603, 803} <= set(after)
         excess = np.array([rows[k].excess for k in after])
@@ -133,7 +133,7 @@ def test_levels_decide_at_once_after_a_gap_by_what_it_can_have_left(name: str) -
         assert all(event.first_row < 100 for event in run.events)
     # A sensor that moves far in a row that was blind before.
     holed.loc[805:, "i"] += 60.0
-    rows = engine_of(design).rows(holed["time"].tolist(), holed.iloc[:, 1:].to_numpy(), 1)
+    rows = LogRun(design).estimates(holed["time"].tolist(), holed.iloc[:, 1:].to_numpy())
     table = obsynth.run_on_data(design, holed, thresholds={"fhat[torque]": level}).table
     assert table is not None
     at, blind = columns.index("fhat[torque]"), [k for k in range(803, 860) if rows[k].status == "recovering"]

@@ -15,7 +15,7 @@ import numpy as np
 from obsynth.analysis.transformations.recovery import Transformation, linear_plant
 from obsynth.comparison.least_thresholds import thresholds_beside_least
 from obsynth.comparison.result import ComparedMethod, Comparison, FaultComparison, comparison_statement
-from obsynth.data.linear_log import faults_on_rows
+from obsynth.data.log_run import faults_on_rows
 from obsynth.data.log_tables import log_table
 from obsynth.data.signals import TIME
 from obsynth.errors import SpecError

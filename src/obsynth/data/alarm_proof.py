@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.data.linear_log import DataObserver
-from obsynth.data.signals import Signals
+from obsynth.data.log_run import LogRun
 from obsynth.data.sources import Data, samples
 from obsynth.errors import SpecError
 from obsynth.experiments.alarm_multipliers import rows_of_test
@@ -128,15 +127,14 @@ def rows_of(
 
     ``complete``: so many of the last rows have to be without gaps; all by default.
     """
-    reader = DataObserver(design)
-    signals = Signals.of(reader, columns, scales)
+    run = LogRun(design, columns, scales)
     found, flawed, count, status = list[FloatArray](), list[tuple[bool, bool, int]](), 0, ""
-    for count, (time, values) in enumerate(itertools.islice(samples(data, signals), row), 1):
-        status = reader.clock.stale(time)
+    for count, (time, values) in enumerate(itertools.islice(samples(data, run.signals), row), 1):
+        status = run.clock.stale(time)
         if status:
             # The same rows are left out as in a run.
             continue
-        _, missing = reader.clock.advance(time, count)
+        _, missing = run.clock.advance(time, count)
         flawed.append((bool(missing and found), not np.isfinite(values).all(), count))
         found.append(values)
     if count < row:

@@ -1,16 +1,15 @@
-"""A linear observer on a log, row by row: irregular stamps, gaps, bad rows, warm-up."""
+"""A linear observer on a log, row by row: gaps, bad rows, warm-up; and which observer a design has on a log."""
 
 from __future__ import annotations
 
 import math
-from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import lru_cache, partial
-from typing import Any, TypeVar
+from typing import ClassVar, TypeVar
 
 import numpy as np
 
-from obsynth.data.log_estimator import GAP, LONGEST_BRIDGE, OK, RECOVERING, WARM_UP, Engine, Row
+from obsynth.data.log_estimator import GAP, LONGEST_BRIDGE, OK, RECOVERING, WARM_UP, LogObserver, Row
 from obsynth.errors import ObsynthError, PreconditionError, SpecError
 from obsynth.experiments.monitors.monitor import LinearSample
 from obsynth.numerics.arguments import is_finite_number
@@ -24,12 +23,15 @@ from obsynth.results.design import ObserverDesign
 
 #: How many lengths of an interval are kept discretised.
 KEPT_INTERVALS = 64
-#: Rows that are taken in one piece at most.
-PIECE = 4096
 #: A gap is over when what it can have left in fault estimates and residuals is below this share of their usual changes
 #: from row to row, which so many rows must have shown, or below what the stated noise of the sensors makes of them.
 LEFT_SHARE, LEAST_SHOWN = 1.0, 20
 SAMPLED_GAP = "gap is for continuous-time designs: a sampled one knows which rows are missing."
+#: What goes from row to row.
+SAVED = (
+    *("z", "v", "row", "model", "fault", "inputs", "measured", "seen"),
+    *("forgotten_at", "begun", "changes", "counted", "left", "held", "excess", "carried"),
+)
 _Part = TypeVar("_Part")
 
 
@@ -55,11 +57,11 @@ class GapModel:
         moving = plant.E @ done.recovery.from_state
         return cls(done.plant, np.asarray(np.linalg.pinv(moving) @ plant.E))
 
-    def start(self, estimate: FloatArray, inputs: Sequence[FloatArray], fault: FloatArray) -> FloatArray:
+    def start(self, estimate: FloatArray, inputs: Iterable[FloatArray], fault: FloatArray) -> FloatArray:
         """Return the dynamic states now from an estimate ``(nx_source,)`` and the inputs of the samples since."""
         return self.forward(self.into @ estimate, inputs, fault)
 
-    def forward(self, state: FloatArray, inputs: Sequence[FloatArray], fault: FloatArray) -> FloatArray:
+    def forward(self, state: FloatArray, inputs: Iterable[FloatArray], fault: FloatArray) -> FloatArray:
         """Return the dynamic states after samples of the inputs."""
         for u in inputs:
             state = self.after(state, 0.0, u, u, fault)
@@ -90,32 +92,20 @@ class GapModel:
         return float(np.linalg.norm(v[plant.nu :] - self.outputs(at, v[: plant.nu], f)))
 
 
-class PartialEstimates:
-    """States from an observer that estimates none, as filters of faults do: the smallest that explain its own state
-    ``z = T E x`` and the outputs.  ``solver (nx_source, nz + ny)``."""
+def _state_solver(design: ObserverDesign) -> FloatArray | None:
+    """Return what gives states from an observer that estimates none, as filters of faults do: the smallest that explain
+    its own state ``z = T E x`` and the outputs, ``(nx, nz + ny)``; ``None`` where faults are not all estimated."""
+    from obsynth.methods.registry import error_model
 
-    def __init__(self, design: ObserverDesign) -> None:
-        from obsynth.methods.registry import error_model
-
-        self.plant, _ = design.linear
-        errors = error_model(design)
-        self.solver = np.linalg.pinv(np.vstack([errors.own[:, : self.plant.nx] @ self.plant.E, self.plant.C]))
-
-    def state(self, z: FloatArray, v: FloatArray, fault: FloatArray) -> FloatArray:
-        """Return the states ``(nx_source,)`` at a sample with inputs and outputs ``v``."""
-        nu = self.plant.nu
-        return np.asarray(self.solver @ np.concatenate([z, v[nu:] - self.plant.D @ v[:nu] - self.plant.Df @ fault]))
-
-
-def _partial_estimates(design: ObserverDesign) -> PartialEstimates | None:
     plant, observer = design.linear
     if observer.fault_names != plant.fault_names:
         # The model needs every fault of the plant: an observer of some of them begins again after a gap.
         return None
     try:
-        return PartialEstimates(design)
+        own = error_model(design).own
     except SpecError:
         return None
+    return np.asarray(np.linalg.pinv(np.vstack([own[:, : plant.nx] @ plant.E, plant.C])))
 
 
 def _running(part: _Part | None) -> _Part:
@@ -125,8 +115,11 @@ def _running(part: _Part | None) -> _Part:
     return part
 
 
-class DataObserver(Engine):
-    """A running linear observer on measured data; ``gap`` and ``warm_up`` in seconds, see `run_on_data`."""
+class LinearLogObserver(LogObserver):
+    """A linear observer on a log; ``gap`` and ``warm_up`` in seconds, see `run_on_data`."""
+
+    plant: DescriptorSystem
+    saved: ClassVar = dict(zip(SAVED, SAVED, strict=True))
 
     def __init__(self, design: ObserverDesign, *, gap: float | None = None, warm_up: float | None = None) -> None:
         self.plant, self.observer = design.linear
@@ -134,15 +127,15 @@ class DataObserver(Engine):
             raise SpecError(f"gap is {gap!r}: give seconds, a positive number.", path="gap")
         if gap is not None and self.observer.dt > 0.0:
             raise SpecError(SAMPLED_GAP, path="gap")
-        super().__init__(self.observer, gap, warm_up, transient(self.observer))
+        super().__init__(self.observer, warm_up, transient(self.observer))
         self.options["gap"], self.input_delay = gap, design.input_delay
         self.input_names, self.output_names = self.observer.input_names, self.observer.output_names
         self.point, self.scales = self.plant.operating_point, self.plant.scales
         self.columns = self.observer.row_names
         lags = set(self.observer.state_delays) or {0}
         states = len(self.observer.state_names) == self.plant.nx
-        self.partial = None if states else _partial_estimates(design)
-        known = states or self.partial is not None
+        self.solver = None if states else _state_solver(design)
+        known = states or self.solver is not None
         self.gap_model = None if len(lags) > 1 or not known else GapModel.of(self.plant)
         self.nu = len(self.input_names)
         self.b = np.hstack([self.observer.Bu, self.observer.By])
@@ -153,7 +146,7 @@ class DataObserver(Engine):
         self.row = np.full(len(self.observer.Cz), np.nan)
         self.model: FloatArray | None = None
         # What is known of the plant's states at the last measured row, from which the model starts.
-        width = len(self.observer.state_names) if self.partial is None else self.plant.nx
+        width = len(self.observer.state_names) if self.solver is None else self.plant.nx
         self.seen = np.full(width, np.nan)
         # Since when nothing is left of a gap: bounds that are never passed hold from there on.
         self.forgotten_at, self.begun = -math.inf, False
@@ -172,12 +165,9 @@ class DataObserver(Engine):
         self.fault = np.zeros(self.plant.nf)
         self.told_faults = [self.plant.fault_names.index(name) for name in self.observer.fault_names]
         self.measured = self.v
-        self.inputs: deque[FloatArray] = deque(maxlen=max(lags) + 1)
-
-    @property
-    def usual_changes(self) -> tuple[float, int]:
-        """Share of usual changes that a gap may have left, and how many rows must have shown them."""
-        return LEFT_SHARE, LEAST_SHOWN
+        # The last of them: from the moment on of which the estimates are.
+        self.kept_inputs = max(lags) + 1
+        self.inputs = np.zeros((0, self.nu))
 
     def _usual(self) -> FloatArray | None:
         """Return what a gap may have left in fault estimates and residuals; nothing where that is not known yet."""
@@ -187,9 +177,8 @@ class DataObserver(Engine):
         changes = self.changes / self.counted if shown else np.zeros_like(self.changes)
         return np.asarray(np.sqrt(np.maximum(LEFT_SHARE**2 * changes, self.noise)))
 
-    def step(self, time: float, values: FloatArray, row: int) -> Row:
-        """Take one row of data."""
-        seconds, missing = self.clock.advance(time, row)
+    def take(self, time: float, values: FloatArray, *, seconds: float, missing: int, longest: float) -> Row:
+        """Take one row."""
         since = seconds
         good = bool(np.isfinite(values).all())
         previous = self.row if self.model is None and self.z is not None else None
@@ -207,10 +196,10 @@ class DataObserver(Engine):
                 if self.begun:
                     self.forgotten_at = time + max(self.warm_up, self.transient)
                 self.begun = True
-                self.inputs.clear()
+                self.inputs = self.inputs[:0]
                 seconds = 0.0
             if good:
-                recovered = self.warm_up if self.model is None else self._recovering(seconds, values)
+                recovered = self.warm_up if self.model is None else self._recovering(seconds, values, longest)
                 if self.model is None:
                     self._advance_excess(seconds)
                 found = self._measured(seconds, values)
@@ -257,33 +246,21 @@ class DataObserver(Engine):
         if self.observer.dt == 0.0 and seconds > 0.0 and self.excess.any():
             self.excess = self._hold(seconds)[0] @ self.excess
 
-    def steps(self, times: list[float], values: FloatArray, row: int) -> list[Row]:
-        """Take rows of data: those that follow each other without a gap in one piece."""
-        found: list[Row] = []
-        complete = np.asarray(np.isfinite(values).all(axis=1))
-        while (done := len(found)) < len(times):
-            missing = np.flatnonzero(~complete[done : done + PIECE])
-            end = done + (int(missing[0]) if missing.size else PIECE)
-            if self.z is not None and self.model is None:
-                found += self._regular_rows(times[done:end], values[done:end])
-            if len(found) < len(times) and (len(found) < end or len(found) == done):
-                place = len(found)
-                found.append(self.step(times[place], values[place], row + place))
-        return found
+    @property
+    def takes_pieces(self) -> bool:
+        """Whether the observer runs, and no model stands in for missing samples."""
+        return self.z is not None and self.model is None
 
-    def _regular_rows(self, times: Sequence[float], values: FloatArray) -> list[Row]:
-        """Take the first complete rows that follow each other without a gap, and end before a number overflows."""
-        steps = self.clock.regular(times)
-        count, observer = len(steps), self.observer
-        if not count:
-            return []
+    def take_piece(self, times: Sequence[float], values: FloatArray, intervals: Sequence[float]) -> list[Row]:
+        """Take complete rows that follow each other without a gap; end before a number overflows."""
+        count, observer = len(intervals), self.observer
         z, before, sampled = _running(self.z), self.v, observer.dt > 0.0
         states, rows = np.empty((count, observer.order)), np.empty((count, len(observer.Cz)))
         # The products of `step`, in the same order: results do not depend on where a piece ends.
         with np.errstate(over="ignore", invalid="ignore"):
             for k, v in enumerate(values[:count]):
                 if not sampled:
-                    transition, constant, ramp = self._hold(steps[k])
+                    transition, constant, ramp = self._hold(intervals[k])
                     z = transition @ z + constant @ before + ramp @ (v - before)
                     before = v
                 states[k] = z
@@ -297,22 +274,17 @@ class DataObserver(Engine):
             if not count:
                 return []
         last = count - 1
-        self.clock.take(times[:count], steps[:count])
         counts = np.array(times[:count]) >= self.settled_at
         if self.phase == RECOVERING:
             counts |= self.counted + np.cumsum(~counts) <= LEAST_SHOWN
         self._count(np.diff(np.vstack([self.row, rows[:count]]), axis=0)[counts])
         self.z, self.v, self.row, self.measured = np.array(after[last]), values[last], rows[last], values[last]
         self.fault = self._faults_in(rows[last])
-        self.seen = (
-            rows[last][observer.state_rows]
-            if self.partial is None
-            else self.partial.state(states[last], values[last], self.fault)
-        )
-        self.inputs.extend(v[: self.nu] for v in values[max(count - (self.inputs.maxlen or count), 0) : count])
+        self.seen = self._states(states[last], values[last], rows[last], self.fault)
+        self.inputs = np.vstack([self.inputs, values[:count, : self.nu]])[-self.kept_inputs :]
         settled, phase, forgotten = self.settled_at, self.phase, self.forgotten_at
         nu, nx, found = self.nu, len(self.state_names), list[Row]()
-        for time, seconds, row, v in zip(times[:count], steps[:count], rows[:count], values[:count], strict=True):
+        for time, seconds, row, v in zip(times[:count], intervals[:count], rows[:count], values[:count], strict=True):
             status = OK if time >= settled else phase
             self._advance_excess(seconds)
             said = LinearSample(row, v[:nu], v[nu:], nx)
@@ -326,9 +298,16 @@ class DataObserver(Engine):
         self.row = np.asarray(self.observer.Cz @ z + self.d @ v + self.observer.added)
         self.measured = v
         faults = self._faults_in(self.row)
-        self.seen = self.row[self.observer.state_rows] if self.partial is None else self.partial.state(z, v, faults)
+        self.seen = self._states(z, v, self.row, faults)
         self._taken(v)
         return self.row
+
+    def _states(self, z: FloatArray, v: FloatArray, row: FloatArray, fault: FloatArray) -> FloatArray:
+        """Return the estimates of states at a sample with inputs and outputs ``v``."""
+        if self.solver is None:
+            return row[self.observer.state_rows]
+        outputs = v[self.nu :] - self.plant.D @ v[: self.nu] - self.plant.Df @ fault
+        return np.asarray(self.solver @ np.concatenate([z, outputs]))
 
     def _faults_in(self, row: FloatArray) -> FloatArray:
         """Return every fault of the plant ``(nf,)`` as a row of estimates says."""
@@ -343,7 +322,7 @@ class DataObserver(Engine):
         self.changes = np.cumsum(np.vstack([self.changes, squares]), axis=0)[-1]
         self.counted += len(changes)
 
-    def _recovering(self, seconds: float, v: FloatArray) -> float:
+    def _recovering(self, seconds: float, v: FloatArray, longest: float) -> float:
         """Return the seconds after a gap in which nothing may be decided; the model stands at this row already.
 
         The outputs of the model missed those of the plant by no more during the gap than they do now, as errors of a
@@ -353,7 +332,7 @@ class DataObserver(Engine):
         missed = np.abs(v[nu:] - gap_model.outputs(_running(self.model), v[:nu], self.fault))
         # An input that was held was off by no more than it has changed since.
         missed = np.concatenate([np.abs(v[:nu] - self.held), missed])
-        usual, step = self._usual(), self.observer.dt or self.clock.longest
+        usual, step = self._usual(), self.observer.dt or longest
         if not (np.isfinite(self.left).all() and step > 0.0):
             self.carried = np.full_like(self.carried, np.inf)
             return self.warm_up
@@ -384,7 +363,7 @@ class DataObserver(Engine):
         if self.observer.dt > 0.0:
             self.z = np.asarray(self.observer.Az @ _running(self.z) + self.b @ v)
         self.v = v
-        self.inputs.append(self.v[: self.nu])
+        self.inputs = np.vstack([self.inputs, v[: self.nu]])[-self.kept_inputs :]
 
     def _flow(self, seconds: float, v: FloatArray) -> None:
         """Bring z of a continuous observer to the time of ``v``, which is reached along a straight line."""
@@ -419,7 +398,7 @@ class DataObserver(Engine):
             return self._held()
         if self.model is None:
             self.carried, self.excess = self._shown_excess(), np.zeros_like(self.excess)
-            known = list(self.inputs) if self.observer.dt > 0.0 else []
+            known = self.inputs if self.observer.dt > 0.0 else ()
             self.model, self.held = self.gap_model.start(self.seen, known, self.fault), self.v[: self.nu]
             if self.observer.dt == 0.0:
                 self._propagate(seconds, u)
@@ -453,7 +432,7 @@ class DataObserver(Engine):
     def _restart(self) -> None:
         self.z = self.model = None
         self.v = np.zeros_like(self.v)
-        self.inputs.clear()
+        self.inputs = self.inputs[:0]
         self.excess, self.carried = np.zeros_like(self.excess), np.zeros_like(self.carried)
         self.settled_at, self.phase = math.inf, WARM_UP
 
@@ -462,40 +441,11 @@ class DataObserver(Engine):
         row[self.observer.fault_rows] = self.fault[self.told_faults]
         return row
 
-    def _own_data(self) -> dict[str, Any]:
-        return {
-            "z": self.z,
-            "v": self.v,
-            "row": self.row,
-            "model": self.model,
-            "fault": self.fault,
-            "inputs": np.array(list(self.inputs)).reshape(len(self.inputs), self.nu),
-            "measured": self.measured,
-            "seen": self.seen,
-            "forgotten_at": self.forgotten_at,
-            "begun": self.begun,
-            "changes": self.changes,
-            "counted": self.counted,
-            "left": self.left,
-            "held": self.held,
-            "excess": self.excess,
-            "carried": self.carried,
-        }
 
-    def _resume_own(self, data: dict[str, Any]) -> None:
-        self.z, self.v, self.row, self.model = data["z"], data["v"], data["row"], data["model"]
-        self.fault, self.measured = data["fault"], data["measured"]
-        self.seen, self.forgotten_at, self.begun = data["seen"], data["forgotten_at"], data["begun"]
-        self.changes, self.counted, self.left = data["changes"], data["counted"], data["left"]
-        self.held, self.excess, self.carried = data["held"], data["excess"], data["carried"]
-        self.inputs.clear()
-        self.inputs.extend(data["inputs"])
-
-
-def engine_of(
+def log_observer(
     design: ObserverDesign, *, gap: float | None = None, warm_up: float | None = None, outliers: str | None = None
-) -> Engine:
-    """Return a running design, at its start; ``outliers`` takes the place of what the design says of them."""
+) -> LogObserver:
+    """Return the observer of a design on a log, at its start; ``outliers`` replace what the design says."""
     if isinstance(design.observer, LinearObserver):
         if outliers not in (None, "none"):
             raise SpecError(
@@ -503,24 +453,16 @@ def engine_of(
                 "its prediction.",
                 path="outliers",
             )
-        return DataObserver(design, gap=gap, warm_up=warm_up)
+        return LinearLogObserver(design, gap=gap, warm_up=warm_up)
     if gap is not None:
         raise SpecError(SAMPLED_GAP, path="gap")
     # What most logs do not need is loaded only where it is used: a run starts in a fraction of a second.
     if isinstance(design.observer, WindowObserver):
-        from obsynth.data.window_log import WindowEngine
+        from obsynth.data.window_log import WindowLogObserver
 
         if outliers not in (None, "none"):
             raise SpecError("outliers is for recursive and nonlinear designs: leave it out.", path="outliers")
-        return WindowEngine(design, design.observer, warm_up=warm_up)
-    from obsynth.data.step_log import SteppingEngine
+        return WindowLogObserver(design, design.observer, warm_up=warm_up)
+    from obsynth.data.step_log import SteppingLogObserver
 
-    return SteppingEngine(design, warm_up=warm_up, outliers=outliers)
-
-
-def faults_on_rows(design: ObserverDesign, times: FloatArray, u: FloatArray, y: FloatArray) -> FloatArray:
-    """Return fault estimates ``(rows, nf)`` on rows of a log, as `run_on_data` has them; NaN where there is none."""
-    engine = engine_of(design)
-    first = len(engine.state_names)
-    rows = engine.rows(times.tolist(), np.hstack([u, y]), 1)
-    return np.array([row.values[first : first + len(engine.fault_names)] for row in rows])
+    return SteppingLogObserver(design, warm_up=warm_up, outliers=outliers)

@@ -1,19 +1,18 @@
-"""What runs on rows of data: rows and their status, the clock, and what every kind of running design has."""
+"""An observer on rows of a log: what it says of each, and what every kind of observer has there; and the clock."""
 
 from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import Any, NamedTuple, Protocol
-
-import numpy as np
+from typing import Any, ClassVar, NamedTuple
 
 from obsynth.errors import SpecError
 from obsynth.experiments.monitors.monitor import Evidence, LinearSample
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear.derived import checked_warm_up
+from obsynth.observers.running import state_as_data, state_from_data
 from obsynth.plants.descriptor import DescriptorSystem
 
 #: What a row of estimates is.
@@ -45,36 +44,18 @@ MOST_SAMPLES = 2.0**53
 
 
 class Row(NamedTuple):
-    """Estimates at one row of data."""
+    """A row of a log, and the estimates at it."""
 
     status: str  # ``ok``, ``warm-up``, ``partial``, ``gap`` or ``recovering``
-    values: FloatArray  # one for each column of the engine; deviations, NaN where nothing is known
+    values: FloatArray  # one for each column of the observer; deviations, NaN where nothing is known
     skipped: int = 0  # how many rows were missing before this one
     evidence: Evidence | LinearSample | None = None  # what was learnt from this row, for decisions
     forgotten: bool = True  # whether nothing is left of gaps: bounds that are never passed hold
     # What a gap has left in each value of a row that is recovering, where the model missed by no more all through it
     # than at its end; infinite where that is not known.
     excess: FloatArray | None = None
-
-
-class Entry(NamedTuple):
-    """A row of a log."""
-
-    time: float  # in seconds
-    deviations: FloatArray  # ``(nu + ny,)`` as read
-    row: Row  # of the filter, and in time smoothed
-
-
-class LagBuffer(Protocol):
-    """Rows that wait for those after them: what leaves is an entry, what the observer said of it, and more."""
-
-    def take(self, entry: Entry) -> Iterable[tuple[Entry, Any, Any]]:
-        """Take a row after its step; return those that need not wait any more."""
-        ...
-
-    def flush(self) -> Iterable[tuple[Entry, Any, Any]]:
-        """Return the rows that wait."""
-        ...
+    time: float = math.nan  # in seconds
+    deviations: FloatArray | None = None  # ``(nu + ny,)`` as read
 
 
 class Clock:
@@ -193,8 +174,9 @@ def interval(before: float, after: float) -> float:
     return rounded if rounded > 0.0 else after - before
 
 
-class Engine(ABC):
-    """A running design on measured data: what it reads and estimates, its clock, its state from row to row."""
+class LogObserver(ABC):
+    """The observer of a design on rows of a log: what it reads and estimates, and its state from row to row. Samples
+    that are missing are its business, time stamps are that of the run."""
 
     input_names: tuple[str, ...]  # what is read from each row, in order
     output_names: tuple[str, ...]
@@ -204,12 +186,12 @@ class Engine(ABC):
     notes: tuple[str, ...] = ()  # what a user should know before anything is run
     plant: DescriptorSystem | None = None  # of a linear design
     input_delay: int = 0  # rows of a log by which inputs act later than the design takes them
+    saved: ClassVar[Mapping[str, str]] = {}  # attributes that go from row to row, by their names in a saved state
 
-    def __init__(self, observer: Any, gap: float | None, warm_up: float | None, default_warm_up: float) -> None:
+    def __init__(self, observer: Any, warm_up: float | None, default_warm_up: float) -> None:
         self.state_names, self.fault_names = observer.state_names, observer.fault_names
         self.state_delays, self.fault_delays = observer.state_delays, observer.fault_delays
         self.dt: float = observer.dt
-        self.clock = Clock(self.dt, gap)
         self.warm_up = checked_warm_up(warm_up, default_warm_up)
         self.settled_at, self.phase = math.inf, WARM_UP
         self.options: dict[str, float | None] = {"warm_up": self.warm_up}
@@ -228,52 +210,31 @@ class Engine(ABC):
         return [(name, delay) for name, delay in found if delay]
 
     @abstractmethod
-    def step(self, time: float, values: FloatArray, row: int) -> Row:
-        """Take one row of data: its time, deviations ``(nu + ny,)``, and its number."""
+    def take(self, time: float, values: FloatArray, *, seconds: float, missing: int, longest: float) -> Row:
+        """Take one row: its time, deviations ``(nu + ny,)``, how many seconds and missing rows are between it and the
+        row before, and the longest interval so far."""
 
-    def steps(self, times: list[float], values: FloatArray, row: int) -> list[Row]:
-        """Take rows of data, ``values (rows, nu + ny)``, of which the first has this number: as `step` one by one."""
-        return [self.step(time, found, row + i) for i, (time, found) in enumerate(zip(times, values, strict=True))]
+    @property
+    def takes_pieces(self) -> bool:
+        """Whether `take_piece` can go on from where the observer is."""
+        return False
 
-    def rows(self, times: Sequence[float], values: FloatArray, first: int) -> list[Row]:
-        """Take rows of a log as they come, ``values (rows, nu + ny)``; those whose stamps do not rise are left out."""
-        found: list[Row] = []
-        while (done := len(found)) < len(times):
-            # Rows that rise are taken in one piece, beginning with the first that does.
-            status = self.clock.stale(times[done])
-            if status:
-                found.append(Row(status, np.full(len(self.columns), np.nan)))
-                continue
-            end = done + 1
-            while end < len(times) and times[end] > times[end - 1]:
-                end += 1
-            found += self.steps(list(times[done:end]), values[done:end], first + done)
-        return found
+    def take_piece(self, times: Sequence[float], values: FloatArray, intervals: Sequence[float]) -> list[Row]:
+        """Take rows that follow each other without a gap, ``values (rows, nu + ny)``, or the first of them."""
+        raise NotImplementedError
 
     def as_dict(self) -> dict[str, Any]:
         """Return the state that goes from row to row, as data."""
-        return {
-            "last": self.clock.last,
-            "longest": self.clock.longest,
-            "settled_at": self.settled_at,
-            "phase": self.phase,
-            **self.options,
-            **self._own_data(),
-        }
+        own = {key: getattr(self, name) for key, name in self.saved.items()}
+        plain = {key: state_as_data(value) if hasattr(value, "_asdict") else value for key, value in own.items()}
+        return {"settled_at": self.settled_at, "phase": self.phase, **self.options, **plain}
 
-    def resume(self, data: dict[str, Any]) -> None:
+    def resume(self, data: Mapping[str, Any]) -> None:
         """Go on from what `as_dict` returned."""
         if any(data[name] != value for name, value in self.options.items()):
             told = " or ".join(name.replace("_", "-") for name in sorted(self.options))
             raise SpecError(f"The saved state is of a run with another {told}: use the same options.", path="state")
-        self.clock.last, self.clock.longest = data["last"], data["longest"]
         self.settled_at, self.phase = data["settled_at"], data["phase"]
-        self._resume_own(data)
-
-    @abstractmethod
-    def _own_data(self) -> dict[str, Any]:
-        """Return the state of the observer, as data."""
-
-    @abstractmethod
-    def _resume_own(self, data: dict[str, Any]) -> None:
-        """Go on from what `_own_data` returned."""
+        for key, name in self.saved.items():
+            own = getattr(self, name)
+            setattr(self, name, state_from_data(own, data[key]) if hasattr(own, "_asdict") else data[key])

@@ -7,10 +7,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.data.linear_log import engine_of
 from obsynth.data.log_estimator import DECIDING, STALE
+from obsynth.data.log_run import LogRun
 from obsynth.data.log_tables import parsed_rows
-from obsynth.data.signals import TIME, Signals, Stamps
+from obsynth.data.signals import TIME, Stamps
 from obsynth.data.sources import CHUNK_ROWS, Data, chunks
 from obsynth.errors import SpecError
 from obsynth.experiments.monitors.learned import (
@@ -103,14 +103,13 @@ def _said(
 ) -> tuple[NDArray[np.int64], FloatArray, FloatArray]:
     """Return numbers from 0 and times ``(n,)`` of rows, and what is watched ``(n, m)``: NaN where nothing is decided,
     or rows are missing."""
-    engine = engine_of(design, gap=gap, warm_up=warm_up)
-    signals, nothing = Signals.of(engine, columns, scales), np.full(len(watched_names(design)), np.nan)
-    residuals = [i for i, name in enumerate(engine.columns) if name.startswith("r[")]
+    run = LogRun(design, columns, scales, gap=gap, warm_up=warm_up)
+    nothing = np.full(len(watched_names(design)), np.nan)
+    residuals = [i for i, name in enumerate(run.observer.columns) if name.startswith("r[")]
     numbers, times, rows = list[int](), list[float](), list[FloatArray]()
     count, settling = 0, settling_rows(design)
-    for chunk in chunks(data, signals, Stamps(), CHUNK_ROWS):
-        stamps = chunk[:, 0].tolist()
-        for time, row in zip(stamps, engine.rows(stamps, signals.deviations(chunk), count + 1), strict=True):
+    for chunk in chunks(data, run.signals, Stamps(), CHUNK_ROWS):
+        for row in run.read(chunk):
             if row.status in STALE:
                 count += 1
                 continue
@@ -120,7 +119,7 @@ def _said(
             # Longer gaps than the statistics look back are all the same.
             missing = min(row.skipped, max(AGES))
             rows += [nothing] * missing + [nothing if said is None else said]
-            times += [time] * (missing + 1)
+            times += [row.time] * (missing + 1)
             numbers += [count] * (missing + 1)
             count += 1
     if count < LEAST_NORMAL:

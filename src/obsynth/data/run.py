@@ -9,10 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
 from obsynth.data.alarm_events import AlarmEvent
-from obsynth.data.job import Job, resume_state, save_state
-from obsynth.data.linear_log import engine_of
-from obsynth.data.log_estimator import Engine, LagBuffer
-from obsynth.data.signals import TIME, Signals, Stamps
+from obsynth.data.log_run import LogRun, resume_state, save_state
+from obsynth.data.signals import TIME, Stamps
 from obsynth.data.sinks import FrameSink, Sink, measured_frame, sink_for
 from obsynth.data.sources import CHUNK_ROWS, Data, chunks
 from obsynth.errors import ObsynthError, SpecError
@@ -245,51 +243,52 @@ def run_on_data(
     if time_column is not None:
         require_kind(time_column, str, "time_column", "the name of a column")
         columns = {**(columns or {}), TIME: time_column}
-    engine = engine_of(design, gap=gap, warm_up=warm_up, outliers=outliers)
     stamps = Stamps()
-    later = _later_rows(engine, data, smooth=smooth, lag=lag, state=state)
-    job = Job(
-        engine,
-        Signals.of(engine, columns, scales),
-        design.recovery,
-        thresholds or {},
-        monitor,
-        recovered,
-        later,
-        stamps,
+    run = LogRun(
+        design,
+        columns,
+        scales,
+        gap=gap,
+        warm_up=warm_up,
+        outliers=outliers,
+        thresholds=thresholds or {},
+        monitor=monitor,
+        recovered=recovered,
+        stamps=stamps,
     )
+    _smoothed(run, data, smooth=smooth, lag=lag, state=state)
     digest = gain_set_digest(design)
     if state is not None and Path(state).exists():
-        resume_state(Path(state), job, digest)
+        resume_state(Path(state), run, digest)
     kept: list[FloatArray] | None = [] if out is None else None
     # What has left a stream cannot be taken back: there the state is saved however the run ends.
     save = None
     if not (state is None or out is None or isinstance(out, str | Path)):
-        save = partial(save_state, Path(state), job, digest)
-    with sink_for(out, job.header, stamps) as sink:
-        _run_rows(job, chunks(data, job.signals, stamps, chunk_rows), sink, kept, save, progress or bool, state_every)
+        save = partial(save_state, Path(state), run, digest)
+    with sink_for(out, run.header, stamps) as sink:
+        _run_rows(run, chunks(data, run.signals, stamps, chunk_rows), sink, kept, save, progress or bool, state_every)
         if state is None and not hasattr(data, "readline"):
-            _require_a_window(design, job.rows)
+            _require_a_window(design, run.rows)
     if state is not None:
-        save_state(Path(state), job, digest)
+        save_state(Path(state), run, digest)
     table = sink.frame() if isinstance(sink, FrameSink) else None
-    shown = {} if job.recovered is None else dict(job.recovered.flags)
+    shown = {} if run.recovered is None else dict(run.recovered.flags)
     return DataRun(
-        job.rows,
-        dict(job.statuses),
-        dict(job.alarms),
-        job.isolated,
+        run.rows,
+        dict(run.statuses),
+        dict(run.alarms),
+        run.isolated,
         shown,
-        dict(getattr(engine, "outliers", {})),
-        (*engine.notes, *stamps.warnings(), *job.first.warnings()),
+        dict(getattr(run.observer, "outliers", {})),
+        (*run.observer.notes, *stamps.warnings(), *run.first.warnings()),
         digest,
         table,
-        measured_frame(kept, job.signals, stamps),
+        measured_frame(kept, run.signals, stamps),
         stamps,
         dict(thresholds or {}),
-        dict(job.alarm_rows),
-        job.events.events(),
-        dict(job.events.silent),
+        dict(run.alarm_rows),
+        run.events.events(),
+        dict(run.events.silent),
         "" if monitor is None else monitor.statement,
     )
 
@@ -307,12 +306,10 @@ def _require_a_window(design: ObserverDesign, rows: int) -> None:
         )
 
 
-def _later_rows(
-    engine: Engine, data: Data, *, smooth: bool, lag: int | None, state: str | Path | None
-) -> LagBuffer | None:
-    """Return where rows wait for those after them, if they do."""
+def _smoothed(run: LogRun, data: Data, *, smooth: bool, lag: int | None, state: str | Path | None) -> None:
+    """Let rows wait for those after them, if they shall."""
     if not truth(smooth, "smooth") and lag is None:
-        return None
+        return
     if smooth and lag is not None:
         raise SpecError("smooth takes the whole record, and lag some samples of it: give one of them.", path="lag")
     if smooth and hasattr(data, "readline"):
@@ -325,11 +322,11 @@ def _later_rows(
         )
     from obsynth.data.smoothing import LaterRows
 
-    return LaterRows(engine, lag)
+    run.later = LaterRows(run.observer, lag)
 
 
 def _run_rows(
-    job: Job,
+    run: LogRun,
     rows: Iterator[FloatArray],
     sink: Sink,
     kept: list[FloatArray] | None,
@@ -343,9 +340,9 @@ def _run_rows(
         for chunk in rows:
             if kept is not None:
                 kept.append(chunk)
-            sink.write(job.take(chunk))
-            progress(job.rows)
-        sink.write(job.finish())
+            sink.write(run.take(chunk))
+            progress(run.rows)
+        sink.write(run.finish())
         return
     with ending_signals(), held.installed():
         try:
@@ -353,17 +350,17 @@ def _run_rows(
                 for row in chunk:
                     with held:
                         is_whole = False
-                        found = job.take(row[None])
+                        found = run.take(row[None])
                         is_whole = True
                         sink.write(found)
-                        if job.rows % state_every == 0:
+                        if run.rows % state_every == 0:
                             save()
-                progress(job.rows)
+                progress(run.rows)
         except ObsynthError:
             # A refused row has changed nothing.
             is_whole = True
             raise
         finally:
-            if is_whole and job.rows:
+            if is_whole and run.rows:
                 save()
-                sink.write(job.finish())
+                sink.write(run.finish())

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.data.log_estimator import Engine
+from obsynth.data.log_estimator import LogObserver
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import is_finite_number, number_in_text
 from obsynth.numerics.arrays import FloatArray, read_only
@@ -135,9 +135,11 @@ class Signals:
     delay: int = 0  # rows by which these act later than the design takes them; negative: earlier
 
     @classmethod
-    def of(cls, engine: Engine, columns: Mapping[str, str] | None, scales: Mapping[str, float] | None) -> Signals:
+    def of(
+        cls, observer: LogObserver, columns: Mapping[str, str] | None, scales: Mapping[str, float] | None
+    ) -> Signals:
         """Return the signals that a running design reads."""
-        names = engine.input_names + engine.output_names
+        names = observer.input_names + observer.output_names
         renamed, factors = dict(columns or {}), dict(scales or {})
         unknown = [name for name in renamed if name not in (TIME, *names)]
         unknown += [name for name in factors if name not in names]
@@ -148,17 +150,17 @@ class Signals:
         for name, factor in factors.items():
             if not is_finite_number(factor) or factor == 0.0:
                 raise SpecError(f"The scale of {name!r} is {factor!r}: give a finite number, not zero.", path="scales")
-        uncertain = getattr(getattr(engine, "plant", None), "uncertainty", None)
+        uncertain = getattr(getattr(observer, "plant", None), "uncertainty", None)
         shift = None if uncertain is None else uncertain.shift
         return cls(
             names,
             tuple(renamed.get(name, name) for name in (TIME, *names) if not shift or name != shift),
-            read_only(np.array([factors.get(name, engine.scales.get(name, 1.0)) for name in names])),
-            read_only(np.array([engine.point.get(name, 0.0) for name in names])),
-            dict(engine.point),
+            read_only(np.array([factors.get(name, observer.scales.get(name, 1.0)) for name in names])),
+            read_only(np.array([observer.point.get(name, 0.0) for name in names])),
+            dict(observer.point),
             names.index(shift) if shift and shift in names else None,
-            len(engine.input_names) - int(bool(shift) and shift in engine.input_names),
-            engine.input_delay,
+            len(observer.input_names) - int(bool(shift) and shift in observer.input_names),
+            observer.input_delay,
         )
 
     def measured(self, rows: FloatArray) -> FloatArray:
@@ -184,12 +186,12 @@ class Signals:
             raise SpecError(f"The data have more than one column {', '.join(map(repr, repeated))}.", path="data")
         return [header.index(name) for name in self.columns]
 
-    def estimates_point(self, engine: Engine) -> FloatArray:
+    def estimates_point(self, observer: LogObserver) -> FloatArray:
         """Return what is added to the columns of estimates: the operating point of states and faults."""
-        biases = getattr(getattr(engine, "plant", None), "sensor_faults", ())
-        values = [self.point.get(name, 0.0) for name in engine.state_names]
-        values += [0.0 if name in biases else self.point.get(name, 0.0) for name in engine.fault_names]
-        return np.array(values + [0.0] * (len(engine.columns) - len(values)))
+        biases = getattr(getattr(observer, "plant", None), "sensor_faults", ())
+        values = [self.point.get(name, 0.0) for name in observer.state_names]
+        values += [0.0 if name in biases else self.point.get(name, 0.0) for name in observer.fault_names]
+        return np.array(values + [0.0] * (len(observer.columns) - len(values)))
 
 
 #: How columns of time stamps are often called.

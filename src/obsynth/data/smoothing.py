@@ -9,11 +9,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from obsynth.data.linear_log import engine_of
-from obsynth.data.log_estimator import STALE, Engine, Entry
-from obsynth.data.signals import TIME, Signals
+from obsynth.data.log_estimator import STALE, LogObserver, Row
+from obsynth.data.log_run import LogRun
+from obsynth.data.signals import TIME
 from obsynth.data.sources import samples
-from obsynth.data.step_log import SteppingEngine
+from obsynth.data.step_log import SteppingLogObserver
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import read_only
@@ -33,7 +33,7 @@ from obsynth.results.design import ObserverDesign
 
 
 class _Waiting(NamedTuple):
-    entry: Entry
+    row: Row
     chain: Chain
     k: int
 
@@ -41,25 +41,25 @@ class _Waiting(NamedTuple):
 class LaterRows:
     """Rows of a log that wait ``lag`` samples for those after them; ``None``: until the end."""
 
-    def __init__(self, engine: Engine, lag: int | None) -> None:
-        if not isinstance(engine, SteppingEngine):
+    def __init__(self, observer: LogObserver, lag: int | None) -> None:
+        if not isinstance(observer, SteppingLogObserver):
             raise SpecError(
                 "Smoothing is for recursive and nonlinear designs, whose covariances say how much a later sample tells "
                 "of an earlier one: design a descriptor-kalman, adaptive-observer or dae-adaptive-observer.",
                 path="smooth",
             )
-        self.engine, self.lag = engine, checked_lag(lag)
-        self.keeping = KeepingObserver(engine.observer)
-        engine.observer = self.keeping  # type: ignore[assignment]
+        self.logged, self.lag = observer, checked_lag(lag)
+        self.keeping = KeepingObserver(observer.observer)
+        observer.observer = self.keeping  # type: ignore[assignment]
         self.waiting: list[_Waiting] = []
 
-    def take(self, entry: Entry) -> Iterator[tuple[Entry, Any, Smoothed]]:
+    def take(self, row: Row) -> Iterator[tuple[Row, Any, Smoothed]]:
         """Take a row after its step; yield those that are smoothed now, with what the observer said of them."""
         chain = self.keeping.chain
         if self.waiting and self.waiting[0].chain is not chain:
             # The observer has started again: what comes says nothing of what was.
             yield from self.flush()
-        self.waiting.append(_Waiting(entry, chain, chain.last))
+        self.waiting.append(_Waiting(row, chain, chain.last))
         if self.lag is None:
             return
         while self.waiting[0].k + self.lag <= chain.last:
@@ -69,7 +69,7 @@ class LaterRows:
         # A late value changes what is known since its own time.
         chain.drop_before(min(self.waiting[0].k, chain.last - self.keeping.observer.timing.longest))
 
-    def flush(self) -> Iterator[tuple[Entry, Any, Smoothed]]:
+    def flush(self) -> Iterator[tuple[Row, Any, Smoothed]]:
         """Yield the rows that wait, smoothed by as many samples as there are."""
         waiting, self.waiting = self.waiting, []
         if not waiting:
@@ -79,10 +79,10 @@ class LaterRows:
         for ready in waiting:
             yield self._shown(ready, found[ready.k - waiting[0].k])
 
-    def _shown(self, ready: _Waiting, found: Smoothed) -> tuple[Entry, Any, Smoothed]:
-        nx, row = len(self.engine.state_names), ready.entry.row
+    def _shown(self, ready: _Waiting, found: Smoothed) -> tuple[Row, Any, Smoothed]:
+        nx, row = len(self.logged.state_names), ready.row
         if row.status in STALE:
-            return ready.entry, ready.chain.row(ready.k), found
+            return row, ready.chain.row(ready.k), found
         theta, spread = parameters_of(found, nx)
         own = (
             found.x[:nx],
@@ -92,7 +92,7 @@ class LaterRows:
         )
         estimated = np.concatenate(own)
         values = np.concatenate((estimated, row.values[len(estimated) :]))
-        return ready.entry._replace(row=row._replace(values=values)), ready.chain.row(ready.k), found
+        return row._replace(values=values), ready.chain.row(ready.k), found
 
 
 def smooth(
@@ -174,7 +174,7 @@ def smooth(
     waited = checked_lag(lag)
     if isinstance(design.observer, LinearObserver):
         # The same refusal as on logs.
-        LaterRows(engine_of(design), waited)
+        LaterRows(LogRun(design).observer, waited)
     if isinstance(data, str) or any(hasattr(data, name) for name in ("__fspath__", "readline", "columns")):
         if u is not None:
             raise SpecError("u is for arrays: a log has the inputs in its columns.", path="u")
@@ -182,8 +182,7 @@ def smooth(
             raise SpecError("A stream has no end: give a lag, or the whole log as a file.", path="lag")
         if time_column is not None:
             columns = {**(columns or {}), TIME: time_column}
-        engine = engine_of(design, outliers=outliers)
-        return _smoothed_log(engine, data, waited, Signals.of(engine, columns, scales))
+        return _smoothed_log(LogRun(design, columns, scales, outliers=outliers), data, waited)
     if columns or scales or time_column:
         raise SpecError(
             "columns, time_column and scales are for logs: arrays have their signals in order.", path="columns"
@@ -196,16 +195,15 @@ def smooth(
     return smoothed_record(observer, data, u, waited)
 
 
-def _smoothed_log(engine: Any, data: Any, lag: int | None, signals: Signals) -> Estimates:
-    later, observer = LaterRows(engine, lag), engine.observer.observer
-    found: list[tuple[Entry, Any, Smoothed]] = []
-    for row, (time, deviations) in enumerate(samples(data, signals), 1):
-        taken = engine.rows([time], deviations[None], row)[0]
-        found.extend(later.take(Entry(time, deviations, taken)))
+def _smoothed_log(run: LogRun, data: Any, lag: int | None) -> Estimates:
+    later = LaterRows(run.observer, lag)
+    found: list[tuple[Row, Any, Smoothed]] = []
+    for time, deviations in samples(data, run.signals):
+        found.extend(later.take(run.estimates([time], deviations[None])[0]))
     found.extend(later.flush())
-    known = smoothed_estimates(observer, [row for _, row, _ in found], [sample for _, _, sample in found])
-    point = signals.estimates_point(engine)
-    nx, nq = len(engine.state_names), len(engine.fault_names)
+    known = smoothed_estimates(later.keeping.observer, [row for _, row, _ in found], [sample for _, _, sample in found])
+    point = run.signals.estimates_point(run.observer)
+    nx, nq = len(run.observer.state_names), len(run.observer.fault_names)
     return replace(
         known, states=read_only(known.states + point[:nx]), faults=read_only(known.faults + point[nx : nx + nq])
     )

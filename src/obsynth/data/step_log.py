@@ -1,30 +1,32 @@
-"""Observers that take missing outputs themselves, on a log: time stamps, held inputs, status, saved state."""
+"""Observers that take missing outputs themselves, on a log: held inputs, new starts, status."""
 
 from __future__ import annotations
 
-from typing import Any, TypeAlias
+from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 
-from obsynth.data.log_estimator import GAP, LONGEST_BRIDGE, OK, PARTIAL, RECOVERING, WARM_UP, Engine, Row
-from obsynth.errors import ObsynthError, PreconditionError, SolverError, SpecError
+from obsynth.data.log_estimator import GAP, LONGEST_BRIDGE, OK, PARTIAL, RECOVERING, WARM_UP, LogObserver, Row
+from obsynth.errors import ObsynthError, SolverError, SpecError
 from obsynth.experiments.monitors.monitor import Evidence
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.dae.estimates import DAERow
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.recursive.estimates import RawEstimate
 from obsynth.observers.recursive.observer import RecursiveObserver
-from obsynth.observers.running import changed, state_as_data, state_from_data
+from obsynth.observers.running import changed
 from obsynth.results.design import ObserverDesign
 
 #: What an observer with deviations knows at one sample.
 StepRow: TypeAlias = RawEstimate | DAERow
 
 
-class SteppingEngine(Engine):
-    """A running observer with deviations on measured data (nonlinear plants: absolute values); the first row is k = 0.
+class SteppingLogObserver(LogObserver):
+    """An observer with deviations on a log (nonlinear plants: absolute values); the first row is k = 0.
     By default no warm-up, as covariances of the start say how uncertain the estimates are, and a gate for outliers
     where the observer says nothing of them."""
+
+    saved: ClassVar = {"observer": "state", "u": "u"}
 
     def __init__(self, design: ObserverDesign, *, warm_up: float | None = None, outliers: str | None = None) -> None:
         observer: Any = design.observer
@@ -33,7 +35,7 @@ class SteppingEngine(Engine):
         if wanted != observer.outliers:
             self.observer = changed(observer, outliers=wanted)
         plant = design.plant
-        super().__init__(self.observer, None, warm_up, 0.0)
+        super().__init__(self.observer, warm_up, 0.0)
         self.input_names, self.output_names = plant.input_names, plant.output_names
         self.input_delay = design.input_delay
         self.is_recursive, self.may_restart = isinstance(self.observer, RecursiveObserver), True
@@ -66,18 +68,12 @@ class SteppingEngine(Engine):
         counts = self.state.refused[1]
         return {name: int(count) for name, count in zip(self.output_names, counts, strict=True) if count}
 
-    def _taken(self, y: FloatArray, u: FloatArray, row: int) -> StepRow | None:
+    def _taken(self, y: FloatArray, u: FloatArray) -> StepRow | None:
         """Take one sample, or none of it: `None` where numbers are no finite ones any more."""
         before = self.state
         try:
             with np.errstate(all="ignore"):
                 self.state, found = self.observer.accept(self.state, y, u)
-        except SolverError as error:
-            raise SolverError(f"Row {row}: {error}") from error
-        except SpecError as error:
-            raise SpecError(f"Row {row}: {error}", path=f"row {row}") from error
-        except PreconditionError as error:
-            raise PreconditionError(f"Row {row}: {error}", condition=error.condition) from error
         except (np.linalg.LinAlgError, ValueError):
             return None
         if found.is_finite:
@@ -93,19 +89,8 @@ class SteppingEngine(Engine):
         deviations = np.sqrt(np.diag(found.parameter_covariance))
         return np.concatenate([found.x, found.theta, found.state_deviations, deviations, residual])
 
-    def step(self, time: float, values: FloatArray, row: int) -> Row:
-        """Take one row of data."""
-        before, stamps = self.state, (self.clock.last, self.clock.longest)
-        try:
-            return self._step(time, values, row)
-        except ObsynthError:
-            # A row that is refused leaves nothing behind: a run may go on after it.
-            self.state = before
-            self.clock.last, self.clock.longest = stamps
-            raise
-
-    def _step(self, time: float, values: FloatArray, row: int) -> Row:
-        _, missing = self.clock.advance(time, row)
+    def take(self, time: float, values: FloatArray, *, seconds: float, missing: int, longest: float) -> Row:
+        """Take one row."""
         nu, fresh = len(self.input_names), self.u is None
         known = np.isfinite(values)
         if self.u is None and not self.is_recursive and not known[:nu].all():
@@ -116,9 +101,9 @@ class SteppingEngine(Engine):
         if missing > LONGEST_BRIDGE and self.may_restart:
             self.state, fresh = self.observer.init(), True
         else:
-            fresh = self._bridged(missing, held, row) or fresh
+            fresh = self._bridged(missing, held) or fresh
         total = self.state.refused[1]
-        found, spoiled, restarted = self._found(y, u, row, may_restart=self.may_restart and not fresh)
+        found, spoiled, restarted = self._found(y, u, may_restart=self.may_restart and not fresh)
         self.u, fresh = u, fresh or restarted
         if fresh:
             self.settled_at, self.phase = time + self.warm_up, WARM_UP
@@ -140,11 +125,11 @@ class SteppingEngine(Engine):
         """Return which outputs of the last sample were left out as outliers: of which more are than before it."""
         return np.asarray(self.state.refused[1] > total) & (self.observer.outliers == "gate")
 
-    def _bridged(self, missing: int, held: FloatArray, row: int) -> bool:
+    def _bridged(self, missing: int, held: FloatArray) -> bool:
         """Take samples without outputs; return whether the observer had to start again."""
         for _ in range(missing):
             try:
-                self._required(held, row)
+                self._required(held)
             except ObsynthError:
                 if not self.may_restart:
                     raise
@@ -152,20 +137,20 @@ class SteppingEngine(Engine):
                 return True
         return False
 
-    def _found(self, y: FloatArray, u: FloatArray, row: int, *, may_restart: bool) -> tuple[StepRow, bool, bool]:
+    def _found(self, y: FloatArray, u: FloatArray, *, may_restart: bool) -> tuple[StepRow, bool, bool]:
         """Take one sample; return also whether its outputs were left out, and whether the observer started again."""
-        found = self._safe(y, u, row)
+        found = self._safe(y, u)
         if found is not None:
             return found, False, False
         try:
-            return self._required(u, row), True, False
+            return self._required(u), True, False
         except ObsynthError:
             # An outlier may have led where the model cannot go on.
             if not may_restart:
                 raise
         self.state = self.observer.init()
-        found = self._safe(y, u, row)
-        return (self._required(u, row), True, True) if found is None else (found, False, True)
+        found = self._safe(y, u)
+        return (self._required(u), True, True) if found is None else (found, False, True)
 
     def _status(self, time: float, inputs: np.ndarray, outputs: np.ndarray, *, spoiled: bool) -> str:
         if spoiled or not inputs.all() or not outputs.any():
@@ -175,26 +160,19 @@ class SteppingEngine(Engine):
         self.phase = OK
         return OK if outputs.all() else PARTIAL
 
-    def _safe(self, y: FloatArray, u: FloatArray, row: int) -> StepRow | None:
+    def _safe(self, y: FloatArray, u: FloatArray) -> StepRow | None:
         """Take one sample, or none of it where there is no solution either."""
         try:
-            return self._taken(y, u, row)
+            return self._taken(y, u)
         except SolverError:
             return None
 
-    def _required(self, u: FloatArray, row: int) -> StepRow:
+    def _required(self, u: FloatArray) -> StepRow:
         """Take one sample without outputs."""
-        found = self._taken(np.full(len(self.output_names), np.nan), u, row)
+        found = self._taken(np.full(len(self.output_names), np.nan), u)
         if found is None:
             raise SpecError(
-                f"Row {row}: the estimates are no finite numbers any more: the model is unstable, or the inputs are "
-                "too large.",
-                path=f"row {row}",
+                "the estimates are no finite numbers any more: the model is unstable, or the inputs are too large.",
+                path="inputs",
             )
         return found
-
-    def _own_data(self) -> dict[str, Any]:
-        return {"observer": state_as_data(self.state), "u": self.u}
-
-    def _resume_own(self, data: dict[str, Any]) -> None:
-        self.state, self.u = state_from_data(self.state, data["observer"]), data["u"]

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from obsynth.data.linear_log import DataObserver
+from obsynth.data.linear_log import LEAST_SHOWN, LEFT_SHARE, LinearLogObserver
 from obsynth.errors import SpecError
 from obsynth.methods.handing_on import unverified_mark
 from obsynth.numerics.arguments import require_kind
@@ -123,9 +123,9 @@ class Realisation:
             return nothing
         if not set(observer.fault_names) <= set(plant.fault_names):
             return nothing
-        engine = DataObserver(self.design.replace(plant=plant, observer=self.running))
-        model = engine.gap_model
-        told = tuple(engine.told_faults)
+        running = LinearLogObserver(self.design.replace(plant=plant, observer=self.running))
+        model = running.gap_model
+        told = tuple(running.told_faults)
         if model is None:
             return GapTables(plant.nf, told)
         moving = model.plant
@@ -141,13 +141,13 @@ class Realisation:
             moves = (moving.A, moving.B, moving.Bf)
         tables = dict(zip(("model_A", "model_B", "model_F", "model_R"), moves, strict=False))
         tables |= {"model_C": moving.C, "model_D": moving.D, "model_Df": moving.Df, "model_into": model.into}
-        tables |= {"noise_variances": engine.noise[None]}
-        if engine.partial is not None:
-            tables |= {"source_D": plant.D, "source_Df": plant.Df, "model_solver": engine.partial.solver}
-        kept = engine.inputs.maxlen or 0
+        tables |= {"noise_variances": running.noise[None]}
+        if running.solver is not None:
+            tables |= {"source_D": plant.D, "source_Df": plant.Df, "model_solver": running.solver}
+        kept = running.kept_inputs
         return GapTables(
-            plant.nf, told, kept, moving.nx, len(engine.seen), True, engine.partial is not None, tables,
-            *engine.usual_changes,
+            plant.nf, told, kept, moving.nx, len(running.seen), True, running.solver is not None, tables,
+            LEFT_SHARE, LEAST_SHOWN,
         )  # fmt: skip
 
     @property

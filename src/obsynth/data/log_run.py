@@ -1,4 +1,4 @@
-"""One run: rows of data to rows of output, what is counted, and the saved state with which it goes on."""
+"""What runs a log: rows of data to rows of output, what is counted, and the saved state with which it goes on."""
 
 from __future__ import annotations
 
@@ -7,26 +7,30 @@ import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
-from obsynth.analysis.transformations.recovery import StateRecovery
 from obsynth.data.alarm_events import NO_DECISION, AlarmLog
-from obsynth.data.log_estimator import DECIDING, RECOVERING, STALE, Engine, Entry, LagBuffer, Row
+from obsynth.data.linear_log import log_observer
+from obsynth.data.log_estimator import DECIDING, RECOVERING, STALE, Clock, Row
 from obsynth.data.recovered import LATE, RecoveredStates
 from obsynth.data.signals import TIME, Signals, Stamps
-from obsynth.errors import SpecError
+from obsynth.errors import ObsynthError, SpecError
 from obsynth.experiments.monitors.monitor import LinearSample, Monitor, Sample
 from obsynth.files.inputs import read_json
 from obsynth.files.outputs import FileKind, write_atomically
 from obsynth.numerics.arguments import is_finite_number, is_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.running import BY_COLUMNS
+from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import digest_of, plain, restored
 
 #: Seconds of data that are compared with the operating point.
 FIRST = 1.0
+#: Rows that are taken in one piece at most.
+PIECE = 4096
 #: A signal is far from its operating point when its mean differs by this share of it.
 FAR = 0.2
 
@@ -75,26 +79,36 @@ def damaged_state(path: Path) -> SpecError:
     return SpecError(f"{path} is damaged: it is no state of this design and these options.", path=str(path))
 
 
-class Job:
-    """Rows of data to rows of output: ``thresholds`` are levels by column, ``later`` where rows wait for others."""
+class LogRun:
+    """A design over a log, from its start: rows of data to estimates (`read`), and to rows of output (`take`).
+
+    ``thresholds`` are levels by column; ``recovered`` is which states of the plant as written stand beside the others;
+    other options are those of `run_on_data`.
+    """
 
     def __init__(
         self,
-        engine: Engine,
-        signals: Signals,
-        recovery: StateRecovery | None,
-        thresholds: Mapping[str, float],
-        monitor: Monitor | None,
-        recovered: str | Sequence[str] | None = None,
-        later: LagBuffer | None = None,
+        design: ObserverDesign,
+        columns: Mapping[str, str] | None = None,
+        scales: Mapping[str, float] | None = None,
+        *,
+        gap: float | None = None,
+        warm_up: float | None = None,
+        outliers: str | None = None,
+        thresholds: Mapping[str, float] = MappingProxyType({}),
+        monitor: Monitor | None = None,
+        recovered: str | Sequence[str] | None = "none",
         stamps: Stamps | None = None,
     ) -> None:
-        self.stamps = stamps
-        self.engine, self.signals, self.monitor, self.later = engine, signals, monitor, later
+        self.observer = observer = log_observer(design, gap=gap, warm_up=warm_up, outliers=outliers)
+        self.clock, self.signals = Clock(observer.dt, gap), Signals.of(observer, columns, scales)
+        self.stamps, self.monitor = stamps, monitor
+        #: What rows wait in for those after them, if they do.
+        self.later: Any = None
         self._watching: Any = None if monitor is None else monitor.init()
-        self.recovered = RecoveredStates.of(recovery, engine, recovered)
+        self.recovered = RecoveredStates.of(design.recovery, observer, recovered)
         extra = () if self.recovered is None else self.recovered.columns
-        names = (*engine.columns, *extra)
+        names = (*observer.columns, *extra)
         for name, level in thresholds.items():
             if name not in names:
                 raise SpecError(
@@ -103,19 +117,19 @@ class Job:
             if not (is_finite_number(level) and level > 0.0):
                 raise SpecError(f"The threshold of {name!r} is {level!r}: give a positive number.", path="thresholds")
         self._levels = tuple((name, names.index(name), level) for name, level in thresholds.items())
-        lags = engine.lags
+        lags = observer.lags
         if self.recovered is not None and self.recovered.delay:
             lags.append((LATE, self.recovered.delay))
-        self._lags = [delay * engine.dt for _, delay in lags]
-        self._point = signals.estimates_point(engine)
+        self._lags = [delay * observer.dt for _, delay in lags]
+        self._point = self.signals.estimates_point(observer)
         if self.recovered is not None:
             self._point = np.concatenate([self._point, self.recovered.point])
-        states, faults = len(engine.state_names), len(engine.fault_names)
+        states, faults = len(observer.state_names), len(observer.fault_names)
         self._faults = slice(states, states + faults)
-        residuals = [i for i, name in enumerate(engine.columns) if name.startswith("r[")]
+        residuals = [i for i, name in enumerate(observer.columns) if name.startswith("r[")]
         self._residuals = slice(residuals[0], residuals[-1] + 1) if residuals else slice(0, 0)
         if monitor is not None:
-            monitor.require_fit(len(residuals), engine.fault_names)
+            monitor.require_fit(len(residuals), observer.fault_names)
         self.header = (
             TIME,
             "status",
@@ -125,10 +139,10 @@ class Job:
             *(("alarm",) if thresholds or monitor is not None else ()),
         )
         # Intervals of faults are in their own units, like the estimates.
-        point = dict(zip(engine.fault_names, self._point[self._faults].tolist(), strict=True))
+        point = dict(zip(observer.fault_names, self._point[self._faults].tolist(), strict=True))
         ends = {f"{end} {name}": value for name, value in point.items() for end in ("lowest", "highest")}
         self._shifts = np.array([ends.get(name, 0.0) for name in (() if monitor is None else monitor.columns)])
-        self.first, self.rows = OperatingPointCheck(signals), 0
+        self.first, self.rows = OperatingPointCheck(self.signals), 0
         #: The file of the state that the first rows go on from: only they show whether its parts fit together.
         self.resumed_from: Path | None = None
         self.statuses, self.alarms, self.isolated = Counter[str](), dict[str, float](), ""
@@ -147,55 +161,89 @@ class Job:
         return found
 
     def _taken(self, chunk: FloatArray) -> list[list[Any]]:
-        times, scaled = chunk[:, 0].tolist(), self.signals.deviations(chunk)
         if self.later is None:
-            return self._shown(self._entries(times, scaled))
+            return self._shown(self.read(chunk))
         # What waits for a row is smoothed by it before the next one is taken.
         return self._shown(
-            [
-                ready
-                for k in range(len(times))
-                for entry in self._entries(times[k : k + 1], scaled[k : k + 1])
-                for ready, *_ in self.later.take(entry)
-            ]
+            [ready for row in chunk for took in self.read(row[None]) for ready, *_ in self.later.take(took)]
         )
 
-    def _entries(self, times: list[float], scaled: FloatArray) -> list[Entry]:
-        rows = self.engine.rows(times, scaled, self.rows + 1)
-        self.rows += len(rows)
-        self.first.take_rows(times, scaled)
-        return [Entry(*parts) for parts in zip(times, scaled, rows, strict=True)]
+    def read(self, chunk: FloatArray) -> list[Row]:
+        """Take rows ``[time, u, y]`` as read; return the estimates at them (``chunk (rows, 1 + nu + ny)``)."""
+        return self.estimates(chunk[:, 0].tolist(), self.signals.deviations(chunk))
+
+    def estimates(self, times: Sequence[float], values: FloatArray) -> list[Row]:
+        """Return the estimates at rows as they come, deviations ``values (rows, nu + ny)``; those whose stamps do not
+        rise are left out."""
+        found: list[Row] = []
+        complete = np.asarray(np.isfinite(values).all(axis=1))
+        while (done := len(found)) < len(times):
+            status = self.clock.stale(times[done])
+            if status:
+                found.append(Row(status, np.full(len(self.observer.columns), np.nan)))
+                continue
+            if self.observer.takes_pieces and complete[done]:
+                bad = np.flatnonzero(~complete[done : done + PIECE])
+                end = done + (int(bad[0]) if bad.size else PIECE)
+                intervals = self.clock.regular(times[done:end])
+                taken = self.observer.take_piece(times[done:end], values[done:end], intervals) if intervals else []
+                if taken:
+                    self.clock.take(times[done : done + len(taken)], intervals[: len(taken)])
+                    found += taken
+                    continue
+            found.append(self._single(times[done], values[done], self.rows + done + 1))
+        self.rows += len(found)
+        self.first.take_rows(times, values)
+        return [row._replace(time=time, deviations=v) for row, time, v in zip(found, times, values, strict=True)]
+
+    def _single(self, time: float, values: FloatArray, number: int) -> Row:
+        """Take one row; one that is refused leaves nothing behind, so that a run may go on after it."""
+        parts = (self.observer, self.clock)
+        before = [dict(vars(part)) for part in parts]
+        try:
+            seconds, missing = self.clock.advance(time, number)
+            return self.observer.take(time, values, seconds=seconds, missing=missing, longest=self.clock.longest)
+        except ObsynthError as error:
+            for part, kept in zip(parts, before, strict=True):
+                vars(part).update(kept)
+            place = f"row {number}"
+            if isinstance(error, SpecError):
+                if error.path == place:
+                    raise
+                error.path = place
+            error.args = (f"Row {number}: {error}",)
+            raise
 
     def finish(self) -> list[list[Any]]:
         """Return the rows of output that waited for what does not come any more."""
         return [] if self.later is None else self._shown([ready for ready, *_ in self.later.flush()])
 
-    def _shown(self, entries: Sequence[Entry]) -> list[list[Any]]:
-        if not entries:
+    def _shown(self, taken: Sequence[Row]) -> list[list[Any]]:
+        if not taken:
             return []
-        estimates = [entry.row.values for entry in entries]
+        estimates = [row.values for row in taken]
         if self.recovered is not None:
-            estimates = [np.concatenate([entry.row.values, self._recovered_in(entry)]) for entry in entries]
-        self.statuses.update(entry.row.status for entry in entries)
+            estimates = [np.concatenate([row.values, self._recovered_in(row)]) for row in taken]
+        self.statuses.update(row.status for row in taken)
         shown: list[list[float]] = (np.array(estimates) + self._point).tolist()
         rows: list[list[Any]] = [
-            [time, row.status, *(time - lag for lag in self._lags), *cells]
-            for (time, _, row), cells in zip(entries, shown, strict=True)
+            [row.time, row.status, *(row.time - lag for lag in self._lags), *cells]
+            for row, cells in zip(taken, shown, strict=True)
         ]
         if self._levels or self.monitor is not None:
             first = self.rows - len(rows) + 1
-            for number, (entry, values, cells) in enumerate(zip(entries, estimates, rows, strict=True), first):
-                cells.extend(self._decided(entry, values, number, cells))
+            for number, (row, values, cells) in enumerate(zip(taken, estimates, rows, strict=True), first):
+                cells.extend(self._decided(row, values, number, cells))
         return rows
 
-    def _recovered_in(self, entry: Entry) -> FloatArray:
-        if self.recovered is None or entry.row.status in STALE:
+    def _recovered_in(self, row: Row) -> FloatArray:
+        if self.recovered is None or row.status in STALE:
             return np.full(0 if self.recovered is None else len(self.recovered.columns), np.nan)
-        return self.recovered.take(entry.row, entry.deviations[: len(self.engine.input_names)])
+        return self.recovered.take(row)
 
-    def _decided(self, entry: Entry, values: FloatArray, number: int, said: Sequence[Any]) -> list[Any]:
+    def _decided(self, row: Row, values: FloatArray, number: int, said: Sequence[Any]) -> list[Any]:
         """Return statistic and threshold, if there is a monitor, and what alarms there are; ``said``: cells so far."""
-        time, deviations, row = entry
+        time = row.time
         if row.status in STALE:
             self.events.silent[row.status] += 1
             return [*([math.nan] * (0 if self.monitor is None else len(self.monitor.columns) + 2)), ""]
@@ -215,7 +263,7 @@ class Job:
         if self.monitor is not None:
             deciding = deciding and (row.forgotten or not self.monitor.guarantees)
             residuals, faults = row.values[self._residuals], row.values[self._faults]
-            sample = Sample(time, residuals, faults, self._evidence(row, deviations), deciding, row.skipped)
+            sample = Sample(time, residuals, faults, self._evidence(row), deciding, row.skipped)
             self._watching, seen = self.monitor.step(self._watching, sample)
             more = seen.more or (math.nan,) * len(self.monitor.columns)
             cells = [*(np.array(more) + self._shifts).tolist(), seen.statistic, seen.threshold]
@@ -245,17 +293,19 @@ class Job:
             return math.inf
         return float(row.excess[column])
 
-    def _evidence(self, row: Row, deviations: FloatArray) -> Any:
+    def _evidence(self, row: Row) -> Any:
         """Return what was learnt from a row; of one with missing samples, to who takes these, what there is."""
         if row.evidence is not None or self.monitor is None or not self.monitor.rule.takes_gaps:
             return row.evidence
-        nu = len(self.engine.input_names)
-        return LinearSample(row.values, deviations[:nu], deviations[nu:], len(self.engine.state_names))
+        nu, deviations = len(self.observer.input_names), row.deviations
+        if deviations is None:
+            return None
+        return LinearSample(row.values, deviations[:nu], deviations[nu:], len(self.observer.state_names))
 
     def as_dict(self) -> dict[str, Any]:
         """Return the state that goes from row to row, as data."""
         return {
-            "observer": self.engine.as_dict(),
+            "observer": {"last": self.clock.last, "longest": self.clock.longest, **self.observer.as_dict()},
             "recovered": None if self.recovered is None else self.recovered.as_dict(),
             "inputs": None if self.stamps is None else self.stamps.earlier,
             "monitor": None if self.monitor is None else self.monitor.as_data(self._watching),
@@ -265,7 +315,8 @@ class Job:
         """Go on from what `as_dict` returned."""
         if (data["monitor"] is None) != (self.monitor is None):
             raise SpecError("The saved state is of a run with another monitor: use the same options.", path="state")
-        self.engine.resume(data["observer"])
+        self.observer.resume(data["observer"])
+        self.clock.last, self.clock.longest = data["observer"]["last"], data["observer"]["longest"]
         if self.stamps is not None:
             self.stamps.earlier = data["inputs"]
         if self.recovered is not None:
@@ -281,14 +332,14 @@ STATE = FileKind("a saved state of obsynth", rb'\A\s*\{\s*"kind":\s*"obsynth run
 _TIMES = frozenset({"last", "longest"})
 
 
-def save_state(path: Path, job: Job, digest: str) -> None:
+def save_state(path: Path, run: LogRun, digest: str) -> None:
     """Write what a run carries from row to row, atomically."""
-    body = plain({"gains": digest, "state": job.as_dict()})
+    body = plain({"gains": digest, "state": run.as_dict()})
     document = {"kind": KIND, "schema_version": SCHEMA_VERSION, "sha256": digest_of(body), "run": body}
     write_atomically(path, json.dumps(document, indent=1, allow_nan=False) + "\n")
 
 
-def resume_state(path: Path, job: Job, digest: str) -> None:
+def resume_state(path: Path, run: LogRun, digest: str) -> None:
     """Let a run go on from a saved state."""
     # The state is written again at the end, so it is no input that has to be kept.
     document = read_json(path, is_protected=False)
@@ -304,16 +355,16 @@ def resume_state(path: Path, job: Job, digest: str) -> None:
         raise SpecError(f"{path} was changed after it was written: its digest does not match.", path=str(path))
     if body.get("gains") != digest:
         raise SpecError(f"{path} is the state of a run with another gain set.", path=str(path))
-    own = job.as_dict()
+    own = run.as_dict()
     try:
         state = restored(body.get("state"))
-        job.resume(state)
+        run.resume(state)
         fits = _fits(own, state)
     except (AttributeError, LookupError, TypeError, ValueError, ArithmeticError):
         fits = False
     if not fits:
         raise damaged_state(path)
-    job.resumed_from = path
+    run.resumed_from = path
 
 
 def _fits(own: Any, saved: Any) -> bool:
@@ -342,3 +393,11 @@ def _alike(own: tuple[int, ...], saved: tuple[int, ...]) -> bool:
     if len(own) == 2 and len(saved) == 2:
         return own[0] == saved[0] or own[1] == saved[1]
     return own == saved
+
+
+def faults_on_rows(design: ObserverDesign, times: FloatArray, u: FloatArray, y: FloatArray) -> FloatArray:
+    """Return fault estimates ``(rows, nf)`` on rows of a log, as `run_on_data` has them; NaN where there is none."""
+    run = LogRun(design)
+    first = len(run.observer.state_names)
+    rows = run.estimates(times.tolist(), np.hstack([u, y]))
+    return np.array([row.values[first : first + len(run.observer.fault_names)] for row in rows])
