@@ -21,9 +21,9 @@ import numpy as np
 
 import obsynth
 from obsynth.experiments.monitors.adaptive_monitor import adaptive_plan
-from obsynth.experiments.monitors.adaptive_record import thresholds_of_records
 from obsynth.experiments.monitors.adaptive_rule import AdaptiveState, adaptive_step
 from obsynth.spec import load_spec
+from obsynth.verification.adaptive_record import thresholds_of_records
 
 REPEATS, SAMPLES = 5, 4000
 DESIGNS = Path(__file__).parents[1] / "designs"

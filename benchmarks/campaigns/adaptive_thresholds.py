@@ -26,8 +26,8 @@ import obsynth
 from obsynth.data.alarm_certificates import verify_alarm
 from obsynth.experiments.alarm_proof import proved_alarm
 from obsynth.experiments.monitors.adaptive_monitor import adaptive_plan
-from obsynth.experiments.monitors.adaptive_record import record_columns
 from obsynth.spec import load_spec
+from obsynth.verification.adaptive_record import record_columns
 
 NAMES = ("wang2015", "smib", "drive")
 #: Cases of each design, by kind, and proofs of a fault on wang2015 after them.

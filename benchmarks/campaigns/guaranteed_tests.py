@@ -18,10 +18,9 @@ from benchmarks.campaigns.frame import Outcome
 from scipy.linalg import block_diag
 
 import obsynth as ob
-from obsynth.experiments.tolerant_tests import thresholds_over_tolerances
 from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
 from obsynth.methods.guaranteed_test.problem import window_as_designed
-from obsynth.methods.guaranteed_test.tolerant import noisy_as_bounded, rows_before, tracked
+from obsynth.methods.guaranteed_test.tolerant import noisy_as_bounded, rows_before, thresholds_over_tolerances, tracked
 from obsynth.tolerances.exact_plant import plant_at
 
 CASES = 625

@@ -110,8 +110,6 @@ provide(
         "conditions of a design": "obsynth.conditions.shipped:conditions_of",
         "design summary": "obsynth.report.summary:summary",
         "picture of a guaranteed test": "obsynth.plotting.guaranteed:plot_least_thresholds",
-        "guaranteed tests over tolerances": "obsynth.experiments.tolerant_tests:synthesise_over_tolerances",
-        "thresholds over tolerances": "obsynth.experiments.tolerant_tests:thresholds_over_tolerances",
     }
 )
 

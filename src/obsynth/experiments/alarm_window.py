@@ -16,15 +16,15 @@ import numpy as np
 
 from obsynth.analysis.transformations.uncertain_plant import AffinePlant, affine_plant
 from obsynth.errors import SpecError
-from obsynth.experiments.monitors.adaptive_bound import adaptive_bound
 from obsynth.experiments.monitors.adaptive_monitor import start_of
-from obsynth.experiments.monitors.adaptive_record import thresholds_of_records
+from obsynth.methods.tracking import tracking_of
 from obsynth.numerics.arguments import is_finite_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.proofs.balls import gamma
 from obsynth.results.design import ObserverDesign
-from obsynth.tolerances.exact_plant import tracking_of
 from obsynth.tolerances.robustness import structure_of
+from obsynth.verification.adaptive_bound import adaptive_bound
+from obsynth.verification.adaptive_record import thresholds_of_records
 
 #: Roundings of a computed right side beside those of its products and sums.
 MORE_ROUNDINGS = 8

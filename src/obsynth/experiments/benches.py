@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TypeAlias
 
 import numpy as np
 
@@ -24,9 +23,9 @@ from obsynth.plants.sequences import MatrixSequence
 from obsynth.plants.validation import index_of
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.dae import simulate_dae
-from obsynth.simulation.linear import Stepper, make_stepper, varying_runs
+from obsynth.simulation.linear import PlantRuns, scenario_runs, scenario_stepper, varying_runs
 from obsynth.simulation.scenario import Scenario, observer_start
-from obsynth.simulation.signals import ScenarioSignals, resolve, resolve_parameters
+from obsynth.simulation.signals import ScenarioSignals, resolve_parameters
 
 #: Warm-up ends when the effect of an error at the start has shrunk to this share of its largest, for good.
 WARM_UP_SHARE = 0.01
@@ -62,10 +61,6 @@ class Runs:
         if not isinstance(self.observer, LinearObserver):
             return self.kept
         return tuple(split_rows(self.observer, self.rows[:, run]) for run in range(self.rows.shape[1]))
-
-
-#: States, outputs as measured, inputs, faults and disturbances of several runs, ``(steps, runs, signals)`` each.
-PlantRuns: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,9 +110,8 @@ class Bench:
 def make_bench(design: ObserverDesign, scenario: Scenario) -> Bench:
     """Return the bench of a linear design and a scenario."""
     plant, observer = design.linear
-    drive = resolve(plant, scenario)
     start = np.array([scenario.initial_state.get(name, 0.0) for name in plant.state_names])
-    stepper = make_stepper(plant, drive, initial_state=start, stabilise=scenario.stabilise)
+    drive, stepper = scenario_stepper(plant, scenario, start)
     begin = observer_start(scenario, observer.order)
     ramp = np.zeros((observer.order, len(observer.input_names) + len(observer.output_names)))
     if observer.dt <= 0.0:
@@ -131,21 +125,9 @@ def make_bench(design: ObserverDesign, scenario: Scenario) -> Bench:
         slice(plant.nu, plant.nu + plant.nf),
         tuple(index_of(name, plant.fault_names, what="The plant") for name in observer.fault_names),
         tuple(text for holds, text in said if holds),
-        partial(_linear_plant, drive, stepper, (plant.nu, plant.nu + plant.nf)),
+        partial(scenario_runs, drive, stepper, (plant.nu, plant.nu + plant.nf)),
         partial(_linear_rows, observer, begin, ramp),
     )
-
-
-def _linear_plant(drive: ScenarioSignals, stepper: Stepper, parts: tuple[int, int], seeds: Sequence[int]) -> PlantRuns:
-    """Run a linear plant; ``parts``: where faults and disturbances begin among its signals."""
-    drawn, noise, sensor_noise = drive.drawn(seeds, stepper.noisy.shape[1])
-    left = drive.left[:, None, :] + drawn
-    difference = np.broadcast_to((drive.right - drive.left)[:, None, :], left.shape)
-    states, clean, fed = stepper.run(left, difference, noise)
-    inputs, faults, disturbances = np.split(left, parts, axis=2)
-    if fed.shape[2]:
-        inputs = inputs + fed
-    return states, drive.measured(clean + sensor_noise), inputs, faults, disturbances
 
 
 def _linear_rows(

@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.experiments.monitors.adaptive_bound import THRESHOLD_ROUNDING, AdaptiveBound
 from obsynth.experiments.monitors.learned import LearnedThresholds, watched_names
 from obsynth.exporting.alarms import Alarms
 from obsynth.exporting.c_source import (
@@ -39,6 +38,7 @@ from obsynth.observers.running import changed
 from obsynth.plants.dae.model import DAEModel
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import gain_set_digest
+from obsynth.verification.adaptive_bound import THRESHOLD_ROUNDING, AdaptiveBound
 
 
 def write_dae_c(

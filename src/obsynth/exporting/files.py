@@ -37,8 +37,8 @@ from obsynth.results.gain_sets import gain_set_digest
 PRECISIONS = ("double", "float")
 SUFFIXES = (".mat", ".npz", ".c", ".fmu")
 if TYPE_CHECKING:
-    from obsynth.experiments.monitors.adaptive_bound import AdaptiveBound
     from obsynth.experiments.monitors.monitor import Monitor
+    from obsynth.verification.adaptive_bound import AdaptiveBound
 
 #: What an existing file has to be for another export to take its place.
 _C_FILE = FileKind("C code that obsynth has exported", rb"sha256 of the gain set")

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from inspect import signature
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,6 @@ from obsynth.analysis.conditions import Condition
 from obsynth.analysis.transformations.elimination import MANY_VARIABLES, eliminate_algebraic_states
 from obsynth.analysis.transformations.recovery import StateRecovery, Transformation, plant_and_recovery
 from obsynth.errors import PreconditionError, SolverError, SpecError, VerificationError
-from obsynth.extensions import extension
 from obsynth.methods.automatic import automatic_design
 from obsynth.methods.method import Method, Synthesis
 from obsynth.methods.refusals import require_above_rounding, rounding_notes, with_advice
@@ -97,7 +97,7 @@ def design(
         each = partial(_designed, name=name, recovery=recovery, progress=report_stage, advise=advise)
         uncertain = plant.uncertainty if isinstance(plant, DescriptorSystem) else None
         if asked.over_scenario and scenario is not None and uncertain is not None and uncertain.box.names:
-            each = partial(each, synthesise=partial(extension(asked.over_scenario), asked, scenario))
+            each = partial(each, more={"scenario": scenario})
         return each(plant, asked)
 
     if method == AUTO:
@@ -117,18 +117,18 @@ def _designed(
     recovery: StateRecovery | None,
     progress: Callable[[str], None],
     advise: bool,
-    synthesise: Callable[..., Synthesis] | None = None,
+    more: Mapping[str, Any] = MappingProxyType({}),
 ) -> ObserverDesign:
     """Return the verified design of one method; with ``advise`` a refusal says what would help.
 
-    ``synthesise``: how, where it is not as the method does.
+    ``more``: what the synthesis takes besides.
     """
     for condition in kind_conditions(plant, type(asked)):
         condition.require()
     with failed_computations(), one_thread_if_small(plant.nx):
         plant, recovery, notes = _with_arrays(plant, recovery, progress)
         try:
-            found = (synthesise or asked.synthesise)(plant, progress=progress)
+            found = asked.synthesise(plant, progress=progress, **more)
         except PreconditionError as error:
             if not isinstance(plant, DescriptorSystem) or not advise:
                 raise

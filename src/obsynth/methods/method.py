@@ -96,8 +96,8 @@ class Method(ABC):
     imposed: ClassVar[frozenset[str]] = frozenset()
     #: Whether an option ``mean`` puts registers behind the observer, which the checks are not about.
     averaged: ClassVar[bool] = False
-    #: The extension that synthesises for a scenario where constants of the plant have tolerances, if there is one.
-    over_scenario: ClassVar[str] = ""
+    #: Whether `synthesise` takes a ``scenario`` where constants of the plant have tolerances.
+    over_scenario: ClassVar[bool] = False
     #: Values of required options, for questions that do not depend on them.
     placeholders: ClassVar[Mapping[str, Any]] = {}
     #: Options of old, and what to take instead.

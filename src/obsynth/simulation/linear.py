@@ -6,7 +6,9 @@ constant or linear between samples.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,7 +24,8 @@ from obsynth.numerics.continuous import driven, first_order_hold
 from obsynth.numerics.ranks import decide_rank
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
-from obsynth.simulation.signals import ScenarioSignals, Trajectory, signal_of
+from obsynth.simulation.scenario import Scenario
+from obsynth.simulation.signals import ScenarioSignals, Trajectory, resolve, signal_of
 
 
 def simulate_plant(
@@ -150,6 +153,30 @@ def make_stepper(
         start,
         gain,
     )
+
+
+def scenario_stepper(
+    plant: DescriptorSystem, scenario: Scenario, initial_state: FloatArray
+) -> tuple[ScenarioSignals, Stepper]:
+    """Return what acts on a plant in a scenario, and the stepper for it from ``initial_state (nx,)``."""
+    drive = resolve(plant, scenario)
+    return drive, make_stepper(plant, drive, initial_state=initial_state, stabilise=scenario.stabilise)
+
+
+#: States, outputs as measured, inputs, faults and disturbances of several runs, ``(steps, runs, signals)`` each.
+PlantRuns: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]
+
+
+def scenario_runs(drive: ScenarioSignals, stepper: Stepper, parts: tuple[int, int], seeds: Sequence[int]) -> PlantRuns:
+    """Run a linear plant over a scenario; ``parts``: where faults and disturbances begin among its signals."""
+    drawn, noise, sensor_noise = drive.drawn(seeds, stepper.noisy.shape[1])
+    left = drive.left[:, None, :] + drawn
+    difference = np.broadcast_to((drive.right - drive.left)[:, None, :], left.shape)
+    states, clean, fed = stepper.run(left, difference, noise)
+    inputs, faults, disturbances = np.split(left, parts, axis=2)
+    if fed.shape[2]:
+        inputs = inputs + fed
+    return states, drive.measured(clean + sensor_noise), inputs, faults, disturbances
 
 
 def _sampled_noise(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -13,8 +13,7 @@ from obsynth.analysis.transformations.elimination import eliminate_algebraic_sta
 from obsynth.analysis.transformations.sampling import discretise
 from obsynth.analysis.transformations.uncertain_plant import AffinePlant, untouched_states
 from obsynth.analysis.zeros import zeros_of_system
-from obsynth.errors import ObsynthError, PreconditionError
-from obsynth.methods.registry import error_model
+from obsynth.errors import ObsynthError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import DIRECTION_SHARE
 from obsynth.observers.linear.observer import LinearObserver
@@ -22,51 +21,7 @@ from obsynth.plants.constants import ConstantsBox
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.uncertainty import SAMPLED, UNCERTAIN_MATRICES, Uncertainty, matrices_of, require_carried
 from obsynth.results.design import ObserverDesign
-from obsynth.verification.error_system import IDENTITY_SHARE
-
-
-class Tracking(NamedTuple):
-    """``z`` follows ``T E x``, ``T (nz, nx)``; outputs use ``T0 (nx + nf + nr, nx)``: ``T0 (A x + B u + Bd d) = 0``."""
-
-    T: FloatArray
-    T0: FloatArray
-
-
-def tracking_of(design: ObserverDesign, affine: AffinePlant) -> Tracking:
-    """Return T and T0 of a linear design; `PreconditionError` where it estimates no full state, or they do not hold."""
-    plant, observer = design.linear
-    if any(observer.state_delays):
-        raise PreconditionError(
-            "The state estimate lags by some samples: what a tolerance does to newer states is not known from it, and "
-            "no bound exists. Use a design whose estimate has no delay (detectability indexes of 1).",
-            condition="full state estimate",
-        )
-    if observer.state_names != plant.state_names:
-        raise PreconditionError(
-            "The design does not estimate the full state, which a bound over tolerances needs.",
-            condition="full state estimate",
-        )
-    model = error_model(design)
-    t0 = _algebraic_rows(observer, plant.E, model.own, affine) if model.T0 is None else model.T0[:, : plant.nx]
-    return Tracking(model.own, t0)
-
-
-def _algebraic_rows(observer: LinearObserver, e: FloatArray, t: FloatArray, affine: AffinePlant) -> FloatArray:
-    """Return T0: zero, unless the outputs use algebraic rows of the plant."""
-    plant = affine.plant
-    rows = len(observer.Cz)
-    target = np.zeros((rows, plant.nx))
-    target[observer.state_rows] = np.eye(plant.nx)
-    missed = target - observer.Cz @ t @ e - observer.Dy @ plant.C
-    size = np.abs(target) + np.abs(observer.Cz) @ np.abs(t @ e) + np.abs(observer.Dy) @ np.abs(plant.C)
-    algebraic = ~e.any(axis=1)
-    if not algebraic.any() or not np.any(np.abs(missed) > IDENTITY_SHARE * size.max(axis=1, keepdims=True)):
-        return np.zeros((rows, plant.nx))
-    found = np.zeros((rows, plant.nx))
-    both = np.hstack([plant.A, plant.B])[algebraic]
-    wanted = np.hstack([missed, -(observer.Du + observer.Dy @ plant.D)])
-    found[:, algebraic] = np.linalg.lstsq(both.T, wanted.T, rcond=None)[0].T
-    return found
+from obsynth.verification.error_structure import Tracking
 
 
 def plant_at(plant: DescriptorSystem, values: Mapping[str, float]) -> DescriptorSystem:

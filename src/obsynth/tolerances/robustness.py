@@ -16,6 +16,7 @@ from obsynth.analysis.transformations.uncertain_plant import (
     untouched_states,
 )
 from obsynth.errors import PreconditionError, SpecError
+from obsynth.methods.tracking import tracking_of
 from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.constants import ConstantsBox
@@ -24,18 +25,18 @@ from obsynth.plants.uncertain_system import uncertain_system
 from obsynth.plants.uncertainty import Uncertainty, require_carried
 from obsynth.proofs.affine import AffineMatrix
 from obsynth.results.design import ObserverDesign
-from obsynth.tolerances.error_structure import ErrorStructure, error_structure
 from obsynth.tolerances.exact_plant import (
-    Tracking,
     is_sampled,
     labels_of,
     moving_at,
     told_from_faults,
-    tracking_of,
     vertex_gains,
     written_matrices,
 )
-from obsynth.tolerances.responses import (
+from obsynth.tolerances.result import EXACT_MODEL, Robustness
+from obsynth.tolerances.subdivision import MOST_BOXES, BoxVerdict, index_one_on_box, proved_stable, values_at
+from obsynth.verification.error_structure import ErrorStructure, Tracking, error_structure
+from obsynth.verification.responses import (
     Responses,
     blame,
     blamed_rows,
@@ -44,8 +45,6 @@ from obsynth.tolerances.responses import (
     responses_of,
     same_sample_inverse,
 )
-from obsynth.tolerances.result import EXACT_MODEL, Robustness
-from obsynth.tolerances.subdivision import MOST_BOXES, BoxVerdict, index_one_on_box, proved_stable, values_at
 
 #: Boxes for stability after which it is left open where most states are algebraic: each elimination takes long.
 FEW_BOXES = 40

@@ -19,12 +19,11 @@ from obsynth.analysis.transformations.sampling import discretise
 from obsynth.analysis.transformations.uncertain_plant import AffinePlant, affine_plant, reduced_family
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.experiments.assumptions import Assumptions
-from obsynth.experiments.monitors.adaptive_bound import Start, adaptive_bound
-from obsynth.experiments.monitors.adaptive_record import AdaptivePlan
 from obsynth.experiments.monitors.adaptive_rule import AdaptiveRule
 from obsynth.experiments.monitors.monitor import Rule
 from obsynth.experiments.monitors.residual_model import noisy_plant, watches_estimates
 from obsynth.experiments.monitors.rules import NormRule
+from obsynth.methods.tracking import tracking_of
 from obsynth.numerics.arguments import is_finite_number, require_mapping
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import first_order_hold
@@ -38,12 +37,13 @@ from obsynth.proofs.balls import rounded_up
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.scenario import Scenario
 from obsynth.simulation.signals import resolve
-from obsynth.tolerances.error_structure import ErrorStructure, error_structure
-from obsynth.tolerances.exact_plant import Tracking, tracking_of
-from obsynth.tolerances.responses import loop_radius
 from obsynth.tolerances.result import EXACT_MODEL
 from obsynth.tolerances.robustness import structure_of, with_tolerances
 from obsynth.tolerances.subdivision import index_one_on_box, values_at
+from obsynth.verification.adaptive_bound import Start, adaptive_bound
+from obsynth.verification.adaptive_record import AdaptivePlan
+from obsynth.verification.error_structure import ErrorStructure, Tracking, error_structure
+from obsynth.verification.responses import loop_radius
 
 #: Pieces of an interval in which a disturbance has a sign of its own.
 PIECES = 16

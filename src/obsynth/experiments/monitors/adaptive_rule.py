@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.experiments.benches import Runs
-from obsynth.experiments.monitors.adaptive_bound import THRESHOLD_ROUNDING, AdaptiveBound
-from obsynth.experiments.monitors.adaptive_record import AdaptivePlan
 from obsynth.experiments.monitors.adaptive_screening import Screening
 from obsynth.experiments.monitors.monitor import Judged, LinearSample, Rule, Sample
 from obsynth.experiments.monitors.rules import FITTING_SHARE, NormRule, NormState, norm_of
 from obsynth.numerics.arrays import FloatArray
+from obsynth.verification.adaptive_bound import THRESHOLD_ROUNDING, AdaptiveBound
+from obsynth.verification.adaptive_record import AdaptivePlan
 
 
 class AdaptiveState(NamedTuple):

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.experiments.benches import Runs
-from obsynth.experiments.monitors.adaptive_bound import THRESHOLD_ROUNDING, AdaptiveBound
-from obsynth.experiments.monitors.adaptive_record import AdaptivePlan, by_run, filtered, thresholds_of_records
 from obsynth.numerics.arrays import FloatArray
 from obsynth.proofs.contraction import inverse_bound
+from obsynth.verification.adaptive_bound import THRESHOLD_ROUNDING, AdaptiveBound
+from obsynth.verification.adaptive_record import AdaptivePlan, filtered, thresholds_of_records
 
 #: Share of a bound within which a value is not decided here: more than rounding can change.
 UNDECIDED_SHARE = 1e-9
@@ -190,7 +190,10 @@ class Screening:
         chosen = np.flatnonzero(candidates.any(axis=0))
         if not len(chosen):
             return passed
-        rows, inputs, outputs = (item[:, :length] for item in by_run(runs, chosen))
+        rows, inputs, outputs = (
+            np.ascontiguousarray(np.moveaxis(signals[:, chosen], 1, 0))[:, :length]
+            for signals in (runs.rows, runs.inputs, runs.outputs)
+        )
         found = thresholds_of_records(plan.bound, rows @ plan.bound.structure.reading.T, inputs, outputs)
         at = plan.residuals
         parts = [found.shift[..., at], found.rest[..., at], *np.moveaxis(found.first[..., at], 2, 0)]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -17,8 +17,14 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.results.checks import Check
 from obsynth.results.design import ObserverDesign
+from obsynth.simulation.scenario import Scenario
 from obsynth.verification.error_system import ErrorModel
 
+#: What a bank says of tolerances, and what to do instead.
+NOMINAL_BANK = (
+    "The thresholds are those of the nominal plant: tolerances are not in them. Design each test alone, with its "
+    "fault, the others free and this scenario, for thresholds over them."
+)
 CLAIMS = {
     "threshold": ClaimMeaning("", "never passed without the fault, in the fault's unit", "threshold"),
     "least": ClaimMeaning("", "no function of these samples tells the fault within less", "least"),
@@ -139,7 +145,7 @@ class GuaranteedTestMethod(Asked, Method):
     summary: ClassVar[str] = "a test of one fault whose threshold no other test on these samples can beat"
     source: ClassVar[str] = "ours, by duality of linear programmes"
     claims: ClassVar[Mapping[str, ClaimMeaning]] = CLAIMS
-    over_scenario: ClassVar[str] = "guaranteed tests over tolerances"
+    over_scenario: ClassVar[bool] = True
     witnesses: ClassVar[frozenset[str]] = frozenset(
         {"multipliers", "multiplier_radius", "witness", "witness_radius", "rounding", "trade_off"}
         | {"state_tracking", "state_rows", "record"}
@@ -192,9 +198,13 @@ class GuaranteedTestMethod(Asked, Method):
         return conditions(plant, self)
 
     def synthesise(
-        self, plant: DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel, *, progress: Callable[[str], None]
+        self,
+        plant: DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel,
+        *,
+        progress: Callable[[str], None],
+        scenario: Scenario | None = None,
     ) -> Any:
-        """Return weights, observer and certificate, not yet verified."""
+        """Return weights, observer and certificate, not yet verified; ``scenario``: see the synthesis."""
         if isinstance(plant, DAEModel):
             from obsynth.methods.guaranteed_test.nonlinear import synthesise_nonlinear
 
@@ -209,10 +219,11 @@ class GuaranteedTestMethod(Asked, Method):
         if self.isolate:
             from obsynth.methods.guaranteed_test.bank_synthesis import synthesise_bank
 
-            return synthesise_bank(plant, self, progress=progress)
+            found = synthesise_bank(plant, self, progress=progress)
+            return found if scenario is None else replace(found, notes=(*found.notes, NOMINAL_BANK))
         from obsynth.methods.guaranteed_test.synthesis import synthesise
 
-        return synthesise(plant, self, progress=progress)
+        return synthesise(plant, self, progress=progress, scenario=scenario)
 
     @classmethod
     def checks(cls, design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from obsynth.analysis.conditions import require_all
-from obsynth.errors import SolverError
+from obsynth.errors import ObsynthError, SolverError
+from obsynth.methods.guaranteed_test.beside import observer_beside
 from obsynth.methods.guaranteed_test.conditions import conditions, told
 from obsynth.methods.guaranteed_test.options import Asked
 from obsynth.methods.guaranteed_test.problem import (
@@ -36,6 +37,7 @@ from obsynth.methods.method import Synthesis
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import Certificate
+from obsynth.simulation.scenario import Scenario
 
 #: A threshold below this share of what all bounds could do is tried as an exact zero.
 ZERO = 1e-9
@@ -44,9 +46,23 @@ TRADE_OFF = "trade_off"
 
 
 def synthesise(
-    plant: DescriptorSystem, asked: Asked, *, progress: Callable[[str], None], beside: Beside | None = None
+    plant: DescriptorSystem, asked: Asked, *, progress: Callable[[str], None], scenario: Scenario | None = None
 ) -> Synthesis:
-    """Return weights, observer and certificate; ``beside``: for constants with tolerances, see there."""
+    """Return weights, observer and certificate; with a scenario the threshold over the tolerances of the plant's
+    constants is least in the mean over it, without its faults."""
+    if scenario is None:
+        return _synthesised(plant, asked, progress, None)
+    try:
+        beside = observer_beside(asked, scenario, plant, progress)
+    except ObsynthError as error:
+        found = _synthesised(plant, asked, progress, None)
+        return replace(found, notes=(*found.notes, f"There is no threshold over the tolerances: {error}"))
+    return _synthesised(plant, asked, progress, beside)
+
+
+def _synthesised(
+    plant: DescriptorSystem, asked: Asked, progress: Callable[[str], None], beside: Beside | None
+) -> Synthesis:
     problem = problem_of(plant, asked)
     require_all(conditions(plant, asked, with_windows=False))
     condition, lag = told(problem, asked)

@@ -11,14 +11,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from obsynth.analysis.transformations.uncertain_plant import AffinePlant
-from obsynth.extensions import extension
+from obsynth.analysis.transformations.uncertain_plant import AffinePlant, affine_plant
 from obsynth.methods.guaranteed_test.windows import Builder, Window
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.windows import WindowObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
+from obsynth.verification.adaptive_bound import Start, adaptive_bound
+from obsynth.verification.adaptive_record import Thresholds, thresholds_of_records
+from obsynth.verification.error_structure import ErrorStructure, Tracking, error_structure
 
 #: Windows of the record that count, at most: evenly spread.
 MOST_WINDOWS = 40
@@ -166,8 +168,35 @@ def mean_over_record(
     window: Window, observer: LinearObserver, multipliers: FloatArray, T: FloatArray, T0: FloatArray, record: FloatArray
 ) -> float:
     """Return the mean threshold over the tolerances on a record ``(steps, nu + ny)``, once the window is full."""
-    thresholds: FloatArray = extension("thresholds over tolerances")(
+    thresholds = thresholds_over_tolerances(
         noisy_as_bounded(window), observer, tracked(window, multipliers, T, T0), window.bounds.disturbance, record
     )
     begin, end = settled(len(record), observer.order - len(T) + 1)
     return float(thresholds[len(record) - 1 - (end - begin) :, -1].mean())
+
+
+def thresholds_over_record(
+    structure: ErrorStructure, observer: LinearObserver, record: FloatArray, *, varying: bool
+) -> tuple[Thresholds, FloatArray]:
+    """Return thresholds on a record ``(steps, nu + ny)`` and what the observer says, as the error system reads it."""
+    nu = len(observer.input_names)
+    u, y = record[:, :nu], record[:, nu:]
+    said = observer.run(y, u)
+    rows = np.hstack([said.states, said.faults, said.residuals])
+    states = rows @ structure.reading.T
+    bound = adaptive_bound(structure, observer, Start(observer.order), varying=varying)
+    return thresholds_of_records(bound, states[None], u[None], y[None]), states
+
+
+def thresholds_over_tolerances(
+    plant: DescriptorSystem,
+    observer: LinearObserver,
+    tracking: tuple[FloatArray, FloatArray],
+    bounds: FloatArray,
+    record: FloatArray,
+) -> FloatArray:
+    """Return thresholds ``(steps, rows)`` on a record ``(steps, nu + ny)``; noise columns of the plant within one."""
+    affine = affine_plant(plant)
+    structure = error_structure(observer, affine, Tracking(*tracking), bounds, 1.0)
+    found, _ = thresholds_over_record(structure, observer, record, varying=affine.box.variation == "varying")
+    return np.asarray(found.total[0])

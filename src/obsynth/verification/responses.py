@@ -11,7 +11,7 @@ from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.proofs.balls import gamma
 from obsynth.proofs.contraction import inverse_bound, positive_vector, spectral_radius_bound
-from obsynth.tolerances.error_structure import ErrorStructure
+from obsynth.verification.error_structure import ErrorStructure
 
 #: A ring of L samples is long enough when ``|Az^L|`` is proved to contract this much.
 CONTRACTION = 1e-2

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from obsynth.experiments.benches import Runs
-from obsynth.experiments.monitors.adaptive_bound import THRESHOLD_ROUNDING, AdaptiveBound
 from obsynth.numerics.arrays import FloatArray
+from obsynth.verification.adaptive_bound import THRESHOLD_ROUNDING, AdaptiveBound
 
 #: Samples whose dependence on older ones is computed at once.
 BLOCK = 32
@@ -99,15 +98,6 @@ def record_columns(
     middle = rows[:, :, first : first + nf] - error.shift[:, :, :nf]
     width = error.total[:, :, :nf] - np.abs(error.shift[:, :, :nf])
     return found.total, np.stack([middle - width, middle + width], axis=3)
-
-
-def by_run(runs: Runs, chosen: Any = slice(None)) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return rows, inputs and outputs ``(runs, steps, any)`` of some runs."""
-    rows, inputs, outputs = (
-        np.ascontiguousarray(np.moveaxis(signals[:, chosen], 1, 0))
-        for signals in (runs.rows, runs.inputs, runs.outputs)
-    )
-    return rows, inputs, outputs
 
 
 def _first_constant(bound: AdaptiveBound, v: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

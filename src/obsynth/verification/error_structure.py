@@ -9,6 +9,7 @@ The brackets vanish at the nominal plant; over the box ``x = xhat - e`` drives t
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,11 +20,17 @@ from obsynth.numerics.ranks import EFFECT_RANK_SHARE
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.proofs.affine import AffineMatrix, affine_block
 from obsynth.proofs.balls import gamma, rounded_up
-from obsynth.tolerances.exact_plant import Tracking
 from obsynth.verification.error_system import IDENTITY_SHARE
 
 #: Remainders below this share of their row's terms are rounding: one common channel is enough for them.
 ROUNDING_SHARE = 1e-9
+
+
+class Tracking(NamedTuple):
+    """``z`` follows ``T E x``, ``T (nz, nx)``; outputs use ``T0 (nx + nf + nr, nx)``: ``T0 (A x + B u + Bd d) = 0``."""
+
+    T: FloatArray
+    T0: FloatArray
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,8 +15,8 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.proofs.affine import AffineMatrix
 from obsynth.proofs.balls import gamma
-from obsynth.tolerances.error_structure import ErrorStructure
-from obsynth.tolerances.responses import (
+from obsynth.verification.error_structure import ErrorStructure
+from obsynth.verification.responses import (
     OUTWARD,
     Responses,
     decay_weights,
