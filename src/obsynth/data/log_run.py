@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -24,6 +23,7 @@ from obsynth.files.outputs import FileKind, write_atomically
 from obsynth.numerics.arguments import is_finite_number, is_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.running import BY_COLUMNS
+from obsynth.results.certificate_files import sealed
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import digest_of, plain, restored
 
@@ -335,8 +335,7 @@ _TIMES = frozenset({"last", "longest"})
 def save_state(path: Path, run: LogRun, digest: str) -> None:
     """Write what a run carries from row to row, atomically."""
     body = plain({"gains": digest, "state": run.as_dict()})
-    document = {"kind": KIND, "schema_version": SCHEMA_VERSION, "sha256": digest_of(body), "run": body}
-    write_atomically(path, json.dumps(document, indent=1, allow_nan=False) + "\n")
+    write_atomically(path, sealed(KIND, SCHEMA_VERSION, body, under="run"))
 
 
 def resume_state(path: Path, run: LogRun, digest: str) -> None:

@@ -22,16 +22,9 @@ from obsynth.experiments.monitors.adaptive_rule import AdaptiveRule
 from obsynth.experiments.monitors.guaranteed import data_monitor, is_guaranteed
 from obsynth.experiments.monitors.learned import LearnedThresholds, learned_monitor, load_thresholds
 from obsynth.experiments.monitors.monitor import KINDS, Monitor, Rule, statement_of
-from obsynth.experiments.monitors.options import (
-    CHANGE,
-    FALSE_ALARMS,
-    LINEAR_OPTIONS,
-    PARAMETER_OPTIONS,
-    WINDOW,
-    refuse_idle,
-)
+from obsynth.experiments.monitors.options import LINEAR_OPTIONS, PARAMETER_OPTIONS, checked_options
 from obsynth.experiments.monitors.residual_model import ResidualModel, residual_model, watches_estimates
-from obsynth.experiments.monitors.residual_monitor import bounds_of, require_options
+from obsynth.experiments.monitors.residual_monitor import bounds_of
 from obsynth.experiments.monitors.rules import ANY_LENGTH, NormRule, WhitenedRule, parameter_monitor
 from obsynth.experiments.monitors.thresholds import samples_of, scaled_inputs, unlimited_bound, unlimited_paper
 from obsynth.experiments.monitors.whitening import steady_mean, whitened
@@ -137,38 +130,23 @@ def online_monitor(
     require_verified(design, unverified=unverified)
     if scenario is not None:
         require_kind(scenario, Scenario, "scenario", "an obsynth.Scenario")
-    for name, given in (("disturbance_bounds", disturbance_bounds), ("nominal", nominal)):
-        require_mapping(given, name)
+    for name, mapping in (("disturbance_bounds", disturbance_bounds), ("nominal", nominal)):
+        require_mapping(mapping, name)
     recursive = isinstance(design.observer, (RecursiveObserver, DAEObserver))
-    refuse_idle(
-        PARAMETER_OPTIONS if recursive else LINEAR_OPTIONS,
-        kind,
-        {
-            "scenario": scenario, "disturbance_bounds": disturbance_bounds, "noise_bound": noise_bound,
-            "initial_error": initial_error, "gamma": gamma, "window": window, "false_alarms": false_alarms,
-            "change": change, "sample_time": sample_time, "constants": constants, "initial_set": initial_set,
-            "normal": normal,
-        },
-    )  # fmt: skip
-    window, false_alarms = WINDOW if window is None else window, FALSE_ALARMS if false_alarms is None else false_alarms
-    change = CHANGE if change is None else change
-    require_options(noise_bound, initial_error, gamma, window, false_alarms, change, 0)
+    given = {
+        "scenario": scenario, "disturbance_bounds": disturbance_bounds, "noise_bound": noise_bound,
+        "initial_error": initial_error, "gamma": gamma, "window": window, "false_alarms": false_alarms,
+        "change": change, "sample_time": sample_time, "constants": constants, "initial_set": initial_set,
+        "normal": normal,
+    }  # fmt: skip
+    window, false_alarms, change = checked_options(PARAMETER_OPTIONS if recursive else LINEAR_OPTIONS, kind, given)
     if kind == "learned":
         return _learned(design, normal)
     if isinstance(design.observer, (RecursiveObserver, DAEObserver)):
         return parameter_monitor(design.observer, kind, nominal or {}, change, false_alarms)
     _require_linear_kind(kind, nominal)
     if is_guaranteed(design):
-        return data_monitor(
-            design,
-            kind,
-            disturbance_bounds=disturbance_bounds,
-            noise_bound=noise_bound,
-            initial_error=initial_error,
-            gamma=gamma,
-            constants=constants,
-            initial_set=initial_set,
-        )
+        return data_monitor(design, kind, given)
     design, adaptive = tolerances_of(design, constants, initial_set, initial_error)
     estimates = watches_estimates(design) and kind in ("pointwise", "window")
     model, dt = _endless_model(design, scenario, window, sample_time, estimates=estimates)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,6 +30,8 @@ from obsynth.tolerances.robustness import with_tolerances
 
 #: Id of the method whose designs bring their threshold.
 METHOD = "guaranteed-test"
+#: Options that other designs leave to their monitor.
+STATED_BY_DESIGN = ("disturbance_bounds", "noise_bound", "initial_error", "gamma")
 
 
 def is_guaranteed(design: ObserverDesign) -> bool:
@@ -36,22 +39,20 @@ def is_guaranteed(design: ObserverDesign) -> bool:
     return design.method == METHOD
 
 
-def _checked(
-    design: ObserverDesign, kind: str, constants: Any, initial_set: Any, given: dict[str, Any]
-) -> GuaranteedTest:
+def _checked(design: ObserverDesign, kind: str, given: Mapping[str, Any]) -> GuaranteedTest:
     if kind != "pointwise":
         raise SpecError(
             f"kind is {kind!r}: a guaranteed test has its own threshold, use pointwise (the default).", path="kind"
         )
     # The command line gives a mapping without entries where nothing is stated.
-    stated = [name for name, value in given.items() if value is not None and value != {}]
+    stated = [name for name in STATED_BY_DESIGN if given[name] is not None and given[name] != {}]
     if stated:
         raise SpecError(
             f"{', '.join(stated)} cannot be given to the monitor of a guaranteed test: its bounds are those of its "
             "design. Design it again with others.",
             path=stated[0],
         )
-    test = GuaranteedTest.of(design)
+    test, constants, initial_set = GuaranteedTest.of(design), given["constants"], given["initial_set"]
     if isinstance(test.observer, WindowObserver):
         if constants is not None or initial_set is not None:
             raise SpecError(
@@ -100,11 +101,10 @@ def _promise(test: GuaranteedTest, group: tuple[str, ...]) -> str:
     )
 
 
-def record_monitor(
-    design: ObserverDesign, scenario: Scenario, kind: str, *, constants: Any, initial_set: Any, **given: Any
-) -> Monitor:
-    """Return the monitor of records as long as a scenario."""
-    test = _checked(design, kind, constants, initial_set, given)
+def record_monitor(design: ObserverDesign, scenario: Scenario, kind: str, given: Mapping[str, Any]) -> Monitor:
+    """Return the monitor of records as long as a scenario; ``given``: the options of a monitor by name."""
+    test = _checked(design, kind, given)
+    constants, initial_set = given["constants"], given["initial_set"]
     if isinstance(test.observer, WindowObserver):
         raise SpecError(
             "A test whose weights change with k is watched on data: use obsynth.online_monitor, or alarms() and "
@@ -323,9 +323,10 @@ class VaryingRule(Rule):
         return [*self._limits.tolist()]
 
 
-def data_monitor(design: ObserverDesign, kind: str, *, constants: Any, initial_set: Any, **given: Any) -> Monitor:
+def data_monitor(design: ObserverDesign, kind: str, given: Mapping[str, Any]) -> Monitor:
     """Return the monitor of data of any length; with constants or a start its threshold follows the signals."""
-    test = _checked(design, kind, constants, initial_set, given)
+    test = _checked(design, kind, given)
+    constants, initial_set = given["constants"], given["initial_set"]
     if isinstance(test.observer, WindowObserver):
         own = test.observer
         rule_by_row = VaryingRule(test, own)

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from obsynth.errors import SpecError
+from obsynth.numerics.arguments import is_finite_number, is_whole
 
 _BOUNDED = ("disturbance_bounds", "noise_bound", "initial_error", "scenario", "sample_time")
 _STATISTICAL = ("window", "false_alarms", "scenario", "sample_time")
@@ -41,3 +42,25 @@ def refuse_idle(table: Mapping[str, tuple[str, ...]], kind: str, given: Mapping[
         kinds = [other for other, names in table.items() if name in names]
         where = f"the monitor {' or '.join(kinds)}" if kinds else "designs of another kind"
         raise SpecError(f"{name} is for {where}, not for {kind}: leave it out.", path=name)
+
+
+def checked_options(
+    table: Mapping[str, tuple[str, ...]], kind: str, given: Mapping[str, Any], isolation_delay: int = 0
+) -> tuple[int, float, float]:
+    """Return window, false_alarms and change as they are given, or by default; raise `SpecError` where an option does
+    nothing for a kind of monitor, or is out of range."""
+    refuse_idle(table, kind, given)
+    for name in ("noise_bound", "initial_error", "gamma"):
+        value = given[name]
+        if value is not None and not (is_finite_number(value) and value >= 0.0):
+            raise SpecError(f"{name} is {value!r}: give a number, 0 or more.", path=name)
+    defaults = {"window": WINDOW, "false_alarms": FALSE_ALARMS, "change": CHANGE}
+    window, false_alarms, change = (value if given[name] is None else given[name] for name, value in defaults.items())
+    for name, count, least in (("window", window, 1), ("isolation_delay", isolation_delay, 0)):
+        if not is_whole(count) or count < least:
+            raise SpecError(f"{name} is {count!r}: give a whole number of samples, {least} or more.", path=name)
+    if not (is_finite_number(false_alarms) and 0.0 < false_alarms < 1.0):
+        raise SpecError(f"false_alarms is {false_alarms!r}: give a probability between 0 and 1.", path="false_alarms")
+    if not (is_finite_number(change) and change > 0.0):
+        raise SpecError(f"change is {change!r}: give a positive number of deviations.", path="change")
+    return window, false_alarms, change

@@ -19,7 +19,7 @@ from obsynth.experiments.monitors.adaptive_monitor import (
 )
 from obsynth.experiments.monitors.guaranteed import is_guaranteed, record_monitor
 from obsynth.experiments.monitors.monitor import KINDS, Monitor, Rule, statement_of
-from obsynth.experiments.monitors.options import CHANGE, FALSE_ALARMS, LINEAR_OPTIONS, WINDOW, refuse_idle
+from obsynth.experiments.monitors.options import LINEAR_OPTIONS, checked_options
 from obsynth.experiments.monitors.residual_model import ResidualModel, residual_model, watches_estimates
 from obsynth.experiments.monitors.rules import NormRule, WhitenedRule
 from obsynth.experiments.monitors.thresholds import (
@@ -30,7 +30,7 @@ from obsynth.experiments.monitors.thresholds import (
 )
 from obsynth.experiments.monitors.whitening import settled, steady_mean, whitened
 from obsynth.methods.handing_on import require_verified
-from obsynth.numerics.arguments import is_finite_number, is_whole, require_kind, require_mapping
+from obsynth.numerics.arguments import is_finite_number, require_kind, require_mapping
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.validation import index_of
@@ -124,30 +124,14 @@ def monitor(
     require_mapping(disturbance_bounds, "disturbance_bounds")
     if kind not in KINDS:
         raise SpecError(f"kind is {kind!r}: use one of {', '.join(KINDS)}.", path="kind")
-    refuse_idle(
-        LINEAR_OPTIONS,
-        kind,
-        {
-            "disturbance_bounds": disturbance_bounds, "noise_bound": noise_bound, "initial_error": initial_error,
-            "gamma": gamma, "window": window, "false_alarms": false_alarms, "change": change, "constants": constants,
-            "initial_set": initial_set,
-        },
-    )  # fmt: skip
-    window, false_alarms = WINDOW if window is None else window, FALSE_ALARMS if false_alarms is None else false_alarms
-    change = CHANGE if change is None else change
-    require_options(noise_bound, initial_error, gamma, window, false_alarms, change, isolation_delay)
+    given = {
+        "disturbance_bounds": disturbance_bounds, "noise_bound": noise_bound, "initial_error": initial_error,
+        "gamma": gamma, "window": window, "false_alarms": false_alarms, "change": change, "constants": constants,
+        "initial_set": initial_set,
+    }  # fmt: skip
+    window, false_alarms, change = checked_options(LINEAR_OPTIONS, kind, given, isolation_delay)
     if is_guaranteed(design):
-        return record_monitor(
-            design,
-            scenario,
-            kind,
-            disturbance_bounds=disturbance_bounds,
-            noise_bound=noise_bound,
-            initial_error=initial_error,
-            gamma=gamma,
-            constants=constants,
-            initial_set=initial_set,
-        )
+        return record_monitor(design, scenario, kind, given)
     design, adaptive = tolerances_of(design, constants, initial_set, initial_error)
     estimates = watches_estimates(design) and kind in ("pointwise", "window")
     model = residual_model(design, scenario, estimates=estimates)
@@ -200,28 +184,6 @@ def monitor(
         isolation_delay=isolation_delay,
         watches_estimates=estimates,
     )
-
-
-def require_options(
-    noise_bound: float | None,
-    initial_error: float | None,
-    gamma: float | None,
-    window: int,
-    false_alarms: float,
-    change: float,
-    isolation_delay: int,
-) -> None:
-    """Raise `SpecError` where an option of a monitor is out of range."""
-    for name, value in (("noise_bound", noise_bound), ("initial_error", initial_error), ("gamma", gamma)):
-        if value is not None and not (is_finite_number(value) and value >= 0.0):
-            raise SpecError(f"{name} is {value!r}: give a number, 0 or more.", path=name)
-    for name, count, least in (("window", window, 1), ("isolation_delay", isolation_delay, 0)):
-        if not is_whole(count) or count < least:
-            raise SpecError(f"{name} is {count!r}: give a whole number of samples, {least} or more.", path=name)
-    if not (is_finite_number(false_alarms) and 0.0 < false_alarms < 1.0):
-        raise SpecError(f"false_alarms is {false_alarms!r}: give a probability between 0 and 1.", path="false_alarms")
-    if not (is_finite_number(change) and change > 0.0):
-        raise SpecError(f"change is {change!r}: give a positive number of deviations.", path="change")
 
 
 def bounds_of(design: ObserverDesign, model: ResidualModel, given: Mapping[str, float] | None) -> FloatArray:
