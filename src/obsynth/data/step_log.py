@@ -71,6 +71,7 @@ class SteppingLogObserver(LogObserver):
     def _taken(self, y: FloatArray, u: FloatArray) -> StepRow | None:
         """Take one sample, or none of it: `None` where numbers are no finite ones any more."""
         before = self.state
+        found: StepRow
         try:
             with np.errstate(all="ignore"):
                 self.state, found = self.observer.accept(self.state, y, u)

@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import fields, replace
 from functools import cached_property
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,33 +17,36 @@ from obsynth.observers.outliers import Outliers, checked_limit, checked_state_bo
 from obsynth.observers.sensor_timing import SensorTiming, checked_sensors
 
 State = TypeVar("State")
-Row = TypeVar("Row", covariant=True)
-Known = TypeVar("Known")
+Row = TypeVar("Row")
 Kept = TypeVar("Kept", bound=tuple[Any, ...])
 Robust = TypeVar("Robust", bound=Any)
 #: Marks an array whose columns are contiguous: sums are rounded in another order there.
 BY_COLUMNS = "by columns"
 
 
-class Observer(Protocol[State, Row]):
+class Observer(ABC, Generic[State, Row]):
     """An observer: values alone, so that one serves any number of runs; a state is a tuple of plain arrays. `advance`
     is `step` without checks of the sample, and returns the row of numbers that the estimates are made of."""
 
+    @abstractmethod
     def init(self) -> State:
         """Return the state before the first sample."""
-        ...
 
+    @abstractmethod
     def advance(self, state: State, y: FloatArray, u: FloatArray) -> tuple[State, Row]:
         """Return the state after a sample, and what is known at it."""
-        ...
 
+    @abstractmethod
     def step(self, state: State, y: ArrayLike, u: ArrayLike = ()) -> tuple[State, Estimates]:
         """Check a sample; return the state after it, and the estimates at it."""
-        ...
+
+    def start(self) -> RunningObserver[State, Row]:
+        """Return a running observer, at k = 0."""
+        return RunningObserver(self)
 
 
-class StepSettings(ABC):
-    """What observers that take missing samples themselves have in common, besides a state."""
+class StepObserver(Observer[Any, Any]):
+    """An observer of states and parameters, which takes missing samples itself and states deviations."""
 
     plant: Any  # what it runs on
     outliers: Outliers
@@ -96,63 +99,54 @@ class StepSettings(ABC):
         """Whether every sensor is sampled at each row, at once, and no state has bounds."""
         return self.timing.is_plain and self.state_bounds is None
 
-
-class StepObserver(StepSettings, Generic[State, Known]):
-    """An observer of states and parameters, which takes missing samples itself and states deviations."""
-
     @property
     @abstractmethod
     def _steps(self) -> Any:
         """What follows from the observer alone, made once for all runs: a state `first`, and `advance`."""
 
-    def _allow(self, state: State) -> None:
+    def _allow(self, state: Any) -> None:
         """Raise where no sample can follow."""
 
-    def _trust(self, row: Known) -> None:
+    def _trust(self, row: Any) -> None:
         """Raise where a step cannot be trusted, and does not say so itself."""
 
     @abstractmethod
-    def _sample(self, state: State, y: ArrayLike, u: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    def _sample(self, state: Any, y: ArrayLike, u: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Return a sample, checked."""
 
     @abstractmethod
-    def _estimates(self, state: State, row: Known) -> Estimates:
+    def _estimates(self, state: Any, row: Any) -> Estimates:
         """Return the estimates of one sample."""
 
-    def shown(self, row: Known) -> Known:
+    def shown(self, row: Any) -> Any:
         """Return a row as it is shown, within the bounds of the states."""
         return row
 
-    def init(self) -> State:
+    def init(self) -> Any:
         """Return the state before the first sample, k = 0."""
-        found: State = self.timing.begun(self._steps.first)
-        return found
+        return self.timing.begun(self._steps.first)
 
-    def advance(self, state: State, y: FloatArray, u: FloatArray) -> tuple[State, Known]:
+    def advance(self, state: Any, y: FloatArray, u: FloatArray) -> tuple[Any, Any]:
         """Return the next state and what is known at a sample, without checking it (``y (ny,)``, ``u (nu,)``)."""
         after, row = self.timing.advance(self._steps.advance, state, y, u)
         return after, self.shown(row)
 
-    def accept(self, state: State, y: FloatArray, u: FloatArray) -> tuple[State, Known]:
+    def accept(self, state: Any, y: FloatArray, u: FloatArray) -> tuple[Any, Any]:
         """Return the same as `advance`, where the step is one that can be trusted (``y (ny,)``, ``u (nu,)``)."""
         after, row = self.timing.advance(self.in_order, state, y, u)
         return after, self.shown(row)
 
-    def in_order(self, state: State, y: FloatArray, u: FloatArray) -> tuple[State, Known]:
+    def in_order(self, state: Any, y: FloatArray, u: FloatArray) -> tuple[Any, Any]:
         """Take a sample whose values are all of its own time, as `accept` takes it (``y (ny,)``, ``u (nu,)``)."""
         self._allow(state)
         after, row = self._steps.advance(state, y, u)
         self._trust(row)
         return after, row
 
-    def step(self, state: State, y: ArrayLike, u: ArrayLike = ()) -> tuple[State, Estimates]:
+    def step(self, state: Any, y: ArrayLike, u: ArrayLike = ()) -> tuple[Any, Estimates]:
         """Return the state after a sample, and the estimates at it (``y (ny,)``, ``u (nu,)``)."""
         after, row = self.accept(state, *self._sample(state, y, u))
         return after, self._estimates(getattr(after, "latest", after), row)
-
-    def start(self) -> RunningObserver[State, Known]:
-        """Return a running observer, at k = 0."""
-        return RunningObserver(self)
 
 
 class RunningObserver(Generic[State, Row]):
@@ -206,7 +200,7 @@ class RunningObserver(Generic[State, Row]):
         return row
 
 
-def named_estimates(observer: StepSettings, *, states: FloatArray, faults: FloatArray, **known: Any) -> Estimates:
+def named_estimates(observer: StepObserver, *, states: FloatArray, faults: FloatArray, **known: Any) -> Estimates:
     """Return the estimates of an observer without delays; arrays are made read-only."""
     residuals = known.pop("residuals", np.zeros((*states.shape[:-1], 0)))
     arrays: dict[str, Any] = {name: value if value.dtype == bool else read_only(value) for name, value in known.items()}

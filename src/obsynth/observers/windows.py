@@ -21,6 +21,7 @@ from obsynth.observers.records import (
     require_names,
     whole_record,
 )
+from obsynth.observers.running import Observer
 
 
 class WindowState(NamedTuple):
@@ -31,7 +32,7 @@ class WindowState(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class WindowObserver:
+class WindowObserver(Observer[WindowState, float]):
     """A weighted sum of the last samples: which weights, says the number k of the row.
 
     Parameters

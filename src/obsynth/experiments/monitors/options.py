@@ -54,8 +54,8 @@ def checked_options(
         value = given[name]
         if value is not None and not (is_finite_number(value) and value >= 0.0):
             raise SpecError(f"{name} is {value!r}: give a number, 0 or more.", path=name)
-    defaults = {"window": WINDOW, "false_alarms": FALSE_ALARMS, "change": CHANGE}
-    window, false_alarms, change = (value if given[name] is None else given[name] for name, value in defaults.items())
+    defaults: dict[str, Any] = {"window": WINDOW, "false_alarms": FALSE_ALARMS, "change": CHANGE}
+    window, false_alarms, change = (defaults[name] if given[name] is None else given[name] for name in defaults)
     for name, count, least in (("window", window, 1), ("isolation_delay", isolation_delay, 0)):
         if not is_whole(count) or count < least:
             raise SpecError(f"{name} is {count!r}: give a whole number of samples, {least} or more.", path=name)

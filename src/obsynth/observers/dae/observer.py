@@ -21,7 +21,6 @@ from obsynth.observers.dae.steps import DAEState, Steps
 from obsynth.observers.estimates import Estimates
 from obsynth.observers.progress import shown_progress
 from obsynth.observers.records import measured_record
-from obsynth.observers.running import StepObserver
 from obsynth.plants.dae.checks import checked_inputs, require_known
 from obsynth.plants.dae.functions import Compiled, take_samples
 
@@ -89,7 +88,7 @@ def advanced(
     return state
 
 
-class DAEObserver(DAESettings, StepObserver[DAEState, DAERow]):
+class DAEObserver(DAESettings):
     """An observer: what `start` and `run` need, and nothing that depends on data.
 
     Parameters

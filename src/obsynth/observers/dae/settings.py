@@ -14,7 +14,7 @@ from obsynth.numerics.arguments import Count, ForgettingFactor, Positive, Probab
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.numerics.ranks import covariance_factor, is_definite
 from obsynth.observers.outliers import Outliers
-from obsynth.observers.running import StepSettings
+from obsynth.observers.running import StepObserver
 from obsynth.plants.dae.checks import finite_vector, step_length
 from obsynth.plants.dae.functions import BUTCHER
 from obsynth.plants.dae.model import DAEModel
@@ -27,7 +27,7 @@ _DEFINITE = ("R", "initial_parameter_covariance")
 
 
 @dataclass(frozen=True, eq=False)
-class DAESettings(StepSettings):
+class DAESettings(StepObserver):
     """The fields of `obsynth.DAEObserver`, which is these with its steps."""
 
     model: DAEModel

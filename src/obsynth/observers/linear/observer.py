@@ -16,7 +16,7 @@ from obsynth.numerics.arguments import is_whole
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.observers.estimates import Estimates
 from obsynth.observers.records import NAME_FIELDS, checked_sample, fields_from_data, require_names, whole_record
-from obsynth.observers.running import RunningObserver
+from obsynth.observers.running import Observer, RunningObserver
 
 
 class LinearState(NamedTuple):
@@ -26,7 +26,7 @@ class LinearState(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class LinearObserver:
+class LinearObserver(Observer[LinearState, FloatArray]):
     r"""A realisation from known inputs and outputs to estimates.
 
     .. math::

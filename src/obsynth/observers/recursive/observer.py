@@ -23,12 +23,11 @@ from obsynth.observers.recursive.compiled_run import kernel_is_chosen, run_compi
 from obsynth.observers.recursive.estimates import RawEstimate, RecursiveState, recursive_estimates
 from obsynth.observers.recursive.recursion import Recursion
 from obsynth.observers.recursive.settings import Adaptation, RecursiveSettings
-from obsynth.observers.running import StepObserver
 from obsynth.plants.sequences import MatrixSequence
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 
 
-class RecursiveObserver(RecursiveSettings, StepObserver[RecursiveState, RawEstimate]):
+class RecursiveObserver(RecursiveSettings):
     """A recursive observer: what `start` and `run` need, and nothing that depends on data.
 
     Parameters

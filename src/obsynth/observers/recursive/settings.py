@@ -13,7 +13,7 @@ from obsynth.numerics.arguments import Count, ForgettingFactor, Probability, che
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.numerics.ranks import covariance_factor, rounding_rank
 from obsynth.observers.outliers import Outliers
-from obsynth.observers.running import StepSettings
+from obsynth.observers.running import StepObserver
 from obsynth.plants.sequences import MatrixSequence
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 
@@ -77,7 +77,7 @@ class Adaptation:
 
 
 @dataclass(frozen=True, eq=False)
-class RecursiveSettings(StepSettings):
+class RecursiveSettings(StepObserver):
     """The fields of `obsynth.RecursiveObserver`, which is these with a recursion."""
 
     plant: TimeVaryingDescriptorSystem
