@@ -48,7 +48,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if item.path.name in NUMERIC:
             item.add_marker(pytest.mark.numerics)
-        if "share" in getattr(item, "fixturenames", ()):
+        drawn = getattr(getattr(item, "function", None), "is_hypothesis_test", False)
+        if drawn or "share" in getattr(item, "fixturenames", ()):
             item.add_marker(pytest.mark.sampled)
 
 

@@ -1,13 +1,19 @@
 """One profile for every property: the same examples in each run, and no clock in the verdict."""
 
+import pytest
 from hypothesis import HealthCheck, settings
 
-settings.register_profile(
-    "obsynth",
-    deadline=None,
-    derandomize=True,
-    database=None,
-    max_examples=15,
-    suppress_health_check=[HealthCheck.too_slow],
-)
-settings.load_profile("obsynth")
+#: Examples of each property with ``--whole``, and without: CI runs both.
+EXAMPLES, FEWER = 15, 5
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    settings.register_profile(
+        "obsynth",
+        deadline=None,
+        derandomize=True,
+        database=None,
+        max_examples=EXAMPLES if config.getoption("--whole") else FEWER,
+        suppress_health_check=[HealthCheck.too_slow],
+    )
+    settings.load_profile("obsynth")

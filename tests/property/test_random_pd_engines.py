@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ from pd_plants import build, random_recipe
 
 import obsynth
 
+Share = Callable[..., Sequence[Any]]
 ENGINES = ("lmi", "riccati")
 FAMILIES: Mapping[str, dict[str, Any]] = {
     "random": {},
@@ -46,9 +47,9 @@ def outcome(plant: obsynth.DescriptorSystem, engine: str, **options: Any) -> tup
 
 @pytest.mark.parametrize("theorem", [1, 2])
 @pytest.mark.parametrize("family", FAMILIES)
-def test_where_there_is_an_observer_every_engine_finds_one(family: str, theorem: int) -> None:
+def test_where_there_is_an_observer_every_engine_finds_one(family: str, theorem: int, share: Share) -> None:
     replaced = 0
-    for plant in plants_of(family)[:: 1 if theorem == 1 else 4]:
+    for plant in share(plants_of(family), 2)[:: 1 if theorem == 1 else 4]:
         for engine in ENGINES:
             kind, ran = outcome(plant, engine, theorem=theorem)
             # Where the semidefinite solver gives up, the closed form takes its place.
@@ -64,8 +65,8 @@ def test_where_there_is_none_every_engine_says_why(mode: complex) -> None:
 
 
 @pytest.mark.parametrize("delta", [1e-2, 20.0])
-def test_theorem_1_has_a_solution_for_every_delta_by_every_engine(delta: float) -> None:
-    for plant in plants_of("random"):
+def test_theorem_1_has_a_solution_for_every_delta_by_every_engine(delta: float, share: Share) -> None:
+    for plant in share(plants_of("random"), 2):
         for engine in ENGINES:
             assert outcome(plant, engine, delta=delta, decay=0.0) == ("found", engine)
 

@@ -41,9 +41,10 @@ def may_exist(plant):
     return all(condition.holds for condition in method_class("fault-estimation-filter")().existence(plant))
 
 
-def test_every_sparse_plant_is_solved_or_refused_with_its_condition():
+def test_every_sparse_plant_is_solved_or_refused_with_its_condition(share):
     solved, refused, failures = 0, 0, []
-    for seed in range(120):
+    seeds = share(range(120), 2)
+    for seed in seeds:
         plant = sparse_plant(seed)
         exists = may_exist(plant)
         if seed % 4 == 0:
@@ -59,7 +60,7 @@ def test_every_sparse_plant_is_solved_or_refused_with_its_condition():
         assert design.report.passed
         solved += 1
     assert failures == []
-    assert solved >= 60, (solved, refused)
+    assert solved >= 0.5 * len(seeds), (solved, refused)
 
 
 def test_plants_of_algebraic_equations_alone():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 import scipy.linalg
@@ -16,7 +17,7 @@ KINDS = ("generic", "masked", "fixed stable", "fixed unstable", "undecouplable",
 MODELS = ("step", "ramp", {"sinusoid": 1.3}, {"exponential": 0.4}, {"exponential": -0.4}, {"polynomial": 2})
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Case:
     """A random plant, its fault model, and what was planted."""
 
@@ -25,6 +26,7 @@ class Case:
     kind: str
 
 
+@cache
 def random_case(seed: int) -> Case:
     """Return the plant of a seed."""
     rng = np.random.default_rng([2026, seed])
@@ -112,6 +114,7 @@ def eigenvalue_of(model: object, dt: float) -> complex:
     return complex(phi[0, 0]) if not np.any(np.tril(phi, -1)) else complex(np.linalg.eigvals(phi)[0])
 
 
+@cache
 def brute_force(case: Case) -> tuple[bool, np.ndarray]:
     """Return whether an observer exists, and all drops of the augmented pencil.
 
