@@ -175,3 +175,79 @@ def test_a_wrong_constant_is_named_with_the_value_that_explains_the_log(tank_des
     assert not found.passed
     explained = next(sentence for sentence in found.verdict if "explains it best" in sentence or "constant" in sentence)
     assert "c" in explained
+
+
+def walking_tank(walk: float, *, jump: float = 0.0, samples: int = 400, seed: int = 5) -> dict[str, np.ndarray]:
+    """A log of the tank above whose valve clogs: by a random walk of this deviation in a sample, and at once."""
+    rng = np.random.default_rng(seed)
+    inflow = np.repeat(0.1 + 0.05 * rng.random(samples // 20 + 1), 20)[:samples]
+    level, clog, gauge = 1.0, 0.0, np.zeros(samples)
+    for k in range(samples):
+        if k:
+            clog += walk * rng.normal() + (jump if k == samples // 2 else 0.0)
+            c, held = 0.1 * (1.0 - clog), level + inflow[k]
+            level = ((-c + np.sqrt(c * c + 4.0 * held)) / 2.0) ** 2
+        gauge[k] = level + 0.01 * rng.normal()
+    return {"time": np.arange(float(samples)), "inflow": inflow, "gauge": gauge}
+
+
+def walking_design(tank_design, walk: float, form: str = "augmented-kalman", R: float = 1e-4):
+    return dae_adaptive_observer(
+        tank_design.plant, dt=1.0, Q={"balance": 1e-8}, R={"gauge": R}, initial_covariance=[[1e-4]], form=form,
+        initial_parameter_covariance=[[1e-6]], random_walk=[[walk**2]],
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("form", ["augmented-kalman", "random-walk"])
+@pytest.mark.parametrize("walk", [0.003, 0.3])
+def test_a_walk_that_is_stated_large_is_no_disagreement(tank_design, form, walk):
+    """A walk is what a fault may do: innovations of rows without one are smaller than with it, and not white."""
+    found = validate(walking_design(tank_design, walk, form), walking_tank(0.0))
+    assert found.passed, str(found)
+    assert any("no walk of clog" in sentence for sentence in found.verdict)
+    # What is wrong beside the walk is still told, by its factor.
+    wrong = validate(walking_design(tank_design, walk, form, R=1e-4 / 8.0), walking_tank(0.0))
+    assert not wrong.passed
+    assert 5.0 < wrong.ratios["gauge"] < 12.0
+
+
+def test_a_parameter_that_walks_as_stated_agrees(tank_design):
+    log = walking_tank(0.02)
+    found = validate(walking_design(tank_design, 0.02), log)
+    assert found.passed, str(found)
+    assert found.ratios == {}
+    assert not any("walk of clog" in sentence for sentence in found.verdict)
+    # Sixteen times the variance that it has, and the sensor's variance an eighth of what it is.
+    wide = validate(walking_design(tank_design, 0.08), log)
+    assert wide.passed, str(wide)
+    assert any("of the variance by which clog may walk" in sentence for sentence in wide.verdict)
+    wrong = validate(walking_design(tank_design, 0.02, R=1e-4 / 8.0), log)
+    assert not wrong.passed
+    assert 5.0 < wrong.ratios["gauge"] < 12.0
+
+
+def test_a_fault_that_is_further_off_than_it_may_walk_is_told(tank_design):
+    found = validate(walking_design(tank_design, 1e-3), walking_tank(0.0, jump=0.5))
+    assert not found.passed
+    assert any("clog ends" in sentence and "not free of faults" in sentence for sentence in found.verdict)
+    # Where it may walk so far nobody can say more than that it did.
+    near = validate(walking_design(tank_design, 0.1), walking_tank(0.0, jump=0.5))
+    assert any("no further than it may walk" in sentence for sentence in near.verdict)
+
+
+def test_the_walk_of_a_recursive_design_is_judged_like_that_too():
+    rng, x, rows = np.random.default_rng(4), 0.0, []
+    for _ in range(300):
+        rows.append([1.0, x + 0.01 * rng.standard_normal()])
+        x = 0.9 * x + 0.1 + 0.001 * rng.standard_normal()
+    u, y = np.array(rows).T
+    plant = obsynth.TimeVaryingDescriptorSystem(
+        [[1.0]], [[0.9]], [[0.1]], [[1.0]], Phi=[[1.0]], dt=1.0, input_names=["u"], output_names=["y"],
+        parameter_names=["f"],
+    )  # fmt: skip
+    for walk in (1e-10, 1e-2):
+        design = obsynth.adaptive_observer(
+            plant, Q=[[1e-6]], R=[[1e-4]], form="random-walk", random_walk=[[walk]], initial_state=[0.0],
+            initial_covariance=[[1e-4]], initial_parameters=[0.0], initial_parameter_covariance=[[1e-4]],
+        )  # fmt: skip
+        assert validate(design, {"time": np.arange(300.0), "u": u, "y": y}).passed

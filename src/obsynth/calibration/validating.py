@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from obsynth.analysis.transformations.noise import with_noise
 from obsynth.calibration.diagnostics import (
     SIGNIFICANT,
     SensorValidation,
@@ -25,6 +26,7 @@ from obsynth.calibration.problem import Problem
 from obsynth.calibration.reporting import IntegrationError, integration_error
 from obsynth.calibration.simulation_error import Fit
 from obsynth.calibration.step_graphs import sample_graphs
+from obsynth.calibration.walks import likeliest_shares, shared_walk, stated_walk, told_shares, with_walk
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import FloatArray, read_only
@@ -52,6 +54,12 @@ class RecordedInnovations:
     def standardised(self) -> FloatArray:
         """Innovations in their own deviations ``(n, ny)``, NaN where nothing was measured."""
         return np.asarray(self.innovations / self.deviations)
+
+    @property
+    def loss(self) -> float:
+        """Negative log likelihood of each sensor's innovations, in nats, up to a constant."""
+        whole = 0.5 * self.standardised**2 + np.log(self.deviations)
+        return float(whole[np.isfinite(whole)].sum())
 
 
 def recorded_innovations(design: ObserverDesign, log: Log) -> RecordedInnovations:
@@ -117,17 +125,35 @@ CLEARLY_MORE = 1.25
 TOLD_FACTOR = 1.5
 
 
-def noise_ratios(observer: DAEObserver, log: Log) -> tuple[Mapping[str, float], float]:
-    """Return likeliest over designed variance for each that the log contradicts, parameters at their start; and the
-    nats that the likeliest ones gain."""
+@dataclass(frozen=True)
+class NoiseRatios:
+    """Likeliest over designed variance for each that the log contradicts, the nats that the likeliest ones gain, and
+    the walk of the parameters ``(nq, nq)`` that goes with them, at most the one that is stated."""
+
+    ratios: Mapping[str, float]
+    gain: float
+    walk: FloatArray
+
+
+def noise_ratios(observer: DAEObserver, log: Log) -> NoiseRatios:
+    """Return what a log says of the variances of a design, parameters at their start, or as they walk."""
     model = observer.model
     held = model.replace(parameters=dict(zip(model.parameter_names, observer.initial_parameters, strict=True)))
     designed_Q, designed_R = np.diag(observer.Q), np.diag(observer.R)
     noisy = tuple(name for name, variance in zip(model.equation_names, designed_Q, strict=True) if variance > 0.0)
-    names = (*noisy, *model.output_names)
-    designed = np.concatenate([designed_Q[designed_Q > 0.0], designed_R])
-    nothing, free_Q = np.zeros(0), np.full(len(noisy), np.nan)
-    plant = NonlinearPlant(held)
+    walk = observer.random_walk if stated_walk(observer).any() else np.zeros((model.nq, model.nq))
+    walking = np.diag(walk) > 0.0
+    if walking.any() and not held.is_data:
+        # Equations given as functions take no further states.
+        return NoiseRatios({}, 0.0, walk)
+    walks = dict(zip(np.array(model.parameter_names)[walking].tolist(), np.diag(walk)[walking].tolist(), strict=True))
+    made: Any = with_noise(held, walks=walks)[0] if walks else held
+    names = (*noisy, *walks, *model.output_names)
+    # What is added to the equation of a state that walks acts during the whole step.
+    designed = np.concatenate([designed_Q[designed_Q > 0.0], np.diag(walk)[walking] / log.dt**2, designed_R])
+    nothing, start = np.zeros(0), np.concatenate([observer.initial_state, observer.initial_parameters[walking]])
+    unsure = observer.initial_parameter_covariance[np.ix_(walking, walking)]
+    plant = NonlinearPlant(made)
     graphs = sample_graphs(plant, (), log.dt, integration=observer.integration, substeps=1, samples=log.samples)
     quanta = np.array([quantum(column) for column in log.y.T])
     problem = Problem(
@@ -140,32 +166,40 @@ def noise_ratios(observer: DAEObserver, log: Log) -> tuple[Mapping[str, float], 
         nothing,
         nothing,
         nothing,
-        noisy,
-        free_Q,
+        (*noisy, *walks),
+        np.full(len(noisy) + len(walks), np.nan),
         np.full(model.ny, np.nan),
-        np.array(observer.initial_state),
-        np.array(observer.initial_covariance),
+        start,
+        np.block(
+            [
+                [observer.initial_covariance, np.zeros((model.nx, len(walks)))],
+                [np.zeros((len(walks), model.nx)), unsure],
+            ]
+        ),
         quanta,
         LEAST_RATIO * designed_R,
         graphs,
         observer.integration,
         1,
     )
-    fit = Fit(nothing, np.array(observer.initial_state), np.sqrt(designed_R), 0.0, np.zeros((0, 0)))
+    fit = Fit(nothing, start, np.sqrt(designed_R), 0.0, np.zeros((0, 0)))
     objective = Objective(problem, fit)
     try:
         best = greatest_likelihood(objective, [fit], lambda text: None)
     except PreconditionError:
         # Without a likelihood nothing can be told of its variances.
-        return {}, 0.0
+        return NoiseRatios({}, 0.0, walk)
     found = {}
     for i, (name, variance) in enumerate(zip(names, designed, strict=True)):
         ratio = float(np.exp(best.z[i]) / variance)
         z = best.z.copy()
         z[i] = np.log(variance)
-        if max(ratio, 1.0 / ratio) > TOLD_FACTOR and objective(z)[0] - best.value > CLEAR_NATS:
+        if name not in walks and max(ratio, 1.0 / ratio) > TOLD_FACTOR and objective(z)[0] - best.value > CLEAR_NATS:
             found[name] = ratio
-    return found, objective(np.log(designed))[0] - best.value
+    shares = np.ones(model.nq)
+    likeliest = np.exp(best.z[len(noisy) : len(noisy) + len(walks)] - np.log(designed[len(noisy) :][: len(walks)]))
+    shares[walking] = np.minimum(likeliest, 1.0)
+    return NoiseRatios(found, objective(np.log(designed))[0] - best.value, shared_walk(walk, shares))
 
 
 #: A mean of innovations, or a parameter's deviation from its start, beyond so many standard deviations is told.
@@ -229,24 +263,29 @@ def validate(
             f"The log has {found.samples} rows here: at least {LEAST_ROWS} are needed.", path="rows", code="too-short"
         )
     found = found.shifted(design.input_delay).without(wrong_samples(found.y))
-    record = recorded_innovations(design, found)
+    estimates = recorded_innovations(design, found).estimates
+    design, told = _as_far_as_it_walks(design, found)
+    far_off, near = _far(estimates, design, found.samples)
+    notes = [*found.notes, *told, *near]
+    record = replace(recorded_innovations(design, found), estimates=estimates)
     sensors = _sensors(record, plant.output_names)
     whole = consistency(record.squares, record.degrees)
     coloured = not _white(sensors)
     place = change_of_mean(whitened(record.standardised) if coloured else record.standardised)
     change = None if place is None else found.rows[0] + place
-    ratios, gain = noise_ratios(design.observer, found) if isinstance(design.observer, DAEObserver) else ({}, 0.0)
+    said = noise_ratios(design.observer, found) if isinstance(design.observer, DAEObserver) else None
+    ratios = {} if said is None else said.ratios
     others = _explanations(design, found, record) if coloured else ()
-    if coloured and ratios and isinstance(design.observer, DAEObserver):
+    if coloured and ratios and said is not None and isinstance(design.observer, DAEObserver):
         # Wrong variances colour the innovations too: with the likeliest ones they are white, and nothing explains more.
-        likeliest = recorded_innovations(design.replace(observer=_with_variances(design.observer, ratios)), found)
+        likeliest = recorded_innovations(design.replace(observer=_with_variances(design.observer, said)), found)
         rival = CLEARLY_MORE * others[0].gain if others else 0.0
-        coloured = not _white(_sensors(likeliest, plant.output_names)) or rival > gain
+        coloured = not _white(_sensors(likeliest, plant.output_names)) or rival > said.gain
         ratios = {} if coloured else ratios
-    verdict = [*found.notes, *_sentences(sensors, ratios, change, record, design, coloured=coloured)]
+    verdict = [*notes, *_sentences(sensors, ratios, change, far_off, coloured=coloured)]
     if coloured:
         verdict.append(_explained(others))
-    passed = not verdict[len(found.notes) :] and whole.holds
+    passed = not verdict[len(notes) :] and whole.holds
     if not passed and not whole.holds and not ratios and not coloured:
         far = "small" if whole.value > whole.high else "large"
         verdict.append(
@@ -277,6 +316,20 @@ def validate(
     )
 
 
+def _as_far_as_it_walks(design: ObserverDesign, log: Log) -> tuple[ObserverDesign, list[str]]:
+    """Return the design with as much of the walk of its parameters as the log shows, and what is said of that."""
+    observer = design.observer
+    walk = stated_walk(observer)
+    if not walk.any() or not isinstance(observer, (DAEObserver, RecursiveObserver)):
+        return design, []
+
+    def with_another(tried: FloatArray) -> ObserverDesign:
+        return design.replace(observer=with_walk(observer, tried))
+
+    shares = likeliest_shares(walk, lambda tried: recorded_innovations(with_another(tried), log).loss)
+    return with_another(shared_walk(walk, shares)), told_shares(design.observer.fault_names, walk, shares)
+
+
 def states_innovations(design: ObserverDesign) -> bool:
     """Whether a design predicts its outputs with a covariance, which a log could contradict."""
     return not isinstance(design.observer, (LinearObserver, WindowObserver))
@@ -296,8 +349,7 @@ def _sentences(
     sensors: Mapping[str, SensorValidation],
     ratios: Mapping[str, float],
     change: int | None,
-    record: RecordedInnovations,
-    design: ObserverDesign,
+    far: Mapping[str, float],
     *,
     coloured: bool,
 ) -> list[str]:
@@ -323,7 +375,7 @@ def _sentences(
             f"The mean of the innovations changes at row {change}: these rows are not free of faults"
             + (", or something that is not in the model changes there." if coloured else ".")
         )
-    for name, deviation in _far(record.estimates, design).items():
+    for name, deviation in far.items():
         found.append(
             f"The estimate of {name} ends {deviation:.1f} deviations from its nominal value: a constant is "
             f"wrong, {'coloured noise moves it, ' if coloured else ''}or the rows are not free of faults."
@@ -335,11 +387,12 @@ def _white(sensors: Mapping[str, SensorValidation]) -> bool:
     return all(sensor.whiteness.probability >= SIGNIFICANT for sensor in sensors.values())
 
 
-def _with_variances(observer: DAEObserver, ratios: Mapping[str, float]) -> DAEObserver:
+def _with_variances(observer: DAEObserver, said: NoiseRatios) -> DAEObserver:
     """Return the observer with the likeliest variances on a log, where these are told."""
-    q = [ratios.get(name, 1.0) for name in observer.model.equation_names]
-    r = [ratios.get(name, 1.0) for name in observer.model.output_names]
-    return replace(observer, Q=np.diag(np.diag(observer.Q) * q), R=np.diag(np.diag(observer.R) * r))
+    q = [said.ratios.get(name, 1.0) for name in observer.model.equation_names]
+    r = [said.ratios.get(name, 1.0) for name in observer.model.output_names]
+    Q, R = np.diag(np.diag(observer.Q) * q), np.diag(np.diag(observer.R) * r)
+    return replace(observer, Q=Q, R=R, random_walk=said.walk)
 
 
 def _explanations(design: ObserverDesign, log: Log, record: RecordedInnovations) -> tuple[Explanation, ...]:
@@ -372,14 +425,29 @@ def _explained(told: Sequence[Explanation]) -> str:
     return f"What explains it best, by likelihood: {listed}. The factors of Q and R say nothing until then."
 
 
-def _far(estimates: Mapping[str, FloatArray], design: ObserverDesign) -> dict[str, float]:
-    start = dict(zip(design.observer.fault_names, getattr(design.observer, "initial_parameters", ()), strict=False))
-    found = {}
+def _far(
+    estimates: Mapping[str, FloatArray], design: ObserverDesign, samples: int
+) -> tuple[dict[str, float], list[str]]:
+    """Return by how many deviations each parameter's estimate ends off its start, where that is further than it walks;
+    and a sentence for each that walks so far."""
+    observer, walk = design.observer, stated_walk(design.observer)
+    start = dict(zip(observer.fault_names, getattr(observer, "initial_parameters", ()), strict=False))
+    variances = np.diag(walk) if walk.size else np.zeros(len(start))
+    walked = dict(zip(start, np.sqrt(samples * variances), strict=True))
+    found, told = {}, []
     for name, columns in estimates.items():
         value, deviation = columns[-1]
-        if name in start and deviation > 0.0 and abs(value - start[name]) > OFFSET * deviation:
-            found[name] = float(abs(value - start[name]) / deviation)
-    return found
+        if name not in start or not deviation > 0.0 or not abs(value - start[name]) > OFFSET * deviation:
+            continue
+        off = float(abs(value - start[name]) / deviation)
+        if abs(value - start[name]) > OFFSET * np.hypot(deviation, walked[name]):
+            found[name] = off
+        else:
+            told.append(
+                f"The estimate of {name} ends {off:.1f} deviations from its nominal value, no further than it may "
+                "walk: if it is a fault, these rows are not free of it."
+            )
+    return found, told
 
 
 def _times(factor: float) -> str:
