@@ -76,9 +76,9 @@ def test_rounded_up_covers_its_roundings(operations):
 
 
 @pytest.mark.parametrize("kind", RANGES)
-def test_products_contain_every_product_of_members(kind):
+def test_products_contain_every_product_of_members(kind, share):
     rng = np.random.default_rng(1)
-    for _ in range(1000):
+    for _ in share(range(1000)):
         rows, length, columns = rng.integers(1, 6, 3)
         left = random_ball(rng, (rows, length), RANGES[kind][0])
         right = random_ball(rng, (length, columns), RANGES[kind][1])
@@ -88,9 +88,9 @@ def test_products_contain_every_product_of_members(kind):
 
 
 @pytest.mark.parametrize("kind", RANGES)
-def test_sums_contain_every_sum_of_members(kind):
+def test_sums_contain_every_sum_of_members(kind, share):
     rng = np.random.default_rng(2)
-    for _ in range(1000):
+    for _ in share(range(1000)):
         shape = tuple(rng.integers(1, 6, 2))
         left, right = (random_ball(rng, shape, exponents) for exponents in RANGES[kind])
         first, second = some_member(rng, left), some_member(rng, right)
