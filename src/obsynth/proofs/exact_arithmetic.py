@@ -12,13 +12,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
-from math import frexp
+from math import frexp, gcd, lcm
 from typing import Any, TypeAlias
 
 import flint
 import numpy as np
 from flint import fmpq, fmpq_mat, fmpq_poly, fmpz, fmpz_mat, fmpz_poly
-from numpy.typing import NDArray
 
 from obsynth.numerics.arrays import FloatArray
 
@@ -66,24 +65,26 @@ def null_basis(matrix: fmpq_mat) -> fmpq_mat:
 def with_integer_entries(E: fmpq_mat, A: fmpq_mat) -> tuple[fmpz_mat, fmpz_mat]:
     """Return two matrices ``(m, n)`` with common rows and columns multiplied by rationals, so that all are integers."""
     rows, columns = int(A.nrows()), int(A.ncols())
-    table = np.array([E.tolist(), A.tolist()], dtype=object).reshape(2, rows, columns)
-    for i in range(rows):
-        table[:, i] /= _common_factor(table[:, i])
+    table = [_coprime(_over_one_denominator([*e, *a])) for e, a in zip(E.tolist(), A.tolist(), strict=True)]
     for j in range(columns):
-        table[:, :, j] /= _common_factor(table[:, :, j])
-    # Columns may have brought denominators back; rows are cleared for good.
-    for i in range(rows):
-        table[:, i] /= _common_factor(table[:, i])
-    e, a = ([fmpz(value.p) for value in part.ravel()] for part in table)
+        common = gcd(*(row[k] for row in table for k in (j, columns + j)))
+        if common > 1:
+            for row in table:
+                row[j], row[columns + j] = row[j] // common, row[columns + j] // common
+    table = [_coprime(row) for row in table]
+    e, a = ([value for row in table for value in row[part]] for part in (slice(columns), slice(columns, None)))
     return fmpz_mat(rows, columns, e), fmpz_mat(rows, columns, a)
 
 
-def _common_factor(values: NDArray[np.object_]) -> fmpq:
-    """Return the number that divides all of these into coprime integers."""
-    numerator, denominator = fmpz(0), fmpz(1)
-    for value in values.ravel():
-        numerator, denominator = numerator.gcd(value.p), denominator.lcm(value.q)
-    return fmpq(numerator, denominator) if numerator else fmpq(1)
+def _over_one_denominator(values: Sequence[fmpq]) -> list[int]:
+    denominators = [int(value.q) for value in values]
+    common = lcm(*denominators)
+    return [int(value.p) * (common // own) for value, own in zip(values, denominators, strict=True)]
+
+
+def _coprime(values: list[int]) -> list[int]:
+    common = gcd(*values)
+    return [value // common for value in values] if common > 1 else values
 
 
 #: Bits of the whole number that, times a power of two, is a double.

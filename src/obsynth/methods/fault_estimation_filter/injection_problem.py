@@ -72,6 +72,8 @@ class GainProblem:
     weight_limit: WeightLimit | None = None
     judged_exactly: bool = True
     _modes: WeakKeyDictionary[Injection, Modes] = field(default_factory=WeakKeyDictionary, init=False, repr=False)
+    _radii: WeakKeyDictionary[Injection, float] = field(default_factory=WeakKeyDictionary, init=False, repr=False)
+    _gains: WeakKeyDictionary[Injection, float] = field(default_factory=WeakKeyDictionary, init=False, repr=False)
 
     @property
     def order(self) -> int:
@@ -139,8 +141,10 @@ class GainProblem:
         return self._modes[solution]
 
     def radius(self, solution: Injection) -> float:
-        """Return the spectral radius of the closed loop."""
-        return self.modes(solution).radius
+        """Return the spectral radius of the closed loop; asked for once, as it takes all modes."""
+        if solution not in self._radii:
+            self._radii[solution] = self.modes(solution).radius
+        return self._radii[solution]
 
     def reaches(self, solution: Injection, level: float) -> bool:
         """Return whether the norm d -> xi is at most ``level``."""
@@ -150,8 +154,10 @@ class GainProblem:
 
     def achieved_gain(self, solution: Injection) -> float:
         """Return the H-infinity norm d -> xi with the given gains: the largest peak found, or the norm itself."""
-        judge = highest_gain_found if self.judged_exactly else largest_peak
-        return judge(*self.closed_loop(solution), modes=self.modes(solution))
+        if solution not in self._gains:
+            judge = highest_gain_found if self.judged_exactly else largest_peak
+            self._gains[solution] = judge(*self.closed_loop(solution), modes=self.modes(solution))
+        return self._gains[solution]
 
 
 @dataclass(frozen=True, eq=False)
