@@ -220,13 +220,13 @@ same = [replace(design.observer, form=form, forgetting=1.0).run(truth.outputs, u
 print("lambda = 1: the same to 1e-12:", bool(np.abs(same[0] - same[1]).max() < 1e-12))
 
 # %% [markdown]
-# Accuracy over twenty trials with other noise, from 100 s on, and processor time for 1,000 steps. `run_batch` runs all
+# Accuracy over eight trials with other noise, from 100 s on, and processor time for 1,000 steps. `run_batch` runs all
 # trials of an observer, as C where there are enough of them and a compiler. The walk of the parameters has the same
 # covariance in both filters that have one.
 
 # %%
 outputs = [
-    obsynth.simulate_dae(model, u, dt=1.0, parameters=faults, seed=10 + trial, **noise).outputs for trial in range(20)
+    obsynth.simulate_dae(model, u, dt=1.0, parameters=faults, seed=10 + trial, **noise).outputs for trial in range(8)
 ]
 walk = np.diag([(3e-3) ** 2, 100.0**2])
 rivals = {

@@ -17,6 +17,8 @@
 # design an observer, and run it over the whole log. `designs/threetank/NOTES.md` names the source of the data.
 
 # %%
+from dataclasses import replace
+
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
@@ -123,8 +125,7 @@ sides = [(found.box.low[name], found.box.high[name]) for name in found.names]
 ends = []
 for corner in np.array(np.meshgrid(*sides)).reshape(len(sides), -1).T:
     at = model.replace(constants={**model.constants, **dict(zip(found.names, corner, strict=True))})
-    other = obsynth.dae_adaptive_observer(at, Q=found.Q, R=found.R, **options)
-    there = other.observer.run(
+    there = replace(design.observer, model=at).run(
         log[["v1", "v2", "v3"]].to_numpy(), log[["u1_held", "u3_held"]].to_numpy(), progress=False
     )
     ends.append(there.parameters[110:150, 0].mean())

@@ -66,11 +66,14 @@ def kernel() -> Iterator[KernelManager]:
 
 
 def begin_anew(kernel: KernelManager, folder: Path) -> None:
-    """Forget all names and counts, and go to a folder."""
+    """Forget all names and counts, go to a folder, and draw each picture once: to cut its margins it is drawn twice."""
     client = kernel.client()
     client.start_channels()
     client.wait_for_ready(timeout=60)
-    code = f"__import__('os').chdir({str(folder)!r}); get_ipython().reset(new_session=True)"
+    code = (
+        "get_ipython().run_line_magic('config', 'InlineBackend.print_figure_kwargs = {\"bbox_inches\": None}');"
+        f"__import__('os').chdir({str(folder)!r}); get_ipython().reset(new_session=True)"
+    )
     done = client.execute_interactive(code, store_history=False, timeout=60)
     client.stop_channels()
     assert done["content"]["status"] == "ok"
