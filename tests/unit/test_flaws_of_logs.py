@@ -187,6 +187,80 @@ def test_nothing_is_decided_while_a_gap_is_forgotten_whatever_the_warm_up(start:
     assert run.alarms == {}
 
 
+@functools.cache
+def pointwise(name: str) -> tuple[obsynth.ObserverDesign, Any]:
+    design = drive() if name == "drive" else designed(name)
+    (disturbance,) = design.plant.disturbance_names
+    return design, obsynth.online_monitor(design, disturbance_bounds={disturbance: 0.2}, noise_bound=3**0.5)
+
+
+def turning(design: obsynth.ObserverDesign, *, rows: int = 330, fault: float = 0.0) -> pd.DataFrame:
+    """A log whose disturbance changes its sign at row 250, where a fault begins, too."""
+    plant = design.linear[0]
+    x, y, u = np.zeros(plant.nx), [], np.sign(np.sin(2 * np.pi * np.arange(rows) / 100))
+    for k in range(rows):
+        y.append(plant.C @ x)
+        sign = 1.0 if k < 250 else -1.0
+        x = plant.A @ x + plant.B @ u[k : k + 1] + plant.Bd @ [0.2 * sign] + plant.Bf @ [fault * (k >= 250)]
+    signals = dict(zip(plant.output_names, np.array(y).T, strict=True))
+    return pd.DataFrame({"time": np.arange(rows) * plant.dt, plant.input_names[0]: u, **signals})
+
+
+@pytest.mark.parametrize("blank", [(0,), (1,), (0, 1)])
+@pytest.mark.parametrize("name", ["drive", *METHODS[1:]])
+def test_a_pointwise_threshold_grows_by_what_missing_outputs_hide_and_decides_at_once(name: str, blank: Any) -> None:
+    design, monitor = pointwise(name)
+    data = turning(design)
+    data.loc[250:269, [design.plant.output_names[i] for i in blank]] = np.nan
+    run = obsynth.run_on_data(design, data, monitor=monitor)
+    assert run.table is not None
+    assert run.alarms == {}
+    after = run.table[data.index >= 270]
+    assert np.isfinite(after["statistic"]).all()
+    assert set(run.silent) == {"warm-up", "gap"}
+    # The bound without the gap would have been passed by a log without a fault.
+    assert after["statistic"].max() > monitor.rule.limit or name == "fault-estimation-filter"
+    assert monitor.rule.limit < after["threshold"].iloc[-1] < after["threshold"].max()
+
+
+def test_a_fault_is_told_in_rows_that_were_blind_after_a_gap() -> None:
+    design, monitor = pointwise("drive")
+    data = turning(design, fault=20.0)
+    data.loc[255:257, ["motor speed"]] = np.nan
+    run = obsynth.run_on_data(design, data, monitor=monitor)
+    assert run.table is not None
+    told = run.table.index[run.table["alarm"] != ""]
+    assert run.table["status"][258] == "recovering"
+    assert 258 in told
+
+
+def test_what_a_pointwise_threshold_has_grown_by_goes_on_over_a_saved_state(tmp_path: Path) -> None:
+    design, monitor = pointwise("ui-pi-observer")
+    data, state = turning(design), tmp_path / "state.json"
+    data.loc[250:252, "a"] = data.loc[258, "b"] = np.nan
+    whole = obsynth.run_on_data(design, data, monitor=monitor).table
+    parts = [obsynth.run_on_data(design, data.iloc[rows], monitor=monitor, state=state).table
+             for rows in (slice(0, 251), slice(251, 255), slice(255, None))]  # fmt: skip
+    pd.testing.assert_frame_equal(whole, pd.concat(parts, ignore_index=True))
+
+
+def test_a_pointwise_threshold_waits_where_nothing_bounds_what_is_missing() -> None:
+    design, monitor = pointwise("drive")
+    data = turning(design)
+    holed = data.copy()
+    holed.loc[250, "torque"] = np.nan
+    # A row that is left out has no inputs either.
+    for flawed_log in (holed, data.drop(index=250)):
+        table = obsynth.run_on_data(design, flawed_log, monitor=monitor).table
+        assert table is not None
+        assert np.isnan(table["statistic"].to_numpy()[251])
+        assert np.isfinite(table["statistic"].iloc[-1])
+    waits = obsynth.online_monitor(motor("spec"), sample_time=0.005, disturbance_bounds={"load torque": 1.0},
+                                   noise_bound=3.0)  # fmt: skip
+    assert "nothing is decided, as between samples of a continuous design" in waits.statement
+    assert "larger by what the plant's model may have missed" in monitor.statement
+
+
 def test_a_bound_of_the_noise_needs_noise_that_is_stated() -> None:
     plant = obsynth.DescriptorSystem(
         E=np.eye(2), A=[[0.9, 0.1], [0, 0.8]], B=[[0], [1]], C=np.eye(2), Bf=[[0], [1]], Bd=[[1], [0]], dt=1.0,

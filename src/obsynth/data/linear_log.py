@@ -30,7 +30,7 @@ SAMPLED_GAP = "gap is for continuous-time designs: a sampled one knows which row
 #: What goes from row to row.
 SAVED = (
     *("z", "v", "row", "model", "fault", "inputs", "measured", "seen"),
-    *("forgotten_at", "begun", "changes", "counted", "left", "held", "excess", "carried"),
+    *("forgotten_at", "begun", "changes", "counted", "left", "held", "excess", "carried", "known_from", "bridged"),
 )
 _Part = TypeVar("_Part")
 
@@ -150,6 +150,8 @@ class LinearLogObserver(LogObserver):
         self.seen = np.full(width, np.nan)
         # Since when nothing is left of a gap: bounds that are never passed hold from there on.
         self.forgotten_at, self.begun = -math.inf, False
+        # Since when the start is forgotten, and whether the model has stood in for all that was missing from there on.
+        self.known_from, self.bridged = math.inf, False
         # Squares of changes of fault estimates and residuals from row to row, summed up, and how many there are.
         self.shown = slice(len(self.observer.state_names), None)
         self.changes, self.counted = np.zeros(len(self.observer.Cz[self.shown])), 0
@@ -193,6 +195,7 @@ class LinearLogObserver(LogObserver):
                 self._restart()
             if good and self.z is None:
                 self.z, self.settled_at, self.phase = np.zeros(self.observer.order), time + self.warm_up, WARM_UP
+                self.known_from = time + max(self.warm_up, self.transient)
                 if self.begun:
                     self.forgotten_at = time + max(self.warm_up, self.transient)
                 self.begun = True
@@ -216,7 +219,7 @@ class LinearLogObserver(LogObserver):
                 found, status = self._unmeasured(seconds, u, values), GAP
         if status == GAP:
             self.settled_at += since if self.phase == WARM_UP else 0.0
-            return Row(GAP, found, missing)
+            return Row(GAP, found, missing, bridged=self.bridged)
         if self.z is None or not (np.isfinite(self.z).all() and np.isfinite(found).all()):
             self._restart()
             return Row(GAP, self._held(), missing)
@@ -226,7 +229,12 @@ class LinearLogObserver(LogObserver):
         if previous is not None and counts and not missing:
             self._count((found - previous)[None])
         sample = LinearSample(found, values[: self.nu], values[self.nu :], len(self.state_names))
-        return Row(status, found, missing, sample, time >= self.forgotten_at, self._excess_in(status))
+        return self._complete_row(status, found, missing, sample, time)
+
+    def _complete_row(self, status: str, found: FloatArray, missing: int, sample: LinearSample, time: float) -> Row:
+        self.bridged |= time >= max(self.forgotten_at, self.known_from)
+        forgotten = time >= self.forgotten_at
+        return Row(status, found, missing, sample, forgotten, self._excess_in(status), self.bridged)
 
     def _excess_in(self, status: str) -> FloatArray | None:
         """Return what gaps can have left in the columns of a complete row, of one that is recovering."""
@@ -282,13 +290,12 @@ class LinearLogObserver(LogObserver):
         self.fault = self._faults_in(rows[last])
         self.seen = self._states(states[last], values[last], rows[last], self.fault)
         self.inputs = np.vstack([self.inputs, values[:count, : self.nu]])[-self.kept_inputs :]
-        settled, phase, forgotten = self.settled_at, self.phase, self.forgotten_at
+        settled, phase = self.settled_at, self.phase
         nu, nx, found = self.nu, len(self.state_names), list[Row]()
         for time, seconds, row, v in zip(times[:count], intervals[:count], rows[:count], values[:count], strict=True):
-            status = OK if time >= settled else phase
             self._advance_excess(seconds)
             said = LinearSample(row, v[:nu], v[nu:], nx)
-            found.append(Row(status, row, 0, said, time >= forgotten, self._excess_in(status)))
+            found.append(self._complete_row(OK if time >= settled else phase, row, 0, said, time))
         return found
 
     def _measured(self, seconds: float, v: FloatArray) -> FloatArray:
@@ -406,6 +413,7 @@ class LinearLogObserver(LogObserver):
             self._propagate(seconds, u)
         # What is measured is taken; what is not, the model says.
         told = ~np.isfinite(values)
+        self.bridged &= not told[: self.nu].any()
         v = np.where(told, np.concatenate([u, self.gap_model.outputs(self.model, u, self.fault)]), values)
         if (told[: self.nu] & self.left[:, : self.nu].any(axis=0)).any():
             # What an input has done in more than one row is not known.
@@ -435,6 +443,7 @@ class LinearLogObserver(LogObserver):
         self.inputs = self.inputs[:0]
         self.excess, self.carried = np.zeros_like(self.excess), np.zeros_like(self.carried)
         self.settled_at, self.phase = math.inf, WARM_UP
+        self.known_from, self.bridged = math.inf, False
 
     def _held(self) -> FloatArray:
         row = np.full(len(self.observer.Cz), np.nan)

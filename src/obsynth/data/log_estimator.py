@@ -54,6 +54,7 @@ class Row(NamedTuple):
     # What a gap has left in each value of a row that is recovering, where the model missed by no more all through it
     # than at its end; infinite where that is not known.
     excess: FloatArray | None = None
+    bridged: bool = False  # whether the plant's model stood in for all that was missing since the start was forgotten
     time: float = math.nan  # in seconds
     deviations: FloatArray | None = None  # ``(nu + ny,)`` as read
 

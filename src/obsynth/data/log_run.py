@@ -241,8 +241,8 @@ class LogRun:
             return np.full(0 if self.recovered is None else len(self.recovered.columns), np.nan)
         return self.recovered.take(row)
 
-    def _decided(self, row: Row, values: FloatArray, number: int, said: Sequence[Any]) -> list[Any]:
-        """Return statistic and threshold, if there is a monitor, and what alarms there are; ``said``: cells so far."""
+    def _decided(self, row: Row, values: FloatArray, number: int, before: Sequence[Any]) -> list[Any]:
+        """Return statistic and threshold, if there is a monitor, and what alarms there are; ``before``: other cells."""
         time = row.time
         if row.status in STALE:
             self.events.silent[row.status] += 1
@@ -262,17 +262,17 @@ class LogRun:
         undecided = not deciding and not above
         if self.monitor is not None:
             deciding = deciding and (row.forgotten or not self.monitor.guarantees)
+            if self.monitor.rule.bridges and row.bridged:
+                deciding = row.status in (*DECIDING, RECOVERING)
             residuals, faults = row.values[self._residuals], row.values[self._faults]
-            sample = Sample(time, residuals, faults, self._evidence(row), deciding, row.skipped)
+            sample = Sample(time, residuals, faults, self._evidence(row), deciding, row.skipped, row.bridged)
             self._watching, seen = self.monitor.step(self._watching, sample)
             more = seen.more or (math.nan,) * len(self.monitor.columns)
             cells = [*(np.array(more) + self._shifts).tolist(), seen.statistic, seen.threshold]
-            undecided = (undecided and not self.monitor.rule.takes_gaps) or (
-                not self._levels and math.isnan(seen.statistic)
-            )
+            undecided = math.isnan(seen.statistic) and (undecided or not self._levels)
             if seen.alarm:
                 evidence = seen.statistic / seen.threshold if seen.threshold else math.inf
-                self.events.take(self.monitor.kind, seen.fault, evidence, time, number, [*said, *cells])
+                self.events.take(self.monitor.kind, seen.fault, evidence, time, number, [*before, *cells])
                 if self.monitor.kind not in self.alarms:
                     self.alarms[self.monitor.kind], self.isolated = time, seen.fault
                     self.alarm_rows[self.monitor.kind] = number
@@ -280,7 +280,7 @@ class LogRun:
         for name, evidence in above:
             if evidence > 1.0:
                 fault = name[5:-1] if name.startswith("fhat[") else ""
-                self.events.take(name, fault, evidence, time, number, [*said, *cells])
+                self.events.take(name, fault, evidence, time, number, [*before, *cells])
         if undecided:
             self.events.silent[row.status if row.status not in DECIDING else NO_DECISION] += 1
         return [*cells, "; ".join(names)]

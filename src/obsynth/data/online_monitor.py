@@ -19,6 +19,7 @@ from obsynth.experiments.monitors.adaptive_monitor import (
     tolerances_of,
 )
 from obsynth.experiments.monitors.adaptive_rule import AdaptiveRule
+from obsynth.experiments.monitors.gap_growth import GapGrowth, gap_growth
 from obsynth.experiments.monitors.guaranteed import data_monitor, is_guaranteed
 from obsynth.experiments.monitors.learned import LearnedThresholds, learned_monitor, load_thresholds
 from obsynth.experiments.monitors.monitor import KINDS, Monitor, Rule, statement_of
@@ -41,6 +42,8 @@ from obsynth.simulation.scenario import Scenario
 _FORGOTTEN = ", once the start is forgotten (the warm-up)"
 _AFTER_A_GAP = " (after a gap likewise)"
 _FROM_THE_FIRST = "; from the first row on, after a gap once that is forgotten"
+_GROWS = "; after missing outputs larger by what the plant's model may have missed"
+_WAITS = "; while a gap is being forgotten nothing is decided, as {reason}"
 _NOT_CLOSER = "; rows are no closer than {dt} s"
 _REGULAR = "; no row is further than {dt} s from the last"
 
@@ -160,8 +163,10 @@ def online_monitor(
         if adaptive:
             return _adaptive(design, scenario, norm, model, bounds, noise_bound, initial_error, initial_set, dt)
         _require_above_zero(limit)
-        rule = norm
+        gaps = gap_growth(model, bounds, noise_bound) if kind == "pointwise" else ""
+        rule = norm.over_gaps(gaps) if isinstance(gaps, GapGrowth) else norm
         ending = (_FORGOTTEN if initial_error is None else _AFTER_A_GAP) + _more_words(kind, model, limit, dt)
+        ending += _WAITS.format(reason=gaps) if isinstance(gaps, str) and gaps else _GROWS * bool(gaps)
     else:
         rule = _whitened(kind, model, bounds if scenario is None else None, window, change, false_alarms, dt)
         ending = ANY_LENGTH

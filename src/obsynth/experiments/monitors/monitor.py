@@ -125,6 +125,7 @@ class Sample(NamedTuple):
     said: Evidence | LinearSample | None  # by the observer; nothing in a gap
     deciding: bool = True  # whether a decision may be taken: not in gaps, and not while a start is being forgotten
     skipped: int = 0  # rows that were missing before this one
+    bridged: bool = False  # whether the plant's model stood in for all that was missing since the start was forgotten
 
 
 class Judged(NamedTuple):
@@ -167,6 +168,8 @@ class Rule(ABC):
     columns: tuple[str, ...] = ()
     #: Whether it takes rows with missing samples (NaN) too.
     takes_gaps: bool = False
+    #: Whether its threshold knows what outputs that were missing have left, and holds right after a gap.
+    bridges: bool = False
 
     @abstractmethod
     def init(self) -> RuleState:
@@ -295,7 +298,8 @@ class Monitor:
             The row.
         """
         inner = state.rule
-        if sample.skipped or (state.decided and not sample.deciding):
+        bridged = self.rule.bridges and sample.bridged
+        if not bridged and (sample.skipped or (state.decided and not sample.deciding)):
             inner = self.rule.restart(inner, sample.skipped)
         inner, (statistic, threshold, which, more) = self.rule.step(inner, sample)
         after = MonitorState(sample.deciding, inner)

@@ -108,6 +108,7 @@ class ResidualModel:
     sensor_noise: tuple[FloatArray, FloatArray] | None = None  # noise drawn as straight lines, to e' and r
     continuous: ContinuousDesign | None = None
     sampled: BetweenSamples | None = None
+    errors: ErrorModel | None = None  # of a plant on samples, with the noise of the scenario
 
     @property
     def initial_error(self) -> float:
@@ -236,6 +237,7 @@ def residual_model(
         heard,
         continuous,
         between,
+        errors if plant.is_discrete else None,
     )
 
 

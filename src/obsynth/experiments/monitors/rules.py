@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from copy import copy
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.experiments.monitors.between_samples import InputResponse
+from obsynth.experiments.monitors.gap_growth import GapGrowth, GapState
 from obsynth.experiments.monitors.monitor import Judged, Monitor, Rule, Sample
 from obsynth.experiments.monitors.thresholds import UnlimitedHorizonBound
 from obsynth.numerics.arguments import is_finite_number
@@ -49,6 +51,7 @@ class NormState(NamedTuple):
     driven: FloatArray | None = None
     inputs: FloatArray | None = None
     moved: bool = False
+    gap: GapState | None = None  # what outputs that were missing have left
 
 
 class NormRule(Rule):
@@ -69,13 +72,23 @@ class NormRule(Rule):
         watched: slice | None = None,
         driven: InputResponse | None = None,
     ) -> None:
+        self.gaps: GapGrowth | None = None
         self.table, self.limit, self.irregular = table, limit, irregular
         self._regular = UnlimitedHorizonBound(table, limit)
         self._window, self._dt, self._watched, self._driven = window, dt, watched, driven
 
+    def over_gaps(self, gaps: GapGrowth) -> NormRule:
+        """Return the rule that knows what missing outputs add after them: it need not wait until they are forgotten."""
+        found = copy(self)
+        found.gaps, found.bridges, found.takes_gaps = gaps, True, True
+        return found
+
     def init(self) -> NormState:
         """Return the state before the first sample."""
-        return NormState(driven=None if self._driven is None else self._driven.start())
+        return NormState(
+            driven=None if self._driven is None else self._driven.start(),
+            gap=None if self.gaps is None else self.gaps.start(),
+        )
 
     def fold(self, state: NormState, residuals: FloatArray) -> tuple[NormState, Any]:
         """Return the state and the norm of the window after residuals ``(..., nr)``."""
@@ -110,6 +123,9 @@ class NormRule(Rule):
         if state.late or (state.moved and not regular):
             threshold = math.inf
         threshold += math.hypot(*state.added)
+        if self.gaps is not None and state.gap is not None:
+            gap, grown = self.gaps.after(state.gap, sample) if sample.bridged else (self.gaps.start(), 0.0)
+            state, threshold = state._replace(gap=gap), threshold + grown
         if not sample.deciding:
             return state, Judged(math.nan, threshold)
         state, value = self.fold(state, sample.residuals if self._watched is None else said.rows[self._watched])
@@ -129,7 +145,8 @@ class NormRule(Rule):
 
     def restart(self, state: NormState, skipped: int = 0) -> NormState:
         """Begin again: the error at a new start is taken to be no larger than that at the first."""
-        return state._replace(norms=(), added=(), begin=None, last=None, regular=True, late=False)
+        gap = None if self.gaps is None else self.gaps.start()
+        return state._replace(norms=(), added=(), begin=None, last=None, regular=True, late=False, gap=gap)
 
     def options(self) -> float:
         """Return the limit: it depends on all options."""
