@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import subprocess
 from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
-from test_dae_c_export import run_c
+from test_dae_c_export import FLAGS, run_c
 from test_validate import designed
 
-from obsynth import dae_adaptive_observer, simulate_dae
+import obsynth
+from obsynth import SpecError, dae_adaptive_observer, simulate_dae
 
 pytestmark = pytest.mark.usefixtures("taken_as_verified")
 OPTIONS = {
@@ -98,6 +100,55 @@ def test_each_option_in_c_does_what_it_does_in_python(form, name, tmp_path) -> N
     plain = replace(design.observer, outliers="none", reset=0.0, state_bounds=None, sensors=None)
     assert np.abs(plain.run(y, u).states - expected.states).max() > 1e-6
     assert_same(run_c(design, y, u, tmp_path), expected)
+
+
+#: All that single precision has to carry beside the plain filter; no reset, which counts squares of innovations.
+WIDE = {"state_bounds": {"h1": [0.0, 5.0], "h2": [0.0, 5.0], "h3": [-1.0, 5.0]}}
+FLOATS = {"plain": {}, "all": {**OPTIONS["gate"], **WIDE, **OPTIONS["late"]}}
+
+
+@pytest.mark.parametrize("name", FLOATS)
+def test_floats_keep_near_doubles_and_say_how_near_they_were_measured(name, tmp_path) -> None:
+    design = tank_observer("forgetting", FLOATS[name])
+    source, header = obsynth.export(design, tmp_path / "tank.c", precision="float", warm_up=0.0)
+    said = header.read_text().splitlines()[0]
+    assert said.startswith('/* "Floats: measured, not proved: the largest error against double precision in 2 records')
+    stated = {part.split()[0]: float(part.split()[1]) for part in said.split("): ")[1].split(";")[0].split(", ")}
+    assert list(stated) == ["xhat[h1]", "xhat[h2]", "xhat[h3]", "fhat[leak]"]
+    assert all(0.0 < error < 1e-4 for error in stated.values())
+    kept = [line for text in (source, header) for line in text.read_text().splitlines() if "double" in line]
+    assert all("time" in line or "warm_up" in line or line == said for line in kept)
+    y, u = (part[:110] for part in leaking(design))
+    y[60, 1] = 1e30  # no float is larger than 3e38
+    if name == "plain":
+        y[[20, 33, 60], [1, 0, 1]] = y[60, 2] = np.nan
+    (tmp_path / "run.c").write_text(
+        '#include "tank.h"\n#include <stdio.h>\nint main(void) { static tank_state s; tank_estimates e; float in[5];\n'
+        "tank_reset(&s); while (fread(in, 4, 5, stdin) == 5) { int i, failed = tank_step(&s, in, in + 2, &e);\n"
+        "float end = (float)failed; for (i = 0; i < 3; i++) fwrite(&e.states[i], 4, 1, stdout);\n"
+        "fwrite(&e.faults[0], 4, 1, stdout); fwrite(&end, 4, 1, stdout); } return 0; }\n"
+    )
+    command = ["cc", *FLAGS, source, tmp_path / "run.c", "-o", tmp_path / "run", "-lm"]
+    subprocess.run(command, check=True)
+    given = np.hstack([u, y]).astype(np.float32)
+    done = subprocess.run([tmp_path / "run"], input=given.tobytes(), capture_output=True, check=True)
+    found = np.frombuffer(done.stdout, np.float32).reshape(len(y), 5).astype(float)
+    exact = given.astype(float)
+    expected = design.observer.run(exact[:, 2:], exact[:, :2])
+    # Another record than those it was measured on, of which 1e6 and blanks are part: within some times as much.
+    gaps = np.abs(found[:, :4] - np.hstack([expected.states, expected.faults])).max(axis=0)
+    assert (gaps <= 30.0 * np.array(list(stated.values()))).all()
+
+
+def test_floats_are_refused_where_they_cannot_carry_an_observer_or_nobody_can_measure(tmp_path, monkeypatch) -> None:
+    design = tank_observer("forgetting", {})
+    exact = replace(design, observer=replace(design.observer, Q=1e-22 * np.eye(3), R=1e-20 * np.eye(3)))
+    with pytest.raises(SpecError, match="does not carry"):
+        obsynth.export(exact, tmp_path / "tank.c", precision="float", unverified=True)
+    monkeypatch.setenv("CC", "no-such-compiler")
+    with pytest.raises(SpecError, match="C compiler"):
+        obsynth.export(design, tmp_path / "tank.c", precision="float")
+    assert not list(tmp_path.iterdir())
 
 
 def test_bounds_that_many_states_break_at_once_and_one_that_is_known_exactly(tmp_path) -> None:

@@ -30,6 +30,7 @@ from obsynth.exporting.c_source import (
     template,
     with_c_linkage,
 )
+from obsynth.exporting.dae_float import float_error, in_floats
 from obsynth.exporting.realisation import verification_words
 from obsynth.files.outputs import write_together
 from obsynth.observers.dae.c_code import observer_code, observer_struct
@@ -50,13 +51,12 @@ def write_dae_c(
             f"{target}: the observer of a nonlinear plant is no matrices; it is exported as C (.c).", path=str(target)
         )
     require_no_sample_time(design, sample_time)
-    if precision != "double":
-        raise SpecError(
-            "The steps of a nonlinear observer are solved to more digits than a float has: leave precision at double.",
-            path="precision",
-        )
     prefix, header = c_identifier(target.stem), target.with_suffix(".h")
     source, declarations, _ = dae_c_texts(design, prefix, header.name, alarms)
+    if precision == "float":
+        source, declarations = in_floats(source), in_floats(declarations)
+        said = float_error(design, prefix, source, declarations)
+        declarations = f"{comment(quoted(said))}\n{declarations}"
     return write_together({target: source, header: with_c_linkage(declarations, prefix)})
 
 

@@ -96,7 +96,8 @@ def export(
         are those of a run), for ``.c`` and ``.fmu``; or with ``constants``, its thresholds over the tolerances as
         ``<stem>_thresholds_step``, for constants that stay the same; for ``.c`` only.
     precision : {"double", "float"}, optional
-        Of the numbers in C, of linear observers; the header of floats bounds what these change.
+        Of the numbers in C; the header of floats bounds what these change for linear observers, and says what was
+        measured for nonlinear ones (which takes a C compiler).
     unverified : bool, optional
         Whether a design whose report fails is written all the same, with a mark in the file that says so.
 
