@@ -34,13 +34,19 @@ def options(design: Any) -> dict[str, Any]:
     return {"disturbance_bounds": {"w": 0.1}, "initial_set": start_set(design)}
 
 
-def test_faults_are_proved_and_certificates_hold(design, tmp_path) -> None:
-    for seed in (1, 2):
-        u, y = record(design, seed, fault=0.2)
-        found = proved_alarm(design, u[:34], y[:34], **options(design))
-        assert found.proved
-        assert found.margin > 0.0
-        assert "a fault since" in found.statement or "without a fault since" in found.statement
+@pytest.fixture(scope="module")
+def found(design: Any) -> Any:
+    """Return the proof of a fault from a record's first rows."""
+    u, y = record(design, 1, fault=0.2)
+    return proved_alarm(design, u[:34], y[:34], **options(design))
+
+
+def test_faults_are_proved_and_certificates_hold(design, found, tmp_path) -> None:
+    u, y = record(design, 2, fault=0.2)
+    for one in (found, proved_alarm(design, u[:34], y[:34], **options(design))):
+        assert one.proved
+        assert one.margin > 0.0
+        assert "a fault since" in one.statement or "without a fault since" in one.statement
     file = found.save(tmp_path / "alarm.json")
     report = obsynth.verify_alarm(file)
     assert report.passed
@@ -62,9 +68,7 @@ def test_healthy_windows_are_never_proved_faulty(make) -> None:
 
 
 @pytest.mark.parametrize("change", ["y", "margin", "below", "bounds", "statement", "window", "tolerance"])
-def test_changed_certificates_fail(design, tmp_path, change: str) -> None:
-    u, y = record(design, 1, fault=0.2)
-    found = proved_alarm(design, u[:34], y[:34], **options(design))
+def test_changed_certificates_fail(found, tmp_path, change: str) -> None:
     content = json.loads(found.save(tmp_path / "alarm.json").read_text())
     body = content["certificate"]
     if change == "y":
@@ -91,9 +95,8 @@ def test_changed_certificates_fail(design, tmp_path, change: str) -> None:
     assert not obsynth.verify_alarm(file).passed
 
 
-def test_a_certificate_with_another_digest_fails(design, tmp_path) -> None:
-    u, y = record(design, 1, fault=0.2)
-    file = proved_alarm(design, u[:34], y[:34], **options(design)).save(tmp_path / "alarm.json")
+def test_a_certificate_with_another_digest_fails(found, tmp_path) -> None:
+    file = found.save(tmp_path / "alarm.json")
     file.write_text(file.read_text().replace('"row": 34', '"row": 33'))
     assert not obsynth.verify_alarm(file).passed
 
@@ -107,10 +110,9 @@ def resigned(content: dict[str, Any], file: Any) -> Any:
     return file
 
 
-def test_the_gain_set_inside_is_verified_too(design, tmp_path) -> None:
+def test_the_gain_set_inside_is_verified_too(design, found, tmp_path) -> None:
     """Claims, plant and tolerances of the gain set in a certificate fail it by name, digests made to fit."""
     u, y = record(design, 1, fault=0.2)
-    found = proved_alarm(design, u[:34], y[:34], **options(design))
     text = found.save(tmp_path / "alarm.json").read_text()
     for path in (("observer", "By"), ("plant", "Bf"), ("certificate", "claims")):
         content = json.loads(text)
@@ -176,10 +178,8 @@ def test_the_sentence_tells_bounds_start_constants_and_log(tmp_path) -> None:
         obsynth.verify_alarm(tmp_path / "old.json")
 
 
-def test_digest_row_and_margin_are_judged_by_themselves(design, tmp_path) -> None:
+def test_digest_row_and_margin_are_judged_by_themselves(found, tmp_path) -> None:
     """A smaller margin and another row are harmless or wrong in themselves; the digest tells the first."""
-    u, y = record(design, 1, fault=0.2)
-    found = proved_alarm(design, u[:34], y[:34], **options(design))
     text = found.save(tmp_path / "alarm.json").read_text()
     content = json.loads(text)
     content["certificate"]["margin"] *= 0.5

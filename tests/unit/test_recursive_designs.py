@@ -178,6 +178,7 @@ def linear_file() -> Path:
 
 
 class TestBatch:
+    @pytest.mark.usefixtures("taken_as_verified")
     @pytest.mark.parametrize("name", FORMS)
     def test_trials_are_runs(self, name: str) -> None:
         observer = obsynth.adaptive_observer(varying(horizon=60), **NOISE, window=10, **FORMS[name]).observer

@@ -98,6 +98,7 @@ def test_late_values_of_a_nonlinear_plant(form) -> None:
     np.testing.assert_array_equal(rows, found.states)
 
 
+@pytest.mark.usefixtures("taken_as_verified")
 def test_a_log_with_slow_and_late_sensors(tmp_path) -> None:
     """A row without a value that is not due is no partial one; a run goes on from its state; the gain set keeps it."""
     y, u = record()
@@ -125,6 +126,7 @@ def test_a_log_with_slow_and_late_sensors(tmp_path) -> None:
     np.testing.assert_array_equal(both.states[0], expected.states)
 
 
+@pytest.mark.usefixtures("taken_as_verified")
 def test_a_simulation_measures_when_the_sensors_do() -> None:
     made = kalman(sensors=SENSORS)
     scenario = Scenario(horizon=20.0, inputs={"u1": Step(size=1.0, start=5.0)}, noise=1.0, seed=3)
@@ -199,6 +201,7 @@ def test_the_projection_is_the_nearest_point(seed, singular) -> None:
     assert own @ own <= best.fun * (1.0 + 1e-5) + 1e-9
 
 
+@pytest.mark.usefixtures("taken_as_verified")
 def test_bounds_hold_and_bring_no_estimate_further_from_the_truth() -> None:
     """The recursion goes on without them, so that innovations and covariances are those of the plain filter."""
     y, u = record()
@@ -243,6 +246,7 @@ def test_bounds_of_a_nonlinear_plant_are_where_the_next_step_begins() -> None:
         assert np.isfinite(found.state_deviations).all()
 
 
+@pytest.mark.usefixtures("taken_as_verified")
 def test_what_is_refused_by_name(tmp_path) -> None:
     y, u = record()
     bounded, late = kalman(state_bounds={"x1": [-1.0, 1.0]}), kalman(sensors={"y1": {"every": 2}})
