@@ -56,7 +56,7 @@ def test_what_was_found_reads_as_a_table_and_as_data(measured):
 
 def test_a_kink_of_the_model_at_the_maximum_spoils_no_box(measured):
     """With a start between the pairs of levels the likelihood's slope jumps at its maximum (abs of a difference)."""
-    found = calibrate(tanks(), LOG, BOUNDS, rows="0:56", starts=1)
+    found = calibrate(tanks(), LOG, BOUNDS, rows="0:56", starts=1, input_delay=1)
     assert found.undetermined == ()
     for name in BOUNDS:
         width = measured.box.high[name] - measured.box.low[name]

@@ -63,7 +63,7 @@ def test_a_start_that_only_the_first_innovations_show() -> None:
     F = 5.0 * np.repeat(np.random.default_rng(3).choice([-1.0, 1.0], 34), 12)[:400, None]
     y = np.array(simulate_dae(model, F, dt=0.2, R=1e-4 * np.eye(1), seed=2, initial_state=[0.0, 0.0]).outputs)[:, 0]
     log = {"time": 0.2 * np.arange(400), "F": F[:, 0], "pos": y}
-    found = calibrate(model, log, {"M": (0.5, 5.0), "k": (10.0, 200.0), "c": (0.1, 10.0)}, starts=1)
+    found = calibrate(model, log, {"M": (0.5, 5.0), "k": (10.0, 200.0), "c": (0.1, 10.0)}, starts=1, input_delay=0)
     assert found.box.holds({"M": 2.0, "k": 50.0, "c": 1.5})
     assert found.fault_free
     assert found.nis.holds
@@ -76,7 +76,7 @@ def test_single_samples_that_are_no_measurements_are_told_and_left_out() -> None
         column[[140, 141]] = -4e4
         return column
 
-    found = calibrate(circuit(), circuit_log(vm=wrong), WIDE, starts=1)
+    found = calibrate(circuit(), circuit_log(vm=wrong), WIDE, starts=1, input_delay=0)
     assert found.box.holds(TRUE)
     assert found.nis.holds
     assert said(found, "3 value(s) of vm are far from all others and count as not measured (row 77: 1e+06, row 140")
@@ -89,7 +89,7 @@ def test_a_sample_that_stands_out_is_named() -> None:
         column[77] += 0.3
         return column
 
-    found = calibrate(circuit(), circuit_log(vm=wrong), WIDE, starts=1)
+    found = calibrate(circuit(), circuit_log(vm=wrong), WIDE, starts=1, input_delay=0)
     assert said(found, "Samples of vm stand out by more than 6 deviations (row 77)")
     # The gate of a design stands between the samples that are none and this one.
     assert found.outlier_limit is not None
@@ -123,11 +123,11 @@ def test_short_errors_of_steps_that_add_up_take_radau() -> None:
     y = np.array(simulate_dae(model, u, dt=5.0, R=0.01 * np.eye(1), seed=5).outputs)[:, 0]
     log = {"time": 5.0 * np.arange(250), "q": u[:, 0], "Tin": u[:, 1], "Ts": y}
     unknown = {"V": (0.05, 0.3), "H": (1e4, 2e5)}
-    found = calibrate(model, log, unknown, starts=1)
+    found = calibrate(model, log, unknown, starts=1, input_delay=0)
     assert found.integration == "radau"
     assert said(found, "of its own: Radau is taken")
     assert found.box.holds({"V": 0.1, "H": 5e4})
-    euler = calibrate(model, log, unknown, starts=1, integration="backward-euler")
+    euler = calibrate(model, log, unknown, starts=1, integration="backward-euler", input_delay=0)
     assert not euler.box.holds({"V": 0.1, "H": 5e4})
 
 
@@ -168,7 +168,7 @@ def test_another_unit_of_one_sensor_of_a_linear_plant_is_refused() -> None:
     y = np.array(rows)
     log = {"time": np.arange(150.0), "u1": u, "y1": y[:, 0], "y2": y[:, 1]}
     unknown = {"p": (0.1, 1.2), "c": (0.0, 2.0), "b": (0.1, 3.0)}
-    assert calibrate(plant, log, unknown, starts=1).box.holds({"p": 0.9, "c": 0.5, "b": 1.0})
+    assert calibrate(plant, log, unknown, starts=1, input_delay=0).box.holds({"p": 0.9, "c": 0.5, "b": 1.0})
     with pytest.raises(PreconditionError, match=r"y1: .* times what the model says") as caught:
         calibrate(plant, {**log, "y1": 1000.0 * y[:, 0]}, unknown, starts=1)
     assert caught.value.code == "explains-nothing"

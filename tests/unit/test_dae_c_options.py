@@ -8,6 +8,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+import test_dae_c_export
 from test_dae_c_export import FLAGS, run_c
 from test_validate import designed
 
@@ -32,6 +33,14 @@ BOTH = {**OPTIONS["gate"], **OPTIONS["reset"], **LATER, **OPTIONS["late"]}
 
 
 tanks = cache(designed)
+
+
+@pytest.fixture(autouse=True)
+def _compiled_in_less_time(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Warnings that take an optimiser are looked for where everything is at once."""
+    if "everything" not in request.node.name:
+        fast = ["-O0" if flag == "-O1" else flag for flag in test_dae_c_export.FLAGS]
+        monkeypatch.setattr(test_dae_c_export, "FLAGS", fast)
 
 
 def tank_observer(form: str, options: dict):

@@ -155,7 +155,7 @@ def level_of(values: FloatArray, every: float) -> float:
     streams = _apart(values)
     rows = np.atleast_2d(values)[:, SETTLING:].size
     allowed = rows / every
-    order = np.argsort(-streams, kind="stable")[: max(min(int(4 * HOLD * allowed), rows), 1)]
+    order = _highest(streams, max(min(int(4 * HOLD * allowed), rows), 1))
     if allowed < 1.0:
         return float(streams[order[0]])
 
@@ -170,6 +170,14 @@ def level_of(values: FloatArray, every: float) -> float:
         middle = (low + high) // 2
         low, high = (middle, high) if alarms(middle) <= allowed else (low, middle)
     return float(streams[order[high - 1]])
+
+
+def _highest(values: FloatArray, count: int) -> NDArray[np.int64]:
+    """Return the places of so many highest values, the highest first; of equal ones the first comes first."""
+    below = -values
+    # Only these need an order: the others are many.  What is no number is no less than any, and comes last.
+    places = np.flatnonzero(~(below > np.partition(below, count - 1)[count - 1]))
+    return places[np.argsort(below[places], kind="stable")][:count]
 
 
 class Tail(NamedTuple):
