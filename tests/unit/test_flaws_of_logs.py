@@ -639,3 +639,29 @@ def test_rows_after_a_missing_sample_count_by_no_more_than_the_observer_says() -
         if k == 151:
             assert np.linalg.norm(state.white[-1]) <= 0.5 + 1e-12
     assert np.linalg.norm(state.white[-1]) > 5.0
+
+
+def test_linear_observers_run_in_batches_and_say_what_decides_of_them() -> None:
+    design = designed("fault-estimation-filter")
+    observer, rng = design.linear[1], np.random.default_rng(2)
+    y, u = rng.standard_normal((3, 20, 2)), rng.standard_normal((20, 1))
+    batch = obsynth.run_batch(observer, y, u)
+    for i in range(3):
+        alone = observer.run(y[i], u)
+        for name in ("states", "faults", "residuals"):
+            np.testing.assert_array_equal(getattr(batch, name)[i], getattr(alone, name))
+    each = obsynth.run_batch(observer, y, np.stack([u, 2.0 * u, u]))
+    np.testing.assert_array_equal(each.faults[1], observer.run(y[1], 2.0 * u).faults)
+    y[1, 4, 0] = np.nan
+    with pytest.raises(obsynth.SpecError, match="y"):
+        obsynth.run_batch(observer, y, u)
+    with pytest.raises(obsynth.SpecError, match="compiled"):
+        obsynth.run_batch(observer, y[:1], u, compiled=True)
+    for what in (design, None):
+        with pytest.raises(obsynth.SpecError, match=r"design\.observer"):
+            obsynth.run_batch(what, y[:1], u)
+    for what in (design, observer):
+        with pytest.raises(obsynth.SpecError, match="online_monitor"):
+            obsynth.decide(what, alone)
+    with pytest.raises(obsynth.SpecError, match="Estimates"):
+        obsynth.decide(recursive().observer, [1.0])

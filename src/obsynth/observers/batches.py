@@ -13,11 +13,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SolverError, SpecError
+from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.observers.dae.c_code import BATCH_PARTS, compiler
 from obsynth.observers.dae.estimates import DAERow
 from obsynth.observers.dae.observer import DAEObserver, advanced
 from obsynth.observers.estimates import Estimates
+from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.progress import shown_progress
 from obsynth.observers.records import batch_record
 from obsynth.observers.recursive import gain_schedule
@@ -109,7 +111,10 @@ def _one(observer: DAEObserver, y: FloatArray, u: FloatArray, trial: int) -> dic
 
 
 def run_batch(
-    observer: RecursiveObserver | DAEObserver, y: ArrayLike, u: ArrayLike | None = None, **options: Any
+    observer: LinearObserver | RecursiveObserver | DAEObserver,
+    y: ArrayLike,
+    u: ArrayLike | None = None,
+    **options: Any,
 ) -> Estimates:
     """Run many trials with one observer.
 
@@ -118,11 +123,11 @@ def run_batch(
 
     Parameters
     ----------
-    observer : RecursiveObserver or DAEObserver
+    observer : LinearObserver, RecursiveObserver or DAEObserver
         At rest.
     y : array_like
-        ``(trials, samples, ny)``.  NaN marks a missing sample for an observer of a DAE; records of a recursive one must
-        be complete.
+        ``(trials, samples, ny)``.  NaN marks a missing sample for an observer of a DAE; records of the others must be
+        complete.
     u : array_like, optional
         ``(trials, samples, nu)``, or ``(samples, nu)`` for all trials; may be left out when there are none.
     **options
@@ -138,10 +143,17 @@ def run_batch(
     Raises
     ------
     SpecError
-        Shapes do not fit, an input is not finite, the record is longer than the horizon, or the observer resets.
+        It is no such observer (but a whole design, say), shapes do not fit, an input is not finite, the record is
+        longer than the horizon, or the observer resets.
     SolverError
         A step of a DAE has no solution; the trial, k and the worst equation are named.
     """
+    kinds = (LinearObserver, RecursiveObserver, DAEObserver)
+    require_kind(observer, kinds, "observer", "the observer of a design (design.observer), not a guaranteed test's")
+    if isinstance(observer, LinearObserver):
+        if options:
+            raise SpecError(f"A linear observer has no {', '.join(options)}: leave it out.", path=min(options))
+        return _stacked(observer, y, u)
     # The gains of a recursive observer that judges its samples depend on them.
     judges = isinstance(observer, RecursiveObserver) and observer.outliers != "none"
     if judges or not observer.is_plain:
@@ -149,6 +161,15 @@ def run_batch(
     if isinstance(observer, DAEObserver):
         return run_dae_batch(observer, y, u, **options)
     return gain_schedule.run_batch(observer, y, u, **options)
+
+
+def _stacked(observer: LinearObserver, y: ArrayLike, u: ArrayLike | None) -> Estimates:
+    """Run trials of a linear observer one after another."""
+    outputs, inputs = batch_record(y, u, len(observer.output_names), observer.input_names)
+    found = [observer.run(outputs[i], _of_trial(inputs, i)) for i in range(len(outputs))]
+    parts: dict[str, Any] = {name: read_only(np.stack([getattr(each, name) for each in found]))
+             for name in ("states", "faults", "residuals")}  # fmt: skip
+    return replace(found[0], **parts)
 
 
 def _one_by_one(observer: RecursiveObserver | DAEObserver, y: ArrayLike, u: ArrayLike | None) -> Estimates:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import chosen, real_array, real_number, real_vector
+from obsynth.numerics.arguments import chosen, real_array, real_number, real_vector, require_kind
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.observers.alarms import (
     Alarm,
@@ -74,9 +74,18 @@ def decide(
     Raises
     ------
     SpecError
-        The statistic is unknown or does not go with the observer's form, an option is out of range, or the estimates
-        are of another observer.
+        It is no such observer, the statistic is unknown or does not go with the observer's form, an option is out of
+        range, or the estimates are of another observer.
     """
+    require_kind(
+        observer,
+        (RecursiveObserver, DAEObserver),
+        "observer",
+        "the recursive or nonlinear observer of a design (design.observer). Linear designs and guaranteed tests are "
+        "watched by their residual: obsynth.monitor(design, scenario) for a record, "
+        "obsynth.online_monitor(design, ...) for data of any length",
+    )
+    require_kind(estimates, Estimates, "estimates", "the Estimates of a whole run, such as observer.run(y, u)")
     chosen(statistic, "statistic", STATISTICS)
     start, form = observer.initial_parameters, observer.form
     if not len(start) and statistic != "nis":
