@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.numerics.arrays import ComplexArray, FloatArray, read_only
-from obsynth.numerics.pencil_points import FEW_COLUMNS, MOST_DIRECTIONS, PencilPoints, smallest_singular
+from obsynth.numerics.pencil_points import FEW_COLUMNS, MOST_DIRECTIONS, NEWTON_STEPS, PencilPoints, smallest_singular
 from obsynth.numerics.pencils import FiniteZeros, finite_zeros
 from obsynth.numerics.ranks import (
     BOUNDARY_NEIGHBOURHOOD,
@@ -24,9 +24,6 @@ from obsynth.numerics.ranks import (
 )
 from obsynth.numerics.scaling import EquilibratedPencil, equilibrate_pencil, power_of_two_below
 from obsynth.plants.descriptor import DescriptorSystem
-
-#: Steps in which a computed zero is improved before the pencil there is judged.
-NEWTON_STEPS = 4
 
 
 def system_zeros(E: FloatArray, A: FloatArray, *, nx: int) -> FiniteZeros:

@@ -18,7 +18,7 @@ from obsynth.calibration.diagnostics import STANDS_OUT, BoolArray, standing_out,
 from obsynth.calibration.innovations_fit import InnovationsFit, Timing, chosen_timing, innovations_fit
 from obsynth.calibration.logs import TOLD_ROWS, Log, LogData, read_log, refused
 from obsynth.calibration.noise_proposals import proposed_states
-from obsynth.calibration.noise_states import NoiseStates, PlantWithNoise, asked_states, with_states
+from obsynth.calibration.noise_states import SIZED_SAMPLES, NoiseStates, PlantWithNoise, asked_states, with_states
 from obsynth.calibration.plants import CalibrationPlant, NonlinearPlant
 from obsynth.calibration.problem import Problem, calibration_problem, require_variation
 from obsynth.calibration.reporting import IntegrationError, integration_error, reported
@@ -37,8 +37,6 @@ from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 
 #: A discrete plant is stepped as it is.
 EXACT = "exact"
-#: Samples whose outputs say how large an initial state can be.
-SIZED_SAMPLES = 50
 #: The least effect of a state on the outputs, as a share of the largest, by which it is sized.
 LEAST_EFFECT = 1e-6
 #: What the matrices of varying and of invariant plants are called here; G and L are of constant effects.

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from obsynth.data.log_estimator import MOST_STALE
 from obsynth.data.log_tables import log_table, parsed_rows
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.arrays import FloatArray, read_only
@@ -38,8 +39,6 @@ LARGEST_JITTER = 0.2
 NOTED_JITTER = 0.02
 #: The same of stamps and the grid itself, where two of them are off each other by more.
 LARGEST_OFFSET = 0.25
-#: So many rows in a row whose stamps do not rise are no slip of a clock.
-MOST_STALE = 10
 #: What counts as one quantum between values of a column: all differences are whole multiples within this.
 QUANTUM_SLACK = 0.02
 #: Share of distinct values above which a column shows no quantum that limits its noise: a ramp has none twice.

@@ -17,7 +17,7 @@ from obsynth.plants.validation import index_of
 
 #: Where the search for a correlation begins, and its bounds: in samples, the last as a share of the log.
 FIRST_CORRELATION, LEAST_CORRELATION, LONGEST_SHARE = 10.0, 0.3, 1.0
-#: A load is sized by what it does to the outputs in this many samples.
+#: A load, or an initial state, is sized by what it does to the outputs in this many samples.
 SIZED_SAMPLES = 50
 #: An offset may be this many times what a sensor changes from row to row, or as large as it moves.
 LARGEST_OFFSET = 10.0

@@ -9,10 +9,9 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from obsynth.data.log_estimator import GAP, OUT_OF_ORDER, PARTIAL, RECOVERING, REPEATED, WARM_UP
+from obsynth.experiments.monitors.learned_levels import HOLD
 from obsynth.observers.estimates import BAND_WIDTH
 
-#: An alarm ends when so many rows in a row were below the threshold.
-HOLD = 20
 #: What stands for the status of rows that are well, but in which the monitor decides nothing.
 NO_DECISION = "undecided"
 #: Why a row cannot alarm, by its status.

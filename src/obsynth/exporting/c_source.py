@@ -15,6 +15,7 @@ from obsynth.experiments.monitors.learned_levels import AGES, FORGETTING, HOLD
 from obsynth.exporting.alarms import Alarms
 from obsynth.exporting.realisation import Realisation
 from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.dae.c_code import in_lines
 
 _KEYWORDS = frozenset(
     {
@@ -89,7 +90,6 @@ def with_c_linkage(header: str, prefix: str) -> str:
     return f"{head}#define {prefix.upper()}_H{_OPENED}{declared}{_CLOSED}#endif{end}"
 
 
-_NUMBERS_PER_LINE = 4
 #: Matrices with fewer entries are multiplied row by row: nothing is gained by more.
 LARGE_TABLE = 1024
 #: At most this share of entries that are not zero makes a matrix sparse.
@@ -505,7 +505,7 @@ def _tables(name: str, matrix: FloatArray) -> Iterator[str]:
 
 def _list(kind: str, name: str, texts: list[str]) -> Iterator[str]:
     yield f"static const {kind} {name}[{len(texts)}] = {{"
-    yield "    " + ",\n    ".join(_in_lines(texts))
+    yield "    " + ",\n    ".join(in_lines(texts))
     yield from ("};", "")
 
 
@@ -514,12 +514,8 @@ def table_lines(name: str, matrix: FloatArray) -> Iterator[str]:
     yield f"static const REAL {name}[{matrix.shape[0]}][{matrix.shape[1]}] = {{"
     for row in matrix.tolist():
         # repr gives the shortest text that is read back bit for bit.
-        yield "    {" + ",\n     ".join(_in_lines([repr(value) for value in row])) + "},"
+        yield "    {" + ",\n     ".join(in_lines([repr(value) for value in row])) + "},"
     yield from ("};", "")
-
-
-def _in_lines(texts: list[str]) -> list[str]:
-    return [", ".join(texts[i : i + _NUMBERS_PER_LINE]) for i in range(0, len(texts), _NUMBERS_PER_LINE)]
 
 
 def _step_arguments(found: Realisation, prefix: str) -> list[str]:

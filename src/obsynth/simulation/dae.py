@@ -14,13 +14,8 @@ from obsynth.numerics.ranks import covariance_factor
 from obsynth.plants.dae.checks import checked_inputs, finite_vector, step_length
 from obsynth.plants.dae.functions import Compiled, DAEFunctions, take_samples
 from obsynth.plants.dae.model import DAEModel
-from obsynth.plants.dae.step import ImplicitStep
+from obsynth.plants.dae.step import ImplicitStep, onto_constraint
 from obsynth.simulation.signals import Trajectory
-
-#: A step of backward Euler this much shorter than dt puts a state onto its constraint and moves it no further.
-PROJECTION_SHARE = 1e-6
-#: Smaller moves, in sizes of the states, are the motion during that step and no projection.
-PROJECTION_NOTICE = 1e-5
 
 
 def simulate_dae(
@@ -90,14 +85,11 @@ def _consistent(model: DAEModel, x: FloatArray, inputs: FloatArray, theta: Float
     """Return a start on the algebraic equations, which is the given one where it is on them already."""
     if not len(inputs):
         return x
-    short = ImplicitStep(DAEFunctions(model), PROJECTION_SHARE * dt)
     try:
-        found = short.solve_carefully(x, inputs[0], theta[0]).x
+        return onto_constraint(model, x, inputs[0], theta[0], dt)
     except SolverError:
         # From there the first step, which is longer, may still find a way.
         return x
-    moved = np.abs((found - x) / model.state_scales).max()
-    return found if moved > PROJECTION_NOTICE else x
 
 
 def _parameters(model: DAEModel, value: ArrayLike | None, samples: int) -> FloatArray:

@@ -12,6 +12,8 @@ from pydantic import Discriminator, Field, Tag, create_model, model_validator
 from obsynth.numerics.arguments import Positive
 from obsynth.plants.uncertainty import UNCERTAIN_MATRICES, expressions_in
 from obsynth.spec.schema_values import (
+    FILE_TAG,
+    LIST_TAG,
     EquationMatrix,
     Matrix,
     Names,
@@ -26,7 +28,7 @@ from obsynth.spec.schema_values import (
 SCHEMA_VERSION = 1
 
 # Tags of unions appear in the locations of pydantic's errors; the bracket marks them for removal.
-_FILE, _LIST, _INLINE, _VARYING, _ONE, _NONLINEAR = "<file>", "<list>", "<inline>", "<varying>", "<one>", "<dae>"
+_INLINE, _VARYING, _ONE, _NONLINEAR = "<inline>", "<varying>", "<one>", "<dae>"
 _COLOURED = "<coloured>"
 
 
@@ -35,7 +37,7 @@ def _kind_of_plant(value: Any) -> str:
         return _VARYING
     if isinstance(value, dict) and value.get("kind") == "dae":
         return _NONLINEAR
-    return _FILE if isinstance(value, dict) and "file" in value else _INLINE
+    return FILE_TAG if isinstance(value, dict) and "file" in value else _INLINE
 
 
 class LineariseSection(Section):
@@ -227,7 +229,7 @@ class MethodSection(Section):
 
 
 def _kind_of_profiles(value: Any) -> str:
-    return _LIST if isinstance(value, list) else _ONE
+    return LIST_TAG if isinstance(value, list) else _ONE
 
 
 class ProfileSection(Section):
@@ -253,7 +255,8 @@ class ProfileSection(Section):
 
 
 Profiles = Annotated[
-    Annotated[ProfileSection, Tag(_ONE)] | Annotated[Annotated[list[ProfileSection], Field(min_length=1)], Tag(_LIST)],
+    Annotated[ProfileSection, Tag(_ONE)]
+    | Annotated[Annotated[list[ProfileSection], Field(min_length=1)], Tag(LIST_TAG)],
     Discriminator(_kind_of_profiles),
 ]
 
@@ -317,7 +320,7 @@ class SpecDocument(Section):
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$")]
     description: str | None = None
     plant: Annotated[
-        Annotated[PlantReference, Tag(_FILE)]
+        Annotated[PlantReference, Tag(FILE_TAG)]
         | Annotated[PlantSection, Tag(_INLINE)]
         | Annotated[TimeVaryingSection, Tag(_VARYING)]
         | Annotated[DAESection, Tag(_NONLINEAR)],

@@ -30,7 +30,7 @@ from obsynth.methods.registry import method_class
 from obsynth.numerics.arguments import Count, NonNegative, OpenUnitInterval, Positive, WrittenAs, field_types, is_number
 
 # Tags of unions appear in the locations of pydantic's errors; the bracket marks them for removal.
-_ROWS, _FILE, _PICK, _LIST, _STACK, _NUMBER = "<rows>", "<file>", "<pick>", "<list>", "<stack>", "<number>"
+_ROWS, FILE_TAG, _PICK, LIST_TAG, _STACK, _NUMBER = "<rows>", "<file>", "<pick>", "<list>", "<stack>", "<number>"
 
 
 def _rectangular(rows: Any, check_entries: ValidatorFunctionWrapHandler) -> Any:
@@ -62,12 +62,12 @@ def _kind_of_error(item: Any) -> Any:
 
 def _kind_of_matrix(value: Any) -> str:
     if isinstance(value, dict):
-        return _FILE if "file" in value or not value else _PICK
+        return FILE_TAG if "file" in value or not value else _PICK
     return _ROWS
 
 
 def _file_or(other: str) -> Discriminator:
-    return Discriminator(lambda value: _FILE if isinstance(value, dict) else other)
+    return Discriminator(lambda value: FILE_TAG if isinstance(value, dict) else other)
 
 
 class Section(BaseModel):
@@ -112,16 +112,16 @@ class StatePick(Section):
     states: Annotated[list[Text], Field(min_length=1)]
 
 
-Matrix = Annotated[Rows | Annotated[MatrixFile, Tag(_FILE)], _file_or(_ROWS)]
+Matrix = Annotated[Rows | Annotated[MatrixFile, Tag(FILE_TAG)], _file_or(_ROWS)]
 EquationMatrix = Annotated[
-    Rows | Annotated[MatrixFile, Tag(_FILE)] | Annotated[StatePick, Tag(_PICK)], Discriminator(_kind_of_matrix)
+    Rows | Annotated[MatrixFile, Tag(FILE_TAG)] | Annotated[StatePick, Tag(_PICK)], Discriminator(_kind_of_matrix)
 ]
 OutputMatrix = Annotated[
-    Rows | Annotated[MatrixFile, Tag(_FILE)] | Annotated[OutputPick, Tag(_PICK)], Discriminator(_kind_of_matrix)
+    Rows | Annotated[MatrixFile, Tag(FILE_TAG)] | Annotated[OutputPick, Tag(_PICK)], Discriminator(_kind_of_matrix)
 ]
 #: A fault, or an unknown input, on each sensor that is named.
 SensorMatrix = OutputMatrix
-Names = Annotated[Annotated[list[Text], Tag(_LIST)] | Annotated[NamesFile, Tag(_FILE)], _file_or(_LIST)]
+Names = Annotated[Annotated[list[Text], Tag(LIST_TAG)] | Annotated[NamesFile, Tag(FILE_TAG)], _file_or(LIST_TAG)]
 
 
 def _number_or_expression(value: Any) -> Any:
@@ -166,22 +166,22 @@ class VaryingFile(MatrixFile):
 
 def _kind_of_varying(value: Any) -> str:
     if isinstance(value, dict):
-        return _FILE
+        return FILE_TAG
     first = value[0] if isinstance(value, list) and value else None
     return _STACK if isinstance(first, list) and first and isinstance(first[0], list) else _ROWS
 
 
-VaryingMatrix = Annotated[VaryingRows | Stack | Annotated[VaryingFile, Tag(_FILE)], Discriminator(_kind_of_varying)]
+VaryingMatrix = Annotated[VaryingRows | Stack | Annotated[VaryingFile, Tag(FILE_TAG)], Discriminator(_kind_of_varying)]
 
 
 Variance = Annotated[float, Field(ge=0.0), Tag(_NUMBER)]
 #: One variance stands for that multiple of the identity, as from Python.
 Covariance = Annotated[
-    Variance | Rows | Annotated[MatrixFile, Tag(_FILE)],
-    Discriminator(lambda value: _NUMBER if is_number(value) else _FILE if isinstance(value, dict) else _ROWS),
+    Variance | Rows | Annotated[MatrixFile, Tag(FILE_TAG)],
+    Discriminator(lambda value: _NUMBER if is_number(value) else FILE_TAG if isinstance(value, dict) else _ROWS),
 ]
 VaryingCovariance = Annotated[
-    Variance | VaryingRows | Stack | Annotated[VaryingFile, Tag(_FILE)],
+    Variance | VaryingRows | Stack | Annotated[VaryingFile, Tag(FILE_TAG)],
     Discriminator(lambda value: _NUMBER if is_number(value) else _kind_of_varying(value)),
 ]
 

@@ -14,7 +14,7 @@ from obsynth.plants.dae.model import DAEModel
 
 #: Samples of the nominal trajectory along which directions are looked for.
 NOMINAL_SAMPLES = 51
-_SOURCE = "Moussa Ali, Zhang 2013 (DAE)"
+SOURCE = "Moussa Ali, Zhang 2013 (DAE)"
 
 
 def dae_conditions(model: object, dt: float) -> Iterator[Condition]:
@@ -26,7 +26,7 @@ def dae_conditions(model: object, dt: float) -> Iterator[Condition]:
             False,
             0.0,
             1.0,
-            f"{_SOURCE}, (3)",
+            f"{SOURCE}, (3)",
             f"the plant is a {type(model).__name__}",
         )
         return
@@ -48,7 +48,7 @@ def dae_conditions(model: object, dt: float) -> Iterator[Condition]:
         found.index == 1,
         float(found.index),
         1.0,
-        f"{_SOURCE}, (7)",
+        f"{SOURCE}, (7)",
         detail,
         signals=found.states,
     )
@@ -60,7 +60,7 @@ def dae_conditions(model: object, dt: float) -> Iterator[Condition]:
             model.nq > 0,
             float(model.nq),
             1.0,
-            f"{_SOURCE}, (3)",
+            f"{SOURCE}, (3)",
             f"{model.nq} parameter(s){told}",
         )
 

@@ -19,9 +19,9 @@ from obsynth.observers.dae.building import (
     resolved_options,
 )
 from obsynth.observers.dae.observer import DAEObserver
-from obsynth.observers.dae.steps import PROJECTION_NOTICE
 from obsynth.observers.running import plain_recursion
 from obsynth.plants.dae.model import DAEModel
+from obsynth.plants.dae.step import PROJECTION_NOTICE
 from obsynth.results.design import Certificate
 
 

@@ -201,7 +201,7 @@ def _largest(plant: TimeVaryingDescriptorSystem, steps: int, late: IntArray) -> 
     return StepBlocks(*found)
 
 
-_SOURCE = "Moussa Ali, Zhang 2013"
+SOURCE = "Moussa Ali, Zhang 2013"
 
 
 def recursive_conditions(
@@ -221,7 +221,7 @@ def recursive_conditions(
             False,
             0.0,
             1.0,
-            f"{_SOURCE}, eq. (4)",
+            f"{SOURCE}, eq. (4)",
             str(error),
         )
         return
@@ -244,7 +244,7 @@ def recursive_conditions(
         varying.nq > 0,
         float(varying.nq),
         1.0,
-        f"{_SOURCE}, eq. (4)",
+        f"{SOURCE}, eq. (4)",
         f"{varying.nq} parameter(s)",
     )
     if not varying.nq:
@@ -262,7 +262,7 @@ def _rank_of_steps(
     late = early_rows(plant, early=early)
     said = FullRank([["E"], ["C"], ["A"]], last_rows=late.tolist()) if late.size else FullRank([["E"], ["C"]])
     worst = ranks.worst if constant is None else constant.rank(said, ranks.worst)
-    condition = rank_condition(name, worst, "", source=f"{_SOURCE}, A2")
+    condition = rank_condition(name, worst, "", source=f"{SOURCE}, A2")
     if constant is None and ranks.steps > 1:
         condition = replace(condition, detail=f"{condition.detail}, in floating point along the horizon")
     where = "for every k" if ranks.steps == 1 else f"for k = 1 ... {ranks.steps}, worst at k = {ranks.worst_k}"

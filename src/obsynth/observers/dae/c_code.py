@@ -27,15 +27,15 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import DEPENDENT_BOUND
 from obsynth.observers.dae.settings import initial_memory
 from obsynth.observers.dae.step_graph import ObserverGraph
-from obsynth.observers.dae.steps import PROJECTION_NOTICE, PROJECTION_SHARE, Steps
+from obsynth.observers.dae.steps import Steps
 from obsynth.observers.outliers import COMPARABLE, LONGEST, OVERFLOW, RESET_WINDOW, chi_square_limit
 from obsynth.plants.dae import step as implicit_step
 from obsynth.plants.dae.functions import DAEFunctions
-from obsynth.plants.dae.step import step_graph
+from obsynth.plants.dae.step import PROJECTION_NOTICE, PROJECTION_SHARE, step_graph
 
 #: What ``record.c`` hands out of a batch, in this order.
 BATCH_PARTS = ("posterior", "theta", "spread", "innovation", "nis", "residual")
-_NUMBERS_PER_LINE = 4
+NUMBERS_PER_LINE = 4
 #: The beginning of a helper that CasADi writes, `casadi_fmax` say, which it leaves visible to the linker.
 _HELPER = re.compile(r"^((?:const )?(?:casadi_real|casadi_int|double|int|void)\*? casadi_\w+ ?\()", re.MULTILINE)
 #: A bound that is missed by less, in deviations of its state, is kept.
@@ -194,8 +194,12 @@ def _integers(name: str, values: Sequence[int]) -> list[str]:
 def c_table(name: str, values: FloatArray) -> list[str]:
     """Return a constant table of C; numbers are read back bit for bit (``values (n,)``)."""
     texts = [repr(value) for value in values.tolist()] or ["0.0"]
-    lines = [", ".join(texts[i : i + _NUMBERS_PER_LINE]) for i in range(0, len(texts), _NUMBERS_PER_LINE)]
-    return [f"static const double {name}[{len(texts)}] = {{", "    " + ",\n    ".join(lines) + "};"]
+    return [f"static const double {name}[{len(texts)}] = {{", "    " + ",\n    ".join(in_lines(texts)) + "};"]
+
+
+def in_lines(texts: list[str]) -> list[str]:
+    """Return the lines of a table of these numbers."""
+    return [", ".join(texts[i : i + NUMBERS_PER_LINE]) for i in range(0, len(texts), NUMBERS_PER_LINE)]
 
 
 def _generated(functions: dict[str, Any]) -> str:

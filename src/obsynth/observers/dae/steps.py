@@ -15,13 +15,8 @@ from obsynth.observers.dae.estimates import DAERow
 from obsynth.observers.dae.settings import DAESettings, initial_memory
 from obsynth.observers.dae.step_graph import ObserverGraph, observer_graph
 from obsynth.observers.outliers import checked_limit, has_jumped, no_refusals, projected, robust_advance, with_surprise
-from obsynth.plants.dae.functions import Compiled, DAEFunctions
-from obsynth.plants.dae.step import ImplicitStep
-
-#: A step of backward Euler this much shorter than dt puts a state onto its constraint and moves it no further.
-PROJECTION_SHARE = 1e-6
-#: Smaller moves, in sizes of the states, are the motion during that step and no projection.
-PROJECTION_NOTICE = 1e-5
+from obsynth.plants.dae.functions import Compiled
+from obsynth.plants.dae.step import ImplicitStep, onto_constraint
 
 
 class DAEState(NamedTuple):
@@ -149,10 +144,9 @@ class Steps:
 
     def projected(self, state: DAEState, u: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Put the initial state onto the algebraic equations; return the memory and how far it moved."""
-        model, start = self.settings.model, self.part(state, "x")
-        short = ImplicitStep(DAEFunctions(model), PROJECTION_SHARE * self.settings.dt)
-        found = short.solve_carefully(start, u, self.part(state, "theta")).x
-        if np.abs((found - start) / model.state_scales).max() <= PROJECTION_NOTICE:
+        start = self.part(state, "x")
+        found = onto_constraint(self.settings.model, start, u, self.part(state, "theta"), self.settings.dt)
+        if found is start:
             return state.memory, np.zeros_like(start)
         return initial_memory(self.settings, found), found - start
 

@@ -26,6 +26,7 @@ from obsynth.numerics.newton import (
     solved,
 )
 from obsynth.plants.dae.functions import Compiled, DAEFunctions
+from obsynth.plants.dae.model import DAEModel
 
 #: Iterations that every step takes, and further ones in blocks for those that need them.  From the last sample's state
 #: three or four are the rule.
@@ -254,3 +255,15 @@ class ImplicitStep:
             f"is {name!r} ({worst}). Check that input and state at this k are possible, or take smaller steps.",
             record={"k": k, "iteration": found.iterations, "equation": name, "residual": found.residual},
         )
+
+
+#: A step of backward Euler this much shorter than dt puts a state onto its constraint and moves it no further.
+PROJECTION_SHARE = 1e-6
+#: Smaller moves, in sizes of the states, are the motion during that step and no projection.
+PROJECTION_NOTICE = 1e-5
+
+
+def onto_constraint(model: DAEModel, x: FloatArray, u: FloatArray, theta: FloatArray, dt: float) -> FloatArray:
+    """Return a state on the algebraic equations: the given one ``x (nx,)`` where it is on them already."""
+    found = ImplicitStep(DAEFunctions(model), PROJECTION_SHARE * dt).solve_carefully(x, u, theta).x
+    return found if np.abs((found - x) / model.state_scales).max() > PROJECTION_NOTICE else x

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from obsynth.errors import ObsynthError
-from obsynth.methods.dae_adaptive_observer.conditions import dae_conditions
+from obsynth.methods.dae_adaptive_observer.conditions import SOURCE, dae_conditions
 from obsynth.methods.recursive.checks import claims_row, listed_gains, refinement_rows
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.newton import LARGEST_RESIDUAL
@@ -51,8 +51,6 @@ SEED = 20130206
 CONSISTENCY_FACTOR = 2.0
 #: Between these probabilities lie 95 %.
 TAILS = (0.025, 0.975)
-
-_SOURCE = "Moussa Ali, Zhang 2013 (DAE)"
 
 
 def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
@@ -119,7 +117,7 @@ def _model_rows(observer: DAEObserver, facts: DAEFacts) -> Iterator[Check]:
         "dF/dx' / dt + dF/dx is far from singular along the nominal run",
         facts.condition,
         SINGULAR_CONDITION,
-        source=f"{_SOURCE}, (7)",
+        source=f"{SOURCE}, (7)",
         detail=f"worst at k = {facts.condition_k}",
     )
     yield upper_bound_check(
@@ -135,7 +133,7 @@ def _model_rows(observer: DAEObserver, facts: DAEFacts) -> Iterator[Check]:
         "F, G, H and L equal central differences of converged steps",
         _derivative_gap(observer),
         DERIVATIVE_TOLERANCE,
-        source=f"{_SOURCE}, (8), (9)",
+        source=f"{SOURCE}, (8), (9)",
         kind="equality",
     )
     yield from _proved_rows(observer, facts)
@@ -147,7 +145,7 @@ def _model_rows(observer: DAEObserver, facts: DAEFacts) -> Iterator[Check]:
             f"excitation: {name}",
             "what nominal constant inputs say, in prior deviations to the power -2",
             float((prior / bound) ** 2),
-            source=f"{_SOURCE}, (26)",
+            source=f"{SOURCE}, (26)",
             detail=told,
         )
         yield information(
@@ -178,7 +176,7 @@ def _proved_rows(observer: DAEObserver, facts: DAEFacts) -> Iterator[Check]:
     last = Ball(facts.kept[-1], allowed[-1])
     rate = proved_rate(last)
     claim = "F (I - K H) at the end of the nominal run makes errors smaller: its spectral radius"
-    source, decay = f"{_SOURCE}, convergence", f"decay in {facts.decay_time:.3g} steps"
+    source, decay = f"{SOURCE}, convergence", f"decay in {facts.decay_time:.3g} steps"
     told = f"for all derivatives within {DERIVATIVE_TOLERANCE:g} of the computed ones, in sizes of the signals"
     if rate is None:
         yield upper_bound_check(

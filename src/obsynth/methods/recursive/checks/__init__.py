@@ -20,7 +20,7 @@ from obsynth.methods.recursive.checks.horizon_proof import (
     parameter_row,
 )
 from obsynth.methods.recursive.checks.steady_state import steady_rows
-from obsynth.methods.recursive.conditions import recursive_conditions
+from obsynth.methods.recursive.conditions import SOURCE, recursive_conditions
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.recursive.gain_schedule import gains_once
@@ -45,8 +45,6 @@ CLAIM_TOLERANCE = 1e-6
 BATCH_TOLERANCE = 1e-9
 #: Gains smaller than this are compared as they are.
 LEAST_GAIN = 1e-12
-
-_SOURCE = "Moussa Ali, Zhang 2013"
 
 
 def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
@@ -124,7 +122,7 @@ def _dynamic_rows(
         "condition of H",
         "largest condition number of [E_k; C_k]",
         ranks.condition,
-        source=f"{_SOURCE}, (6)",
+        source=f"{SOURCE}, (6)",
         detail=f"at k = {ranks.condition_k}",
     )
     yield information(
@@ -144,7 +142,7 @@ def _dynamic_rows(
             "the recursion equals the least-squares solution of the whole record",
             found,
             BATCH_TOLERANCE * ranks.condition,
-            source=f"{_SOURCE}, (6)-(10)",
+            source=f"{SOURCE}, (6)-(10)",
             kind="equality",
             detail=said,
         )
@@ -161,7 +159,7 @@ def _dynamic_rows(
             "excitation",
             "least information on the parameters in a window",
             facts.excitation,
-            source=f"{_SOURCE}, (26)",
+            source=f"{SOURCE}, (26)",
             detail=f"window of {observer.adaptation.window} ends at k = {facts.excitation_k}",
         )
         for name, deviation in zip(observer.fault_names, facts.deviations, strict=True):
@@ -178,7 +176,7 @@ def _dynamic_rows(
 
 
 def _contraction_row(facts: GainScheduleSummary, proof: HorizonProof | None) -> Check:
-    claim, source = "mean factor per step of the product of L_k A_k", f"{_SOURCE}, (13)"
+    claim, source = "mean factor per step of the product of L_k A_k", f"{SOURCE}, (13)"
     detail = f"{facts.steps} steps, {facts.span}; an error grows at most by {facts.growth:.3g} on the way"
     proved = proof is not None and proof.contraction < 1.0
     if proof is not None and proved:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
+from obsynth.methods.recursive.conditions import SOURCE
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.scaling import balance_by_least_squares
 from obsynth.observers.recursive.gain_schedule import Gains, GainStep, gain_steps
@@ -27,8 +28,6 @@ from obsynth.verification.identities import EQUALITY_TOLERANCE
 
 #: Of more states nothing is proved: work goes with their cube, and bounds grow with them.
 MOST_PROVED_STATES = 100
-
-_SOURCE = "Moussa Ali, Zhang 2013"
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,7 +204,7 @@ def bias_row(proof: HorizonProof, condition: float) -> Check:
         "[L_k K_k] [E_k; C_k] = I at every step: without noise and start error there is no error",
         proof.bias,
         EQUALITY_TOLERANCE * condition,
-        source=f"{_SOURCE}, (10)-(11)",
+        source=f"{SOURCE}, (10)-(11)",
         kind="proved",
         detail=f"largest entry in units of its terms, of the gains as computed, outward rounded; {proof.steps} steps",
     )
@@ -220,7 +219,7 @@ def parameter_row(proof: HorizonProof) -> Iterator[Check]:
         "contraction with parameters",
         "bound on the mean factor per step of errors of states and constant parameters together",
         proof.with_parameters,
-        source=f"{_SOURCE}, Theorem 3.1",
+        source=f"{SOURCE}, Theorem 3.1",
         status="proved" if proved else "assumed",
         detail="of the gains as computed, in outward rounding"
         if proved

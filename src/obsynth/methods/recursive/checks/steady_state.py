@@ -18,6 +18,7 @@ from obsynth.methods.recursive.checks.horizon_proof import (
     natural_units,
     noise_is_definite,
 )
+from obsynth.methods.recursive.conditions import SOURCE
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.norms import spectral_radius
 from obsynth.observers.recursive.gain_schedule import GainStep
@@ -36,8 +37,6 @@ WIDEST = 0.1
 LISTED = 6
 #: Both ends are told where the upper one is so many times the lower one.
 TOLD_APART = 1.001
-
-_SOURCE = "Moussa Ali, Zhang 2013"
 
 
 def steady_rows(
@@ -58,14 +57,14 @@ def steady_rows(
         "L E + K C = I for the listed gains",
         largest_bias([(step, listed)], natural_units(stated)[: plant.nx]),
         EQUALITY_TOLERANCE * condition,
-        source=f"{_SOURCE}, (10)-(11)",
+        source=f"{SOURCE}, (10)-(11)",
         kind="proved",
         detail="in units of its terms, outward rounded",
     )
     transition = Ball.exact(L) @ Ball.exact(A)
     contraction = prove_contraction(transition, discrete=True)
     claim = "errors die out with the listed gains, were they kept: modulus per step in a norm"
-    source = f"{_SOURCE}, (13); Lyapunov inequality of L A"
+    source = f"{SOURCE}, (13); Lyapunov inequality of L A"
     if contraction is None:
         radius = spectral_radius(transition.midpoint)
         if spectral_radius(recomputed.gain[:, :ne] @ A) >= CLEARLY_STABLE:
