@@ -163,14 +163,14 @@ def test_bounds_hold_for_bounded_noise_whatever_it_is(kind: str, noisy) -> None:
     )  # fmt: skip
     watched = obsynth.monitor(design, scenario, kind, noise_bound=2.0, window=7 if kind == "window" else None)
     bench, rng = make_bench(design, scenario), np.random.default_rng(0)
-    steps, runs = bench.drive.steps, 400
-    signals = np.zeros((steps, runs, bench.drive.left.shape[1]))
+    steps, runs = bench.signals.steps, 400
+    signals = np.zeros((steps, runs, bench.signals.left.shape[1]))
     # The extremes of the bounds, at random and in steady patterns.
     signs = rng.choice([-1.0, 1.0], (steps, runs, 1))
     signs[:, ::2] = np.sign(np.sin(rng.uniform(0, np.pi, (1, runs // 2, 1)) * np.arange(steps)[:, None, None] + 0.1))
     signals[:, :, -1:] = 0.3 * signs
     noise = 2.0 * rng.choice([-1.0, 1.0], (steps, runs, 2))
-    stepper = make_stepper(design.plant, bench.drive, initial_state=bench.initial_state, stabilise=False)
+    stepper = make_stepper(design.plant, bench.signals, initial_state=bench.initial_state, stabilise=False)
     _, outputs, _ = stepper.run(signals, np.zeros_like(signals), noise)
     rows, _ = bench.observed(outputs, np.zeros((steps, runs, 0)))
     statistic = watched.statistic(rows[:, :, design.observer.residual_rows])

@@ -82,7 +82,7 @@ def test_a_ring_is_as_short_as_its_contraction_allows() -> None:
     """0.5^8 and 0.9^64 are the first below 1 % at a power of two; an observer that keeps its error has none."""
     assert ring_length(np.array([[0.5]])) == 8
     assert ring_length(np.array([[0.9]])) == 64
-    with pytest.raises(PreconditionError, match="forgets too slowly"):
+    with pytest.raises(PreconditionError, match="decay too slowly"):
         ring_length(np.array([[1.0]]))
 
 

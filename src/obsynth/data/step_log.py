@@ -113,10 +113,10 @@ class SteppingLogObserver(LogObserver):
             self.settled_at = time + self.warm_up
             self.phase = WARM_UP if self.phase == WARM_UP else RECOVERING
         # A filter that begins with y(1) does not miss y(0).
-        heard = (known[nu:] & ~self._refused(total)) | ~self.observer.timing.expected(self.state.k - 1)
+        received = (known[nu:] & ~self._refused(total)) | ~self.observer.timing.expected(self.state.k - 1)
         if fresh and self.is_recursive:
-            heard = np.ones_like(heard)
-        status = self._status(time, known[:nu], heard, spoiled=spoiled)
+            received = np.ones_like(received)
+        status = self._status(time, known[:nu], received, spoiled=spoiled)
         evidence = Evidence(
             found.theta, found.parameter_covariance, found.whitened, found.regressor, found.score, found.information
         )

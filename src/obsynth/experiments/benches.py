@@ -67,7 +67,7 @@ class Runs:
 class Bench:
     """A design and a scenario, ready to run; it can be sent to another process, with a model that is data."""
 
-    drive: ScenarioSignals
+    signals: ScenarioSignals
     observer: LinearObserver | RecursiveObserver | DAEObserver  # in discrete time
     initial_state: FloatArray
     fault_signals: slice
@@ -87,11 +87,11 @@ class Bench:
     @property
     def onset(self) -> int | None:
         """First sample at which a fault acts, or a faulty sensor; `None` if there is none."""
-        return self.drive.first_fault(self.fault_signals)
+        return self.signals.first_fault(self.fault_signals)
 
     def warm_ups(self) -> tuple[int | None, int | None]:
         """Return from when the start no longer shows in the estimates of states, and of faults; 0 with deviations."""
-        observer, steps = self.observer, self.drive.steps
+        observer, steps = self.observer, self.signals.steps
         if not isinstance(observer, LinearObserver):
             return 0, 0
 

@@ -209,7 +209,7 @@ def evaluate(
     bench = bench_of(design, scenario)
     _require_fit(bench, monitor, plants)
     benches = [bench] if plants is None else _drawn_benches(design, scenario, plants)
-    size = max(1, BATCH_SAMPLES // bench.drive.steps)
+    size = max(1, BATCH_SAMPLES // bench.signals.steps)
     # The first row of a plant with parameters is what was known before: no sample has been used.
     states, faults = ((end or 0) if isinstance(bench.observer, LinearObserver) else 1 for end in bench.warm_ups())
     names = design.linear[0].fault_names if isinstance(bench.observer, LinearObserver) else ()
@@ -285,7 +285,7 @@ def _judged_parameters(watched: ParameterMonitor, bench: Bench, estimates: Estim
     if not later.size:
         return false, float("nan"), float("nan")
     k, alarm, names = begin + int(later[0]), decision.alarm, bench.observer.fault_names
-    acted = np.any(bench.drive.left[: k + 1, -len(names) :] != 0.0, axis=0)
+    acted = np.any(bench.signals.left[: k + 1, -len(names) :] != 0.0, axis=0)
     if alarm is None or alarm.k != k or not alarm.parameter or not acted.any():
         return false, float(k), float("nan")
     return false, float(k), float(not acted[names.index(alarm.parameter)])
@@ -299,7 +299,7 @@ def _summed(
     detected, judged = ~np.isnan(parts["found"]), ~np.isnan(parts["wrong"])
     counted = runs if watched else 0
     faulty = counted if onset is not None else 0
-    delays = np.array([]) if not watched or onset is None else (parts["found"] - onset) * bench.drive.dt
+    delays = np.array([]) if not watched or onset is None else (parts["found"] - onset) * bench.signals.dt
 
     def errors(name: str, signals: tuple[str, ...]) -> Mapping[str, Interval]:
         return MappingProxyType({signal: mean(parts[name][:, i], level) for i, signal in enumerate(signals)})

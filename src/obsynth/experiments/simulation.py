@@ -243,7 +243,7 @@ _PLANTS: dict[type, Callable[..., Trajectory]] = {
 def _simulated(design: ObserverDesign, scenario: Scenario) -> Simulation:
     bench = bench_of(design, scenario)
     runs = bench.run([scenario.seed])
-    plant, dt = design.plant, bench.drive.dt
+    plant, dt = design.plant, bench.signals.dt
     state_warm_up, fault_warm_up = bench.warm_ups()
     change, notes = float(np.linalg.norm(runs.states[0, 0] - bench.initial_state)), list(bench.notes)
     if isinstance(design.observer, LinearObserver) and not scenario.initial_state:
@@ -255,7 +255,7 @@ def _simulated(design: ObserverDesign, scenario: Scenario) -> Simulation:
             f"{change:.3g} (norm)."
         )
     return Simulation(
-        time=dt * np.arange(bench.drive.steps, dtype=np.float64),
+        time=dt * np.arange(bench.signals.steps, dtype=np.float64),
         states=runs.states[:, 0],
         outputs=runs.outputs[:, 0],
         inputs=runs.inputs[:, 0],

@@ -65,7 +65,7 @@ def float_error(found: Realisation) -> str:
     """Return what the header of an export in floats says of its error."""
     bounds = float_bounds(found)
     if bounds is None:
-        return "Floats: no bound on the error of single precision was found, as the observer forgets too slowly."
+        return "Floats: no bound on the error of single precision was found, as its errors decay too slowly."
     names = found.observer.row_names
     listed = ", ".join(f"{name} {bound:.2g}" for name, bound in zip(names, bounds, strict=True))
     return (

@@ -36,18 +36,19 @@ class Candidate:
     milliseconds: float  # to design
     refused: str
 
-    def rank(self, leaky: bool, settling: float = np.inf) -> tuple[float, ...]:
-        """Return what sorts candidates, best first; ``settling``: the plant's time (s); ``leaky``: unknown inputs."""
+    def rank(self, has_unknown_inputs: bool, settling: float = np.inf) -> tuple[float, ...]:
+        """Return what sorts candidates, best first; ``settling``: the plant's time (s); and whether the plant
+        has unknown inputs."""
         if not self.figures:
             return (2.0, 0.0, 0.0, np.inf)
         missed = float(not all(found.reaches for found in self.figures))
-        leak = float(leaky and any(found.leak > DECOUPLED for found in self.figures))
+        coupled = float(has_unknown_inputs and any(found.leak > DECOUPLED for found in self.figures))
         slow = float(any(found.most > SLOW * settling for found in self.figures))
         dt = self.observer.dt if self.observer is not None else 0.0
         # A mean over time T divides noise by the root of T: it cannot change deviation times the root of delay.
         prices = [found.deviation * np.sqrt(max(found.most, dt)) for found in self.figures]
         price = float(np.prod(prices) ** (1.0 / len(prices))) if np.all(np.isfinite(prices)) else np.inf
-        return (missed, leak, slow, price)
+        return (missed, coupled, slow, price)
 
 
 def candidate(
@@ -195,10 +196,10 @@ def reason(best: Candidate, others: list[Candidate], plant: DescriptorSystem) ->
     """Return in one sentence why a candidate is first."""
     if not others:
         return "no other method exists for this plant"
-    worst_leak = max(found.leak for found in best.figures)
+    gain = max(found.leak for found in best.figures)
     words = ["it reaches every step"] if best.rank(False)[0] == 0.0 else []
     if plant.nd:
-        words.append(f"unknown inputs leak by {worst_leak:.1e}")
+        words.append(f"gain from the unknown inputs {gain:.1e}")
     deviation = ", ".join(f"{found.deviation:.3g}" for found in best.figures)
     delay = ", ".join(f"{found.most:.3g}" for found in best.figures)
     words.append(f"deviation {deviation} at 90 % of a step after {delay} s")

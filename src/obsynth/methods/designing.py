@@ -57,7 +57,7 @@ def design(
     method : str, optional
         Method id; for its options see the function of the same name, such as `fault_estimation_filter`.  By default
         ``auto``: every method that exists and has the options given is designed, and the best by closed-form figures
-        (reach of a step, leak of the unknown inputs, noise against delay) is taken; the design names it.
+        (reach of a step, gain from the unknown inputs, noise against delay) is taken; the design names it.
     name : str, optional
         Name of the design.
     recovery : StateRecovery, optional

@@ -102,7 +102,7 @@ def peak_gain(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
             if np.all(left <= LEFT_SHARE * total[:inputs]):
                 return np.asarray(total[:inputs] + left)
         step, transition = 2.0 * step, transition @ transition
-    raise SpecError("The observer forgets too slowly for a bound on its residual.", path="observer")
+    raise SpecError("Errors of the observer decay too slowly for a bound on its residual.", path="observer")
 
 
 def _in_lyapunov_norm(a: FloatArray, b: FloatArray, c: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -26,7 +26,7 @@ from obsynth.observers.recursive import gain_schedule
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.running import named_estimates
 
-#: Samples in one call of the library: a second or less, so that progress shows and an interrupt is heard.
+#: Samples in one call of the library: a second or less, so that progress shows and an interrupt takes effect.
 SAMPLES_PER_CALL = 100_000
 #: Steps from which it pays to compile unasked: compiling takes about a second, and the rest thirty microseconds a step.
 WORTH_COMPILING = 50_000

@@ -71,7 +71,7 @@ def robust_advance(
     predicted_outputs: Callable[[State, FloatArray], tuple[FloatArray, FloatArray]] | None = None,
 ) -> tuple[State, Row]:
     """Take a step; where its innovation is too long, ask each sensor and take the step again without the outliers.
-    ``predicted(state, heard, u)``: mean and deviation of each output ``(ny,)`` from the samples that are heard;
+    ``predicted(state, received, u)``: mean and deviation of each output ``(ny,)`` from the samples that are received;
     ``predicted_outputs(state, u)``: of outputs that determine the state; these may be `BLIND` times further off."""
     failed, mean, deviation, far = False, y, y, np.zeros(len(y), dtype=bool)
     try:
@@ -91,13 +91,13 @@ def robust_advance(
     if kind == "gate":
         # A wrong sample stands alone; of a sensor, or a plant, that has moved the next is on the same side, as far off.
         gone = far & (~_follows(state.refused, off) | (np.abs(y) > OVERFLOW))
-        heard = np.where(gone, np.nan, y)
+        received = np.where(gone, np.nan, y)
     else:
         pulled = mean + limit * deviation * np.sign(y - mean)
-        heard = np.where(gone, np.where(np.isfinite(pulled), pulled, np.nan), y)
+        received = np.where(gone, np.where(np.isfinite(pulled), pulled, np.nan), y)
     try:
         if failed or gone.any():
-            after, row = plain(state, heard, u)
+            after, row = plain(state, received, u)
     except (SolverError, np.linalg.LinAlgError, ValueError):
         # A sample that nothing predicts, and with which there is no step.
         gone = ~np.isnan(y)

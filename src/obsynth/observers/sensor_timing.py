@@ -139,17 +139,17 @@ class SensorTiming:
         """Take a row as it arrives by the steps of an observer without delays (``y (ny,)``, ``u (nu,)``)."""
         if self.is_plain:
             return inner(state, y, u)
-        heard = np.where(self.expected(state.k), y, np.nan)
+        received = np.where(self.expected(state.k), y, np.nan)
         if not self.longest:
-            return inner(state, heard, u)
+            return inner(state, received, u)
         k, states = state.k, [*state.before, state.latest]
         oldest = k - len(state.before)
-        outputs = np.vstack((state.outputs, np.where(self.delays == 0, heard, np.nan)))
+        outputs = np.vstack((state.outputs, np.where(self.delays == 0, received, np.nan)))
         inputs, earliest = np.vstack((state.inputs, u)), k
         for i in np.flatnonzero(self.delays):
             taken = k - int(self.delays[i])
-            if taken >= oldest and not np.isnan(heard[i]):
-                outputs[taken - oldest, i] = heard[i]
+            if taken >= oldest and not np.isnan(received[i]):
+                outputs[taken - oldest, i] = received[i]
                 earliest = min(earliest, taken)
         row = None
         for t in range(earliest - oldest, len(states)):

@@ -99,7 +99,7 @@ def estimate_gains(design: ObserverDesign, *, to: str = "faults") -> EstimateGai
 class FaultGains:
     """Largest gain from unknown inputs to fault estimates ``(nf, nd)``; share of a step shown in the end ``(nf,)``."""
 
-    leaks: FloatArray
+    disturbance_gains: FloatArray
     steady: FloatArray
 
 
@@ -107,14 +107,14 @@ def fault_gains(design: ObserverDesign) -> FaultGains:
     """Return what reaches each fault estimate of a linear design that estimates faults."""
     plant, observer = design.linear
     _, points, to_estimate = _over_frequencies(observer, observer.fault_rows)
-    leaks = np.zeros((len(observer.fault_names), plant.nd))
+    disturbance_gains = np.zeros((len(observer.fault_names), plant.nd))
     if plant.nd:
         _, found, terms = _seen(plant, plant.Bd, plant.Dd, points, to_estimate)
-        leaks = _above_rounding(np.abs(found), terms[:, None, None]).max(axis=0)
+        disturbance_gains = _above_rounding(np.abs(found), terms[:, None, None]).max(axis=0)
     own = [plant.fault_names.index(name) for name in observer.fault_names]
     _, slowest, _ = _seen(plant, plant.Bf, plant.Df, points, to_estimate)
     steady = slowest[0].real[np.arange(len(own)), own]
-    return FaultGains(leaks, np.asarray(steady))
+    return FaultGains(disturbance_gains, np.asarray(steady))
 
 
 def _over_frequencies(observer: LinearObserver, rows: slice) -> tuple[FloatArray, ComplexArray, ComplexArray]:

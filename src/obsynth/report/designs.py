@@ -193,12 +193,16 @@ def fault_estimates(design: ObserverDesign, gains: FaultGains | None) -> tuple[t
     none, noise = "by sampling" if plant.nw else "none stated", "deviation" if plant.is_discrete else "deviation, 1 s"
     delays = ("delay", "delay in s") if plant.is_discrete else ()
     rows: list[tuple[str, ...]] = []
-    for name, late, leaks in zip(linear.fault_names, linear.fault_delays, gains.leaks, strict=True):
-        delay = (str(late), number(late * plant.dt)) if plant.is_discrete else ()
+    for name, lag, disturbance_gains in zip(
+        linear.fault_names, linear.fault_delays, gains.disturbance_gains, strict=True
+    ):
+        delay = (str(lag), number(lag * plant.dt)) if plant.is_discrete else ()
         row = (name, *delay, deviation(name, none))
         if plant.nd:
-            leak = float(leaks.max())
-            row += (f"{number(leak)} of {plant.disturbance_names[int(leaks.argmax())]}" if leak else "none",)
+            gain = float(disturbance_gains.max())
+            row += (
+                f"{number(gain)} of {plant.disturbance_names[int(disturbance_gains.argmax())]}" if gain else "none",
+            )
         rows.append(row)
     return ("fault", *delays, noise, *(("worst gain",) if plant.nd else ())), rows
 

@@ -220,7 +220,7 @@ def _assumptions(design: ObserverDesign) -> Iterator[str]:
 
 
 def _warnings(design: ObserverDesign, gains: FaultGains | None, steps: Mapping[str, FaultFigures]) -> Iterator[str]:
-    """Yield what a user should not overlook: leaks that look like faults, steps that are not followed."""
+    """Yield what a user should not overlook: disturbances that look like faults, steps that are not followed."""
     if isinstance(design.plant, DescriptorSystem):
         yield from questions(design.plant)
     if gains is None:
@@ -230,10 +230,10 @@ def _warnings(design: ObserverDesign, gains: FaultGains | None, steps: Mapping[s
     told = []
     for i, fault in enumerate(observer.fault_names):
         for j, name in enumerate(plant.disturbance_names):
-            leak = float(gains.leaks[i, j])
-            if leak >= NEAR_ONE and units.get(fault) == units.get(name):
+            gain = float(gains.disturbance_gains[i, j])
+            if gain >= NEAR_ONE and units.get(fault) == units.get(name):
                 yield (
-                    f"{name} reaches the estimate of {fault} with a gain of up to {number(leak)}: it looks like the "
+                    f"{name} reaches the estimate of {fault} with a gain of up to {number(gain)}: it looks like the "
                     "fault."
                 )
         followed = float(gains.steady[i])

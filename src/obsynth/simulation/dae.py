@@ -73,12 +73,12 @@ def simulate_dae(
         raise SpecError(f"seed is {seed!r}: give a whole number, not negative.", path="seed")
     rng = np.random.default_rng(seed)
     pushed = _noise(Q, model.nx, "Q", rng, len(inputs))
-    heard = _noise(R, model.ny, "R", rng, len(inputs))
+    measurement_noise = _noise(R, model.ny, "R", rng, len(inputs))
     run = _Run(ImplicitStep(DAEFunctions(model, integration), length), inputs, theta, pushed)
     run.start(_consistent(model, x, inputs, theta, length))
     take_samples(1, len(inputs), run.together, run.alone)
     time = length * np.arange(len(inputs), dtype=np.float64)
-    return Trajectory(run.states, run.outputs + heard, inputs, theta, time=time, residuals=run.residuals)
+    return Trajectory(run.states, run.outputs + measurement_noise, inputs, theta, time=time, residuals=run.residuals)
 
 
 def _consistent(model: DAEModel, x: FloatArray, inputs: FloatArray, theta: FloatArray, dt: float) -> FloatArray:

@@ -137,11 +137,11 @@ def make_stepper(
     inputs = np.hstack([reduced.B, reduced.Bf, reduced.Bd])
     if plant.is_discrete:
         transition, held, ramped = a, inputs, np.zeros_like(inputs)
-        noisy, heard = reduced.Bw, reduced.Dw
+        noisy, measurement_noise = reduced.Bw, reduced.Dw
         shown = recovery.from_noise
     else:
         transition, held, ramped = first_order_hold(a, inputs, drive.dt)
-        noisy, heard, shown = _sampled_noise(reduced, recovery, a, drive)
+        noisy, measurement_noise, shown = _sampled_noise(reduced, recovery, a, drive)
     direct = np.hstack([recovery.from_input, recovery.from_fault, recovery.from_disturbance])
     return Stepper(
         transition,
@@ -149,7 +149,7 @@ def make_stepper(
         ramped,
         noisy,
         (recovery.from_state - recovery.from_input @ closing, direct, shown),
-        (reduced.C - reduced.D @ closing, np.hstack([reduced.D, reduced.Df, reduced.Dd]), heard),
+        (reduced.C - reduced.D @ closing, np.hstack([reduced.D, reduced.Df, reduced.Dd]), measurement_noise),
         start,
         gain,
     )

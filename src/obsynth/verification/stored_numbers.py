@@ -300,7 +300,7 @@ def _when_it_matters(system: _Composite, level: float, unit: float, beyond: floa
     outside = distance > BOUNDARY_TOLERANCE
     seconds = per_unit / beyond if beyond > 0.0 else np.inf
     if not poles.size or np.all(distance < -BOUNDARY_TOLERANCE):
-        return "the plant forgets: a finite gain exists", np.inf
+        return "the plant is stable: a finite gain exists", np.inf
     if outside.any():
         rate = float(np.max(np.log(np.abs(poles[outside])) / dt if dt > 0.0 else poles[outside].real))
         left = max(float(np.max(np.abs(system.K), initial=0.0)), float(np.max(np.abs(system.J), initial=0.0)))

@@ -190,10 +190,10 @@ def _noise(smooth: DescriptorSystem, back: FloatArray, dt: float) -> tuple[Float
     if process.any():
         whole = DescriptorSystem(None, smooth.A, C=np.eye(smooth.nx), Bw=smooth.Bw[:, process])
         gathered = back @ discretise(whole, dt).plant.Bw
-    heard = smooth.Dw[:, sensors]
+    measurement_noise = smooth.Dw[:, sensors]
     return (
-        np.hstack([gathered, np.zeros((smooth.nx, heard.shape[1]))]),
-        np.hstack([np.zeros((smooth.ny, gathered.shape[1])), heard]),
+        np.hstack([gathered, np.zeros((smooth.nx, measurement_noise.shape[1]))]),
+        np.hstack([np.zeros((smooth.ny, gathered.shape[1])), measurement_noise]),
     )
 
 

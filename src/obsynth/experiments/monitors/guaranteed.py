@@ -128,7 +128,7 @@ def record_monitor(design: ObserverDesign, scenario: Scenario, kind: str, given:
             path="samples",
         )
     threshold[:before] = np.inf
-    dt, statement = bench.drive.dt, _statement(test)
+    dt, statement = bench.signals.dt, _statement(test)
     rule: Rule = _RecordRule(test, threshold, scales, dt)
     if constants is not None or initial_set is not None:
         changed, bounds = _bounded(test, constants)

@@ -72,14 +72,14 @@ def sampled_errors(errors: ErrorModel, dt: float) -> SampledErrors:
     driven = errors.noise[:, process]
     whole = DescriptorSystem(None, observer.Az, C=np.eye(observer.order), Bw=driven)
     gathered = discretise(whole, dt).plant.Bw
-    heard = plant.Dw[:, sensors]
+    measurement_noise = plant.Dw[:, sensors]
     ramp = first_order_hold(observer.Az, observer.By, dt)[2]
     return SampledErrors(
         transition,
         gathered_d,
-        np.hstack([-held.By @ heard, gathered]),
-        held.Dy @ heard,
-        ramp @ heard,
+        np.hstack([-held.By @ measurement_noise, gathered]),
+        held.Dy @ measurement_noise,
+        ramp @ measurement_noise,
         gathered.shape[1],
     )
 
@@ -204,13 +204,20 @@ def residual_model(
     rows = observer.fault_rows if estimates else observer.residual_rows
     faults, _, faults_d, faults_w = errors.fault_output
     bounds, means, deviations, steady = _disturbances(scenario, plant.disturbance_names, drive.steps, drive.dt)
-    a, driven, noise, flow, start_noise, heard = errors.Az, errors.disturbance, errors.noise, None, None, None
+    a, driven, noise, flow, start_noise, measurement_noise = (
+        errors.Az,
+        errors.disturbance,
+        errors.noise,
+        None,
+        None,
+        None,
+    )
     continuous = None
     if not plant.is_discrete:
         held, flow = sampled_errors(errors, drive.dt), (errors.Az, errors.disturbance)
         a, driven, noise, start_noise = held.A, held.Bd, held.Bw, held.start
         sensors = noisy.Dw.any(axis=0)
-        heard = errors.noise[:, sensors], direct_w[:, sensors]
+        measurement_noise = errors.noise[:, sensors], direct_w[:, sensors]
         continuous = ContinuousDesign(noisy, observer, errors.own, drive.dt, endless, rows)
         direct_w, faults_w = held.direct(rows), held.direct(observer.fault_rows)
     between = None
@@ -234,7 +241,7 @@ def residual_model(
         steady,
         flow,
         start_noise,
-        heard,
+        measurement_noise,
         continuous,
         between,
         errors if plant.is_discrete else None,

@@ -149,7 +149,7 @@ def monitor(
             window=window,
             change=None if kind == "chi-square" else float(change),
             false_alarms=false_alarms,
-            dt=bench.drive.dt,
+            dt=bench.signals.dt,
             white=white,
             table=_statistical(kind, model, len(whitener), start, window, false_alarms, white=white),
         )
@@ -163,10 +163,10 @@ def monitor(
                 threshold = window_threshold(model, inputs, start, window)
         if model.flow is not None:
             threshold = threshold + _straight_lines(design, scenario, model, kind, window, rows)
-        rule = NormRule(threshold, np.inf, window=window if kind == "window" else 1, dt=bench.drive.dt)
+        rule = NormRule(threshold, np.inf, window=window if kind == "window" else 1, dt=bench.signals.dt)
     noisy = noisy_design(design, scenario)
     assumed = Assumptions(noisy.linear[0], bounds, noise_bound or 0.0, initial_error=start)
-    numbers = {"window": window, "false_alarms": false_alarms, "change": change, "dt": bench.drive.dt}
+    numbers = {"window": window, "false_alarms": false_alarms, "change": change, "dt": bench.signals.dt}
     bounded = assumed if kind in ("pointwise", "window") else None
     statement = statement_of(kind, model, bounded, estimates=estimates, **numbers) + EXACT
     if adaptive:
@@ -179,7 +179,7 @@ def monitor(
         fault_names=design.linear[1].fault_names,
         fault_scales=model.fault_scales(),
         horizon=model.steps,
-        dt=bench.drive.dt,
+        dt=bench.signals.dt,
         floor=_floor(bench, scenario, rows),
         isolation_delay=isolation_delay,
         watches_estimates=estimates,

@@ -164,8 +164,8 @@ def samples_of(transition: FloatArray, window: int) -> int:
         power, count = np.triu(power @ power), 2 * count
         if count > MOST_SAMPLES or count * power.size > MOST_NUMBERS or not np.isfinite(power).all():
             raise SpecError(
-                "The observer forgets too slowly at this sampling for a bound for ever: use a statistical monitor, or "
-                "obsynth.monitor for a record of known length.",
+                "Errors of the observer decay too slowly at this sampling for a bound for ever: use a statistical "
+                "monitor, or obsynth.monitor for a record of known length.",
                 path="monitor",
             )
     return max(count, 1) + window

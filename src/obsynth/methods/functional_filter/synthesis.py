@@ -417,7 +417,7 @@ def _notes(plant: DescriptorSystem, asked: FunctionalFilter, slowest: float, rat
         )
     if np.isfinite(slowest) and slowest * SLOW * settling_time(plant) < 1.0:
         notes.append(
-            f"The slowest pole forgets the start with a time constant of {1.0 / slowest:.3g} s: errors of the state at "
+            f"The slowest pole has a time constant of {1.0 / slowest:.3g} s: errors of the state at "
             "the start stay that long where they show. Ask for decay= to be faster, at a price in noise."
         )
     return notes

@@ -46,16 +46,16 @@ def _in_c(
     moved = np.zeros(0)
     state = library.started()
     for begin in range(0, len(y), SAMPLES_PER_CALL):
-        heard = y[begin : begin + SAMPLES_PER_CALL]
-        after, said = library.record(state, heard, u[begin : begin + SAMPLES_PER_CALL])
-        if len(after) < len(heard):
+        received = y[begin : begin + SAMPLES_PER_CALL]
+        after, said = library.record(state, received, u[begin : begin + SAMPLES_PER_CALL])
+        if len(after) < len(received):
             # Go there again where the message is written.
             advanced(steps, y, u, bool, note)
             raise SolverError(f"The C stops at k = {begin + len(after)}, but CasADi goes on: leave compiled=True out.")
         if begin == 0:
             moved = steps.projected(steps.first, u[0])[1]
-        keep(DAERow(steps.graph, begin, after, said, ~np.isnan(heard[: len(after)]), moved))
-        note(begin + len(heard))
+        keep(DAERow(steps.graph, begin, after, said, ~np.isnan(received[: len(after)]), moved))
+        note(begin + len(received))
 
 
 def advanced(

@@ -97,23 +97,23 @@ class Steps:
             memory[layout.slices["cross"]] = np.zeros(self.settings.model.nx * nq)
         return memory
 
-    def predicted(self, state: DAEState, heard: FloatArray, u: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return mean and deviation of each output ``(ny,)`` from what is heard of the next sample."""
-        after, row = self.plain(state, heard, u)
+    def predicted(self, state: DAEState, received: FloatArray, u: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return mean and deviation of each output ``(ny,)`` from what is received of the next sample."""
+        after, row = self.plain(state, received, u)
         mean, deviation = self._call("forecast", after.memory, row.said)
         return mean[:, 0], deviation[:, 0]
 
     def plain(self, state: DAEState, y: FloatArray, u: FloatArray) -> tuple[DAEState, DAERow]:
         """Take a sample as it is."""
         seen = ~np.isnan(y)
-        heard, moved = np.where(seen, y, 0.0), np.zeros(self.settings.model.nx)
+        received, moved = np.where(seen, y, 0.0), np.zeros(self.settings.model.nx)
         if state.k == 0:
             memory, moved = self.projected(state, u)
-            after, said = self._call("first", memory, heard, seen)
+            after, said = self._call("first", memory, received, seen)
         else:
-            after, said = self._call("whole", state.memory, np.concatenate([u, heard, seen]))
+            after, said = self._call("whole", state.memory, np.concatenate([u, received, seen]))
             if said[-1, 0] != 1.0:
-                after, said = self._carefully(state, heard, seen, u)
+                after, said = self._carefully(state, received, seen, u)
         if not np.isfinite(after).all():
             raise SolverError(
                 f"The matrix of (7), dF/dx' / dt + dF/dx, is singular at k = {state.k}, or the model is not defined "

@@ -159,13 +159,13 @@ class Recursion:
             return nothing, np.full(plant.ny, np.inf)
         return self._outputs(self._estimate(corrected, v, G, v, nothing)._replace(k=k))
 
-    def predicted(self, state: RecursiveState, heard: FloatArray, u: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return mean and deviation of each output ``(ny,)`` from what is heard of the next sample. The deviation is
+    def predicted(self, state: RecursiveState, received: FloatArray, u: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return mean and deviation of each output ``(ny,)`` from what is received of the next sample. The deviation is
         infinite where nothing is known."""
         plant, k = self.settings.plant, state.k
         if k == 0:
             return np.zeros(plant.ny), np.full(plant.ny, np.inf)
-        return self._outputs(self.plain(state, heard, u)[1])
+        return self._outputs(self.plain(state, received, u)[1])
 
     def _outputs(self, row: RawEstimate) -> tuple[FloatArray, FloatArray]:
         """Return mean and deviation of each output ``(ny,)`` at what is known; infinite where nothing is."""

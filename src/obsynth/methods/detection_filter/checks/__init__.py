@@ -144,4 +144,4 @@ def _why_not(plant: DescriptorSystem) -> str:
             "equations of the error by rounding: together they have no finite gain. How much a state of the plant adds "
             "to the residuals is told by 'stored numbers: states'"
         )
-    return f"not proved: the plant forgets at {-rate:.3g} 1/s only, too slowly for what the stored numbers miss"
+    return f"not proved: the plant decays at {-rate:.3g} 1/s only, too slowly for what the stored numbers miss"
