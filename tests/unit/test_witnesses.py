@@ -215,7 +215,7 @@ def test_a_long_fault_model_has_a_witness_of_its_own() -> None:
     assert "of Phi of the fault model" in failed.detail
     drops = exact_drops(Evaluator(witness.plant(plant)), witness.model(model))
     assert drops is not None
-    assert not drops.facts.full or drops.facts.outside
+    assert not drops[0].full or drops[0].outside
 
 
 def test_a_plant_that_was_sampled_or_reduced_is_named_so() -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol, Self, TypeVar
+from typing import Any, Protocol, Self, TypeVar
 
 import flint
 import numpy as np
@@ -63,10 +63,11 @@ def prove_by_ball_arithmetic(formula: Formula) -> ExtendedProof:
             pivot = undecided_pivot(matrix.entries())
             if pivot is None:
                 return ExtendedProof(True, _lower_bound(matrix), bits)
-        if pivot.certain:
-            return ExtendedProof(False, 0.0, bits, f"pivot {pivot.place} is not positive: not positive definite")
-        reason = f"{bits} bits of ball arithmetic leave the sign of pivot {pivot.place} open: singular, or next to it"
-        if pivot.hopeless:
+        place, is_certain, is_hopeless = pivot
+        if is_certain:
+            return ExtendedProof(False, 0.0, bits, f"pivot {place} is not positive: not positive definite")
+        reason = f"{bits} bits of ball arithmetic leave the sign of pivot {place} open: singular, or next to it"
+        if is_hopeless:
             break
     return ExtendedProof(False, 0.0, bits, reason)
 
@@ -90,21 +91,14 @@ def middle_of(ball: Any) -> complex:
     return complex(float(ball.real.mid()), float(ball.imag.mid()))
 
 
-class _Pivot(NamedTuple):
-    """A pivot that is not known to be positive."""
-
-    place: int
-    certain: bool  # it is known not to be
-    hopeless: bool  # digits do not help: it is not finite
-
-
-def undecided_pivot(rows: list[list[Any]]) -> _Pivot | None:
-    """Return the first pivot of ``L D L'`` not certainly positive, if any; only the upper triangle is read."""
+def undecided_pivot(rows: list[list[Any]]) -> tuple[int, bool, bool] | None:
+    """Return the place of the first pivot of ``L D L'`` not certainly positive, if any, whether it certainly is not,
+    and whether digits do not help, as it is not finite; only the upper triangle is read."""
     size = len(rows)
     for k, pivot_row in enumerate(rows):
         pivot = pivot_row[k]
         if not pivot > 0:
-            return _Pivot(k + 1, bool(pivot <= 0), not pivot.is_finite())
+            return k + 1, bool(pivot <= 0), not pivot.is_finite()
         for i in range(k + 1, size):
             factor, row = pivot_row[i] / pivot, rows[i]
             for j in range(i, size):

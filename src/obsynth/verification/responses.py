@@ -82,8 +82,8 @@ def ring_length(az: FloatArray) -> int:
             length, power = 2 * length, power @ power
         if length > LONGEST or not np.isfinite(power).all():
             raise PreconditionError(
-                f"Errors of the observer decay too slowly for a bound over tolerances (not within {LONGEST} samples): ask "
-                "for a faster one, or sample more slowly.",
+                f"Errors of the observer decay too slowly for a bound over tolerances (not within {LONGEST} samples): "
+                "ask for a faster one, or sample more slowly.",
                 condition="observer's decay",
             )
     return length

@@ -11,7 +11,6 @@ Between samples it may do anything within its bound:
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -36,14 +35,6 @@ PIECES = 32
 COEFFICIENT_ROUNDINGS = 16.0
 
 
-@dataclass(frozen=True, eq=False)
-class BoundedModel:
-    """A sampled linear model whose last disturbances stand for what it leaves out, with the bounds of these by name."""
-
-    plant: DescriptorSystem
-    bounds: Mapping[str, float]
-
-
 def bounded_model(
     model: DAEModel,
     region: Mapping[str, Sequence[float]],
@@ -53,8 +44,9 @@ def bounded_model(
     disturbances: Sequence[str],
     given: Mapping[str, float] | None = None,
     shipped: DescriptorSystem | None = None,
-) -> BoundedModel:
-    """Return the model at an equilibrium; ``shipped``: bound what this one leaves out, instead of a new one.
+) -> tuple[DescriptorSystem, Mapping[str, float]]:
+    """Return the sampled linear model at an equilibrium, whose last disturbances stand for what it leaves out, and the
+    bounds of these by name; ``shipped``: bound what this one leaves out, instead of a new one.
 
     ``region``: ``[low, high]`` of every state, input and fault; others have their nominal values.
     """
@@ -77,8 +69,8 @@ def bounded_model(
     own = found if shipped is None else shipped
     bounds = _sampled(linear, own, sample_time, (equations, outputs), dict(zip(signals, at.tolist(), strict=True)))
     if shipped is not None:
-        return BoundedModel(shipped, bounds)
-    return BoundedModel(_with_remainders(found), bounds)
+        return shipped, bounds
+    return _with_remainders(found), bounds
 
 
 def remainder_names(plant: DescriptorSystem) -> list[str]:

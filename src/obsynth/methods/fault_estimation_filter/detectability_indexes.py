@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import random
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
@@ -30,12 +30,8 @@ DEPENDENT_SHARE = 0.1
 _SEED = 45
 
 
-@dataclass(frozen=True)
-class ExactIndexes:
-    """Indexes (``None``: the fault never reaches the outputs) and the rank of Upsilon (0 where one is missing)."""
-
-    indexes: tuple[int | None, ...]
-    rank: int
+#: Indexes (``None``: the fault never reaches the outputs) and the rank of Upsilon (0 where one is missing).
+ExactIndexes: TypeAlias = tuple[tuple[int | None, ...], int]
 
 
 def numbers_with_fault_states(plant: DescriptorSystem, numbers: PlantNumbers | None) -> PlantNumbers | None:
@@ -96,7 +92,7 @@ def _decided_indexes(plant: DescriptorSystem, known: PlantNumbers) -> ExactIndex
         else:
             indexes.append(None)
     rank = numbers.rank(numbers.blocks([columns])) if None not in indexes and columns else 0
-    return ExactIndexes(tuple(indexes), rank)
+    return tuple(indexes), rank
 
 
 def nonsingular_t(numbers: PlantNumbers) -> fmpq_mat | None:
@@ -160,7 +156,7 @@ def fault_detectability(
     if exact is None:
         results = [_first_visible(ta, c, tf[:, i], size) for i in range(tf.shape[1])]
     else:
-        results = [_at_index(ta, tf[:, i], index) for i, index in enumerate(exact.indexes)]
+        results = [_at_index(ta, tf[:, i], index) for i, index in enumerate(exact[0])]
     psi = np.column_stack([vector for _, vector in results]) if results else np.zeros((ta.shape[0], 0))
     upsilon = c @ psi
     lengths = np.linalg.norm(upsilon, axis=0)
@@ -169,7 +165,7 @@ def fault_detectability(
     invertible = unit.shape[0] >= unit.shape[1] and values[-1] > 0.0
     condition = float(values[0] / values[-1]) if invertible else np.inf
     rank = decide_rank(unit, expected=tf.shape[1], tolerance=1.0 / REFUSE_CONDITION)
-    rank = settled_rank(rank, None if exact is None else exact.rank)
+    rank = settled_rank(rank, None if exact is None else exact[1])
     return FaultDetectability(tuple(index for index, _ in results), psi, upsilon, rank, condition)
 
 

@@ -73,18 +73,16 @@ def _linear(model: DAEModel, asked: Any) -> tuple[DescriptorSystem, Any]:
             f"{', '.join(model.inputs) or 'none'}; the others are known.",
             path="method.options.disturbance_bounds",
         )
-    found = bounded_model(
+    linear, bounds = bounded_model(
         model, asked.region, asked.sample_time, faults=[fault, *others], disturbances=list(given), given=asked.given
     )
-    _require_inside(found.plant, given, asked.region)
+    _require_inside(linear, given, asked.region)
     sizes = {
         name: max(abs(float(end)) for end in asked.region.get(name, (1.0, 1.0)))
         for name in (*model.state_names, *model.input_names)
     }
     largest = max(sizes.values(), default=1.0)
-    room = {
-        name: value * (1.0 + SHARE_ROOM) + ROUNDINGS * UNIT_ROUNDOFF * largest for name, value in found.bounds.items()
-    }
+    room = {name: value * (1.0 + SHARE_ROOM) + ROUNDINGS * UNIT_ROUNDOFF * largest for name, value in bounds.items()}
     own = replace(
         asked,
         fault=fault,
@@ -94,7 +92,7 @@ def _linear(model: DAEModel, asked: Any) -> tuple[DescriptorSystem, Any]:
         sample_time=None,
         given=None,
     )
-    return found.plant, own
+    return linear, own
 
 
 def _require_inside(plant: DescriptorSystem, given: Mapping[str, Any], region: Mapping[str, Any]) -> None:

@@ -35,7 +35,7 @@ def remainder_check(design: ObserverDesign, read: Callable[[Mapping[str, Any]], 
     try:
         asked = read(design.options)
         own = [name for name in plant.disturbance_names if name in asked.model["inputs"]]
-        found = bounded_model(
+        _, found = bounded_model(
             DAEModel(**asked.model),
             asked.region,
             asked.sample_time,
@@ -43,7 +43,7 @@ def remainder_check(design: ObserverDesign, read: Callable[[Mapping[str, Any]], 
             disturbances=own,
             given=asked.given,
             shipped=plant,
-        ).bounds
+        )
         kept = plant.disturbance_names[len(own) :] == tuple(found) and plant.dt == asked.sample_time
         ratios = [value / max(asked.disturbance_bounds[name], np.finfo(float).tiny) for name, value in found.items()]
         worst = max(ratios) if kept and _apart(design, len(own)) else np.inf

@@ -605,12 +605,12 @@ def _fixed_modes(
     augmented, given = AugmentedPlant.of(plant, model), judge.plant
     exact = exact_drops(judge, courses)
     if exact is not None:
-        inputs, direct = plant.Bd[:, exact.kept], plant.Dd[:, exact.kept]
+        inputs, direct = plant.Bd[:, exact[1]], plant.Dd[:, exact[1]]
     else:
         inputs, direct = independent_disturbances(plant)
     below = np.vstack([inputs, np.zeros((model.order, inputs.shape[1]))])
     pencil = system_pencil(augmented.E, augmented.A, below, augmented.C, direct)
-    facts = None if exact is None else believed(exact.facts.timed(units.rate), *pencil, nx=augmented.order)
+    facts = None if exact is None else believed(exact[0].timed(units.rate), *pencil, nx=augmented.order)
     if facts is not None and facts.full and not facts.outside:
         # A mode that only rounding of the data moves is fixed as well.
         nearly = zeros_at_rounding_level(*pencil, finite_zeros(*pencil).values, facts.zeros, nx=augmented.order)

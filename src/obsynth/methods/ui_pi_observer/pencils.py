@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,13 +83,6 @@ def equilibrated(matrix: NDArray[Any]) -> tuple[NDArray[Any], FloatArray]:
     return pencil.rows[:, None] * matrix * pencil.columns, pencil.columns
 
 
-class ExactDrops(NamedTuple):
-    """Facts on the augmented pencil ``[Aa - s Ea, Bda; Ca, Dd]``, and the disturbances that are kept in it."""
-
-    facts: SystemFacts
-    kept: list[int]
-
-
 def _exact_pencil(
     judge: Evaluator, numbers: PlantNumbers, model: Exosystem
 ) -> tuple[PlantNumbers, Any, Any, list[int]]:
@@ -102,18 +95,19 @@ def _exact_pencil(
     return _augmented(numbers, judge.plant, model), below, dd, kept
 
 
-def exact_drops(judge: Evaluator, model: Exosystem) -> ExactDrops | None:
-    """Return the drops of the augmented pencil; ``None`` for too many states."""
+def exact_drops(judge: Evaluator, model: Exosystem) -> tuple[SystemFacts, list[int]] | None:
+    """Return facts on the augmented pencil ``[Aa - s Ea, Bda; Ca, Dd]``, and the disturbances that are kept in it;
+    ``None`` for too many states."""
     numbers = judge.numbers
     if numbers is None:
         return None
 
-    def decided() -> ExactDrops:
+    def decided() -> tuple[SystemFacts, list[int]]:
         whole, below, direct, kept = _exact_pencil(judge, numbers, model)
-        return ExactDrops(whole.system(below, direct), kept)
+        return whole.system(below, direct), kept
 
     key = ("drops", model.Phi.tobytes(), model.Cw.tobytes(), model.order)
-    found: ExactDrops = numbers.remembered(key, decided)
+    found: tuple[SystemFacts, list[int]] = numbers.remembered(key, decided)
     return found
 
 

@@ -7,7 +7,6 @@ is used from `LONG_RECORD` samples and up to `SMALL_ORDER` states.  Its first us
 from __future__ import annotations
 
 import importlib.util
-from typing import NamedTuple
 
 import numpy as np
 
@@ -22,15 +21,6 @@ from obsynth.observers.recursive.settings import RecursiveSettings
 from obsynth.observers.recursive.step_model import PlantSteps, StepMatrices, StepModel, stacked_noise
 from obsynth.observers.running import named_estimates
 from obsynth.plants.sequences import MatrixSequence
-
-
-class StepStack(NamedTuple):
-    """Steps as `obsynth.numerics.compiled_steps.square_root_steps` takes them."""
-
-    moved: FloatArray  # ``(1 or steps, n, rows)``
-    known: FloatArray  # ``(1 or steps, rows, rows)``, upper triangular
-    head: FloatArray  # ``(1 or steps, n, n)``
-    data: FloatArray  # ``(steps, rows)``: as many steps as have an H of full rank, from the first one
 
 
 def stacked_matrices(model: StepModel, first: int, count: int) -> StepMatrices:
@@ -78,9 +68,15 @@ def _triangles(noise: FloatArray) -> FloatArray:
     return np.pad(found, ((0, 0), (0, rows - found.shape[1]), (0, 0)))
 
 
-def stacked_steps(step: StepMatrices, before: FloatArray, y: FloatArray, u: FloatArray) -> StepStack | None:
-    """Return steps with H factorised and everything rotated, up to the first H whose rank has to be decided.
-    Shapes: ``before (steps, nu)``, ``y (steps, measured)``, ``u (steps, nu)``."""
+def stacked_steps(
+    step: StepMatrices, before: FloatArray, y: FloatArray, u: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray] | None:
+    """Return steps with H factorised and everything rotated, up to the first H whose rank has to be decided, as
+    `obsynth.numerics.compiled_steps.square_root_steps` takes them: ``moved (1 or steps, n, rows)``, the triangles
+    ``known (1 or steps, rows, rows)``, ``head (1 or steps, n, n)`` and ``data (steps, rows)``.
+
+    Shapes: ``before (steps, nu)``, ``y (steps, measured)``, ``u (steps, nu)``.
+    """
     ne, rows, n = step.A.shape[1], step.H.shape[1], step.H.shape[2]
     if rows < n:
         return None
@@ -96,7 +92,8 @@ def stacked_steps(step: StepMatrices, before: FloatArray, y: FloatArray, u: Floa
     known = _triangles(np.matmul(step.noise.transpose(0, 2, 1), turned))
     right = np.concatenate((_products(step.B, before), y, _products(step.Dn, u)), axis=1)
     data = _products(turned.transpose(0, 2, 1), right)
-    return StepStack(*(np.ascontiguousarray(part) for part in (moved, known, triangle[:, :n], data[:count])))
+    head, data = np.ascontiguousarray(triangle[:, :n]), np.ascontiguousarray(data[:count])
+    return np.ascontiguousarray(moved), np.ascontiguousarray(known), head, data
 
 
 #: Samples from which the kernel is used unasked: they take seconds without it, which is what loading numba, or the
@@ -213,7 +210,7 @@ def _kernel_steps(
     stack = stacked_steps(stacked_matrices(recursion.model, first - 1, len(y)), u[:-1], y, u[1:])
     if stack is None:
         return state
-    count, rows = stack.data.shape
+    count, rows = stack[-1].shape
     n, nx = len(state.x), recursion.settings.plant.nx
     x, factor = np.array(state.x), np.array(state.factor, order="C")
     states, innovations = np.empty((count, n)), np.empty((count, rows - n))

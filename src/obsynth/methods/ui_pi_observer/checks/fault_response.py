@@ -7,7 +7,6 @@ T(s) f0 = 0 for every stable decoupled observer: a step is then first answered i
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -80,18 +79,11 @@ def _transfer(
     return response(*_system(plant, observer, tracking), points)
 
 
-@dataclass(frozen=True)
-class SteadyError:
-    """The constant error of a fault estimate when the fault is one order higher than its model."""
-
-    order: int  # the fault is t^order / order!
-    error: float  # fhat - f in the end, in units of that derivative
-
-
 def steady_errors(
     plant: DescriptorSystem, observer: LinearObserver, tracking: FloatArray, phi: FloatArray, cw: FloatArray
-) -> tuple[SteadyError, ...]:
-    """Return, for each fault, the error for a polynomial of the least order that its model does not hold."""
+) -> list[tuple[int, float]]:
+    """Return for each fault the order of the least ``t^order / order!`` that its model does not hold, and the error
+    ``fhat - f`` for it in the end, in units of that derivative."""
     a, b, c, d = _system(plant, observer, tracking)
     shift = np.eye(len(a)) if plant.dt > 0.0 else np.zeros_like(a)
     step = plant.dt if plant.dt > 0.0 else 1.0
@@ -103,8 +95,8 @@ def steady_errors(
         for _ in range(order + 1):
             vector = np.asarray(np.linalg.solve(a - shift, vector), dtype=np.float64)
         coefficient = -float(c[fault] @ vector) + (float(d[fault, fault]) - 1.0 if order == 0 else 0.0)
-        found.append(SteadyError(order, coefficient * step**order))
-    return tuple(found)
+        found.append((order, coefficient * step**order))
+    return found
 
 
 def _constants(phi: FloatArray, row: FloatArray, *, shift: float) -> int:
@@ -142,12 +134,12 @@ def tracking_rows(
             source=source,
             detail=f"largest |fhat/f| {abs(own[peak]):.3g} at {frequencies[peak]:.3g} rad/s; |fhat/f| = 1 is faithful",
         )
-        order = errors[fault].order
+        order, error = errors[fault]
         course = {0: "a step of 1", 1: "a ramp of 1 per s"}.get(order, f"t^{order} / {order}!")
         yield information(
             f"steady error[{name}]",
             f"fhat - f in the end when the fault is {course}, one order above its model",
-            errors[fault].error,
+            error,
             source=source,
             detail=plant.units.get(name, ""),
         )
