@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from obsynth.exporting.float_error import UNIT, float_bounds
-from obsynth.methods.guaranteed_test.proofs import down, exact_right_sides, up
+from obsynth.methods.guaranteed_test.problem import rounded_outward
+from obsynth.methods.guaranteed_test.proofs import down, exact_right_sides
 
 
 def one_state(pole: float, *, into: float, rise: float = 0.0) -> SimpleNamespace:
@@ -43,9 +44,9 @@ def test_what_never_forgets_has_no_bound() -> None:
 def test_fractions_become_doubles_on_the_safe_side() -> None:
     tiny = Fraction(1, 2**60)
     for value in (Fraction(1) + tiny, Fraction(1) - tiny, -Fraction(1) - tiny, Fraction(1, 3), Fraction(3, 4)):
-        assert Fraction(down(value)) <= value <= Fraction(up(value))
-        assert up(value) <= np.nextafter(float(value), np.inf)
-    assert up(Fraction(3, 4)) == down(Fraction(3, 4)) == 0.75
+        assert Fraction(down(value)) <= value <= Fraction(rounded_outward(value))
+        assert rounded_outward(value) <= np.nextafter(float(value), np.inf)
+    assert rounded_outward(Fraction(3, 4)) == down(Fraction(3, 4)) == 0.75
 
 
 def test_right_sides_of_a_window_are_exact() -> None:

@@ -31,11 +31,6 @@ def require_names(names: Any, field: str) -> None:
         )
 
 
-def fields_from_data(data: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the fields of an observer from plain data: JSON has lists where these are tuples of names and delays."""
-    return {key: tuple(value) if isinstance(value, list) else value for key, value in data.items()}
-
-
 def require_horizon(horizon: int | None, samples: int, *, early: bool) -> None:
     """Raise `SpecError` when a record of ``samples`` is longer than a model of ``horizon`` steps reaches."""
     if horizon is None:

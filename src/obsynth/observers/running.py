@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import fields, replace
 from functools import cached_property
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, Self, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -43,6 +43,17 @@ class Observer(ABC, Generic[State, Row]):
     def start(self) -> RunningObserver[State, Row]:
         """Return a running observer, at k = 0."""
         return RunningObserver(self)
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Self:
+        """Return the observer that its `as_dict` described.
+
+        Parameters
+        ----------
+        data : mapping
+            Every field by name; lists stand for tuples.
+        """
+        return cls(**{key: tuple(value) if isinstance(value, list) else value for key, value in data.items()})
 
 
 class StepObserver(Observer[Any, Any]):

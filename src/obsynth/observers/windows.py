@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,7 +14,6 @@ from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.observers.estimates import Estimates
 from obsynth.observers.records import (
     NAME_FIELDS,
-    fields_from_data,
     measured_record,
     require_horizon,
     require_names,
@@ -118,17 +116,6 @@ class WindowObserver(Observer[WindowState, float]):
     def as_dict(self) -> dict[str, Any]:
         """Return every field, as the constructor takes it."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
-
-    @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> Self:
-        """Return the observer that `as_dict` described.
-
-        Parameters
-        ----------
-        data : mapping
-            Every field by name; lists stand for tuples.
-        """
-        return cls(**fields_from_data(data))
 
     def programme_at(self, k: int) -> int:
         """Return the number of the weights at a row; -1 where there is no sum.

@@ -19,7 +19,14 @@ from obsynth.numerics.ranks import DIRECTION_SHARE
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.constants import ConstantsBox
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.uncertainty import SAMPLED, UNCERTAIN_MATRICES, Uncertainty, matrices_of, require_carried
+from obsynth.plants.uncertainty import (
+    SAMPLED,
+    UNCERTAIN_MATRICES,
+    Uncertainty,
+    as_written,
+    matrices_of,
+    require_carried,
+)
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.error_structure import Tracking
 
@@ -52,13 +59,8 @@ def moving_at(plant: DescriptorSystem, values: Mapping[str, float]) -> FloatArra
 
 def _written_at(plant: DescriptorSystem, uncertain: Uncertainty, values: Mapping[str, float]) -> DescriptorSystem:
     """Return the plant as it was written, for values of its constants."""
-    matrices: dict[str, Any] = uncertain.filled(written_matrices(plant, uncertain), values)
+    matrices: dict[str, Any] = uncertain.filled(as_written(plant, uncertain), values)
     return DescriptorSystem(**matrices, dt=0.0 if is_sampled(uncertain.steps) else plant.dt)
-
-
-def written_matrices(plant: DescriptorSystem, uncertain: Uncertainty) -> Mapping[str, FloatArray]:
-    """Return the matrices whose entries are written in the constants: the plant's own, unless it was transformed."""
-    return matrices_of(plant) if uncertain.written is None else uncertain.written
 
 
 def is_sampled(steps: tuple[tuple[str, float], ...]) -> bool:
@@ -90,7 +92,7 @@ def vertex_gains(
 ) -> dict[str, float]:
     """Return the largest peak (l1) gain from disturbances at the vertices; some drawn where there are too many."""
     observer, uncertain = design.linear[1], plant.uncertainty
-    labels = labels_of(observer)
+    labels = observer.row_names[len(observer.state_names) :]
     if uncertain is None or not plant.nd or not labels:
         return {}
     count = len(uncertain.box.names)
@@ -161,11 +163,6 @@ def _summed_response(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
     return total
 
 
-def labels_of(observer: LinearObserver) -> tuple[str, ...]:
-    """Return what fault estimates and residuals are called in tables."""
-    return (*(f"fhat[{name}]" for name in observer.fault_names), *(f"r[{name}]" for name in observer.residual_names))
-
-
 @dataclass(frozen=True)
 class Told:
     """Whether a constant acts where a fault does (``shares``), or an observer that it does not disturb exists."""
@@ -180,7 +177,7 @@ def told_from_faults(plant: DescriptorSystem) -> dict[str, Told]:
     uncertain = plant.uncertainty
     if uncertain is None or not plant.nf:
         return {}
-    numbers = written_matrices(plant, uncertain)
+    numbers = as_written(plant, uncertain)
     affine = uncertain.affine(numbers, uncertain.box)
     dt = 0.0 if is_sampled(uncertain.steps) else plant.dt
     found = {}

@@ -22,16 +22,14 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.constants import ConstantsBox
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.uncertain_system import uncertain_system
-from obsynth.plants.uncertainty import Uncertainty, require_carried
+from obsynth.plants.uncertainty import Uncertainty, as_written, require_carried
 from obsynth.proofs.affine import AffineMatrix
 from obsynth.results.design import ObserverDesign
 from obsynth.tolerances.exact_plant import (
     is_sampled,
-    labels_of,
     moving_at,
     told_from_faults,
     vertex_gains,
-    written_matrices,
 )
 from obsynth.tolerances.result import EXACT_MODEL, Robustness
 from obsynth.tolerances.subdivision import MOST_BOXES, BoxVerdict, index_one_on_box, proved_stable, values_at
@@ -75,7 +73,7 @@ def _with_tolerances_of(plant: DescriptorSystem, given: DescriptorSystem) -> Des
     own, other = plant.uncertainty, given.uncertainty
     if not same and own is not None and other is not None and own.written is not None:
         # The design is for a plant that was made from the one that is given.
-        before = written_matrices(given, other)
+        before = as_written(given, other)
         if dict(own.entries) == dict(other.entries) and all(
             np.array_equal(own.written[name], before[name]) for name in own.written
         ):
@@ -242,9 +240,7 @@ def _stability(plant: DescriptorSystem, affine: AffinePlant) -> tuple[BoxVerdict
     def build(lower: FloatArray, upper: FloatArray) -> AffineMatrix:
         return moving_family(plant, box.part(lower, upper), basis)[rest, rest]
 
-    most = (
-        MOST_BOXES if uncertain is None or len(basis) * 4 > len(written_matrices(plant, uncertain)["A"]) else FEW_BOXES
-    )
+    most = MOST_BOXES if uncertain is None or len(basis) * 4 > len(as_written(plant, uncertain)["A"]) else FEW_BOXES
     return proved_stable(build, affine.count, exactly, discrete=discrete, most=most), lasting
 
 
@@ -261,4 +257,7 @@ def _error_per_unit(design: ObserverDesign, responses: Responses, affine: Affine
     rest = np.hstack([structure.state.radius @ np.abs(back), structure.inputs.radius])
     total += responses.absolute_gain(structure.Co, rest[inner]) + rest[outputs]
     names = (*plant.state_names, *plant.input_names)
-    return {label: _named(names, row) for label, row in zip(labels_of(observer), total, strict=True)}
+    return {
+        label: _named(names, row)
+        for label, row in zip(observer.row_names[len(observer.state_names) :], total, strict=True)
+    }

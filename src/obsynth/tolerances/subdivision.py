@@ -17,8 +17,8 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import ROUNDED_ZERO
 from obsynth.plants.constants import ConstantsBox
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.uncertainty import as_written
 from obsynth.proofs.affine import AffineMatrix, affine_block, affine_inverse
-from obsynth.tolerances.exact_plant import written_matrices
 
 #: Boxes after which a statement is left open.
 MOST_BOXES = 150
@@ -194,7 +194,7 @@ def index_one_on_box(plant: DescriptorSystem) -> BoxVerdict:
 
         index = pencil_structure(plant.E, plant.A).index
         return BoxVerdict("proved" if index is not None and index <= 1 else "refuted", 0, np.zeros(0))
-    numbers = written_matrices(plant, written)
+    numbers = as_written(plant, written)
     affine = written.affine(numbers, written.box)
     dynamic, algebraic = compressed_rows(affine["E"].at(written.box.offsets))
     require_algebraic(affine["E"], algebraic)

@@ -15,6 +15,7 @@ import numpy as np
 from flint import arb, arb_mat, ctx, fmpq, fmpq_mat
 
 from obsynth.methods.guaranteed_test.condensed import Condensed
+from obsynth.methods.guaranteed_test.problem import rounded_outward
 from obsynth.methods.guaranteed_test.windows import Window
 from obsynth.numerics.arrays import FloatArray
 from obsynth.proofs.balls import UNIT_ROUNDOFF, Ball, rounded_up
@@ -131,15 +132,9 @@ def exact_multipliers(window: Window, multipliers: FloatArray) -> list[Fraction]
     return found
 
 
-def up(value: Fraction) -> float:
-    """Return a double that is not below a rational number."""
-    found = float(value)
-    return found if Fraction(found) >= value else float(np.nextafter(found, np.inf))
-
-
 def down(value: Fraction) -> float:
     """Return a double that is not above a rational number."""
-    return -up(-value)
+    return -rounded_outward(-value)
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,7 +192,7 @@ class Square:
     def proved_step(self, right: list[Fraction]) -> FloatArray | None:
         """Return bounds of the exact correction ``(chosen,)``; ``None`` where nothing is proved."""
         if self.contraction < 1.0:
-            return self.bounded_step(np.array([up(abs(value)) for value in right]))
+            return self.bounded_step(np.array([rounded_outward(abs(value)) for value in right]))
         if len(right) > MOST_ROWS_IN_BALLS or self.part.radius.any():
             return None
         return self._in_balls(right)
@@ -373,7 +368,7 @@ def _in_rationals(
     if refine:
         values[columns] = [float(value) for value in moved]
     distance = np.zeros(len(values))
-    away = [up(abs(v - Fraction(float(values[c])))) for v, c in zip(moved, columns, strict=True)]
+    away = [rounded_outward(abs(v - Fraction(float(values[c])))) for v, c in zip(moved, columns, strict=True)]
     distance[columns] = np.maximum(away, np.finfo(np.float64).tiny)
     return Repaired(values, distance)
 
@@ -431,10 +426,10 @@ def proved_threshold(window: Window, repaired: Repaired, *, exact_zero: bool = F
     bounded = np.flatnonzero(window.bounded)
     parts = [Fraction(float(window.bar[j])) * (abs(seen[j]) + away[j]) for j in bounded]
     if not window.question.ellipsoid:
-        return up(sum(parts, start=standing))
-    sizes, groups = np.array([up(part) for part in parts]), window.group[bounded]
+        return rounded_outward(sum(parts, start=standing))
+    sizes, groups = np.array([rounded_outward(part) for part in parts]), window.group[bounded]
     norms = [float(np.sqrt(np.sum(sizes[groups == group] ** 2))) for group in np.unique(groups[groups >= 0])]
-    norms += [*sizes[groups < 0].tolist(), up(standing)]
+    norms += [*sizes[groups < 0].tolist(), rounded_outward(standing)]
     return float(rounded_up(np.array(sum(norms)), 2 * len(sizes) + 8))
 
 

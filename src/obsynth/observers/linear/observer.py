@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -15,7 +14,7 @@ from obsynth.errors import SpecError
 from obsynth.numerics.arguments import is_whole
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.observers.estimates import Estimates
-from obsynth.observers.records import NAME_FIELDS, checked_sample, fields_from_data, require_names, whole_record
+from obsynth.observers.records import NAME_FIELDS, checked_sample, require_names, whole_record
 from obsynth.observers.running import Observer, RunningObserver
 
 
@@ -134,17 +133,6 @@ class LinearObserver(Observer[LinearState, FloatArray]):
     def added(self) -> FloatArray:
         """What is added to the rows ``(nx + nf + nr,)``."""
         return np.zeros(len(self.Cz)) if self.constant is None else self.constant
-
-    @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> LinearObserver:
-        """Return the observer that `as_dict` described.
-
-        Parameters
-        ----------
-        data : mapping
-            Every field by name; lists stand for tuples.
-        """
-        return cls(**fields_from_data(data))
 
     def init(self, initial_state: ArrayLike | None = None) -> LinearState:
         """Return the state before the first sample.
