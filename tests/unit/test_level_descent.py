@@ -102,11 +102,11 @@ def test_where_the_first_promise_is_broken_each_is_judged():
 
 
 def test_a_wary_descent_judges_the_first_and_gives_up_in_a_narrow_bracket():
-    broken = GammaIteration(Equation(straight, lambda level: math.inf), 0.0, 1.0, TOLERANCE, wary=True)
+    broken = GammaIteration(Equation(straight, lambda level: math.inf), 0.0, 1.0, TOLERANCE, expects_rounding=True)
     broken.run(1.0 - 1e-6)
     assert not broken.reached
     equation = Equation(lambda level: 1.0 if level >= 0.9995 else 0.0)
-    narrow = GammaIteration(equation, 0.999, 1.0, TOLERANCE, wary=True)
+    narrow = GammaIteration(equation, 0.999, 1.0, TOLERANCE, expects_rounding=True)
     narrow.run(1.0 - 1e-6)
     assert len(narrow.reached) >= 1
     assert sum(level < 0.9995 for level in equation.asked) == 3

@@ -16,8 +16,8 @@ from obsynth.observers.estimates import BAND_WIDTH
 NO_DECISION = "undecided"
 #: Why a row cannot alarm, by its status.
 REASONS = {
-    WARM_UP: "the start is not forgotten yet (--warm-up)",
-    RECOVERING: "a gap before them is not forgotten yet (--warm-up)",
+    WARM_UP: "the initial-condition response has not settled yet (--warm-up)",
+    RECOVERING: "the effect of a gap before them has not settled yet (--warm-up)",
     GAP: "samples are missing",
     REPEATED: "their stamps are those of the rows before",
     OUT_OF_ORDER: "their stamps are earlier than those of the rows before",

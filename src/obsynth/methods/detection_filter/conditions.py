@@ -109,7 +109,7 @@ def _no_zero_on_the_axis(plant: DescriptorSystem) -> tuple[Condition, ...]:
         if not found
         else (
             f"s = {found[0]:.4g}: the unknown inputs do not reach some residual there, and the filter that makes them "
-            "all alike would never forget. State noise of the states (Bw)."
+            "all alike would not be stable. State noise of the states (Bw)."
         )
     )
     return (

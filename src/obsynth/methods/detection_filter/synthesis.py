@@ -108,7 +108,7 @@ def _notes(plant: DescriptorSystem, observer: LinearObserver, claims: Mapping[st
         return told
     return (
         *told,
-        "The plant does not forget: both norms are those of the error's own equations, and what rounding of the stored "
+        "The plant is not stable: both norms are those of the error's own equations, and what rounding of the stored "
         "numbers adds has no finite gain. It matters for disturbances that last very long.",
     )
 

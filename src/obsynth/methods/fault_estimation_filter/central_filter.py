@@ -189,7 +189,8 @@ CAUTION = 10.0
 MOST_FAILURES = 3
 #: A filter whose true gain is above its level by this relative amount shows that the equation was not solved.
 NORM_EXCESS = 2e-3
-#: Steps away from a broken promise, each longer than the one before, and halvings (of their logarithm) back.
+#: Steps away from a level that the true gain exceeds, each longer than the one before, and halvings (of their
+#: logarithm) back.
 RETREAT = 10.0
 HALVINGS = 2
 
@@ -207,8 +208,8 @@ class Reached:
 class GammaIteration:
     """The way down from ``high`` to the least level; low and high are the bracket, tolerance its relative width.
 
-    ``settled``: the margin tells that nothing is below; ``wary``: rounding is expected, the first filter is judged and
-    a few failures in a narrow bracket end it; ``judged``: a level counts only when its filter keeps its promise.
+    ``settled``: the margin tells that nothing is below; ``expects_rounding``: the first filter is judged and a few
+    failures in a narrow bracket end it; ``judged``: a level counts only when the true gain of its filter is within it.
     """
 
     equation: CentralEquation
@@ -217,7 +218,7 @@ class GammaIteration:
     tolerance: float
     reached: list[Reached] = field(default_factory=list)
     settled: bool = False
-    wary: bool = False
+    expects_rounding: bool = False
     judged: bool = False
 
     def run(self, first: float) -> None:
@@ -237,7 +238,7 @@ class GammaIteration:
                 return
             else:
                 self.low, caution, failures = level, caution * CAUTION, failures + 1
-                if self.wary and failures >= MOST_FAILURES and self.high - self.low <= NEXT_TO * self.high:
+                if self.expects_rounding and failures >= MOST_FAILURES and self.high - self.low <= NEXT_TO * self.high:
                     return
             level = self._next_level(caution)
 
@@ -245,8 +246,8 @@ class GammaIteration:
         """Whether the margin has shrunk with the level, without which the solution is not the one looked for."""
         if self.reached and margin * level**2 >= self.reached[-1].margin * self.reached[-1].level ** 2:
             return False
-        believed = not self.judged and (not self.wary or bool(self.reached))
-        return believed or self._gain_as_promised(found, level) is not None
+        believed = not self.judged and (not self.expects_rounding or bool(self.reached))
+        return believed or self._gain_within(found, level) is not None
 
     def _next_level(self, caution: float) -> float:
         """Return the level to try: a little above where the margin should vanish."""
@@ -270,9 +271,9 @@ class GammaIteration:
         return level if self.low < level < self.high * (1.0 - 0.5 * self.tolerance) else middle
 
     def best(self) -> tuple[Injection, float] | None:
-        """Return the filter of the lowest level that keeps its promise, and its true gain; ``None`` if there is none.
+        """Return the filter of the lowest level that its true gain does not exceed, and that gain, if there is one.
 
-        Rounding may break the promise of the equation next to its least level, where the margin vanishes.
+        Next to the least level, where the margin vanishes, rounding may let the true gain exceed the level.
         """
         if not self.reached:
             return None
@@ -293,20 +294,20 @@ class GammaIteration:
         return found
 
     def judged_again(self, high: float) -> GammaIteration:
-        """Return a descent in which each filter is judged by itself, down to the lowest level that was in vain."""
+        """Return a descent in which each filter is judged by itself, down to the lowest level that failed."""
         top, last = self.reached[0].level, self.reached[-1].level
-        in_vain = self._gain_as_promised(self.reached[0].injection, top) is None
-        again = GammaIteration(self.equation, top if in_vain else last, high, self.tolerance, judged=True)
-        again.run(0.5 * (top + high) if in_vain else top)
+        first_fails = self._gain_within(self.reached[0].injection, top) is None
+        again = GammaIteration(self.equation, top if first_fails else last, high, self.tolerance, judged=True)
+        again.run(0.5 * (top + high) if first_fails else top)
         return again
 
     def _kept(self, level: float) -> tuple[Injection, float] | None:
-        """Return the filter of a level and its true gain where that is as low as promised."""
+        """Return the filter of a level and its true gain where the level is not exceeded."""
         found = self.equation.filter_at(level)
-        gain = None if found is None else self._gain_as_promised(found, level)
+        gain = None if found is None else self._gain_within(found, level)
         return None if found is None or gain is None else (found, gain)
 
-    def _gain_as_promised(self, found: Injection, level: float) -> float | None:
+    def _gain_within(self, found: Injection, level: float) -> float | None:
         gain = self.equation.problem.achieved_gain(found)
         return gain if gain <= level * (1.0 + self.tolerance) else None
 
@@ -398,7 +399,7 @@ def search_central_filter(
             continue
         close = start_is_good or best is not start
         equation = CentralEquation.of(problem, noise=noise)
-        descent = GammaIteration(equation, low, gain, tolerance, wary=close)
+        descent = GammaIteration(equation, low, gain, tolerance, expects_rounding=close)
         share = START_SHARE if problem.order <= FEW_STATES else COARSE_START_SHARE
         descent.run(max(low, gain * (1.0 - PROBE * tolerance if close else share)))
         found = descent.best()
@@ -475,7 +476,7 @@ def least_noise_filter(problem: GainProblem) -> Injection | None:
 def noise_weighted_filters(
     problem: GainProblem, gain: float, *, reaches: Callable[[Injection], bool], artificial: float = NOISES[0]
 ) -> Iterator[Injection]:
-    """Yield central filters that promise a gain of at most ``gain``, for which the noise counts as much as it can.
+    """Yield central filters with a gain of at most ``gain`` on paper, for which the noise counts as much as it can.
 
     The noise, times a weight, is one more disturbance; at a level above ``gain`` the true gain finds the weight.
     """

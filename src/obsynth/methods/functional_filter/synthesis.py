@@ -335,7 +335,7 @@ def _gain(
                 if not given[fault] and not asked.decay:
                     raise SpecError(
                         f"fault_rate says nothing about {plant.fault_names[fault]}, which is to be estimated: a walk "
-                        "of 0 is a constant that is never forgotten.",
+                        "of 0 is a constant, and errors of its estimate would never decay.",
                         path="method.options.fault_rate",
                     )
         return walks, kalman_gain(model, walks, lag=asked.delay, decay=asked.decay or 0.0)

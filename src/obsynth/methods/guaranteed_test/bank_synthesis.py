@@ -70,7 +70,7 @@ def synthesise_bank(plant: DescriptorSystem, asked: Any, *, progress: Callable[[
 
 
 def _silent(_: str) -> None:
-    """Progress of the tests one by one is told to nobody (no-op)."""
+    """Report no progress of the tests one by one (no-op)."""
 
 
 def _smallest(plant: DescriptorSystem, asked: Any, fault: int) -> tuple[tuple[int, ...], int, str]:

@@ -140,7 +140,7 @@ def _why_not(plant: DescriptorSystem) -> str:
     rate = abscissa(plant.A, 0.0)
     if rate >= 0.0:
         return (
-            f"not proved: the plant does not forget (a pole at {rate:.3g} 1/s), and the stored numbers miss the "
+            f"not proved: the plant is not stable (a pole at {rate:.3g} 1/s), and the stored numbers miss the "
             "equations of the error by rounding: together they have no finite gain. How much a state of the plant adds "
             "to the residuals is told by 'stored numbers: states'"
         )

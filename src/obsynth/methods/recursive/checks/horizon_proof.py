@@ -223,7 +223,7 @@ def parameter_row(proof: HorizonProof) -> Iterator[Check]:
         status="proved" if proved else "assumed",
         detail="of the gains as computed, in outward rounding"
         if proved
-        else "not proved: parameters that are not excited are not forgotten, and slow ones too little for the bound",
+        else "not proved: errors of parameters that are not excited do not decay, and slow ones too little",
     )
 
 
