@@ -72,24 +72,14 @@ def fault_conditions(
 def _decided(plant: DescriptorSystem, model: Exosystem, fault: int, exactly: bool | None) -> tuple[Condition, ...]:
     name = plant.fault_names[fault]
     asked = question(plant, [j for j in range(plant.nf) if j != fault], fault, exactly)
-    rest = dc_point(plant.dt)
-    seen = Condition(
-        f"{name} shows",
-        f"{name} is visible, decoupled from {_rest(plant, fault)}",
-        asked.visible,
-        float(asked.visible),
-        1.0,
-        _SOURCE,
-        _gap(asked) if asked.visible else _hidden(plant, asked, rest),
-        signals=() if asked.visible else (name,),
-    )
+    seen = _shown(plant, asked, f"{name} shows", _rest(plant, fault))
     if not asked.visible:
-        return (_in_doubt(seen, plant, asked, rest) if _may_show(asked) else seen,)
+        return (seen,)
     points = model_points(model, fault)
     lost = [point for point in points if not asked.shows_at(point)]
     doubtful = [point for point in lost if _may_show(asked, point)]
     shares = {point: _named(plant, asked).last_share(point) for point in points}
-    least = min(points, key=lambda point: shares[point], default=rest)
+    least = min(points, key=lambda point: shares[point], default=dc_point(plant.dt))
     share = f", {shares[least]:.2g} of it at least at the poles of its model" if shares else ""
     kept = Condition(
         f"{name} follows its model",
@@ -150,21 +140,27 @@ def _residual_conditions(plant: DescriptorSystem, seen: Sequence[int], exactly: 
     found = []
     for fault in seen:
         asked = question(plant, removed, fault, exactly)
-        name = plant.fault_names[fault]
         blind = [*plant.disturbance_names, *(plant.fault_names[j] for j in removed)]
-        rest = dc_point(plant.dt)
-        shown = Condition(
-            f"{name} shows" + (f" without {', '.join(plant.fault_names[j] for j in removed)}" if removed else ""),
-            f"{name} is visible, decoupled from {', '.join(blind) or 'the initial state'}",
-            asked.visible,
-            float(asked.visible),
-            1.0,
-            _SOURCE,
-            _gap(asked) if asked.visible else _hidden(plant, asked, rest),
-            signals=() if asked.visible else (name,),
-        )
-        found.append(_in_doubt(shown, plant, asked, rest) if not asked.visible and _may_show(asked) else shown)
+        without = f" without {', '.join(plant.fault_names[j] for j in removed)}" if removed else ""
+        name = f"{plant.fault_names[fault]} shows{without}"
+        found.append(_shown(plant, asked, name, ", ".join(blind) or "the initial state"))
     return found
+
+
+def _shown(plant: DescriptorSystem, asked: Question, name: str, rest: str) -> Condition:
+    """Return the condition of this name that a fault shows, decoupled from the rest."""
+    fault, point = plant.fault_names[asked.number], dc_point(plant.dt)
+    found = Condition(
+        name,
+        f"{fault} is visible, decoupled from {rest}",
+        asked.visible,
+        float(asked.visible),
+        1.0,
+        _SOURCE,
+        _gap(asked) if asked.visible else _hidden(plant, asked, point),
+        signals=() if asked.visible else (fault,),
+    )
+    return _in_doubt(found, plant, asked, point) if not asked.visible and _may_show(asked) else found
 
 
 def _rest(plant: DescriptorSystem, fault: int) -> str:
