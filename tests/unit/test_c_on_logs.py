@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import shutil
 import subprocess
+import zipfile
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -26,15 +27,19 @@ ROOT = Path(__file__).parents[2]
 COMPILER = shutil.which("cc")
 pytestmark = pytest.mark.skipif(COMPILER is None, reason="no C compiler")
 FLAGS = ["-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", "-O0", "-ffp-contract=off", "-shared", "-fPIC"]
-#: All that can be exported: not the time-varying filter, whose gains change, nor one that says there is none;
-#: guaranteed tests have C of their own (test_guaranteed_c); the adaptive observer of smib takes ten seconds to settle,
-#: and a small one stands for it in test_export_recursive.
 LINEAR = (
     "bicycle/spec", "drive/spec", "filasova/spec", "ieee14/spec", "kundur/spec", "kundur/spec_fault_filter",
     "motor/sampled", "motor/spec", "sharepasand/spec", "smib/functional", "smib/pd_observer", "smib/spec", "tanks/spec",
-    "wang2015/spec",
+    "wang2015/spec", "wang2015_printed_psi/spec",
 )  # fmt: skip
 NONLINEAR = ("diode_circuit/spec", "moussaali2013_dae/spec", "pendulum/spec", "threetank/spec")
+#: Their C is a dot product of its own, with the same test in test_guaranteed_c.
+WINDOWS = ("drive/guaranteed_test", "smib/guaranteed_test", "vehicle/spec")
+#: Those of which there is no C: gains or noise that change with k, and specs that say that there is no filter.  The
+#: adaptive observer of smib takes ten seconds to settle: a small one stands for its steady state in
+#: test_export_recursive.
+NONE = ("moussaali2013_ltv/as_printed", "moussaali2013_ltv/spec", "moussaali2013_ltv/two_outputs", "motor/one_encoder")
+SLOW = ("smib/spec_inertia",)
 ROWS, WARM_UP, SAMPLE_TIME = 260, 20, 0.01
 #: Rows and columns (of outputs, then of inputs) that are missing: in the warm-up, cells, whole rows, and inputs.
 MISSING = ((3, 0), (60, 0), *((row, None) for row in range(90, 97)), (131, -1), (170, 0), (172, 0), (200, None))
@@ -172,6 +177,42 @@ def shipped(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[:4000]
     return SimpleNamespace(designs=designs, widths=widths, code=ctypes.CDLL(str(folder / "all.so")), folder=folder)
+
+
+def test_every_shipped_design_is_one_of_these() -> None:
+    from test_guaranteed_c import SHIPPED
+
+    files = (path for path in (ROOT / "designs").glob("*/*.yaml") if "method:" in path.read_text())
+    found = {str(path.relative_to(ROOT / "designs").with_suffix("")) for path in files}
+    assert found == {*LINEAR, *NONLINEAR, *WINDOWS, *NONE, *SLOW}
+    assert set(WINDOWS) <= {*SHIPPED}
+
+
+@pytest.mark.parametrize("name", NONE)
+def test_what_has_no_c_says_why(name: str, tmp_path: Path) -> None:
+    refused = {"motor/one_encoder": "torque shows", "moussaali2013_ltv/as_printed": "residual directions"}
+    if name in refused:
+        with pytest.raises(obsynth.PreconditionError, match=refused[name]):
+            designed(name)
+        return
+    design = designed(name)
+    with pytest.raises(obsynth.SpecError, match=r"changes? with k|time-varying|horizon"):
+        obsynth.export(design, tmp_path / "a.c", unverified=True)
+
+
+def test_an_fmu_holds_the_c_that_is_tested_here(shipped: SimpleNamespace, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of every design, with the same monitor; test_fmu_export runs the wrapper around it."""
+    from obsynth.exporting.fmu import archive
+
+    monkeypatch.setattr(archive, "_binary", lambda *_: None)
+    for name, design in shipped.designs.items():
+        stem, rate = c_identifier(name), {"sample_time": SAMPLE_TIME} if design.observer.dt == 0.0 else {}
+        monitor = obsynth.online_monitor(design, "learned", normal=told(design))
+        (unit,) = obsynth.export(design, shipped.folder / f"{stem}.fmu", monitor=monitor, **rate)
+        with zipfile.ZipFile(unit) as packed:
+            inside = packed.read("sources/observer.c").decode()
+        alone = (shipped.folder / f"{stem}.c").read_text()
+        assert inside == alone.replace(stem, "observer").replace(stem.upper(), "OBSERVER")
 
 
 def test_headers_say_what_a_controller_needs(shipped: SimpleNamespace) -> None:

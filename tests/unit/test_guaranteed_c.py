@@ -24,7 +24,7 @@ int main(void)
     double in[%(width)d], out[2 * %(tests)d + 1];
     test_reset(&state);
     while (fread(in, sizeof in, 1, stdin) == 1) {
-        out[2 * %(tests)d] = test_step(&state, in, in + %(nu)d, out, out + %(tests)d);
+        out[2 * %(tests)d] = test_step(&state, %(given)s, out, out + %(tests)d);
         fwrite(out, sizeof out, 1, stdout);
     }
     return 0;
@@ -33,15 +33,19 @@ int main(void)
 
 
 @cache
-def drive() -> obsynth.GuaranteedTest:
-    spec = obsynth.load_spec(ROOT / "designs/drive/guaranteed_test.yaml")
-    return obsynth.guaranteed_test(spec.plant, **spec.options)
-
-
-@cache
 def tanks() -> obsynth.GuaranteedTest:
     plant = obsynth.load_spec(ROOT / "designs/tanks/spec.yaml").plant
     return obsynth.guaranteed_test(plant, isolate=True, course="constant", samples=6, noise_bound=3.0)
+
+
+#: Shipped designs with this method: specs, and how far signals move in a sample.
+SHIPPED = {"drive/guaranteed_test": 0.01, "smib/guaranteed_test": 0.05, "vehicle/spec": 1.0}
+
+
+@cache
+def shipped(name: str) -> obsynth.GuaranteedTest:
+    spec = obsynth.load_spec(ROOT / "designs" / f"{name}.yaml")
+    return obsynth.guaranteed_test(spec.plant, **spec.options)
 
 
 def through_c(design: obsynth.GuaranteedTest, folder: Path, signals: np.ndarray) -> np.ndarray:
@@ -49,7 +53,9 @@ def through_c(design: obsynth.GuaranteedTest, folder: Path, signals: np.ndarray)
     if compiler is None:
         pytest.skip("no C compiler")
     source, _ = obsynth.export(design, folder / "test.c")
-    sizes = {"width": signals.shape[1], "tests": len(design.tests), "nu": design.linear[0].nu}
+    nu = design.linear[0].nu
+    given = f"in, in + {nu}" if nu else "in"
+    sizes = {"width": signals.shape[1], "tests": len(design.tests), "given": given}
     (folder / "main.c").write_text(HARNESS % sizes)
     command = [compiler, *FLAGS, str(source), str(folder / "main.c"), "-lm", "-o", str(folder / "program")]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -58,12 +64,12 @@ def through_c(design: obsynth.GuaranteedTest, folder: Path, signals: np.ndarray)
     return np.frombuffer(ran.stdout).reshape(len(signals), -1)
 
 
-@pytest.mark.parametrize("name", ["drive", "tanks"])
+@pytest.mark.parametrize("name", [*SHIPPED, "tanks"])
 def test_c_equals_the_run_on_a_log_with_blanks(name: str, tmp_path: Path) -> None:
-    design = {"drive": drive, "tanks": tanks}[name]()
+    design = tanks() if name == "tanks" else shipped(name)
     plant, rng = design.linear[0], np.random.default_rng(4)
     names = (*plant.input_names, *plant.output_names)
-    size = 0.01 if name == "drive" else 1e-4
+    size = SHIPPED.get(name, 1e-4)
     values = np.cumsum(size * rng.standard_normal((140, len(names))), axis=0)
     values[50:53, -1], values[90, plant.nu] = np.nan, np.nan
     found, count = through_c(design, tmp_path, values), len(design.tests)
@@ -95,7 +101,7 @@ def test_c_equals_the_run_on_a_log_with_blanks(name: str, tmp_path: Path) -> Non
 @pytest.mark.parametrize("option", [{"exact": True}, {"missing": "solve"}])
 @pytest.mark.parametrize("suffix", [".c", ".npz", ".fmu"])
 def test_what_solves_programmes_is_not_exported(option: dict[str, object], suffix: str, tmp_path: Path) -> None:
-    design = drive().replace(options={**drive().options, **option})
+    design = shipped("drive/guaranteed_test").replace(options={**shipped("drive/guaranteed_test").options, **option})
     with pytest.raises(obsynth.SpecError, match=f"option '{next(iter(option))}'.*the fixed test.*can be exported"):
         obsynth.export(design, tmp_path / f"test{suffix}", unverified=True)
     assert not list(tmp_path.iterdir())
