@@ -76,9 +76,9 @@ def as_matrix(value: Any, name: str) -> FloatArray:
     if raw.ndim != 2:
         raise SpecError(f"{name} has {raw.ndim} dimension(s): give a matrix (a list of rows).", path=name)
     matrix = raw.astype(np.float64)
-    bad = np.argwhere(~np.isfinite(matrix))
-    if bad.size:
-        row, column = (int(i) + 1 for i in bad[0])
+    finite = np.isfinite(matrix)
+    if not finite.all():
+        row, column = (int(i) + 1 for i in np.argwhere(~finite)[0])
         entry = matrix[row - 1, column - 1]
         raise SpecError(f"{name} has {entry} in row {row}, column {column}: every entry must be finite.", path=name)
     return read_only(matrix)

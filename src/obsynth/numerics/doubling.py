@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from obsynth.numerics import lapack
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.scaling import power_of_two_below
 
@@ -73,12 +74,10 @@ def slow_equation(
     part: SlowPart, power: FloatArray, back: FloatArray, solution: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
     """Return p, g and h ``(s, s)`` of the equation in the lower order, all in C order; ``None`` where M is singular."""
-    from obsynth.numerics.lapack import dgesv
-
     u, rows = part
     matrix = solution.dot(back)
     matrix.reshape(-1)[:: len(power) + 1] += 1.0
-    _, _, found, failed = dgesv(matrix.T, np.concatenate([rows, u.T.dot(back)]).T, overwrite_a=1)
+    _, _, found, failed = lapack.dgesv(matrix.T, np.concatenate([rows, u.T.dot(back)]).T, overwrite_a=1)
     if failed:
         return None
     through, returned = found.T[: len(rows)], found.T[len(rows) :]
@@ -249,9 +248,7 @@ def _doubled_once(
 
 def _solved_in_place(matrix: FloatArray, rows: FloatArray) -> bool:
     """Replace ``rows (k, n)`` by ``rows @ inv(matrix)``, both in C order, uncopied; false where singular."""
-    from obsynth.numerics.lapack import dgesv
-
-    _, _, found, failed = dgesv(matrix.T, rows.T, overwrite_a=1, overwrite_b=1)
+    _, _, found, failed = lapack.dgesv(matrix.T, rows.T, overwrite_a=1, overwrite_b=1)
     if not np.may_share_memory(found, rows):
         rows[...] = found.T
     return not failed
@@ -300,7 +297,5 @@ def is_clearly_negative(left: FloatArray, b: FloatArray, p: FloatArray) -> bool:
 
 def is_positive(matrix: FloatArray) -> bool:
     """Return whether a Cholesky factorisation of a symmetric matrix runs to its end (computed, not proved)."""
-    from obsynth.numerics.lapack import dpotrf
-
-    factor, failed = dpotrf(matrix, lower=1, clean=0)
+    factor, failed = lapack.dpotrf(matrix, lower=1, clean=0)
     return not failed and math.isfinite(factor.trace())

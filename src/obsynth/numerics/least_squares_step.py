@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from obsynth.errors import PreconditionError
+from obsynth.numerics import lapack
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import PERFECT_PARITY, RANK_TOLERANCE
 
@@ -53,28 +54,24 @@ class Projection(NamedTuple):
 
 def projection_of(H: FloatArray, *, least: float = DEPENDENT_COLUMN) -> Projection | None:
     """Return the factorisation of ``H (rows, n)``, or ``None`` where its rank has to be decided."""
-    from obsynth.numerics.lapack import dgeqrf, dormqr
-
     rows, n = H.shape
     if rows < n:
         return None
-    packed, tau, _, _ = dgeqrf(H)
+    packed, tau, _, _ = lapack.dgeqrf(H)
     diagonal = np.abs(packed.diagonal())
     if (diagonal <= least * np.sqrt(np.einsum("ij,ij->j", H, H))).any():
         return None
-    transposed = dormqr("L", "T", packed, tau, np.eye(rows), 64 * rows)[0]
+    transposed = lapack.dormqr("L", "T", packed, tau, np.eye(rows), 64 * rows)[0]
     rotation = np.concatenate((transposed[n:], transposed[:n]))
     return Projection(rotation, np.asfortranarray(packed[:n]), np.tri(n))
 
 
 def noise_triangle(noise: FloatArray) -> FloatArray:
     """Return the triangular factor ``(rows, rows)`` of rotated noise ``(any, rows)``, for `projected_step`."""
-    from obsynth.numerics.lapack import dgeqrf
-
     rows = noise.shape[1]
     padded = np.zeros((max(len(noise), rows), rows), order="F")
     padded[: len(noise)] = noise
-    return np.asfortranarray(np.triu(dgeqrf(padded, overwrite_a=1)[0][:rows]))
+    return np.asfortranarray(np.triu(lapack.dgeqrf(padded, overwrite_a=1)[0][:rows]))
 
 
 def projected_step(
@@ -85,8 +82,6 @@ def projected_step(
     ``known (rows, rows)``: triangular factor of more noise. Noise that outgrows double precision is left to the caller
     too.
     """
-    from obsynth.numerics.lapack import dgeqrf, dtpqrt, dtrtrs
-
     n = len(projection.head)
     rows, columns = data.shape
     m = rows - n
@@ -96,22 +91,22 @@ def projected_step(
         return None
     suspect = SUSPECT_PARITY * math.sqrt(squares)
     if known is None:
-        triangle = dgeqrf(noise, overwrite_a=1)[0]
+        triangle = lapack.dgeqrf(noise, overwrite_a=1)[0]
     else:
-        triangle = dtpqrt(0, min(BLOCK, rows), known, np.asfortranarray(noise), overwrite_b=1)[0]
+        triangle = lapack.dtpqrt(0, min(BLOCK, rows), known, np.asfortranarray(noise), overwrite_b=1)[0]
     right = np.empty((n, columns + n), order="F")
     innovation = data[:m]
     if m:
         if abs(triangle.diagonal()[:m]).min() <= suspect:
             return None
-        innovation = dtrtrs(triangle[:m, :m], innovation, trans=1)[0]
+        innovation = lapack.dtrtrs(triangle[:m, :m], innovation, trans=1)[0]
         right[:, :columns] = data[m:] - triangle[:m, m:rows].T @ innovation
         # A reflection goes by the sign of what may be rounding of zero: that of a positive diagonal is the one taken.
         innovation = innovation * np.sign(triangle.diagonal()[:m])[:, None]
     else:
         right[:, :columns] = data
     np.multiply(triangle[m:rows, m:rows].T, projection.lower, out=right[:, columns:])
-    solved = dtrtrs(projection.head, right, overwrite_b=1)[0]
+    solved = lapack.dtrtrs(projection.head, right, overwrite_b=1)[0]
     return LeastSquaresStep(solved[:, :columns], solved[:, columns:], innovation, np.empty((n, 0)))
 
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from obsynth.numerics import lapack
 from obsynth.numerics.arrays import FloatArray, read_only
 
 #: Sweeps of the balancing; each one must improve on the last, so few are ever used.
@@ -60,11 +61,9 @@ class EquilibratedPencil:
 def balancing_factors(matrix: FloatArray) -> FloatArray:
     """Return powers of two ``(n,)`` that balance a matrix ``(n, n)``: ``matrix * s / s[:, None]`` is balanced."""
     # Not by scipy's matrix_balance, which casts the factors to integers and warns where they are too large for that.
-    from obsynth.numerics.lapack import dgebal
-
     if not matrix.size:
         return np.ones(len(matrix))
-    return np.asarray(dgebal(np.asarray_chkfinite(matrix), scale=1, permute=0)[3], dtype=np.float64)
+    return np.asarray(lapack.dgebal(np.asarray_chkfinite(matrix), scale=1, permute=0)[3], dtype=np.float64)
 
 
 def balanced_matrix(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -266,14 +265,12 @@ class LogBalance:
 
 def _factored(matrix: FloatArray) -> Callable[[FloatArray], FloatArray]:
     """Return what solves equations with a matrix ``(n, n)``, which is factored once."""
-    from obsynth.numerics.lapack import dgetrf, dgetrs
-
     if not matrix.size:
         return lambda right: right
-    factors, pivots, failed = dgetrf(np.asarray_chkfinite(matrix))
+    factors, pivots, failed = lapack.dgetrf(np.asarray_chkfinite(matrix))
     if failed:
         raise np.linalg.LinAlgError("Singular matrix")
-    return lambda right: np.asarray(dgetrs(factors, pivots, right)[0], dtype=np.float64)
+    return lambda right: np.asarray(lapack.dgetrs(factors, pivots, right)[0], dtype=np.float64)
 
 
 class _Sums:

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from obsynth.numerics import lapack
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.least_squares_step import (
     DEPENDENT_COLUMN,
@@ -206,8 +207,6 @@ def update(
     ``M+ = lambda M + (1 - lambda) M_reg + G'G``, ``Theta = M+^-1 G'``, ``theta+ = theta + Theta (v - G theta)``, ``P+ =
     (I - Theta G) P (I - Theta G)' + Theta W W' Theta'``; M_reg bounds ``M^-1`` against wind-up.
     """
-    from obsynth.numerics.lapack import dgeqrf, dtrtrs
-
     q, gap = len(state.theta), v - G @ state.theta
     if q == 1:
         kept = _scalar(state, G, forgetting, regular, directional)
@@ -220,12 +219,12 @@ def update(
         stacked = np.zeros((sum(len(block) for block in blocks), q + 1))
         stacked[:, :q] = np.concatenate(blocks)
         stacked[len(stacked) - len(G) :, q] = gap
-        packed = dgeqrf(stacked)[0]
+        packed = lapack.dgeqrf(stacked)[0]
         triangle = np.triu(packed[:q, :q])
-        theta = state.theta + dtrtrs(triangle, packed[:q, q])[0]
-        gain = dtrtrs(triangle, dtrtrs(triangle, G.T, trans=1)[0])[0] if len(G) else np.zeros((q, 0))
+        theta = state.theta + lapack.dtrtrs(triangle, packed[:q, q])[0]
+        gain = lapack.dtrtrs(triangle, lapack.dtrtrs(triangle, G.T, trans=1)[0])[0] if len(G) else np.zeros((q, 0))
     spread = np.concatenate((state.spread - gain @ (G @ state.spread), gain if noise is None else gain @ noise), axis=1)
-    compact = np.triu(dgeqrf(spread.T)[0][:q]).T
+    compact = np.triu(lapack.dgeqrf(spread.T)[0][:q]).T
     return ParameterState(theta, triangle, compact), np.asarray(gain)
 
 

@@ -24,8 +24,8 @@ def require_names(names: Any, field: str) -> None:
         raise SpecError(f"{field} of the observer is a {type(names).__name__}: give a tuple of names.", path=field)
     if not all(isinstance(name, str) and name.strip() for name in names):
         raise SpecError(f"{field} of the observer must be a tuple of non-empty texts.", path=field)
-    repeated = sorted({name for name in names if names.count(name) > 1})
-    if repeated:
+    if len(set(names)) < len(names):
+        repeated = sorted({name for name in names if names.count(name) > 1})
         raise SpecError(
             f"{field} of the observer repeats {', '.join(map(repr, repeated))}: names must be unique.", path=field
         )

@@ -31,6 +31,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from obsynth.numerics import lapack
 from obsynth.numerics.arrays import FloatArray
 from obsynth.proofs.balls import UNDERFLOW, UNIT_ROUNDOFF, Ball, gamma, rounded_up
 from obsynth.proofs.extended_balls import MOST_ROWS, Enclosed, Formula, prove_by_ball_arithmetic
@@ -142,14 +143,12 @@ def _by_cholesky(ball: Ball, means: Means = "Cholesky") -> DefinitenessProof:
 
 def _smallest_eigenvalue(factor: FloatArray) -> float:
     """Return an estimate of the smallest eigenvalue of ``factor factor'``, from above, by inverse iteration."""
-    from obsynth.numerics.lapack import dpotrs
-
     vector = np.ones(len(factor)) / np.sqrt(len(factor))
     # Signs that alternate where those of the factor do keep the start away from a right angle.
     vector = np.where(factor[-1] > 0.0, -vector, vector)
     size = 0.0
     for _ in range(INVERSE_ITERATIONS):
-        vector = dpotrs(factor, vector, lower=1)[0]
+        vector = lapack.dpotrs(factor, vector, lower=1)[0]
         size = float(np.linalg.norm(vector))
         if not np.isfinite(size) or size == 0.0:
             return 0.0

@@ -146,6 +146,12 @@ def tracking_identities(model: ErrorModel) -> dict[str, Identity]:
     }
 
 
+def tracking_totals(model: ErrorModel) -> dict[str, FloatArray]:
+    """Return what is left of the same identities, whatever they are judged by."""
+    found = _tracking_identities(model, _balances(model.plant)[0])
+    return {name: identity.total for name, identity in found.items()}
+
+
 @remembered
 def _balances(plant: DescriptorSystem) -> tuple[Scaling, Scaling]:
     """Return the sizes of a plant's states without what drives them, and with it."""

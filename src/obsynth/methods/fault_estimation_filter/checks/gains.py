@@ -23,7 +23,7 @@ from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.checks import Check, upper_bound_check
 from obsynth.verification.error_system import ErrorModel
-from obsynth.verification.identities import Identity, equality, tracking_identities, worst
+from obsynth.verification.identities import Identity, equality, tracking_totals, worst
 
 #: Letters that every gain set has, and that it may have.
 NEEDED, OPTIONAL = ("T", "N", "L", "W", "Psi", "Upsilon"), ("R",)
@@ -206,7 +206,7 @@ def _totals(
     tracking = equations.tracking(gains["T"])
     lag = tracking.shape[1] // plant.nx - 1
     errors = ErrorModel(plant, observer, tracking, lag=lag)
-    found = {**tracking_identities(errors), **gain_identities(work, gains, equations, scaling)}
+    found = gain_identities(work, gains, equations, scaling)
     for name, steps in fault_identities(errors, observer.fault_delays).items():
         found |= {step_key(name, step): identity for step, identity in enumerate(steps)}
-    return {name: identity.total for name, identity in found.items()}
+    return {**tracking_totals(errors), **{name: identity.total for name, identity in found.items()}}
