@@ -10,6 +10,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from obsynth.errors import PreconditionError
 from obsynth.numerics import lapack
@@ -28,6 +29,8 @@ SUSPECT_COLUMN = RANK_TOLERANCE
 SUSPECT_PARITY = 1e-12
 #: Columns that LAPACK's ``tpqrt`` treats at once.
 BLOCK = 32
+#: Room for each column that LAPACK's factorisations are given: more than any of their blocks takes.
+WORK = 64
 #: Noise-free parity directions must vanish to this share of their terms; rounding of data in double precision.
 CONSISTENCY = 1e-9
 
@@ -128,30 +131,68 @@ def rank_revealing_step(
     H: FloatArray, S: FloatArray, Y: FloatArray, unknown: FloatArray, *, mapped: int = 0
 ) -> LeastSquaresStep:
     """Solve one step in which x may be undetermined, noise missing, and earlier directions ``unknown (rows, r)``."""
-    from scipy.linalg import qr, solve_triangular
-
     n = H.shape[1]
     whole = np.hstack([H, -unknown])
     lengths = np.sqrt(np.einsum("ij,ij->j", whole, whole))
     lengths[lengths == 0.0] = 1.0
-    q, r, order = qr(whole / lengths, pivoting=True)
+    q, r, order = _pivoted(whole / lengths)
     sizes = np.abs(np.diagonal(r))
     rank = int(np.sum(sizes > RANK_TOLERANCE * max(float(sizes[0]), 0.0))) if sizes.size else 0
     q1, q2, head = q[:, :rank], q[:, rank:], r[:rank, :rank]
     innovation, carried, rest = _whitened(q1, q2, S, Y, mapped)
-    noise = qr(rest.T, mode="economic")[1].T if rest.size else np.zeros((rank, 0))
-    solved = solve_triangular(head, np.hstack([q1.T @ Y - carried, noise])) if rank else np.zeros((0, Y.shape[1]))
+    noise = _triangle(rest.T)[: min(rest.shape)].T if rest.size else np.zeros((rank, 0))
+    solved = _substituted(head, np.hstack([q1.T @ Y - carried, noise])) if rank else np.zeros((0, Y.shape[1]))
     back = np.zeros((whole.shape[1], solved.shape[1]))
     back[order[:rank]] = solved
     null = np.zeros((whole.shape[1], whole.shape[1] - rank))
     if rank and null.shape[1]:
-        null[order[:rank]] = -solve_triangular(head, r[:rank, rank:])
+        null[order[:rank]] = -_substituted(head, r[:rank, rank:])
     null[order[rank:]] = np.eye(null.shape[1])
     back = back / lengths[:, None]
     found, factor = back[:n, Y.shape[1] :], np.zeros((n, n))
-    compact = qr(found.T, mode="r")[0][:n].T if found.size else found
+    compact = _triangle(found.T)[:n].T if found.size else found
     factor[:, : compact.shape[1]] = compact
     return LeastSquaresStep(back[:n, : Y.shape[1]], factor, innovation, _basis(null, lengths[:n]))
+
+
+def _pivoted(matrix: FloatArray) -> tuple[FloatArray, FloatArray, NDArray[np.intp]]:
+    """Return Q ``(rows, rows)``, R and the order of columns of ``matrix (rows, any)``: LAPACK's QR with pivoting."""
+    from obsynth.numerics.lapack import dgeqp3, dorgqr
+
+    rows, columns = matrix.shape
+    if not matrix.size:
+        return np.eye(rows), np.empty_like(matrix), np.arange(columns)
+    packed, order, tau, _, _ = dgeqp3(_finite(matrix), lwork=WORK * (columns + 1))
+    reflections = min(rows, columns)
+    whole = np.empty((rows, rows), order="F")
+    whole[:, :reflections] = packed[:, :reflections]
+    return dorgqr(whole, tau, lwork=WORK * rows, overwrite_a=1)[0], np.triu(packed), order - 1
+
+
+def _triangle(matrix: FloatArray) -> FloatArray:
+    """Return R of the QR factorisation of a matrix, with as many rows as that has."""
+    from obsynth.numerics.lapack import dgeqrf
+
+    return np.triu(dgeqrf(_finite(matrix), lwork=WORK * matrix.shape[1])[0])
+
+
+def _substituted(triangle: FloatArray, right: FloatArray, *, lower: bool = False) -> FloatArray:
+    """Return ``triangle^-1 right`` of a triangle without zeros on its diagonal, upper or ``lower``."""
+    from obsynth.numerics.lapack import dtrtrs
+
+    if not right.size:
+        return np.zeros(right.shape)
+    _finite(right)
+    if triangle.flags.f_contiguous:
+        return np.asarray(dtrtrs(_finite(triangle), right, lower=lower)[0])
+    # LAPACK reads rows as columns: the transposed triangle, transposed.
+    return np.asarray(dtrtrs(_finite(triangle).T, right, lower=not lower, trans=1)[0])
+
+
+def _finite(matrix: FloatArray) -> FloatArray:
+    if not np.isfinite(matrix).all():
+        raise ValueError("a step of the recursion is not finite")
+    return matrix
 
 
 def _basis(null: FloatArray, lengths: FloatArray) -> FloatArray:
@@ -167,18 +208,16 @@ def _whitened(
     q1: FloatArray, q2: FloatArray, S: FloatArray, Y: FloatArray, mapped: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the whitened parity of Y, what it tells about the rest, and the noise that is left in the rest."""
-    from scipy.linalg import qr, solve_triangular
-
     parity, data = q2.T @ S, q2.T @ Y
     if not q2.shape[1]:
         return data, np.zeros((q1.shape[1], Y.shape[1])), q1.T @ S
     sizes = np.abs(q2.T) @ np.linalg.norm(S, axis=1)
     sizes[sizes == 0.0] = 1.0
-    z, t, order = qr((parity / sizes[:, None]).T, pivoting=True)
+    z, t, order = _pivoted((parity / sizes[:, None]).T)
     rank = int(np.sum(np.abs(np.diagonal(t)) > PERFECT_PARITY))
     scaled = (data / sizes[:, None])[order]
     lower = t[:rank, :rank].T
-    innovation = solve_triangular(lower, scaled[:rank], lower=True) if rank else np.zeros((0, Y.shape[1]))
+    innovation = _substituted(lower, scaled[:rank], lower=True) if rank else np.zeros((0, Y.shape[1]))
     # What is left is free of noise: it must vanish, or the constraints contradict each other.
     left = scaled[rank:] - (t[:rank, rank:].T @ innovation if rank else 0.0)
     terms = ((np.abs(q2.T) @ np.abs(Y)) / sizes[:, None])[order][rank:]
