@@ -142,6 +142,8 @@ def monitor(
     rows = observer.fault_rows if estimates else observer.residual_rows
     rule: Rule
     if kind in ("chi-square", "cusum"):
+        # A window that outlasts the scenario is refused before its covariance is factorised.
+        first = settled(model, start, window)
         whitener, white = whitened(kind, model, window)
         rule = WhitenedRule(
             whitener,
@@ -151,7 +153,7 @@ def monitor(
             false_alarms=false_alarms,
             dt=bench.signals.dt,
             white=white,
-            table=_statistical(kind, model, len(whitener), start, window, false_alarms, white=white),
+            table=_statistical(kind, model, len(whitener), first, false_alarms, white=white),
         )
     else:
         if kind == "paper":
@@ -201,17 +203,16 @@ def _statistical(
     kind: str,
     model: ResidualModel,
     degrees: int,
-    start: float,
-    window: int,
+    first: int,
     false_alarms: float,
     *,
     white: bool,
 ) -> FloatArray:
-    """Return thresholds by Bonferroni's inequality over all looks (chi-square), or Ville's over all white sums."""
+    """Return thresholds by Bonferroni's inequality over all looks (chi-square), or Ville's over all white sums; they
+    are infinite before the ``first`` look."""
     from scipy.special import chdtri
 
     threshold = np.full(model.steps, np.inf)
-    first = settled(model, start, window)
     looks = model.steps - first
     if kind == "chi-square":
         threshold[first:] = float(chdtri(degrees, false_alarms / looks))
