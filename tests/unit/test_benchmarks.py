@@ -93,6 +93,12 @@ def test_the_false_alarm_benchmark_runs(printed):
             assert shares == sorted(shares)
 
 
+def test_the_benchmark_of_nonlinear_observers_runs(printed):
+    rows = [line.strip("| ").split(" | ") for line in printed("dae_adaptive_observer", "--small").splitlines()[3:]]
+    assert len(rows) == 7
+    assert all(len(row) == 3 for row in rows)
+
+
 def test_the_unknown_input_observer_benchmark_runs(small_table):
     (row,) = small_table("ui_pi_observer")
     rates = [float(cell.split(", ")[1].split()[0]) for cell in row[1:]]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import pickle
 from collections.abc import Callable
 from functools import cache
 
@@ -22,6 +23,7 @@ from obsynth import (
     dae_adaptive_observer,
     verify,
 )
+from obsynth.methods.dae_adaptive_observer import checks
 from obsynth.methods.designing import check
 from obsynth.observers.dae import step_graph as dae_algebra
 from obsynth.observers.dae.estimates import DAERow
@@ -35,6 +37,24 @@ OPTIONS = {
     "initial_covariance": {"p1": 4e6, "p2": 4e6, "T1": 25.0, "T2": 25.0},
     "initial_parameter_covariance": {"phi": 0.01, "psi": 1e6},
 }  # fmt: skip
+
+
+#: What was simulated for a model, by the numbers it was simulated with.
+RECORDS: dict[tuple[int, bytes], tuple[obsynth.DAEModel, obsynth.types.Trajectory]] = {}
+
+
+def simulated(model: obsynth.DAEModel, u: np.ndarray, **options) -> obsynth.types.Trajectory:
+    """Verification simulates the stated model with stated draws: the same for most corruptions, and done once."""
+    key = id(model), pickle.dumps((u, sorted(options.items())))
+    if key not in RECORDS:
+        # The model is kept, so that its id stays its own.
+        RECORDS[key] = model, obsynth.simulate_dae(model, u, **options)
+    return RECORDS[key][1]
+
+
+@pytest.fixture(autouse=True)
+def each_record_once(monkeypatch) -> None:
+    monkeypatch.setattr(checks, "simulate_dae", simulated)
 
 
 @cache

@@ -68,20 +68,22 @@ def registered(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @cache
-def plant_of(method: str) -> Any:
-    """Return the first plant for which the method's own conditions hold."""
+def designed(method: str) -> tuple[Any, obsynth.ObserverDesign]:
+    """Return the first plant for which the method's own conditions hold, and its design."""
     for plant in PLANTS:
         try:
-            obsynth.design(plant, method, **OPTIONS.get(method, {}))
+            return plant, obsynth.design(plant, method, **OPTIONS.get(method, {}))
         except obsynth.PreconditionError:
             continue
-        return plant
     raise AssertionError(f"{method} has no observer for any plant of the table: add one to PLANTS")
 
 
-@cache
+def plant_of(method: str) -> Any:
+    return designed(method)[0]
+
+
 def design_of(method: str) -> obsynth.ObserverDesign:
-    return obsynth.design(plant_of(method), method, **OPTIONS.get(method, {}))
+    return designed(method)[1]
 
 
 def record_of(design: obsynth.ObserverDesign) -> tuple[np.ndarray, np.ndarray]:

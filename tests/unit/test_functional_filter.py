@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -14,16 +15,24 @@ from obsynth.spec.loader import load_spec
 DESIGNS = Path(__file__).parents[2] / "designs"
 
 
+@cache
 def motor() -> obsynth.DescriptorSystem:
     return load_spec(DESIGNS / "motor" / "spec.yaml").plant
 
 
+@cache
 def smib() -> obsynth.DescriptorSystem:
     return load_spec(DESIGNS / "smib" / "functional.yaml").plant
 
 
+@cache
 def tanks() -> obsynth.DescriptorSystem:
     return load_spec(DESIGNS / "tanks" / "spec.yaml").plant
+
+
+@cache
+def delayed() -> obsynth.ObserverDesign:
+    return obsynth.functional_filter(smib(), fault_rate=0.01, delay=5)
 
 
 def on_the_log(design: obsynth.ObserverDesign) -> float:
@@ -69,7 +78,7 @@ def test_refusal_names_the_load_and_the_sensor() -> None:
 
 def test_delay_against_noise_is_what_monte_carlo_finds() -> None:
     plant = smib()
-    found = obsynth.functional_filter(plant, fault_rate=0.01, delay=5)
+    found = delayed()
     _, claimed = found.certificate.matrices["deviations"][0]
     assert claimed == pytest.approx(0.0090, rel=0.02)
     rng = np.random.default_rng(5)
@@ -77,11 +86,11 @@ def test_delay_against_noise_is_what_monte_carlo_finds() -> None:
     f = np.cumsum(0.01 * rng.standard_normal(steps))
     d = np.cumsum(0.01 * rng.standard_normal(steps))
     noise = rng.standard_normal((steps, plant.nw))
-    x, outputs = np.zeros(plant.nx), np.empty((steps, plant.ny))
-    for k in range(steps):
-        w = noise[k]
-        outputs[k] = plant.C @ x + plant.Dd[:, 0] * d[k] + plant.Df[:, 0] * f[k] + plant.Dw @ w
-        x = plant.A @ x + plant.Bd[:, 0] * d[k] + plant.Bf[:, 0] * f[k] + plant.Bw @ w
+    signals, states = np.column_stack([d, f, noise]), np.zeros((steps, plant.nx))
+    driven = signals @ np.hstack([plant.Bd, plant.Bf, plant.Bw]).T
+    for k in range(1, steps):
+        states[k] = plant.A @ states[k - 1] + driven[k - 1]
+    outputs = states @ plant.C.T + signals @ np.hstack([plant.Dd, plant.Df, plant.Dw]).T
     estimate = found.observer.run(outputs).faults[:, 0]
     error = estimate[1000:] - f[995:-5]
     assert np.sqrt(np.mean(error**2)) == pytest.approx(claimed, rel=0.03)
@@ -90,7 +99,7 @@ def test_delay_against_noise_is_what_monte_carlo_finds() -> None:
 
 def test_leak_of_the_load_is_rounding() -> None:
     plant = smib()
-    found = obsynth.functional_filter(plant, fault_rate=0.01, delay=5)
+    found = delayed()
     observer = found.observer
     for w in (1e-3, 0.1, 1.0, 10.0, 100.0):
         z = np.exp(1j * w * plant.dt)
@@ -233,7 +242,7 @@ def test_monitors_of_residuals(sampled: bool) -> None:
 
 
 def test_monitors_of_estimates_with_a_delay() -> None:
-    design = obsynth.functional_filter(smib(), fault_rate=0.01, delay=5)
+    design = delayed()
     scenario = obsynth.Scenario(horizon=6.0, faults={"tm GENCLS 1": obsynth.Step(size=0.5, start=3.0)})
     monitor = obsynth.monitor(design, scenario, "pointwise")
     counted = obsynth.evaluate(design, scenario, monitor=monitor, runs=3)
@@ -241,7 +250,7 @@ def test_monitors_of_estimates_with_a_delay() -> None:
 
 
 def test_saved_file_is_verified_alone_and_exported(tmp_path: Path) -> None:
-    found = obsynth.functional_filter(smib(), fault_rate=0.01, delay=5)
+    found = delayed()
     loaded = obsynth.load(found.save(tmp_path / "gains.json"))
     assert obsynth.verify(loaded).passed
     obsynth.export(loaded, tmp_path / "filter.c")

@@ -318,9 +318,9 @@ def test_runs_do_not_depend_on_where_they_are_made(wang) -> None:
         design, scenario, runs=700, monitor=watched, progress=lambda some, total: done.append((some, total))
     )
     assert done == [(332, 700), (664, 700), (700, 700)]
-    processes = partial(ProcessPoolExecutor, mp_context=get_context("spawn"))
-    for make in (ThreadPoolExecutor, processes):
-        with make(2) as executor:
+    processes = partial(ProcessPoolExecutor, 1, mp_context=get_context("spawn"))
+    for make in (partial(ThreadPoolExecutor, 2), processes):
+        with make() as executor:
             there = obsynth.evaluate(design, scenario, runs=700, monitor=watched, executor=executor)
         assert there.as_dict() == here.as_dict()
 

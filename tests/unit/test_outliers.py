@@ -14,6 +14,9 @@ import obsynth
 from obsynth import SolverError, SpecError, run_on_data, simulate_dae
 from obsynth.observers.running import state_as_data, state_from_data
 
+#: Samples of the records of a recursive observer: its gains are asked for no further.
+RECORD = 150
+
 
 def tank_log(samples=120, seed=2):
     design = designed()
@@ -27,6 +30,7 @@ def tank_log(samples=120, seed=2):
 def filter_design(**options):
     plant = obsynth.TimeVaryingDescriptorSystem(
         E=[[1, 0], [0, 0]], A=[[0.9, 0.1], [0.5, 1.0]], B=[[1.0], [0.0]], C=np.eye(2), Phi=[[0.1], [0.0]], dt=1.0,
+        horizon=RECORD,
     )  # fmt: skip
     return obsynth.adaptive_observer(
         plant, Q=np.diag([1e-4, 1e-4]), R=np.diag([1e-3, 1e-3]), forgetting=0.98, initial_state=[0.0, 0.0],
@@ -34,7 +38,7 @@ def filter_design(**options):
     )  # fmt: skip
 
 
-def filter_record(samples=150, seed=5):
+def filter_record(samples=RECORD, seed=5):
     rng = np.random.default_rng(seed)
     u, x, rows = np.sin(np.arange(samples) / 9.0)[:, None], np.zeros(2), []
     for k in range(samples):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from functools import cache
 
 import numpy as np
 import pandas as pd
@@ -12,6 +13,7 @@ from test_dae_observer import linear_observer, matrices
 from obsynth import (
     DAEModel,
     DescriptorSystem,
+    ObserverDesign,
     PreconditionError,
     SpecError,
     TimeVaryingDescriptorSystem,
@@ -39,7 +41,9 @@ FILTER = {"Q": Q, "R": R, "initial_state": START, "initial_covariance": P0}
 
 def plant(**changes) -> TimeVaryingDescriptorSystem:
     """An algebraic state, and one parameter in an equation and in an output."""
-    return TimeVaryingDescriptorSystem(E, A, B, C, **{"Phi": PHI, "Psi": PSI, "dt": 1.0, **changes})
+    return TimeVaryingDescriptorSystem(
+        E, A, B, C, **{"Phi": PHI, "Psi": PSI, "dt": 1.0, "horizon": 2 * SAMPLES, **changes}
+    )
 
 
 def record(seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
@@ -48,6 +52,11 @@ def record(seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
     y, u = rng.standard_normal((SAMPLES, 2)), rng.standard_normal((SAMPLES, 1))
     y[5], y[9, 0], y[12, 1], y[20:24] = np.nan, np.nan, np.nan, np.nan
     return y, u
+
+
+@cache
+def filtering() -> ObserverDesign:
+    return descriptor_kalman(plant(Phi=None, Psi=None), **FILTER)
 
 
 class Batch:
@@ -98,7 +107,7 @@ def whole_record(y, u, *, theta=None, walk=None):
 
 def test_a_filter_is_smoothed_to_the_least_squares_of_the_whole_record() -> None:
     y, u = record()
-    design = descriptor_kalman(plant(Phi=None, Psi=None), **FILTER)
+    design = filtering()
     found, (states, deviations, _, _) = smooth(design, y, u), whole_record(y, u)
     np.testing.assert_allclose(found.states, states, atol=1e-11)
     np.testing.assert_allclose(found.state_deviations, deviations, rtol=1e-11)
@@ -112,7 +121,7 @@ def test_a_filter_is_smoothed_to_the_least_squares_of_the_whole_record() -> None
 def test_a_state_that_nothing_later_determines_stays_undetermined() -> None:
     y, u = record()
     y[-1, 1] = np.nan
-    found = smooth(descriptor_kalman(plant(Phi=None, Psi=None), **FILTER), y, u)
+    found = smooth(filtering(), y, u)
     assert np.isinf(found.state_deviations[-1, 2])
     assert np.isfinite(found.state_deviations[:-1]).all()
 
@@ -207,7 +216,7 @@ def test_early_constraints_say_the_same_of_the_past() -> None:
     y, u = record()
     early = smooth(descriptor_kalman(plant(Phi=None, Psi=None), early_constraints=True, **FILTER), y, u)
     longer = np.vstack((y, [[np.nan, np.nan]])), np.vstack((u, [[0.0]]))
-    late = smooth(descriptor_kalman(plant(Phi=None, Psi=None), **FILTER), longer)
+    late = smooth(filtering(), longer)
     np.testing.assert_allclose(early.states, late.states[:-1], atol=1e-10)
     np.testing.assert_allclose(early.state_deviations, late.state_deviations[:-1], rtol=1e-9)
 
@@ -269,7 +278,7 @@ def test_the_end_of_a_nonlinear_record_is_the_observers_estimate() -> None:
 def test_deviations_are_those_of_the_errors() -> None:
     """Monte Carlo: squared errors in units of their variances, and smaller than those of the filter."""
     rng = np.random.default_rng(6)
-    design = descriptor_kalman(plant(Phi=None, Psi=None), **FILTER)
+    design = filtering()
     head = np.vstack((E[:2], A[2:]))
     ratios, gains = [], []
     for _ in range(60):
@@ -302,7 +311,7 @@ def test_an_outlier_that_was_left_out_is_left_out_here() -> None:
     wrong[15, 0], missing[15, 0] = 1e6, np.nan
     model = plant(Phi=None, Psi=None)
     gated = smooth(descriptor_kalman(model, outliers="gate", **FILTER), wrong, u)
-    np.testing.assert_allclose(gated.states, smooth(descriptor_kalman(model, **FILTER), missing, u).states, atol=1e-12)
+    np.testing.assert_allclose(gated.states, smooth(filtering(), missing, u).states, atol=1e-12)
 
 
 def log(y: np.ndarray, u: np.ndarray) -> pd.DataFrame:
@@ -310,7 +319,8 @@ def log(y: np.ndarray, u: np.ndarray) -> pd.DataFrame:
     return frame.drop(index=[14, 15])
 
 
-def shifted_design():
+@cache
+def shifted_design() -> ObserverDesign:
     return adaptive_observer(plant(operating_point={"x1": 100.0, "y1": 100.0}), outliers="none", **FILTER)
 
 

@@ -30,6 +30,12 @@ def recursive() -> tuple[obsynth.ObserverDesign, obsynth.Scenario, object]:
     return design, spec.scenario.replace(horizon=300), obsynth.ParameterMonitor()
 
 
+@pytest.fixture(scope="module")
+def here(linear, recursive) -> tuple[dict[str, object], dict[str, object]]:
+    """Return what this process finds."""
+    return swept(linear, None), swept(recursive, None)
+
+
 def swept(
     case: tuple[obsynth.ObserverDesign, obsynth.Scenario, object], executor: Executor | None
 ) -> dict[str, object]:
@@ -43,7 +49,7 @@ def swept(
     return found.as_dict()
 
 
-def test_a_dask_cluster_gives_the_same_numbers(linear, recursive) -> None:
+def test_a_dask_cluster_gives_the_same_numbers(linear, recursive, here) -> None:
     distributed = pytest.importorskip("distributed", reason="no Dask: pip install 'obsynth[cluster]'")
     with (
         distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=False, dashboard_address=None) as cluster,
@@ -51,24 +57,24 @@ def test_a_dask_cluster_gives_the_same_numbers(linear, recursive) -> None:
     ):
         executor = client.get_executor()
         there = [swept(case, executor) for case in (linear, recursive)]
-    assert there == [swept(case, None) for case in (linear, recursive)]
+    assert there == [*here]
 
 
-def test_a_dask_worker_of_another_process_gives_the_same_numbers(linear) -> None:
+def test_a_dask_worker_of_another_process_gives_the_same_numbers(linear, here) -> None:
     distributed = pytest.importorskip("distributed", reason="no Dask: pip install 'obsynth[cluster]'")
     with (
         distributed.LocalCluster(n_workers=1, threads_per_worker=1, processes=True, dashboard_address=None) as cluster,
         distributed.Client(cluster) as client,
     ):
         there = swept(linear, client.get_executor())
-    assert there == swept(linear, None)
+    assert there == here[0]
 
 
 @pytest.mark.parametrize("kind", ["threads", "processes"])
-def test_threads_and_processes_give_the_same_numbers(kind: str, recursive) -> None:
+def test_threads_and_processes_give_the_same_numbers(kind: str, recursive, here) -> None:
     make = ThreadPoolExecutor(2) if kind == "threads" else ProcessPoolExecutor(1, mp_context=get_context("spawn"))
     with make as executor:
-        assert swept(recursive, executor) == swept(recursive, None)
+        assert swept(recursive, executor) == here[1]
 
 
 def test_a_bar_shows_how_far_it_is(linear, capsys) -> None:

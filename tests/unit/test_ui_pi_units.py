@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 import scipy.linalg
 
-from obsynth import DescriptorSystem, PreconditionError, SpecError, ui_pi_observer
+from obsynth import DescriptorSystem, ObserverDesign, PreconditionError, SpecError, ui_pi_observer
 from obsynth.numerics.spectra import spectrum_error
 
 #: Two masses, a spring and a damper: positions and velocities.
@@ -36,9 +38,23 @@ def rod(count: int, sample_time: float = 0.0) -> DescriptorSystem:
     return DescriptorSystem(None, a, C=outputs, Bf=inputs[:, :1], Bd=inputs[:, 1:], dt=sample_time)
 
 
+@cache
+def of_one_hertz() -> ObserverDesign:
+    return ui_pi_observer(resonator(1.0))
+
+
+#: Courses of the fault, by name.
+MODELS: dict[str, object] = {"step": "step", "ramp": "ramp", "quartic": {"polynomial": 4}}
+
+
+@cache
+def in_si_units(model: str) -> ObserverDesign:
+    return ui_pi_observer(masses([1, 1, 1, 1], 1.0), fault_model=MODELS[model])
+
+
 @pytest.mark.parametrize("frequency", [1e-4, 1e3, 3e3, 1e4, 1e5, 1e9])
 def test_a_resonator_of_any_frequency(frequency: float) -> None:
-    slow, fast = ui_pi_observer(resonator(1.0)), ui_pi_observer(resonator(frequency))
+    slow, fast = of_one_hertz(), ui_pi_observer(resonator(frequency))
     assert fast.report.passed
     poles = frequency * np.linalg.eigvals(slow.observer.Az)
     assert spectrum_error(fast.observer.Az, poles, 0.0) < 1e-6
@@ -51,12 +67,11 @@ def test_an_oscillating_circuit_in_farad_and_henry() -> None:
     assert design.certificate.claims["decay"] > 1e5
 
 
-@pytest.mark.parametrize("model", ["step", "ramp", {"polynomial": 4}])
+@pytest.mark.parametrize("model", MODELS)
 @pytest.mark.parametrize("states", [[1, 1, 1, 1], [1e-2, 1e2, 1e-2, 1e2], [1e3, 1e-3, 1, 1e3]])
 @pytest.mark.parametrize("time", [1e-9, 1e-6, 1e6])
-def test_two_masses_in_any_units(states: list[float], time: float, model: object) -> None:
-    own = ui_pi_observer(masses([1, 1, 1, 1], 1.0), fault_model=model)
-    other = ui_pi_observer(masses(states, time), fault_model=model)
+def test_two_masses_in_any_units(states: list[float], time: float, model: str) -> None:
+    own, other = in_si_units(model), ui_pi_observer(masses(states, time), fault_model=MODELS[model])
     assert other.report.passed
     assert spectrum_error(other.observer.Az, np.linalg.eigvals(own.observer.Az) / time, 0.0) < 1e-5
     assert other.certificate.claims["noise_price"] == pytest.approx(own.certificate.claims["noise_price"], rel=1e-4)
