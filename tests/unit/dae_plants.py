@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -12,10 +13,15 @@ from obsynth import DAEModel
 DESIGNS = Path(__file__).parents[2] / "designs"
 
 
-def exchanger(**changes) -> DAEModel:
+@cache
+def _exchanger() -> DAEModel:
     document = YAML(typ="safe").load((DESIGNS / "moussaali2013_dae" / "plant.yaml").read_text(encoding="utf-8"))
-    fields = {key: value for key, value in document.items() if key not in ("schema_version", "kind")}
-    return DAEModel(**{**fields, **changes})
+    return DAEModel(**{key: value for key, value in document.items() if key not in ("schema_version", "kind")})
+
+
+def exchanger(**changes) -> DAEModel:
+    """The shipped heat exchanger: one model for all, whose functions are compiled once; or another one with changes."""
+    return _exchanger().replace(**changes) if changes else _exchanger()
 
 
 def diode() -> DAEModel:

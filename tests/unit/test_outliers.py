@@ -15,7 +15,7 @@ from obsynth import SolverError, SpecError, run_on_data, simulate_dae
 from obsynth.observers.running import state_as_data, state_from_data
 
 #: Samples of the records of a recursive observer: its gains are asked for no further.
-RECORD = 150
+RECORD = 110
 
 
 def tank_log(samples=120, seed=2):
