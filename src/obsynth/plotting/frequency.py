@@ -151,7 +151,10 @@ def _delayed(observer: LinearObserver, points: ComplexArray) -> ComplexArray:
 def _state_response(plant: DescriptorSystem, b: FloatArray, points: ComplexArray) -> ComplexArray:
     """Return a state for each input: of a plant that is not regular one of many, which its estimates cannot tell."""
     if pencil_structure(plant.E, plant.A).regular:
-        return np.concatenate([*resolved(plant.E, plant.A, b, points)])
+        try:
+            return np.concatenate([*resolved(plant.E, plant.A, b, points)])
+        except np.linalg.LinAlgError:
+            pass  # beside an integrator a low frequency is lost in rounding
     return np.stack([_least_state(point * plant.E - plant.A, b) for point in points])
 
 

@@ -183,5 +183,5 @@ def _named(names: Sequence[str], values: ComplexArray) -> dict[str, complex]:
 
 def _amplitude(value: complex) -> str:
     if abs(value.imag) <= EXACTNESS * abs(value):
-        return f"{value.real:.4g}"
-    return f"{value.real:.4g}{value.imag:+.4g}j"
+        return f"{value.real:.3g}"
+    return f"{value.real:.3g}{value.imag:+.3g}j"

@@ -16,7 +16,13 @@ from obsynth.analysis.existence.numbers import numbers_of
 from obsynth.analysis.existence.rational import PlantNumbers
 from obsynth.analysis.existence.statements import settled_rank
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.ranks import DEAD_CHAIN_TOLERANCE, MARKOV_TOLERANCE, RankDecision, decide_rank
+from obsynth.numerics.ranks import (
+    CANCELLATION_TOLERANCE,
+    DEAD_CHAIN_TOLERANCE,
+    MARKOV_TOLERANCE,
+    RankDecision,
+    decide_rank,
+)
 from obsynth.plants.descriptor import DescriptorSystem
 
 if TYPE_CHECKING:
@@ -224,12 +230,18 @@ def detectability_conditions(
         detectability.condition_number,
         REFUSE_CONDITION,
         "Wang 2015, Theorem 2 (i)",
-        f"{rank.describe()}, condition number {detectability.condition_number:.3g}, "
+        f"{rank.describe()}, condition number {_told(detectability.condition_number)}, "
         f"||Upsilon|| = {float(np.linalg.norm(user_units, 2)):.3g}"
         + (f"; {_names(mixed)} cannot be told apart at first sight. Leave one out, or measure more." if mixed else "."),
         signals=mixed,
     )
     return finite, independent
+
+
+def _told(condition_number: float) -> str:
+    """Return the number to the digits that are not rounding: none beyond what a double holds."""
+    most = 1.0 / CANCELLATION_TOLERANCE
+    return f"{condition_number:.3g}" if condition_number < most else f"above {most:.0e}"
 
 
 def _names(faults: tuple[str, ...]) -> str:
