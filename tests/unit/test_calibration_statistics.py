@@ -103,6 +103,27 @@ def test_what_stands_out_alone() -> None:
         assert np.flatnonzero(standing_out(y[:, None])[:, 0]).tolist() == (rows if told else [])
 
 
+@pytest.mark.parametrize(
+    ("values", "told"),
+    [
+        ([20.0, -18.0], [30]),  # what a filter of noise of AR(.9) makes of one wrong sample
+        ([-20.0, 18.0], [30]),
+        ([20.0, -21.0], []),
+        ([20.0, 18.0], []),
+        ([20.0, -18.0, 16.0], []),
+        ([20.0, 2.0, 20.0], [30, 32]),
+    ],
+)
+def test_a_wrong_sample_of_a_sensor_with_coloured_noise_stands_out_with_the_one_after_it(values, told) -> None:
+    column = np.tile([1.0, -1.0], 60)
+    column[30 : 30 + len(values)] = values
+    assert np.flatnonzero(standing_out(column[:, None])[:, 0]).tolist() == told
+    # At the ends of a log nothing is beside.
+    ends = np.tile([1.0, -1.0], 60)
+    ends[0], ends[-2:] = 20.0, [20.0, -18.0]
+    assert np.flatnonzero(standing_out(ends[:, None])[:, 0]).tolist() == [0, 118]
+
+
 def explained(innovations: np.ndarray, inputs: np.ndarray | None = None, **more) -> dict[str, float]:
     n = len(innovations)
     given = {"constants": {}, "with_constant": lambda name, value: innovations, **more}

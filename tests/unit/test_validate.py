@@ -251,3 +251,15 @@ def test_the_walk_of_a_recursive_design_is_judged_like_that_too():
             initial_covariance=[[1e-4]], initial_parameters=[0.0], initial_parameter_covariance=[[1e-4]],
         )  # fmt: skip
         assert validate(design, {"time": np.arange(300.0), "u": u, "y": y}).passed
+
+
+def test_outliers_that_a_gate_leaves_out_blame_no_variance(tank_design):
+    log = emptying_tank(400)
+    log["gauge"][[60, 150, 333]] += [1.0, -1.0, 1.0]
+    gated = dae_adaptive_observer(
+        tank_design.plant, dt=1.0, Q={"balance": 1e-8}, R={"gauge": 1e-4}, initial_covariance=[[1e-4]], outliers="gate",
+        initial_parameter_covariance=[[1e-6]],
+    )  # fmt: skip
+    found = validate(gated, log)
+    assert found.passed, str(found)
+    assert found.ratios == {}

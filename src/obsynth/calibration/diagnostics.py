@@ -140,7 +140,8 @@ def standing_out(whitened: FloatArray) -> FloatArray:
     """Return by how much single whitened innovations ``(n, ny)`` stand out of what most of their sensor are: in
     deviations of these, zero where they do not.
 
-    Those whose neighbours stand out too are no wrong samples, but something that happened.
+    Those whose neighbours stand out too are no wrong samples, but something that happened; unless there are two, and
+    the second is what a filter of coloured noise makes of the sample after a wrong one: less, to the other side.
     """
     found = np.zeros(whitened.shape)
     for i, column in enumerate(whitened.T):
@@ -150,10 +151,17 @@ def standing_out(whitened: FloatArray) -> FloatArray:
         usual = max(NORMAL_OF_MEDIAN * float(np.median(np.abs(column[seen]))), LEAST_USUAL)
         far = seen & (np.abs(column) > STANDS_OUT * usual)
         beside = np.concatenate([[False], far[:-1]]) | np.concatenate([far[1:], [False]])
-        alone = far & ~beside
+        alone = far & (~beside | _answered(column, far))
         if alone.sum() <= MOST_OUTLIERS * seen.sum():
             found[alone, i] = np.abs(column[alone]) / usual
     return found
+
+
+def _answered(column: FloatArray, far: BoolArray) -> BoolArray:
+    """Return which of two far innovations ``(n,)`` are followed by a smaller one to the other side, and by no third."""
+    after = np.where(np.append(far[1:], False), np.append(column[1:], 0.0), 0.0)
+    pair = np.append(far[1:], False) & ~np.concatenate([[False], far[:-1]]) & ~np.append(far[2:], [False, False])
+    return np.asarray(far & pair & (after * column < 0.0) & (np.abs(after) < np.abs(column)))
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,9 @@ LOWEST_VARIANCE, HIGHEST_VARIANCE = -16.0, 12.0
 MOST_WIDENINGS = 4
 #: First guess of the process noise: what it moves a state by in a sample, in sizes of the states.
 FIRST_PROCESS_NOISE = 1e-3
+#: Correlations of coloured noise, in samples, from which the search begins again: with the first one alone it ended
+#: 26 nats below the best on a motor, at a correlation as long as the log.
+CORRELATIONS = (3.0, 10.0, 30.0)
 #: Scales of the search: constants in widths of their bounds, logarithms of variances.
 CONSTANT_SCALE, VARIANCE_SCALE = 0.01, 1.0
 #: Fits of the simulation whose costs differ by less than this share are the same minimum.
@@ -209,8 +212,26 @@ def greatest_likelihood(objective: Objective, fits: Sequence[Fit], note: Callabl
         if not objective.widened(best):
             break
         value, best = objective.descent(best)
+    value, best = _at_other_correlations(objective, value, best, note)
     value, best, curvature = polished(objective, best)
     return Maximum(best, value, curvature, best)
+
+
+def _at_other_correlations(
+    objective: Objective, value: float, best: FloatArray, note: Callable[[str], object]
+) -> tuple[float, FloatArray]:
+    """Return the best of searches that begin where another one ended, but for one correlation of coloured noise: what
+    drives such noise moves a sensor from row to row by the same whatever the correlation."""
+    problem = objective.problem
+    for i in range(len(problem.names), objective.nt):
+        for samples in CORRELATIONS:
+            note(f"{problem.unknown[i]}, start {samples:g} samples")
+            start = best.copy()
+            start[i] = np.log(samples * problem.log.dt) / problem.widths[i]
+            reached, z = objective.descent(start)
+            if reached < value:
+                value, best = reached, z
+    return value, best
 
 
 def polished(

@@ -273,8 +273,12 @@ def validate(
     coloured = not _white(sensors)
     place = change_of_mean(whitened(record.standardised) if coloured else record.standardised)
     change = None if place is None else found.rows[0] + place
-    said = noise_ratios(design.observer, found) if isinstance(design.observer, DAEObserver) else None
-    ratios = {} if said is None else said.ratios
+    # What a gate leaves out is no sample of the stated noise.
+    heard = replace(found, y=read_only(np.where(np.isfinite(record.innovations), found.y, np.nan)))
+    said = noise_ratios(design.observer, heard) if isinstance(design.observer, DAEObserver) else None
+    agree = whole.holds and not coloured and all(item.nis.holds for item in sensors.values())
+    # A variance that moves no innovation out of what is expected is no reason to change a design.
+    ratios = {} if said is None or agree else said.ratios
     others = _explanations(design, found, record) if coloured else ()
     if coloured and ratios and said is not None and isinstance(design.observer, DAEObserver):
         # Wrong variances colour the innovations too: with the likeliest ones they are white, and nothing explains more.

@@ -210,7 +210,9 @@ def summary_of_run(found: DataRun, watched: Monitor | None) -> str:
         told = ", ".join(f"{count} of {name}" for name, count in found.outliers.items())
         lines.append(f"{sum(found.outliers.values())} outliers: {told}.")
     for name, time in found.alarms.items():
-        fault = f"; {found.isolated} stands out" if watched and name == watched.kind and found.isolated else ""
+        first = next((event for event in found.events if event.by == name), None)
+        clear = watched is not None and name == watched.kind and first is not None and first.clear
+        fault = f"; {first.fault} stands out" if clear and first is not None else ""
         lines.append(f"Alarm: {name} first above its threshold at {found.stamps.shown(time)}{fault}.")
     lines += _alarm_table(found)
     if watched is not None or found.thresholds:

@@ -60,6 +60,11 @@ class AlarmEvent:
     high: float
     evidence: float
 
+    @property
+    def clear(self) -> bool:
+        """Whether the fault's interval, where one is known, excludes zero: else another fault may be meant."""
+        return bool(self.fault) and not self.low < 0.0 < self.high
+
     def as_dict(self) -> dict[str, Any]:
         """Return the event as plain data."""
         return asdict(self)
@@ -135,7 +140,8 @@ def alarm_rows(events: Sequence[AlarmEvent], shown: Callable[[float], str]) -> t
         interval = "" if math.isnan(event.low) else f"{number(event.low)} to {number(event.high)}"
         ends = shown(event.start), shown(event.end)
         evidence = f"{event.evidence:.3g} times"
-        rows.append((event.by, *ends, str(event.rows), event.fault, number(event.size), interval, evidence))
+        fault = event.fault if event.clear or not event.fault else f"{event.fault} (unclear)"
+        rows.append((event.by, *ends, str(event.rows), fault, number(event.size), interval, evidence))
     kept = [i for i in range(len(rows[0])) if any(row[i] for row in rows[1:])]
     return [tuple(row[i] for i in kept) for row in rows], len(events) - len(rows) + 1
 
