@@ -34,7 +34,7 @@ NUMERIC = frozenset({
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
-        "--whole", action="store_true", help="all random cases of the tests marked sampled, not every fourth"
+        "--whole", action="store_true", help="all random cases of the tests marked sampled, not a share of them"
     )
 
 
@@ -65,7 +65,7 @@ def taken_as_verified(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="session")
 def share(pytestconfig: pytest.Config) -> Callable[..., Sequence[Any]]:
-    """Return the cases of a family that this run looks at: all with ``--whole``, else every fourth."""
+    """Return the cases of a family that this run looks at: all with ``--whole``, else one in ``parts``."""
     whole = pytestconfig.getoption("--whole")
 
     def taken(cases: Sequence[Any], parts: int = PARTS) -> Sequence[Any]:

@@ -1,4 +1,4 @@
-"""What the tests of the command line share: a gain set that several commands of a test read is verified once."""
+"""What the tests of the command line share: a gain set that several commands read is verified and bounded once."""
 
 from __future__ import annotations
 
@@ -9,7 +9,10 @@ from typing import Any
 
 import pytest
 
+from obsynth import ObserverDesign
 from obsynth.cli import data_commands, output
+from obsynth.report import designs, page
+from obsynth.results.gain_sets import gain_set_digest
 
 
 @pytest.fixture(scope="session")
@@ -33,3 +36,25 @@ def _verified_once(verified_again: Callable[[Path], Any], monkeypatch: pytest.Mo
     """The verbs that hand a gain set on remember; ``verify`` does not."""
     for module in (output, data_commands):
         monkeypatch.setattr(module, "verified_again", verified_again)
+
+
+@pytest.fixture(scope="session")
+def facts_once() -> Callable[[ObserverDesign], list[tuple[str, str]]]:
+    """Return what a design promises within its tolerances, and remember it for exactly the contents of a gain set."""
+    really, known = designs.tolerance_facts, {}
+
+    def remembered(design: ObserverDesign) -> list[tuple[str, str]]:
+        digest = gain_set_digest(design)
+        if digest not in known:
+            known[digest] = really(design)
+        return known[digest]
+
+    return remembered
+
+
+@pytest.fixture(autouse=True)
+def _tolerances_once(
+    facts_once: Callable[[ObserverDesign], list[tuple[str, str]]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module in (designs, page):
+        monkeypatch.setattr(module, "tolerance_facts", facts_once)

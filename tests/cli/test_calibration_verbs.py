@@ -24,6 +24,13 @@ def folder(tmp_path_factory):
     return place
 
 
+@pytest.fixture(scope="module")
+def gains(folder):
+    path = folder / "gains.json"
+    assert main(["design", "--system", str(folder / "spec.yaml"), "--output", str(path), "--quiet"]) == 0
+    return path
+
+
 def test_linearise_names_the_combination_that_nothing_can_satisfy(folder, capsys):
     assert main(["linearise", "--system", str(folder / "plant.yaml")]) == 3
     assert "tank1 + tank2 + tank3" in capsys.readouterr().err
@@ -82,9 +89,7 @@ def test_calibrate_takes_everything_from_the_spec_and_can_be_made_again(folder, 
     spec.write_text(text, encoding="utf-8")
 
 
-def test_validate_says_yes_and_no_by_its_exit_code(folder, capsys):
-    gains = folder / "gains.json"
-    assert main(["design", "--system", str(folder / "spec.yaml"), "--output", str(gains), "--quiet"]) == 0
+def test_validate_says_yes_and_no_by_its_exit_code(folder, gains, capsys):
     columns = ["--map", "u1=u1_held", "--map", "u3=u3_held", "--data", str(folder / "log.csv")]
     capsys.readouterr()
     assert main(["validate", "--gains", str(gains), *columns, "--rows", "0:56", "--quiet"]) == 0
@@ -131,9 +136,8 @@ def test_logs_that_cannot_be_used_have_a_code_in_the_json(folder, tmp_path, caps
     assert json.loads(capsys.readouterr().out)["code"] == code
 
 
-def test_the_report_on_a_log_says_whether_it_agrees(folder, capsys):
-    gains, page = folder / "report.gains.json", folder / "report.html"
-    assert main(["design", "--system", str(folder / "spec.yaml"), "--output", str(gains), "--quiet"]) == 0
+def test_the_report_on_a_log_says_whether_it_agrees(folder, gains, capsys):
+    page = folder / "report.html"
     columns = ["--map", "u1=u1_held", "--map", "u3=u3_held", "--data", str(folder / "log.csv")]
     shown = []
     for rows in (["--rows", "0:56"], []):

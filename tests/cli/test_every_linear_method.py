@@ -19,6 +19,14 @@ SCENARIOS = {
     "smib/spec.yaml": "horizon: 2",
     "kundur/spec.yaml": "horizon: 2",
     "smib/pd_observer.yaml": "horizon: 2",
+    "sharepasand/spec.yaml": "horizon: 8",
+    "moussaali2013_ltv/spec.yaml": "horizon: 299",
+    "smib/spec_inertia.yaml": "horizon: 20",
+}
+#: Shorter horizons of plants that vary with time, in samples: a design goes along all of them.
+HORIZONS = {
+    "moussaali2013_ltv/spec.yaml": ("plant.yaml", "horizon: 1000", "horizon: 300"),
+    "smib/spec_inertia.yaml": ("plant_inertia.yaml", "horizon: 2000", "horizon: 1020"),
 }
 PAPERS_AND_NETWORKS = (
     "wang2015/spec.yaml", "smib/spec.yaml", "filasova/spec.yaml", "smib/pd_observer.yaml", "sharepasand/spec.yaml",
@@ -54,6 +62,11 @@ def spec_of(name: str, folder: Path) -> Path:
         return source
     for file in source.parent.iterdir():
         (folder / file.name).write_bytes(file.read_bytes())
+    if name in HORIZONS:
+        plant, own, shorter = HORIZONS[name]
+        text = (folder / plant).read_text(encoding="utf-8")
+        assert text.count(own) == 1
+        (folder / plant).write_text(text.replace(own, shorter), encoding="utf-8")
     text = source.read_text(encoding="utf-8").split("scenario:")[0]
     own = source.read_text(encoding="utf-8").partition("scenario:")[2]
     target = folder / source.name

@@ -186,7 +186,7 @@ def heeds_signals() -> None:
 
 
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP", "SIGINT"])
-def test_a_stream_saves_its_state_when_it_is_ended(name):
+def test_a_stream_saves_its_state_when_it_is_ended(name, monkeypatch, capsys):
     assert main([*RUN, "whole.csv"]) == 0
     lines = log(range(10)).splitlines(keepends=True)
     words = ["run", "--gains", "g.json", "--data", "-", "--quiet", "--state", "state.json"]
@@ -206,9 +206,11 @@ def test_a_stream_saves_its_state_when_it_is_ended(name):
         process.send_signal(getattr(signal, name))
         assert process.wait(60) == 128 + getattr(signal, name)
         assert "Traceback" not in process.stderr.read()
-    rest = command(*words, input=lines[0] + "".join(lines[6:]))
-    assert rest.returncode == 0
-    assert "".join([*answers, *rest.stdout.splitlines(keepends=True)[1:]]) == Path("whole.csv").read_text("utf-8")
+    monkeypatch.setattr("sys.stdin", io.StringIO(lines[0] + "".join(lines[6:])))
+    capsys.readouterr()
+    assert main(words) == 0
+    rest = capsys.readouterr().out.splitlines(keepends=True)[1:]
+    assert "".join([*answers, *rest]) == Path("whole.csv").read_text("utf-8")
 
 
 def with_digest(document, part):
