@@ -97,9 +97,12 @@ def test_a_sample_that_stands_out_is_named() -> None:
     assert 6.0 < found.outlier_limit <= 8.0
 
 
-def test_a_sensor_of_another_sign_and_one_with_a_bias_are_named() -> None:
-    turned = calibrate(circuit(), circuit_log(240, vm=lambda column: -column), WIDE, starts=1)
-    assert said(turned, "The best simulation leaves nearly all of what vm does")
+def test_a_sensor_of_another_sign_and_one_with_a_bias_are_named(share) -> None:
+    # Offsets and delays are looked for with --whole, which takes twice as long.
+    for samples, options in share(((200, {"offset": {}, "input_delay": 0}), (240, {})), 2):
+        log = circuit_log(samples, vm=lambda column: -column)
+        turned = calibrate(circuit(), log, WIDE, starts=1, **options)
+        assert said(turned, "The best simulation leaves nearly all of what vm does")
     bias, short = (circuit_log(samples, vm=lambda column: column + 0.3) for samples in (300, 100))
     biased = calibrate(circuit(), bias, WIDE, starts=1, offset={}, input_delay=0)
     assert said(biased, "The innovations of vm have the mean +1.00 deviations: a bias")

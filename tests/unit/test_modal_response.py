@@ -34,16 +34,17 @@ def test_an_estimate_for_many_states_and_signals_is_below_and_close():
 
 
 @pytest.mark.parametrize("damping", [0.5, 1e-1, 1e-2, 1e-4, 1e-6])
-@pytest.mark.parametrize("seed", range(5))
-def test_the_highest_peak_is_found_where_a_fine_grid_has_it(damping, seed):
-    rng = np.random.default_rng([3, seed])
-    a, b, c, d = random_system(rng, 8, 2, 2, damping=damping)
-    modes = Modes.of(a)
-    angles = ModalResponse.of(modes, b, c, d).peaks(33)
-    found = np.linalg.svd(frequency_response(a, b, c, d, angles), compute_uv=False)[:, 0].max()
-    poles = np.abs(np.angle(modes.values))[:, None] + damping * np.linspace(-3.0, 3.0, 601)
-    fine = np.concatenate([np.linspace(0.0, np.pi, 4001), poles.ravel()])
-    assert found >= np.linalg.svd(frequency_response(a, b, c, d, fine), compute_uv=False)[:, 0].max() * (1.0 - 1e-6)
+def test_the_highest_peak_is_found_where_a_fine_grid_has_it(damping, share):
+    for seed in share(range(5)):
+        rng = np.random.default_rng([3, seed])
+        a, b, c, d = random_system(rng, 8, 2, 2, damping=damping)
+        modes = Modes.of(a)
+        angles = ModalResponse.of(modes, b, c, d).peaks(33)
+        found = np.linalg.svd(frequency_response(a, b, c, d, angles), compute_uv=False)[:, 0].max()
+        poles = np.abs(np.angle(modes.values))[:, None] + damping * np.linspace(-3.0, 3.0, 601)
+        fine = np.concatenate([np.linspace(0.0, np.pi, 4001), poles.ravel()])
+        grid = np.linalg.svd(frequency_response(a, b, c, d, fine), compute_uv=False)[:, 0]
+        assert found >= grid.max() * (1.0 - 1e-6)
 
 
 def test_eigenvectors_that_are_no_basis_give_no_response():
