@@ -188,7 +188,7 @@ def test_a_frequency_that_meets_a_mode_of_the_plant_stops_no_summary():
 
 def test_a_condition_number_beyond_a_double_is_no_number():
     plant = obsynth.DescriptorSystem(
-        None, 0.5 * np.eye(2), C=np.eye(2), Bf=[[0.1, 0.3], [0.3, 0.9 + 1e-16]], dt=1.0, fault_names=["a", "b"]
+        None, np.diag([0.5, 0.3, 0.1]), C=[[0.1, 0.3, 0.0], [0.2, 0.6, 1.0]], Bf=np.eye(3, 2), dt=1.0
     )
     with pytest.raises(obsynth.PreconditionError, match=r"condition number above 1e\+14"):
         obsynth.fault_estimation_filter(plant)
