@@ -220,8 +220,9 @@ def test_the_command_draws_a_file(design, frame, tmp_path, monkeypatch, capsys, 
     assert "Alarm: fhat[leak] first above its threshold at 2026-05-01T00:00:1" in printed
     assert f"Written: log{suffix}" in printed
     assert Path(f"log{suffix}").stat().st_size > 5000
-    assert main([*arguments, "--out", "log.bmp"]) == 2
-    assert main([*arguments, "--out", "log.csv"]) == 2
+    if suffix == ".png":
+        assert main([*arguments, "--out", "log.bmp"]) == 2
+        assert main([*arguments, "--out", "log.csv"]) == 2
 
 
 def test_the_page_shows_one_s_own_data_first(design, frame, tmp_path, monkeypatch):

@@ -14,6 +14,7 @@ from benchmarks.campaigns._walking_parameters import cases, linear_errors, nonli
 
 from obsynth import SpecError, adaptive_observer, dae_adaptive_observer, simulate_dae
 
+pytestmark = pytest.mark.usefixtures("taken_as_verified")
 TANK = cases()["leak and bias of a tank"]
 OPTIONS = {"dt": TANK.dt, "Q": TANK.Q, "R": TANK.R, "initial_parameter_covariance": TANK.start,
            "initial_covariance": 1e-4, "integration": "backward-euler"}  # fmt: skip
@@ -44,7 +45,6 @@ def record(jump: float = 0.0, samples: int = 160):
     return true, u, path
 
 
-@pytest.mark.usefixtures("taken_as_verified")
 @pytest.mark.parametrize("form", ["forgetting", "random-walk", "augmented-kalman"])
 def test_a_reset_follows_a_jump_and_nothing_else(form):
     slow = {**OPTIONS, "form": form, "forgetting": 0.998}
@@ -65,7 +65,6 @@ def test_a_reset_follows_a_jump_and_nothing_else(form):
     assert found[1e-6, 0.0][1] == found[0.0, 1.0][1] == 0
 
 
-@pytest.mark.usefixtures("taken_as_verified")
 def test_records_batches_and_samples_reset_alike_and_the_c_refuses():
     from obsynth import run_batch
 
