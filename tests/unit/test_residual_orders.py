@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
 import numpy as np
 import pytest
 from flint import fmpq_mat
@@ -66,9 +63,9 @@ def random_plant(rng: np.random.Generator, scale: float = 1.0) -> obsynth.Descri
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_least_order_is_that_of_a_minimal_polynomial_basis(seed: int, share: Callable[..., Any]) -> None:
+def test_least_order_is_that_of_a_minimal_polynomial_basis(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    for _ in share(range(8), 3):
+    for _ in range(8):
         plant = random_plant(rng)
         for fault in range(plant.nf):
             removed = tuple(j for j in range(plant.nf) if j != fault) if rng.random() < 0.5 else ()
