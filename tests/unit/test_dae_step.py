@@ -37,7 +37,7 @@ def test_sensitivities_equal_finite_differences(method, dt) -> None:
     step = ImplicitStep(DAEFunctions(model, method), dt)
     u, theta = model.nominal_input * [1.05, 1.0, 1.0, 0.98], np.array([0.9, 500.0])
     x = step.solve(model.nominal_state, u, theta).x
-    local = step.sensitivities(step.solve(x, u, theta), x, u, theta)
+    F, G, _ = step.sensitivities(step.solve(x, u, theta), x, u, theta)
     steps = 1e-5 * np.concatenate([model.state_scales, [1.0, 1e3]])
     ends = model.state_scales
     for j, size in enumerate(steps):
@@ -45,7 +45,7 @@ def test_sensitivities_equal_finite_differences(method, dt) -> None:
         moved[j] = size
         sides = [step.solve(x + s * moved[:4], u, theta + s * moved[4:]).x for s in (1.0, -1.0)]
         slope = (sides[0] - sides[1]) / (2 * size) / ends * (steps[j] / 1e-5)
-        exact = np.hstack([local.F, local.G])[:, j] / ends * (steps[j] / 1e-5)
+        exact = np.hstack([F, G])[:, j] / ends * (steps[j] / 1e-5)
         assert np.abs(slope - exact).max() < 1e-8
 
 
@@ -53,12 +53,12 @@ def test_noise_gain_equals_finite_differences_in_the_equations() -> None:
     model = exchanger()
     step = ImplicitStep(DAEFunctions(model), 0.37)
     u, theta, x = model.nominal_input, model.nominal_parameters, model.nominal_state
-    local = step.sensitivities(step.solve(x, u, theta), x, u, theta)
+    _, _, noise = step.sensitivities(step.solve(x, u, theta), x, u, theta)
     equations = dict(model.equations)
     # 0.5 W on the right side of the energy balance.
     moved = model.replace(equations={**equations, "energy": equations["energy"] + " + 0.5"})
     sides = [ImplicitStep(DAEFunctions(m), 0.37).solve(x, u, theta).x for m in (moved, model)]
-    assert (sides[0] - sides[1]) / 0.5 == pytest.approx(local.noise[:, 1], rel=1e-6)
+    assert (sides[0] - sides[1]) / 0.5 == pytest.approx(noise[:, 1], rel=1e-6)
 
 
 @pytest.mark.parametrize("volts", [5.0, 60.0, 300.0])

@@ -144,10 +144,10 @@ class TestKalman:
         problem = noisy(PAIR, OUTPUTS)
         found = compromise(problem, 10.0)
         assert found is not None
-        assert 0.5 * NOISE_PRICE < found.price <= NOISE_PRICE
+        assert 0.5 * NOISE_PRICE < found[2] <= NOISE_PRICE
         easy = compromise(problem, 0.1)
         assert easy is not None
-        assert easy.decay == 0.1
+        assert easy[1] == 0.1
 
     def test_correlated_noise(self) -> None:
         """Process noise that the measurement carries: the gain that removes it is part of the filter."""

@@ -174,15 +174,15 @@ def _sensitivities(
     found = []
     for k in range(1, len(inputs)):
         solution = step.solve(x, inputs[k], theta, before=inputs[k - 1], k=k)
-        local = step.sensitivities(solution, x, inputs[k], theta)
+        F, G, _ = step.sensitivities(solution, x, inputs[k], theta)
         x = solution.x
         if k == 1:
-            left, values, _ = np.linalg.svd(local.F * scales / scales[:, None])
+            left, values, _ = np.linalg.svd(F * scales / scales[:, None])
             free = left[:, values > IDENTIFIABLE_SHARE * values[0]]
             moved = np.hstack([scales[:, None] * free, np.zeros((model.nx, model.nq))])
         else:
-            moved = local.F @ moved
-            moved[:, free.shape[1] :] += local.G
+            moved = F @ moved
+            moved[:, free.shape[1] :] += G
         _, H, L = step.functions.outputs(x, theta)
         rows = H @ moved
         rows[:, free.shape[1] :] += L

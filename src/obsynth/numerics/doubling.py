@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 
@@ -34,21 +33,15 @@ LEAST_SIZE = 1e-20
 PROBES = 6
 
 
-class SlowPart(NamedTuple):
-    """A power as ``basis (n, s) @ rows (s, n)``, with an orthonormal basis."""
-
-    basis: FloatArray
-    rows: FloatArray
-
-
 class RankWatch:
     """Says when fewer directions of a power are enough, with as few looks as its decay allows."""
 
     def __init__(self) -> None:
         self.wait = FIRST_POWER
 
-    def slow_part(self, power: FloatArray) -> SlowPart | None:
-        """Return a power ``(n, n)`` in fewer directions, or ``None``; to be asked once for each squaring."""
+    def slow_part(self, power: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+        """Return a power ``(n, n)`` as an orthonormal basis ``(n, s)`` and rows ``(s, n)``, or ``None``; to be asked
+        once for each squaring."""
         n = len(power)
         if n < FEWEST_STATES:
             return None
@@ -65,13 +58,13 @@ class RankWatch:
         left = float(np.linalg.norm(probes - basis @ (basis.T @ probes)))
         share = left / max(float(np.linalg.norm(probes)), float(np.finfo(np.float64).tiny))
         if share <= POWER_ROUNDING:
-            return SlowPart(np.asarray(basis), basis.T @ power)
+            return np.asarray(basis), basis.T @ power
         self.wait = max(0, math.ceil(math.log2(math.log(POWER_ROUNDING) / math.log(share))) - 1) if share < 1.0 else 1
         return None
 
 
 def slow_equation(
-    part: SlowPart, power: FloatArray, back: FloatArray, solution: FloatArray
+    part: tuple[FloatArray, FloatArray], power: FloatArray, back: FloatArray, solution: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
     """Return p, g and h ``(s, s)`` of the equation in the lower order, all in C order; ``None`` where M is singular."""
     u, rows = part
@@ -207,7 +200,7 @@ def _doubled(
                 power, back, solution = lifts.balanced(power, back, solution)
             part = watch.slow_part(power)
             if part is not None:
-                lifts.add(solution, part.basis)
+                lifts.add(solution, part[0])
             found = _doubled_once(power, back, solution) if part is None else slow_equation(part, power, back, solution)
             if found is None:
                 return None

@@ -141,7 +141,7 @@ class _Run:
         solution = self.step.solve(x, u, theta, before=self.inputs[k - 1], k=k)
         moved = solution.x
         if self.pushed[k].any():
-            moved = moved + self.step.sensitivities(solution, x, u, theta).noise @ self.pushed[k]
+            moved = moved + self.step.sensitivities(solution, x, u, theta)[2] @ self.pushed[k]
         self._note(slice(k, k + 1), moved[None], solution.residual)
 
     def _note(self, kept: slice, states: FloatArray, residuals: FloatArray | float = 0.0) -> None:

@@ -6,8 +6,7 @@ draw x(0) and project it onto the constraint would be inconsistent, as mu(k) of 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import NamedTuple
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
@@ -38,7 +37,7 @@ def consistency(stated: RecursiveObserver, shipped: RecursiveObserver, steps: in
     model = stated.recursion.model
     early = isinstance(model, EarlyConstraintSteps)
     nis, pairs = [], []
-    scores: dict[int, Scores] = {}
+    scores: dict[int, tuple[FloatArray, FloatArray]] = {}
     before = np.zeros((TRIALS, 0))
     count, factor = min(steps, STEPS), truth.factor
     for position, gains in enumerate(gain_steps(shipped, count)):
@@ -103,33 +102,27 @@ def state_terms(step: StepMatrices, sizes: FloatArray) -> FloatArray:
     return np.asarray(np.abs(np.linalg.pinv(step.H)) @ sizes)
 
 
-class Scores(NamedTuple):
-    """Errors at one sample, in units of their deviations, and of the terms where they are claimed to be known."""
-
-    normalised: FloatArray
-    known: FloatArray
-
-
-def normalised(errors: FloatArray, root: FloatArray, terms: FloatArray) -> Scores:
-    """Return ``errors (trials, n)`` in units of their covariance ``root root'``, of the rank beside ``terms (n,)``."""
+def normalised(errors: FloatArray, root: FloatArray, terms: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return ``errors (trials, n)`` in units of their covariance ``root root'``, of the rank beside ``terms (n,)``, and
+    those that are claimed to be zero in units of the terms."""
     sizes = np.where(terms > 0.0, terms, 1.0)
     left, values, _ = np.linalg.svd(root / sizes[:, None])
     found = (errors / sizes) @ left
     kept = np.flatnonzero(values > KNOWN_SHARE)
-    return Scores(np.asarray(found[:, kept] / values[kept]), np.delete(found, kept, axis=1))
+    return np.asarray(found[:, kept] / values[kept]), np.delete(found, kept, axis=1)
 
 
-def _error_rows(scores: dict[int, Scores]) -> Iterator[Check]:
+def _error_rows(scores: Mapping[int, tuple[FloatArray, FloatArray]]) -> Iterator[Check]:
     """Yield NEES at its worst sample, and the errors in directions without covariance."""
     # Errors at different samples are correlated, fully so without process noise: each has a band of its own.
     rows = [
-        _band("NEES", "squared errors per degree of freedom are one", found.normalised**2, f" at k = {k}")
-        for k, found in scores.items()
-        if found.normalised.size
+        _band("NEES", "squared errors per degree of freedom are one", found**2, f" at k = {k}")
+        for k, (found, _) in scores.items()
+        if found.size
     ]
     if rows:
         yield min(rows, key=lambda row: row.margin / (row.bound - 1.0) * np.sign(row.bound - 1.0))
-    exact = [float(np.max(np.abs(found.known))) for found in scores.values() if found.known.size]
+    exact = [float(np.max(np.abs(known))) for _, known in scores.values() if known.size]
     if exact:
         yield upper_bound_check(
             "known directions",

@@ -52,15 +52,6 @@ def question(plant: DescriptorSystem, removed: Sequence[int], number: int, exact
     return Questions(plant, decided_exactly(plant) if exactly is None else exactly).of(removed, number)
 
 
-class _Reduction(NamedTuple):
-    """What `_reduced` leaves: dynamics, outputs, and the columns of every fault, then of u and y, beside both."""
-
-    A: fmpq_mat
-    C: fmpq_mat
-    right: fmpq_mat
-    outputs: fmpq_mat
-
-
 @dataclass(frozen=True, eq=False)
 class ExactRemoval(Removal):
     """What is left of a plant without its unknown inputs and a set of faults, over the rational numbers as well."""
@@ -75,13 +66,13 @@ class ExactRemoval(Removal):
         return self.pencils[gone]
 
     @cached_property
-    def reduction(self) -> _Reduction:
-        """The reduced plant."""
+    def reduction(self) -> tuple[fmpq_mat, fmpq_mat, fmpq_mat, fmpq_mat]:
+        """The reduced plant: dynamics, outputs, and the columns of every fault, then of u and y, beside both."""
         plant = self.source
         e, a = (written_matrix(part) for part in unknowns_pencil(plant, self.removed))
         known = np.block([[plant.B, np.zeros((plant.nx, plant.ny))], [plant.D, -np.eye(plant.ny)]])
         right = written_matrix(np.hstack([np.vstack([plant.Bf, plant.Df]), known]))
-        return _Reduction(*_reduced(e, a, right)[:4])
+        return _reduced(e, a, right)[:4]
 
 
 @dataclass(frozen=True, eq=False)

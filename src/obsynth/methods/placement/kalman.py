@@ -169,17 +169,9 @@ SAME_DEVIATION = 0.1
 MOST_RATE_HALVINGS = 40
 
 
-@dataclass(frozen=True, eq=False)
-class Compromise:
-    """What the default found."""
-
-    K: FloatArray  # (n, ny)
-    decay: float  # 1/s
-    price: float  # largest deviation of an estimate over that of the Kalman gain without a rate
-
-
-def compromise(problem: KalmanProblem, rate: float) -> Compromise | None:
-    """Return the fastest gain, up to ``rate`` (1/s), that costs at most `NOISE_PRICE` in noise."""
+def compromise(problem: KalmanProblem, rate: float) -> tuple[FloatArray, float, float] | None:
+    """Return the fastest gain ``(n, ny)``, up to ``rate`` (1/s), that costs at most `NOISE_PRICE` in noise; its decay
+    (1/s), and the largest deviation of an estimate over that of the Kalman gain without a rate."""
     start = np.eye(problem.F.shape[0])
     plain, change = problem.solved(0.0, start)
     if plain is None:
@@ -190,15 +182,15 @@ def compromise(problem: KalmanProblem, rate: float) -> Compromise | None:
     # A deviation that depends on the coordinates it is computed in is rounding, too.
     again = problem.deviations(plain, start)
     counted = (quietest > silent) & np.isclose(quietest, again, rtol=SAME_DEVIATION, atol=0.0) & np.isfinite(quietest)
-    best = Compromise(plain, 0.0, 1.0)
+    best = plain, 0.0, 1.0
 
-    def attempt(decay: float) -> Compromise | None:
+    def attempt(decay: float) -> tuple[FloatArray, float, float] | None:
         gain, change = problem.solved(decay, start)
         if gain is None:
             return None
         ratios = problem.deviations(gain, change)[counted] / quietest[counted]
         price = float(np.max(ratios)) if ratios.size else 1.0
-        return Compromise(gain, decay, price) if price <= NOISE_PRICE else None
+        return (gain, decay, price) if price <= NOISE_PRICE else None
 
     high = rate
     slowest = float(np.min(decay_rates(eigenvalues(problem.F - plain @ problem.C), problem.dt), initial=np.inf))
@@ -211,9 +203,9 @@ def compromise(problem: KalmanProblem, rate: float) -> Compromise | None:
         if high <= slowest:
             # The quietest filter is as fast as that by itself.
             break
-    if best.decay in (0.0, rate):
+    if best[1] in (0.0, rate):
         return best
-    low, high = best.decay, 2.0 * best.decay
+    low, high = best[1], 2.0 * best[1]
     while high > RATE_STEP * low:
         middle = float(np.sqrt(low * high))
         found = attempt(middle)

@@ -9,8 +9,8 @@ What a user of the unknown-input PI observer should know besides the claims.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -101,33 +101,26 @@ def synthesise(plant: DescriptorSystem, asked: UiPiObserver, *, progress: Callab
     if asked.G is not None:
         _require_stable(problem)
     progress("choosing the gains")
-    chosen = _chosen(asked, problem, region, weights, plant.dt)
+    gain, wanted, claims, runs = _chosen(asked, problem, region, weights, plant.dt)
     progress("building the realisation and its certificate")
-    gains = problem.gains(chosen.gain)
-    poles = None if chosen.poles is None else np.array([*chosen.poles, *problem.fixed_modes])
-    synthesis = assembled(working, model, gains, poles, dict(chosen.claims), structured=not asked.joint)
+    gains = problem.gains(gain)
+    poles = None if wanted is None else np.array([*wanted, *problem.fixed_modes])
+    synthesis = assembled(working, model, gains, poles, dict(claims), structured=not asked.joint)
     return Synthesis(
         asked.resolved(model, plant.fault_names),
         synthesis.gains,
         synthesis.observer,
         synthesis.certificate,
-        {"runs": list(chosen.runs)},
+        {"runs": list(runs)},
         tuple(notes(found, problem, asked, synthesis.certificate.claims)),
         found.transformation,
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _Chosen:
-    """A gain of the observable part, its poles where they were asked for, and what is claimed about the choice."""
-
-    gain: FloatArray
-    poles: Sequence[complex] | None
-    claims: Mapping[str, float]
-    runs: tuple[Mapping[str, Any], ...] = ()
+Choice: TypeAlias = tuple[FloatArray, Sequence[complex] | None, Mapping[str, float], tuple[Mapping[str, Any], ...]]
 
 
-def _placed(problem: PlacementProblem, wanted: Sequence[complex], objective: str) -> _Chosen:
+def _placed(problem: PlacementProblem, wanted: Sequence[complex], objective: str) -> Choice:
     """Return the gain for given poles; its size is that in the user's units where outputs are not mixed."""
     split, plant, units = problem.split, problem.plant, problem.units
     plain_outputs = problem.free == 0 and np.array_equal(problem.decoupled.seen, np.eye(plant.ny))
@@ -141,12 +134,13 @@ def _placed(problem: PlacementProblem, wanted: Sequence[complex], objective: str
         objective=objective,
         weight=units.augmented_states[:, None] * split.lift(np.eye(split.order)),
     )
-    return _Chosen(found.K / outputs, wanted, {"condition": found.condition})
+    return found.K / outputs, wanted, {"condition": found.condition}, ()
 
 
 def _chosen(
     asked: UiPiObserver, problem: PlacementProblem, region: Region | None, weights: NoiseWeights, dt: float
-) -> _Chosen:
+) -> Choice:
+    """Return a gain of the observable part, its poles where they were asked for, what is claimed of it, and records."""
     split, time = problem.split, problem.units.time
     if asked.poles is not None:
         wanted = checked_poles(asked.poles, split.order, problem.fixed_modes, dt)
@@ -170,8 +164,8 @@ def _chosen(
         fair = compromise(kalman, problem.rate)
         if fair is None:
             raise SolverError("The Riccati equation has no usable solution: give poles= or a slow decay=.")
-        gain, claims = fair.K, {"noise_price": fair.price}
-    return _Chosen(gain, None, claims, runs)
+        gain, claims = fair[0], {"noise_price": fair[2]}
+    return gain, None, claims, runs
 
 
 def _in_region(
@@ -181,7 +175,7 @@ def _in_region(
     if asked.region.get("decay") is None:
         fair = compromise(kalman, rate)
         most = np.inf if region.radius is None else RADIUS_SHARE * region.radius
-        wanted = replace(region, decay=float(min(fair.decay, most)) if fair is not None else 0.0)
+        wanted = replace(region, decay=float(min(fair[1], most)) if fair is not None else 0.0)
         try:
             return region_gain(kalman, wanted, solver=asked.solver)
         except SolverError:

@@ -20,7 +20,6 @@ from obsynth.numerics.newton import (
     MOST_ITERATIONS,
     SMALL,
     NewtonResult,
-    condition_number,
     equilibrated,
     newton,
     solved,
@@ -149,16 +148,6 @@ class Solution:
     subsolves: int
 
 
-@dataclass(frozen=True, eq=False)
-class Sensitivities:
-    """Derivatives of a step: F (8), G (9), of what is added to the equations; condition of the matrix of (7)."""
-
-    F: FloatArray
-    G: FloatArray
-    noise: FloatArray
-    condition: float
-
-
 class ImplicitStep:
     """Steps of dt s; moves beyond ``largest_move`` in parts along a homotopy, to the root connected with the last."""
 
@@ -203,12 +192,14 @@ class ImplicitStep:
             raise self._error(found, k, "")
         return self._homotopy(start, x, before, u, theta, k)
 
-    def sensitivities(self, solution: Solution, x: FloatArray, u: FloatArray, theta: FloatArray) -> Sensitivities:
-        """Return the derivatives of a step that was solved."""
-        F, G, noise, scaled = self._local(solution.stages, x, u, theta)
+    def sensitivities(
+        self, solution: Solution, x: FloatArray, u: FloatArray, theta: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the derivatives of a step that was solved: F (8), G (9), and of what is added to the equations."""
+        F, G, noise, _ = self._local(solution.stages, x, u, theta)
         if not (np.isfinite(F).all() and np.isfinite(G).all() and np.isfinite(noise).all()):
             raise SolverError("The matrix of (7), dF/dx' / dt + dF/dx, is singular: the step has no unique solution.")
-        return Sensitivities(F, G, noise, condition_number(scaled))
+        return F, G, noise
 
     def _move(self, stages: FloatArray, start: FloatArray) -> float:
         return float(np.abs((stages - start) / self.sizes).max())
