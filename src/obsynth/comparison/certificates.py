@@ -27,7 +27,7 @@ from obsynth.results.certificate_files import (
     differences,
     opened,
 )
-from obsynth.results.checks import Check, information, upper_bound_check
+from obsynth.results.checks import Check, information, nothing_wrong
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import loaded
 from obsynth.results.verification_report import VerificationReport
@@ -94,12 +94,19 @@ def designs_inside(path: Path) -> list[ObserverDesign]:
 def _verified_result(path: str | Path, data: str | Path | None) -> VerificationReport:
     again = "make it again"
     kind, body, intact = opened(Path(path), RESULTS, RESULT_VERSION, "certificate of a result", again)
-    rows = [_row("digest", "the file is as it was written", [] if intact else ["sha256"])]
+    rows = [nothing_wrong("digest", "the file is as it was written", [] if intact else ["sha256"], source=_SOURCE)]
     try:
         for row in _rows(kind, body, None if data is None else Path(data)):
             rows.append(row)  # those before an error stay
     except (ObsynthError, LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
-        rows.append(_row("contents", "the certificate can be read and computed again", [str(error) or repr(error)]))
+        rows.append(
+            nothing_wrong(
+                "contents",
+                "the certificate can be read and computed again",
+                [str(error) or repr(error)],
+                source=_SOURCE,
+            )
+        )
     return VerificationReport.of(rows)
 
 
@@ -119,13 +126,18 @@ def _rows(kind: str, body: dict[str, Any], log_file: Path | None) -> Iterator[Ch
         yield _log_row(log, log_file)
     result, statement, wrong = _AGAIN[kind]({**stored, "gain_sets": body["gain_sets"]}, designs, log_file)
     if kind == COMPARISON:
-        yield _row("plant", "every gain set is for the plant of the comparison", wrong)
+        yield nothing_wrong("plant", "every gain set is for the plant of the comparison", wrong, source=_SOURCE)
         yield information(
             "other methods", "methods that are not in the table do not exist for this plant: assumed, as nothing is "
             "designed again", float(len(designs)), source=_SOURCE, status="assumed",
         )  # fmt: skip
-    yield _row("figures", "every figure is found again", differences(stored["result"], result))
-    yield _row("statement", statement, [] if statement == stored["statement"] else ["another sentence is stored"])
+    yield nothing_wrong("figures", "every figure is found again", differences(stored["result"], result), source=_SOURCE)
+    yield nothing_wrong(
+        "statement",
+        statement,
+        [] if statement == stored["statement"] else ["another sentence is stored"],
+        source=_SOURCE,
+    )
 
 
 def _log_row(log: Log | None, file: Path | None) -> Check:
@@ -135,7 +147,9 @@ def _log_row(log: Log | None, file: Path | None) -> Check:
             float("nan"), source=_SOURCE, status="assumed",
         )  # fmt: skip
     same = log is not None and file is not None and file_digest(file) == log.sha256
-    return _row("log", "the log that is given is the one that the certificate names", [] if same else ["digest"])
+    return nothing_wrong(
+        "log", "the log that is given is the one that the certificate names", [] if same else ["digest"], source=_SOURCE
+    )
 
 
 def _robustness(body: Mapping[str, Any], designs: Mapping[str, ObserverDesign], _: Path | None) -> Again:
@@ -156,8 +170,3 @@ _AGAIN: Mapping[str, Callable[[Mapping[str, Any], Mapping[str, ObserverDesign], 
     STUDY: _study,
     COMPARISON: compared_again,
 }
-
-
-def _row(name: str, claim: str, wrong: list[str]) -> Check:
-    detail = f"wrong: {', '.join(wrong)}" if wrong else ""
-    return upper_bound_check(name, claim, float(len(wrong)), 0.0, source=_SOURCE, detail=detail)

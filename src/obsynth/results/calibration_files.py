@@ -10,7 +10,7 @@ from typing import Any
 from obsynth.errors import SpecError
 from obsynth.files.inputs import read_json
 from obsynth.numerics.arguments import is_finite_number
-from obsynth.results.checks import Check, information, upper_bound_check
+from obsynth.results.checks import Check, information, nothing_wrong
 from obsynth.results.gain_set_writing import digest_of, plain
 from obsynth.results.verification_report import VerificationReport
 
@@ -66,9 +66,17 @@ def verify_calibration(path: str | Path, again: Mapping[str, Any] | None = None)
     found = read_json(Path(path))
     if not isinstance(found, dict) or found.get("kind") != KIND:
         raise SpecError(f"{path} is no calibration.", path=str(path))
-    rows = [_row("digest", "the file is as it was written", [] if _intact(found) else ["sha256"])]
-    rows.append(_row("box", "ranges are finite, hold their nominal values, and the level is a probability",
-                     _misfits(found)))  # fmt: skip
+    rows = [
+        nothing_wrong("digest", "the file is as it was written", [] if _intact(found) else ["sha256"], source=_SOURCE)
+    ]
+    rows.append(
+        nothing_wrong(
+            "box",
+            "ranges are finite, hold their nominal values, and the level is a probability",
+            _misfits(found),
+            source=_SOURCE,
+        )
+    )
     log = found.get("log") if isinstance(found.get("log"), dict) else {}
     cited = str(log.get("digest", "")) if isinstance(log, dict) else ""
     if again is None:
@@ -77,10 +85,22 @@ def verify_calibration(path: str | Path, again: Mapping[str, Any] | None = None)
             "given (--system, --data)", float("nan"), source=_SOURCE, status="assumed",
         ))  # fmt: skip
     else:
-        rows.append(_row("log", "the log that is given has the digest that the file cites",
-                         [] if again["log"]["digest"] == cited else ["digest"]))  # fmt: skip
-        rows.append(_row("ranges", "the same calibration gives the same constants, ranges and level",
-                         _differences(found, again)))  # fmt: skip
+        rows.append(
+            nothing_wrong(
+                "log",
+                "the log that is given has the digest that the file cites",
+                [] if again["log"]["digest"] == cited else ["digest"],
+                source=_SOURCE,
+            )
+        )
+        rows.append(
+            nothing_wrong(
+                "ranges",
+                "the same calibration gives the same constants, ranges and level",
+                _differences(found, again),
+                source=_SOURCE,
+            )
+        )
     return VerificationReport.of(rows)
 
 
@@ -124,11 +144,6 @@ def _misfits(found: Mapping[str, Any]) -> list[str]:
     return wrong
 
 
-def _row(name: str, claim: str, wrong: list[str]) -> Check:
-    detail = f"wrong: {', '.join(wrong)}" if wrong else ""
-    return upper_bound_check(name, claim, float(len(wrong)), 0.0, source=_SOURCE, detail=detail)
-
-
 def box_row(box: Any, path: Path) -> Check:
     """Return the row that a calibrated box is that of a calibration file."""
     found = read_calibration(path)
@@ -140,5 +155,4 @@ def box_row(box: Any, path: Path) -> Check:
         if item is None or stated is None or [item.low, item.high, item.nominal] != [*stated["range"],
                                                                                      stated["nominal"]]:  # fmt: skip
             wrong.append(name)
-    return upper_bound_check("calibration", f"the box is that of {path.name}", float(len(wrong)), 0.0, source=_SOURCE,
-                             detail=f"wrong: {', '.join(wrong)}" if wrong else "")  # fmt: skip
+    return nothing_wrong("calibration", f"the box is that of {path.name}", wrong, source=_SOURCE)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 CheckKind = Literal["proved", "equality", "computed", "condition", "information"]
 Status = Literal["proved", "computed twice", "estimated", "assumed"]
@@ -75,6 +75,12 @@ def upper_bound_check(
     return Check(
         name, claim, float(value), float(bound), float(bound - value), bool(value <= bound), source, kind, detail
     )
+
+
+def nothing_wrong(name: str, claim: str, wrong: Sequence[Any], *, source: str) -> Check:
+    """Return a check that passes where nothing is wrong; its detail says what is."""
+    detail = f"wrong: {', '.join(map(str, wrong))}" if wrong else ""
+    return upper_bound_check(name, claim, float(len(wrong)), 0.0, source=source, detail=detail)
 
 
 def lower_bound_check(

@@ -17,7 +17,7 @@ from obsynth.numerics.arguments import is_number
 from obsynth.observers.linear.derived import unaveraged
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.covariances import certain_noise_covariance
-from obsynth.results.checks import Check, information, upper_bound_check
+from obsynth.results.checks import Check, information, nothing_wrong, upper_bound_check
 from obsynth.results.design import Certificate, ObserverDesign
 from obsynth.verification.identities import EQUALITY_TOLERANCE
 
@@ -45,13 +45,8 @@ def claim_rows(plant: DescriptorSystem, claims: Mapping[str, Any]) -> Iterator[C
     wrong += sorted(needed - claims.keys())
     if "gamma" in claims and not claimed(claims, "gamma") > 0.0 and "gamma" not in wrong:
         wrong.append("gamma")
-    yield upper_bound_check(
-        "claims",
-        "every claim is known and a finite number, and none is missing",
-        float(len(wrong)),
-        0.0,
-        source="certificate",
-        detail=f"wrong: {', '.join(map(str, wrong))}" if wrong else "",
+    yield nothing_wrong(
+        "claims", "every claim is known and a finite number, and none is missing", wrong, source="certificate"
     )
     if "gamma_min" in claims or bracketed:
         yield upper_bound_check(
@@ -82,13 +77,11 @@ def recovery_rows(plant: DescriptorSystem, recovery: StateRecovery | None) -> It
         return
     wrong = _misfits(plant, recovery)
     source = "the plant; the one before its transformation is not stored"
-    yield upper_bound_check(
+    yield nothing_wrong(
         "recovery fits",
         "the map back to the original states has unique names, the plant's signals and finite entries",
-        float(len(wrong)),
-        0.0,
+        wrong,
         source=source,
-        detail=f"wrong: {', '.join(wrong)}" if wrong else "",
     )
     if wrong:
         return

@@ -12,7 +12,7 @@ from obsynth.errors import ObsynthError
 from obsynth.numerics.sparse import dense, same_matrix
 from obsynth.plants.descriptor import SIGNAL_NAMES, DescriptorSystem
 from obsynth.plants.uncertainty import ELIMINATED, SAMPLED, UNCERTAIN_MATRICES, Uncertainty, as_written
-from obsynth.results.checks import Check, information, upper_bound_check
+from obsynth.results.checks import Check, information, nothing_wrong, upper_bound_check
 from obsynth.results.design import ObserverDesign
 from obsynth.results.plant_source import PlantSource
 
@@ -39,14 +39,12 @@ def tolerance_rows(design: ObserverDesign) -> Iterator[Check]:
     wrong = [*_not_nominal(plant, uncertain), *(_not_of(uncertain, source) if source is not None else ())]
     if any(kind not in (ELIMINATED, SAMPLED) for kind, _ in uncertain.steps):
         wrong.append("steps")
-    yield upper_bound_check(
+    yield nothing_wrong(
         "tolerances as written",
         "the entries at nominal values are those of the plant as written, and the steps since "
         "are those of the design's plant",
-        float(len(wrong)),
-        0.0,
+        wrong,
         source=_SOURCE,
-        detail=f"wrong: {', '.join(wrong)}" if wrong else "",
     )
     if wrong:
         return
@@ -151,13 +149,11 @@ def stored_twice_rows(design: ObserverDesign) -> Iterator[Check]:
         wrong += _noise_of(source, plant)
     if source is None and not wrong:
         return
-    yield upper_bound_check(
+    yield nothing_wrong(
         "stored twice",
         "names, units, operating point, sample time and noise agree wherever they are stored",
-        float(len(wrong)),
-        0.0,
+        wrong,
         source=_SOURCE,
-        detail=f"wrong: {', '.join(wrong)}" if wrong else "",
     )
 
 

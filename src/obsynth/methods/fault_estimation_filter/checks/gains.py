@@ -21,7 +21,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.scaling import Scaling
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.results.checks import Check, upper_bound_check
+from obsynth.results.checks import Check, nothing_wrong
 from obsynth.verification.error_system import ErrorModel
 from obsynth.verification.identities import Identity, equality, tracking_totals, worst
 
@@ -51,13 +51,11 @@ def gains_fit(work: DescriptorSystem, gains: Mapping[str, FloatArray], observer:
     ]
     order = na + len(observer.state_names) * (max(observer.fault_delays, default=1) - 1)
     wrong += ["the order of the observer"] if observer.order != order else []
-    return upper_bound_check(
+    return nothing_wrong(
         "gains fit",
         "the gain set has the letters and shapes of the plant, the observer the order that follows",
-        float(len(wrong)),
-        0.0,
+        wrong,
         source="gain set",
-        detail=f"wrong: {', '.join(wrong)}" if wrong else "",
     )
 
 
