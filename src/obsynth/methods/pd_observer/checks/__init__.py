@@ -94,8 +94,9 @@ def _gains_row(design: ObserverDesign, augmented: DescriptorSystem, tolerance: f
     estimate, direct = observer.Cz[: observer.order], observer.Dy[: observer.order]
     # A gain on an output in small units must not hide behind one on an output in large units.
     units = 1.0 / balance_by_least_squares(augmented.E, augmented.A, outputs=[augmented.C]).outputs
+    # S = I - T C is stored to rounding of T C, so S L is known to rounding of T C L.
     found = [
-        residual(estimate @ gain_l, -direct, factors=((estimate, gain_l),), units=units),
+        residual(estimate @ gain_l, -direct, factors=((estimate, gain_l), (direct, augmented.C, gain_l)), units=units),
         residual(
             gain_j,
             observer.Az @ gain_l,
