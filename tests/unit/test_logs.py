@@ -94,6 +94,18 @@ def test_dates_come_in_and_go_out(design, frame, wanted, tmp_path, zone):
     same(obsynth.run_on_data(design, tmp_path / "log.csv", thresholds=THRESHOLDS), wanted)
 
 
+@pytest.mark.parametrize("hour", ["%H", "%-H"])
+def test_dates_with_points_have_the_day_first(design, frame, wanted, hour):
+    """A log as a German spreadsheet writes it: semicolons, decimal commas, and those in the seconds too."""
+    begin = pd.Timestamp("2026-05-03T08:30:00")
+    stamps = [begin + pd.Timedelta(seconds=t) for t in frame["time"]]
+    told = [f"{stamp.strftime(f'%d.%m.%Y {hour}:%M:%S')},{stamp.microsecond // 1000:03d}" for stamp in stamps]
+    text = frame.assign(time=told).to_csv(index=False, sep=";", decimal=",")
+    found = obsynth.run_on_data(design, io.StringIO(text), thresholds=THRESHOLDS)
+    same(found, wanted)
+    assert found.stamps.shown(found.alarms["fhat[leak]"]).startswith("2026-05-03T08:30")
+
+
 def test_an_index_of_dates_is_the_time(design, frame, wanted):
     index = pd.to_datetime("2026-05-01") + pd.to_timedelta(frame["time"], unit="s")
     log = frame.drop(columns="time").set_index(pd.DatetimeIndex(index).tz_localize("Europe/Berlin"))
@@ -108,7 +120,8 @@ def test_an_index_of_dates_is_the_time(design, frame, wanted):
     [
         (["0", "2026-05-01T00:00:00"], r"Row 2, column 'time': .* is no time stamp: the rows before hold seconds"),
         (["2026-05-01T00:00:00", "1.5"], r"Row 2, .*the rows before hold dates and times"),
-        (["01.05.2026 08:00", "2"], r"Row 1, .*give seconds, such as 12\.5, or a date"),
+        (["01/05/2026 08:00", "2"], r"Row 1, .*give seconds, such as 12\.5, or a date"),
+        (["31.02.2026 08:00", "2"], r"Row 1, .*give seconds, such as 12\.5, or a date"),
         (["2026-05-01T00:00:00", "2026-05-01T00:00:01Z"], r"Row 2, .*with a time zone and without one"),
     ],
 )

@@ -215,7 +215,11 @@ _SCALE = option(
     "--scale", "SIGNAL=FACTOR", "the column's value times the factor is in the signal's unit; may be repeated"
 )
 SCALE = Settings((_SCALE,))
-TIME_COLUMN = option("--time-column", "COLUMN", "column of the time, in seconds or as dates (ISO 8601); default: time")
+TIME_COLUMN = option(
+    "--time-column",
+    "COLUMN",
+    "column of the time, in seconds or as dates (ISO 8601, or 05.03.2026 08:30); default: time",
+)
 #: How a log without faults is read.
 LOG_OPTIONS = (
     MAP,

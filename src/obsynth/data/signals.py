@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta, tzinfo
@@ -19,9 +20,20 @@ from obsynth.numerics.arrays import FloatArray, read_only
 MISSING = frozenset({"", "nan", "na", "n/a", "null", "none"})
 _ZERO = datetime(1970, 1, 1, tzinfo=UTC)
 _EXPECTED = "seconds, such as 12.5, or a date and a time, such as 2026-05-01T08:30:00.5+02:00"
+#: Dates with points, which have the day first wherever they are written; slashes have no such rule.
+_POINTED = re.compile(r"(\d{1,2})\.(\d{1,2})\.(\d{4})(?:[ T]+(\d{1,2}:\d{2}\S*))?")
 _MICROSECOND = timedelta(microseconds=1)
 #: Seconds in a nanosecond, a microsecond and a day; microseconds in a second.
 _NANO, _MICRO, _DAY, _MICROSECONDS = 1e-9, 1e-6, 86400.0, 1e6
+
+
+def _as_iso(cell: str) -> str:
+    """Return a date as ISO 8601 writes it; one with points, such as 5.3.2026 08:30:00,5, has the day first."""
+    found = _POINTED.fullmatch(cell)
+    if found is None:
+        return cell
+    day, month, year, time = found.groups()
+    return f"{year}-{month:0>2}-{day:0>2}" + (f"T{time:0>{len(time) + (time[1] == ':')}}" if time else "")
 
 
 class Stamps:
@@ -58,7 +70,7 @@ class Stamps:
                 return seconds
         if self.is_dated is not False:
             try:
-                found = datetime.fromisoformat(cell)
+                found = datetime.fromisoformat(_as_iso(cell))
             except ValueError:
                 found = None
             if found is not None:
