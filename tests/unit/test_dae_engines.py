@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 from dae_plants import diode, exchanger, linear
-from test_dae_observer import BALANCES, drive, linear_observer, observer, record
+from test_dae_observer import BALANCES, drive, linear_observer, made, observer, record
 
 import obsynth
 from obsynth import DAEModel, DAEObserver, SolverError, SpecError, run_batch, simulate_dae
@@ -257,14 +257,14 @@ def test_without_a_compiler_it_runs_and_says_so_when_asked_for_c(monkeypatch) ->
     monkeypatch.setattr(dae_library, "COMPILERS", ("no-such-compiler",))
     monkeypatch.setenv("CC", "")
     y, u = trials(samples=20, count=2)
-    assert np.isfinite(run_batch(observer(), y, u).states).all()
+    assert np.isfinite(run_batch(made(exchanger()), y, u).states).all()
     with pytest.raises(SpecError, match="no C compiler"):
-        run_batch(observer(), y, u, compiled=True)
+        run_batch(made(exchanger()), y, u, compiled=True)
     with pytest.raises(SpecError, match="no C compiler"):
-        observer().run(y[0], u[0], compiled=True)
+        made(exchanger()).run(y[0], u[0], compiled=True)
     monkeypatch.setenv("CC", "false")
     with pytest.raises(SpecError, match="'false' fails"):
-        observer().run(y[0], u[0], compiled=True)
+        made(exchanger()).run(y[0], u[0], compiled=True)
 
 
 def test_a_long_run_shows_a_bar_and_a_short_one_does_not(capsys, monkeypatch) -> None:

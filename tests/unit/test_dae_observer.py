@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import pickle
+from functools import cache
 
 import numpy as np
 import pytest
 from dae_plants import exchanger, linear
 
 from obsynth import DAEModel, DAEObserver, SolverError, SpecError, dae_adaptive_observer, run_batch, simulate_dae
+from obsynth.numerics.arrays import read_only
 from obsynth.plants.dae.functions import DAEFunctions
 from obsynth.plants.dae.step import ImplicitStep
 from obsynth.types import Estimates
@@ -22,8 +24,17 @@ def part(running, name):
     return running.observer.steps.part(running.state, name)
 
 
+@cache
+def shipped_observer() -> DAEObserver:
+    return made(exchanger())
+
+
 def observer(model=None, **changes) -> DAEObserver:
-    model = model or exchanger()
+    """That of the heat exchanger, one for all, as its functions and its C are compiled once; or another one."""
+    return shipped_observer() if model is None and not changes else made(model or exchanger(), **changes)
+
+
+def made(model: DAEModel, **changes) -> DAEObserver:
     fields = {
         "model": model, "dt": 1.0, "Q": np.diag(BALANCES), "R": np.diag([1e4, 0.25]),
         "initial_state": model.nominal_state, "initial_covariance": np.diag([4e6, 4e6, 25.0, 25.0]),
@@ -87,13 +98,14 @@ def test_what_the_parameters_do_not_explain_decays_by_itself(weight) -> None:
     assert part(running, "theta") == pytest.approx(theta, abs=1e-6)
 
 
+@cache
 def record(samples: int = 200, seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
     model, rng = exchanger(), np.random.default_rng(seed)
     u = np.tile(model.nominal_input, (samples, 1))
     u[:, 0] *= 1.0 + 0.01 * rng.standard_normal(samples)
     faults = np.column_stack([np.where(np.arange(samples) > 60, 0.9, 1.0), np.where(np.arange(samples) > 90, 2e3, 0.0)])
     found = simulate_dae(model, u, dt=1.0, parameters=faults, Q=np.diag(BALANCES), R=np.diag([1e4, 0.25]), seed=seed)
-    return found.outputs, u
+    return read_only(found.outputs), read_only(u)
 
 
 def test_without_forgetting_it_is_the_augmented_kalman_filter() -> None:

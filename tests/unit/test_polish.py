@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from importlib.metadata import version
 
 import numpy as np
@@ -21,6 +22,12 @@ def plant(nd: int) -> obsynth.DescriptorSystem:
     return obsynth.DescriptorSystem(None, a, None, rng.standard_normal((6, 14)), Bf=bf, Bd=bd, dt=0.1)
 
 
+@cache
+def filtering(nd: int) -> obsynth.ObserverDesign:
+    """Return what is designed by default."""
+    return obsynth.fault_estimation_filter(plant(nd))
+
+
 def test_the_inequality_is_asked_and_nothing_is_lost() -> None:
     design = obsynth.fault_estimation_filter(plant(nd=9), engine="lmi")
     runs = [run for run in design.solver["runs"] if run["what"] == "least gain"]
@@ -28,7 +35,7 @@ def test_the_inequality_is_asked_and_nothing_is_lost() -> None:
     assert design.solver["engine"] == "lmi"
     assert [run["solver"] for run in runs] == ["central filter", "CLARABEL"]
     assert runs[1]["version"] == version("clarabel")
-    default = obsynth.fault_estimation_filter(plant(nd=9))
+    default = filtering(nd=9)
     assert default.solver["engine"] == "riccati"
     polished = design.certificate.claims["gamma_min"]
     assert (1.0 - 1e-5) * default.certificate.claims["gamma_min"] <= polished
@@ -42,12 +49,12 @@ def test_where_a_bound_is_reached_the_record_says_that_there_is_nothing_to_polis
     assert last["solver"] == "lower bound"
     assert "nothing to polish" in last["status"]
     assert last["gain"] == pytest.approx(design.certificate.claims["gamma_min"])
-    assert "lower bound" not in str(obsynth.fault_estimation_filter(plant(nd=1)).solver["runs"])
+    assert "lower bound" not in str(filtering(nd=1).solver["runs"])
 
 
 @pytest.mark.parametrize(("factor", "engine"), [(1.01, "riccati"), (1.0 + 5e-5, "lmi")])
 def test_a_gamma_next_to_the_least_calls_the_inequality(factor: float, engine: str) -> None:
-    least = obsynth.fault_estimation_filter(plant(nd=9)).certificate.claims["gamma_min"]
+    least = filtering(nd=9).certificate.claims["gamma_min"]
     design = obsynth.fault_estimation_filter(plant(nd=9), gamma=factor * least)
     assert design.report.passed
     assert design.solver["engine"] == engine

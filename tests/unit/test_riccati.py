@@ -1,6 +1,7 @@
 """Riccati equations of filters: against SciPy's solver and against what the equation says."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -192,21 +193,27 @@ def test_a_level_that_is_exceeded_in_finitely_many_steps_has_no_certificate_and_
     assert asked == []
 
 
-@pytest.mark.parametrize("spread", [0.0, 12.0])
-@pytest.mark.parametrize("level", [np.inf, 3000.0])
-def test_an_equation_of_slow_and_fast_states_is_solved_in_fewer_of_them(spread, level):
-    # Of 240 states six are slow: after some doublings the power has their rank, whatever the units of the states.
+@cache
+def slow_and_fast(level):
+    """Return an equation of 240 states, of which six are slow, and its solution."""
     rng = np.random.default_rng(3)
     n, p = 240, 4
     turn = np.linalg.qr(rng.normal(size=(n, n)))[0]
     a = turn @ np.diag(np.concatenate([0.9999 - 0.002 * np.arange(6), np.linspace(-0.9, 0.9, n - 6)])) @ turn.T
     h, b = rng.normal(size=(p, n)), rng.normal(size=(n, 8))
     process, weight = b @ b.T, np.diag([1.0, 1.0, 1.0, 1.0 if level == np.inf else -(level**2)])
-    expected = solve_discrete_are(a.T, h.T, process, weight)
-    units = np.exp2(np.round(rng.uniform(-spread, spread, n)))
+    return a, h, process, weight, solve_discrete_are(a.T, h.T, process, weight)
+
+
+@pytest.mark.parametrize("spread", [0.0, 12.0])
+@pytest.mark.parametrize("level", [np.inf, 3000.0])
+def test_an_equation_of_slow_and_fast_states_is_solved_in_fewer_of_them(spread, level):
+    # After some doublings the power has the rank of the slow states, whatever the units of the states.
+    a, h, process, weight, expected = slow_and_fast(level)
+    units = np.exp2(np.round(np.random.default_rng(4).uniform(-spread, spread, len(a))))
     sizes = np.sqrt(np.abs(np.diag(expected)))
     found = doubled_riccati_solution(
-        a * units / units[:, None], h * units, process / np.outer(units, units), weight, np.zeros((n, p))
+        a * units / units[:, None], h * units, process / np.outer(units, units), weight, np.zeros(h.shape[::-1])
     )
     assert found is not None
     assert np.max(np.abs(found * np.outer(units, units) - expected) / np.outer(sizes, sizes)) <= 1e-8
