@@ -2,7 +2,7 @@
 
 A campaign is a module of this folder with ``CASES`` (how many), ``LIMIT`` (seconds, for one case) and
 ``case(seed) -> Outcome``; its docstring is the text of its table.  Every case follows from its seed alone, so that any
-share of a campaign can be run, in any order: CI takes one case in ``SHARE``, the tests every eighth of these.
+share of a campaign can be run, in any order: CI takes one case in ``SHARE``, the tests every sixteenth of these.
 """
 
 from __future__ import annotations

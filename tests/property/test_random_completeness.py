@@ -93,7 +93,7 @@ def test_every_plant_is_solved(family, share):
     ids=str,
 )
 def test_every_plant_is_solved_with_options(options, share):
-    plants = share(plants_of("random")[:30], 5)
+    plants = share(plants_of("random")[:30], 10)
     failures = [failure for failure in (outcome_of(known, **options) for known in plants) if failure is not None]
     assert failures == []
 
@@ -108,7 +108,7 @@ def least_weight(number: int) -> float:
 @pytest.mark.parametrize(("engine", "factor", "count"), [("lmi", 2.0, 30), ("auto", 2.0, 30), ("auto", 1.2, 10)])
 def test_limit_on_the_residual_weight_is_kept(engine, factor, count, share):
     failures = []
-    for number in share(range(count)):
+    for number in share(range(count), 8):
         known, least = plants_of("random")[number], least_weight(number)
         design = obsynth.fault_estimation_filter(known.plant, residual_weight_limit=factor * least, engine=engine)
         if not design.report.passed or np.linalg.norm(design.gains["W"], 2) > factor * least:
