@@ -86,7 +86,7 @@ Each row of estimates has a status:
   warm-up     the start is not forgotten yet
   gap         a sample is missing: fault estimates are held, the plant model stands in, no alarms
   partial     recursive and nonlinear designs: some outputs are missing, the others are used
-  recovering  after a gap, like warm-up
+  recovering  after a gap; levels decide by as much more as it can have left
   repeated stamp, out of order
               a stamp that does not rise: the row is left out (more than 10 in a row are an error)
 Of sampled designs, stamps may be off their sample by a fifth of the sampling time and more (.45 at once, .25 on
