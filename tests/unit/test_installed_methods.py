@@ -48,7 +48,7 @@ def run(installed: Path, folder: Path, *arguments: str) -> str:
 
 @pytest.fixture(scope="module")
 def designed(installed, tmp_path_factory) -> Path:
-    """The H2 filter within a disk of .3 on the plant of Wang et al., by the command line."""
+    """The H2 filter within a disk of .3 on the plant of Wang et al., by the command line; then corrupted claims."""
     folder = tmp_path_factory.mktemp("designed")
     plant = ROOT / "designs/wang2015/plant.yaml"
     (folder / "spec.yaml").write_text(
@@ -63,6 +63,12 @@ def designed(installed, tmp_path_factory) -> Path:
         "assert main(['report', '--gains', 'h2.gains.json', '--out', 'report.html']) == 0\n"
         "try: main(['design', '--help'])\n"
         "except SystemExit: pass\n"
+        "import obsynth\n"
+        "design = obsynth.load('h2.gains.json')\n"
+        "claims = dict(design.certificate.claims)\n"
+        "for name in ('h2_norm', 'radius'):\n"
+        "    worse = obsynth.Certificate(design.certificate.matrices, {**claims, name: 0.9 * claims[name]})\n"
+        "    print([row.name for row in obsynth.verify(design.replace(certificate=worse)).failures])\n"
     )
     (folder / "told.txt").write_text(run(installed, folder, "-c", script))
     return folder
@@ -114,16 +120,8 @@ def test_the_example_fits_on_a_page():
     assert len((EXAMPLE / "h2_filter.py").read_text().splitlines()) <= 100
 
 
-def test_a_corrupted_claim_is_found(installed, designed):
-    script = (
-        "import obsynth\n"
-        "design = obsynth.load('h2.gains.json')\n"
-        "claims = dict(design.certificate.claims)\n"
-        "for name in ('h2_norm', 'radius'):\n"
-        "    worse = obsynth.Certificate(design.certificate.matrices, {**claims, name: 0.9 * claims[name]})\n"
-        "    print([row.name for row in obsynth.verify(design.replace(certificate=worse)).failures])\n"
-    )
-    assert run(installed, designed, "-c", script).splitlines() == ["['h2_norm']", "['radius']"]
+def test_a_corrupted_claim_is_found(designed):
+    assert (designed / "told.txt").read_text().splitlines()[-2:] == ["['h2_norm']", "['radius']"]
 
 
 def test_what_cannot_be_loaded_is_told(monkeypatch):
