@@ -18,8 +18,12 @@ from obsynth.observers.running import state_as_data, state_from_data
 RECORD = 110
 
 
+tank_design = cache(designed)
+
+
+@cache
 def tank_log(samples=120, seed=2):
-    design = designed()
+    design = tank_design()
     u = np.tile(design.plant.nominal_input, (samples, 1))
     true = simulate_dae(design.plant, u, dt=1.0, Q=np.diag([2e-5, 1.2e-5, 9e-7]), R=np.diag([1.7e-5, 4.8e-6, 2.7e-5]),
                         integration="backward-euler", seed=seed)  # fmt: skip
@@ -145,10 +149,10 @@ ONSETS = {
 }
 
 
-@pytest.mark.parametrize("name", ONSETS)
-@pytest.mark.parametrize("kind", ["recursive", "nonlinear"])
-def test_a_gate_believes_a_second_sample_as_far_off_as_the_first_and_no_wild_one(kind, name):
-    onset, lost = np.array(ONSETS[name][0], dtype=float), ONSETS[name][1]
+@cache
+def gated(kind):
+    """Return a design with a gate, a record, where its onset is, the size of a step, and what a gate leaves out of it
+    without an onset."""
     if kind == "recursive":
         design, (y, u), at = filter_design(outliers="gate"), filter_record(100), 80
     else:
@@ -156,7 +160,15 @@ def test_a_gate_believes_a_second_sample_as_far_off_as_the_first_and_no_wild_one
         design, y, at = replace(design, observer=replace(design.observer, outliers="gate")), np.array(true.outputs), 60
     # A second is ten deviations of the innovation: what the first samples that are believed leave is far no more.
     size = 10.0 * design.observer.run(y[: at + 1], u[: at + 1]).innovations[20:, 0].std()
-    clean, _ = gate_counts(design.observer, y, u)
+    return design, y, u, at, size, gate_counts(design.observer, y, u)[0]
+
+
+@pytest.mark.parametrize("name", ONSETS)
+@pytest.mark.parametrize("kind", ["recursive", "nonlinear"])
+def test_a_gate_believes_a_second_sample_as_far_off_as_the_first_and_no_wild_one(kind, name):
+    onset, lost = np.array(ONSETS[name][0], dtype=float), ONSETS[name][1]
+    design, y, u, at, size, clean = gated(kind)
+    y = y.copy()
     y[at : at + len(onset), 0] += size * onset
     found, row = gate_counts(design.observer, y, u)
     new = np.diff(found[at - 1 : at + len(onset), 0])
