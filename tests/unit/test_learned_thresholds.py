@@ -287,6 +287,9 @@ def test_every_kind_of_design_learns() -> None:
     run = obsynth.run_on_data(design, data, columns=names, monitor=monitor)
     assert run.table is not None
     assert run.table.statistic.notna().sum() >= 100
+    # What is watched has the names of the columns: residuals are those of the sensors.
+    assert set(watched_names(design)) == {"fhat[leak]", "r[v1]", "r[v2]", "r[v3]"}
+    assert set(watched_names(design)) <= set(run.table.columns)
 
 
 def test_files_and_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 
 from obsynth.data.log_estimator import GAP, LONGEST_BRIDGE, OK, PARTIAL, RECOVERING, WARM_UP, LogObserver, Row
 from obsynth.errors import ObsynthError, SolverError, SpecError
+from obsynth.experiments.monitors.learned import innovation_names
 from obsynth.experiments.monitors.monitor import Evidence
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.dae.estimates import DAERow
@@ -39,12 +40,10 @@ class SteppingLogObserver(LogObserver):
         self.input_names, self.output_names = plant.input_names, plant.output_names
         self.input_delay = design.input_delay
         self.is_recursive, self.may_restart = isinstance(self.observer, RecursiveObserver), True
-        residuals: tuple[str, ...] = plant.output_names
+        residuals = innovation_names(self.observer)
         if isinstance(self.observer, RecursiveObserver):
             model, Q, R = self.observer.plant, self.observer.Q, self.observer.R
             self.point, self.scales = model.operating_point, model.scales
-            # H_k has as many directions beside the state as there are parity innovations.
-            residuals = tuple(f"innovation {i + 1}" for i in range(self.observer.innovation_count))
             constant = model.is_time_invariant and Q.is_constant and R.is_constant
             self.may_restart = constant and model.horizon is None
         self.columns = (

@@ -30,6 +30,7 @@ from obsynth.numerics.arguments import is_finite_number
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.numerics.autoregression import Autoregression, fitted_autoregression
 from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.windows import WindowObserver
 from obsynth.results.certificate_files import opened, sealed
 from obsynth.results.design import ObserverDesign
@@ -271,7 +272,7 @@ def watched_names(design: ObserverDesign) -> tuple[str, ...]:
     if isinstance(observer, LinearObserver):
         names = observer.row_names
         return (*names[observer.fault_rows], *names[observer.residual_rows])
-    return (*(f"fhat[{name}]" for name in observer.fault_names), *(f"r[{i + 1}]" for i in range(innovations(observer))))
+    return (*(f"fhat[{name}]" for name in observer.fault_names), *(f"r[{name}]" for name in innovation_names(observer)))
 
 
 def settling_rows(design: ObserverDesign) -> int:
@@ -279,9 +280,13 @@ def settling_rows(design: ObserverDesign) -> int:
     return 0 if isinstance(design.observer, LinearObserver) else SETTLING
 
 
-def innovations(observer: Any) -> int:
-    """Return how many innovations a recursive or nonlinear observer says."""
-    return int(getattr(observer, "innovation_count", 0) or len(observer.output_names))
+def innovation_names(observer: Any) -> tuple[str, ...]:
+    """Return the names of the innovations of a recursive or nonlinear observer, as columns of runs have them."""
+    if isinstance(observer, RecursiveObserver):
+        # H_k has as many directions beside the state as there are parity innovations.
+        return tuple(f"innovation {i + 1}" for i in range(observer.innovation_count))
+    names: tuple[str, ...] = observer.plant.output_names
+    return names
 
 
 def watched_values(residuals: FloatArray, evidence: Any) -> FloatArray | None:
@@ -491,8 +496,13 @@ def learned_monitor(design: ObserverDesign, learned: LearnedThresholds) -> Monit
     observer, names = design.observer, watched_names(design)
     missing = [name for name in learned.columns if name not in names]
     if missing:
-        raise SpecError(f"The thresholds watch {missing[0]!r}, which the design does not say.", path="normal")
-    residuals = len(observer.residual_names) if isinstance(observer, LinearObserver) else innovations(observer)
+        raise SpecError(
+            f"The thresholds watch {missing[0]!r}, which the design does not say: learn them again for this design.",
+            path="normal",
+        )
+    residuals = (
+        len(observer.residual_names) if isinstance(observer, LinearObserver) else len(innovation_names(observer))
+    )
     return Monitor(
         "learned",
         learned.statement,
