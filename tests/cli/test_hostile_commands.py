@@ -191,6 +191,7 @@ def test_a_stream_saves_its_state_when_it_is_ended(name, monkeypatch, capsys):
     lines = log(range(10)).splitlines(keepends=True)
     words = ["run", "--gains", "g.json", "--data", "-", "--quiet", "--state", "state.json"]
     environment = {**os.environ, "PYTHONPATH": str(ROOT / "src")}
+    environment.pop("PYTHONUNBUFFERED", None)
     line = [sys.executable, "-W", "error", "-m", "obsynth", *words]
     with subprocess.Popen(
         line, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment,

@@ -65,6 +65,7 @@ def test_a_stream_gives_what_a_file_gives_a_row_in_a_row_out(gains):
     log(*ROWS)
     assert run(gains, "--quiet") == 0
     environment = {**os.environ, "PYTHONPATH": str(ROOT / "src")}
+    environment.pop("PYTHONUNBUFFERED", None)  # it would flush what we must flush
     command = [sys.executable, "-W", "error", "-m", "obsynth", "run", "--gains", str(gains), "--data", "-"]
     with subprocess.Popen(
         [*command, "--quiet"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment

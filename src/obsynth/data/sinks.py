@@ -53,6 +53,8 @@ class TextSink:
     def __init__(self, stream: TextIO, header: Sequence[str], stamps: Stamps) -> None:
         self._stream, self._writer, self._stamps = stream, TableWriter(stream, header), stamps
         self._times = time_columns(header)
+        # Who reads a stream may wait for the header before a row is sent.
+        stream.flush()
 
     def write(self, rows: Sequence[Sequence[Any]]) -> None:
         """Write rows; floats so that they are read back bit for bit."""
