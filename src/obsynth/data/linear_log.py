@@ -231,10 +231,13 @@ class LinearLogObserver(LogObserver):
         sample = LinearSample(found, values[: self.nu], values[self.nu :], len(self.state_names))
         return self._complete_row(status, found, missing, sample, time)
 
-    def _complete_row(self, status: str, found: FloatArray, missing: int, sample: LinearSample, time: float) -> Row:
-        self.bridged |= time >= max(self.forgotten_at, self.known_from)
+    def _complete_row(
+        self, status: str, found: FloatArray, missing: int, sample: LinearSample, time: float, *, clear: bool = False
+    ) -> Row:
+        """Return a complete row; ``clear`` where it is known that gaps have left nothing."""
         forgotten = time >= self.forgotten_at
-        return Row(status, found, missing, sample, forgotten, self._excess_in(status), self.bridged)
+        self.bridged |= forgotten and time >= self.known_from
+        return Row(status, found, missing, sample, forgotten, None if clear else self._excess_in(status), self.bridged)
 
     def _excess_in(self, status: str) -> FloatArray | None:
         """Return what gaps can have left in the columns of a complete row, of one that is recovering."""
@@ -291,11 +294,13 @@ class LinearLogObserver(LogObserver):
         self.seen = self._states(states[last], values[last], rows[last], self.fault)
         self.inputs = np.vstack([self.inputs, values[:count, : self.nu]])[-self.kept_inputs :]
         settled, phase = self.settled_at, self.phase
-        nu, nx, found = self.nu, len(self.state_names), list[Row]()
+        nu, nx, found, clear = self.nu, len(self.state_names), list[Row](), False
         for time, seconds, row, v in zip(times[:count], intervals[:count], rows[:count], values[:count], strict=True):
-            self._advance_excess(seconds)
-            said = LinearSample(row, v[:nu], v[nu:], nx)
-            found.append(self._complete_row(OK if time >= settled else phase, row, 0, said, time))
+            if not clear:
+                self._advance_excess(seconds)
+            status, said = OK if time >= settled else phase, LinearSample(row, v[:nu], v[nu:], nx)
+            found.append(self._complete_row(status, row, 0, said, time, clear=clear))
+            clear = status != RECOVERING
         return found
 
     def _measured(self, seconds: float, v: FloatArray) -> FloatArray:
