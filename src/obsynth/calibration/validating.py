@@ -274,8 +274,8 @@ def validate(
     place = change_of_mean(whitened(record.standardised) if coloured else record.standardised)
     change = None if place is None else found.rows[0] + place
     # What a gate leaves out is no sample of the stated noise.
-    heard = replace(found, y=read_only(np.where(np.isfinite(record.innovations), found.y, np.nan)))
-    said = noise_ratios(design.observer, heard) if isinstance(design.observer, DAEObserver) else None
+    passed_by_gate = replace(found, y=read_only(np.where(np.isfinite(record.innovations), found.y, np.nan)))
+    said = noise_ratios(design.observer, passed_by_gate) if isinstance(design.observer, DAEObserver) else None
     agree = whole.holds and not coloured and all(item.nis.holds for item in sensors.values())
     # A variance that moves no innovation out of what is expected is no reason to change a design.
     ratios = {} if said is None or agree else said.ratios
