@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import ctypes
 import re
-import subprocess
 import tempfile
 from pathlib import Path
 
@@ -17,7 +16,7 @@ import numpy as np
 from obsynth.errors import ObsynthError, SpecError
 from obsynth.exporting.c_source import in_precision
 from obsynth.numerics.arrays import FloatArray
-from obsynth.observers.dae.c_code import FLAGS, compiler
+from obsynth.observers.dae.c_code import FLAGS, compiler, shared_library
 from obsynth.observers.estimates import Estimates
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.dae import simulate_dae
@@ -157,19 +156,8 @@ def _compiled(
     for word, value in parts.items():
         harness = harness.replace(word, value)
     own = re.sub(r'^#include ".*"$', '#include "observer.h"', source, count=1, flags=re.MULTILINE)
-    for name, text in (("observer.h", declared), ("observer.c", own), ("run.c", harness)):
-        (folder / name).write_text(text, encoding="utf-8", newline="\n")
-    files = [str(folder / name) for name in ("observer.c", "run.c")]
-    done = subprocess.run(
-        [*command, *FLAGS, *files, "-o", str(folder / "run.so"), "-lm"],
-        capture_output=True,
-        encoding="utf-8",
-        errors="replace",
-        check=False,
-    )
-    if done.returncode != 0:
-        raise SpecError(f"The C compiler {command[0]!r} fails: {done.stderr.strip()[:500]}", path="precision")
-    return ctypes.CDLL(str(folder / "run.so"))
+    texts = {"observer.h": declared, "observer.c": own, "run.c": harness}
+    return ctypes.CDLL(str(shared_library(folder, texts, [*command, *FLAGS], path="precision")))
 
 
 def _taken(library: ctypes.CDLL, u: FloatArray, y: FloatArray, width: int) -> FloatArray:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import io
 import platform
-import subprocess
 import sys
 import tempfile
 import uuid
@@ -30,7 +29,7 @@ from obsynth.exporting.realisation import Realisation, verification_words
 from obsynth.files.outputs import write_atomically
 from obsynth.methods.handing_on import unverified_mark
 from obsynth.numerics.arguments import chosen
-from obsynth.observers.dae.c_code import FLAGS, compiler
+from obsynth.observers.dae.c_code import FLAGS, compiler, shared_library
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.results.design import ObserverDesign
 
@@ -352,7 +351,7 @@ def write_fmu(
         content["sources/buildDescription.xml"] = build_description(model, compiled)
     place = _binary_folder(version)
     if place is not None:
-        binary = _binary(sources, compiled)
+        binary = _binary(sources)
         if binary is not None:
             content[f"binaries/{place[0]}/{identifier}{place[1]}"] = binary
     return write_atomically(target, _zipped(content))
@@ -498,34 +497,14 @@ def _binary_folder(version: str) -> tuple[str, str] | None:
     return {"linux": "linux64", "darwin": "darwin64", "windows": "win64"}[system[0]], system[1]
 
 
-def _binary(sources: Mapping[str, str], compiled: list[str]) -> bytes | None:
+def _binary(sources: Mapping[str, str]) -> bytes | None:
     """Return the shared library, or `None` where there is no compiler."""
     command = compiler()
     if command is None:
         return None
-    with tempfile.TemporaryDirectory(prefix="obsynth-") as name:
-        folder = Path(name)
-        for file, text in sources.items():
-            (folder / file).write_text(text, encoding="utf-8", newline="\n")
-        library = folder / "library"
-        done = subprocess.run(
-            [
-                *command,
-                *FLAGS,
-                "-fvisibility=hidden",
-                *(str(folder / file) for file in compiled),
-                "-o",
-                str(library),
-                "-lm",
-            ],
-            capture_output=True,
-            encoding="utf-8",
-            errors="replace",
-            check=False,
-        )
-        if done.returncode != 0:
-            raise SpecError(f"The C compiler {command[0]!r} fails: {done.stderr.strip()[:500]}", path="fmu")
-        return library.read_bytes()
+    with tempfile.TemporaryDirectory(prefix="obsynth-") as folder:
+        hidden = [*command, *FLAGS, "-fvisibility=hidden"]
+        return shared_library(Path(folder), sources, hidden, path="fmu").read_bytes()
 
 
 def _zipped(content: Mapping[str, bytes]) -> bytes:

@@ -13,7 +13,7 @@ import shlex
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from importlib.resources import files
 from pathlib import Path
@@ -261,19 +261,27 @@ def compiler() -> list[str] | None:
 def _loaded(code: str, command: tuple[str, ...]) -> ctypes.CDLL:
     """Return C code as a library; the same code is compiled once."""
     with tempfile.TemporaryDirectory(prefix="obsynth-", ignore_cleanup_errors=True) as folder:
-        source, library = Path(folder) / "observer.c", Path(folder) / "observer.so"
-        source.write_text(code, encoding="utf-8", newline="\n")
-        done = subprocess.run(
-            [*command, str(source), "-o", str(library), "-lm"],
-            capture_output=True,
-            encoding="utf-8",
-            errors="replace",
-            check=False,
-        )
-        if done.returncode != 0:
-            raise SpecError(f"The C compiler {command[0]!r} fails: {done.stderr.strip()[:500]}", path="compiled")
         # It stays loaded when the file is gone; Windows keeps the file.
-        return ctypes.CDLL(str(library))
+        return ctypes.CDLL(str(shared_library(Path(folder), {"observer.c": code}, command, path="compiled")))
+
+
+def shared_library(folder: Path, texts: Mapping[str, str], command: Sequence[str], *, path: str) -> Path:
+    """Write C and headers by name into a folder, compile the C, and return the library; `SpecError` at ``path`` says
+    why the compiler fails."""
+    for name, text in texts.items():
+        (folder / name).write_text(text, encoding="utf-8", newline="\n")
+    library = folder / "library.so"
+    sources = [str(folder / name) for name in texts if name.endswith(".c")]
+    done = subprocess.run(
+        [*command, *sources, "-o", str(library), "-lm"],
+        capture_output=True,
+        encoding="utf-8",
+        errors="replace",
+        check=False,
+    )
+    if done.returncode != 0:
+        raise SpecError(f"The C compiler {command[0]!r} fails: {done.stderr.strip()[:500]}", path=path)
+    return library
 
 
 class DAELibrary:
