@@ -143,9 +143,9 @@ def test_a_corrupted_design_fails(name: str) -> None:
 
 def with_graph(monkeypatch, change: Callable[[StepGraph], StepGraph]) -> ObserverDesign:
     """The good design, as an implementation would run it whose implicit step is changed."""
-    right = dae_algebra.step_graph
+    right, design = dae_algebra.step_graph, good()
     monkeypatch.setattr(dae_algebra, "step_graph", lambda *arguments: change(right(*arguments)))
-    return good().replace(observer=dataclasses.replace(good().observer))
+    return design.replace(observer=dataclasses.replace(design.observer))
 
 
 def replaced(function: ca.Function, change: Callable[..., list]) -> ca.Function:
@@ -171,8 +171,9 @@ def test_steps_that_are_not_solved_are_found(monkeypatch) -> None:
 
 
 def test_a_nearly_singular_step_is_found(monkeypatch) -> None:
+    design = good()
     monkeypatch.setattr(DAERow, "conditions", property(lambda self: np.full(len(self.several.memory), 1e14)))
-    assert failed(good()) == {CONDITION, CLAIMS}
+    assert failed(design) == {CONDITION, CLAIMS}
 
 
 def growing() -> obsynth.DAEModel:
