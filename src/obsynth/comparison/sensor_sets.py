@@ -244,10 +244,8 @@ def sensor_sets(
             found, exact = ([], exact) if one is None else ([one], False)
     report_stage("designing for each set")
     ranked = _ranked(search, found, costs, noise is not None and goal.startswith("estimate"))
-    asked = Questions(plant, exactly=False)
-    had = [task for task in wanted if reached(asked, task)]
-    failing = {name: _lost_without(plant, had, i) for i, name in enumerate(plant.output_names)} if had else {}
-    kept = tuple(name for name, faults in failing.items() if len(had) == len(wanted) and not faults)
+    failing = _lost_without(plant, search.had, range(plant.ny))
+    kept = tuple(name for name, faults in failing.items() if len(search.had) == len(wanted) and not faults)
     out_of_reach = []
     for task in lost:
         others = ", ".join(plant.fault_names[j] for j in task.beside)
@@ -363,19 +361,34 @@ def _ranked(
     return tuple(sorted(rows, key=lambda row: (row.cost, np.inf if row.deviation is None else row.deviation)))
 
 
-def _lost_without(plant: DescriptorSystem, had: Sequence[Task], output: int) -> tuple[str, ...]:
-    """Return the faults of what the plant reaches that are lost without one of its outputs."""
-    rest = [i for i in range(plant.ny) if i != output]
-    fewer = plant.replace(
+def _lost_without(plant: DescriptorSystem, had: Sequence[Task], outputs: Sequence[int]) -> dict[str, tuple[str, ...]]:
+    """Return the faults that are lost without each of some outputs, one at a time, of what the plant reaches.
+
+    Outputs that may fail together may fail alone: halves are asked about before what is in them."""
+    if not had or not outputs:
+        return {}
+    asked = Questions(_without(plant, outputs), exactly=False)
+    if len(outputs) == 1:
+        lost = (plant.fault_names[task.fault] for task in had if not reached(asked, task))
+        return {plant.output_names[outputs[0]]: tuple(dict.fromkeys(lost))}
+    if all(reached(asked, task) for task in had):
+        return {plant.output_names[i]: () for i in outputs}
+    half = len(outputs) // 2
+    return {**_lost_without(plant, had, outputs[:half]), **_lost_without(plant, had, outputs[half:])}
+
+
+def _without(plant: DescriptorSystem, outputs: Sequence[int]) -> DescriptorSystem:
+    """Return a plant without some of its outputs."""
+    rest = [i for i in range(plant.ny) if i not in outputs]
+    gone = {plant.output_names[i] for i in outputs}
+    return plant.replace(
         C=plant.C[rest],
         D=plant.D[rest],
         Dd=plant.Dd[rest],
         Df=plant.Df[rest],
         Dw=plant.Dw[rest],
         output_names=[plant.output_names[i] for i in rest],
-        scales={name: value for name, value in plant.scales.items() if name != plant.output_names[output]},
+        scales={name: value for name, value in plant.scales.items() if name not in gone},
         units={},
         operating_point={},
     )
-    asked = Questions(fewer, exactly=False)
-    return tuple(dict.fromkeys(plant.fault_names[task.fault] for task in had if not reached(asked, task)))

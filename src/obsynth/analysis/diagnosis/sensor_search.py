@@ -146,10 +146,19 @@ class SensorSearch:
             return [*(Task(i, (), self.goal) for i in faults), *pairs]
         return [Task(i, others(plant, i), self.goal) for i in faults]
 
+    @cached_property
+    def had(self) -> list[Task]:
+        """The tasks that the plant reaches with no sensor added."""
+        return [task for task in self.tasks(self.plant, self.faults) if reached(self._bare, task)]
+
+    @cached_property
+    def _bare(self) -> Questions:
+        return Questions(self.plant, exactly=False)
+
     def reachable(self) -> list[Task]:
-        """Return the tasks that all candidates together reach: no set can do more."""
-        whole = Questions(with_sensors(self.plant, self.sensors), exactly=False)
-        return [task for task in self.tasks(self.plant, self.faults) if reached(whole, task)]
+        """Return the tasks that all candidates together reach: no set can do more, and no sensor takes one away."""
+        whole, had = Questions(with_sensors(self.plant, self.sensors), exactly=False), set(self.had)
+        return [task for task in self.tasks(self.plant, self.faults) if task in had or reached(whole, task)]
 
     def equipped(self, chosen: Sequence[int]) -> DescriptorSystem:
         """Return the plant with a set of candidates, each with a fault of its own where sensors may fail."""
@@ -171,6 +180,8 @@ class SensorSearch:
 
     def feasible(self, chosen: Sequence[int], wanted: Sequence[Task]) -> bool:
         """Whether a set reaches all that is wanted (and all about its own faults)."""
+        if not chosen:
+            return set(wanted) <= set(self.had)
         plant = self.equipped(chosen)
         asked = Questions(plant, exactly=False)
         if not all(reached(asked, task) for task in wanted):
@@ -198,6 +209,8 @@ class SensorSearch:
                 if len(found) + len(new) >= most or tried >= MOST_CONFIRMED:
                     return [*found, *new], False
             found += new
+            if () in found:  # every other set holds it
+                break
         return found, True
 
     def _promising(
