@@ -29,7 +29,7 @@ from obsynth.version import __version__ as __version__
 
 #: What is public, by the module that holds it.  Imported when it is first used, so that ``import obsynth`` stays fast;
 #: ``__init__.pyi`` tells the types.
-_NAMES = {
+_PUBLIC_NAMES = {
     "analysis.diagnosis.decoupled": "decouple",
     "analysis.diagnosis.diagnosing": "diagnose",
     "analysis.dae_structure": "identifiability",
@@ -99,11 +99,11 @@ _NAMES = {
     "sweeps.sweep": "sweep",
     "tolerances.robustness": "robustness",
 }
-_HOMES = {name: f"obsynth.{module}" for module, names in _NAMES.items() for name in names.split()}
+_PUBLIC_HOMES = {name: f"obsynth.{module}" for module, names in _PUBLIC_NAMES.items() for name in names.split()}
 #: Modules whose names are used through them, such as ``obsynth.plotting.plot_data``.
-_PACKAGES = ("conditions", "plotting", "types")
+_PUBLIC_PACKAGES = ("conditions", "plotting", "types")
 
-__all__ = sorted(_HOMES)
+__all__ = sorted(_PUBLIC_HOMES)
 
 provide(
     {
@@ -136,9 +136,9 @@ def _replaced(name: str) -> Any:
 def __getattr__(name: str) -> Any:
     if name in _FROM_GAINS:
         return _replaced(name)
-    if name in _HOMES:
-        return getattr(import_module(_HOMES[name]), name)
-    if name in _PACKAGES:
+    if name in _PUBLIC_HOMES:
+        return getattr(import_module(_PUBLIC_HOMES[name]), name)
+    if name in _PUBLIC_PACKAGES:
         return import_module(f"obsynth.{name}")
     if name[:1].isupper() and name in (types := import_module("obsynth.types")).__all__:
         from warnings import warn
@@ -149,4 +149,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted([*__all__, *_PACKAGES, "__version__"])
+    return sorted([*__all__, *_PUBLIC_PACKAGES, "__version__"])

@@ -4,7 +4,7 @@ from importlib import import_module
 from typing import Any
 
 #: By the module that holds it, imported when a name is first used.
-_NAMES = {
+_TYPE_NAMES = {
     "analysis.diagnosis.decoupled": "DecoupledPlant",
     "analysis.diagnosis.verdicts": "Diagnosis FaultDiagnosis StructuredResidual",
     "analysis.dae_structure": "Identifiability",
@@ -36,15 +36,15 @@ _NAMES = {
     "sweeps.sweep": "Sweep SweepResult",
     "tolerances.result": "Robustness",
 }
-_HOMES = {name: f"obsynth.{module}" for module, names in _NAMES.items() for name in names.split()}
+_TYPE_HOMES = {name: f"obsynth.{module}" for module, names in _TYPE_NAMES.items() for name in names.split()}
 
-__all__ = sorted(_HOMES)
+__all__ = sorted(_TYPE_HOMES)
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
+    if name not in _TYPE_HOMES:
         raise AttributeError(f"module 'obsynth.types' has no attribute {name!r}")
-    return getattr(import_module(_HOMES[name]), name)
+    return getattr(import_module(_TYPE_HOMES[name]), name)
 
 
 def __dir__() -> list[str]:

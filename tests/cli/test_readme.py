@@ -12,7 +12,7 @@ import pytest
 
 from obsynth.cli.main import main
 from obsynth.methods.registry import REGISTRY
-from obsynth.simulation.profiles import KINDS
+from obsynth.simulation.profiles import PROFILE_KINDS
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -123,5 +123,7 @@ def test_the_example_spec_has_only_keys_that_exist(tmp_path):
     spec = load_spec(tmp_path / "spec.yaml")
     assert spec.plant.dt == 0.02
     assert spec.scenario is not None
-    assert set(re.findall(r"`([a-z-]+)`", README[README.index("Kinds: `step`") :].split("\n\n")[0])) == set(KINDS)
+    assert set(re.findall(r"`([a-z-]+)`", README[README.index("Kinds: `step`") :].split("\n\n")[0])) == set(
+        PROFILE_KINDS
+    )
     assert spec.plant.output_names == ("omega 1", "v 3")

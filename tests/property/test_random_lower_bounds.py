@@ -6,7 +6,7 @@ import pytest
 import obsynth
 from obsynth.methods.fault_estimation_filter.central_filter import search_least_gain
 from obsynth.methods.fault_estimation_filter.gamma_lower_bound import _checked_bound, _DualProblem, proved_lower_bound
-from obsynth.methods.fault_estimation_filter.least_gain_proof import ALONE, LAST, PAIRS, InvisiblePairs
+from obsynth.methods.fault_estimation_filter.least_gain_proof import ALONE, LAST, LEAST_GAIN_PAIRS, InvisiblePairs
 from obsynth.methods.fault_estimation_filter.prepared_plant import prepare
 from obsynth.methods.fault_estimation_filter.synthesis import gain_problem
 from obsynth.proofs.exact_arithmetic import stored_matrix
@@ -117,8 +117,12 @@ def test_no_stated_proof_of_the_least_gain_proves_more_than_what_is_true(free_we
             runs = [samples(a, b, rng.normal(size=(5, 1))) for _ in range(2)]
             mixture = np.hstack(runs) if trial % 2 else rng.normal(size=(3, 2)) * (rng.random((3, 2)) < 0.6)
             size = 10.0 ** rng.uniform(-3.0, 3.0, size=2)
-            parts = {PAIRS: mixture, LAST: size[0] * rng.normal(size=(1, 2)), ALONE: size[1] * rng.normal(size=(1, 1))}
-            for left_out in (set(), {PAIRS}, {LAST}, {ALONE}, {LAST, ALONE}):
+            parts = {
+                LEAST_GAIN_PAIRS: mixture,
+                LAST: size[0] * rng.normal(size=(1, 2)),
+                ALONE: size[1] * rng.normal(size=(1, 1)),
+            }
+            for left_out in (set(), {LEAST_GAIN_PAIRS}, {LAST}, {ALONE}, {LAST, ALONE}):
                 stated = {name: part for name, part in parts.items() if name not in left_out}
                 bound = pairs.bound(stated, free_weight=free_weight)
                 assert bound <= norm, (trial, left_out)
@@ -131,9 +135,9 @@ def test_a_long_run_proves_nearly_the_norm():
     one = np.eye(1)
     mixture = samples(0.5 * one, one, np.ones((400, 1)))
     pairs = pairs_of_everything(0.5 * one, one, one, 0.0 * one)
-    assert 1.99 < pairs.bound({PAIRS: mixture}, free_weight=False) <= 2.0
+    assert 1.99 < pairs.bound({LEAST_GAIN_PAIRS: mixture}, free_weight=False) <= 2.0
     # Without the first sample, which is the one at rest, nothing says where the run came from.
-    assert pairs.bound({PAIRS: np.array([[1.0], [0.0]])}, free_weight=False) == 0.0
+    assert pairs.bound({LEAST_GAIN_PAIRS: np.array([[1.0], [0.0]])}, free_weight=False) == 0.0
 
 
 def noisy_plant(seed: int, nx: int) -> obsynth.DescriptorSystem:
@@ -155,7 +159,7 @@ def test_runs_of_a_few_samples_prove_the_least_gain_of_small_filters(nx):
         row, claims = design.report["least gain"], design.certificate.claims
         assert row.status == "proved"
         assert (1.0 - 1e-4) * claims["gamma_min"] <= row.value <= claims["gamma_min"] * (1.0 + 1e-6)
-        pairs = design.certificate.matrices[PAIRS]
+        pairs = design.certificate.matrices[LEAST_GAIN_PAIRS]
         assert pairs.shape[1] > 1
 
 

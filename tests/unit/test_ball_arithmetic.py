@@ -14,7 +14,7 @@ from obsynth.observers.linear.observer import LinearObserver
 from obsynth.proofs import definiteness
 from obsynth.proofs.balls import Ball
 from obsynth.proofs.definiteness import prove_positive_definite
-from obsynth.proofs.extended_balls import MOST_ROWS, Enclosed, ExtendedBall, block, prove_by_ball_arithmetic
+from obsynth.proofs.extended_balls import LARGEST_ORDER, Enclosed, ExtendedBall, block, prove_by_ball_arithmetic
 from obsynth.verification.certificates import prove_bounded_real, prove_stable
 
 ULP = 2.0**-52
@@ -140,14 +140,14 @@ def test_the_precision_of_others_is_left_alone() -> None:
 
 
 def test_a_larger_matrix_is_not_tried_and_the_reason_says_so() -> None:
-    found = prove_positive_definite(next_to_singular(np.random.default_rng(0), MOST_ROWS + 1, np.inf))
+    found = prove_positive_definite(next_to_singular(np.random.default_rng(0), LARGEST_ORDER + 1, np.inf))
     assert not found.proved
-    assert f"up to order {MOST_ROWS}" in found.reason
+    assert f"up to order {LARGEST_ORDER}" in found.reason
     assert found.reason in found.text
 
 
 def test_what_is_far_from_definite_needs_no_digits(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(definiteness, "MOST_ROWS", 0)
+    monkeypatch.setattr(definiteness, "LARGEST_ORDER", 0)
     found = prove_positive_definite(next_to_singular(np.random.default_rng(0), 5, np.inf))
     assert not found.proved
     assert "up to order 0" in found.reason
@@ -214,7 +214,7 @@ def test_the_report_says_which_proof_it_was(monkeypatch: pytest.MonkeyPatch) -> 
     again = obsynth.verify(design)
     assert again.passed
     assert again["LMI"].detail.startswith("ball arithmetic with 128 bits")
-    monkeypatch.setattr(definiteness, "MOST_ROWS", 0)
+    monkeypatch.setattr(definiteness, "LARGEST_ORDER", 0)
     failed = obsynth.verify(design)["LMI"]
     assert not failed.passed
     assert "up to order 0" in failed.detail

@@ -201,5 +201,5 @@ class TestExponentialsOfManyStates:
     def test_what_double_precision_does_not_tell_is_left_to_more_digits(self, monkeypatch):
         a = np.random.default_rng(8).normal(size=(products.MOST_STATES_FOR_BALLS + 1,) * 2) / 8.0
         fast = products.exponential(a, 1.0)
-        monkeypatch.setattr(products, "LARGEST_SHARE", 1e-15)
+        monkeypatch.setattr(products, "LARGEST_RADIUS_SHARE", 1e-15)
         assert np.max(products.exponential(a, 1.0).radius) < 0.01 * np.max(fast.radius)

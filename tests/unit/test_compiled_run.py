@@ -183,7 +183,7 @@ def test_long_records_are_taken_in_parts(single_steps, monkeypatch) -> None:
     y, u = record(observer.plant, SAMPLES)
     exact = observer.run(y, u, compiled=False)
     single_steps.clear()
-    monkeypatch.setattr(compiled_run, "CHUNK", 10)
+    monkeypatch.setattr(compiled_run, "PREPARED_STEPS", 10)
     assert_same(observer.run(y, u, compiled=True), exact)
     assert single_steps == [0]
 

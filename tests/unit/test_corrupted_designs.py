@@ -35,7 +35,7 @@ from obsynth import (
     verify,
 )
 from obsynth.analysis.transformations.recovery import StateRecovery
-from obsynth.methods.fault_estimation_filter.least_gain_proof import WITNESSES
+from obsynth.methods.fault_estimation_filter.least_gain_proof import LEAST_GAIN_WITNESSES
 from obsynth.plants.uncertainty import matrices_of
 from obsynth.spec.loader import load_spec
 from obsynth.verification.claims import WITNESS_CLAIMS
@@ -657,7 +657,7 @@ def test_not_a_number_anywhere_is_refused_or_fails(name: str, share: Callable[..
                         change(design, **{field: changed})
     for key, matrix in design.certificate.matrices.items():
         for row, column in share(scattered(matrix.shape), 8):
-            expected = {LEAST if key in WITNESSES else WITNESS_CLAIMS.get(key, FITS)}
+            expected = {LEAST if key in LEAST_GAIN_WITNESSES else WITNESS_CLAIMS.get(key, FITS)}
             assert failed(certificate_entry(key, row, column, np.nan)(design)) == expected
     needed = {"state_lag": {FITS, CLAIMS}}
     needed["gamma"] = {LMI, NORM, CLAIMS, ORDER} if design.plant.nd else {CLAIMS}
@@ -691,7 +691,9 @@ def in_units(design: ObserverDesign, powers: np.ndarray) -> ObserverDesign:
     matrices = design.certificate.matrices
     moved = {letter: design.gains[letter] / own[:core, None] for letter in ("T", "N", "L", "Psi", "R")}
     changed = changed.replace(gains={**design.gains, **moved})
-    kept = {key: value for key, value in matrices.items() if key not in WITNESS_CLAIMS and key not in WITNESSES}
+    kept = {
+        key: value for key, value in matrices.items() if key not in WITNESS_CLAIMS and key not in LEAST_GAIN_WITNESSES
+    }
     changed = changed.replace(certificate=Certificate(kept, design.certificate.claims))
     return with_certificate(
         changed,

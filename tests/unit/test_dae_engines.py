@@ -214,7 +214,7 @@ def trials(samples: int = 60, count: int = 7) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize(("compiled", "shared"), [(False, True), (False, False), (True, True), (True, False)])
 def test_a_batch_is_its_trials(compiled, shared, monkeypatch) -> None:
-    monkeypatch.setattr(dae_batch, "SAMPLES_PER_CALL", 180)
+    monkeypatch.setattr(dae_batch, "BATCH_SAMPLES_PER_CALL", 180)
     y, u = trials()
     y[2, 20:30] = np.nan
     y[3, 5, 1] = np.nan

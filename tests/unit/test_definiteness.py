@@ -85,7 +85,7 @@ FAMILIES = (singular_gram, gram_off_by_one_ulp, known_inertia, shifted_to_the_ed
 
 @pytest.fixture
 def without_more_digits(monkeypatch):
-    monkeypatch.setattr(definiteness, "MOST_ROWS", 0)
+    monkeypatch.setattr(definiteness, "LARGEST_ORDER", 0)
 
 
 @pytest.mark.parametrize("family", FAMILIES, ids=lambda family: family.__name__)
@@ -123,7 +123,7 @@ def test_no_false_proof_of_larger_singular_matrices(size, count, monkeypatch):
     rng = np.random.default_rng(size)
     for i in range(10 + count):
         if i == count:
-            monkeypatch.setattr(definiteness, "MOST_ROWS", 0)
+            monkeypatch.setattr(definiteness, "LARGEST_ORDER", 0)
         factor = rng.integers(-9, 10, (size, size - 1)).astype(float)
         assert not prove_positive_definite(factor @ factor.T).proved
 
@@ -256,5 +256,5 @@ def test_extreme_sizes_neither_warn_nor_raise(monkeypatch):
     factor[0, 0] = 1.0
     # Definite (the product is exact), with a smallest eigenvalue far below every double.
     assert prove_positive_definite(factor @ factor.T).means == "ball arithmetic"
-    monkeypatch.setattr(definiteness, "MOST_ROWS", 0)
+    monkeypatch.setattr(definiteness, "LARGEST_ORDER", 0)
     assert not prove_positive_definite(factor @ factor.T).proved

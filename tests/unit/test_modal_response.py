@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from obsynth.numerics.modal_response import SAFE_CONDITION, ModalResponse, Modes, level_crossings
+from obsynth.numerics.modal_response import SAFE_RECIPROCAL_CONDITION, ModalResponse, Modes, level_crossings
 from obsynth.numerics.norms import frequency_response, highest_gain_found, hinf_norm
 
 
@@ -73,5 +73,5 @@ def test_crossings_next_to_zero_and_to_the_highest_frequency(side):
         assert np.min(np.abs(crossings - angle)) < 1e-6
     # At the peak itself the pencil is singular at z = 1 or -1.
     crossings, distance = level_crossings(*(np.full((1, 1), v) for v in (a, 1.0, 1.0, 0.0)), 2.0)
-    assert distance < np.sqrt(SAFE_CONDITION)
+    assert distance < np.sqrt(SAFE_RECIPROCAL_CONDITION)
     assert np.all(np.minimum(crossings, np.pi - crossings) < 1e-3)

@@ -122,3 +122,38 @@ def test_names_of_ranks_are_not_made_again(modules: dict[Path, ast.Module]) -> N
     made = {path: theirs & own_constants(tree) for path, tree in modules.items()
             if path != Path(ranks.__file__)}  # fmt: skip
     assert {name: names for name, names in made.items() if names} == {}
+
+
+#: What is of one module by its nature: the paper that it follows, which its conditions and checks cite.
+OF_ITS_MODULE = frozenset({"SOURCE"})
+
+
+def constants(tree: ast.Module) -> Iterator[str]:
+    """Yield the constants that a module assigns at its top, without the underscore of private ones."""
+    for node in tree.body:
+        if isinstance(node, ast.Assign | ast.AnnAssign):
+            for target in node.targets if isinstance(node, ast.Assign) else [node.target]:
+                for name in ast.walk(target):
+                    if isinstance(name, ast.Name) and isinstance(name.ctx, ast.Store) and name.id.isupper():
+                        yield name.id.lstrip("_")
+
+
+def in_several(modules: dict[Path, ast.Module]) -> dict[str, list[str]]:
+    """Return the constants that more than one module assigns, with these modules."""
+    homes: dict[str, set[str]] = {}
+    for path, tree in modules.items():
+        for name in constants(tree):
+            homes.setdefault(name, set()).add(str(path))
+    return {name: sorted(found) for name, found in homes.items() if len(found) > 1 and name not in OF_ITS_MODULE}
+
+
+def test_a_constant_has_one_meaning(modules: dict[Path, ast.Module]) -> None:
+    assert in_several(modules) == {}
+
+
+@pytest.mark.parametrize(
+    ("one", "other"), [("MOST = 3", "MOST: int = 4"), ("A, _MOST = 1, 2", "MOST = 2"), ("MOST = NEXT = 1", "_NEXT = 2")]
+)
+def test_a_constant_with_two_meanings_is_found(one: str, other: str) -> None:
+    assert in_several({Path("one.py"): ast.parse(one), Path("other.py"): ast.parse(other)})
+    assert not in_several({Path("one.py"): ast.parse(one), Path("other.py"): ast.parse("from one import MOST")})

@@ -185,7 +185,7 @@ def test_a_peak_gain_holds_however_early_its_intervals_end(share, monkeypatch):
     """What is left after the last interval is part of the bound: the integral of exp(-t) is one."""
     from obsynth.numerics import continuous
 
-    monkeypatch.setattr(continuous, "LEFT_SHARE", share)
+    monkeypatch.setattr(continuous, "RESPONSE_LEFT_SHARE", share)
     for rates in ([1.0], [1.0, 1e-3], [50.0, 0.2, 0.01]):
         a = -np.diag(rates)
         found = continuous.peak_gain(a, np.eye(len(rates)), np.ones((1, len(rates))))

@@ -494,7 +494,7 @@ def test_rows_in_one_piece_are_those_of_single_steps_bit_for_bit(continuous, mon
     times = np.cumsum(intervals)
     values = rng.normal(size=(count, 3))
     values[60, 1], values[61], values[150, 0], values[[250, 251]] = np.nan, np.nan, np.inf, 1e308
-    monkeypatch.setattr(log_run, "PIECE", 37)
+    monkeypatch.setattr(log_run, "ROWS_AT_ONCE", 37)
     whole = run.estimates(times.tolist(), values)
     single = log_run.LogRun(design)
     monkeypatch.setattr(type(single.observer), "takes_pieces", False)

@@ -22,7 +22,7 @@ FAR_UNITS = 256.0
 #: Weight of inputs and outputs beside equations and states, which they scale only where A and E leave that open.
 SIGNALS_WEIGHT = 1e-3
 
-_KINDS = ("equations", "states", "outputs", "faults", "disturbances", "model")
+_SIGNAL_KINDS = ("equations", "states", "outputs", "faults", "disturbances", "model")
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +74,7 @@ class PlantUnits:
         ]
         courses = _model_units(model, factors[fault_model], entering[0])
         found = (factors[equations], own, shown, *entering, courses)
-        parts = {kind: read_only(part) for kind, part in zip(_KINDS, found, strict=True)}
+        parts = {kind: read_only(part) for kind, part in zip(_SIGNAL_KINDS, found, strict=True)}
         return cls(time=plant.dt or float(factors[0]), discrete=plant.is_discrete, **parts)
 
     @property
@@ -101,7 +101,7 @@ class PlantUnits:
     def rounded(self) -> PlantUnits:
         """Return the same with powers of two, with which scaling is exact."""
 
-        powers = {kind: read_only(np.exp2(np.round(np.log2(getattr(self, kind))))) for kind in _KINDS}
+        powers = {kind: read_only(np.exp2(np.round(np.log2(getattr(self, kind))))) for kind in _SIGNAL_KINDS}
         time = self.time if self.discrete else float(np.exp2(np.round(np.log2(self.time))))
         return PlantUnits(time=time, discrete=self.discrete, **powers)
 

@@ -117,7 +117,7 @@ def analyse_structure(plant: DescriptorSystem | Transformation) -> Structure:
 
 
 #: A sampled plant with an eigenvalue this far from zero grows so fast that it is hardly one.
-_FAR = 3.0
+_FAR_EIGENVALUE = 3.0
 #: Larger plants are not asked: their eigenvalues would take too long for a question.
 _MOST_STATES_FOR_QUESTIONS = 200
 #: Signals that a question lists.
@@ -167,7 +167,7 @@ def _other_time(plant: DescriptorSystem) -> tuple[str, ...]:
     plain = plant.dense()
     values = np.asarray(pencil_structure(plain.E, plain.A).finite_eigenvalues)
     values = values[np.isfinite(values)]
-    far, close = int(np.sum(np.abs(values) > _FAR)), (np.abs(values) < 1.0) & (values.real > 0.0)
+    far, close = int(np.sum(np.abs(values) > _FAR_EIGENVALUE)), (np.abs(values) < 1.0) & (values.real > 0.0)
     if plant.is_discrete and far and np.sum(values.real < 0.0) >= values.size / 2.0:
         return (
             f"dt is {plant.dt:g} s, but {far} of {values.size} eigenvalues lie far outside the unit circle (up to "

@@ -18,7 +18,7 @@ from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 #: Steps that are looked at where the plant has no horizon.
 STEPS_WITHOUT_HORIZON = 1000
 #: Condition numbers of H_k above this are worth a note: half the digits of double precision are left.
-WARN_CONDITION = 1e6
+WARN_MARKOV_CONDITION = 1e6
 
 IntArray: TypeAlias = NDArray[np.intp]
 

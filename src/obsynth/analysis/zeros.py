@@ -10,7 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.numerics.arrays import ComplexArray, FloatArray, read_only
-from obsynth.numerics.pencil_points import FEW_COLUMNS, MOST_DIRECTIONS, NEWTON_STEPS, PencilPoints, smallest_singular
+from obsynth.numerics.pencil_points import (
+    FEW_COLUMNS,
+    GENERIC_POINTS,
+    MOST_DIRECTIONS,
+    ZERO_STEPS,
+    PencilPoints,
+    smallest_singular,
+)
 from obsynth.numerics.pencils import FiniteZeros, finite_zeros
 from obsynth.numerics.ranks import (
     BOUNDARY_NEIGHBOURHOOD,
@@ -45,7 +52,7 @@ def _is_singular(E: FloatArray, A: FloatArray, value: complex, normal_rank: int,
     """Whether the rank drops at, or within the accuracy of, a computed zero."""
     pencil = equilibrated_at(E, A, value, nx=nx)
     point, best = value, np.inf
-    for _ in range(NEWTON_STEPS):
+    for _ in range(ZERO_STEPS):
         matrix = pencil.A - point * pencil.E
         if matrix.shape[0] >= matrix.shape[1] == normal_rank >= FEW_COLUMNS:
             found = smallest_singular(matrix)
@@ -80,8 +87,6 @@ def equilibrated_at(E: FloatArray, A: FloatArray, value: complex, *, nx: int) ->
     return EquilibratedPencil(scaled.E / size, scaled.A, scaled.rows, read_only(scaled.columns * columns))
 
 
-#: Points without meaning, tried as generic ones; the clearest of them is used.
-_GENERIC_POINTS = (0.7391, -1.3247, 1.9561, -0.4142)
 #: Where a pencil is tested between a zero and the nearest point of the stability boundary.
 _PATH_TO_BOUNDARY = (1.0, 0.75, 0.5, 0.25)
 
@@ -173,7 +178,7 @@ def hidden_direction(plant: DescriptorSystem, *, missing: int) -> tuple[FloatArr
     """Return the faults that never show, and their direction ``(nf,)`` in the null space at a generic point."""
     pencil = equilibrate_pencil(*system_pencil(plant.E, plant.A, plant.Bf, plant.C, plant.Df))
     kernels = []
-    for point in _GENERIC_POINTS:
+    for point in GENERIC_POINTS:
         _, singular_values, right = np.linalg.svd(pencil.A - point * pencil.E)
         kernels.append((float(singular_values[plant.nx + plant.nf - missing - 1]), right[-missing:].T))
     _, kernel = max(kernels, key=lambda pair: pair[0])

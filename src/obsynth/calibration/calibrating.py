@@ -36,11 +36,11 @@ from obsynth.plants.sequences import INDEX_NAME, MatrixSequence
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 
 #: A discrete plant is stepped as it is.
-EXACT = "exact"
+EXACT_STEP = "exact"
 #: The least effect of a state on the outputs, as a share of the largest, by which it is sized.
 LEAST_EFFECT = 1e-6
 #: What the matrices of varying and of invariant plants are called here; G and L are of constant effects.
-VARYING = {"E": "E", "A": "A", "B": "B", "C": "C", "Phi": "G", "Psi": "L"}
+MATRIX_LETTERS = {"E": "E", "A": "A", "B": "B", "C": "C", "Phi": "G", "Psi": "L"}
 INVARIANT = {"E": "E", "A": "A", "B": "B", "C": "C", "D": "D"}
 #: Constant effects of an invariant plant: its faults, then its unknown inputs.
 EFFECTS = {"G": ("Bf", "Bd"), "L": ("Df", "Dd")}
@@ -96,7 +96,7 @@ class LinearPlant(CalibrationPlant):
         uncertainty = getattr(plant, "uncertainty", None)
         constants = {} if uncertainty is None else uncertainty.box.constants
         if isinstance(plant, TimeVaryingDescriptorSystem):
-            self.matrices = {key: _of_sequence(getattr(plant, name)) for name, key in VARYING.items()}
+            self.matrices = {key: _of_sequence(getattr(plant, name)) for name, key in MATRIX_LETTERS.items()}
             values, effects = {name: float(value) for name, value in plant.constants.items()}, plant.parameter_names
             self.continuous = False
         else:
@@ -124,7 +124,7 @@ class LinearPlant(CalibrationPlant):
                 f"Of the unknown inputs ({', '.join(unknown)}) nothing is known: the noise of the equations "
                 "stands for them.",
             )
-        self.integrations = tuple(BUTCHER) if self.continuous else (EXACT,)
+        self.integrations = tuple(BUTCHER) if self.continuous else (EXACT_STEP,)
         if self.matrices["E"].shape != (self.nx, self.nx):
             raise SpecError(
                 "The plant has another number of equations than of states: they do not determine a step, "
@@ -143,8 +143,8 @@ class LinearPlant(CalibrationPlant):
 
     def integration(self, asked: str) -> str:
         """Return Radau unless something else is asked for; a discrete plant is stepped as it is."""
-        if self.integrations == (EXACT,):
-            return EXACT
+        if self.integrations == (EXACT_STEP,):
+            return EXACT_STEP
         return "radau" if asked == "auto" else asked
 
     def _algebraic(self, log: Log) -> list[int]:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 BoolArray = NDArray[np.bool_]
 #: Lags of the whiteness test, and their least number of rows each.
-LAGS, ROWS_PER_LAG = 10, 5
+WHITENESS_LAGS, ROWS_PER_LAG = 10, 5
 #: Probability of the interval of a mean square.
 INTERVAL = 0.95
 #: A test fails below this probability.
@@ -27,7 +27,7 @@ SIGNIFICANT = 0.01
 #: A change of the mean is told above this confidence, shared by all rows at which it may be.
 CHANGE_CONFIDENCE = 0.999
 #: Rows at both ends between which a change is looked for, and how many there must be at all.
-CHANGE_MARGIN, LEAST_ROWS = 5, 20
+CHANGE_MARGIN, LEAST_DIAGNOSED_ROWS = 5, 20
 #: The mean of whitened innovations is told where it is this many of its deviations from zero.
 MEAN_LIMIT = 4.0
 #: A whitened innovation of this size stands out.
@@ -83,7 +83,7 @@ def whiteness(column: FloatArray) -> Whiteness:
 
     e = column[np.isfinite(column)]
     n = len(e)
-    lags = max(1, min(LAGS, n // ROWS_PER_LAG))
+    lags = max(1, min(WHITENESS_LAGS, n // ROWS_PER_LAG))
     e = e - (e.mean() if n else 0.0)
     power = float(e @ e)
     if n <= lags + 1 or power == 0.0:
@@ -101,7 +101,7 @@ def change_of_mean(whitened: FloatArray) -> int | None:
     n, m = w.shape
     # Where a variance is wrong, that is another sentence: the mean is judged by what each column really does.
     w = w / np.maximum(np.sqrt((w**2).mean(axis=0)), 1.0)
-    if n < LEAST_ROWS:
+    if n < LEAST_DIAGNOSED_ROWS:
         return None
     total = np.cumsum(w, axis=0)
     k = np.arange(CHANGE_MARGIN, n - CHANGE_MARGIN)
@@ -123,7 +123,7 @@ def wrong_samples(y: FloatArray) -> BoolArray:
     found = np.zeros(y.shape, dtype=bool)
     for i, column in enumerate(y.T):
         seen = np.isfinite(column)
-        if seen.sum() < LEAST_ROWS:
+        if seen.sum() < LEAST_DIAGNOSED_ROWS:
             continue
         middle = float(np.median(column[seen]))
         away = np.abs(column - middle)
@@ -146,7 +146,7 @@ def standing_out(whitened: FloatArray) -> FloatArray:
     found = np.zeros(whitened.shape)
     for i, column in enumerate(whitened.T):
         seen = np.isfinite(column)
-        if seen.sum() < LEAST_ROWS:
+        if seen.sum() < LEAST_DIAGNOSED_ROWS:
             continue
         usual = max(NORMAL_OF_MEDIAN * float(np.median(np.abs(column[seen]))), LEAST_USUAL)
         far = seen & (np.abs(column) > STANDS_OUT * usual)

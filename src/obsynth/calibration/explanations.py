@@ -15,11 +15,11 @@ import numpy as np
 from obsynth.numerics.arrays import FloatArray
 
 #: Gains below this are no explanation: three nats are one in twenty.
-LEAST_GAIN = 3.0
+LEAST_EXPLANATION = 3.0
 #: Explanations that are told, and constants that are tried: each costs a run over the log.
 MOST_TOLD, MOST_CONSTANTS = 3, 12
 #: Relative change of a constant by which its effect on the innovations is found: small beside any error worth telling.
-CONSTANT_STEP = 1e-3
+CONSTANT_CHANGE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -51,12 +51,12 @@ def explanations(
             gain, _ = _together(innovations, move[:, None, None] * np.eye(innovations.shape[1]))
             found.append(Explanation(f"an input {name} that acts {word} than the design takes it", gain))
     for name, value in list(constants.items())[:MOST_CONSTANTS]:
-        step = CONSTANT_STEP * (abs(value) or 1.0)
+        step = CONSTANT_CHANGE * (abs(value) or 1.0)
         effect = (with_constant(name, value + step) - innovations) / step
         gain, coefficient = _together(innovations, effect[:, :, None])
         nearer = value - float(coefficient[0]) if len(coefficient) else value
         found.append(Explanation(f"a constant {name} near {nearer:.3g} instead of {value:.3g}", gain))
-    kept = sorted((item for item in found if item.gain >= LEAST_GAIN), key=lambda item: -item.gain)
+    kept = sorted((item for item in found if item.gain >= LEAST_EXPLANATION), key=lambda item: -item.gain)
     return tuple(kept[:MOST_TOLD])
 
 

@@ -15,7 +15,7 @@ from obsynth.calibration.noise_states import PlantWithNoise
 from obsynth.calibration.problem import Problem
 from obsynth.calibration.simulation_error import UNKNOWN_START, Fit, simulation_fits
 from obsynth.numerics.arrays import FloatArray
-from obsynth.plants.noise_model import WHITE_SHARE
+from obsynth.plants.noise_model import DEFAULT_WHITE_SHARE
 
 BoolArray = NDArray[np.bool_]
 #: Nats by which another timing of the inputs must be better to be taken: a likelihood ratio of about 150.
@@ -146,7 +146,7 @@ def innovations_fit(
     Q, R = np.where(limited[: len(Q)], limits[: len(Q)], Q), np.where(limited[len(Q) :], limits[len(Q) :], R)
     whitened, e, spread = objective.likelihood.innovations(objective.full(maximum.z))
     coloured = [len(Q) + j in _beside(problem) for j in range(len(R))]
-    R = np.where(coloured, np.maximum(R, WHITE_SHARE**2 * np.mean(e**2, axis=0)), R)
+    R = np.where(coloured, np.maximum(R, DEFAULT_WHITE_SHARE**2 * np.mean(e**2, axis=0)), R)
     bounds = at_bounds(maximum.z, objective.low, objective.high)[: objective.nt]
     return InnovationsFit(
         objective.constants(maximum.z),

@@ -15,17 +15,18 @@ from obsynth.numerics.ranks import LEAST_INFORMATION
 #: A direction whose deviation exceeds this share of the bounds' width is not determined by the log.
 UNDETERMINED = 1.0 / 6.0
 #: Entries of a direction that are named.
-LISTED_SHARE = 0.05
+LISTED_ENTRY_SHARE = 0.05
 #: Variances that are found from n rows are themselves uncertain, which a quantile of Student's distribution covers in
-#: part; what it leaves was measured (benchmarks/campaigns/calibration_coverage.md): boxes of `SHORT` rows need this.
-SHORT, SHORT_WIDENING = 56.0, 1.05
+#: part; what it leaves was measured (benchmarks/campaigns/calibration_coverage.md): boxes of `SHORT_LOG` rows need
+#: this.
+SHORT_LOG, SHORT_WIDENING = 56.0, 1.05
 #: Root of the deviance at a one-sided limit of 95 %.
 LIMIT_ROOT = 1.645
 #: A profile ends when its root is within this share of what is sought.
 PROFILE_TOLERANCE = 0.02
 MOST_PROFILE_STEPS = 12
 #: Curvatures below this share of the largest count as this much: rounding of the Hessian.
-LEAST_CURVATURE = 1e-8
+LEAST_CURVATURE_SHARE = 1e-8
 #: Of the search for the others along a profile: the gain in nats that ends it, and its steps.
 PROFILE_SEARCH_TOLERANCE, MOST_PROFILE_SEARCHES = 1e-4, 60
 #: In widths of the bounds: a place this near to a bound is at it; the least deviation a profile begins with.
@@ -33,7 +34,7 @@ AT_BOUND, LEAST_DEVIATION = 1e-9, 1e-9
 #: A root below this says nothing of how far to go; two roots nearer than the second are one.
 LEAST_ROOT, SAME_ROOT = 1e-9, 1e-12
 #: Outwards a profile goes this much further than proportion says, and grows by a factor between these.
-FURTHER, LEAST_GROWTH, MOST_GROWTH = 1.1, 1.2, 4.0
+PROFILE_FURTHER, LEAST_GROWTH, MOST_PROFILE_GROWTH = 1.1, 1.2, 4.0
 #: Inwards an interval is cut at a share of it no nearer to its ends than this, until it is this share of the way.
 LEAST_CUT, SHORT_INTERVAL = 0.1, 1e-3
 #: Along a valley: longest step in widths of the bounds, Newton's steps at each, and the gain in nats that ends them.
@@ -78,7 +79,11 @@ def covariance_of(found: FloatArray, widths: FloatArray, names: tuple[str, ...])
         if deviations[i] > UNDETERMINED:
             shares = vectors[:, i] / vectors[int(np.argmax(np.abs(vectors[:, i]))), i]
             directions.append(
-                {name: float(share) for name, share in zip(names, shares, strict=True) if abs(share) > LISTED_SHARE}
+                {
+                    name: float(share)
+                    for name, share in zip(names, shares, strict=True)
+                    if abs(share) > LISTED_ENTRY_SHARE
+                }
             )
     covariance = (vectors * deviations**2) @ vectors.T * np.outer(widths, widths)
     return Information(covariance, tuple(directions))
@@ -93,7 +98,7 @@ def quantile(level: float, constants: int, samples: int, variances: int) -> floa
     if not variances:
         return float(norm.ppf(each))
     return float(t.ppf(each, max(samples - constants - 2, 3))) * (
-        1.0 + (SHORT_WIDENING - 1.0) * min(1.0, SHORT / samples)
+        1.0 + (SHORT_WIDENING - 1.0) * min(1.0, SHORT_LOG / samples)
     )
 
 
@@ -142,11 +147,11 @@ class Profile:
         self.objective, self.maximum, self.i = objective, maximum, i
         self.others = [j for j in range(len(maximum.z)) if j != i]
         values, vectors = np.linalg.eigh(maximum.hessian)
-        values = np.maximum(values, LEAST_CURVATURE * max(float(values.max()), SMALLEST))
+        values = np.maximum(values, LEAST_CURVATURE_SHARE * max(float(values.max()), SMALLEST))
         self.covariance = (vectors / values) @ vectors.T
         inner = maximum.hessian[np.ix_(self.others, self.others)]
         values, vectors = np.linalg.eigh(inner)
-        values = np.maximum(values, LEAST_CURVATURE * max(float(values.max(initial=0.0)), SMALLEST))
+        values = np.maximum(values, LEAST_CURVATURE_SHARE * max(float(values.max(initial=0.0)), SMALLEST))
         spread = np.sqrt(np.diag((vectors / values) @ vectors.T))
         # Variables that the log does not determine move by no more than their search does.
         self.scale = np.minimum(spread, np.where(np.arange(len(maximum.z))[self.others] < objective.nt, 1.0, 3.0))
@@ -189,7 +194,9 @@ def _side(objective: Objective, maximum: Maximum, i: int, sign: float, target: f
         if reached >= target or outer == end:
             break
         inner, reached_inner = outer, reached
-        longer = abs(outer - begin) * min(max(FURTHER * target / max(reached, LEAST_ROOT), LEAST_GROWTH), MOST_GROWTH)
+        longer = abs(outer - begin) * min(
+            max(PROFILE_FURTHER * target / max(reached, LEAST_ROOT), LEAST_GROWTH), MOST_PROFILE_GROWTH
+        )
         outer = begin + sign * min(longer, abs(end - begin))
     if reached < target:
         return Side(end, True)

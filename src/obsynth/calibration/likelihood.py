@@ -17,7 +17,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.dae.functions import Compiled
 
 #: A scaled Newton residual above this is no solution of a step.
-LARGEST_RESIDUAL = 1e-7
+LARGEST_STEP_RESIDUAL = 1e-7
 #: Stands for the likelihood where there is none.
 IMPOSSIBLE = 1e12
 
@@ -43,7 +43,7 @@ class Likelihood:
         """Return the value and its gradient ``(nt + len(noisy) + ny,)``."""
         total, gradient, rows = self._both(v)
         left = rows[-1]
-        good = np.isfinite(total).all() and np.isfinite(gradient).all() and np.abs(left).max() <= LARGEST_RESIDUAL
+        good = np.isfinite(total).all() and np.isfinite(gradient).all() and np.abs(left).max() <= LARGEST_STEP_RESIDUAL
         return (float(total[0, 0]), gradient[:, 0]) if good else (IMPOSSIBLE, np.zeros(self.size))
 
     def innovations(self, v: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

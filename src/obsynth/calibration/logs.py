@@ -38,11 +38,11 @@ LogData: TypeAlias = "str | Path | pd.DataFrame | Mapping[str, Any] | Log"
 LARGEST_JITTER = 0.2
 NOTED_JITTER = 0.02
 #: The same of stamps and the grid itself, where two of them are off each other by more.
-LARGEST_OFFSET = 0.25
+LARGEST_STAMP_OFFSET = 0.25
 #: What counts as one quantum between values of a column: all differences are whole multiples within this.
 QUANTUM_SLACK = 0.02
 #: Share of distinct values above which a column shows no quantum that limits its noise: a ramp has none twice.
-REPEATED = 0.7
+DISTINCT_SHARE = 0.7
 #: Rows of wrong values that are named.
 TOLD_ROWS = 5
 #: Decimals to which values of a column are compared, and the share of the largest below which a step is rounding.
@@ -225,7 +225,7 @@ def _on_grid(
         # Two stamps that are off the grid may be off each other by twice as much: against the grid itself.
         away = time - time[0] - step * np.concatenate([[0], np.cumsum(counts)])
         jitter = np.abs(away - np.median(away))[1:] / step
-        irregular = jitter.max() > LARGEST_OFFSET
+        irregular = jitter.max() > LARGEST_STAMP_OFFSET
     if irregular or (counts < 1).any():
         worst = int(np.argmax(jitter))
         raise bad_log(
@@ -282,4 +282,4 @@ def quantum(column: FloatArray) -> float:
 def repeats(column: FloatArray) -> bool:
     """Whether values of a column come again often enough that its quantum limits what its noise can be."""
     values = column[np.isfinite(column)]
-    return bool(len(np.unique(np.round(values, VALUE_DIGITS))) < REPEATED * len(values))
+    return bool(len(np.unique(np.round(values, VALUE_DIGITS))) < DISTINCT_SHARE * len(values))

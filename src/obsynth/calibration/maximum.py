@@ -32,15 +32,15 @@ CONSTANT_SCALE, VARIANCE_SCALE = 0.01, 1.0
 #: Fits of the simulation whose costs differ by less than this share are the same minimum.
 SAME_MINIMUM = 1e-3
 SEARCH_TOLERANCE = 1e-6
-MOST_SEARCH_STEPS = 150
+MOST_LIKELIHOOD_STEPS = 150
 #: Newton steps at the end: how many, what is added to curvatures until one helps, how far one goes (in widths
 #: of the bounds, and as a logarithm of a variance), the least curvature that is seen, the gain in nats that ends them.
-MOST_NEWTON_STEPS, NEWTON_DAMPINGS = 12, (0.0, 1e1, 1e3, 1e5, 1e7)
-NEWTON_REACH, LEAST_CURVATURE, NEWTON_TOLERANCE = (0.1, 2.0), 0.1, 1e-6
+MOST_FINAL_STEPS, NEWTON_DAMPINGS = 12, (0.0, 1e1, 1e3, 1e5, 1e7)
+FINAL_STEP_REACH, LEAST_CURVATURE, NEWTON_TOLERANCE = (0.1, 2.0), 0.1, 1e-6
 #: Steps along directions of high curvature alone, and what a value is rounded by.
 ACROSS_STEPS, STEEP, VALUE_ROUNDING = 4, 1e3, 1e-13
 #: Differences of the gradient: the longest, as a share of a deviation, and the shortest.
-DIFFERENCE, DIFFERENCE_SHARE, LEAST_DIFFERENCE = 1e-4, 0.03, 1e-6
+GRADIENT_DIFFERENCE, DIFFERENCE_SHARE, LEAST_DIFFERENCE = 1e-4, 0.03, 1e-6
 #: Longer ones, where a kink of the model bends the likelihood the wrong way: of logarithms of variances, and what share
 #: of them of constants; curvatures below zero that are rounding, and as a share of the largest.
 LONGER_DIFFERENCES, CONSTANT_STEP, DOWNWARDS, DOWNWARDS_SHARE = (1e-3, 1e-2, 1e-1), 0.1, 1e-2, 1e-6
@@ -49,7 +49,7 @@ COLLAPSE, COLLAPSE_NATS = 3.0, 0.05
 #: Where variances that must not collapse begin, as logarithms of factors of their first guess.
 RAISED = (0.0, 3.0, -3.0)
 #: Nearer to a bound than this, relative to its size, a variable counts as on it.
-AT_BOUND = 1e-6
+NEAR_BOUND = 1e-6
 
 
 class Objective:
@@ -110,7 +110,7 @@ class Objective:
 
     def widened(self, z: FloatArray) -> bool:
         """Widen the search of variances that stop at a bound of it and would go on; whether there are any."""
-        slope, room = self(z)[1], AT_BOUND * (1.0 + np.abs(z))
+        slope, room = self(z)[1], NEAR_BOUND * (1.0 + np.abs(z))
         # A sensor's variance ends at its floor, which is what its resolution says.
         down = self.is_q & (z - self.low <= room) & (slope > COLLAPSE_NATS)
         up = (self.is_q | self.is_r) & (self.high - z <= room) & (slope < -COLLAPSE_NATS)
@@ -165,7 +165,7 @@ def descent(
     scale: FloatArray,
     *,
     tolerance: float = SEARCH_TOLERANCE,
-    most: int = MOST_SEARCH_STEPS,
+    most: int = MOST_LIKELIHOOD_STEPS,
 ) -> tuple[float, FloatArray]:
     """Return a bounded minimum near a start, in variables scaled by what they may differ by."""
     from scipy.optimize import minimize
@@ -239,7 +239,7 @@ def polished(
     z: FloatArray,
     *,
     fixed: int | None = None,
-    most: int = MOST_NEWTON_STEPS,
+    most: int = MOST_FINAL_STEPS,
     tolerance: float = NEWTON_TOLERANCE,
     near: FloatArray | None = None,
 ) -> tuple[float, FloatArray, FloatArray]:
@@ -292,14 +292,14 @@ def _newton_step(
     least: float = 0.0,
 ) -> FloatArray:
     """Return where a damped step leads within the bounds, along directions of more than the least curvature."""
-    room = AT_BOUND * (1.0 + np.abs(z))
+    room = NEAR_BOUND * (1.0 + np.abs(z))
     held = ((z - objective.low <= room) & (gradient > 0.0)) | ((objective.high - z <= room) & (gradient < 0.0))
     if fixed is not None:
         held[fixed] = True
     free = np.flatnonzero(~held)
     if not free.size:
         return z
-    reach = np.where(objective.is_q | objective.is_r, NEWTON_REACH[1], NEWTON_REACH[0])[free]
+    reach = np.where(objective.is_q | objective.is_r, FINAL_STEP_REACH[1], FINAL_STEP_REACH[0])[free]
     values, vectors = np.linalg.eigh(curvature[np.ix_(free, free)])
     lengths = -(vectors.T @ gradient[free]) / (np.maximum(np.abs(values), LEAST_CURVATURE) + damping)
     longest = 1.0 / np.abs(vectors / reach[:, None]).max(axis=0)
@@ -345,10 +345,10 @@ def hessian(
 ) -> FloatArray:
     """Return second derivatives by central differences of the exact gradient, in steps that suit those nearby."""
     if steps is None:
-        steps = np.full(len(z), DIFFERENCE)
+        steps = np.full(len(z), GRADIENT_DIFFERENCE)
     if near is not None:
         steeper = np.sqrt(np.maximum(np.diag(near), 1.0))
-        steps = np.clip(DIFFERENCE_SHARE / steeper, LEAST_DIFFERENCE, DIFFERENCE)
+        steps = np.clip(DIFFERENCE_SHARE / steeper, LEAST_DIFFERENCE, GRADIENT_DIFFERENCE)
     found = np.array(
         [
             (both(z + step)[1] - both(z - step)[1]) / (2.0 * size)
@@ -360,5 +360,5 @@ def hessian(
 
 def at_bounds(z: FloatArray, low: FloatArray, high: FloatArray) -> BoolArray:
     """Return which variables are at a bound, as truth values."""
-    room = AT_BOUND * (1.0 + np.abs(z))
+    room = NEAR_BOUND * (1.0 + np.abs(z))
     return (z - low <= room) | (high - z <= room)

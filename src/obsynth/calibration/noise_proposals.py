@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from obsynth.calibration.diagnostics import SIGNIFICANT, whiteness
-from obsynth.calibration.explanations import LEAST_GAIN, regression_gain
+from obsynth.calibration.explanations import LEAST_EXPLANATION, regression_gain
 from obsynth.calibration.innovations_fit import InnovationsFit
 from obsynth.calibration.likelihood import IMPOSSIBLE, Likelihood
 from obsynth.calibration.maximum import Objective
@@ -25,9 +25,9 @@ from obsynth.plants.noise_model import noise_state, process_variance
 #: Autocorrelations between which a search for coloured noise begins, and the share of R that it begins with.
 FIRST_KEPT, COLOURED_SHARE = (0.3, 0.98), 0.7
 #: Numbers that a state adds: the variance and correlation of coloured noise, the variance of a walk.
-NUMBERS = {"coloured": 2, "offset": 0, "walk": 1}
+ADDED_NUMBERS = {"coloured": 2, "offset": 0, "walk": 1}
 #: Nats above which a state is taken.  An offset that is not taken spoils constants, and one too many only widens boxes.
-LEAST = {"coloured": LEAST_GAIN, "offset": 1.0, "walk": LEAST_GAIN}
+LEAST_NATS = {"coloured": LEAST_EXPLANATION, "offset": 1.0, "walk": LEAST_EXPLANATION}
 #: Nats that an offset explains beside constants, variances as they are, before it is tried; and by how much constants
 #: are moved to see what they explain, in widths of their bounds.
 ASKING, SMALL_MOVE = 2.0, 1e-4
@@ -52,19 +52,19 @@ def proposed_states(
                 continue
             note(f"{kind} of {name}")
             reached, place = known.best(_like(problem, problem_with(tried)))
-            gain = value - reached - 0.5 * NUMBERS[kind] * np.log(problem.log.samples)
-            found.append((gain - LEAST[kind], kind, name, tried, reached, place))
+            gain = value - reached - 0.5 * ADDED_NUMBERS[kind] * np.log(problem.log.samples)
+            found.append((gain - LEAST_NATS[kind], kind, name, tried, reached, place))
         if not found:
             break
         gain, kind, name, tried, reached, place = max(found, key=lambda item: item[0])
         if not gain > 0.0:
             break
-        told.append(_TOLD[kind].format(name=name, gain=gain + LEAST[kind]))
+        told.append(_STATE_SENTENCES[kind].format(name=name, gain=gain + LEAST_NATS[kind]))
         states, value, known = tried, reached, place
     return states, told
 
 
-_TOLD = {
+_STATE_SENTENCES = {
     "coloured": "The noise of {name} is coloured: a state stands for it (better by {gain:.3g} nats).",
     "offset": "The sensor {name} has an offset: a state stands for it (better by {gain:.3g} nats).",
     "walk": "The unknown input {name} is taken as a random walk (better by {gain:.3g} nats).",

@@ -12,7 +12,7 @@ from obsynth.calibration.logs import Log
 from obsynth.calibration.plants import CalibrationPlant
 from obsynth.numerics.arrays import SMALLEST, FloatArray
 from obsynth.plants.dae.functions import BUTCHER
-from obsynth.plants.noise_model import UNKNOWN, noise_state, offset_state, seconds
+from obsynth.plants.noise_model import UNKNOWN_NUMBER, noise_state, offset_state, seconds
 from obsynth.plants.validation import index_of
 
 #: Where the search for a correlation begins, and its bounds: in samples, the last as a share of the log.
@@ -20,7 +20,7 @@ FIRST_CORRELATION, LEAST_CORRELATION, LONGEST_SHARE = 10.0, 0.3, 1.0
 #: A load, or an initial state, is sized by what it does to the outputs in this many samples.
 SIZED_SAMPLES = 50
 #: An offset may be this many times what a sensor changes from row to row, or as large as it moves.
-LARGEST_OFFSET = 10.0
+LARGEST_SENSOR_OFFSET = 10.0
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ def asked_states(
         if not isinstance(item, Mapping) or "correlation" not in item:
             continue
         value = item["correlation"]
-        correlations[name] = None if value == UNKNOWN else seconds(value, f"sensor_noise.{name}.correlation")
+        correlations[name] = None if value == UNKNOWN_NUMBER else seconds(value, f"sensor_noise.{name}.correlation")
     for name in offset or ():
         index_of(name, output_names, what="offset")
     return NoiseStates(correlations, tuple(offset or ()), tuple(walks or ()))
@@ -118,7 +118,7 @@ class PlantWithNoise(CalibrationPlant):
         moved = np.nan_to_num(np.nanstd(log.y, axis=0))
         moved = np.maximum(np.where(moved > 0.0, moved, 1.0), rough)
         large = dict(zip(log.output_names, moved, strict=True))
-        offsets = dict(zip(log.output_names, np.maximum(moved, LARGEST_OFFSET * rough), strict=True))
+        offsets = dict(zip(log.output_names, np.maximum(moved, LARGEST_SENSOR_OFFSET * rough), strict=True))
         found = [large[name] for name in self.coloured] + [offsets[name] for name in self.states.offsets]
         return np.array([*found, *self._load_sizes(log, moved)])
 

@@ -18,7 +18,7 @@ from obsynth.plants.dae.symbols import symbols_of
 from obsynth.plants.validation import index_of
 
 #: Deviation of an initial state that is not stated, as a share of its nominal size.
-DEFAULT_STATE_SHARE = 0.1
+CALIBRATED_STATE_SHARE = 0.1
 
 
 class CalibrationPlant(ABC):
@@ -64,7 +64,7 @@ class NonlinearPlant(CalibrationPlant):
         self.values: Mapping[str, float] = {**model.constants, **model.parameters}
         self.units = model.units
         self.nominal_state, self.state_scales = np.array(model.nominal_state), np.array(model.state_scales)
-        self.state_deviations = DEFAULT_STATE_SHARE * self.state_scales
+        self.state_deviations = CALIBRATED_STATE_SHARE * self.state_scales
         self.nominal_signals = np.array(model.nominal_input)
         self._promoted: dict[tuple[str, ...], DAEModel] = {}
 

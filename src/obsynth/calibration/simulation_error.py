@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.calibration.likelihood import LARGEST_RESIDUAL
+from obsynth.calibration.likelihood import LARGEST_STEP_RESIDUAL
 from obsynth.calibration.logs import refused
 from obsynth.calibration.problem import Problem
 from obsynth.numerics.arrays import SMALLEST, FloatArray
@@ -18,8 +18,8 @@ from obsynth.plants.noise_model import offset_state
 
 BoolArray = NDArray[np.bool_]
 #: Rounds in which the sensors' weights are estimated again; the first is robust against single wrong values.
-ROUNDS = 3
-MOST_EVALUATIONS = 60
+WEIGHT_ROUNDS = 3
+MOST_FIT_EVALUATIONS = 60
 #: Share of a signal's deviation that stands for its noise before anything is fitted.
 FIRST_NOISE = 0.05
 #: Further starts keep this share of the bounds' width away from them; every start keeps the second.
@@ -30,9 +30,9 @@ LARGEST_MISFIT = 1e6
 UNEXPLAINED = 0.9
 UNEXPLAINED_AT_REST = 5.0
 #: A signal moves if its deviation is this many times its roughness from sample to sample.
-MOVING = 3.0
+MOVING_SIGNAL = 3.0
 #: A simulated output that moves by less than this share of what its sensor does is moved by no input.
-UNMOVED = 1e-9
+UNMOVED_OUTPUT = 1e-9
 #: Without inputs, outputs that move by more than this multiple of what the states' sizes make are of other units.
 OUTSIZED = 10.0
 #: A sensor that the best fit does not explain, and whose level is so many times another, is in other units.
@@ -72,7 +72,7 @@ class SimulationError:
         if self._last is None or self._last[0] != key:
             rows = self.run(v * self.scale)[0].T
             y = rows[:, : self.ny].copy()
-            y[np.abs(rows[:, -1]) > LARGEST_RESIDUAL] = np.nan
+            y[np.abs(rows[:, -1]) > LARGEST_STEP_RESIDUAL] = np.nan
             S = rows[:, self.ny : -1].reshape(len(rows), self.size, self.ny).transpose(0, 2, 1)
             self._last = key, y, S.reshape(-1, self.size) * self.scale
         return self._last[1], self._last[2]
@@ -114,7 +114,7 @@ class SimulationError:
         inside = np.clip(start / p.widths, low[: self.nt] + INSIDE, high[: self.nt] - INSIDE)
         v = np.concatenate([inside, p.x0 / self.spread])
         weights = FIRST_NOISE * np.nanstd(p.y, axis=0) + np.sqrt(p.floors)
-        for i in range(ROUNDS):
+        for i in range(WEIGHT_ROUNDS):
             found = least_squares(
                 self.residuals,
                 v,
@@ -123,7 +123,7 @@ class SimulationError:
                 args=(weights,),
                 x_scale="jac",
                 loss="soft_l1" if i == 0 else "linear",
-                max_nfev=MOST_EVALUATIONS,
+                max_nfev=MOST_FIT_EVALUATIONS,
             )
             v = np.asarray(found.x)
             left = self.simulated(v)[0] - p.y
@@ -194,7 +194,7 @@ def _shares(problem: Problem, left: FloatArray) -> tuple[FloatArray, BoolArray]:
     deviations = np.nanstd(problem.y, axis=0)
     with np.errstate(invalid="ignore"):
         roughness = np.nan_to_num(np.nanstd(np.diff(problem.y, axis=0), axis=0)) / np.sqrt(2.0)
-    moves = deviations > MOVING * np.maximum(roughness, np.sqrt(problem.floors))
+    moves = deviations > MOVING_SIGNAL * np.maximum(roughness, np.sqrt(problem.floors))
     return left / np.maximum(deviations, SMALLEST), moves
 
 
@@ -203,7 +203,7 @@ def _judged(problem: Problem, simulated: FloatArray) -> BoolArray:
     where no input is unknown."""
     if problem.plant.unknown_inputs:
         return np.zeros(len(problem.output_names), dtype=bool)
-    moved = np.std(simulated, axis=0) > UNMOVED * np.nanstd(problem.y, axis=0)
+    moved = np.std(simulated, axis=0) > UNMOVED_OUTPUT * np.nanstd(problem.y, axis=0)
     return np.asarray(moved | problem.plant.has_levels)
 
 

@@ -22,7 +22,7 @@ from obsynth.numerics.newton import largest_entries
 from obsynth.observers.dae.c_code import compiler
 
 #: Optimisation costs more than it gains on straight code of thousands of lines.
-FLAGS = ("-std=c99", "-O1", "-ffp-contract=off", "-shared", "-fPIC")
+STRAIGHT_CODE_FLAGS = ("-std=c99", "-O1", "-ffp-contract=off", "-shared", "-fPIC")
 
 
 def compiled(functions: Sequence[Any]) -> list[Any]:
@@ -36,7 +36,11 @@ def compiled(functions: Sequence[Any]) -> list[Any]:
     for function in functions:
         generator.add(function)
     try:
-        return list(_loaded(generator.dump(), tuple(function.name() for function in functions), (*command, *FLAGS)))
+        return list(
+            _loaded(
+                generator.dump(), tuple(function.name() for function in functions), (*command, *STRAIGHT_CODE_FLAGS)
+            )
+        )
     except subprocess.CalledProcessError:
         return list(functions)
 
@@ -54,9 +58,10 @@ def _loaded(code: str, names: tuple[str, ...], command: tuple[str, ...]) -> tupl
         return tuple(ca.external(name, str(library)) for name in names)
 
 
-#: Newton iterations of every step, from the last sample's state, and further ones where the residual is above `SOLVED`.
-ITERATIONS, FURTHER = 3, 8
-SOLVED = 1e-11
+#: Newton iterations of every step, from the last sample's state, and further ones where the residual is above
+#: `SOLVED_STEP`.
+ITERATIONS, FURTHER_ITERATIONS = 3, 8
+SOLVED_STEP = 1e-11
 #: Operations in one evaluation above which functions are compiled: a second or so, before a thousand evaluations.
 COMPILED_OPERATIONS = 200_000
 
@@ -170,12 +175,12 @@ class _Substep:
             X, left = self.newton(X, *before)
         X, left = self.newton(X, *before)
         more, rest = start[0], ca.MX(0.0)
-        for _ in range(FURTHER):
+        for _ in range(FURTHER_ITERATIONS):
             more, rest = self.newton(more, *before)
         further = ca.Function("iterate", start, [more, rest])
         done = ca.Function("done", start, [start[0], ca.MX(0.0)])
         choice = ca.Function.if_else("choice", further, done)
-        unsolved = ca.logic_not(left <= SOLVED)
+        unsolved = ca.logic_not(left <= SOLVED_STEP)
         after, rest = choice(unsolved, X, *before)
         return ca.Function("solution", start, [after, ca.if_else(unsolved, rest, left)])
 

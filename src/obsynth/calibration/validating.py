@@ -205,7 +205,7 @@ def noise_ratios(observer: DAEObserver, log: Log) -> NoiseRatios:
 #: A mean of innovations, or a parameter's deviation from its start, beyond so many standard deviations is told.
 OFFSET = 3.0
 #: Rows that a log must have at least.
-LEAST_ROWS = 20
+LEAST_VALIDATED_ROWS = 20
 #: A sensor's variance that a log may say, at least, as a share of what the design says.
 LEAST_RATIO = 1e-6
 
@@ -258,9 +258,11 @@ def validate(
     found = read_log(
         log, plant.input_names, plant.output_names, rows=rows, columns=columns, scales=factors, dt=design.observer.dt
     )
-    if found.samples < LEAST_ROWS:
+    if found.samples < LEAST_VALIDATED_ROWS:
         raise SpecError(
-            f"The log has {found.samples} rows here: at least {LEAST_ROWS} are needed.", path="rows", code="too-short"
+            f"The log has {found.samples} rows here: at least {LEAST_VALIDATED_ROWS} are needed.",
+            path="rows",
+            code="too-short",
         )
     found = found.shifted(design.input_delay).without(wrong_samples(found.y))
     estimates = recorded_innovations(design, found).estimates

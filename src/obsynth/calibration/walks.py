@@ -18,7 +18,7 @@ from obsynth.observers.recursive.observer import RecursiveObserver
 
 #: Shares of a stated variance that are tried, from all of it: a factor of four apart, so that the right one is missed
 #: by at most two; and none.
-SHARES = (*(0.25**i for i in range(8)), 0.0)
+VARIANCE_SHARES = (*(0.25**i for i in range(8)), 0.0)
 
 
 def stated_walk(observer: object) -> FloatArray:
@@ -49,7 +49,7 @@ def likeliest_shares(walk: FloatArray, loss: Callable[[FloatArray], float]) -> F
     shares = np.ones(len(walk))
     least = loss(walk) if walk.any() else 0.0
     for i in np.flatnonzero(np.diag(walk) > 0.0):
-        for share in SHARES[1:]:
+        for share in VARIANCE_SHARES[1:]:
             tried = np.where(np.arange(len(walk)) == i, share, shares)
             reached = loss(shared_walk(walk, tried))
             if reached < least:

@@ -10,9 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from obsynth.errors import SpecError
-
-#: Probability of a false alarm in the whole run, where none is given.
-FALSE_ALARMS = 0.01
+from obsynth.experiments.monitors.options import CHANGE, FALSE_ALARMS, WINDOW
 
 
 class Argument(NamedTuple):
@@ -246,13 +244,13 @@ MONITOR_SETTINGS = Settings(
             type=probability,
             default=FALSE_ALARMS,
         ),
-        option("--window", "N", "samples looked back (default: 20)", type=count, default=20),
+        option("--window", "N", "samples looked back (default: %(default)s)", type=count, default=WINDOW),
         option(
             "--change",
             "X",
             "cusum: change to be found, in deviations of the residual, or in parameter units (default: 1)",
             type=positive,
-            default=1.0,
+            default=CHANGE,
         ),
     )
 )

@@ -97,7 +97,7 @@ def run_calibrate(options: argparse.Namespace) -> int:
     """Run ``calibrate``: spec and log in, constants with their box and a verdict out."""
     from obsynth.calibration.calibrating import calibrate
     from obsynth.calibration.spec_writing import calibrated_spec
-    from obsynth.results.calibration_files import KIND, calibration_text
+    from obsynth.results.calibration_files import CALIBRATION_KIND, calibration_text
     from obsynth.results.gain_sets import plain
     from obsynth.spec.loader import load_plant
 
@@ -118,7 +118,7 @@ def run_calibrate(options: argparse.Namespace) -> int:
                 f"calibrate.digest {digest}.", path="calibrate.digest",
             )  # fmt: skip
     told = {name: value for name, value in asked.items() if name not in ("log", "digest")}
-    data = {"kind": KIND, "system": options.system.name, **found.to_dict()}
+    data = {"kind": CALIBRATION_KIND, "system": options.system.name, **found.to_dict()}
     if target is not None:
         write_atomically(target, calibration_text({**data, "asked": plain(told)}))
     if written is not None:

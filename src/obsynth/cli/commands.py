@@ -242,21 +242,20 @@ def run_sensors(options: argparse.Namespace) -> int:
 def run_verify(options: argparse.Namespace) -> int:
     """Run ``verify``: recheck any certificate, without a solver, to the end of what it rests on."""
     from obsynth.comparison.certificates import kind_of_file, verify_certificate
-    from obsynth.experiments.alarm_proof import KIND as ALARM
-    from obsynth.results.calibration_files import KIND as CALIBRATION
-    from obsynth.results.calibration_files import verify_calibration
+    from obsynth.experiments.alarm_proof import ALARM_KIND
+    from obsynth.results.calibration_files import CALIBRATION_KIND, verify_calibration
     from obsynth.results.certificate_files import RESULTS
 
     # A pipe would keep us waiting; who reads a gain set says what is wrong with it.
     found = kind_of_file(options.gains) if options.gains.is_file() else ""
-    kind = {ALARM: "alarm", CALIBRATION: "calibration"}.get(found, found.removeprefix("obsynth "))
-    if found not in (ALARM, CALIBRATION, *RESULTS):
+    kind = {ALARM_KIND: "alarm", CALIBRATION_KIND: "calibration"}.get(found, found.removeprefix("obsynth "))
+    if found not in (ALARM_KIND, CALIBRATION_KIND, *RESULTS):
         _require_fitting(options, "gain set")
         return _verify_gain_set(options)
     _require_fitting(options, kind)
     from obsynth.results.layout import print_checks
 
-    if found == CALIBRATION:
+    if found == CALIBRATION_KIND:
         report = verify_calibration(options.gains, None if options.data is None else _calibrated_again(options))
     else:
         report = verify_certificate(options.gains, data=options.data)

@@ -16,7 +16,7 @@ from obsynth.files.outputs import require_distinct
 
 def run_thresholds(options: argparse.Namespace) -> int:
     """Run ``thresholds``: 0 whether the rows suffice for the rate or not, which is told; every failure is an error."""
-    from obsynth.data.normal_rows import FALSE_ALARMS, learn_thresholds
+    from obsynth.data.normal_rows import FALSE_ALARM_RATE, learn_thresholds
     from obsynth.experiments.monitors.learned import LEARNED
 
     is_stream = options.data == STREAM
@@ -33,7 +33,7 @@ def run_thresholds(options: argparse.Namespace) -> int:
     found = learn_thresholds(
         with_input_delay(design, options),
         sys.stdin if is_stream else Path(options.data),
-        false_alarms=options.false_alarms or FALSE_ALARMS,
+        false_alarms=options.false_alarms or FALSE_ALARM_RATE,
         rows=options.rows,
         columns=columns_of(options),
         scales=numbers_of(options.scale),

@@ -111,7 +111,7 @@ and fleet.png; the same command goes on where another was stopped.
 What disturbances and noise are to be expected comes from the scenario of --system, or from the options.
 """
 _LOG = "text (.csv, .tsv), Parquet, TDMS or MDF file; - for text on standard input"
-_EXPECTED = option("--system", "FILE", "spec (YAML) whose scenario tells what is to be expected", type=Path)
+_EXPECTED_SCENARIO = option("--system", "FILE", "spec (YAML) whose scenario tells what is to be expected", type=Path)
 
 VERBS = {
     "design": Verb(
@@ -307,7 +307,7 @@ VERBS = {
                 default="-",
             ),
             *DATA_OPTIONS,
-            _EXPECTED,
+            _EXPECTED_SCENARIO,
             Settings(
                 (
                     option(
@@ -456,7 +456,7 @@ VERBS = {
                     ),
                 )
             ),
-            _EXPECTED,
+            _EXPECTED_SCENARIO,
             FORCE,
             JSON,
             QUIET,

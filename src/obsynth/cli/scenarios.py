@@ -54,9 +54,9 @@ def _prepared(
 def run_simulate(options: argparse.Namespace) -> int:
     """Run ``simulate``: spec in, table of errors out, and every signal in a file if asked."""
     with progress(quiet=options.quiet) as report_stage:
-        from obsynth.experiments.simulation import SIGNALS, simulate
+        from obsynth.experiments.simulation import SIMULATED_SIGNALS, simulate
 
-        spec, scenario, target, design = _prepared(options, report_stage, SIGNALS)
+        spec, scenario, target, design = _prepared(options, report_stage, SIMULATED_SIGNALS)
         report_stage("simulating")
         found = simulate(design, scenario)
         written = None if target is None else str(found.write_csv(target))

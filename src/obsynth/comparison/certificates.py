@@ -11,12 +11,11 @@ from typing import Any
 from obsynth.comparison.comparing import compared_again
 from obsynth.data.alarm_certificates import gain_set_row, verify_alarm
 from obsynth.errors import ObsynthError, SpecError
-from obsynth.experiments.alarm_proof import KIND as ALARM
+from obsynth.experiments.alarm_proof import ALARM_KIND
 from obsynth.experiments.assumptions import Log, file_digest
 from obsynth.experiments.tolerance_study import study_statement, tolerance_study
 from obsynth.files.inputs import read_json
-from obsynth.results.calibration_files import KIND as CALIBRATION
-from obsynth.results.calibration_files import verify_calibration
+from obsynth.results.calibration_files import CALIBRATION_KIND, verify_calibration
 from obsynth.results.certificate_files import (
     COMPARISON,
     RESULT_VERSION,
@@ -46,14 +45,14 @@ def kind_of_file(path: Path) -> str:
     """Return what a file that obsynth wrote says it is; empty where it says nothing."""
     try:
         with path.open("rb") as stream:
-            found = re.match(rb'\s*\{\s*"kind":\s*"([a-z ]+)"', stream.read(_HEAD_BYTES))
+            found = re.match(rb'\s*\{\s*"kind":\s*"([a-z ]+)"', stream.read(_CERTIFICATE_HEAD_BYTES))
     except OSError:
         return ""
     return "" if found is None else found.group(1).decode()
 
 
 #: Bytes in which a file says its kind.
-_HEAD_BYTES = 200
+_CERTIFICATE_HEAD_BYTES = 200
 
 
 def verify_certificate(path: str | Path, *, data: str | Path | None = None) -> VerificationReport:
@@ -77,11 +76,11 @@ def verify_certificate(path: str | Path, *, data: str | Path | None = None) -> V
         The file is no certificate (gain sets are read by `load`), or ``data`` does not belong to its kind.
     """
     kind = kind_of_file(Path(path))
-    if data is not None and kind not in (ALARM, COMPARISON):
+    if data is not None and kind not in (ALARM_KIND, COMPARISON):
         raise SpecError("data is for the certificates of alarms and comparisons.", path="data")
-    if kind == ALARM:
+    if kind == ALARM_KIND:
         return verify_alarm(path, data=data)
-    return verify_calibration(path) if kind == CALIBRATION else _verified_result(path, data)
+    return verify_calibration(path) if kind == CALIBRATION_KIND else _verified_result(path, data)
 
 
 def designs_inside(path: Path) -> list[ObserverDesign]:

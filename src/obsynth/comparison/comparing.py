@@ -17,7 +17,7 @@ from obsynth.comparison.least_thresholds import thresholds_beside_least
 from obsynth.comparison.result import ComparedMethod, Comparison, FaultComparison, comparison_statement
 from obsynth.data.log_run import faults_on_rows
 from obsynth.data.log_tables import log_table
-from obsynth.data.signals import TIME
+from obsynth.data.signals import TIME_HEADER
 from obsynth.errors import SpecError
 from obsynth.experiments.assumptions import Log
 from obsynth.experiments.monitors.residual_model import largest_disturbances
@@ -47,7 +47,7 @@ from obsynth.simulation.signals import resolve
 from obsynth.tolerances.exact_plant import plant_at
 
 #: Entries of A, B, Bf, Bd that tolerances do not touch: they are kinematics, not parameters.
-EXACT = (0.0, 1.0, -1.0)
+EXACT_ENTRIES = (0.0, 1.0, -1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +129,7 @@ def _drawn(plant: DescriptorSystem, tolerance: float, rng: np.random.Generator) 
     def off(matrix: FloatArray) -> FloatArray:
         changed = matrix.copy()
         for index, value in np.ndenumerate(matrix):
-            if value not in EXACT:
+            if value not in EXACT_ENTRIES:
                 factor = factors.setdefault(abs(float(value)), 1.0 + tolerance * rng.uniform(-1.0, 1.0))
                 changed[index] = value * factor
         return changed
@@ -167,7 +167,7 @@ def rms(errors: Sequence[float] | FloatArray) -> float:
 
 #: Runs of the scenario, and samples and settling times where nothing is stated.
 RUNS, SCENARIO_SAMPLES, MOST_SCENARIO_SAMPLES = 20, 40, 6000
-SEED = 7
+COMPARISON_SEED = 7
 #: Unknown inputs of the scenario that is made up are sines with so many periods in a settling time.
 PERIOD_SHARE = 0.2
 
@@ -326,7 +326,9 @@ def side_by_side(
         report_stage(f"designing by {method}")
         found.append(candidate(method, plant, sampled, steps, maker, (options or {}).get(method, {})))
     report_stage("running the scenario")
-    drawn = drawn_runs(plant, sampled, happening, runs=runs, tolerance=tolerance, seed=SEED, feedback=kept.feedback)
+    drawn = drawn_runs(
+        plant, sampled, happening, runs=runs, tolerance=tolerance, seed=COMPARISON_SEED, feedback=kept.feedback
+    )
     log = None if data is None else _log(data, sampled, columns, scales, input_delay)
     limit = within if within is not None else settling_time(plant)
     bounds = largest_disturbances(happening, sampled.disturbance_names, kept.steps, dt)
@@ -464,7 +466,7 @@ def _log(
     wanted = {
         name: (columns or {}).get(name, name) for name in (*plant.input_names, *plant.output_names, *plant.fault_names)
     }
-    table, _ = log_table(data, list(wanted.values()), (columns or {}).get(TIME, TIME))
+    table, _ = log_table(data, list(wanted.values()), (columns or {}).get(TIME_HEADER, TIME_HEADER))
     frame = {name: table[column] for name, column in wanted.items() if column in table}
     missing = [wanted[name] for name in (*plant.input_names, *plant.output_names) if name not in frame]
     if missing:
@@ -485,7 +487,7 @@ def _log(
         truth[:, plant.fault_names.index(name)] = frame[name]
     u, y = signals(plant.input_names), signals(plant.output_names)
     u = u[np.clip(np.arange(count) - input_delay, 0, count - 1)]
-    stamps = table.get((columns or {}).get(TIME, TIME))
+    stamps = table.get((columns or {}).get(TIME_HEADER, TIME_HEADER))
     return _Record(_clock(count, plant.dt) if stamps is None else stamps, u, y, truth, bool(there))
 
 

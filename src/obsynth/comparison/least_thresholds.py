@@ -8,6 +8,7 @@ import numpy as np
 
 from obsynth.errors import ObsynthError
 from obsynth.experiments.monitors.residual_model import largest_disturbances
+from obsynth.methods.automatic import SETTLING_TIMES
 from obsynth.methods.fault_figures import held, on_the_clock, step_responses
 from obsynth.methods.functional_filter.rates import settling_time
 from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
@@ -22,11 +23,11 @@ from obsynth.simulation.scenario import Scenario
 #: Noise counts as within so many deviations.
 DEVIATIONS = 3.0
 #: Samples of the window on which the least threshold is looked for, at most.
-WINDOW = 32
+LONGEST_WINDOW = 32
 #: What a response may differ from one sample of the fault, and be taken as it.
-SAME = 1e-6
-#: Settling times after which a response is over.
-SETTLING_TIMES, MOST_STEPS = 8, 6000
+SAME_RESPONSE = 1e-6
+#: A response is followed for `SETTLING_TIMES`, and for so many steps at most.
+MOST_RESPONSE_STEPS = 6000
 
 
 def thresholds_beside_least(
@@ -44,9 +45,9 @@ def thresholds_beside_least(
         gains = np.abs(impulses[:, row]).sum(axis=0)
         bound = float(gains[plant.nf :] @ np.concatenate([bounds, noise]))
         seen = impulses[:, row, plant.fault_names.index(name)]
-        lag = int(np.argmax(np.abs(seen) > SAME))
-        alone = abs(seen[lag] - 1.0) <= SAME and float(np.abs(seen).sum() - abs(seen[lag])) <= SAME
-        blind = [other for k, other in enumerate(plant.fault_names) if other != name and gains[k] <= SAME]
+        lag = int(np.argmax(np.abs(seen) > SAME_RESPONSE))
+        alone = abs(seen[lag] - 1.0) <= SAME_RESPONSE and float(np.abs(seen).sum() - abs(seen[lag])) <= SAME_RESPONSE
+        blind = [other for k, other in enumerate(plant.fault_names) if other != name and gains[k] <= SAME_RESPONSE]
         found.append((bound, _least(plant, name, bounds, noisy=noisy, lag=lag if alone else None, blind=blind)))
     return found
 
@@ -56,7 +57,7 @@ def _least(
 ) -> float:
     """Return the least threshold: of a fault of any course told after a lag, else of a constant one."""
     course = {"course": "constant"} if lag is None else {"course": "any", "lag": lag}
-    samples = max(min(WINDOW, MOST_STATES // max(plant.nx, 1)), (lag or 0) + 2)
+    samples = max(min(LONGEST_WINDOW, MOST_STATES // max(plant.nx, 1)), (lag or 0) + 2)
     try:
         asked = GuaranteedTestMethod.of({
             "fault": fault, "samples": samples, "free": blind, "noise_bound": DEVIATIONS if noisy else None,
@@ -73,7 +74,7 @@ def in_words(fault: str, bound: float, least: float, unit: str = "") -> str:
     own = f"Without a fault the estimate of {fault} stays within {bound:.4g}{f' {unit}' if unit else ''}"
     if not np.isfinite(least):
         return f"{own}; no least threshold is known."
-    if least <= SAME * bound:
+    if least <= SAME_RESPONSE * bound:
         return f"{own}; a test exists that sees no disturbance and no noise at all."
     return f"{own}, {bound / least:.2f} times the least that any test with its delay can have ({least:.4g})."
 
@@ -87,7 +88,7 @@ def design_beside_least(design: ObserverDesign, scenario: Scenario) -> dict[str,
         return {}
     try:
         sampled = on_the_clock(plant, plant.dt)
-        steps = int(min(max(SETTLING_TIMES * settling_time(plant) / plant.dt, observer.order + 2), MOST_STEPS))
+        steps = int(min(max(SETTLING_TIMES * settling_time(plant) / plant.dt, observer.order + 2), MOST_RESPONSE_STEPS))
         kept = held(sampled, steps)
         impulses, _ = step_responses(sampled, observer, kept.steps, kept.feedback)
         bounds = largest_disturbances(scenario, sampled.disturbance_names, kept.steps, plant.dt)

@@ -103,7 +103,7 @@ class ComparedMethod:
 
 
 #: A picture of estimates reaches as far as this share of their samples.
-SHOWN = 0.98
+SHOWN_SAMPLES = 0.98
 #: What the page of a comparison begins with.
 COMPARISON_PAGE = FileKind("a comparison of obsynth", rb'name="generator" content="obsynth compare"')
 _HEADER = (
@@ -296,7 +296,9 @@ class Comparison:
             right.set(xlabel="s", ylabel=name)
             spread = float(np.max(np.abs(self.truth[:, row]), initial=0.0)) or 1.0
             best = shown[0].estimates[:, 0] if shown else self.truth[:, row]
-            reach = max(2.5 * spread, 1.5 * float(np.quantile(np.abs(best), SHOWN))) if row == 0 else 2.5 * spread
+            reach = (
+                max(2.5 * spread, 1.5 * float(np.quantile(np.abs(best), SHOWN_SAMPLES))) if row == 0 else 2.5 * spread
+            )
             right.set_ylim(-reach, reach)
         axes[0, 0].legend(fontsize=8)
         return figure

@@ -15,7 +15,7 @@ from obsynth.methods.guaranteed_test.result import GuaranteedTest, guaranteed_te
 from obsynth.plants.descriptor import DescriptorSystem
 
 #: Sets are tried in the order of their cost; more than these are too many.
-MOST_SETS = 4096
+MOST_TRIED_SETS = 4096
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,9 +57,9 @@ class ThresholdQuestion:
         """Return the inclusion-minimal sets, cheapest first: more sensors never raise a least threshold."""
         count = len(self.sensors)
         sizes = range(min(count, count if largest is None else largest) + 1)
-        if sum(comb(count, size) for size in sizes) > MOST_SETS:
+        if sum(comb(count, size) for size in sizes) > MOST_TRIED_SETS:
             raise SpecError(
-                f"{count} candidates have more than {MOST_SETS} sets: give fewer candidates, or largest.",
+                f"{count} candidates have more than {MOST_TRIED_SETS} sets: give fewer candidates, or largest.",
                 path="candidates",
             )
         sets = [chosen for size in sizes for chosen in combinations(range(count), size)]

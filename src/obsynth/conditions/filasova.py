@@ -41,7 +41,7 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
 
 #: Conditions whose failure leaves an inequality that no matrices satisfy.
-LEFT_TO_THE_SOLVER = ("nf <= ny", "rank F", "detectability", "rank [A F; C Df]")
+LEFT_TO_THE_PD_INEQUALITY = ("nf <= ny", "rank F", "detectability", "rank [A F; C Df]")
 
 
 def filasova_theorem1(
@@ -154,7 +154,7 @@ def _theorem(
     safe = chosen(reading, "reading", ("safe", "printed")) == "safe"
     own = linear_plant(plant)
     held = pd_observer_conditions(own)
-    require_data(held, solvers=LEFT_TO_THE_SOLVER)
+    require_data(held, solvers=LEFT_TO_THE_PD_INEQUALITY)
     form = explicit_form(own.dense())
     work = own.dense() if form is None else form.plant
     A_o, C_o = _augmented(work)

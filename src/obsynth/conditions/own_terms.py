@@ -46,7 +46,7 @@ AUTOMATIC = ("CLARABEL", "SCS")
 #: What a claimed gain keeps to the true norm, so that the claim has a proof with room for rounding.
 CLAIM_ROOM = 1e-3
 #: Multiples of a rate among which one inside a region is looked for.
-RATES = np.logspace(-4, 4, 161)
+RATE_MULTIPLES = np.logspace(-4, 4, 161)
 #: Eigenvalues may be outside a region by this much, by a solver's rounding.
 REGION_TOLERANCE = 1e-6
 
@@ -154,7 +154,7 @@ def _fitting_delta(delta: float, where: LMIRegion | None) -> float:
     """Return the delta nearest to a given one with ``-1 / delta`` well inside a region."""
     if where is None or where.contains([-1.0 / delta]):
         return delta
-    rates = RATES * (1.0 / delta)
+    rates = RATE_MULTIPLES * (1.0 / delta)
     margins = where.margins(-rates) / rates
     inside = rates[margins > 0.5 * np.max(margins)]
     return float(1.0 / inside[np.argmin(np.abs(np.log(inside * delta)))]) if len(inside) else delta

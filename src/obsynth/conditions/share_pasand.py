@@ -52,10 +52,10 @@ from obsynth.plants.fault_models import Exosystem, exosystem
 from obsynth.results.design import ObserverDesign
 
 #: Conditions whose failure leaves an inequality that no matrices satisfy.
-LEFT_TO_THE_SOLVER = ("(D2)", "(D3)", "fixed modes", "order of the fault model", "fault model in double")
+LEFT_TO_THE_UI_PI_INEQUALITY = ("(D2)", "(D3)", "fixed modes", "order of the fault model", "fault model in double")
 
 #: Real numbers among which the slowest of a region is looked for: a scale alone depends on it.
-_RATES, _NUMBERS = -np.logspace(-6, 9, 151), np.linspace(-1.0, 1.0, 401)
+_REAL_RATES, _REAL_NUMBERS = -np.logspace(-6, 9, 151), np.linspace(-1.0, 1.0, 401)
 
 
 def sharepasand(
@@ -111,7 +111,7 @@ def sharepasand(
     own = linear_plant(plant).dense()
     model = exosystem(fault_model, own.fault_names, own.dt)
     found = existence(own, model)
-    require_data(found.conditions, solvers=LEFT_TO_THE_SOLVER)
+    require_data(found.conditions, solvers=LEFT_TO_THE_UI_PI_INEQUALITY)
     parts = _decoupling(found.plant, E_sharp, C_sharp, G)  # (10), (11)
     target = plant if found.transformation is None else found.transformation
     return augmented_problem(
@@ -208,7 +208,7 @@ def _coordinates(F: FloatArray, C: FloatArray, where: LMIRegion, *, discrete: bo
     from scipy.linalg import solve_continuous_are, solve_discrete_are
 
     n = len(F)
-    found = [x for x in (_NUMBERS if discrete else _RATES) if where.contains(x)]
+    found = [x for x in (_REAL_NUMBERS if discrete else _REAL_RATES) if where.contains(x)]
     if not found:
         return np.eye(n)
     solve, moved = (

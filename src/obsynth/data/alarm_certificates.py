@@ -15,7 +15,7 @@ from obsynth.experiments.alarm_multipliers import (
     checked,
     statement_of,
 )
-from obsynth.experiments.alarm_proof import KIND, SCHEMA_VERSION, Question, statement
+from obsynth.experiments.alarm_proof import ALARM_KIND, ALARM_VERSION, Question, statement
 from obsynth.experiments.assumptions import Log, file_digest
 from obsynth.methods.verifying import verify
 from obsynth.numerics.arguments import is_whole
@@ -48,7 +48,7 @@ def verify_alarm(path: str | Path, *, data: str | Path | None = None) -> Verific
         The file is no certificate.
     """
     again = "prove the alarm again (obsynth prove-alarm)"
-    _, body, intact = opened(Path(path), (KIND,), SCHEMA_VERSION, "certificate of an alarm", again)
+    _, body, intact = opened(Path(path), (ALARM_KIND,), ALARM_VERSION, "certificate of an alarm", again)
     checks = [_row("digest", "the file is as it was written", float(intact), 1.0, intact)]
     try:
         for check in _checked(body, None if data is None else Path(data)):

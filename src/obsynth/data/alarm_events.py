@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from obsynth.data.log_estimator import GAP, OUT_OF_ORDER, PARTIAL, RECOVERING, REPEATED, WARM_UP
+from obsynth.data.log_estimator import GAP, OUT_OF_ORDER, PARTIAL, RECOVERING, REPEATED_STAMP, WARM_UP
 from obsynth.experiments.monitors.learned_levels import HOLD
 from obsynth.observers.estimates import BAND_WIDTH
 
@@ -19,7 +19,7 @@ REASONS = {
     WARM_UP: "the initial-condition response has not settled yet (--warm-up)",
     RECOVERING: "the effect of a gap before them has not settled yet (--warm-up)",
     GAP: "samples are missing",
-    REPEATED: "their stamps are those of the rows before",
+    REPEATED_STAMP: "their stamps are those of the rows before",
     OUT_OF_ORDER: "their stamps are earlier than those of the rows before",
     NO_DECISION: "the monitor decides nothing there, as it waits for its window, its start, or the end of a gap",
 }
@@ -124,7 +124,7 @@ def silent_rows(silent: Mapping[str, int]) -> list[str]:
 
 
 #: Alarms that a summary lists.
-MOST_LISTED = 20
+MOST_LISTED_ALARMS = 20
 
 
 def alarm_rows(events: Sequence[AlarmEvent], shown: Callable[[float], str]) -> tuple[list[tuple[str, ...]], int]:
@@ -136,7 +136,7 @@ def alarm_rows(events: Sequence[AlarmEvent], shown: Callable[[float], str]) -> t
         return "" if math.isnan(value) else f"{value:.4g}"
 
     rows = [("alarm by", "from", "to", "rows", "fault", "size", "interval", "of its threshold")]
-    for event in events[:MOST_LISTED]:
+    for event in events[:MOST_LISTED_ALARMS]:
         interval = "" if math.isnan(event.low) else f"{number(event.low)} to {number(event.high)}"
         ends = shown(event.start), shown(event.end)
         evidence = f"{event.evidence:.3g} times"

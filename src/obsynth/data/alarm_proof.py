@@ -13,9 +13,10 @@ from obsynth.data.log_run import LogRun
 from obsynth.data.sources import Data, samples
 from obsynth.errors import SpecError
 from obsynth.experiments.alarm_multipliers import rows_of_test
-from obsynth.experiments.alarm_proof import WINDOW, AlarmProof, proved_alarm
+from obsynth.experiments.alarm_proof import AlarmProof, proved_alarm
 from obsynth.experiments.assumptions import Log
 from obsynth.experiments.monitors.guaranteed import is_guaranteed
+from obsynth.experiments.monitors.options import WINDOW
 from obsynth.methods.guaranteed_test.result import GuaranteedTest
 from obsynth.numerics.arguments import is_whole, require_kind, require_mapping
 from obsynth.numerics.arrays import FloatArray

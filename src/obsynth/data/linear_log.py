@@ -25,7 +25,7 @@ from obsynth.results.design import ObserverDesign
 KEPT_INTERVALS = 64
 #: A gap is over when what it can have left in fault estimates and residuals is below this share of their usual changes
 #: from row to row, which so many rows must have shown, or below what the stated noise of the sensors makes of them.
-LEFT_SHARE, LEAST_SHOWN = 1.0, 20
+GAP_LEFT_SHARE, LEAST_SHOWN = 1.0, 20
 SAMPLED_GAP = "gap is for continuous-time designs: a sampled one knows which rows are missing."
 #: What goes from row to row.
 SAVED = (
@@ -177,7 +177,7 @@ class LinearLogObserver(LogObserver):
         if not shown and not self.noise.all():
             return None
         changes = self.changes / self.counted if shown else np.zeros_like(self.changes)
-        return np.asarray(np.sqrt(np.maximum(LEFT_SHARE**2 * changes, self.noise)))
+        return np.asarray(np.sqrt(np.maximum(GAP_LEFT_SHARE**2 * changes, self.noise)))
 
     def take(self, time: float, values: FloatArray, *, seconds: float, missing: int, longest: float) -> Row:
         """Take one row."""

@@ -18,14 +18,14 @@ from obsynth.plants.descriptor import DescriptorSystem
 #: What a row of estimates is.
 OK, WARM_UP, PARTIAL, GAP, RECOVERING = "ok", "warm-up", "partial", "gap", "recovering"
 #: Rows whose stamps do not rise: they are left out, and say nothing.
-REPEATED, OUT_OF_ORDER = "repeated stamp", "out of order"
-STALE = (REPEATED, OUT_OF_ORDER)
+REPEATED_STAMP, OUT_OF_ORDER = "repeated stamp", "out of order"
+STALE = (REPEATED_STAMP, OUT_OF_ORDER)
 #: Rows in which a decision may be taken.
 DECIDING = (OK, PARTIAL)
 #: Gaps longer than this many samples are not bridged: the observer starts again.
 LONGEST_BRIDGE = 10_000
 #: A sampled design takes a stamp as the sample that it is nearest to: it is off by up to this share of dt.
-FITTING_SHARE = 0.45
+STAMP_SHARE = 0.45
 #: Continuous designs: a gap of so little more than a number of intervals has no further row in it.
 COUNTING_SHARE = 0.01
 #: What remains of a deviation from the samples in the next one: a clock that is a little fast is followed.
@@ -40,7 +40,7 @@ SURE_SHARE = 0.009
 #: Without another word, an interval is a gap when it is longer than this many times the longest one before.
 GAP_FACTOR = 10.0
 #: A gap of more samples than this cannot be counted in double precision.
-MOST_SAMPLES = 2.0**53
+MOST_COUNTED_SAMPLES = 2.0**53
 
 
 class Row(NamedTuple):
@@ -99,11 +99,11 @@ class Clock:
         if last is None or not math.isfinite(time) or self.left_out >= MOST_STALE:
             return ""
         # Of a sampled design the last sample may be told a little later than its stamp.
-        before = max(self.stamp, last - FITTING_SHARE * self.dt) if self.dt > 0.0 else last
+        before = max(self.stamp, last - STAMP_SHARE * self.dt) if self.dt > 0.0 else last
         if time > before and time != last:
             return ""
         self.left_out += 1
-        return REPEATED if time in (self.stamp, last) else OUT_OF_ORDER
+        return REPEATED_STAMP if time in (self.stamp, last) else OUT_OF_ORDER
 
     def regular(self, times: Sequence[float]) -> list[float]:
         """Return the intervals to the first of these stamps that certainly follow each other without a gap; nothing is
@@ -133,7 +133,7 @@ class Clock:
         count = _counted(step / self.dt, step, row)
         away = abs(step - count * self.dt) / self.dt
         average = (1.0 - AVERAGED_SHARE) * self.away + AVERAGED_SHARE * away
-        if count < 1 or away > FITTING_SHARE or average > OTHER_SHARE:
+        if count < 1 or away > STAMP_SHARE or average > OTHER_SHARE:
             raise SpecError(
                 f"Row {row} comes {step:.10g} s after the row before, but the design has dt = {self.dt:.10g} s: "
                 "stamps may be a fifth of it off; irregular time stamps need a continuous-time design.",
@@ -159,7 +159,7 @@ class Clock:
 
 def _counted(samples: float, step: float, row: int) -> int:
     """Return a whole number of samples; more than can be counted are no gap but a mistake."""
-    if not samples < MOST_SAMPLES:
+    if not samples < MOST_COUNTED_SAMPLES:
         raise SpecError(
             f"Row {row} comes {step:.10g} s after the row before, {samples:.3g} samples: are the times in seconds?",
             path=f"row {row}",

@@ -15,7 +15,7 @@ from obsynth.data.alarm_events import NO_DECISION, AlarmLog
 from obsynth.data.linear_log import log_observer
 from obsynth.data.log_estimator import DECIDING, RECOVERING, STALE, Clock, Row
 from obsynth.data.recovered import LATE, RecoveredStates
-from obsynth.data.signals import TIME, Signals, Stamps
+from obsynth.data.signals import TIME_HEADER, Signals, Stamps
 from obsynth.errors import ObsynthError, SpecError
 from obsynth.experiments.monitors.monitor import LinearSample, Monitor, Sample
 from obsynth.files.inputs import read_json
@@ -28,11 +28,11 @@ from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import digest_of, plain, restored
 
 #: Seconds of data that are compared with the operating point.
-FIRST = 1.0
+FIRST_SECONDS = 1.0
 #: Rows that are taken in one piece at most.
-PIECE = 4096
+ROWS_AT_ONCE = 4096
 #: A signal is far from its operating point when its mean differs by this share of it.
-FAR = 0.2
+FAR_FROM_POINT = 0.2
 
 
 class OperatingPointCheck:
@@ -46,7 +46,7 @@ class OperatingPointCheck:
     def take(self, time: float, deviations: FloatArray) -> None:
         """Take one row: seconds, and deviations ``(nu + ny,)`` of which some may be missing."""
         self._begin = time if self._begin is None else self._begin
-        if time - self._begin <= FIRST:
+        if time - self._begin <= FIRST_SECONDS:
             known = np.isfinite(deviations)
             self._sum[known] += deviations[known]
             self._count[known] += 1.0
@@ -54,7 +54,7 @@ class OperatingPointCheck:
     def take_rows(self, times: Sequence[float], deviations: FloatArray) -> None:
         """Take rows, as `take` one by one."""
         for time, row in zip(times, deviations, strict=True):
-            if self._begin is not None and not time - self._begin <= FIRST:
+            if self._begin is not None and not time - self._begin <= FIRST_SECONDS:
                 break
             self.take(time, row)
 
@@ -66,7 +66,7 @@ class OperatingPointCheck:
             if point == 0.0 or self._count[i] == 0.0:
                 continue
             away = self._sum[i] / self._count[i]
-            if abs(away) > FAR * abs(point):
+            if abs(away) > FAR_FROM_POINT * abs(point):
                 texts.append(
                     f"{name} begins at {point + away:.6g}, far from its operating point {point:.6g}: the linear model "
                     "may not hold there, or the data are deviations already, or in another unit."
@@ -131,7 +131,7 @@ class LogRun:
         if monitor is not None:
             monitor.require_fit(len(residuals), observer.fault_names)
         self.header = (
-            TIME,
+            TIME_HEADER,
             "status",
             *(f"time of {name}" for name, _ in lags),
             *names,
@@ -183,8 +183,8 @@ class LogRun:
                 found.append(Row(status, np.full(len(self.observer.columns), np.nan)))
                 continue
             if self.observer.takes_pieces and complete[done]:
-                bad = np.flatnonzero(~complete[done : done + PIECE])
-                end = done + (int(bad[0]) if bad.size else PIECE)
+                bad = np.flatnonzero(~complete[done : done + ROWS_AT_ONCE])
+                end = done + (int(bad[0]) if bad.size else ROWS_AT_ONCE)
                 intervals = self.clock.regular(times[done:end])
                 taken = self.observer.take_piece(times[done:end], values[done:end], intervals) if intervals else []
                 if taken:
@@ -325,25 +325,25 @@ class LogRun:
             self._watching = self.monitor.from_data(data["monitor"])
 
 
-KIND = "obsynth run state"
-SCHEMA_VERSION = 9
+RUN_STATE_KIND = "obsynth run state"
+RUN_STATE_VERSION = 9
 STATE = FileKind("a saved state of obsynth", rb'\A\s*\{\s*"kind":\s*"obsynth run state"')
 #: Parts that are seconds, or nothing before the first row.
-_TIMES = frozenset({"last", "longest"})
+_TIME_PARTS = frozenset({"last", "longest"})
 
 
 def save_state(path: Path, run: LogRun, digest: str) -> None:
     """Write what a run carries from row to row, atomically."""
     body = plain({"gains": digest, "state": run.as_dict()})
-    write_atomically(path, sealed(KIND, SCHEMA_VERSION, body, under="run"))
+    write_atomically(path, sealed(RUN_STATE_KIND, RUN_STATE_VERSION, body, under="run"))
 
 
 def resume_state(path: Path, run: LogRun, digest: str) -> None:
     """Let a run go on from a saved state."""
     # The state is written again at the end, so it is no input that has to be kept.
     document = read_json(path, is_protected=False)
-    known = isinstance(document, dict) and document.get("kind") == KIND
-    if not known or document.get("schema_version") != SCHEMA_VERSION:
+    known = isinstance(document, dict) and document.get("kind") == RUN_STATE_KIND
+    if not known or document.get("schema_version") != RUN_STATE_VERSION:
         raise SpecError(f"{path} is no saved state of a run.", path=str(path))
     body = document.get("run")
     try:
@@ -375,7 +375,8 @@ def _fits(own: Any, saved: Any) -> bool:
         if not isinstance(saved, dict) or saved.keys() != own.keys():
             return False
         return all(
-            _fits(own[key], saved[key]) and (key not in _TIMES or saved[key] is None or is_finite_number(saved[key]))
+            _fits(own[key], saved[key])
+            and (key not in _TIME_PARTS or saved[key] is None or is_finite_number(saved[key]))
             for key in own
         )
     if isinstance(own, (bool, np.bool_)):

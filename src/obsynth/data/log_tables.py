@@ -9,19 +9,19 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.data.signals import TIME, Signals, Stamps
-from obsynth.data.sources import CHUNK_ROWS, PACKAGES, TEXTS, check_suffix, chunks
+from obsynth.data.signals import TIME_HEADER, Signals, Stamps
+from obsynth.data.sources import CHUNK_ROWS, NEEDED_PACKAGES, TEXT_SUFFIXES, check_suffix, chunks
 from obsynth.data.text_logs import header_of
 from obsynth.errors import SpecError
 from obsynth.files.inputs import input_file
 from obsynth.numerics.arrays import FloatArray
 
 #: Decimals of seconds that dates are told to.
-MICROSECONDS = 6
+SECOND_DECIMALS = 6
 
 
 def log_table(
-    data: str | Path | Any, names: Sequence[str], time: str = TIME
+    data: str | Path | Any, names: Sequence[str], time: str = TIME_HEADER
 ) -> tuple[dict[str, FloatArray], list[str]]:
     """Return those of some columns that a log has ``(rows,)``, dates as seconds since the first, and the names of all
     columns; ``data`` is the name of a file or a data frame, ``time`` the column of the stamps."""
@@ -37,7 +37,7 @@ def log_table(
     found, times = dict(zip(there, rows[:, 1:].T, strict=True)), rows[:, 0]
     if stamps.is_dated:
         # Seconds since 1970 in double precision have lost what is below a microsecond.
-        times = np.round(times - times[0], MICROSECONDS)
+        times = np.round(times - times[0], SECOND_DECIMALS)
     return {**({time: times} if time in header else {}), **found}, header
 
 
@@ -46,11 +46,14 @@ def _header(data: Any, wanted: Sequence[str]) -> list[str]:
     if not isinstance(data, str | Path):
         names = [str(name) for name in data.columns]
         dated = getattr(data.index, "dtype", None) is not None and data.index.dtype.kind in "Mm"
-        return [*([TIME] if TIME not in names and (dated or data.index.name == TIME) else []), *names]
+        return [
+            *([TIME_HEADER] if TIME_HEADER not in names and (dated or data.index.name == TIME_HEADER) else []),
+            *names,
+        ]
     path = Path(data)
-    check_suffix(path, (*TEXTS, *PACKAGES))
+    check_suffix(path, (*TEXT_SUFFIXES, *NEEDED_PACKAGES))
     input_file(path)
-    if path.suffix.lower() in TEXTS:
+    if path.suffix.lower() in TEXT_SUFFIXES:
         return header_of(path, wanted)
     if path.suffix.lower() == ".parquet":
         import pyarrow.parquet

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from obsynth.data.log_estimator import DECIDING, STALE
 from obsynth.data.log_run import LogRun
 from obsynth.data.log_tables import parsed_rows
-from obsynth.data.signals import TIME, Stamps
+from obsynth.data.signals import TIME_HEADER, Stamps
 from obsynth.data.sources import CHUNK_ROWS, Data, chunks
 from obsynth.errors import SpecError
 from obsynth.experiments.monitors.learned import (
@@ -28,14 +28,14 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.results.design import ObserverDesign
 
 #: One false alarm in so many rows, where nothing else is asked for.
-FALSE_ALARMS = "1 per 1000 rows"
+FALSE_ALARM_RATE = "1 per 1000 rows"
 
 
 def learn_thresholds(
     design: ObserverDesign,
     data: Data,
     *,
-    false_alarms: str | float = FALSE_ALARMS,
+    false_alarms: str | float = FALSE_ALARM_RATE,
     rows: str | slice | Sequence[int] | None = None,
     columns: Mapping[str, str] | None = None,
     time_column: str | None = None,
@@ -84,7 +84,7 @@ def learn_thresholds(
     require_kind(design, ObserverDesign, "design", "an ObserverDesign, such as obsynth.load(path)")
     rows_per_alarm(false_alarms, 1.0 if design.observer.dt == 0.0 else design.observer.dt)
     if time_column is not None:
-        columns = {**(columns or {}), TIME: time_column}
+        columns = {**(columns or {}), TIME_HEADER: time_column}
     numbers, times, found = _said(design, data, columns, scales, gap, warm_up)
     first, last = parsed_rows(rows, int(numbers[-1]) + 1)
     chosen = (first <= numbers) & (numbers < last)

@@ -12,7 +12,7 @@ from obsynth.data.normal_rows import learn_thresholds
 from obsynth.errors import SpecError
 from obsynth.experiments.assumptions import Assumptions
 from obsynth.experiments.monitors.adaptive_monitor import (
-    EXACT,
+    NO_TOLERANCE,
     adaptive_plan,
     adaptive_statement,
     noisy_design,
@@ -22,7 +22,7 @@ from obsynth.experiments.monitors.adaptive_rule import AdaptiveRule
 from obsynth.experiments.monitors.gap_growth import GapGrowth, gap_growth
 from obsynth.experiments.monitors.guaranteed import data_monitor, is_guaranteed
 from obsynth.experiments.monitors.learned import LearnedThresholds, learned_monitor, load_thresholds
-from obsynth.experiments.monitors.monitor import KINDS, Monitor, Rule, statement_of
+from obsynth.experiments.monitors.monitor import MONITOR_KINDS, Monitor, Rule, statement_of
 from obsynth.experiments.monitors.options import LINEAR_OPTIONS, PARAMETER_OPTIONS, checked_options
 from obsynth.experiments.monitors.residual_model import ResidualModel, residual_model, watches_estimates
 from obsynth.experiments.monitors.residual_monitor import bounds_of
@@ -39,7 +39,7 @@ from obsynth.plants.constants import shown
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.scenario import Scenario
 
-_FORGOTTEN = ", once the start is forgotten (the warm-up)"
+_AFTER_WARM_UP = ", once the start is forgotten (the warm-up)"
 _AFTER_A_GAP = " (after a gap likewise)"
 _FROM_THE_FIRST = "; from the first row on, after a gap once that is forgotten"
 _GROWS = "; after missing outputs larger by what the plant's model may have missed"
@@ -165,7 +165,7 @@ def online_monitor(
         _require_above_zero(limit)
         gaps = gap_growth(model, bounds, noise_bound) if kind == "pointwise" else ""
         rule = norm.over_gaps(gaps) if isinstance(gaps, GapGrowth) else norm
-        ending = (_FORGOTTEN if initial_error is None else _AFTER_A_GAP) + _more_words(kind, model, limit, dt)
+        ending = (_AFTER_WARM_UP if initial_error is None else _AFTER_A_GAP) + _more_words(kind, model, limit, dt)
         ending += _WAITS.format(reason=gaps) if isinstance(gaps, str) and gaps else _GROWS * bool(gaps)
     else:
         rule = _whitened(kind, model, bounds if scenario is None else None, window, change, false_alarms, dt)
@@ -175,7 +175,7 @@ def online_monitor(
     assumed = Assumptions(noisy, bounds, noise_bound or 0.0, initial_error=initial_error) if limited else None
     return Monitor(
         kind,
-        statement_of(kind, model, assumed, estimates=estimates, **numbers) + ending + EXACT,
+        statement_of(kind, model, assumed, estimates=estimates, **numbers) + ending + NO_TOLERANCE,
         rule,
         residuals=len(design.linear[1].residual_names),
         fault_names=design.linear[1].fault_names,
@@ -198,10 +198,10 @@ def _learned(design: ObserverDesign, normal: Any) -> Monitor:
 
 
 def _require_linear_kind(kind: str, nominal: Mapping[str, float] | None) -> None:
-    if kind not in KINDS:
+    if kind not in MONITOR_KINDS:
         hint = " glr is a decision on parameters, which a linear design has none of: cusum is nearest to it."
         raise SpecError(
-            f"kind is {kind!r}: for this design use one of {', '.join(KINDS)}.{hint if kind == 'glr' else ''}",
+            f"kind is {kind!r}: for this design use one of {', '.join(MONITOR_KINDS)}.{hint if kind == 'glr' else ''}",
             path="kind",
         )
     if nominal:
@@ -309,7 +309,7 @@ def _adaptive(
         initial_set=initial_set,
         sample_time=dt,
     )
-    start = _FROM_THE_FIRST if initial_set is not None else _FORGOTTEN if initial_error is None else _AFTER_A_GAP
+    start = _FROM_THE_FIRST if initial_set is not None else _AFTER_WARM_UP if initial_error is None else _AFTER_A_GAP
     return Monitor(
         "pointwise",
         adaptive_statement(first, assumed) + start,

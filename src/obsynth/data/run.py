@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 from obsynth.data.alarm_events import AlarmEvent
 from obsynth.data.log_run import LogRun, resume_state, save_state
-from obsynth.data.signals import TIME, Stamps
+from obsynth.data.signals import TIME_HEADER, Stamps
 from obsynth.data.sinks import FrameSink, Sink, measured_frame, sink_for
 from obsynth.data.sources import CHUNK_ROWS, Data, chunks
 from obsynth.errors import ObsynthError, SpecError
@@ -242,7 +242,7 @@ def run_on_data(
         check_output(state)
     if time_column is not None:
         require_kind(time_column, str, "time_column", "the name of a column")
-        columns = {**(columns or {}), TIME: time_column}
+        columns = {**(columns or {}), TIME_HEADER: time_column}
     stamps = Stamps()
     run = LogRun(
         design,

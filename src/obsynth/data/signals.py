@@ -17,14 +17,14 @@ from obsynth.numerics.arguments import is_finite_number, number_in_text
 from obsynth.numerics.arrays import FloatArray, read_only
 
 #: What a missing sample may look like in a log.
-MISSING = frozenset({"", "nan", "na", "n/a", "null", "none"})
-_ZERO = datetime(1970, 1, 1, tzinfo=UTC)
-_EXPECTED = "seconds, such as 12.5, or a date and a time, such as 2026-05-01T08:30:00.5+02:00"
+MISSING_TEXTS = frozenset({"", "nan", "na", "n/a", "null", "none"})
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+_EXPECTED_TIMES = "seconds, such as 12.5, or a date and a time, such as 2026-05-01T08:30:00.5+02:00"
 #: Dates with points, which have the day first wherever they are written; slashes have no such rule.
 _POINTED = re.compile(r"(\d{1,2})\.(\d{1,2})\.(\d{4})(?:[ T]+(\d{1,2}:\d{2}\S*))?")
 _MICROSECOND = timedelta(microseconds=1)
 #: Seconds in a nanosecond, a microsecond and a day; microseconds in a second.
-_NANO, _MICRO, _DAY, _MICROSECONDS = 1e-9, 1e-6, 86400.0, 1e6
+_NANO, _MICRO, _DAY_SECONDS, _MICROSECONDS = 1e-9, 1e-6, 86400.0, 1e6
 
 
 def _as_iso(cell: str) -> str:
@@ -58,7 +58,7 @@ class Stamps:
     def read(self, text: str, row: int, column: str, *, comma: bool = False) -> float:
         """Return the seconds of one cell; ``comma`` takes a decimal comma."""
         cell = text.strip()
-        if cell.lower() in MISSING:
+        if cell.lower() in MISSING_TEXTS:
             return math.nan
         if self.is_dated is not True:
             try:
@@ -109,7 +109,7 @@ class Stamps:
 
     def moment(self, seconds: float) -> datetime:
         """Return the date and time of some seconds, to the microsecond, with the log's zone if it names one."""
-        found = _ZERO + timedelta(seconds=math.floor(seconds)) + round((seconds % 1.0) * _MICROSECONDS) * _MICROSECOND
+        found = _EPOCH + timedelta(seconds=math.floor(seconds)) + round((seconds % 1.0) * _MICROSECONDS) * _MICROSECOND
         return found.replace(tzinfo=None) if self.zone is None else found.astimezone(self.zone)
 
     def _seconds(self, found: datetime, row: int, column: str) -> float:
@@ -120,17 +120,17 @@ class Stamps:
                 f"Row {row}, column {column!r}: stamps with a time zone and without one stand in one log.",
                 path=f"row {row}",
             )
-        past = (found if found.tzinfo is not None else found.replace(tzinfo=UTC)) - _ZERO
-        return past.days * _DAY + past.seconds + past.microseconds * _MICRO
+        past = (found if found.tzinfo is not None else found.replace(tzinfo=UTC)) - _EPOCH
+        return past.days * _DAY_SECONDS + past.seconds + past.microseconds * _MICRO
 
     def _expected(self) -> str:
         if self.is_dated is None:
-            return f"give {_EXPECTED}"
+            return f"give {_EXPECTED_TIMES}"
         return "the rows before hold dates and times" if self.is_dated else "the rows before hold seconds"
 
 
 #: The column of time stamps, in seconds.
-TIME = "time"
+TIME_HEADER = "time"
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,7 +153,7 @@ class Signals:
         """Return the signals that a running design reads."""
         names = observer.input_names + observer.output_names
         renamed, factors = dict(columns or {}), dict(scales or {})
-        unknown = [name for name in renamed if name not in (TIME, *names)]
+        unknown = [name for name in renamed if name not in (TIME_HEADER, *names)]
         unknown += [name for name in factors if name not in names]
         if unknown:
             raise SpecError(
@@ -166,7 +166,7 @@ class Signals:
         shift = None if uncertain is None else uncertain.shift
         return cls(
             names,
-            tuple(renamed.get(name, name) for name in (TIME, *names) if not shift or name != shift),
+            tuple(renamed.get(name, name) for name in (TIME_HEADER, *names) if not shift or name != shift),
             read_only(np.array([factors.get(name, observer.scales.get(name, 1.0)) for name in names])),
             read_only(np.array([observer.point.get(name, 0.0) for name in names])),
             dict(observer.point),
@@ -207,13 +207,13 @@ class Signals:
 
 
 #: How columns of time stamps are often called.
-_TIMES = ("timestamp", "datetime", "date", "t", "zeit", "time")
+_TIME_NAMES = ("timestamp", "datetime", "date", "t", "zeit", "time")
 
 
 def _advice(header: tuple[str, ...], missing: list[str]) -> str:
     if len(header) == 1 and any(mark in header[0] for mark in ":#~^ "):
         return "Separate columns by commas, semicolons, tabs or bars."
-    found = next((name for kind in _TIMES for name in header if name.lower().startswith(kind)), None)
-    if TIME in missing and found is not None:
+    found = next((name for kind in _TIME_NAMES for name in header if name.lower().startswith(kind)), None)
+    if TIME_HEADER in missing and found is not None:
         return f"If {found!r} is the time: --time-column {found!r}, or columns={{'time': {found!r}}}."
     return "Map signals to columns where their names differ."

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Protocol, TextIO
 
 import numpy as np
 
-from obsynth.data.signals import TIME, Signals, Stamps
+from obsynth.data.signals import TIME_HEADER, Signals, Stamps
 from obsynth.data.sources import check_suffix
 from obsynth.files.outputs import FileKind, replacement_of
 from obsynth.files.tables import TableWriter
@@ -22,12 +22,12 @@ if TYPE_CHECKING:
 #: A table that a run on measured data has written, as CSV or as Parquet.
 ESTIMATES = FileKind("a table of estimates of obsynth", rb"\Atime,status,|\APAR1(?s:.*)status(?s:.*)hat\[")
 #: Columns of a table that hold text.
-TEXTS = ("status", "alarm")
+TEXT_COLUMNS = ("status", "alarm")
 
 
 def time_columns(header: Sequence[str]) -> tuple[int, ...]:
     """Return which columns hold times."""
-    return tuple(i for i, name in enumerate(header) if name == TIME or name.startswith(f"{TIME} of "))
+    return tuple(i for i, name in enumerate(header) if name == TIME_HEADER or name.startswith(f"{TIME_HEADER} of "))
 
 
 def dated(rows: Sequence[Sequence[Any]], places: Sequence[int], shown: Callable[[float], Any]) -> list[list[Any]]:
@@ -74,7 +74,7 @@ class FrameSink:
     def write(self, rows: Sequence[Sequence[Any]]) -> None:
         """Keep rows."""
         for place, cells in enumerate(zip(*rows, strict=True)):
-            if self._header[place] in TEXTS:
+            if self._header[place] in TEXT_COLUMNS:
                 self._others[place].extend(cells)
             elif self._stamps.is_dated and place in self._times:
                 self._others[place].extend(map(self._stamps.moment, cells))
@@ -104,7 +104,7 @@ class ParquetSink:
         import pyarrow as pa
         import pyarrow.parquet as pq
 
-        self._schema = pa.schema([(name, pa.string() if name in TEXTS else pa.float64()) for name in header])
+        self._schema = pa.schema([(name, pa.string() if name in TEXT_COLUMNS else pa.float64()) for name in header])
         self._writer = pq.ParquetWriter(path, self._schema)
 
     def write(self, rows: Sequence[Sequence[Any]]) -> None:
@@ -160,5 +160,5 @@ def measured_frame(kept: list[FloatArray] | None, signals: Signals, stamps: Stam
         done += len(chunk)
     kept.clear()
     frame = pd.DataFrame(found.T, columns=list(signals.names), copy=False)
-    frame.insert(0, TIME, [stamps.moment(time) for time in seconds.tolist()] if stamps.is_dated else seconds)
+    frame.insert(0, TIME_HEADER, [stamps.moment(time) for time in seconds.tolist()] if stamps.is_dated else seconds)
     return frame

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from obsynth.data.log_estimator import STALE, LogObserver, Row
 from obsynth.data.log_run import LogRun
-from obsynth.data.signals import TIME
+from obsynth.data.signals import TIME_HEADER
 from obsynth.data.sources import samples
 from obsynth.data.step_log import SteppingLogObserver
 from obsynth.errors import SpecError
@@ -181,7 +181,7 @@ def smooth(
         if waited is None and hasattr(data, "readline"):
             raise SpecError("A stream has no end: give a lag, or the whole log as a file.", path="lag")
         if time_column is not None:
-            columns = {**(columns or {}), TIME: time_column}
+            columns = {**(columns or {}), TIME_HEADER: time_column}
         return _smoothed_log(LogRun(design, columns, scales, outliers=outliers), data, waited)
     if columns or scales or time_column:
         raise SpecError(

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, TextIO, TypeAlias
 
 import numpy as np
 
-from obsynth.data.signals import TIME, Signals, Stamps
+from obsynth.data.signals import TIME_HEADER, Signals, Stamps
 from obsynth.data.text_logs import Dialect, stream_rows, text_chunks
 from obsynth.errors import SpecError
 from obsynth.files.inputs import input_file
@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from typing_extensions import TypeIs
 
 #: Files that are read as text, and those that need a package: its name and the extra that installs it.
-TEXTS = (".csv", ".tsv")
-PACKAGES = {
+TEXT_SUFFIXES = (".csv", ".tsv")
+NEEDED_PACKAGES = {
     ".parquet": ("pyarrow", "parquet"),
     ".tdms": ("nptdms", "tdms"),
     ".mf4": ("asammdf", "mdf"),
@@ -34,7 +34,7 @@ PACKAGES = {
 #: Rows that are held in memory at a time.
 CHUNK_ROWS = 10_000
 #: Files that estimates are written to.
-SUFFIXES = (".csv", ".parquet")
+TABLE_SUFFIXES = (".csv", ".parquet")
 Data: TypeAlias = "str | Path | TextIO | pd.DataFrame"
 
 
@@ -84,9 +84,9 @@ def _advanced(found: Iterator[FloatArray], signals: Signals) -> Iterator[FloatAr
 def _chunks(data: Data, signals: Signals, stamps: Stamps, rows: int) -> Iterator[FloatArray]:
     if isinstance(data, str | Path):
         path = Path(data)
-        check_suffix(path, (*TEXTS, *PACKAGES))
+        check_suffix(path, (*TEXT_SUFFIXES, *NEEDED_PACKAGES))
         with _readable(path):
-            if path.suffix.lower() in TEXTS:
+            if path.suffix.lower() in TEXT_SUFFIXES:
                 yield from text_chunks(path, signals, stamps, rows)
             else:
                 _require_beginning(path)
@@ -118,13 +118,13 @@ def is_stream(data: TextIO | pd.DataFrame) -> TypeIs[TextIO]:
     return hasattr(data, "readline")
 
 
-def check_suffix(path: Path, suffixes: tuple[str, ...] = SUFFIXES) -> None:
+def check_suffix(path: Path, suffixes: tuple[str, ...] = TABLE_SUFFIXES) -> None:
     """Raise `SpecError` unless a file is of a known kind by its name, and its package is installed."""
     suffix = path.suffix.lower()
     if suffix not in suffixes:
         raise SpecError(f"{path} has an unknown suffix: use one of {', '.join(suffixes)}.", path=str(path))
-    if suffix in PACKAGES:
-        package, extra = PACKAGES[suffix]
+    if suffix in NEEDED_PACKAGES:
+        package, extra = NEEDED_PACKAGES[suffix]
         try:
             import_module(package)
         except ImportError:
@@ -241,7 +241,7 @@ def _with_time(frame: pd.DataFrame, signals: Signals) -> pd.DataFrame:
     dated = isinstance(frame.index, (pd.DatetimeIndex, pd.TimedeltaIndex))
     if time in names or not (dated or frame.index.name == time):
         return frame
-    if time != TIME and frame.index.name != time:
+    if time != TIME_HEADER and frame.index.name != time:
         return frame
     return frame.assign(**{time: frame.index}).reset_index(drop=True)
 

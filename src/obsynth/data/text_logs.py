@@ -13,7 +13,7 @@ from typing import TextIO
 
 import numpy as np
 
-from obsynth.data.signals import MISSING, Signals, Stamps
+from obsynth.data.signals import MISSING_TEXTS, Signals, Stamps
 from obsynth.errors import SpecError
 from obsynth.files.tables import unquoted
 from obsynth.numerics.arguments import number_in_text
@@ -42,7 +42,7 @@ class Dialect:
         """Return the number in a cell, NaN where it is missing; a cell that is none is named with its row.
         In a column that has shown numbers, a word is what loggers write for a bad sample: ``stamps`` counts these."""
         cell = "" if text is None else text.strip()
-        if cell.lower() in MISSING:
+        if cell.lower() in MISSING_TEXTS:
             return float("nan")
         try:
             return number_in_text(cell.replace(",", ".") if self.comma and "." not in cell else cell)

@@ -19,6 +19,7 @@ from obsynth.experiments.alarm_multipliers import (
 )
 from obsynth.experiments.alarm_window import Window, window_data, window_programme
 from obsynth.experiments.assumptions import Assumptions, Log
+from obsynth.experiments.monitors.options import WINDOW
 from obsynth.files.outputs import FileKind, write_atomically
 from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
 from obsynth.methods.guaranteed_test.result import GuaranteedTest
@@ -30,11 +31,9 @@ from obsynth.results.certificate_files import SHOWN_DIGITS, sealed
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import design_as_dict, plain
 
-SCHEMA_VERSION = 2
-KIND = "obsynth alarm certificate"
+ALARM_VERSION = 2
+ALARM_KIND = "obsynth alarm certificate"
 CERTIFICATE = FileKind("an alarm certificate", b'"kind": "obsynth alarm certificate"')
-#: Samples of a window.
-WINDOW = 20
 #: The solver of linear programmes may take so long; without an answer nothing is proved.
 SOLVER_SECONDS = 60.0
 #: Multipliers are kept to this many significant digits: any numbers prove a bound, and few digits stay readable.
@@ -88,7 +87,7 @@ class AlarmProof:
         """
         if not self.proved:
             raise SpecError("There is no proof to write: the alarm cannot be proved.", path="certificate")
-        return write_atomically(path, sealed(KIND, SCHEMA_VERSION, self.certificate))
+        return write_atomically(path, sealed(ALARM_KIND, ALARM_VERSION, self.certificate))
 
     def __str__(self) -> str:
         return self.statement

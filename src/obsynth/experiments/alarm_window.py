@@ -31,7 +31,7 @@ MORE_ROUNDINGS = 8
 #: The largest value of t that is of interest, in bounds of the variables.
 LARGEST_RELAXATION = 1e3
 #: Bounds of the state are widened by this share: more than rounding can take from them.
-OUTWARD = 1e-9
+WINDOW_OUTWARD = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,7 +255,7 @@ class _Builder:
 
 
 #: Where the bounds of the state come from.
-REPLAY, STATED = "replay from the start", "stated"
+REPLAY, STATED_BOUNDS = "replay from the start", "stated"
 
 
 def window_data(
@@ -275,7 +275,7 @@ def window_data(
     first = max(0, len(y) - length)
     if initial_set is None:
         low, high = _stated(affine, state_bounds or {}, len(y) - first)
-        return affine, WindowData(u[first:], y[first:], low, high), STATED
+        return affine, WindowData(u[first:], y[first:], low, high), STATED_BOUNDS
     _, observer = design.linear
     tracking = tracking_of(design, affine)
     structure = structure_of(
@@ -288,7 +288,7 @@ def window_data(
     read = rows @ structure.reading.T
     found = thresholds_of_records(bound, read[None], u[None], y[None])
     middle = read - found.shift[0]
-    width = (found.total - np.abs(found.shift))[0] + OUTWARD * (np.abs(read) + found.total[0])
+    width = (found.total - np.abs(found.shift))[0] + WINDOW_OUTWARD * (np.abs(read) + found.total[0])
     low, high = (middle - width)[first:], (middle + width)[first:]
     return affine, WindowData(u[first:], y[first:], low, high), REPLAY
 

@@ -30,7 +30,7 @@ from obsynth.simulation.signals import ScenarioSignals, resolve_parameters
 #: Warm-up ends when the effect of an error at the start has shrunk to this share of its largest, for good.
 WARM_UP_SHARE = 0.01
 #: Notes on simulations.
-BETWEEN_SAMPLES = (
+INPUTS_BETWEEN_SAMPLES = (
     "Between samples the plant is exact for signals that are constant or linear there; its observer is sampled by a "
     "first-order hold."
 )
@@ -117,7 +117,7 @@ def make_bench(design: ObserverDesign, scenario: Scenario) -> Bench:
     if observer.dt <= 0.0:
         ramp = first_order_hold(observer.Az, np.hstack([observer.Bu, observer.By]), drive.dt)[2]
         observer = sample_observer(observer, drive.dt)
-    said = ((not plant.is_discrete, BETWEEN_SAMPLES), (stepper.feedback is not None, STABILISED))
+    said = ((not plant.is_discrete, INPUTS_BETWEEN_SAMPLES), (stepper.feedback is not None, STABILISED))
     return Bench(
         drive,
         observer,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
+from obsynth.methods.fault_figures import HELD_GROWTH
 from obsynth.numerics.spectra import decay_rates, eigenvalues
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.linear.observer import LinearObserver
@@ -18,11 +19,9 @@ from obsynth.simulation.scenario import Scenario
 #: A segment lasts as long as the slowest error needs to shrink by this factor, and more.
 SEGMENT_LEFT = 0.005
 #: Samples in a segment, at least and at most; those of a continuous observer are chosen.
-SHORTEST, LONGEST, CHOSEN = 12, 1500, 150
+SHORTEST_SEGMENT, LONGEST_SEGMENT, CHOSEN = 12, 1500, 150
 #: An observer with this forgetting factor or more, or none, is shown for as long as one with this.
 LONG_MEMORY = 0.99
-#: A plant that grows by more than this over the scenario gets a stabilising feedback, or is not shown.
-GROWTH = 1e3
 
 
 def demonstration_scenario(design: ObserverDesign) -> Scenario | None:
@@ -38,7 +37,7 @@ def _of_linear(plant: DescriptorSystem, observer: LinearObserver) -> Scenario:
     settling = -np.log(SEGMENT_LEFT) / slowest if slowest > 0.0 else 0.0
     if observer.dt > 0.0:
         step = observer.dt
-        samples = int(np.clip(np.ceil(settling / step), SHORTEST, LONGEST)) + max(observer.fault_delays)
+        samples = int(np.clip(np.ceil(settling / step), SHORTEST_SEGMENT, LONGEST_SEGMENT)) + max(observer.fault_delays)
     else:
         samples = CHOSEN
         step = (settling or 1.0) / samples
@@ -53,7 +52,7 @@ def _of_linear(plant: DescriptorSystem, observer: LinearObserver) -> Scenario:
         horizon=count * segment,
         sample_time=None if plant.is_discrete else step,
         faults=faults,
-        stabilise=growth > np.log(GROWTH),
+        stabilise=growth > np.log(HELD_GROWTH),
     )
 
 
@@ -77,11 +76,11 @@ def _of_recursive(observer: RecursiveObserver | DAEObserver) -> Scenario | None:
             spread, forgetting = adaptation.initial_covariance, adaptation.forgetting
             forgets = adaptation.form != "random-walk"
     memory = min(forgetting, LONG_MEMORY) if forgets else LONG_MEMORY
-    samples = int(np.clip(np.log(SEGMENT_LEFT) / np.log(memory), SHORTEST, LONGEST))
+    samples = int(np.clip(np.log(SEGMENT_LEFT) / np.log(memory), SHORTEST_SEGMENT, LONGEST_SEGMENT))
     count = len(observer.fault_names) + 1
     if longest is not None:
         samples = min(samples, (longest - 1) // count)
-    if samples < SHORTEST:
+    if samples < SHORTEST_SEGMENT:
         return None
     deviations = np.sqrt(np.diag(spread))
     faults = {

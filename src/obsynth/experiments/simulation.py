@@ -29,7 +29,7 @@ from obsynth.simulation.scenario import Scenario
 from obsynth.simulation.signals import Trajectory
 
 #: A table that `Simulation.write_csv` has written: signals of the plant beside time, and no status of rows.
-SIGNALS = FileKind("a table of simulated signals", rb"\Atime,(?!status,)[^\n]*x(hat)?\[")
+SIMULATED_SIGNALS = FileKind("a table of simulated signals", rb"\Atime,(?!status,)[^\n]*x(hat)?\[")
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,7 +221,7 @@ def simulate(
     integrated by Radau IIA (fifth order) with inputs that are constant during each step, whatever its observer uses.
     """
     design, _ = plant_and_recovery(design)
-    for kind, plant_alone in _PLANTS.items():
+    for kind, plant_alone in _PLANT_SIMULATIONS.items():
         if isinstance(design, kind) and scenario is None:
             found: Trajectory = plant_alone(design, **signals)
             return found
@@ -233,7 +233,7 @@ def simulate(
 
 
 #: What simulates a plant alone.
-_PLANTS: dict[type, Callable[..., Trajectory]] = {
+_PLANT_SIMULATIONS: dict[type, Callable[..., Trajectory]] = {
     DescriptorSystem: simulate_plant,
     TimeVaryingDescriptorSystem: simulate_time_varying,
     DAEModel: simulate_dae,

@@ -14,7 +14,7 @@ from obsynth.errors import SpecError
 from obsynth.experiments.monitors.learned_levels import AGES, FORGETTING, HOLD
 from obsynth.exporting.alarms import Alarms
 from obsynth.exporting.realisation import Realisation
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import SMALLEST, FloatArray
 from obsynth.observers.dae.c_code import in_lines
 
 _KEYWORDS = frozenset(
@@ -93,12 +93,10 @@ def with_c_linkage(header: str, prefix: str) -> str:
 #: Matrices with fewer entries are multiplied row by row: nothing is gained by more.
 LARGE_TABLE = 1024
 #: At most this share of entries that are not zero makes a matrix sparse.
-SPARSE_SHARE = 0.25
-#: Least power of a step or ramp.
-_NOTHING = 1e-300
+SPARSE_C_SHARE = 0.25
 #: Columns that are added in one pass over the rows.
 UNROLLED = 4
-PLAIN, ENTRIES, COLUMNS = "plain", "entries", "columns"
+PLAIN, ENTRIES, COLUMNS_MACRO = "plain", "entries", "columns"
 ADVICE = (
     "Compile with -O3, and with -march=native where it runs on the same machine: the products are written so that rows "
     "are independent, and sums keep their order."
@@ -106,13 +104,13 @@ ADVICE = (
 
 
 #: What a row is called in C, as runs call it.
-STATUSES = ("OK", "WARM_UP", "GAP", "RECOVERING", "PARTIAL")
+ROW_STATUSES = ("OK", "WARM_UP", "GAP", "RECOVERING", "PARTIAL")
 
 
 def status_lines(prefix: str) -> list[str]:
     """Return the declaration of what a row is."""
     upper = prefix.upper()
-    listed = ", ".join(f"{upper}_{name}" for name in STATUSES)
+    listed = ", ".join(f"{upper}_{name}" for name in ROW_STATUSES)
     return [
         comment("What a row is: alarms are raised in rows that are OK or PARTIAL, and where levels are passed by more"),
         comment("than a gap can have left in rows that are RECOVERING."),
@@ -232,7 +230,7 @@ def monitor_source(alarms: Alarms, prefix: str) -> str:
         "monitor_flat": straight[:, 0],
         "monitor_slopes": slopes,
         "monitor_early": (shapes - straight).reshape(-1, model.channels),
-        "monitor_weights": 1.0 / np.maximum(powers, _NOTHING),
+        "monitor_weights": 1.0 / np.maximum(powers, SMALLEST),
         "monitor_centres": found.centres[None],
         "monitor_scales": found.scales[None],
     }
@@ -440,7 +438,7 @@ def _form(matrix: FloatArray) -> str:
     """Return how a matrix is multiplied: small ones plainly, by entries where most are zero, else by columns."""
     if matrix.size < LARGE_TABLE:
         return PLAIN
-    return ENTRIES if np.count_nonzero(matrix) <= SPARSE_SHARE * matrix.size else COLUMNS
+    return ENTRIES if np.count_nonzero(matrix) <= SPARSE_C_SHARE * matrix.size else COLUMNS_MACRO
 
 
 def _product(target: str, parts: dict[str, FloatArray]) -> list[str]:
@@ -491,7 +489,7 @@ def _tables(name: str, matrix: FloatArray) -> Iterator[str]:
     form = _form(matrix)
     if form == PLAIN:
         yield from table_lines(name, matrix)
-    elif form == COLUMNS:
+    elif form == COLUMNS_MACRO:
         yield comment("by columns")
         yield from table_lines(name, matrix.T)
     else:
@@ -566,7 +564,7 @@ def template(name: str) -> str:
 
 
 #: A number of a table, or of a line that a macro names.
-_NUMBER = re.compile(r"(?<![\w.\"])-?\d+(?:\.\d+(?:e[+-]?\d+)?|e[+-]?\d+)(?![\w.\"])")
+_WRITTEN_NUMBER = re.compile(r"(?<![\w.\"])-?\d+(?:\.\d+(?:e[+-]?\d+)?|e[+-]?\d+)(?![\w.\"])")
 
 
 def in_precision(text: str, precision: str) -> str:
@@ -576,7 +574,7 @@ def in_precision(text: str, precision: str) -> str:
     rounded = []
     for line in re.sub(r"\bREAL\b", "float", text).split("\n"):
         plain = line.startswith(("#define", "/*", " *"))
-        rounded.append(line if plain else _NUMBER.sub(_as_float, line))
+        rounded.append(line if plain else _WRITTEN_NUMBER.sub(_as_float, line))
     return "\n".join(rounded)
 
 

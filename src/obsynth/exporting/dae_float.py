@@ -22,23 +22,23 @@ from obsynth.results.design import ObserverDesign
 from obsynth.simulation.dae import simulate_dae
 
 #: Newton in floats: a last step whose square is rounding, and a residual of some roundings of its terms.
-LAST_STEP, LARGEST_RESIDUAL = 3e-4, 1e-5
+FLOAT_LAST_STEP, FLOAT_RESIDUAL = 3e-4, 1e-5
 #: A projection that moves no state by more than rounding moves none, and bounds that dependent rows miss are kept.
-PROJECTION_NOTICE, DEPENDENT, SLACK = 1e-4, 1e-5, 1e-4
+FLOAT_PROJECTION_NOTICE, FLOAT_DEPENDENT, FLOAT_SLACK = 1e-4, 1e-5, 1e-4
 #: What is larger has no square in a float.
-OVERFLOW = 1e18
+FLOAT_OVERFLOW = 1e18
 #: Samples of each record that errors are measured on, their seeds, and the samples without outputs.
-SAMPLES, SEEDS = 400, (1, 2)
-MISSING = slice(200, 205)
+RECORD_SAMPLES, SEEDS = 400, (1, 2)
+MISSING_SAMPLES = slice(200, 205)
 #: Errors beyond this share of an estimate's own deviation: single precision does not carry the observer.
-LARGEST_SHARE = 0.5
-_CONSTANTS = {
-    "LAST_STEP": LAST_STEP,
-    "LARGEST_RESIDUAL": LARGEST_RESIDUAL,
-    "PROJECTION_NOTICE": PROJECTION_NOTICE,
-    "DEPENDENT": DEPENDENT,
-    "SLACK": SLACK,
-    "OVERFLOW_LIMIT": OVERFLOW,
+LARGEST_ERROR_SHARE = 0.5
+_FLOAT_CONSTANTS = {
+    "LAST_STEP": FLOAT_LAST_STEP,
+    "LARGEST_RESIDUAL": FLOAT_RESIDUAL,
+    "PROJECTION_NOTICE": FLOAT_PROJECTION_NOTICE,
+    "DEPENDENT": FLOAT_DEPENDENT,
+    "SLACK": FLOAT_SLACK,
+    "OVERFLOW_LIMIT": FLOAT_OVERFLOW,
 }
 _HARNESS = """
 #include "HEADER"
@@ -68,7 +68,7 @@ int run(const float *in, double *out, int samples)
 
 def in_floats(text: str) -> str:
     """Return C with floats in place of doubles; seconds stay doubles, as they are counted up."""
-    for name, value in _CONSTANTS.items():
+    for name, value in _FLOAT_CONSTANTS.items():
         text = re.sub(rf"^#define {name} .*$", f"#define {name} {value!r}f", text, flags=re.MULTILINE)
     lines = [
         line if re.search(r"\b(time|warm_up)\b", line) else re.sub(r"\bdouble\b", "float", line)
@@ -94,7 +94,7 @@ def float_error(design: ObserverDesign, prefix: str, source: str, declared: str)
             with np.errstate(divide="ignore", invalid="ignore"):
                 share = np.where(error > 0.0, error / deviations, 0.0)[1:]
             shares = np.maximum(shares, share.max(axis=0))
-    if not (np.isfinite(worst).all() and (shares <= LARGEST_SHARE).all()):
+    if not (np.isfinite(worst).all() and (shares <= LARGEST_ERROR_SHARE).all()):
         at = int(np.argmax(np.where(np.isfinite(shares), shares, np.inf)))
         raise SpecError(
             f"Single precision does not carry this observer: {names[at]} is off by {worst[at]:.2g}, "
@@ -104,7 +104,7 @@ def float_error(design: ObserverDesign, prefix: str, source: str, declared: str)
     listed = ", ".join(f"{name} {error:.2g}" for name, error in zip(names, worst, strict=True))
     return (
         f"Floats: measured, not proved: the largest error against double precision in {len(SEEDS)} records of "
-        f"{SAMPLES} samples simulated from the design (5 of them missing): {listed}; at most "
+        f"{RECORD_SAMPLES} samples simulated from the design (5 of them missing): {listed}; at most "
         f"{shares.max(initial=0.0):.2g} of an estimate's own standard deviation"
     )
 
@@ -113,7 +113,7 @@ def _record(design: ObserverDesign, seed: int) -> tuple[FloatArray, FloatArray, 
     """Return inputs and outputs, as floats hold them, of the plant with the noise that the observer assumes, and what
     the observer says of them in doubles."""
     model, observer = design.nonlinear
-    u = np.tile(model.nominal_input, (SAMPLES, 1)).reshape(SAMPLES, model.nu)
+    u = np.tile(model.nominal_input, (RECORD_SAMPLES, 1)).reshape(RECORD_SAMPLES, model.nu)
     try:
         found = simulate_dae(
             model,
@@ -127,7 +127,7 @@ def _record(design: ObserverDesign, seed: int) -> tuple[FloatArray, FloatArray, 
             seed=seed,
         )
         y = np.array(found.outputs)
-        y[MISSING] = np.nan
+        y[MISSING_SAMPLES] = np.nan
         u, y = (given.astype(np.float32).astype(np.float64) for given in (u, y))
         return u, y, observer.run(y, u)
     except ObsynthError as error:

@@ -34,8 +34,8 @@ from obsynth.observers.sensor_timing import require_plain
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import gain_set_digest
 
-PRECISIONS = ("double", "float")
-SUFFIXES = (".mat", ".npz", ".c", ".fmu")
+C_PRECISIONS = ("double", "float")
+EXPORT_SUFFIXES = (".mat", ".npz", ".c", ".fmu")
 if TYPE_CHECKING:
     from obsynth.experiments.monitors.monitor import Monitor
     from obsynth.verification.adaptive_bound import AdaptiveBound
@@ -130,8 +130,8 @@ def export(
     require_kind(path, (str, Path), "path", "the name of a file")
     target = Path(path)
     suffix = target.suffix.lower()
-    if suffix not in SUFFIXES:
-        raise SpecError(f"{target} has an unknown suffix: use one of {', '.join(SUFFIXES)}.", path=str(target))
+    if suffix not in EXPORT_SUFFIXES:
+        raise SpecError(f"{target} has an unknown suffix: use one of {', '.join(EXPORT_SUFFIXES)}.", path=str(target))
     if isinstance(design, ObserverDesign):
         require_verified(design, unverified=unverified)
         require_fixed(design, suffix)
@@ -141,7 +141,7 @@ def export(
         raise SpecError("precision is for C (.c): other files hold doubles.", path="precision")
     if monitor is not None and suffix not in (".c", ".fmu"):
         raise SpecError("A monitor is written as C (.c) or in an FMU (.fmu).", path="monitor")
-    numbers = chosen(precision or "double", "precision", PRECISIONS)
+    numbers = chosen(precision or "double", "precision", C_PRECISIONS)
     learned = None if monitor is None else _learned_by(monitor, design)
     if suffix == ".fmu":
         from obsynth.exporting.fmu.archive import write_fmu

@@ -10,9 +10,9 @@ from obsynth.numerics.arrays import FloatArray
 #: Relative rounding of a float, and of a double.
 UNIT = 2.0**-24
 #: Samples whose effects are summed up at most, and what is left of an effect that is over.
-MOST_SAMPLES, OVER = 100_000, 1e-9
+MOST_SUMMED_SAMPLES, OVER = 100_000, 1e-9
 #: Rounds in which an error that feeds on itself has to settle, and by how much it may still grow.
-MOST_ROUNDS, SETTLED = 100, 1e-3
+MOST_ROUNDS, SETTLED_ERROR = 100, 1e-3
 
 
 def float_bounds(found: Realisation) -> FloatArray | None:
@@ -39,16 +39,16 @@ def float_bounds(found: Realisation) -> FloatArray | None:
     for _ in range(MOST_ROUNDS):
         local = unit * (np.abs(transition) @ (size + error) + driven)
         after = gathered @ local
-        if np.all(after <= error * (1.0 + SETTLED)):
-            return np.asarray((1.0 + SETTLED) * (rows @ error + unit * (rows @ (size + error) + through)))
-        error = np.maximum(after, error) * (1.0 + SETTLED)
+        if np.all(after <= error * (1.0 + SETTLED_ERROR)):
+            return np.asarray((1.0 + SETTLED_ERROR) * (rows @ error + unit * (rows @ (size + error) + through)))
+        error = np.maximum(after, error) * (1.0 + SETTLED_ERROR)
     return None
 
 
 def _sum_of_powers(matrix: FloatArray) -> FloatArray | None:
     """Return ``sum |A^k|`` over all k >= 0, from above but for rounding; `None` where it does not end."""
     power, total = np.eye(len(matrix)), np.zeros_like(matrix)
-    for _ in range(MOST_SAMPLES):
+    for _ in range(MOST_SUMMED_SAMPLES):
         with np.errstate(over="ignore", invalid="ignore"):  # an observer that is not stable
             total += np.abs(power)
             power = power @ matrix

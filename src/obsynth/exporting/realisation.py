@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from obsynth.data.linear_log import LEAST_SHOWN, LEFT_SHARE, LinearLogObserver
+from obsynth.data.linear_log import GAP_LEFT_SHARE, LEAST_SHOWN, LinearLogObserver
 from obsynth.errors import SpecError
 from obsynth.methods.handing_on import unverified_mark
 from obsynth.numerics.arguments import require_kind
@@ -147,7 +147,7 @@ class Realisation:
         kept = running.kept_inputs
         return GapTables(
             plant.nf, told, kept, moving.nx, len(running.seen), True, running.solver is not None, tables,
-            LEFT_SHARE, LEAST_SHOWN,
+            GAP_LEFT_SHARE, LEAST_SHOWN,
         )  # fmt: skip
 
     @property

@@ -16,7 +16,7 @@ from typing import Any, TextIO
 from obsynth.errors import SpecError
 
 #: Documents larger than this are refused: matrices of that size belong in matrix files.
-MAXIMUM_CHARACTERS = 32_000_000
+MOST_DOCUMENT_CHARACTERS = 32_000_000
 #: Half of a pair of characters, which no file can hold; as JSON writes it, and as text.
 _HALF_CHARACTER = re.compile(r"\\u[dD][89a-fA-F]|[\ud800-\udfff]")
 #: What a path can be that is neither a file nor a folder.
@@ -98,7 +98,7 @@ def input_file(path: Path, *, where: str | None = None, is_protected: bool = Tru
 
 
 def read_text(
-    path: Path, *, where: str | None = None, is_protected: bool = True, most: int = MAXIMUM_CHARACTERS
+    path: Path, *, where: str | None = None, is_protected: bool = True, most: int = MOST_DOCUMENT_CHARACTERS
 ) -> str:
     """Return the text of a UTF-8 file of at most ``most`` characters."""
     place = where or str(path)
@@ -120,7 +120,7 @@ def read_text(
 
 
 def read_json(
-    path: Path, *, where: str | None = None, is_protected: bool = True, most: int = MAXIMUM_CHARACTERS
+    path: Path, *, where: str | None = None, is_protected: bool = True, most: int = MOST_DOCUMENT_CHARACTERS
 ) -> Any:
     """Return a JSON document: no NaN, no whole number beyond the range of floats, no key twice, no half characters."""
     place = where or str(path)

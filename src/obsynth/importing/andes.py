@@ -129,7 +129,7 @@ def _dense(matrix: Any) -> FloatArray:
 
 
 #: Devices that a message lists.
-_SHOWN = 12
+_LISTED_DEVICES = 12
 
 
 def _names(picked: Picked, known: Sequence[str], what: str) -> list[str]:
@@ -143,7 +143,7 @@ def _names(picked: Picked, known: Sequence[str], what: str) -> list[str]:
         own = [name.removesuffix(f" {device}") for name in known if name.endswith(f" {device}")]
         if not own:
             devices = list(dict.fromkeys(name.partition(" ")[2] for name in known))
-            shown = ", ".join(devices[:_SHOWN]) + (", ..." if len(devices) > _SHOWN else "")
+            shown = ", ".join(devices[:_LISTED_DEVICES]) + (", ..." if len(devices) > _LISTED_DEVICES else "")
             raise SpecError(f"{what}: the network has no device {device!r}; it has {shown}.", path=what)
         for variable in variables:
             if variable not in own:

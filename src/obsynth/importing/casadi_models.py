@@ -11,7 +11,7 @@ from obsynth.numerics.libraries import imported
 from obsynth.plants.dae.model import DAEModel
 
 #: What goes in and what comes out, by the names that CasADi's integrators have; y is ours.
-INPUTS, OUTPUTS = ("x", "z", "u", "p"), ("ode", "alg", "y")
+INTEGRATOR_INPUTS, OUTPUTS = ("x", "z", "u", "p"), ("ode", "alg", "y")
 
 
 def from_casadi(
@@ -61,7 +61,7 @@ def from_casadi(
     for given, name in ((states, "states"), (inputs, "inputs"), (parameters, "parameters")):
         require_mapping(given, name)
     function = _function(casadi, system)
-    taken = {name: function.size1_in(name) if name in function.name_in() else 0 for name in INPUTS}
+    taken = {name: function.size1_in(name) if name in function.name_in() else 0 for name in INTEGRATOR_INPUTS}
     made = {name: function.size1_out(name) if name in function.name_out() else 0 for name in OUTPUTS}
     nx, nz = taken["x"], taken["z"]
     for what, count, wanted in (
@@ -103,13 +103,13 @@ def from_casadi(
 def _function(casadi: Any, system: Any) -> Any:
     """Return a Function with our names; raise `SpecError` for what is none."""
     if isinstance(system, Mapping):
-        unknown = [key for key in system if key not in (*INPUTS, *OUTPUTS)]
+        unknown = [key for key in system if key not in (*INTEGRATOR_INPUTS, *OUTPUTS)]
         if unknown:
             raise SpecError(
-                f"system has the unknown key {unknown[0]!r}; there are: {', '.join((*INPUTS, *OUTPUTS))}.",
+                f"system has the unknown key {unknown[0]!r}; there are: {', '.join((*INTEGRATOR_INPUTS, *OUTPUTS))}.",
                 path="system",
             )
-        names = [name for name in INPUTS if name in system]
+        names = [name for name in INTEGRATOR_INPUTS if name in system]
         results = [name for name in OUTPUTS if name in system]
         try:
             made = casadi.Function("plant", [system[n] for n in names], [system[n] for n in results], names, results)
@@ -118,10 +118,10 @@ def _function(casadi: Any, system: Any) -> Any:
         return made
     if not isinstance(system, casadi.Function):
         raise SpecError(f"system is {shown(system)}: give a casadi.Function, or a dictionary.", path="system")
-    unknown = [name for name in (*system.name_in(), *system.name_out()) if name not in (*INPUTS, *OUTPUTS)]
+    unknown = [name for name in (*system.name_in(), *system.name_out()) if name not in (*INTEGRATOR_INPUTS, *OUTPUTS)]
     if unknown:
         raise SpecError(
-            f"The Function has an input or output {unknown[0]!r}: name them {', '.join(INPUTS)} and "
+            f"The Function has an input or output {unknown[0]!r}: name them {', '.join(INTEGRATOR_INPUTS)} and "
             f"{', '.join(OUTPUTS)}.", path="system",
         )  # fmt: skip
     return system

@@ -221,7 +221,7 @@ class Instance:
 
 
 #: Newton steps towards an equilibrium.
-_NEWTON_STEPS = 50
+_EQUILIBRIUM_STEPS = 50
 #: A derivative counts as zero when it is this small next to the terms it is the sum of.
 _AT_REST = 1e-8
 
@@ -370,7 +370,7 @@ def _used(known: Sequence[str], picked: Sequence[str] | None, what: str) -> list
 def _equilibrium(instance: Instance, states: FloatArray) -> FloatArray:
     """Return the states at which the derivatives vanish, by Newton with halved steps."""
     rates = instance.derivatives()
-    for _ in range(_NEWTON_STEPS):
+    for _ in range(_EQUILIBRIUM_STEPS):
         a = instance.jacobians([], [])[0]
         if _is_rest(rates, a, states, np.zeros(len(states))):
             return states

@@ -18,16 +18,16 @@ from obsynth.numerics.arguments import number_in_text
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.descriptor import DescriptorSystem
 
-_MATRICES = ("E", "A", "B", "C", "D")
+_MODEL_MATRICES = ("E", "A", "B", "C", "D")
 _MORE = ("Bf", "Df", "Bd", "Dd", "Bw", "Dw")
 # What MATLAB's state-space objects call them, and what obsynth does.
-_NAMES = {
+_MATLAB_NAMES = {
     "StateName": "state_names",
     "InputName": "input_names",
     "OutputName": "output_names",
     **{f"{kind}_names": f"{kind}_names" for kind in ("state", "input", "output", "fault", "disturbance", "noise")},
 }
-_TIMES = ("Ts", "dt")
+_SAMPLE_TIME_NAMES = ("Ts", "dt")
 
 
 def from_matlab(
@@ -72,18 +72,20 @@ def from_matlab(
         raise SpecError(
             f"{source} has no matrix A{_in(variable)}; it has: {', '.join(fields) or 'nothing'}.", path=str(source)
         )
-    times = [float(np.squeeze(fields[name])) for name in _TIMES if name in fields and np.size(fields[name]) == 1]
+    times = [
+        float(np.squeeze(fields[name])) for name in _SAMPLE_TIME_NAMES if name in fields and np.size(fields[name]) == 1
+    ]
     if dt is None and not times:
         raise SpecError(
             f"{source} does not say the sampling time (Ts): give dt in seconds, or 0 for continuous time.", path="dt"
         )
     if dt is not None and times and dt != times[0]:
         raise SpecError(f"dt is {dt}, but {source} has {times[0]:g}: leave dt out.", path="dt")
-    names = {ours: _texts(fields[theirs]) for theirs, ours in _NAMES.items() if theirs in fields}
+    names = {ours: _texts(fields[theirs]) for theirs, ours in _MATLAB_NAMES.items() if theirs in fields}
     labels = {ours: names.pop(ours, None) for ours in ("state_names", "input_names", "output_names")}
-    given = {name: _dense(fields[name]) for name in (*_MATRICES, *_MORE) if name in fields}
+    given = {name: _dense(fields[name]) for name in (*_MODEL_MATRICES, *_MORE) if name in fields}
     return plant_of(
-        {name: given[name] for name in _MATRICES if name in given and np.size(given[name])},
+        {name: given[name] for name in _MODEL_MATRICES if name in given and np.size(given[name])},
         {**{name: given[name] for name in _MORE if name in given}, **names, **plant},
         labels=labels,
         dt=times[0] if dt is None else dt,
@@ -148,7 +150,7 @@ def _texts(value: Any) -> list[str] | None:
 
 
 _SIZE = re.compile(r"parameter\s+Integer\s+([nmp])\s*=\s*(\d+)")
-_MATRIX = re.compile(r"parameter\s+Real\s+([ABCD])\s*\[[^\]]*\]\s*=\s*(\[[^\]]*\]|zeros\([^)]*\))\s*;")
+_MODELICA_MATRIX = re.compile(r"parameter\s+Real\s+([ABCD])\s*\[[^\]]*\]\s*=\s*(\[[^\]]*\]|zeros\([^)]*\))\s*;")
 _POINT = re.compile(r"parameter\s+Real\s+([xu])0\s*\[[^\]]*\]\s*=\s*(\{[^}]*\}|zeros\([^)]*\)|fill\([^)]*\))\s*;")
 _ALIAS = re.compile(r"Real\s+'([xuy])_([^']*)'\s*=\s*([xuy])\[(\d+)\]\s*;")
 # OpenModelica makes outputs that are states into states of their own name.
@@ -188,7 +190,7 @@ def from_modelica(path: str | Path, **plant: Any) -> DescriptorSystem:
         raise SpecError(f"{source} cannot be read: {os.strerror(errno.ENOENT)}.", path=str(source))
     text = re.sub(r"//[^\n]*|/\*.*?\*/", "", read_text(source), flags=re.DOTALL)
     sizes = {name: int(count) for name, count in _SIZE.findall(text)}
-    found = {name: body for name, body in _MATRIX.findall(text)}
+    found = {name: body for name, body in _MODELICA_MATRIX.findall(text)}
     missing = [name for name in ("n", "m", "p") if name not in sizes] + [name for name in "ABCD" if name not in found]
     if missing:
         raise SpecError(

@@ -13,7 +13,7 @@ from obsynth.importing.roles import plant_of
 from obsynth.numerics.arguments import is_finite_number, require_mapping
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.libraries import imported
-from obsynth.plants.descriptor import MATRICES, SIGNAL_NAMES, DescriptorSystem
+from obsynth.plants.descriptor import ALL_MATRICES, SIGNAL_NAMES, DescriptorSystem
 from obsynth.plants.validation import suggestion
 
 
@@ -158,7 +158,7 @@ def from_sympy(
     sympy = imported("sympy", extra="sympy")
     require_mapping(parameters, "parameters")
     given = {"A": A, "B": B, "C": C, **plant}
-    symbolic = {name: sympy.Matrix(given[name]) for name in MATRICES if _is_symbolic(given.get(name), sympy)}
+    symbolic = {name: sympy.Matrix(given[name]) for name in ALL_MATRICES if _is_symbolic(given.get(name), sympy)}
     free = {str(symbol) for matrix in symbolic.values() for symbol in matrix.free_symbols}
     values = {str(name): value for name, value in (parameters or {}).items()}
     _require_values(free, values)

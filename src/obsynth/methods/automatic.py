@@ -22,7 +22,7 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
 
 #: An estimate that shows 90 % of a step later than this share of the plant's settling time comes after faster ones.
-SLOW = 0.25
+SLOW_ESTIMATE = 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +43,7 @@ class Candidate:
             return (2.0, 0.0, 0.0, np.inf)
         missed = float(not all(found.reaches for found in self.figures))
         coupled = float(has_unknown_inputs and any(found.leak > DECOUPLED for found in self.figures))
-        slow = float(any(found.most > SLOW * settling for found in self.figures))
+        slow = float(any(found.most > SLOW_ESTIMATE * settling for found in self.figures))
         dt = self.observer.dt if self.observer is not None else 0.0
         # A mean over time T divides noise by the root of T: it cannot change deviation times the root of delay.
         prices = [found.deviation * np.sqrt(max(found.most, dt)) for found in self.figures]
@@ -112,7 +112,7 @@ def linear_methods() -> Sequence[type[Method]]:
 
 
 #: Samples of the plant's settling time, and how many settling times figures look ahead.
-SAMPLES, SETTLING_TIMES, MOST_FIGURE_SAMPLES = 200, 8, 2000
+SETTLING_SAMPLES, SETTLING_TIMES, MOST_FIGURE_SAMPLES = 200, 8, 2000
 
 
 Maker = Callable[[Any, str, Mapping[str, Any]], ObserverDesign]
@@ -176,7 +176,7 @@ def _chosen(
 
 def designed(plant: DescriptorSystem, options: Mapping[str, Any], methods: list[str], maker: Maker) -> list[Candidate]:
     """Return every method for a plant in its own time, with figures on one clock."""
-    step = plant.dt if plant.dt > 0.0 else settling_time(plant) / SAMPLES
+    step = plant.dt if plant.dt > 0.0 else settling_time(plant) / SETTLING_SAMPLES
     steps = int(min(max(SETTLING_TIMES * settling_time(plant) / step, 50), MOST_FIGURE_SAMPLES))
     try:
         sampled = on_the_clock(plant, step)

@@ -21,14 +21,14 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.simulation.linear import stabilising_feedback
 
 #: Shares of a step at which its delay is read.
-HALF, NEARLY_ALL = 0.5, 0.9
+DELAY_SHARE, NEARLY_ALL = 0.5, 0.9
 #: A fault estimate off its step by more than this at the horizon did not reach it.
-REACHED = 0.1
+REACHED_STEP = 0.1
 #: Peak gain from an unknown input to a fault estimate, in fault per input, above which it is not decoupled.
 DECOUPLED = 1e-3
 #: An unstable plant that grows by more than this is held by a feedback; one without inputs is followed until it has
 #: grown by the second, beyond which differences of its outputs are rounding.
-GROWTH, LARGEST_STEP_GROWTH = 1e3, 1e6
+HELD_GROWTH, LARGEST_STEP_GROWTH = 1e3, 1e6
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class FaultFigures:
     @property
     def reaches(self) -> bool:
         """Whether a step is there at the horizon."""
-        return abs(self.at_horizon - 1.0) <= REACHED and np.isfinite(self.most)
+        return abs(self.at_horizon - 1.0) <= REACHED_STEP and np.isfinite(self.most)
 
 
 def on_the_clock(plant: DescriptorSystem, sample_time: float) -> DescriptorSystem:
@@ -85,7 +85,7 @@ def held(plant: DescriptorSystem, steps: int) -> Held:
     """Return what holds a sampled plant ``(E = I)``: nothing where it hardly grows; with no input, a shorter time."""
     nothing = np.zeros((plant.nu, plant.nx))
     rate = float(np.log(max(float(np.max(np.abs(np.linalg.eigvals(plant.A)), initial=0.0)), 1.0)))
-    if rate * steps <= np.log(GROWTH):
+    if rate * steps <= np.log(HELD_GROWTH):
         return Held(nothing, steps)
     try:
         found = stabilising_feedback(plant)
@@ -142,7 +142,7 @@ def _figures(
         gains = np.abs(np.fft.rfft(unknown[:, row], axis=0))
         yield FaultFigures(
             name,
-            _first(own >= HALF, plant.dt),
+            _first(own >= DELAY_SHARE, plant.dt),
             _first(own >= NEARLY_ALL, plant.dt),
             float(own[-1]),
             float(np.max(np.abs(own))),

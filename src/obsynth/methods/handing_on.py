@@ -7,7 +7,7 @@ from obsynth.results.design import ObserverDesign
 from obsynth.results.verification_report import VerificationReport
 
 #: Checks that a mark names; the others are counted.
-_MOST_NAMED = 4
+_MOST_NAMED_CHECKS = 4
 
 
 def unverified_mark(report: VerificationReport) -> str:
@@ -17,8 +17,10 @@ def unverified_mark(report: VerificationReport) -> str:
     names = [check.name for check in report.failures]
     if not names:
         return "UNVERIFIED: no check was made"
-    more = f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else ""
-    return f"UNVERIFIED: {len(names)} of {len(report.checks)} checks FAIL: {', '.join(names[:_MOST_NAMED])}{more}"
+    more = f" and {len(names) - _MOST_NAMED_CHECKS} more" if len(names) > _MOST_NAMED_CHECKS else ""
+    return (
+        f"UNVERIFIED: {len(names)} of {len(report.checks)} checks FAIL: {', '.join(names[:_MOST_NAMED_CHECKS])}{more}"
+    )
 
 
 def require_verified(design: ObserverDesign, *, unverified: bool = False) -> None:

@@ -112,11 +112,11 @@ def _nothing(plant: DescriptorSystem) -> str:
 #: Share of a unit fault that rounding of the outputs may be of its estimate.
 LARGEST_ROUNDED_SHARE = 0.1
 #: Share of a unit fault from which on rounding of the observer's own numbers is told.
-TOLD = 1e-6
+TOLD_ROUNDING = 1e-6
 #: Observers of more states are not examined: their certificates bound what rounding of their numbers does.
 MOST_OBSERVER_STATES = 150
 #: Points at which that is judged, in continuous time in units of the plant's own rate.
-POINTS = (0.0, 1e-2, 1e-1, 1.0)
+ROUNDING_POINTS = (0.0, 1e-2, 1e-1, 1.0)
 
 
 def require_above_rounding(plant: DescriptorSystem, observer: LinearObserver) -> None:
@@ -198,7 +198,7 @@ def rounding_notes(plant: DescriptorSystem, observer: LinearObserver) -> tuple[s
             f" by {share:.2g} of the fault, and by more at some frequencies. State the noise of the sensors, or ask "
             "for a larger gamma."
             for name, share in zip(plant.fault_names, found, strict=True)
-            if share >= TOLD
+            if share >= TOLD_ROUNDING
         )
     )
 
@@ -221,10 +221,10 @@ def _least(plant: DescriptorSystem, observer: LinearObserver, *, own: bool) -> F
 
 def _points(plant: DescriptorSystem) -> list[complex]:
     if plant.is_discrete:
-        return [complex(np.exp(1j * point)) for point in POINTS]
+        return [complex(np.exp(1j * point)) for point in ROUNDING_POINTS]
     sizes = np.linalg.norm(plant.E), np.linalg.norm(plant.A)
     rate = float(sizes[1] / sizes[0]) if all(sizes) else 1.0
-    return [complex(0.0, rate * point) for point in POINTS]
+    return [complex(0.0, rate * point) for point in ROUNDING_POINTS]
 
 
 def _responses(

@@ -29,7 +29,7 @@ __all__ = [
 #: What a spec and `obsynth.design` call the choice between all methods that exist.
 AUTO = "auto"
 Plant: TypeAlias = DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel
-_KINDS: Mapping[PlantKind, tuple[type, str]] = {
+_PLANT_KINDS: Mapping[PlantKind, tuple[type, str]] = {
     "time-invariant": (DescriptorSystem, "a linear plant with constant matrices"),
     "time-varying": (TimeVaryingDescriptorSystem, "a linear plant whose matrices change with k"),
     "nonlinear": (DAEModel, "a nonlinear DAEModel"),
@@ -68,7 +68,7 @@ def methods_for(kind: PlantKind) -> tuple[str, ...]:
 
 def kind_of(plant: Any) -> PlantKind:
     """Return the kind of a plant; raise `SpecError` for anything else."""
-    for kind, (plant_type, _) in _KINDS.items():
+    for kind, (plant_type, _) in _PLANT_KINDS.items():
         if isinstance(plant, plant_type):
             return kind
     raise SpecError(
@@ -83,7 +83,7 @@ def kind_conditions(plant: Plant, method: type[Method]) -> tuple[Condition, ...]
     kind = kind_of(plant)
     if kind in method.plants:
         return ()
-    wanted = " or ".join(_KINDS[taken][1] for taken in method.plants)
+    wanted = " or ".join(_PLANT_KINDS[taken][1] for taken in method.plants)
     return (
         Condition(
             "kind of plant",
@@ -92,6 +92,6 @@ def kind_conditions(plant: Plant, method: type[Method]) -> tuple[Condition, ...]
             0.0,
             1.0,
             method.id,
-            f"{_KINDS[kind][1]}; methods for such plants are: {', '.join(methods_for(kind))}.",
+            f"{_PLANT_KINDS[kind][1]}; methods for such plants are: {', '.join(methods_for(kind))}.",
         ),
     )

@@ -186,9 +186,9 @@ def normalising_change(p: FloatArray) -> FloatArray:
 
 #: Shares of the decay that the Lyapunov function is asked to show, largest first: more makes a tighter fit to the slow
 #: modes and a larger condition number.
-SHARES = (0.9, 0.5, 0.99, 0.0)
+DECAY_SHARES = (0.9, 0.5, 0.99, 0.0)
 #: Times the equation is solved again in the coordinates of its last solution.
-ROUNDS = 3
+COORDINATE_ROUNDS = 3
 
 
 def lyapunov_factor(a: FloatArray, dt: float) -> FloatArray:
@@ -198,7 +198,10 @@ def lyapunov_factor(a: FloatArray, dt: float) -> FloatArray:
     edge = abscissa(a, dt)
     if n == 0 or not edge < (1.0 if dt > 0.0 else 0.0):
         return best
-    ways = (partial(_factor, a, dt, share, rounds, edge) for rounds, share in product(range(1, ROUNDS + 1), SHARES))
+    ways = (
+        partial(_factor, a, dt, share, rounds, edge)
+        for rounds, share in product(range(1, COORDINATE_ROUNDS + 1), DECAY_SHARES)
+    )
     for way in chain(ways, [partial(_modal_factor, a)]):
         found = way()
         if found is None:

@@ -15,7 +15,7 @@ from obsynth.numerics.arrays import FloatArray, read_only
 #: Longest memory that is tried, and rows that each coefficient of an equation needs.
 MOST_ORDER, ROWS_PER_COEFFICIENT = 12, 20
 #: A fit forgets at least so fast: one that does not is shrunk by steps of the second number.
-SLOWEST, SHRINKING = 0.999, 0.99
+SLOWEST_FIT, SHRINKING = 0.999, 0.99
 #: Shares of the mean variance that are added so that nothing is singular: to regressors, and to what is left.
 REGRESSOR_SHARE, NOISE_SHARE = 1e-10, 1e-12
 
@@ -111,7 +111,7 @@ def _stable(a: FloatArray) -> FloatArray:
     powers = SHRINKING ** np.arange(1, p + 1)[:, None, None]
     while p:
         companion = np.vstack([np.hstack(list(a)), np.eye((p - 1) * m, p * m)])
-        if np.abs(np.linalg.eigvals(companion)).max() < SLOWEST:
+        if np.abs(np.linalg.eigvals(companion)).max() < SLOWEST_FIT:
             break
         a = a * powers
     return a

@@ -24,8 +24,8 @@ SETTLED_STEPS = 3
 Function = TypeVar("Function", bound=Callable[..., object])
 
 #: Types of `square_root_steps`, so that it is compiled once for all sizes.
-VECTOR, MATRIX, STACK = "float64[::1]", "float64[:, ::1]", "float64[:, :, ::1]"
-SIGNATURE = f"int64({', '.join([VECTOR, MATRIX, *[STACK] * 3, *[MATRIX] * 4, STACK, 'float64'])})"
+VECTOR, MATRIX_TYPE, STACK_TYPE = "float64[::1]", "float64[:, ::1]", "float64[:, :, ::1]"
+SIGNATURE = f"int64({', '.join([VECTOR, MATRIX_TYPE, *[STACK_TYPE] * 3, *[MATRIX_TYPE] * 4, STACK_TYPE, 'float64'])})"
 
 
 def compiled(function: Function, signature: str | None = None) -> Function:

@@ -66,7 +66,7 @@ INTERVALS_PER_LENGTH = 64
 #: First length, in units of one over the norm of A.
 FIRST_LENGTH = 0.02
 #: The intervals end when no more than this share of the response can be left.
-LEFT_SHARE = 1e-4
+RESPONSE_LEFT_SHARE = 1e-4
 #: Doublings of the length before the response is held to have ended.
 MOST_LENGTHS = 60
 
@@ -99,7 +99,7 @@ def peak_gain(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
             # Each further stretch as long as all so far: the response of what is left of the columns of b.
             per_state = float(np.linalg.norm(total[inputs:]))
             left = per_state * np.linalg.norm(columns[:, :inputs], axis=0) / (1.0 - contraction)
-            if np.all(left <= LEFT_SHARE * total[:inputs]):
+            if np.all(left <= RESPONSE_LEFT_SHARE * total[:inputs]):
                 return np.asarray(total[:inputs] + left)
         step, transition = 2.0 * step, transition @ transition
     raise SpecError("Errors of the observer decay too slowly for a bound on its residual.", path="observer")

@@ -112,14 +112,14 @@ class Lifts:
 DOUBLING_TOLERANCE = 1e-14
 STAGNATION = 1e-9
 #: Below this change, that of the next step is told from the last two; and when it is far below rounding.
-SETTLED = 1e-8
-NOTHING = 1e-18
+SETTLED_CHANGE = 1e-8
+FAR_BELOW_ROUNDING = 1e-18
 #: Residual of a Riccati equation that counts as solved, relative to its terms.
 EQUATION_TOLERANCE = 1e-8
 MOST_DOUBLINGS = 60
 #: A change larger than the solution, after the first steps, is a jump through infinity: where a stabilising solution
 #: exists there was none (1,253 equations of random plants).
-FIRST_STEPS, LARGE_CHANGE, MOST_JUMPS = 8, 1.5, 1
+FIRST_DOUBLINGS, LARGE_CHANGE, MOST_JUMPS = 8, 1.5, 1
 #: Eigenvalues that are smaller than the largest by more than this share do not set the rate of a Cayley transform.
 WIDEST_SPECTRUM = 1e-3
 #: Keeps that rate off an eigenvalue, which a single one would be.
@@ -129,7 +129,7 @@ REFUTED = 1e-6
 #: Norm of the dynamics above which a level is not refuted by doubling.
 LARGEST_TRUSTED_NORM = 10.0
 #: Keeps a division by the size of a zero solution from failing.
-SMALLEST = float(np.finfo(np.float64).tiny)
+LEAST_POSITIVE = float(np.finfo(np.float64).tiny)
 
 
 def doubled_riccati_solution(
@@ -166,7 +166,7 @@ def continuous_riccati_solution(
         return np.zeros((0, 0))
     sizes = np.abs(np.linalg.eigvals(a))
     # In the middle of the eigenvalues, on a logarithmic scale: both ends are as slow.
-    largest = max(float(sizes.max()), SMALLEST)
+    largest = max(float(sizes.max()), LEAST_POSITIVE)
     rate = RATE_OFFSET * math.sqrt(largest * max(float(sizes.min()), WIDEST_SPECTRUM * largest))
     shown = c.T @ np.linalg.solve(measured, c)
     try:
@@ -213,15 +213,15 @@ def _doubled(
             size = math.sqrt(np.vdot(full, full))
             if not math.isfinite(size):
                 return None
-            error, last = math.sqrt(np.vdot(changed, changed)) / max(size, SMALLEST), error
-            jumps += step >= FIRST_STEPS and error > LARGE_CHANGE
+            error, last = math.sqrt(np.vdot(changed, changed)) / max(size, LEAST_POSITIVE), error
+            jumps += step >= FIRST_DOUBLINGS and error > LARGE_CHANGE
             if jumps > most_jumps:
                 return None
             # Rounding leaves changes that shrink no more; small ones are as good as none.
             if error <= DOUBLING_TOLERANCE or last <= error <= STAGNATION:
                 return full
             # Each step squares the change, up to a factor that the last two show: the next adds nothing.
-            if error <= SETTLED and error * max(error, (error / last) ** 2) <= NOTHING:
+            if error <= SETTLED_CHANGE and error * max(error, (error / last) ** 2) <= FAR_BELOW_ROUNDING:
                 return full
     return None
 

@@ -54,7 +54,7 @@ FUNCTIONS: Mapping[str, Callable[[Any], Any]] = {
 }
 #: Functions of two arguments.
 FUNCTIONS_OF_TWO: Mapping[str, Callable[[Any, Any], Any]] = {"min": np.minimum, "max": np.maximum}
-CONSTANTS: Mapping[str, float] = {"pi": float(np.pi)}
+NAMED_NUMBERS: Mapping[str, float] = {"pi": float(np.pi)}
 #: What may stand in the first place of ``where``.
 COMPARISONS: Mapping[str, Callable[[Any, Any], Any]] = {
     "<": np.less,
@@ -179,8 +179,8 @@ class _Parser:
             return lambda values, _: number
         if self.take("("):
             return self.function(token)
-        if token in CONSTANTS:
-            constant = CONSTANTS[token]
+        if token in NAMED_NUMBERS:
+            constant = NAMED_NUMBERS[token]
             return lambda values, _: constant
         self.names.add(token)
         return lambda values, _: values[token]

@@ -28,7 +28,7 @@ SUSPECT_COLUMN = RANK_TOLERANCE
 #: must lie above `PERFECT_PARITY`, or rounding passes for noise.
 SUSPECT_PARITY = 1e-12
 #: Columns that LAPACK's ``tpqrt`` treats at once.
-BLOCK = 32
+TPQRT_BLOCK = 32
 #: Room for each column that LAPACK's factorisations are given: more than any of their blocks takes.
 WORK = 64
 #: Noise-free parity directions must vanish to this share of their terms; rounding of data in double precision.
@@ -96,7 +96,7 @@ def projected_step(
     if known is None:
         triangle = lapack.dgeqrf(noise, overwrite_a=1)[0]
     else:
-        triangle = lapack.dtpqrt(0, min(BLOCK, rows), known, np.asfortranarray(noise), overwrite_b=1)[0]
+        triangle = lapack.dtpqrt(0, min(TPQRT_BLOCK, rows), known, np.asfortranarray(noise), overwrite_b=1)[0]
     right = np.empty((n, columns + n), order="F")
     innovation = data[:m]
     if m:

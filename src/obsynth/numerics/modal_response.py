@@ -143,7 +143,7 @@ class ModalResponse:
 #: one more look, a missed one would cost the bound.
 CIRCLE_TOLERANCE = 1e-3
 #: Reciprocal condition number down to which a matrix may be inverted on the way to those eigenvalues.
-SAFE_CONDITION = 1e-7
+SAFE_RECIPROCAL_CONDITION = 1e-7
 
 
 def level_crossings(
@@ -183,7 +183,7 @@ def _pencil_eigenvalues(right: FloatArray, left: FloatArray) -> tuple[ComplexArr
     for sign in (1.0, -1.0):
         both = np.asarray_chkfinite(right + sign * left)
         factors, pivots, failed = dgetrf(both)
-        if not failed and dgecon(factors, np.max(np.sum(np.abs(both), axis=0)))[0] > SAFE_CONDITION:
+        if not failed and dgecon(factors, np.max(np.sum(np.abs(both), axis=0)))[0] > SAFE_RECIPROCAL_CONDITION:
             s = np.linalg.eigvals(dgetrs(factors, pivots, right - sign * left)[0])
             return np.asarray(sign * (1.0 + s), dtype=np.complex128), np.asarray(1.0 - s, dtype=np.complex128)
     alpha, size = pencil_eigenvalues(right, left)

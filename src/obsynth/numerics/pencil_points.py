@@ -14,14 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.numerics.arrays import ComplexArray, FloatArray
-from obsynth.numerics.least_squares_step import BLOCK
+from obsynth.numerics.least_squares_step import TPQRT_BLOCK
 from obsynth.numerics.ranks import RANK_TOLERANCE, RankDecision, rank_from
 from obsynth.numerics.scaling import EquilibratedPencil
 
 #: Matrices with fewer columns are decomposed as a whole.
 FEW_COLUMNS = 80
 #: Steps of inverse iteration: values that decide are smaller than the next by many digits, and each step squares that.
-INVERSE_STEPS = 4
+NULL_DIRECTION_STEPS = 4
 
 
 class SmallestSingular(NamedTuple):
@@ -58,7 +58,7 @@ def iterated(triangle: NDArray[Any], count: int) -> SmallestSingular:
     diagonal[small] = np.finfo(float).eps * norm
     basis = np.random.default_rng(0).normal(size=(size, count)).astype(work.dtype)
     with np.errstate(over="ignore", invalid="ignore"):
-        for _ in range(INVERSE_STEPS):
+        for _ in range(NULL_DIRECTION_STEPS):
             inner = solve_triangular(work, basis, trans="C", check_finite=False)
             inner /= np.max(np.abs(inner), axis=0, initial=0.0) + np.finfo(float).tiny
             basis = np.linalg.qr(solve_triangular(work, inner, check_finite=False))[0]
@@ -67,13 +67,15 @@ def iterated(triangle: NDArray[Any], count: int) -> SmallestSingular:
 
 
 #: Above this condition of its leading part the Schur basis is not orthonormal enough to judge the pencil in it.
-SAFE_CONDITION = 1e5
+SAFE_BASIS_CONDITION = 1e5
+#: Points without meaning, at which a pencil has its normal rank; where several are tried, the clearest is used.
+GENERIC_POINTS = (0.7391, -1.3247, 1.9561, -0.4142)
 #: Most null directions that are looked for at a point.
 MOST_DIRECTIONS = 4
 #: Steps in which a computed zero is improved before the pencil there is judged.
-NEWTON_STEPS = 4
+ZERO_STEPS = 4
 #: A zero that moves further than this, relative to its size or one, is another one.
-NEWTON_REACH = 1e-2
+ZERO_REACH = 1e-2
 
 
 class PencilPoints:
@@ -111,7 +113,7 @@ class PencilPoints:
         if self.nullity(point):
             return point
         place = point
-        for _ in range(NEWTON_STEPS):
+        for _ in range(ZERO_STEPS):
             matrix = self.A - place * self.E
             left, _, right = np.linalg.svd(matrix, full_matrices=False)
             u, v = left[:, -1].conj(), right[-1].conj()
@@ -119,7 +121,7 @@ class PencilPoints:
             if slope == 0.0:
                 return None
             place = place + (u @ matrix @ v) / slope
-            if not abs(place - point) <= NEWTON_REACH * max(1.0, abs(point)):
+            if not abs(place - point) <= ZERO_REACH * max(1.0, abs(point)):
                 return None
             if self.nullity(place):
                 return complex(place.real, place.imag if point.imag else 0.0)
@@ -134,7 +136,7 @@ class PencilPoints:
         basis, square = np.linalg.qr(self.E, mode="complete")
         turned, top = basis.T @ self.A, square[:columns]
         sizes = np.linalg.svd(top, compute_uv=False)
-        if not sizes[-1] * SAFE_CONDITION > sizes[0]:
+        if not sizes[-1] * SAFE_BASIS_CONDITION > sizes[0]:
             return None
         t, u = rsf2csf(*schur(np.linalg.solve(top, turned[:columns]), check_finite=False))
         # The leading part is divided by E; the rows below are brought to its size.
@@ -149,7 +151,7 @@ class PencilPoints:
         below = np.array(schur[2] if schur else self.E, dtype=np.complex128, order="F")
         if not below.shape[0]:
             return triangle
-        found, _, _, _ = ztpqrt(0, min(BLOCK, triangle.shape[0]), triangle, below, overwrite_a=1, overwrite_b=1)
+        found, _, _, _ = ztpqrt(0, min(TPQRT_BLOCK, triangle.shape[0]), triangle, below, overwrite_a=1, overwrite_b=1)
         return np.triu(found)
 
 

@@ -27,7 +27,7 @@ from obsynth.numerics.scaling import equilibrate_pencil
 
 #: From so many states on, a well-conditioned E is inverted: ordinary eigenvalues take a fraction of the time.
 STATES_FOR_INVERTED_E = 100
-SAFE_CONDITION = 1e5
+SAFE_E_CONDITION = 1e5
 #: An eigenvalue belongs to the closest of others unless a second one is not further away than this many times that.
 TIE = 4.0
 
@@ -245,7 +245,7 @@ def _safe_inverse(E: FloatArray) -> FloatArray | None:
         inverse = np.linalg.inv(E)
     except np.linalg.LinAlgError:
         return None
-    return np.asarray(inverse) if float(np.linalg.norm(E) * np.linalg.norm(inverse)) <= SAFE_CONDITION else None
+    return np.asarray(inverse) if float(np.linalg.norm(E) * np.linalg.norm(inverse)) <= SAFE_E_CONDITION else None
 
 
 def _in_pairs(values: ComplexArray) -> ComplexArray:

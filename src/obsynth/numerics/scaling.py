@@ -171,7 +171,7 @@ WISH_WEIGHT = 1e-8
 #: An entry this many bits below one has half a say: what is far below is coupling that hardly counts, or rounding.
 HALF_SAY = 10.0
 #: Corrections by exact residuals, each of which takes four or five digits of rounding away.
-REFINEMENTS = 3
+RESIDUAL_CORRECTIONS = 3
 #: Passes in which small entries lose their say.
 PASSES = 3
 #: Up to so many unknowns lists of numbers are added up faster than arrays in pairs.
@@ -214,7 +214,7 @@ class LogBalance:
             weights = [term.weights * term.say(found) for term in self._terms]
             solved, found = self._solved(weights, ridge)
         # What the entries leave open would be rounding over the ridge: of exact residuals nothing is left of it.
-        for _ in range(REFINEMENTS):
+        for _ in range(RESIDUAL_CORRECTIONS):
             before, found = found, found + solved(self._missed(weights, found, ridge))
             if np.array_equal(before, found):
                 break

@@ -15,17 +15,17 @@ from obsynth.numerics.scaling import power_of_two_below
 from obsynth.numerics.sparse import csr
 
 #: Columns that are solved for at a time.
-CHUNK = 256
+COLUMNS_AT_ONCE = 256
 #: Sweeps of the scaling; two bring every largest entry near one.
 SCALING_SWEEPS = 3
 #: Steps and relative accuracy of the scaling by all entries, whose unknowns are exponents of two.
 SCALING_STEPS, SCALING_ACCURACY = 400, 1e-4
 #: Steps of inverse iteration for the smallest singular value: the gap to the next decides, and few are needed.
-INVERSE_STEPS = 6
+SMALLEST_VALUE_STEPS = 6
 #: Relative size of what is added to the diagonal of a factor that SuperLU calls singular, to find its null vectors.
 PERTURBATION = 1e-14
 #: Samples of the usual size of terms, and how far their mean may be off.
-SAMPLES, SAMPLED = 8, 8.0
+SIZE_SAMPLES, MEAN_FACTOR = 8, 8.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +87,7 @@ class SparseFactor:
         right = np.random.default_rng(1).normal(size=self.size)
         left, smallest = right, np.inf
         norm = _norm_estimate(self.matrix)
-        for _ in range(INVERSE_STEPS):
+        for _ in range(SMALLEST_VALUE_STEPS):
             left = self._lu.solve(right / np.linalg.norm(right), trans="T")
             left = left / max(float(np.linalg.norm(left)), np.finfo(float).tiny)
             right = self._lu.solve(left)
@@ -164,10 +164,10 @@ class SparseFactor:
     def usual_size_of_terms(self, solution: FloatArray) -> FloatArray:
         """Return an estimate of `size_of_terms` of all rows, with sums of squares: terms of random signs.
 
-        The sum is at most the root of ``size`` times it; eight samples are within `SAMPLED` of the truth.
+        The sum is at most the root of ``size`` times it; eight samples are within `MEAN_FACTOR` of the truth.
         """
         terms = abs(self.matrix) @ (np.abs(solution) / self.columns[:, None])
-        signs = np.random.default_rng(2).choice((-1.0, 1.0), (SAMPLES, *terms.shape))
+        signs = np.random.default_rng(2).choice((-1.0, 1.0), (SIZE_SAMPLES, *terms.shape))
         squares = [self._lu.solve(part * terms) ** 2 for part in signs]
         return np.asarray(self.columns[:, None] * np.sqrt(np.mean(squares, axis=0)))
 
@@ -206,7 +206,7 @@ def scales_by_all_entries(matrix: Any) -> tuple[FloatArray, FloatArray]:
 
 
 def _chunks(count: int) -> Iterator[slice]:
-    return (slice(start, min(start + CHUNK, count)) for start in range(0, count, CHUNK))
+    return (slice(start, min(start + COLUMNS_AT_ONCE, count)) for start in range(0, count, COLUMNS_AT_ONCE))
 
 
 def _scaled(matrix: Any, rows: FloatArray, columns: FloatArray) -> Any:

@@ -27,7 +27,7 @@ from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.running import named_estimates
 
 #: Samples in one call of the library: a second or less, so that progress shows and an interrupt takes effect.
-SAMPLES_PER_CALL = 100_000
+BATCH_SAMPLES_PER_CALL = 100_000
 #: Steps from which it pays to compile unasked: compiling takes about a second, and the rest thirty microseconds a step.
 WORTH_COMPILING = 50_000
 
@@ -73,7 +73,7 @@ def _in_c(observer: DAEObserver, y: FloatArray, u: FloatArray, note: Callable[[i
     library, begin = observer.library, 0
     found: list[dict[str, FloatArray]] = []
     while begin < len(y):
-        trials = slice(begin, min(begin + max(1, SAMPLES_PER_CALL // y.shape[1]), len(y)))
+        trials = slice(begin, min(begin + max(1, BATCH_SAMPLES_PER_CALL // y.shape[1]), len(y)))
         taken, parts = library.batch(y[trials], _of_trial(u, trials))
         found.append({name: part[:taken] for name, part in parts.items()})
         begin += taken

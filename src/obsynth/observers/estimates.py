@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from obsynth.numerics.arrays import FloatArray, read_only
 
-NOTHING = read_only(np.zeros(0))
+NO_NUMBERS = read_only(np.zeros(0))
 #: Standard deviations within which 95 % of a normal number lie: the width of bands, drawn or counted.
 BAND_WIDTH = 1.96
 #: The residual of an observer of a nonlinear plant: of its equations in each step.
@@ -18,7 +18,7 @@ STEP_RESIDUAL = ("equations",)
 
 def nothing() -> FloatArray:
     """Return an empty array: what an observer does not say."""
-    return NOTHING
+    return NO_NUMBERS
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,13 +103,13 @@ class Estimates:
     conditions: FloatArray = field(default_factory=nothing)
     contraction: FloatArray = field(default_factory=nothing)
     projection: FloatArray = field(default_factory=nothing)
-    received: NDArray[np.bool_] = field(default_factory=lambda: NOTHING.astype(bool))
+    received: NDArray[np.bool_] = field(default_factory=lambda: NO_NUMBERS.astype(bool))
 
     def __post_init__(self) -> None:
         nf = len(self.fault_names)
         unknown = {"state_deviations": self.states.shape, "fault_covariances": (*self.faults.shape, nf)}
         for name, shape in unknown.items():
-            if getattr(self, name) is NOTHING:
+            if getattr(self, name) is NO_NUMBERS:
                 object.__setattr__(self, name, np.broadcast_to(np.nan, shape))
 
     @property
@@ -126,7 +126,7 @@ class Estimates:
     def joint_covariances(self) -> FloatArray:
         """Covariances of states and faults together ``(samples, nx + nf, nx + nf)``; empty where they are not known."""
         if not self.state_covariances.size:
-            return NOTHING
+            return NO_NUMBERS
         across = self.cross_covariances
         return np.concatenate(
             [

@@ -20,20 +20,20 @@ from obsynth.observers.records import named_bounds
 
 BoolArray = NDArray[np.bool_]
 Outliers = Literal["none", "gate", "huber"]
-KINDS = ("none", "gate", "huber")
+OUTLIER_KINDS = ("none", "gate", "huber")
 #: Standard deviations: of a gate, so that no sample of a true model is left out in a million; and of Huber's weight.
 LIMITS = {"gate": 6.0, "huber": 3.0}
 #: What is larger has no square: it is no measurement, whatever the model says.
-OVERFLOW = 1e150
+NO_SQUARE = 1e150
 #: Samples of one sensor in a row that are left out where their sides change; the second on one side is believed, and
 #: so are those that follow it there, unless they are wild.
-LONGEST = 2
+LONGEST_LEFT_OUT = 2
 #: How many times further off than the one before it a sample may be that is believed for it: at the onset of a fault
 #: that grows with the square of time the second is 4 times further off, and noise moves both.
 COMPARABLE = 5.0
 #: How many times further off than the limit a sample must be that nothing contradicts but the equations of the model;
 #: and what rounding makes of a prediction without noise.
-BLIND, ROUNDING = 10.0, 1e-6
+BLIND, PREDICTION_ROUNDING = 10.0, 1e-6
 #: Samples whose squared innovations are summed up before a reset.
 RESET_WINDOW = 20
 State = TypeVar("State", bound=Any)
@@ -42,7 +42,7 @@ Row = TypeVar("Row", bound=Any)
 
 def checked_limit(kind: str, limit: float | None) -> float:
     """Return the limit in standard deviations, infinite for ``none``."""
-    chosen(kind, "outliers", KINDS)
+    chosen(kind, "outliers", OUTLIER_KINDS)
     if limit is None:
         return LIMITS.get(kind, float("inf"))
     if not is_finite_number(limit) or not limit > 0.0:
@@ -80,7 +80,9 @@ def robust_advance(
             passes = float(row.nis) <= limit**2
             if passes and predicted_outputs is not None:
                 mean, deviation = predicted_outputs(state, u)
-                far = np.abs(y - mean) > BLIND * limit * deviation + ROUNDING * (np.abs(y) + np.abs(mean).max())
+                far = np.abs(y - mean) > BLIND * limit * deviation + PREDICTION_ROUNDING * (
+                    np.abs(y) + np.abs(mean).max()
+                )
         if passes and not far.any():
             return after._replace(refused=_remembered(state.refused, y, far, far, y)), row
     except (SolverError, np.linalg.LinAlgError, ValueError):
@@ -90,7 +92,7 @@ def robust_advance(
     off, gone = np.where(far, y - mean, 0.0), far
     if kind == "gate":
         # A wrong sample stands alone; of a sensor, or a plant, that has moved the next is on the same side, as far off.
-        gone = far & (~_follows(state.refused, off) | (np.abs(y) > OVERFLOW))
+        gone = far & (~_follows(state.refused, off) | (np.abs(y) > NO_SQUARE))
         received = np.where(gone, np.nan, y)
     else:
         pulled = mean + limit * deviation * np.sign(y - mean)
@@ -107,13 +109,13 @@ def robust_advance(
 
 def _follows(refused: FloatArray, off: FloatArray) -> BoolArray:
     """Return which samples ``off (ny,)`` their prediction go on with what was off before: with what was believed, or as
-    far as the one that was left out, on its side or after `LONGEST` of them on any."""
+    far as the one that was left out, on its side or after `LONGEST_LEFT_OUT` of them on any."""
     row, _, left, believed = refused
     sizes, others = np.abs(off), np.abs(left)
     with np.errstate(over="ignore"):
         on = (off * np.sign(believed) > 0.0) & (sizes <= COMPARABLE * np.abs(believed))
         like = (others > 0.0) & (sizes <= COMPARABLE * others) & (others <= COMPARABLE * sizes)
-    return np.asarray(on | like & ((off * np.sign(left) > 0.0) | (np.abs(row) >= LONGEST)))
+    return np.asarray(on | like & ((off * np.sign(left) > 0.0) | (np.abs(row) >= LONGEST_LEFT_OUT)))
 
 
 def _remembered(refused: FloatArray, y: FloatArray, far: BoolArray, gone: BoolArray, off: FloatArray) -> FloatArray:
@@ -137,7 +139,7 @@ def _judged(
     of an output, the others of the same sample do."""
     with np.errstate(all="ignore"):
         mean, deviation = predicted(state, np.full(len(y), np.nan), u)
-        far = (np.abs(y - mean) > limit * deviation) | (np.abs(y) > OVERFLOW)
+        far = (np.abs(y - mean) > limit * deviation) | (np.abs(y) > NO_SQUARE)
         ratios = np.zeros(len(y))
         for i in np.flatnonzero(np.isinf(deviation) & ~np.isnan(y) & ~far):
             others = np.where(far | (np.arange(len(y)) == i), np.nan, y)

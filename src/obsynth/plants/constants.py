@@ -22,7 +22,7 @@ MOST_LISTED = 6
 #: Whole numbers up to so many digits are shown without a point.
 WHOLE_DIGITS = 12
 #: Shares of tolerances that agree so well are one share: they were stated as per cent.
-SAME_SHARE = 1e-9
+SAME_TOLERANCE = 1e-9
 _PER_CENT = re.compile(r"\s*([0-9]*\.?[0-9]+(?:[eE][+-]?[0-9]+)?)\s*%\s*")
 
 
@@ -190,10 +190,11 @@ class ConstantsBox:
             return "an exact model"
         shares = [item.half / abs(item.nominal) if item.nominal else np.nan for item in self.uncertain]
         centred = [
-            abs(item.middle - item.nominal) <= SAME_SHARE * max(item.half, abs(item.nominal)) for item in self.uncertain
+            abs(item.middle - item.nominal) <= SAME_TOLERANCE * max(item.half, abs(item.nominal))
+            for item in self.uncertain
         ]
         names = ", ".join(self.names) if len(self.names) <= MOST_LISTED else f"{len(self.names)} constants"
-        if np.ptp(shares) <= SAME_SHARE and all(centred):  # false where there is no share
+        if np.ptp(shares) <= SAME_TOLERANCE and all(centred):  # false where there is no share
             text = f"{names} within {100.0 * float(np.mean(shares)):.6g} % of nominal"
         elif len(self.names) <= MOST_LISTED:
             text = ", ".join(

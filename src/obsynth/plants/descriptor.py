@@ -236,7 +236,7 @@ def _noise_of_sensors(
 
 MatrixOrNames = ArrayLike | Sequence[str] | None
 SIGNAL_NAMES = ("state_names", "input_names", "output_names", "fault_names", "disturbance_names", "noise_names")
-MATRICES = tuple(name for name, *_ in MATRIX_LAYOUT)
+ALL_MATRICES = tuple(name for name, *_ in MATRIX_LAYOUT)
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -410,13 +410,13 @@ class DescriptorSystem:
     @property
     def is_sparse(self) -> bool:
         """Whether any matrix of the plant is a sparse one."""
-        return any(is_sparse(getattr(self, name)) for name in MATRICES)
+        return any(is_sparse(getattr(self, name)) for name in ALL_MATRICES)
 
     def dense(self) -> DescriptorSystem:
         """Return the same plant with arrays instead of sparse matrices; a plant without any is returned as it is."""
         if not self.is_sparse:
             return self
-        return self.replace(**{name: dense(getattr(self, name)) for name in MATRICES})
+        return self.replace(**{name: dense(getattr(self, name)) for name in ALL_MATRICES})
 
     @property
     def sensor_faults(self) -> tuple[str, ...]:

@@ -15,7 +15,7 @@ from obsynth.plants.dae.functions import BUTCHER
 from obsynth.plants.validation import index_of
 
 #: Stands for a number that `obsynth.calibrate` is to find.
-UNKNOWN = "unknown"
+UNKNOWN_NUMBER = "unknown"
 
 
 def noise_state(output: str) -> str:
@@ -52,12 +52,12 @@ def noise_variance(process: float, correlation: float, dt: float, integration: s
 
 
 #: White noise beside coloured noise whose size is not stated, as a share of its deviation: no sensor is without any.
-WHITE_SHARE = 0.01
+DEFAULT_WHITE_SHARE = 0.01
 #: An offset that is unknown, in deviations of its sensor; and by how many it walks in a sample, or per root of a
 #: second: so that filters with a steady state follow it within a thousand samples.
 OFFSET_SIZE, OFFSET_WALK = 10.0, 1e-3
 #: Units of time in s.
-TIMES = {"ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
+SECONDS_OF_UNITS = {"ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
 
 
 @dataclass(frozen=True)
@@ -77,9 +77,9 @@ class SensorNoise:
 def seconds(value: Any, path: str) -> float:
     """Return a time in s from a number or a text such as ``5 s``, ``200 ms`` or ``3 min``."""
     found = re.fullmatch(r"\s*([0-9.]+(?:[eE][+-]?\d+)?)\s*([a-z]+)\s*", value) if isinstance(value, str) else None
-    if found is not None and found[2] in TIMES:
+    if found is not None and found[2] in SECONDS_OF_UNITS:
         try:
-            return stated_number(float(found[1]) * TIMES[found[2]], path)
+            return stated_number(float(found[1]) * SECONDS_OF_UNITS[found[2]], path)
         except ValueError:
             pass
     return stated_number(value, path)
@@ -87,13 +87,15 @@ def seconds(value: Any, path: str) -> float:
 
 def stated_number(value: Any, path: str) -> float:
     """Return a positive number; what is still unknown is to be found first."""
-    if value == UNKNOWN:
+    if value == UNKNOWN_NUMBER:
         raise SpecError(
             f"{path} is unknown: find it from normal rows (obsynth calibrate --write-spec), or state a number.",
             path=path,
         )
     if not is_finite_number(value) or not value > 0.0:
-        raise SpecError(f"{path} is {value!r}: give a number above 0 ({', '.join(TIMES)} for times).", path=path)
+        raise SpecError(
+            f"{path} is {value!r}: give a number above 0 ({', '.join(SECONDS_OF_UNITS)} for times).", path=path
+        )
     return float(value)
 
 
@@ -120,6 +122,6 @@ def sensor_noises(given: Mapping[str, Any] | None, outputs: Sequence[str]) -> di
         found[name] = SensorNoise(
             deviation,
             seconds(item["correlation"], f"{path}.correlation"),
-            WHITE_SHARE * deviation if white is None else stated_number(white, f"{path}.white"),
+            DEFAULT_WHITE_SHARE * deviation if white is None else stated_number(white, f"{path}.white"),
         )
     return found

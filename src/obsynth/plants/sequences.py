@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import is_finite_number, is_whole
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
-from obsynth.numerics.expressions import CONSTANTS, Expression, parse_expression
+from obsynth.numerics.expressions import NAMED_NUMBERS, Expression, parse_expression
 from obsynth.plants.validation import Problems, checked_dt
 
 #: A matrix, a stack of matrices, a function of k, or rows whose entries may be texts.
@@ -23,7 +23,7 @@ MatrixLike: TypeAlias = ArrayLike | Callable[[int], ArrayLike] | Sequence[Sequen
 #: The name of the time index in expressions.
 INDEX_NAME = "k"
 #: Numbers of a computed sequence that are kept: two megabytes.
-MOST_KEPT = 2**18
+MOST_KEPT_ENTRIES = 2**18
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +113,7 @@ class MatrixSequence:
             matrix[i, j] = (self.entries or ())[i][j](values)
         found = as_matrix(matrix, f"{self.name}({k})")
         # Design, checks and runs ask for the same k many times; what does not fit is computed again.
-        if len(self.computed) * matrix.size < MOST_KEPT:
+        if len(self.computed) * matrix.size < MOST_KEPT_ENTRIES:
             self.computed[k] = found
         return found
 
@@ -176,7 +176,7 @@ def _parsed(value: Any, name: str, constants: Mapping[str, float]) -> tuple[tupl
                 raise SpecError(f"{where}: {error}", path=name) from error
             unknown = sorted(expression.names - {INDEX_NAME} - set(constants))
             if unknown:
-                known = ", ".join(sorted([INDEX_NAME, *constants, *CONSTANTS]))
+                known = ", ".join(sorted([INDEX_NAME, *constants, *NAMED_NUMBERS]))
                 raise SpecError(f"{where}: {unknown[0]!r} is unknown; the known names are: {known}.", path=name)
             expressions.append(expression)
         parsed.append(tuple(expressions))
@@ -207,7 +207,7 @@ LAYOUT = (
     ("Psi", "y", "p", 0),
 )
 #: E and C are needed at k = 1 ... N for N steps: as stacks they have N + 1 entries, of which the first is not used.
-_FIRST = {name: first for name, *_, first in LAYOUT}
+_FIRST_INDEX = {name: first for name, *_, first in LAYOUT}
 
 
 def positive_dt(dt: Any) -> float:
@@ -226,7 +226,7 @@ def checked_constants(constants: Mapping[str, float] | None) -> dict[str, float]
     if constants is not None and not isinstance(constants, Mapping):
         raise SpecError(f"constants is a {type(constants).__name__}: give names and values.", path="constants")
     for name, value in (constants or {}).items():
-        if not (isinstance(name, str) and name.isidentifier()) or name == "k" or name in CONSTANTS:
+        if not (isinstance(name, str) and name.isidentifier()) or name == "k" or name in NAMED_NUMBERS:
             raise SpecError(f"constants names {name!r}: use letters, digits and '_', not k or pi.", path="constants")
         if not is_finite_number(value):
             raise SpecError(f"The constant {name!r} is {value!r}: give a finite number.", path=f"constants.{name}")
@@ -260,7 +260,7 @@ def checked_horizon(horizon: int | None, values: Mapping[str, MatrixSequence]) -
     """Return the number of steps that all stacks are good for, or ``None`` without any limit."""
     if horizon is not None and (not is_whole(horizon) or horizon < 1):
         raise SpecError(f"horizon is {horizon!r}: give the number of steps, at least 1.", path="horizon")
-    lengths = {name: m.length - _FIRST[name] for name, m in values.items() if m.length is not None}
+    lengths = {name: m.length - _FIRST_INDEX[name] for name, m in values.items() if m.length is not None}
     if not lengths:
         return None if horizon is None else int(horizon)
     shortest = min(lengths, key=lambda name: lengths[name])
@@ -283,5 +283,5 @@ def check_every_k(values: Mapping[str, MatrixSequence], horizon: int | None) -> 
     """Evaluate callables and expressions along the horizon, so that a bad k is found before anything runs."""
     for name, matrix in values.items():
         if matrix.values is None and horizon is not None:
-            for k in range(_FIRST[name], horizon + _FIRST[name]):
+            for k in range(_FIRST_INDEX[name], horizon + _FIRST_INDEX[name]):
                 matrix.at(k)

@@ -14,7 +14,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.constants import Constant, ConstantsBox, constant_of, constants_box, tolerance_share
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.uncertainty import (
-    SAME_SHARE,
+    SAME_EXPRESSION_VALUE,
     UNCERTAIN_MATRICES,
     Entry,
     Uncertainty,
@@ -184,7 +184,8 @@ def _with_tolerances(
     moved = [
         name
         for name, item in before.box.constants.items()
-        if name not in box.constants or abs(box.constants[name].nominal - item.nominal) > SAME_SHARE * abs(item.nominal)
+        if name not in box.constants
+        or abs(box.constants[name].nominal - item.nominal) > SAME_EXPRESSION_VALUE * abs(item.nominal)
     ]
     if moved and before.written is None and moved[0] in box.constants:
         return filled_plant(plant, after, set())

@@ -23,7 +23,7 @@ UNCERTAIN_MATRICES = ("E", "A", "B", "C", "D", "Bf", "Df", "Bd", "Dd")
 #: Transformations that carry tolerances along.
 ELIMINATED, SAMPLED = "eliminate", "sample"
 #: A stored number and the value of its expression may differ by this share: matrices in files have few digits.
-SAME_SHARE = 1e-6
+SAME_EXPRESSION_VALUE = 1e-6
 #: Rounding of a middle and of half a width, relative to the ends of a range.
 HALVING = 2.0**-51
 

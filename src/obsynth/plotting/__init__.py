@@ -34,7 +34,7 @@ __all__ = [
     "plot_trade_off",
 ]
 
-_HOMES = {
+_PICTURE_HOMES = {
     name: module
     for module, names in {
         "data": "plot_data",
@@ -50,8 +50,8 @@ _HOMES = {
 
 
 def __getattr__(name: str) -> Any:
-    if name in _HOMES:
-        return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+    if name in _PICTURE_HOMES:
+        return getattr(import_module(f"{__name__}.{_PICTURE_HOMES[name]}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

@@ -40,15 +40,15 @@ if TYPE_CHECKING:
     from obsynth.results.design import ObserverDesign
 
 #: Kinds of panels, in their order.
-PARTS = ("outputs", "faults", "residuals", "statistic", "shares")
+PANELS = ("outputs", "faults", "residuals", "statistic", "shares")
 #: Letters in a line of the sentence below a picture.
 STATEMENT_LETTERS = 125
 #: Signals of a kind that are drawn.
 MOST_DRAWN = 6
 #: A statistic this many times above its threshold gets a logarithmic axis.
-_FAR = 30.0
+_FAR_ABOVE = 30.0
 #: Rows in which nothing is decided lie in grey, those with an alarm in red.
-_UNDECIDED: dict[str, Any] = {"color": "0.9", "linewidth": 0.0, "zorder": 0}
+_UNDECIDED_ROWS: dict[str, Any] = {"color": "0.9", "linewidth": 0.0, "zorder": 0}
 _ALARM: dict[str, Any] = {"color": "tab:red", "alpha": 0.15, "linewidth": 0.0, "zorder": 0}
 
 
@@ -56,7 +56,7 @@ def plot_data(
     run: DataRun,
     *,
     design: ObserverDesign | None = None,
-    show: Sequence[str] = PARTS,
+    show: Sequence[str] = PANELS,
     axes: Iterable[Axes] | None = None,
 ) -> list[Axes]:
     """Plot what a design says of measured data.
@@ -90,9 +90,9 @@ def plot_data(
     require_kind(run, DataRun, "run", "what obsynth.run_on_data returns")
     if run.table is None or run.measured is None:
         raise SpecError("The run holds no table, since it was written to a file: run it without out.", path="run")
-    unknown = [part for part in show if part not in PARTS]
+    unknown = [part for part in show if part not in PANELS]
     if isinstance(show, str) or unknown:
-        raise SpecError(f"show is {show!r}: use some of {', '.join(PARTS)}.", path="show")
+        raise SpecError(f"show is {show!r}: use some of {', '.join(PANELS)}.", path="show")
     plans = _plans(run.table, run.measured, show)
     panels = new_panels(axes, len(plans), size=(WIDTH, PANEL_HEIGHT * max(len(plans), 1) + 0.6))
     units = {} if design is None else dict(design.plant.units)
@@ -135,7 +135,7 @@ def plot_data(
     return panels
 
 
-def panel_count(run: DataRun, show: Sequence[str] = PARTS) -> int:
+def panel_count(run: DataRun, show: Sequence[str] = PANELS) -> int:
     """Return how many axes `plot_data` needs."""
     return 0 if run.table is None or run.measured is None else len(_plans(run.table, run.measured, show))
 
@@ -225,7 +225,7 @@ class _Drawing:
             first = int(passed[0])
             mark(panel, table["time"].iloc[first], values[first], f"first alarm at {run.stamps.shown(own[0])}")
         level = float(np.nanmax(levels, initial=0.0))
-        if level > 0.0 and np.nanmax(values, initial=0.0) > _FAR * level:
+        if level > 0.0 and np.nanmax(values, initial=0.0) > _FAR_ABOVE * level:
             panel.set_yscale("symlog", linthresh=level)
         panel.set_ylabel("statistic")
 
@@ -282,7 +282,7 @@ def _alarm_rows(table: Any, part: str, column: str) -> Any:
 def _shade(panel: Axes, table: Any, told: set[str], alarms: Any) -> None:
     """Shade the rows in which nothing is decided, and those with an alarm; each is explained in one panel."""
     undecided = ~table["status"].isin(DECIDING).to_numpy()
-    marks = [(undecided, _UNDECIDED, "warm-up or gap"), (alarms, _ALARM, "alarm")]
+    marks = [(undecided, _UNDECIDED_ROWS, "warm-up or gap"), (alarms, _ALARM, "alarm")]
     times = table["time"]
     for where, style, label in marks:
         edges = np.flatnonzero(np.diff(np.concatenate([[False], where, [False]]).astype(np.int64)))

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 #: Of the model: a parameter that moves faster than the model says leaves it.
-BAND = "95 % band of the model"
+MODEL_BAND = "95 % band of the model"
 CROSSING_MARKERS = ("o", "s", "^")
 #: Around what is drawn there is this share of its range, and room for this many usual half-widths of the band.
 ROOM_SHARE, USUAL_BANDS = 0.2, 3.0
@@ -213,7 +213,9 @@ def _draw(
         if deviations is not None:
             half = np.where(np.isfinite(deviations[:, i]), BAND_WIDTH * deviations[:, i], np.nan)
             low, high = values[:, i] - half, values[:, i] + half
-            label = BAND + ("" if true is None else _share_within(true[: steps - late, i], low[late:], high[late:]))
+            label = MODEL_BAND + (
+                "" if true is None else _share_within(true[: steps - late, i], low[late:], high[late:])
+            )
             panel.fill_between(time, low, high, **BAND_STYLE, label=label)
         panel.plot(time, values[:, i], **ESTIMATE_STYLE, label="estimate")
         panel.set_ylabel(with_unit(names[i], units))

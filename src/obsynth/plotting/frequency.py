@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 #: A gain below this share of what is subtracted from one another in it is rounding: nothing gets through.
-ROUNDING_SHARE = 1e-9
+GAIN_ROUNDING_SHARE = 1e-9
 #: The least singular value is drawn where it is below this share of the largest one somewhere.
 VISIBLE_SHARE = 0.99
 TARGETS = {"faults": "fault estimates", "states": "errors of the states", "residuals": "residual"}
@@ -33,7 +33,7 @@ _STYLES: dict[str, dict[str, Any]] = {
     "disturbances": {"color": "tab:red", "linewidth": 1.6, "linestyle": "--"},
     "noise": {"color": "tab:blue", "linewidth": 1.6, "linestyle": ":"},
 }
-_LEAST: dict[str, Any] = {"color": "black", "linewidth": 0.8, "linestyle": "-"}
+_LEAST_LINE: dict[str, Any] = {"color": "black", "linewidth": 0.8, "linestyle": "-"}
 _BOUND: dict[str, Any] = {"color": "tab:green", "linewidth": 1.2, "linestyle": "-."}
 
 
@@ -135,7 +135,7 @@ def _seen(
 
 def _above_rounding(sizes: Any, terms: FloatArray) -> FloatArray:
     """Return sizes, and zero where only the rounding of terms is left."""
-    return np.asarray(np.where(sizes > ROUNDING_SHARE * terms, sizes, 0.0), dtype=np.float64)
+    return np.asarray(np.where(sizes > GAIN_ROUNDING_SHARE * terms, sizes, 0.0), dtype=np.float64)
 
 
 def _sizes(matrices: ComplexArray) -> FloatArray:
@@ -204,7 +204,7 @@ def plot_gains(design: ObserverDesign, *, to: str = "faults", axes: Axes | None 
             panel.plot([], [], label=f"{name}: nothing gets through", **_STYLES[name])
     largest = found.gains.get("faults", found.least)
     if to != "states" and np.any(found.least < VISIBLE_SHARE * largest):
-        panel.plot(found.frequencies, _positive(found.least), label="faults, least singular value", **_LEAST)
+        panel.plot(found.frequencies, _positive(found.least), label="faults, least singular value", **_LEAST_LINE)
     gamma = design.certificate.claims.get("gamma")
     if to == "faults" and gamma is not None and "disturbances" in found.gains:
         panel.plot(found.frequencies[[0, -1]], [gamma, gamma], label=f"proved for disturbances: {gamma:.4g}", **_BOUND)

@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 #: Courses below this share of the largest number are zero but for rounding.
-ROUNDED = 1e-12
+ROUNDED_COURSE = 1e-12
 #: From this ratio of largest to smallest threshold on, its axis is logarithmic.
-WIDE_SPREAD = 5.0
+WIDE_THRESHOLDS = 5.0
 
 
 def plot_least_thresholds(design: ObserverDesign, *, axes: Axes | None = None) -> Axes:
@@ -61,7 +61,7 @@ def plot_least_thresholds(design: ObserverDesign, *, axes: Axes | None = None) -
         label=f"chosen: {found.samples} samples, proved",
     )
     sizes = table[:, 1]
-    if sizes.size and sizes.min() > 0.0 and sizes.max() > WIDE_SPREAD * sizes.min():
+    if sizes.size and sizes.min() > 0.0 and sizes.max() > WIDE_THRESHOLDS * sizes.min():
         panel.set_yscale("log")
         panel.set_ylim(bottom=0.7 * float(sizes.min()))
     else:
@@ -149,7 +149,7 @@ def plot_hidden_course(design: ObserverDesign, *, fault: str | None = None, axes
     styles |= dict.fromkeys(plant.state_names, ":") | dict.fromkeys(found.fault_names, "-")
     sizes = {name: float(np.max(np.abs(course))) for name, course in courses.items()}
     largest = max(sizes.values())
-    shown = [name for name in courses if sizes[name] > ROUNDED * largest]
+    shown = [name for name in courses if sizes[name] > ROUNDED_COURSE * largest]
     # Faults first, then disturbances, then states.
     for name in sorted(shown, key=lambda name: ("-", "--", ":").index(styles.get(name, ":"))):
         style, unit = styles.get(name, ":"), plant.units.get(name, "")

@@ -77,7 +77,7 @@ _DETECTIONS = {
 #: An estimate whose typical step from sample to sample is this share of its range is a band, not a line.
 NOISY_SHARE = 0.05
 #: Such a band lies under the truth.
-_BAND = {"color": "0.7", "linewidth": 0.6, "linestyle": "-", "zorder": 1.8}
+_BAND_LINE = {"color": "0.7", "linewidth": 0.6, "linestyle": "-", "zorder": 1.8}
 _TRUTH_ON_BAND = {"color": "black", "linewidth": 1.8, "zorder": 2.5}
 #: Decades that a logarithmic axis shows below the lowest threshold.
 DECADES_BELOW = 3
@@ -139,7 +139,7 @@ def _plot_linear(
         if np.median(np.abs(np.diff(estimate))) > NOISY_SHARE * np.ptp(estimate):
             truth, band = panel.get_lines()
             truth.set(**_TRUTH_ON_BAND)
-            band.set(**_BAND)
+            band.set(**_BAND_LINE)
             legend_above(panel)
 
 

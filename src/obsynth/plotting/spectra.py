@@ -18,13 +18,13 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 #: From this ratio of the fastest to the slowest part on, axes are logarithmic away from zero.
-WIDE_SPREAD = 30.0
+WIDE_RATES = 30.0
 #: Points of the grid on which a region is found, each way.
-GRID = 400
+REGION_GRID = 400
 _LIMIT: dict[str, Any] = {"color": "0.45", "linewidth": 1.0, "linestyle": "--"}
 _REGION_EDGE: dict[str, Any] = {"color": "tab:green", "linewidth": 1.4, "linestyle": "-."}
 _REGION_SHADE = "0.93"
-_POLES: dict[str, Any] = {
+_POLE_MARKS: dict[str, Any] = {
     "marker": "x",
     "markersize": 9,
     "markeredgewidth": 1.6,
@@ -78,7 +78,7 @@ def plot_poles(design: ObserverDesign, *, axes: Axes | None = None) -> Axes:
     else:
         _continuous_plane(axes, poles, zeros)
     _draw_region(axes, region_asked_for(design))
-    axes.plot(poles.real, poles.imag, label=f"observer eigenvalues ({len(poles)})", **_POLES)
+    axes.plot(poles.real, poles.imag, label=f"observer eigenvalues ({len(poles)})", **_POLE_MARKS)
     axes.plot(zeros.real, zeros.imag, label=f"fault zeros ({len(zeros)})", **_ZEROS)
     axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False)
     return axes
@@ -107,7 +107,7 @@ def _continuous_plane(axes: Axes, poles: ComplexArray, zeros: ComplexArray) -> N
         alive = sizes[sizes > np.finfo(np.float64).eps * np.max(np.abs(shown), initial=0.0)]
         if not alive.size:
             limits(-1.0, 1.0)
-        elif alive.max() > WIDE_SPREAD * alive.min():
+        elif alive.max() > WIDE_RATES * alive.min():
             scale("symlog", linthresh=float(alive.min()))
             limits(*(side * 3.0 * float(max(np.max(side * values), alive.min())) for side in (-1.0, 1.0)))
         else:
@@ -165,4 +165,4 @@ def _draw_region(axes: Axes, parts: list[Excess]) -> None:
 def _grid(scale: Any, limits: tuple[float, float]) -> FloatArray:
     """Return points that are evenly spaced on a scale."""
     low, high = scale.transform(np.array(limits))
-    return np.asarray(scale.inverted().transform(np.linspace(float(low), float(high), GRID)))
+    return np.asarray(scale.inverted().transform(np.linspace(float(low), float(high), REGION_GRID)))

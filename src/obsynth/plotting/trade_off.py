@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 #: From this ratio of largest to smallest on, an axis is logarithmic.
-WIDE_SPREAD = 10.0
+WIDE_AXIS = 10.0
 
 
 def plot_trade_off(
@@ -60,7 +60,7 @@ def plot_trade_off(
         y = np.array([_number(design, name) for design in designs])
         panel.plot(x[order], y[order], color="black", linewidth=1.2, marker="o", markersize=5)
         for values, scale in ((x, panel.set_xscale), (y, panel.set_yscale)):
-            if values.min() > 0.0 and values.max() > WIDE_SPREAD * values.min():
+            if values.min() > 0.0 and values.max() > WIDE_AXIS * values.min():
                 scale("log")
         panel.set_ylabel(name)
         tidy(panel)
@@ -124,7 +124,7 @@ def plot_tolerances(study: ToleranceStudy, *, axes: Iterable[Axes] | None = None
         tidy(panel)
     panels[0].set_ylim(-4.0, 104.0)
     known = least[np.isfinite(least)]
-    if known.size and known.max() > WIDE_SPREAD * known.min():
+    if known.size and known.max() > WIDE_AXIS * known.min():
         plain_decades(panels[1])
     else:
         panels[1].set_ylim(bottom=0.0)

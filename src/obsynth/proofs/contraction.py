@@ -23,7 +23,7 @@ from obsynth.proofs.definiteness import prove_positive_definite
 from obsynth.proofs.extended_balls import Enclosed, block
 
 #: Where between the spectral radius (0) and one (1) the rate is tried, in turn.
-RATES = (0.5, 0.2, 0.8, 0.95)
+TRIED_RATES = (0.5, 0.2, 0.8, 0.95)
 #: Roundings of an entry, of every order n, that a Lyapunov equation by Schur vectors and its square root may take.
 OPERATIONS = 1e3
 #: Up to so many states Lyapunov equations are solved by sums first; doublings of these, and when they have settled.
@@ -114,7 +114,7 @@ def proved_contractions(matrix: FloatArray | Ball, *, discrete: bool) -> Iterato
     bound = float(np.max(np.abs(values))) if discrete else float(-np.max(values.real))
     if not (bound < 1.0 if discrete else bound > 0.0):
         return
-    for share in RATES:
+    for share in TRIED_RATES:
         found = _tried(ball, bound + share * (1.0 - bound) if discrete else (1.0 - share) * bound, discrete=discrete)
         if found is not None:
             yield found

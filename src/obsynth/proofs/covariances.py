@@ -17,7 +17,7 @@ from obsynth.numerics.spectra import abscissa, noise_covariance
 from obsynth.proofs.extended_balls import arb_matrix
 
 #: Relative difference of two ways of computing a variance up to which double precision is believed.
-SURE = 1e-6
+SURE_DIFFERENCE = 1e-6
 #: With more states nothing is enclosed, and this much is believed.
 MOST_ENCLOSED_STATES, AGREEMENT = 40, 1e-2
 #: Digits in bits, tried in turn; doublings, of which each doubles the time; and the radius that is small enough.
@@ -30,7 +30,7 @@ def certain_noise_covariance(a: FloatArray, b: FloatArray, c: FloatArray, d: Flo
     found = noise_covariance(a, b, c, d, dt)
     # A variance below zero is rounding as well.
     variance, again = float(np.trace(found)), float(np.trace(noise_covariance(a.T, c.T, b.T, d.T, dt)))
-    if np.isfinite(variance) and abs(variance - again) <= SURE * variance:
+    if np.isfinite(variance) and abs(variance - again) <= SURE_DIFFERENCE * variance:
         return found
     exact = enclosed_noise_covariance(a, b, c, d, dt)
     if exact is not None:

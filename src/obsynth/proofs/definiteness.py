@@ -34,12 +34,12 @@ from numpy.typing import NDArray
 from obsynth.numerics import lapack
 from obsynth.numerics.arrays import FloatArray
 from obsynth.proofs.balls import UNDERFLOW, UNIT_ROUNDOFF, Ball, gamma, rounded_up
-from obsynth.proofs.extended_balls import MOST_ROWS, Enclosed, Formula, prove_by_ball_arithmetic
+from obsynth.proofs.extended_balls import LARGEST_ORDER, Enclosed, Formula, prove_by_ball_arithmetic
 
 #: The first shift that is tried, relative to the error bound: as little as leaves a bound above zero.
 LEAST_SHIFT = 1.0 + 2.0**-5
 #: Shares of the estimated eigenvalue that are tried as lower bounds, in turn.
-SHARES = (0.5, 2.0**-4)
+EIGENVALUE_SHARES = (0.5, 2.0**-4)
 #: Steps of inverse iteration behind that estimate.
 INVERSE_ITERATIONS = 4
 
@@ -134,7 +134,7 @@ def _by_cholesky(ball: Ball, means: Means = "Cholesky") -> DefinitenessProof:
         return DefinitenessProof(False, min(estimate - error, 0.0), error, reason=reason)
     # That is a proof.  How much there is besides is estimated, and proved by another factorisation.
     left = _smallest_eigenvalue(factor)
-    for share in SHARES:
+    for share in EIGENVALUE_SHARES:
         larger = shift + share * left
         if larger > shift and _cholesky_factor(ball.midpoint - larger * np.eye(size)) is not None:
             return DefinitenessProof(True, larger - error, error, means)
@@ -181,8 +181,8 @@ def _in_more_digits(formula: Formula, exponents: NDArray[np.int64], first: Defin
     """Prove by ball arithmetic what double precision left open; or return ``first`` with the reason."""
     if first.lower_bound < -2.0 * first.error_bound:
         return first  # negative beyond all errors
-    if len(exponents) > MOST_ROWS:
-        told = f"ball arithmetic is tried up to order {MOST_ROWS}, this is {len(exponents)}"
+    if len(exponents) > LARGEST_ORDER:
+        told = f"ball arithmetic is tried up to order {LARGEST_ORDER}, this is {len(exponents)}"
         return replace(first, reason=f"{first.reason}; {told}")
     units = np.diag(np.ldexp(1.0, exponents))
 

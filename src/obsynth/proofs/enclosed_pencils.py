@@ -16,7 +16,7 @@ import flint
 import numpy as np
 from flint import arb, arb_mat, fmpq_mat
 
-from obsynth.proofs.exact_pencils import SEED
+from obsynth.proofs.exact_pencils import POINTS_SEED
 
 #: Binary digits for a pencil of one state, and for each state more.
 BASE_BITS, BITS_PER_STATE = 1200, 60
@@ -95,7 +95,7 @@ class EnclosedPencil:
     @cached_property
     def normal_rank(self) -> int:
         """Rank at almost every z: at least this for certain."""
-        return self.rank_at(arb(flint.fmpq(random.Random(SEED).randrange(1 << 40), 1 << 39)))
+        return self.rank_at(arb(flint.fmpq(random.Random(POINTS_SEED).randrange(1 << 40), 1 << 39)))
 
     @cached_property
     def zero_coefficients(self) -> list[Any]:
@@ -126,7 +126,7 @@ class EnclosedPencil:
     def _determinant(self, seed: int) -> list[Any]:
         """Return the coefficients of the determinant of the pencil with its rows compressed at random."""
         rows, columns = self.shape
-        rng = random.Random(SEED + seed)
+        rng = random.Random(POINTS_SEED + seed)
         e, a = arb_mat(enclosed(self.E)), arb_mat(self.A)
         if rows > columns:
             left = arb_mat(columns, rows, [rng.randint(-4096, 4096) for _ in range(columns * rows)])

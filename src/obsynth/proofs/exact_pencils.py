@@ -35,7 +35,7 @@ from obsynth.proofs.exact_arithmetic import (
 _PRIMES = ((1 << 61) - 1, 2305843009213693921, 2305843009213693907)
 #: Random integers of a compression are of 16 bits less these; and the seed that makes every decision repeatable.
 _DROPPED_BITS = 3
-SEED = 20150709
+POINTS_SEED = 20150709
 #: Compressions after which a factor that all of them share is a factor of all minors.
 _MOST_COMPRESSIONS = 6
 
@@ -140,7 +140,7 @@ class ExactPencil:
 
     @cached_property
     def _rng(self) -> random.Random:
-        return random.Random(SEED)
+        return random.Random(POINTS_SEED)
 
     def _has_no_zero_modulo(self, rank: int) -> bool:
         """Whether two compressions have coprime determinants modulo a prime that keeps the degree: then they are."""

@@ -33,9 +33,9 @@ def block(rows: Sequence[Sequence[Enclosed]]) -> Enclosed:
 
 
 #: Digits to try, in bits.
-PRECISIONS = (128, 512, 2048)
+PRECISION_BITS = (128, 512, 2048)
 #: The largest order that is tried: 128 takes 0.1 s where 128 bits decide, 0.5 s where nothing does.
-MOST_ROWS = 128
+LARGEST_ORDER = 128
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ MOST_ENCLOSED = 80
 def prove_by_ball_arithmetic(formula: Formula) -> ExtendedProof:
     """Try to prove that every symmetric member of a matrix is positive definite, with as many digits as it takes."""
     reason = ""
-    for bits in PRECISIONS:
+    for bits in PRECISION_BITS:
         # A local precision: the one in python-flint's context is for the whole process.
         with flint.ctx.workprec(bits):
             matrix = formula(ExtendedBall)

@@ -21,11 +21,11 @@ from obsynth.proofs.contraction import Contraction
 from obsynth.proofs.products import exponential
 
 #: Most steps that are summed up one by one, and the share of the sum that the rest may then have.
-MOST_SUMMED_STEPS, LEFT = 65_536, 1e-3
+MOST_SUMMED_STEPS, LEFT_OF_SUM = 65_536, 1e-3
 #: Steps that are taken together; what is left is looked at when their number has grown by one in so many.
 STEPS_AT_ONCE, LOOKS = 64, 8
 #: A piece of an interval is at most this share of one over the norm of A; most pieces.
-PIECE, MOST_PIECES = 0.05, 1_024
+NORM_PIECE, MOST_PIECES = 0.05, 1_024
 #: More than the square root of what underflows in a square.
 LOST_SQUARES = 2.0**-510
 #: Length of an interval in units of one over the norm of A, and the largest order, for gains in continuous time.
@@ -49,7 +49,7 @@ def peak_sums(
     contraction: Contraction,
     *,
     least: int = 0,
-    left: float = LEFT,
+    left: float = LEFT_OF_SUM,
     each: bool = False,
     most: int = MOST_SUMMED_STEPS,
 ) -> PeakSums:
@@ -133,7 +133,7 @@ class Pieces(NamedTuple):
 def interval_pieces(a: FloatArray, b: FloatArray, into: Ball, length: float) -> Pieces:
     """Return the pieces of ``into e^{A s} b``, s from 0 to ``length``: ``a (n, n)``, ``b (n, m)``, ``into (k, n)``."""
     norm = _natural_norm(a)
-    count = int(np.clip(np.ceil(length * norm / PIECE), 1, MOST_PIECES))
+    count = int(np.clip(np.ceil(length * norm / NORM_PIECE), 1, MOST_PIECES))
     step, m = length / count, b.shape[1]
     transition, ball_a = exponential(a, step), Ball.exact(a)
     at = Ball.exact(b)

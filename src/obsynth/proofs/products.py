@@ -28,10 +28,10 @@ from obsynth.proofs.extended_balls import arb_matrix
 EXPONENTIAL_BITS = 160
 #: With more states double precision comes first, where its radius is below this share of the largest entry; with
 #: few, where python-flint takes no second, it must be as good as nothing.
-MOST_STATES_FOR_BALLS, LARGEST_SHARE = 60, 1e-7
+MOST_STATES_FOR_BALLS, LARGEST_RADIUS_SHARE = 60, 1e-7
 FEW_STATES_FOR_BALLS, LARGEST_SHARE_OF_FEW = 8, 1e-12
 #: Norm of the shortest interval's exponent, and orders of the Taylor polynomials: what is left is below 1e-18.
-SHORT, ORDER, ENERGY_ORDER = 2.0**-4, 10, 12
+SHORT_NORM, ORDER, ENERGY_ORDER = 2.0**-4, 10, 12
 
 
 def exponential(matrix: FloatArray, time: float) -> Ball:
@@ -63,7 +63,7 @@ def energy(a: FloatArray, b: FloatArray, time: float) -> Ball:
 
 
 def _is_sharp(ball: Ball) -> bool:
-    share = LARGEST_SHARE if len(ball.midpoint) > MOST_STATES_FOR_BALLS else LARGEST_SHARE_OF_FEW
+    share = LARGEST_RADIUS_SHARE if len(ball.midpoint) > MOST_STATES_FOR_BALLS else LARGEST_SHARE_OF_FEW
     return bool(np.max(ball.radius) <= share * np.max(np.abs(ball.midpoint)))
 
 
@@ -76,7 +76,7 @@ class _Doubling:
         moved = self._moved(matrix, -1)
         balanced = Ball(moved, np.full(moved.shape, UNDERFLOW))
         norm = float(np.max(np.sum(np.abs(balanced.midpoint), axis=1))) * abs(float(time))
-        self.times = max(0, math.ceil(math.log2(norm / SHORT))) + 1 if 0.0 < norm < math.inf else 0
+        self.times = max(0, math.ceil(math.log2(norm / SHORT_NORM))) + 1 if 0.0 < norm < math.inf else 0
         self.short = math.ldexp(float(time), -self.times)
         self.x = balanced.scaled(self.short)
         #: Above the norm of the exponent over the short interval.

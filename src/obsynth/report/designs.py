@@ -13,7 +13,7 @@ from obsynth.analysis.diagnosis.exact import question
 from obsynth.analysis.diagnosis.fault_columns import dc_point
 from obsynth.analysis.transformations.recovery import StateRecovery
 from obsynth.errors import ObsynthError, PreconditionError
-from obsynth.methods.automatic import SAMPLES
+from obsynth.methods.automatic import SETTLING_SAMPLES
 from obsynth.methods.fault_figures import FaultFigures, fault_figures, on_the_clock
 from obsynth.methods.functional_filter.rates import DelayCurve, delay_curve, settling_time
 from obsynth.methods.registry import REGISTRY, method_class
@@ -48,7 +48,7 @@ def tolerance_facts(design: ObserverDesign) -> list[tuple[str, str]]:
 
 
 #: Signals of any kind of plant, as they are called here.
-_SIGNALS = {
+_NAMES_OF_SIGNALS = {
     "states": "state_names",
     "known inputs": "input_names",
     "outputs": "output_names",
@@ -71,7 +71,7 @@ def plant_facts(plant: DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel
         yield "equations", str(plant.ne)
     else:
         yield "time", f"discrete, {plant.dt:g} s between samples" if plant.is_discrete else "continuous"
-    for label, attribute in _SIGNALS.items():
+    for label, attribute in _NAMES_OF_SIGNALS.items():
         if (names := getattr(plant, attribute, None)) is not None:
             yield label, f"{len(names)}: {name_list(names)}" if names else "none"
 
@@ -234,7 +234,7 @@ def followed_steps(design: ObserverDesign) -> Mapping[str, FaultFigures]:
     plant, observer = pair
     if (observer.Bu.shape[1], observer.By.shape[1]) != (plant.nu, plant.ny):
         return {}
-    step = plant.dt if plant.dt > 0.0 else settling_time(plant) / SAMPLES
+    step = plant.dt if plant.dt > 0.0 else settling_time(plant) / SETTLING_SAMPLES
     length = STEP_SETTLING_TIMES * settling_time(plant)
     steps = int(min(max(length / step, 20), MOST_STEP_SAMPLES))
     try:

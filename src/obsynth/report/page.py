@@ -49,12 +49,12 @@ from obsynth.results.verification_report import VerificationReport
 from obsynth.simulation.scenario import Scenario
 
 #: Prefix of a check's name -> heading of its group; the others are about the shipped observer.
-_GROUPS = {"plant": "The plant", "exists": "Does such an observer exist?"}
+_CHECK_GROUPS = {"plant": "The plant", "exists": "Does such an observer exist?"}
 _SHIPPED = "The shipped observer"
 #: Characters of an option; a solver's log may be long.
 LONGEST_VALUE = 400
 #: What each kind of check is worth.
-KINDS: dict[CheckKind, str] = {
+CHECK_KINDS: dict[CheckKind, str] = {
     "proved": "an inequality that was proved, with bounds on every rounding error",
     "condition": "an existence condition of the method, on the plant alone",
     "equality": "an identity: what is left of it, against a bound scaled by the size of its terms; it is not called "
@@ -63,7 +63,7 @@ KINDS: dict[CheckKind, str] = {
     "information": "a number worth knowing that no verdict depends on",
 }
 #: What each row is worth, whatever its kind.
-STATUSES: dict[Status, str] = {
+CHECK_STATUSES: dict[Status, str] = {
     "proved": "outward rounding, on the numbers that are stored",
     "computed twice": "double precision, by a route that shares no intermediate result with the design",
     "estimated": "statistics, with the interval in which chance alone puts the number",
@@ -114,10 +114,10 @@ def check_rows(checks: Sequence[Check]) -> Iterator[str]:
     yield "<h3>What each kind of check is worth</h3>"
     yield from fact_rows(
         [
-            *((kind, meaning) for kind, meaning in KINDS.items() if any(check.kind == kind for check in checks)),
+            *((kind, meaning) for kind, meaning in CHECK_KINDS.items() if any(check.kind == kind for check in checks)),
             *(
                 (f"({status})", meaning)
-                for status, meaning in STATUSES.items()
+                for status, meaning in CHECK_STATUSES.items()
                 if any(check.status == status for check in checks)
             ),
         ]
@@ -125,11 +125,11 @@ def check_rows(checks: Sequence[Check]) -> Iterator[str]:
 
 
 def _group(check: Check) -> str:
-    return "What fails" if not check.passed else _GROUPS.get(check.name.partition(":")[0], _SHIPPED)
+    return "What fails" if not check.passed else _CHECK_GROUPS.get(check.name.partition(":")[0], _SHIPPED)
 
 
 def _place(check: Check) -> int:
-    return ("What fails", *_GROUPS.values(), _SHIPPED).index(_group(check))
+    return ("What fails", *_CHECK_GROUPS.values(), _SHIPPED).index(_group(check))
 
 
 def _row(check: Check) -> str:

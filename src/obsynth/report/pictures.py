@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 
 #: Inches: a picture beside another one, and one of a row of its own; small, so that texts stay readable on a phone.
-HALF, WIDE = 5.6, 6.6
+HALF_WIDTH, WIDE = 5.6, 6.6
 #: Inches: a panel of several, and what the axis of time takes.
 PANEL, EDGE = 1.5, 0.6
 #: More states than this are not drawn.
@@ -70,7 +70,7 @@ def pictures_of(design: ObserverDesign, *, scenario: Scenario | None = None) -> 
         yield Picture(
             "Spectrum",
             f"Eigenvalues of the observer: its initial-condition response decays where all are {region}.",
-            drawn((HALF, 5.4 if sampled else 4.2), 1, lambda axes: plot_poles(design, axes=axes[0])),
+            drawn((HALF_WIDTH, 5.4 if sampled else 4.2), 1, lambda axes: plot_poles(design, axes=axes[0])),
         )
     if design.observer.fault_names:
         yield _gains(
@@ -94,13 +94,13 @@ def _hidden(test: GuaranteedTest) -> Iterator[Picture]:
     if len(test.tests) == 1:
         if len(test.trade_off) > 1:
             text = "The least threshold of any test against the time that its samples take; the marked one is proved."
-            yield Picture("How small a fault", text, drawn((HALF, 4.2), 1, lambda axes: test.plot(axes=axes[0])))
+            yield Picture("How small a fault", text, drawn((HALF_WIDTH, 4.2), 1, lambda axes: test.plot(axes=axes[0])))
         if test.least > 0.0:
             yield Picture(
                 "Why no smaller one",
                 f"This course of {test.fault} with these disturbances, and the opposite of all of them, give the same "
                 "samples: every equation and all bounds hold.",
-                drawn((HALF, 4.2), 1, lambda axes: plot_hidden_course(test, axes=axes[0])),
+                drawn((HALF_WIDTH, 4.2), 1, lambda axes: plot_hidden_course(test, axes=axes[0])),
             )
         return
     for own, group in zip(test.tests, test.groups, strict=True):
@@ -108,7 +108,7 @@ def _hidden(test: GuaranteedTest) -> Iterator[Picture]:
             yield Picture(
                 f"Why {own.fault} is not isolated",
                 "Together these courses change no output: every equation holds, without disturbance and noise.",
-                drawn((HALF, 4.2), 1, partial(_draw_hidden, test, own.fault)),
+                drawn((HALF_WIDTH, 4.2), 1, partial(_draw_hidden, test, own.fault)),
             )
 
 
@@ -117,7 +117,7 @@ def _draw_hidden(test: GuaranteedTest, fault: str, axes: Sequence[Axes]) -> None
 
 
 def _gains(design: ObserverDesign, to: str, title: str, text: str) -> Picture:
-    return Picture(title, text, drawn((HALF, 4.2), 1, lambda axes: plot_gains(design, to=to, axes=axes[0])))
+    return Picture(title, text, drawn((HALF_WIDTH, 4.2), 1, lambda axes: plot_gains(design, to=to, axes=axes[0])))
 
 
 def _at_work(design: ObserverDesign, scenario: Scenario | None) -> Iterator[Picture]:

@@ -91,9 +91,9 @@ def _yes(value: bool) -> str:
 
 
 #: Of a bank of residuals so many rows are shown.
-MOST_ROWS = 12
+MOST_BANK_ROWS = 12
 #: What the columns of numbers mean.
-_COLUMNS = (
+_COLUMN_MEANINGS = (
     "delay: samples, or derivatives in continuous time; residual, filter: states of the smallest residual that shows "
     "the fault, and of a filter that estimates it."
 )
@@ -104,14 +104,14 @@ def diagnosis_report(diagnosis: Diagnosis, *, console: Console, everything: bool
     if not diagnosis.faults:
         return
     print_section(console, diagnosis.heading, _table(diagnosis.verdict_rows()))
-    console.print(Text(_COLUMNS, style="dim"))
+    console.print(Text(_COLUMN_MEANINGS, style="dim"))
     if everything and len(diagnosis.faults) > 1:
         rows = diagnosis.bank_rows()
         print_section(console, "Which fault can be told from which", _table(diagnosis.isolability_rows()))
-        more = len(rows) - 1 - MOST_ROWS
+        more = len(rows) - 1 - MOST_BANK_ROWS
         title = "Structured residuals" + (f" ({more} more are not shown; --json has them)" if more > 0 else "")
         if len(rows) > 1:
-            print_section(console, title, _table(rows[: MOST_ROWS + 1]))
+            print_section(console, title, _table(rows[: MOST_BANK_ROWS + 1]))
     for sentence in diagnosis.sentences:
         console.print(Text(sentence))
     for warning in diagnosis.warnings:
@@ -130,12 +130,12 @@ def _table(rows: Sequence[Sequence[str]]) -> Table:
 
 
 #: Conditions that ask for another time than the plant's, and what to do about each.
-_TIME = {
+_TIME_CONDITIONS = {
     "exists: continuous time": "continuous only: design for the plant in continuous time (dt: 0, without sample_time), "
     "and sample the observer afterwards (obsynth.sample_observer)",
     "exists: discrete time": "discrete only: sample the plant first (transform: {sample_time: ...})",
 }
-_KIND, _OF_THIS_KIND = "exists: kind of plant", "exists: plant of this kind"
+_PLANT_KIND, _OF_THIS_KIND = "exists: kind of plant", "exists: plant of this kind"
 
 
 def method_lines(methods: Mapping[str, VerificationReport], *, own: str = "") -> Iterator[tuple[str, str, str]]:
@@ -147,10 +147,10 @@ def method_lines(methods: Mapping[str, VerificationReport], *, own: str = "") ->
         asked = " (the spec's method)" if method == own else ""
         if report.passed:
             yield method, f"all conditions hold, so a design exists{asked}", "green"
-        elif _KIND in names and method != own:
+        elif _PLANT_KIND in names and method != own:
             others.append(method)
-        elif names & set(_TIME):
-            yield method, next(text for name, text in _TIME.items() if name in names) + asked, "yellow"
+        elif names & set(_TIME_CONDITIONS):
+            yield method, next(text for name, text in _TIME_CONDITIONS.items() if name in names) + asked, "yellow"
         elif _OF_THIS_KIND in names:
             reason = next(check.detail for check in failed if check.name == _OF_THIS_KIND)
             yield method, f"not for this plant{asked}: {reason}".rstrip("."), "yellow"
@@ -179,7 +179,7 @@ def _reason(failed: Sequence[Check]) -> str:
     return told.rstrip(".") + (f" (and {len(more)} more with -v)" if more else "")
 
 
-_NAMES = ("state_names", "input_names", "output_names", "fault_names", "disturbance_names")
+_PLANT_NAMES = ("state_names", "input_names", "output_names", "fault_names", "disturbance_names")
 
 
 def linear_plant_text(plant: DescriptorSystem) -> str:
@@ -211,7 +211,7 @@ def plant_document(plant: DescriptorSystem, source: str) -> str:
         matrix = getattr(plant, name)
         if matrix.size and (np.any(matrix) or name in "EAC"):
             data[name] = [[float(value) + 0.0 for value in row] for row in matrix]
-    data |= {name: list(getattr(plant, name)) for name in _NAMES if getattr(plant, name)}
+    data |= {name: list(getattr(plant, name)) for name in _PLANT_NAMES if getattr(plant, name)}
     data["operating_point"] = {name: float(value) for name, value in plant.operating_point.items()}
     data["units"] = dict(plant.units)
     where = "at the operating point below and at nominal values of all constants"

@@ -20,7 +20,7 @@ from obsynth.observers.decisions import ParameterMonitor
 from obsynth.results.layout import headed_table, number, print_section
 
 #: Rows of a table; of a large plant the worst estimates are shown.
-SHOWN = 12
+SHOWN_ROWS = 12
 _DECISIONS = {
     "false_alarm_rate": ("false alarms", "share of runs"),
     "missed_detection_rate": ("missed detections", "share of runs"),
@@ -67,9 +67,9 @@ def evaluation_report(
 
 def _worst(title: str, rows: list[Any], size: Callable[[Any], float]) -> tuple[str, list[Any]]:
     """Return title and rows of a table; of many the worst."""
-    if len(rows) <= SHOWN:
+    if len(rows) <= SHOWN_ROWS:
         return title, rows
-    return f"{title}: the worst {SHOWN} of {len(rows)}", sorted(rows, key=lambda row: -size(row))[:SHOWN]
+    return f"{title}: the worst {SHOWN_ROWS} of {len(rows)}", sorted(rows, key=lambda row: -size(row))[:SHOWN_ROWS]
 
 
 def described(monitor: Monitor | ParameterMonitor) -> tuple[str, str]:
@@ -97,7 +97,7 @@ def _interval(item: Interval) -> str:
 NARROW = 130
 _LESS = ("order", "s to 50 %", "at horizon", "peak", "bias", "s to alarm", "smallest", "ms")
 #: Columns of names, and how wide they are there: eighty columns less six of numbers.
-_NAMES = ("method", "fault")
+_NAME_COLUMNS = ("method", "fault")
 _NAME_WIDTH = 11
 
 
@@ -109,9 +109,9 @@ def comparison_report(found: Comparison, *, console: Console, file: Path | None 
     table = headed_table(*(header[i] for i in kept))
     # Only names break, and at their hyphens and blanks: a number that is cut is another number.
     for column, i in zip(table.columns, kept, strict=True):
-        column.no_wrap = header[i] not in _NAMES
+        column.no_wrap = header[i] not in _NAME_COLUMNS
     for row in rows:
-        texts = [row[i] if wide or header[i] not in _NAMES else fill(row[i], _NAME_WIDTH) for i in kept]
+        texts = [row[i] if wide or header[i] not in _NAME_COLUMNS else fill(row[i], _NAME_WIDTH) for i in kept]
         table.add_row(*map(Text, texts))
     console.print(Text(found.setting))
     if rows:

@@ -17,7 +17,7 @@ from obsynth.analysis.structure import questions
 from obsynth.files.tables import html_table
 from obsynth.methods.fault_figures import FaultFigures
 from obsynth.methods.registry import REGISTRY, method_class
-from obsynth.observers.linear.derived import FORGOTTEN, transient
+from obsynth.observers.linear.derived import FORGOTTEN_SHARE, transient
 from obsynth.observers.windows import WindowObserver
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
@@ -35,9 +35,9 @@ from obsynth.results.design import ObserverDesign
 from obsynth.results.layout import number, verdict_line
 
 #: Faults, warnings and notes that are listed; the others are counted.
-_MOST_FAULTS, _MOST_NOTES = 5, 1
+_MOST_IN_SUMMARY, _MOST_NOTES = 5, 1
 #: An unknown input that reaches a fault estimate in the fault's own unit with this gain or more looks like the fault.
-NEAR_ONE = 0.5
+LOOKS_LIKE_FAULT = 0.5
 #: An estimate follows a step if in the end it misses it by no more than this share.
 FOLLOWS = 0.1
 _LABEL = 10
@@ -111,7 +111,7 @@ def summary(design: ObserverDesign, *, file: Path | None = None, everything: boo
     steps = followed_steps(design)
     headings, rows = fault_estimates(design, gains)
     warnings = tuple(_warnings(design, gains, steps))
-    shown = len(rows) if everything else _MOST_FAULTS
+    shown = len(rows) if everything else _MOST_IN_SUMMARY
     notes = design.notes if everything else design.notes[:_MOST_NOTES]
     hidden = ((len(rows) - shown, "more estimate"), (len(design.notes) - len(notes), "more note"))
     more = _counted([(count, what) for count, what in hidden if count > 0])
@@ -184,7 +184,7 @@ def _slowest(design: ObserverDesign) -> str:
         seconds = transient(design.linear[1])
         if not math.isfinite(seconds):
             return f"the initial-condition response does not decay; observer of order {design.observer.order}"
-        settling = f"{100.0 * FORGOTTEN:g} % settling time {number(seconds, digits=2)} s"
+        settling = f"{100.0 * FORGOTTEN_SHARE:g} % settling time {number(seconds, digits=2)} s"
         return f"{settling}; observer of order {design.observer.order}"
     factor = design.certificate.claims.get("contraction", math.nan)
     return f"errors shrink to {number(100.0 * factor)} % per step on average; observer of order {design.observer.order}"
@@ -199,8 +199,8 @@ def _speed(design: ObserverDesign, steps: Mapping[str, FaultFigures]) -> Iterato
     reached = [(name, found.most) for name, found in steps.items() if found.reaches]
     told = [f"{name} {number(most, digits=4)} s" for name, most in reached if most > (late[name] + 0.5) * observer.dt]
     if told:
-        more = f" and {len(told) - _MOST_FAULTS} more" if len(told) > _MOST_FAULTS else ""
-        yield "step", f"90 % is shown after: {', '.join(told[:_MOST_FAULTS])}{more}"
+        more = f" and {len(told) - _MOST_IN_SUMMARY} more" if len(told) > _MOST_IN_SUMMARY else ""
+        yield "step", f"90 % is shown after: {', '.join(told[:_MOST_IN_SUMMARY])}{more}"
 
 
 def _assumptions(design: ObserverDesign) -> Iterator[str]:
@@ -231,7 +231,7 @@ def _warnings(design: ObserverDesign, gains: FaultGains | None, steps: Mapping[s
     for i, fault in enumerate(observer.fault_names):
         for j, name in enumerate(plant.disturbance_names):
             gain = float(gains.disturbance_gains[i, j])
-            if gain >= NEAR_ONE and units.get(fault) == units.get(name):
+            if gain >= LOOKS_LIKE_FAULT and units.get(fault) == units.get(name):
                 yield (
                     f"{name} reaches the estimate of {fault} with a gain of up to {number(gain)}: it looks like the "
                     "fault."

@@ -14,22 +14,22 @@ from obsynth.results.checks import Check, information, nothing_wrong
 from obsynth.results.gain_set_writing import digest_of, plain
 from obsynth.results.verification_report import VerificationReport
 
-KIND = "obsynth calibration"
-SCHEMA_VERSION = 1
+CALIBRATION_KIND = "obsynth calibration"
+CALIBRATION_VERSION = 1
 _SOURCE = "the calibration file"
 
 
 def calibration_text(data: Mapping[str, Any]) -> str:
     """Return what a calibration file holds: the data and their digest."""
-    body = plain({"kind": KIND, "schema_version": SCHEMA_VERSION, **data})
-    return json.dumps({"kind": KIND, "sha256": digest_of(body), **body}, indent=1, allow_nan=False) + "\n"
+    body = plain({"kind": CALIBRATION_KIND, "schema_version": CALIBRATION_VERSION, **data})
+    return json.dumps({"kind": CALIBRATION_KIND, "sha256": digest_of(body), **body}, indent=1, allow_nan=False) + "\n"
 
 
 def read_calibration(path: Path, *, where: str = "") -> dict[str, Any]:
     """Return the content of a calibration file whose digest is right; raise `SpecError` for any other."""
     found = read_json(path, where=where) if where else read_json(path)
     name = path.name
-    if not isinstance(found, dict) or found.get("kind") != KIND:
+    if not isinstance(found, dict) or found.get("kind") != CALIBRATION_KIND:
         raise SpecError(f"{name} is no calibration: write one by obsynth calibrate --out {name}.", path=where or name)
     if "sha256" not in found:
         raise SpecError(f"{name} holds no digest of itself, as files of older versions: calibrate again (obsynth "
@@ -64,7 +64,7 @@ def verify_calibration(path: str | Path, again: Mapping[str, Any] | None = None)
         The file is no calibration.
     """
     found = read_json(Path(path))
-    if not isinstance(found, dict) or found.get("kind") != KIND:
+    if not isinstance(found, dict) or found.get("kind") != CALIBRATION_KIND:
         raise SpecError(f"{path} is no calibration.", path=str(path))
     rows = [
         nothing_wrong("digest", "the file is as it was written", [] if _intact(found) else ["sha256"], source=_SOURCE)

@@ -64,7 +64,7 @@ def result_text(
 
 
 #: Figures that are found again agree to this share of themselves, or of the largest beside them for rounding.
-SAME_SHARE, ROUNDING_SHARE = 1e-6, 1e-9
+SAME_FIGURE, FIGURE_ROUNDING_SHARE = 1e-6, 1e-9
 
 
 def differences(stored: Any, found: Any, where: str = "") -> list[str]:
@@ -80,7 +80,7 @@ def differences(stored: Any, found: Any, where: str = "") -> list[str]:
     else:
         return [] if _same(stored, found, 0.0) else [where]
     numbers = [abs(float(other)) for _, _, other in items if _is_figure(other)]
-    rounding = ROUNDING_SHARE * max((size for size in numbers if size < float("inf")), default=0.0)
+    rounding = FIGURE_ROUNDING_SHARE * max((size for size in numbers if size < float("inf")), default=0.0)
     wrong = []
     for name, one, other in items:
         place = f"{where}, {name}" if where else name
@@ -102,7 +102,7 @@ def _same(one: Any, other: Any, rounding: float) -> bool:
         return True
     if not (np.isfinite(one) and np.isfinite(other)):
         return False
-    return bool(abs(one - other) <= max(SAME_SHARE * abs(other), rounding))
+    return bool(abs(one - other) <= max(SAME_FIGURE * abs(other), rounding))
 
 
 def body_of(body: Mapping[str, Any]) -> dict[str, Any]:

@@ -26,8 +26,8 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 
-SCHEMA_VERSION = 2
-KIND = "obsynth gain set"
+GAIN_SET_VERSION = 2
+GAIN_SET_KIND = "obsynth gain set"
 _PLACE_DIGITS = 16
 GAIN_SET = FileKind(
     "a gain set",
@@ -35,7 +35,7 @@ GAIN_SET = FileKind(
     ending=".gains.json",
 )
 #: Tags of kinds of designs; linear time-invariant ones have none.
-KINDS = (None, "recursive", "dae", "window")
+DESIGN_KINDS = (None, "recursive", "dae", "window")
 #: From so many numbers on, which are more than a megabyte as text, the arrays of a gain set are a binary member.
 MANY_NUMBERS = 50_000
 DOCUMENT, ARRAYS = "gain_set.json", "arrays.npz"
@@ -52,14 +52,14 @@ _MARKS = (_ARRAY, _FLOAT, _MAPPING, _MEMBER)
 def design_as_dict(design: Any) -> dict[str, Any]:
     """Return the whole gain set as JSON data, digest included."""
     body = plain(_body_of(design))
-    return {"kind": KIND, "schema_version": SCHEMA_VERSION, "sha256": digest_of(body), "design": body}
+    return {"kind": GAIN_SET_KIND, "schema_version": GAIN_SET_VERSION, "sha256": digest_of(body), "design": body}
 
 
 def gain_set_bytes(design: Any, *, spec: Path | None = None) -> bytes:
     """Return what a file with a gain set holds; with ``spec`` it remembers the place of that spec."""
     body, arrays, digest = _written(design)
     place = {} if spec is None else {"written_for": place_of(spec)}
-    document = {"kind": KIND, **place, "schema_version": SCHEMA_VERSION, "sha256": digest, "design": body}
+    document = {"kind": GAIN_SET_KIND, **place, "schema_version": GAIN_SET_VERSION, "sha256": digest, "design": body}
     text = json.dumps(document, indent=1, allow_nan=False) + "\n"
     return text.encode() if arrays is None else _zipped({DOCUMENT: text, ARRAYS: arrays})
 
@@ -134,7 +134,7 @@ def types_of(kind: str | None) -> tuple[Any, Any]:
 
 def _tag(design: Any) -> dict[str, str]:
     """Return the entry that tells of which kind plant and observer are."""
-    found = next((kind for kind in KINDS if isinstance(design.observer, types_of(kind)[1])), None)
+    found = next((kind for kind in DESIGN_KINDS if isinstance(design.observer, types_of(kind)[1])), None)
     return {} if found is None else {"kind": found}
 
 

@@ -23,12 +23,12 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.results.design import Certificate, ObserverDesign
 from obsynth.results.gain_set_writing import (
     ARRAYS,
+    DESIGN_KINDS,
     DOCUMENT,
     GAIN_SET,
-    KIND,
-    KINDS,
+    GAIN_SET_KIND,
+    GAIN_SET_VERSION,
     MAXIMUM_BYTES,
-    SCHEMA_VERSION,
     design_as_dict,
     digest_of,
     gain_set_bytes,
@@ -44,7 +44,7 @@ from obsynth.results.verification_report import VerificationReport
 
 __all__ = [
     "GAIN_SET",
-    "SCHEMA_VERSION",
+    "GAIN_SET_VERSION",
     "design_as_dict",
     "digest_of",
     "gain_set_bytes",
@@ -59,7 +59,7 @@ __all__ = [
 ]
 
 #: Larger gain sets are refused before they fill the memory.
-MAXIMUM_CHARACTERS = 2_000_000_000
+MOST_GAIN_SET_CHARACTERS = 2_000_000_000
 _HEAD_BYTES = 256
 
 
@@ -134,7 +134,7 @@ def _read_members(source: Path) -> tuple[Any, bytes | None]:
     with file.open("rb") as stream:
         start = stream.read(_HEAD_BYTES)
     if not is_packed(start):
-        return read_json(source, most=MAXIMUM_CHARACTERS), None
+        return read_json(source, most=MOST_GAIN_SET_CHARACTERS), None
     try:
         text, arrays = unpacked(file.read_bytes())
         return json_data(text), arrays
@@ -144,12 +144,12 @@ def _read_members(source: Path) -> tuple[Any, bytes | None]:
 
 def _design_of(document: Any, arrays: bytes | None, source: str) -> ObserverDesign:
     """Return the design in a document whose digest is right."""
-    if not isinstance(document, dict) or document.get("kind") != KIND:
+    if not isinstance(document, dict) or document.get("kind") != GAIN_SET_KIND:
         raise SpecError(f"{source} is no gain set of obsynth.", path=source)
-    if document.get("schema_version") != SCHEMA_VERSION:
+    if document.get("schema_version") != GAIN_SET_VERSION:
         version = document.get("schema_version")
         raise SpecError(
-            f"{source} has schema version {version!r}; this obsynth reads {SCHEMA_VERSION}.",
+            f"{source} has schema version {version!r}; this obsynth reads {GAIN_SET_VERSION}.",
             path=source,
         )
     body = document.get("design")
@@ -186,7 +186,7 @@ def _recovery_from(**data: Any) -> StateRecovery:
 
 
 def _design_from(data: dict[str, Any]) -> ObserverDesign:
-    if not isinstance(data.get("kind"), (str, type(None))) or data.get("kind") not in KINDS:
+    if not isinstance(data.get("kind"), (str, type(None))) or data.get("kind") not in DESIGN_KINDS:
         raise SpecError(f"A design of the kind {data['kind']!r} is unknown to this obsynth.", path="kind")
     plant, observer = types_of(data.get("kind"))
     recovery = data["recovery"]

@@ -22,7 +22,7 @@ from obsynth.results.checks import Check, all_hold
 #: Two values this near to each other, relative to their size or one, are shown as conjugates.
 SAME_NUMBER = 1e-9
 #: Values that are listed; the others are counted.
-MOST_VALUES = 8
+MOST_LISTED_VALUES = 8
 
 
 def number(value: float, *, digits: int = 4) -> str:
@@ -54,7 +54,7 @@ def complex_numbers(values: Iterable[complex]) -> str:
         else:
             waiting.remove(partner)
             shown.append(f"{number(value.real)} +- {number(abs(value.imag))}j")
-    return name_list(shown, limit=MOST_VALUES)
+    return name_list(shown, limit=MOST_LISTED_VALUES)
 
 
 def name_list(names: Sequence[str], *, limit: int = 6) -> str:

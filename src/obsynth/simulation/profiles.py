@@ -296,7 +296,7 @@ class Gaussian(Random):
 
 
 #: The profiles by their names in a spec.
-KINDS: dict[str, type[Profile]] = {
+PROFILE_KINDS: dict[str, type[Profile]] = {
     "step": Step,
     "ramp": Ramp,
     "sine": Sine,

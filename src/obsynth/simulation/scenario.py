@@ -14,11 +14,11 @@ from obsynth.numerics.arguments import is_finite_number, is_whole
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.validation import index_of
-from obsynth.simulation.profiles import KINDS, Additive, Failure, Profile, Random
+from obsynth.simulation.profiles import PROFILE_KINDS, Additive, Failure, Profile, Random
 
-_ADDITIVE = tuple(kind for kind in KINDS.values() if issubclass(kind, Additive))
-_FAILING = tuple(kind for kind in KINDS.values() if issubclass(kind, Failure))
-_RANDOM = tuple(kind for kind in KINDS.values() if issubclass(kind, Random))
+_ADDITIVE = tuple(kind for kind in PROFILE_KINDS.values() if issubclass(kind, Additive))
+_FAILING = tuple(kind for kind in PROFILE_KINDS.values() if issubclass(kind, Failure))
+_RANDOM = tuple(kind for kind in PROFILE_KINDS.values() if issubclass(kind, Random))
 #: What each group of signals may do.
 _ALLOWED: dict[str, tuple[type[Profile], ...]] = {
     "inputs": _ADDITIVE,
@@ -27,7 +27,7 @@ _ALLOWED: dict[str, tuple[type[Profile], ...]] = {
     "sensors": (*_ADDITIVE, *_FAILING),
 }
 #: The names of a plant's signals that each group speaks of; the faults of a plant with parameters are these.
-_NAMES = {
+_GROUP_NAMES = {
     "inputs": "input_names",
     "faults": "fault_names",
     "disturbances": "disturbance_names",
@@ -123,7 +123,7 @@ class Scenario:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the scenario as plain data, as `scenario_from` reads it."""
-        kinds = {kind: name for name, kind in KINDS.items()}
+        kinds = {kind: name for name, kind in PROFILE_KINDS.items()}
         found = dict(vars(self))
         for group in _ALLOWED:
             found[group] = {
@@ -169,7 +169,7 @@ class Scenario:
         SpecError
             An unknown name, with the closest ones; ``path`` says where.
         """
-        for group, names in _NAMES.items():
+        for group, names in _GROUP_NAMES.items():
             if group == "faults" and not isinstance(plant, DescriptorSystem):
                 names = "parameter_names"
             known: Sequence[str] = getattr(plant, names, ())
@@ -186,7 +186,8 @@ def scenario_from(data: Mapping[str, Any]) -> Scenario:
     for group in _ALLOWED:
         given[group] = {
             name: [
-                KINDS[item["kind"]](**{key: value for key, value in item.items() if key != "kind"}) for item in profiles
+                PROFILE_KINDS[item["kind"]](**{key: value for key, value in item.items() if key != "kind"})
+                for item in profiles
             ]
             for name, profiles in given[group].items()
         }

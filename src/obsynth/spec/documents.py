@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 #: Values that the aliases of a document may repeat it to.
-MOST_VALUES = 1_000_000
+MOST_ALIASED_VALUES = 1_000_000
 
 
 def read_yaml(path: Path, *, where: str | None = None) -> dict[str, Any]:
@@ -47,7 +47,7 @@ def read_yaml(path: Path, *, where: str | None = None) -> dict[str, Any]:
         raise SpecError(f"{path} is no valid spec: it is nested too deeply.", path=place) from error
     except (ValueError, TypeError, OverflowError, AttributeError) as error:
         raise SpecError(f"{path} has a value that YAML cannot read: {error}.", path=place) from error
-    if count > max(len(text), MOST_VALUES):
+    if count > max(len(text), MOST_ALIASED_VALUES):
         raise SpecError(
             f"{path} stands for {count:.3g} values: its aliases (*name) repeat what they name too often. Put such "
             "matrices into files beside it.",
@@ -216,11 +216,11 @@ def checked_plant(document: Mapping[str, Any], source: Path) -> PlantSection | T
 
 def _check_version(document: Mapping[str, Any], problems: DocumentProblems) -> None:
     """Raise at once for another version: the other keys would then mean something else."""
-    from obsynth.spec.schema import SCHEMA_VERSION
+    from obsynth.spec.schema import SPEC_VERSION
 
     version = document.get("schema_version")
-    if is_whole(version) and version != SCHEMA_VERSION:
-        problems.add("schema_version", f"version {version} is unknown; this obsynth reads version {SCHEMA_VERSION}.")
+    if is_whole(version) and version != SPEC_VERSION:
+        problems.add("schema_version", f"version {version} is unknown; this obsynth reads version {SPEC_VERSION}.")
         problems.raise_if_any()
 
 

@@ -29,13 +29,13 @@ from obsynth.numerics.libraries import one_thread_if_small
 from obsynth.numerics.sparse import as_sparse_matrix, is_sparse
 from obsynth.plants.constants import constant_of
 from obsynth.plants.dae.model import DAEModel
-from obsynth.plants.descriptor import MATRICES, SIGNAL_NAMES, DescriptorSystem
+from obsynth.plants.descriptor import ALL_MATRICES, SIGNAL_NAMES, DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.plants.uncertain_system import with_expressions
 from obsynth.plants.uncertainty import UNCERTAIN_MATRICES, Entry
 from obsynth.plants.validation import index_of
 from obsynth.results.calibration_files import read_calibration
-from obsynth.simulation.profiles import KINDS, Profile
+from obsynth.simulation.profiles import PROFILE_KINDS, Profile
 from obsynth.simulation.scenario import Scenario
 from obsynth.simulation.signals import check_parameters
 from obsynth.spec.documents import DocumentProblems, checked_plant, checked_spec, read_names, read_yaml
@@ -384,7 +384,7 @@ def _varying_plant(section: TimeVaryingSection, source: Path, prefix: str) -> Ti
 
 
 #: Noise of a nonlinear plant, which its linear model or the options of a method take; and what `with_noise` takes.
-_NOISE = ("sensor_noise", "process_noise")
+_TAKEN_NOISE = ("sensor_noise", "process_noise")
 _NOISE_MODEL = ("sensor_noise", "offset", "walks")
 
 
@@ -404,7 +404,7 @@ def _needs_states(noise: Mapping[str, Any]) -> bool:
 
 
 def _nonlinear_plant(section: DAESection, source: Path, prefix: str) -> DAEModel:
-    left_out = {"kind", "schema_version", "transform", "variation", "box", *_NOISE, *_NOISE_MODEL}
+    left_out = {"kind", "schema_version", "transform", "variation", "box", *_TAKEN_NOISE, *_NOISE_MODEL}
     arguments = section.model_dump(exclude=left_out, exclude_none=True)
 
     def made() -> DAEModel:
@@ -421,7 +421,7 @@ def _nonlinear_plant(section: DAESection, source: Path, prefix: str) -> DAEModel
 
 def _invariant_plant(section: PlantSection, source: Path, prefix: str) -> DescriptorSystem:
     arguments = _read(
-        section, source, prefix, ("dt", "sensor_noise", *_LABELS), MATRICES, SIGNAL_NAMES, keep_sparse=True
+        section, source, prefix, ("dt", "sensor_noise", *_LABELS), ALL_MATRICES, SIGNAL_NAMES, keep_sparse=True
     )
     if _needs_states(_noise_model(section)):
         arguments["sensor_noise"] = None
@@ -448,7 +448,7 @@ def matlab_plant(reference: PlantReference, spec: Path) -> DescriptorSystem | No
 
 
 #: Signals that name the columns of a matrix; rows are equations (states) or outputs.
-_COLUMNS = {
+_COLUMN_NAMES = {
     "B": "input_names",
     "D": "input_names",
     "Bf": "fault_names",
@@ -520,7 +520,7 @@ def _entry(plant: DescriptorSystem, matrix: str, item: EntrySection) -> Entry:
             f"{matrix!r} holds no constants: {', '.join(UNCERTAIN_MATRICES)} may.", path=f"entries.{matrix}"
         )
     rows = plant.output_names if matrix in _OUTPUT_ROWS else plant.state_names
-    columns = getattr(plant, _COLUMNS.get(matrix, "state_names"))
+    columns = getattr(plant, _COLUMN_NAMES.get(matrix, "state_names"))
     places = []
     for key, value, names in (("row", item.row, rows), ("column", item.column, columns)):
         if isinstance(value, str):
@@ -532,7 +532,7 @@ def _entry(plant: DescriptorSystem, matrix: str, item: EntrySection) -> Entry:
     return places[0], places[1], str(item.value)
 
 
-_GROUPS = ("inputs", "faults", "disturbances", "sensors")
+_SCENARIO_GROUPS = ("inputs", "faults", "disturbances", "sensors")
 
 
 def built_scenario(
@@ -543,7 +543,7 @@ def built_scenario(
         return None
     problems = DocumentProblems(source, what="spec")
     given: dict[str, Any] = {name: getattr(section, name) for name in section.model_fields_set}
-    for group in _GROUPS:
+    for group in _SCENARIO_GROUPS:
         given[group] = {
             name: [
                 _profile(item, f"scenario.{group}.{name}", problems)
@@ -567,7 +567,7 @@ def built_scenario(
 
 def _profile(section: ProfileSection, where: str, problems: DocumentProblems) -> Profile | None:
     """Return the profile; note what is wrong with it."""
-    kind = KINDS[section.kind]
+    kind = PROFILE_KINDS[section.kind]
     given = {name: getattr(section, name) for name in section.model_fields_set - {"kind"}}
     known = {field.name: field.default is MISSING for field in fields(kind)}
     for name in sorted(given.keys() - known.keys()):

@@ -25,16 +25,16 @@ from obsynth.spec.schema_values import (
     VaryingMatrix,
 )
 
-SCHEMA_VERSION = 1
+SPEC_VERSION = 1
 
 # Tags of unions appear in the locations of pydantic's errors; the bracket marks them for removal.
-_INLINE, _VARYING, _ONE, _NONLINEAR = "<inline>", "<varying>", "<one>", "<dae>"
+_INLINE, _VARYING_TAG, _ONE, _NONLINEAR = "<inline>", "<varying>", "<one>", "<dae>"
 _COLOURED = "<coloured>"
 
 
 def _kind_of_plant(value: Any) -> str:
     if isinstance(value, dict) and value.get("kind") == "time-varying":
-        return _VARYING
+        return _VARYING_TAG
     if isinstance(value, dict) and value.get("kind") == "dae":
         return _NONLINEAR
     return FILE_TAG if isinstance(value, dict) and "file" in value else _INLINE
@@ -322,7 +322,7 @@ class SpecDocument(Section):
     plant: Annotated[
         Annotated[PlantReference, Tag(FILE_TAG)]
         | Annotated[PlantSection, Tag(_INLINE)]
-        | Annotated[TimeVaryingSection, Tag(_VARYING)]
+        | Annotated[TimeVaryingSection, Tag(_VARYING_TAG)]
         | Annotated[DAESection, Tag(_NONLINEAR)],
         Discriminator(_kind_of_plant),
     ]

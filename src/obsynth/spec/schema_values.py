@@ -30,7 +30,14 @@ from obsynth.methods.registry import method_class
 from obsynth.numerics.arguments import Count, NonNegative, OpenUnitInterval, Positive, WrittenAs, field_types, is_number
 
 # Tags of unions appear in the locations of pydantic's errors; the bracket marks them for removal.
-_ROWS, FILE_TAG, _PICK, LIST_TAG, _STACK, _NUMBER = "<rows>", "<file>", "<pick>", "<list>", "<stack>", "<number>"
+_ROWS, FILE_TAG, _PICK, LIST_TAG, _STACK_TAG, _NUMBER_TAG = (
+    "<rows>",
+    "<file>",
+    "<pick>",
+    "<list>",
+    "<stack>",
+    "<number>",
+)
 
 
 def _rectangular(rows: Any, check_entries: ValidatorFunctionWrapHandler) -> Any:
@@ -155,7 +162,7 @@ def _same_shapes(stack: Any, check_entries: ValidatorFunctionWrapHandler) -> Any
     )
 
 
-Stack = Annotated[list[Rows], Field(min_length=1), WrapValidator(_same_shapes), Tag(_STACK)]
+Stack = Annotated[list[Rows], Field(min_length=1), WrapValidator(_same_shapes), Tag(_STACK_TAG)]
 
 
 class VaryingFile(MatrixFile):
@@ -168,21 +175,21 @@ def _kind_of_varying(value: Any) -> str:
     if isinstance(value, dict):
         return FILE_TAG
     first = value[0] if isinstance(value, list) and value else None
-    return _STACK if isinstance(first, list) and first and isinstance(first[0], list) else _ROWS
+    return _STACK_TAG if isinstance(first, list) and first and isinstance(first[0], list) else _ROWS
 
 
 VaryingMatrix = Annotated[VaryingRows | Stack | Annotated[VaryingFile, Tag(FILE_TAG)], Discriminator(_kind_of_varying)]
 
 
-Variance = Annotated[float, Field(ge=0.0), Tag(_NUMBER)]
+Variance = Annotated[float, Field(ge=0.0), Tag(_NUMBER_TAG)]
 #: One variance stands for that multiple of the identity, as from Python.
 Covariance = Annotated[
     Variance | Rows | Annotated[MatrixFile, Tag(FILE_TAG)],
-    Discriminator(lambda value: _NUMBER if is_number(value) else FILE_TAG if isinstance(value, dict) else _ROWS),
+    Discriminator(lambda value: _NUMBER_TAG if is_number(value) else FILE_TAG if isinstance(value, dict) else _ROWS),
 ]
 VaryingCovariance = Annotated[
     Variance | VaryingRows | Stack | Annotated[VaryingFile, Tag(FILE_TAG)],
-    Discriminator(lambda value: _NUMBER if is_number(value) else _kind_of_varying(value)),
+    Discriminator(lambda value: _NUMBER_TAG if is_number(value) else _kind_of_varying(value)),
 ]
 
 
@@ -210,7 +217,7 @@ class SensorTimes(Section):
 
 
 #: What a document may write for an option that is no plain number, text or truth.
-KINDS: Mapping[str, Any] = {
+OPTION_KINDS: Mapping[str, Any] = {
     "matrix": Matrix | None,
     "covariance": Covariance | None,
     "varying covariance": VaryingCovariance | None,
@@ -255,5 +262,5 @@ def _in_document(kind: Any) -> Any:
     if get_origin(kind) is Annotated:
         marks = [mark for mark in get_args(kind)[1:] if isinstance(mark, WrittenAs)]
         if marks:
-            return KINDS[marks[0].kind]
+            return OPTION_KINDS[marks[0].kind]
     return kind

@@ -22,12 +22,12 @@ from obsynth.methods.handing_on import require_verified
 from obsynth.methods.verifying import verify
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import load
-from obsynth.sweeps.work import STATUSES, ResultFolder, ResultTable, all_of, carried_out
+from obsynth.sweeps.work import WORK_STATUSES, ResultFolder, ResultTable, all_of, carried_out
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_KIND = "obsynth fleet result"
+_FLEET_KIND = "obsynth fleet result"
 #: What ends the name of a gain set; logs by their suffix.
 GAINS_ENDING = ".gains.json"
 LOG_ENDINGS = (".csv", ".tsv", ".parquet", ".tdms", ".mf4", ".mdf", ".dat")
@@ -196,7 +196,7 @@ def run_fleet(
     if wrong:
         raise SpecError(f"{', '.join(wrong)}: use some of {', '.join(known)}.", path=wrong[0])
     pairs = _pairs(_files(gains, (GAINS_ENDING,), "gains"), _files(data, LOG_ENDINGS, "data"), options)
-    place = ResultFolder(folder, _KIND, FleetRun, ending=".csv")
+    place = ResultFolder(folder, _FLEET_KIND, FleetRun, ending=".csv")
     return Fleet(
         carried_out(
             pairs,
@@ -258,7 +258,7 @@ def _run(pair: _Pair) -> tuple[FleetRun, str]:
         design = _verified(pair.gains, file_digest(pair.gains), unverified=bool(options.pop("unverified", False)))
         found = run_on_data(design, pair.log, stream, **options)
     except ObsynthError as error:
-        return FleetRun(pair.name, STATUSES[error.exit_code], str(error)), ""
+        return FleetRun(pair.name, WORK_STATUSES[error.exit_code], str(error)), ""
     text = stream.getvalue()
     return FleetRun(pair.name, "run", "", found.rows, dict(found.statuses), dict(found.alarms), _largest(text)), text
 

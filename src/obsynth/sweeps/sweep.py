@@ -22,7 +22,7 @@ from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import gain_set_bytes, load, loaded, plain
 from obsynth.spec.loader import spec_of
 from obsynth.sweeps.work import (
-    STATUSES,
+    WORK_STATUSES,
     ResultFolder,
     ResultTable,
     SweepCase,
@@ -35,8 +35,8 @@ from obsynth.sweeps.work import (
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_KIND = "obsynth sweep result"
-_PLANTS = get_args(Plant)
+_SWEEP_KIND = "obsynth sweep result"
+_PLANT_TYPES = get_args(Plant)
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,7 +149,7 @@ class Sweep(ResultTable):
         for i, result in enumerate(self.results):
             if name in result.claims:
                 found[i] = result.claims[name]
-            elif result.status == STATUSES[0]:
+            elif result.status == WORK_STATUSES[0]:
                 found[i] = next((row.value for row in result.design.report.checks if row.name == name), np.nan)
         return found
 
@@ -215,7 +215,7 @@ def sweep(
         The cases or parameters are malformed, or the folder cannot be written.
     """
     made = _cases(cases, parameters or {}, method)
-    place = None if folder is None else ResultFolder(folder, _KIND, SweepResult, ending=".gains.json")
+    place = None if folder is None else ResultFolder(folder, _SWEEP_KIND, SweepResult, ending=".gains.json")
     with progress_of_runs(progress) as told:
         return Sweep(
             carried_out(
@@ -237,10 +237,10 @@ def _cases(cases: Any, parameters: Mapping[str, Sequence[Any]], method: str | No
 
     if not isinstance(parameters, Mapping):
         raise SpecError("parameters must be a mapping of names to lists of values.", path="parameters")
-    if isinstance(cases, _PLANTS):
+    if isinstance(cases, _PLANT_TYPES):
         cases = {"plant": cases}
     if isinstance(cases, Mapping):
-        wrong = [name for name, plant in cases.items() if not isinstance(plant, _PLANTS)]
+        wrong = [name for name, plant in cases.items() if not isinstance(plant, _PLANT_TYPES)]
         if wrong or not cases:
             raise SpecError(f"{wrong or 'nothing'}: give a mapping of names to plants.", path="cases")
         if method is None:
@@ -263,7 +263,7 @@ def run_case(case: SweepCase) -> SweepResult:
     except ObsynthError as error:
         told = error.as_dict()
         return result(
-            STATUSES[error.exit_code],
+            WORK_STATUSES[error.exit_code],
             message=str(error),
             condition=str(told.get("condition") or ""),
             signals=tuple(told.get("signals", ())),
@@ -277,7 +277,7 @@ def run_case(case: SweepCase) -> SweepResult:
         "checks": f"{sum(check.passed for check in checks)} of {len(checks)}",
     }
     return result(
-        STATUSES[0],
+        WORK_STATUSES[0],
         claims={name: float(value) for name, value in made.certificate.claims.items()},
         facts=facts,
         content=gain_set_bytes(made),

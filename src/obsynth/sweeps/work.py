@@ -177,9 +177,9 @@ def _distinct(cases: list[SweepCase]) -> list[SweepCase]:
 
 
 #: What a piece of work came to, by the exit code of its error.
-STATUSES = {0: "designed", 2: "malformed", 3: "impossible", 4: "infeasible", 5: "unknown", 6: "unverified"}
+WORK_STATUSES = {0: "designed", 2: "malformed", 3: "impossible", 4: "infeasible", 5: "unknown", 6: "unverified"}
 #: Digits of the digest of a piece of work in the names of its files.
-DIGITS = 16
+DIGEST_DIGITS = 16
 #: Letters of its name there.
 LONGEST_STEM = 60
 _Item = TypeVar("_Item")
@@ -202,7 +202,7 @@ class ResultTable(ABC):
     def counts(self) -> dict[str, int]:
         """Number of results by what they came to."""
         found = [result.status for result in self._found]
-        return {status: found.count(status) for status in ("run", *STATUSES.values()) if status in found}
+        return {status: found.count(status) for status in ("run", *WORK_STATUSES.values()) if status in found}
 
     @abstractmethod
     def rows(self) -> tuple[list[str], list[list[Any]]]:
@@ -268,7 +268,7 @@ class ResultFolder(Generic[_Result]):
     def _file(self, item: Any, ending: str) -> Path:
         """Return a file of a piece of work: its name in letters that every file may have, and its digest."""
         stem = "".join(letter if letter.isalnum() or letter in "-_." else "-" for letter in item.name)[:LONGEST_STEM]
-        return self.folder / f"{stem}-{item.key[:DIGITS]}{ending}"
+        return self.folder / f"{stem}-{item.key[:DIGEST_DIGITS]}{ending}"
 
     def kept(self, item: Any, result: _Result, content: bytes | str | None) -> _Result:
         """Write what was made, then the result; return the result with the file."""

@@ -12,7 +12,7 @@ from obsynth.errors import SpecError
 from obsynth.files.outputs import write_atomically
 from obsynth.methods.handing_on import require_verified
 from obsynth.methods.verifying import verify
-from obsynth.plants.constants import SAME_SHARE, ConstantsBox
+from obsynth.plants.constants import SAME_TOLERANCE, ConstantsBox
 from obsynth.results.certificate_files import ROBUSTNESS, SHOWN_DIGITS, result_text
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import design_as_dict
@@ -20,9 +20,9 @@ from obsynth.results.gain_sets import design_as_dict
 #: A design without tolerances says this.
 EXACT_MODEL = "assumes an exact model"
 #: What is to blame for less is left out.
-LISTED_SHARE = 5e-3
+LISTED_BLAME_SHARE = 5e-3
 #: What a certificate of robustness claims.
-CLAIMS = (
+ROBUSTNESS_CLAIMS = (
     "regular", "stable", "breaking", "loop_radius", "largest_factor", "error_per_unit", "vertex_gains", "sharing",
     "untouched",
 )  # fmt: skip
@@ -104,13 +104,13 @@ class Robustness:
         shares = [item.half / abs(item.nominal) for item in self.box.uncertain if item.nominal]
         if self.largest_factor is None or len(shares) != len(self.box.uncertain) or not shares:
             return None
-        common = max(shares) - min(shares) <= SAME_SHARE * max(shares)
+        common = max(shares) - min(shares) <= SAME_TOLERANCE * max(shares)
         return self.largest_factor * shares[0] if common else None
 
     def claims(self) -> dict[str, Any]:
         """Return what a certificate claims, as plain data."""
         found = self.as_dict()
-        return {name: found[name] for name in CLAIMS}
+        return {name: found[name] for name in ROBUSTNESS_CLAIMS}
 
     @property
     def statement(self) -> str:
@@ -237,4 +237,6 @@ def robustness_statement(claims: Mapping[str, Any], design: ObserverDesign, dige
 
 def _top(shares: Mapping[str, float], most: int = 4) -> str:
     found = sorted(shares.items(), key=lambda item: -item[1])[:most]
-    return ", ".join(f"{name} {100.0 * share:.0f} %" for name, share in found if share > LISTED_SHARE) or "nothing"
+    return (
+        ", ".join(f"{name} {100.0 * share:.0f} %" for name, share in found if share > LISTED_BLAME_SHARE) or "nothing"
+    )

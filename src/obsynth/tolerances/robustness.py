@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.analysis.transformations.uncertain_plant import (
-    ROUNDING_SHARE,
+    ROW_ROUNDING_SHARE,
     AffinePlant,
     affine_plant,
     moving_basis,
@@ -47,7 +47,7 @@ from obsynth.verification.responses import (
 #: Boxes for stability after which it is left open where most states are algebraic: each elimination takes long.
 FEW_BOXES = 40
 #: Two plants are the same where entries agree so well, relatively and around zero.
-SAME_ENTRY, SAME_ZERO = 1e-9, 1e-12
+SAME_ENTRY, SAME_PLANT_ZERO = 1e-9, 1e-12
 
 
 def with_tolerances(design: ObserverDesign, constants: Any) -> tuple[ObserverDesign, DescriptorSystem]:
@@ -67,7 +67,7 @@ def _with_tolerances_of(plant: DescriptorSystem, given: DescriptorSystem) -> Des
     """Return a plant with the tolerances of one that is the same but for these."""
     same = all(
         getattr(plant, name).shape == getattr(given, name).shape
-        and np.allclose(getattr(plant, name), getattr(given, name), rtol=SAME_ENTRY, atol=SAME_ZERO)
+        and np.allclose(getattr(plant, name), getattr(given, name), rtol=SAME_ENTRY, atol=SAME_PLANT_ZERO)
         for name in ("E", "A", "B", "C", "D", "Bd", "Dd", "Bf", "Df")
     )
     own, other = plant.uncertainty, given.uncertainty
@@ -225,7 +225,9 @@ def _stability(plant: DescriptorSystem, affine: AffinePlant) -> tuple[BoxVerdict
     size = whole.magnitude.sum(axis=1)
     apart = untouched_states(least, np.concatenate([size, size]))
     values = np.linalg.eigvals(whole.center[np.ix_(apart, apart)])
-    outside = np.abs(values) >= 1.0 - ROUNDING_SHARE if discrete else values.real >= -ROUNDING_SHARE * size.max()
+    outside = (
+        np.abs(values) >= 1.0 - ROW_ROUNDING_SHARE if discrete else values.real >= -ROW_ROUNDING_SHARE * size.max()
+    )
     lasting = tuple(complex(value) for value in values[outside])
     # Stable modes that no constant touches are stable everywhere.
     rest = [i for i in range(len(whole.center)) if i not in apart]

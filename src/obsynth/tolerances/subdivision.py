@@ -29,9 +29,9 @@ BISECTIONS = 50
 #: With more constants than this, not all vertices are looked at first.
 MOST_VERTEX_CONSTANTS = 10
 #: Norms computed in double precision are multiplied by this before they are compared.
-_OUTWARD = 1.0 + 1e-9
+_NORM_OUTWARD = 1.0 + 1e-9
 #: What rounding takes from a product of matrices, beside its terms.
-_ROUNDING = 1e-14
+_PRODUCT_ROUNDING = 1e-14
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +150,7 @@ def _contracts(part: AffineMatrix, *, discrete: bool) -> bool:
         return False
     parts = [root @ item @ inverse for item in part.parts]
     rest = np.abs(root) @ part.radius @ np.abs(inverse)
-    rest = rest + _ROUNDING * len(a) * (np.abs(root) @ part.magnitude @ np.abs(inverse))
+    rest = rest + _PRODUCT_ROUNDING * len(a) * (np.abs(root) @ part.magnitude @ np.abs(inverse))
     size, remainder = np.abs(lyapunov), float(np.linalg.norm(rest, 2))
     if discrete:
         first = sum(float(np.linalg.norm(a.T @ lyapunov @ item + item.T @ lyapunov @ a, 2)) for item in parts)
@@ -162,8 +162,8 @@ def _contracts(part: AffineMatrix, *, discrete: bool) -> bool:
         first = sum(float(np.linalg.norm(lyapunov @ item + item.T @ lyapunov, 2)) for item in parts)
         second = 2.0 * float(np.linalg.norm(size, 2)) * remainder
         middle = lyapunov @ a + a.T @ lyapunov
-    rounding = _ROUNDING * len(a) * float(np.linalg.norm(size, 2)) * (1.0 + float(np.linalg.norm(a, 2)) ** 2)
-    return float(np.linalg.eigvalsh((middle + middle.T) / 2.0)[-1]) + (first + second + rounding) * _OUTWARD < 0.0
+    rounding = _PRODUCT_ROUNDING * len(a) * float(np.linalg.norm(size, 2)) * (1.0 + float(np.linalg.norm(a, 2)) ** 2)
+    return float(np.linalg.eigvalsh((middle + middle.T) / 2.0)[-1]) + (first + second + rounding) * _NORM_OUTWARD < 0.0
 
 
 def _lyapunov(a: FloatArray, *, discrete: bool) -> FloatArray:

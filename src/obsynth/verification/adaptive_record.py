@@ -11,7 +11,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.verification.adaptive_bound import THRESHOLD_ROUNDING, AdaptiveBound
 
 #: Samples whose dependence on older ones is computed at once.
-BLOCK = 32
+SAMPLES_AT_ONCE = 32
 #: Samples of all runs together whose first order is computed at once.
 CACHED_SAMPLES = 4000
 
@@ -201,8 +201,8 @@ def _recursion(bound: AdaptiveBound, fixed: FloatArray, known: FloatArray) -> tu
     eps = np.zeros((runs, steps + length, nz))
     found = np.empty((runs, steps, no))
     kernels, tail = bound.kernels, np.ascontiguousarray(bound.tail.T)
-    for begin in range(0, steps, min(BLOCK, length)):
-        end = min(begin + min(BLOCK, length), steps)
+    for begin in range(0, steps, min(SAMPLES_AT_ONCE, length)):
+        end = min(begin + min(SAMPLES_AT_ONCE, length), steps)
         size = end - begin
         older = _windows(ring[:, begin : end + length], size, length) @ kernels
         older += eps[:, begin:end] @ tail

@@ -130,7 +130,7 @@ def _misfits(plant: DescriptorSystem, recovery: StateRecovery) -> list[str]:
 
 
 #: In place of a row: what the search stated, which no check recomputes.  Such a claim has a row that says so.
-STATED = "stated by the search"
+STATED_BY_SEARCH = "stated by the search"
 #: Matrices that the certificate of any linear design may hold, with the rows that cover them.
 WITNESS_CLAIMS: Mapping[str, str] = {
     "state_error": "stored numbers: states",
@@ -158,10 +158,10 @@ def closed_claims(
         # Of a bank each test has its claims, "threshold[leak]", and its rows.
         own, mark, which = name.partition("[")
         row = covered.get(own)
-        row = f"{row}{mark}{which}" if row and row != STATED else row
+        row = f"{row}{mark}{which}" if row and row != STATED_BY_SEARCH else row
         # NaN claims nothing: a number that this design does not have.
         number = is_number(value) and not math.isinf(value)
-        if not row or not number or (row != STATED and row not in names):
+        if not row or not number or (row != STATED_BY_SEARCH and row not in names):
             wrong.append(str(name))
     for name in design.certificate.matrices:
         if name not in witnesses and WITNESS_CLAIMS.get(name) not in names:
@@ -176,7 +176,7 @@ def closed_claims(
     )
     for name, value in claims.items():
         own = name.partition("[")[0]
-        if covered.get(own) == STATED and name not in wrong:
+        if covered.get(own) == STATED_BY_SEARCH and name not in wrong:
             yield information(
                 f"stated: {name}",
                 f"{meanings[own]}; stated by the search, not recomputed",

@@ -18,32 +18,32 @@ from obsynth.observers.recursive.step_model import EarlyConstraintSteps, StepMat
 from obsynth.results.checks import Check, upper_bound_check
 
 #: Trials and steps: a wrong variance of 10 % is 20 standard deviations away.
-TRIALS = 400
-STEPS = 60
-SEED = 20130703
+CONSISTENCY_TRIALS = 400
+CONSISTENCY_STEPS = 60
+CONSISTENCY_SEED = 20130703
 #: Bands are this many standard deviations of the statistic wide: a sound design fails one time in two million.
-BAND = 5.0
+BAND_DEVIATIONS = 5.0
 
 _SOURCE = "recomputed, Monte Carlo with a fixed seed"
 
 
 def consistency(stated: RecursiveObserver, shipped: RecursiveObserver, steps: int) -> Iterator[Check]:
     """Yield NEES, NIS and whiteness of a shipped observer on noise as it is stated."""
-    rng = np.random.default_rng(SEED)
+    rng = np.random.default_rng(CONSISTENCY_SEED)
     truth = stated.init()
     nq = len(truth.parameters.theta)
-    x = rng.standard_normal((TRIALS, truth.factor.shape[1])) @ truth.factor.T
-    theta = rng.standard_normal((TRIALS, nq)) @ truth.parameters.spread.T
+    x = rng.standard_normal((CONSISTENCY_TRIALS, truth.factor.shape[1])) @ truth.factor.T
+    theta = rng.standard_normal((CONSISTENCY_TRIALS, nq)) @ truth.parameters.spread.T
     model = stated.recursion.model
     early = isinstance(model, EarlyConstraintSteps)
     nis, pairs = [], []
     scores: dict[int, tuple[FloatArray, FloatArray]] = {}
-    before = np.zeros((TRIALS, 0))
-    count, factor = min(steps, STEPS), truth.factor
+    before = np.zeros((CONSISTENCY_TRIALS, 0))
+    count, factor = min(steps, CONSISTENCY_STEPS), truth.factor
     for position, gains in enumerate(gain_steps(shipped, count)):
         k = position - 1 if early else position
         true = model.first() if isinstance(model, EarlyConstraintSteps) and position == 0 else model.at(k)
-        noise = rng.standard_normal((TRIALS, true.noise.shape[1])) @ true.noise.T
+        noise = rng.standard_normal((CONSISTENCY_TRIALS, true.noise.shape[1])) @ true.noise.T
         known = np.zeros_like(noise)
         known[:, : len(true.A)] = x @ gains.step.A.T
         data = known + noise
@@ -69,7 +69,7 @@ def consistency(stated: RecursiveObserver, shipped: RecursiveObserver, steps: in
                 "mean product of innovations of successive samples: they are uncorrelated",
                 float(products.mean()),
                 0.0,
-                BAND / float(np.sqrt(products.size)),
+                BAND_DEVIATIONS / float(np.sqrt(products.size)),
                 f"{products.size} products",
             )
 
@@ -128,15 +128,15 @@ def _error_rows(scores: Mapping[int, tuple[FloatArray, FloatArray]]) -> Iterator
             "known directions",
             "where the covariance is zero, so is the error (in units of what it is made of)",
             float(np.max(exact)),
-            BAND * KNOWN_SHARE,
+            BAND_DEVIATIONS * KNOWN_SHARE,
             source=_SOURCE,
-            detail=f"{TRIALS} trials",
+            detail=f"{CONSISTENCY_TRIALS} trials",
         )
 
 
 def _band(name: str, claim: str, squares: FloatArray, where: str = "") -> Check:
     """Return the row that the mean of squares of independent standard normal numbers is one."""
-    width = BAND * float(np.sqrt(2.0 / squares.size))
+    width = BAND_DEVIATIONS * float(np.sqrt(2.0 / squares.size))
     return _estimated(name, claim, float(squares.mean()), 1.0, width, f"mean of {squares.size}{where}")
 
 

@@ -23,7 +23,7 @@ from obsynth.proofs.balls import gamma, rounded_up
 from obsynth.verification.error_system import IDENTITY_SHARE
 
 #: Remainders below this share of their row's terms are rounding: one common channel is enough for them.
-ROUNDING_SHARE = 1e-9
+REMAINDER_SHARE = 1e-9
 
 
 class Tracking(NamedTuple):
@@ -271,8 +271,8 @@ def _remainder_channels(rest: FloatArray, sizes: FloatArray) -> tuple[FloatArray
     """Return rows, how many of them are channels of their own, and effects: small remainders share one channel."""
     n = rest.shape[1]
     share = (rest / sizes).max(axis=0, initial=0.0)
-    large = np.flatnonzero(share > ROUNDING_SHARE)
-    small = np.flatnonzero((share > 0.0) & (share <= ROUNDING_SHARE))
+    large = np.flatnonzero(share > REMAINDER_SHARE)
+    small = np.flatnonzero((share > 0.0) & (share <= REMAINDER_SHARE))
     rows, effects = [np.eye(n)[large]], [rest[:, large]]
     if len(small):
         rows.append(np.eye(n)[small] * share[small][:, None])

@@ -87,7 +87,7 @@ def condition_rows(conditions: Iterable[Condition]) -> Iterator[Check]:
 #: Matrices found again may differ by this share of the largest entry of their row or column: another order of sums.
 DERIVED_TOLERANCE = 1e-9
 PLANT_MATRICES = ("E", "A", "B", "C", "D", "Bf", "Df", "Bd", "Dd")
-_MAPS = ("from_state", "from_input", "from_fault", "from_disturbance")
+_STORED_MAPS = ("from_state", "from_input", "from_fault", "from_disturbance")
 _SOURCE = "the plant as written, eliminated and sampled again"
 
 
@@ -131,7 +131,7 @@ def derivation_rows(design: ObserverDesign, model: ErrorModel) -> Iterator[Check
         yield upper_bound_check(
             "recovery as written",
             "the states as written follow from those of the design as its recovery says",
-            _difference(found.recovery, design.recovery, _MAPS),
+            _difference(found.recovery, design.recovery, _STORED_MAPS),
             DERIVED_TOLERANCE,
             source=_SOURCE,
             kind="equality",
@@ -201,7 +201,7 @@ def _sampling_rows(
     )
 
 
-_PARTS = ("midpoint", "radius")
+_INTERVAL_PARTS = ("midpoint", "radius")
 
 
 #: Terms that are summed up for a row that only informs: the bound on all that follow is a little wider, and holds.
@@ -218,7 +218,9 @@ def _peak_gain(
     pieces = interval_pieces(smooth.A, smooth.Bd, Ball.exact(-t), dt)
     az = Ball.exact(observer.Az)
     at_samples, count = Ball.exact(observer.By) @ Ball.exact(smooth.Dd), pieces.columns.shape[1]
-    both = Ball(*(np.hstack([getattr(part, name) for part in (pieces.columns, at_samples)]) for name in _PARTS))
+    both = Ball(
+        *(np.hstack([getattr(part, name) for part in (pieces.columns, at_samples)]) for name in _INTERVAL_PARTS)
+    )
     sums = peak_sums(az, rows, both, contraction, most=STEPS_OF_INFORMATION).whole
     between, sampled = gathered(pieces, sums[..., :count], smooth.nd), sums[..., count:]
     return float(np.sum(between + sampled + column_norms(Ball.exact(direct))))

@@ -16,7 +16,7 @@ from obsynth.verification.error_structure import ErrorStructure
 #: A ring of L samples is long enough when ``|Az^L|`` is proved to contract this much.
 CONTRACTION = 1e-2
 #: Shortest and longest ring.
-SHORTEST, LONGEST = 8, 8192
+SHORTEST_RING, LONGEST_RING = 8, 8192
 #: Sums of products of doubles are multiplied by this: more than rounding can take from them.
 OUTWARD = 1.0 + 1e-12
 
@@ -75,15 +75,15 @@ def power_rounding(left: FloatArray, powers: FloatArray) -> FloatArray:
 
 def ring_length(az: FloatArray) -> int:
     """Return the least power of two L with ``|Az^L|`` proved to contract to `CONTRACTION`."""
-    length = SHORTEST
+    length = SHORTEST_RING
     power = np.linalg.matrix_power(az, length)
     while not spectral_radius_bound(power) < CONTRACTION:
         with np.errstate(over="ignore", invalid="ignore"):  # an observer that does not forget
             length, power = 2 * length, power @ power
-        if length > LONGEST or not np.isfinite(power).all():
+        if length > LONGEST_RING or not np.isfinite(power).all():
             raise PreconditionError(
-                f"Errors of the observer decay too slowly for a bound over tolerances (not within {LONGEST} samples): "
-                "ask for a faster one, or sample more slowly.",
+                f"Errors of the observer decay too slowly for a bound over tolerances (not within {LONGEST_RING} "
+                "samples): ask for a faster one, or sample more slowly.",
                 condition="observer's decay",
             )
     return length
@@ -173,7 +173,7 @@ FACTOR_SHARE = 1e-3
 #: Factors beyond this are as good as infinite.
 LARGEST_FACTOR = 1e6
 #: Added to the loop, as a share of its largest entry, so that its eigenvector is positive.
-_SHIFT = 1e-12
+_LOOP_SHIFT = 1e-12
 
 
 def largest_factor(structure_at: Callable[[float], ErrorStructure], radius: float) -> float:
@@ -242,8 +242,8 @@ def _perron(loop: FloatArray) -> tuple[FloatArray, FloatArray]:
     size = float(loop.max(initial=0.0))
     if size == 0.0:
         return np.ones(len(loop)), np.ones(len(loop))
-    values, right = np.linalg.eig(loop + _SHIFT * size)
-    transposed, left = np.linalg.eig(loop.T + _SHIFT * size)
+    values, right = np.linalg.eig(loop + _LOOP_SHIFT * size)
+    transposed, left = np.linalg.eig(loop.T + _LOOP_SHIFT * size)
     return (
         np.abs(left[:, int(np.argmax(transposed.real))].real),
         np.abs(right[:, int(np.argmax(values.real))].real),

@@ -31,7 +31,7 @@ from obsynth.verification.error_system import (
 #: Claimed bounds have room for what rounding of the contraction can do on another machine; at most this share of them.
 MOST_ROOM = 1.0
 #: A gain is claimed for disturbances that last up to one over this, rad per sample: slower ones are reported.
-SLOWEST, POINTS = 1e-7, 120
+SLOWEST_CLAIMED, CLAIM_POINTS = 1e-7, 120
 #: With more states, of plant and observer together, fewer are looked at.
 MANY_JOINT_STATES, FEWER_POINTS = 300, 40
 #: Frequencies beyond that at which the time is looked for after which stored numbers matter, rad per sample.
@@ -41,15 +41,15 @@ ABOUT_THE_BOUNDARY, APART, MOST_ANGLES = 1e-2, 1e-2, 8
 #: Beyond this distance (rad per sample) from such poles a gain is none that takes long to build up.
 MOST_DISTANCE = 0.1
 #: What rounding of the stored numbers leaves of an identity, relative to its terms.
-ROUNDED = 1e-11
+IDENTITY_ROUNDING = 1e-11
 #: Without a claimed gain stored numbers matter when they turn a unit disturbance into this error.
 NOTICED = 1e-3
 #: Tolerance of the comparison of gains found in double precision.
 GAIN_TOLERANCE = 1e-9
 
 _ON_THE_BOUNDARY = "the plant has a pole on the boundary of stability: no finite gain exists for stored numbers"
-_NAMES = ("states", "inputs", "disturbances")
-_WITNESSES = ("state_error", "input_error", "disturbance_error")
+_WITNESS_SIGNALS = ("states", "inputs", "disturbances")
+_ERROR_WITNESSES = ("state_error", "input_error", "disturbance_error")
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +87,7 @@ class StoredErrors:
         What has no column is left out."""
         return {
             name: np.where(bound > 0.0, rounded_up(self.room * bound, 2), 0.0)
-            for name, bound in zip(_WITNESSES, self.bounds, strict=True)
+            for name, bound in zip(_ERROR_WITNESSES, self.bounds, strict=True)
             if bound.shape[1]
         }
 
@@ -109,7 +109,7 @@ def stored_number_rows(design: ObserverDesign, model: ErrorModel, gamma: float |
     """Yield the rows on stored numbers; ``gamma`` is the gain from the disturbances that is claimed, if any."""
     plant, observer = design.linear
     found = StoredErrors.of(model)
-    claimed = {name: design.certificate.matrices.get(name) for name in _WITNESSES}
+    claimed = {name: design.certificate.matrices.get(name) for name in _ERROR_WITNESSES}
     if found is None:
         yield information(
             "stored numbers",
@@ -123,10 +123,10 @@ def stored_number_rows(design: ObserverDesign, model: ErrorModel, gamma: float |
                 "stored numbers: states", "the claimed bounds are found again", np.nan, 0.0, source="stored numbers"
             )
         return
-    if any(_exceeds(bound, claimed[name]) for name, bound in zip(_WITNESSES, found.bounds, strict=True)):
+    if any(_exceeds(bound, claimed[name]) for name, bound in zip(_ERROR_WITNESSES, found.bounds, strict=True)):
         found = found.least(observer)
     columns = (model.state_names, plant.input_names, plant.disturbance_names)
-    for kind, name, bound, labels in zip(_NAMES, _WITNESSES, found.bounds, columns, strict=True):
+    for kind, name, bound, labels in zip(_WITNESS_SIGNALS, _ERROR_WITNESSES, found.bounds, columns, strict=True):
         if bound.size:
             yield _per_unit(observer, kind, bound, claimed[name], labels)
         elif claimed[name] is not None:
@@ -180,11 +180,11 @@ def _gain_rows(design: ObserverDesign, model: ErrorModel, gamma: float | None) -
     system = _Composite(model)
     unit = 1.0 if plant.dt > 0.0 else system.fastest
     few = plant.nx + observer.order <= MANY_JOINT_STATES
-    points = POINTS if few else FEWER_POINTS
-    frequencies = unit * np.geomspace(SLOWEST, np.pi if plant.dt > 0.0 else 10.0, points)
+    points = CLAIM_POINTS if few else FEWER_POINTS
+    frequencies = unit * np.geomspace(SLOWEST_CLAIMED, np.pi if plant.dt > 0.0 else 10.0, points)
     angles = system.boundary_angles(unit)
     if few:
-        frequencies = np.concatenate([frequencies, _around(angles[angles > SLOWEST * unit], unit, plant.dt)])
+        frequencies = np.concatenate([frequencies, _around(angles[angles > SLOWEST_CLAIMED * unit], unit, plant.dt)])
     gains = system.gains(frequencies)
     worst = int(np.argmax(gains))
     level = NOTICED if gamma is None else float(gamma) * (1.0 + GAIN_TOLERANCE)
@@ -192,10 +192,12 @@ def _gain_rows(design: ObserverDesign, model: ErrorModel, gamma: float | None) -
     nearest = np.min(np.abs(beyond[:, None] - angles[None, :]), axis=1, initial=np.inf) / unit
     verdict, seconds = _when_it_matters(system, level, unit, float(np.max(nearest, initial=0.0)))
     if gamma is not None:
-        text = f"gain d -> fault error of the plant and the stored observer, from {SLOWEST:.0e} rad per sample up"
+        text = (
+            f"gain d -> fault error of the plant and the stored observer, from {SLOWEST_CLAIMED:.0e} rad per sample up"
+        )
         detail = f"largest of {len(frequencies)} frequencies at {frequencies[worst]:.2g} rad per sample; {verdict}"
         drifting = np.isfinite(seconds) and np.all(nearest <= MOST_DISTANCE)
-        if beyond.size and drifting and model.rounding() <= ROUNDED:
+        if beyond.size and drifting and model.rounding() <= IDENTITY_ROUNDING:
             # Nobody could store better numbers: no finite gain exists, and what can be said is for how long it holds.
             yield information(
                 "gain with stored numbers",
@@ -225,7 +227,7 @@ def _gain_rows(design: ObserverDesign, model: ErrorModel, gamma: float | None) -
 
 def _around(angles: FloatArray, unit: float, dt: float) -> FloatArray:
     """Return frequencies on both sides of each angle, ever closer to it."""
-    apart = unit * np.geomspace(SLOWEST, MOST_DISTANCE, POINTS // 4)
+    apart = unit * np.geomspace(SLOWEST_CLAIMED, MOST_DISTANCE, CLAIM_POINTS // 4)
     found = np.abs(np.concatenate([angles[:, None] - apart, angles[:, None] + apart], axis=1)).ravel()
     return np.asarray(np.minimum(found, np.pi) if dt > 0.0 else found)
 
@@ -309,7 +311,7 @@ def _when_it_matters(system: _Composite, level: float, unit: float, beyond: floa
             "the plant has a pole outside the region of stability: no finite gain exists for stored numbers; where its "
             f"state is not held down, they matter after about {seconds:.3g} s"
         ), seconds
-    last = SLOWEST
+    last = SLOWEST_CLAIMED
     for frequency in () if np.isfinite(seconds) else SLOWER:
         if system.gains(np.array([frequency * unit]))[0] > level:
             seconds = per_unit / frequency

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from obsynth.analysis.diagnosis.exact import Questions, decided_exactly
 from obsynth.analysis.diagnosis.explanations import (
-    MOST_FOR_ONE,
-    MOST_FOR_PAIRS,
+    MOST_STATES_FOR_SENSOR_PAIRS,
+    MOST_STATES_FOR_SENSORS,
     Sensor,
     hidden_motion,
     least_additions,
@@ -23,8 +23,8 @@ from obsynth.analysis.diagnosis.explanations import (
 from obsynth.analysis.diagnosis.fault_columns import Question, dc_point, others
 from obsynth.analysis.diagnosis.sensor_search import SensorResponses
 from obsynth.analysis.diagnosis.verdicts import (
-    MOST_FAULTS,
     MOST_FAULTS_OF_WHOLE_BANK,
+    MOST_PATTERN_FAULTS,
     Diagnosis,
     FaultDiagnosis,
     residual_bank,
@@ -123,7 +123,7 @@ def diagnose(
     report_stage("telling faults from each other")
     weak, strong, pairs = _isolability(plant, shown, asked)
     bank = residual_bank(asked, whole_bank)
-    part = () if whole_bank or plant.nf <= MOST_FAULTS else (_PART_OF_THE_BANK.format(count=plant.nf),)
+    part = () if whole_bank or plant.nf <= MOST_PATTERN_FAULTS else (_PART_OF_THE_BANK.format(count=plant.nf),)
     return Diagnosis(
         faults,
         weak,
@@ -220,9 +220,9 @@ class _Candidates:
     @property
     def searched(self) -> str:
         """Which additions are searched, in words; empty where none are: each is asked anew for each fault."""
-        if self.plant.nx > MOST_FOR_ONE or len(self.sensors) * self.plant.nf > MOST_ADDITIONS:
+        if self.plant.nx > MOST_STATES_FOR_SENSORS or len(self.sensors) * self.plant.nf > MOST_ADDITIONS:
             return ""
-        return "state" if self.plant.nx > MOST_FOR_PAIRS else "state or pair of states"
+        return "state" if self.plant.nx > MOST_STATES_FOR_SENSOR_PAIRS else "state or pair of states"
 
     @cached_property
     def responses(self) -> SensorResponses | None:

@@ -17,9 +17,9 @@ from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.plants.descriptor import DescriptorSystem
 
 #: Plants with more states are not searched for pairs.
-MOST_FOR_PAIRS = 24
+MOST_STATES_FOR_SENSOR_PAIRS = 24
 #: Plants with more states are not searched for suggestions at all.
-MOST_FOR_ONE = 120
+MOST_STATES_FOR_SENSORS = 120
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +74,7 @@ def least_additions(
     sensors: Sequence[Sensor],
     reached: Callable[[DescriptorSystem], bool],
     *,
-    most: tuple[int, int] = (MOST_FOR_ONE, MOST_FOR_PAIRS),
+    most: tuple[int, int] = (MOST_STATES_FOR_SENSORS, MOST_STATES_FOR_SENSOR_PAIRS),
     promising: Callable[[NDArray[np.int64]], NDArray[np.bool_]] | None = None,
 ) -> tuple[tuple[str, ...], ...]:
     """Return all single sensors that do it, or else all pairs; none for plants of more states than ``most``.
@@ -102,7 +102,7 @@ def listed(sets: Sequence[Sequence[str]], most: int = 6) -> str:
 #: A motion is stated where it cancels the fault to this, relative to the fault's own column.
 EXACTNESS = 1e-8
 #: Signals of a motion that are named; the others are counted.
-MOST_NAMED = 6
+MOST_NAMED_SIGNALS = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +118,7 @@ class HiddenMotion:
     def __str__(self) -> str:
         named = list(self.values.items())
         inputs = [f"{self._course} of {_amplitude(value)} in {name}" for name, value in named[: self.causes]]
-        states = [f"{name} = {_amplitude(value)}" for name, value in named[self.causes :][:MOST_NAMED]]
+        states = [f"{name} = {_amplitude(value)}" for name, value in named[self.causes :][:MOST_NAMED_SIGNALS]]
         more = len(named) - self.causes - len(states)
         rest = [*states, *([f"{more} more states"] if more else [])]
         by = " and ".join(inputs) or "the initial state"

@@ -12,15 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from obsynth.numerics.arrays import ComplexArray, FloatArray
-from obsynth.numerics.lapack import pencil_eigenvalues
+from obsynth.numerics.lapack import LAPACK_BLOCK, pencil_eigenvalues
 from obsynth.numerics.pencil_points import full_svd, largest_singular_value
 from obsynth.numerics.ranks import RankDecision, rank_from
 from obsynth.numerics.scaling import LogBalance, equilibrate_pencil, power_of_two_below
 
 #: Pencils of more columns are of plants of many parts, whose couplings outnumber what each part is made of.
 BY_LEAST_SQUARES = 40
-#: Columns that LAPACK turns at once: its room is so many times the columns.
-BLOCK = 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,7 +164,10 @@ def _invariant(
         kept = turn(left[:, rank:].T @ leaving)[:, rank:]
         if count:
             packed, factors, _, _ = dgeqrf(moving)
-            moving, staying = np.triu(packed[:count]), dormqr("L", "T", packed, factors, staying, BLOCK * count)[0]
+            moving, staying = (
+                np.triu(packed[:count]),
+                dormqr("L", "T", packed, factors, staying, LAPACK_BLOCK * count)[0],
+            )
         leaving, staying = np.vstack([kept, staying[count:]]), staying[:count]
     return hidden
 

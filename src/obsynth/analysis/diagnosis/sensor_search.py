@@ -25,9 +25,9 @@ from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, RANK_TOLERANCE
 from obsynth.plants.descriptor import DescriptorSystem
 
 #: Points without meaning, in units of the plant's own time scale.
-GENERIC_POINTS = (0.7391 + 0.2j, 0.31 + 1.3247j)
+GENERIC_SCALED_POINTS = (0.7391 + 0.2j, 0.31 + 1.3247j)
 #: Part of a fault's column outside the span of the others, relative to it, below which it does not show.
-SHOWN = 1e-9
+SHOWN_PART = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +48,7 @@ class SensorResponses:
             [np.hstack([plant.Dd, plant.Df]), *(np.hstack([sensor.Dd, sensor.Df])[None, :] for sensor in sensors)]
         )
         tables = []
-        for point in GENERIC_POINTS:
+        for point in GENERIC_SCALED_POINTS:
             pencil = units.rows[:, None] * (point * units.time * plant.E - plant.A) * units.columns
             values = np.linalg.svd(pencil, compute_uv=False) if pencil.size else np.ones(1)
             if values[-1] <= RANK_TOLERANCE * values[0]:
@@ -78,7 +78,7 @@ class SensorResponses:
             rest = _outside(table[:, columns][rows], goal)
             size = np.linalg.norm(goal, axis=1)
             found = np.maximum(found, np.where(size > 0.0, rest / np.where(size > 0.0, size, 1.0), 0.0))
-        return np.where(found > SHOWN, found, 0.0)
+        return np.where(found > SHOWN_PART, found, 0.0)
 
 
 def _solution(matrix: ComplexArray | FloatArray, right: FloatArray) -> tuple[ComplexArray, FloatArray]:
@@ -108,7 +108,7 @@ def _outside(span: ComplexArray, vector: ComplexArray) -> NDArray[np.float64]:
 #: What sensors may be wanted for.
 GOALS = ("detect", "isolate", "estimate-step", "estimate")
 #: Sets of one size are enumerated up to so many; the best of each size are confirmed until so many fail in a row.
-MOST_SETS = 40_000
+MOST_ENUMERATED_SETS = 40_000
 MOST_CONFIRMED = 400
 
 
@@ -198,7 +198,7 @@ class SensorSearch:
         found: list[tuple[int, ...]] = []
         count = len(self.sensors)
         for size in range(largest + 1):
-            if comb(count * self.copies, size) > MOST_SETS:
+            if comb(count * self.copies, size) > MOST_ENUMERATED_SETS:
                 return found, False
             every = dict.fromkeys(combinations([i for i in range(count) for _ in range(self.copies)], size))
             sets = [chosen for chosen in every if not any(Counter(f) <= Counter(chosen) for f in found)]

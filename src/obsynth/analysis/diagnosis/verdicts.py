@@ -16,7 +16,7 @@ from obsynth.files.tables import html_table, text_table
 from obsynth.numerics.arrays import ComplexArray
 
 #: With more faults only residuals that are blind to one fault, or see one, are looked for unless all are asked for.
-MOST_FAULTS = 6
+MOST_PATTERN_FAULTS = 6
 #: Of more faults the whole bank is refused: 4095 sets are asked about for this many.
 MOST_FAULTS_OF_WHOLE_BANK = 12
 
@@ -61,7 +61,7 @@ def residual_bank(questions: Questions, whole: bool = False) -> tuple[Structured
 
 def _sets(count: int, whole: bool) -> Iterator[Sequence[int]]:
     """Yield the sets of faults to be blind to."""
-    if whole or count <= MOST_FAULTS:
+    if whole or count <= MOST_PATTERN_FAULTS:
         for size in range(count):
             yield from combinations(range(count), size)
         return

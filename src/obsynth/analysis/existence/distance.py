@@ -23,11 +23,11 @@ from obsynth.numerics.scaling import equilibrate_pencil, power_of_two_below
 #: inverse would be needed, which double precision drowns.
 ROUNDING_LEVEL = 2e-14
 #: Zeros closer than this, relative to their size, may be one that rounding has moved.
-SAME_ZERO = 1e-3
+SAME_ZERO_DISTANCE = 1e-3
 #: Points on the stability boundary; in continuous time between these magnitudes of the own rates.
 BOUNDARY_POINTS = 33
 #: Further out a pencil is close to what it is at infinity, where other conditions decide.
-SLOWEST, FASTEST = 1e-3, 1e3
+FARTHEST_OUT, FASTEST = 1e-3, 1e3
 #: Compressions of a tall pencil, at most so many points of each.
 COMPRESSIONS = 2
 MOST_POINTS = 40
@@ -69,7 +69,7 @@ def zeros_at_rounding_level(
     return [
         value
         for value in map(complex, found)
-        if not any(abs(value - other) <= SAME_ZERO * max(1.0, abs(other)) for other in exact)
+        if not any(abs(value - other) <= SAME_ZERO_DISTANCE * max(1.0, abs(other)) for other in exact)
         and relative_singular_value(E, A, value, nx=nx) <= ROUNDING_LEVEL
     ]
 
@@ -123,7 +123,7 @@ def _boundary(E: FloatArray, A: FloatArray, discrete: bool) -> list[complex]:
     if discrete:
         return [complex(np.exp(1j * angle)) for angle in np.linspace(0.0, np.pi, BOUNDARY_POINTS)]
     rate = _typical_rate(E, A)
-    return [0j, *(complex(0.0, rate * size) for size in np.geomspace(SLOWEST, FASTEST, BOUNDARY_POINTS))]
+    return [0j, *(complex(0.0, rate * size) for size in np.geomspace(FARTHEST_OUT, FASTEST, BOUNDARY_POINTS))]
 
 
 def _typical_rate(E: FloatArray, A: FloatArray) -> float:

@@ -33,7 +33,7 @@ from obsynth.plants.fault_models import Exosystem
 from obsynth.proofs.exact_arithmetic import written_fraction
 
 #: Digits to which the direction of a witness is rounded, until the plant is within the tolerance.
-DIGITS = (1, 2, 3, 5, 8, 11, 14, 17)
+WITNESS_DIGITS = (1, 2, 3, 5, 8, 11, 14, 17)
 #: How much rather an entry is changed that is not zero, and one of E, whose ones are structure rather than data.
 KNOWN_ENTRY, STRUCTURE = 8.0, 1e-2
 
@@ -102,7 +102,7 @@ class NamedPencil:
             vector = np.linalg.svd(whole)[2][-1].conj()
         vector = vector / vector[int(np.argmax(np.abs(vector)))]
         best: Witness | None = None
-        for digits in DIGITS:
+        for digits in WITNESS_DIGITS:
             place = _placed(at, digits, dt)
             changes, size = self._changes(_rounded(vector, digits), place, rows, columns)
             if best is None or size < best.size:
@@ -212,7 +212,7 @@ def _rounded(vector: ComplexArray | FloatArray, digits: int) -> tuple[Rational, 
 
 def _placed(point: complex, digits: int, dt: float | None) -> tuple[Fraction, Fraction]:
     """Return a point rounded to some digits, on or outside the stability boundary; without ``dt`` to almost all."""
-    if dt is None and digits < DIGITS[-2]:
+    if dt is None and digits < WITNESS_DIGITS[-2]:
         # An eigenvalue that was computed of a matrix of short numbers.
         return Fraction(f"{point.real:.13g}"), Fraction(f"{point.imag:.13g}")
     if dt is None:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 #: Degree of the minimal polynomial of an eigenvalue, times columns of the pencil, above which its rank there is left
 #: to floating point.
-MOST_COLUMNS = 400
+MOST_EXACT_SIZE = 400
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,7 +220,7 @@ class WrittenNumbers(PlantNumbers):
     def rank_at_root(self, inputs: fmpq_mat, direct: fmpq_mat, polynomial: fmpz_poly) -> int | None:
         """Return the rank of ``[A - s E, inputs; C, direct]`` at the roots of an irreducible polynomial."""
         pencil = self.pencil(inputs, direct)
-        if pencil.shape[1] * polynomial.degree() > MOST_COLUMNS:
+        if pencil.shape[1] * polynomial.degree() > MOST_EXACT_SIZE:
             return None
         return pencil.rank_at_root(polynomial)
 

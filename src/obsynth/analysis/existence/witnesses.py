@@ -17,7 +17,7 @@ from obsynth.plants.fault_models import Exosystem
 from obsynth.proofs.exact_arithmetic import written_fraction
 
 #: At most so many changes are listed.
-LISTED = 4
+LISTED_CHANGES = 4
 
 #: Rational matrices, as arrays of fractions.
 Rational: TypeAlias = NDArray[Any]
@@ -74,7 +74,7 @@ class Witness:
 
     def described(self, plant: DescriptorSystem, *, parameters: bool = False) -> str:
         """Return the changes in words."""
-        texts = [change.described(plant, parameters=parameters) for change in self.changes[:LISTED]]
+        texts = [change.described(plant, parameters=parameters) for change in self.changes[:LISTED_CHANGES]]
         more = len(self.changes) - len(texts)
         return "; ".join(texts) + (f"; and {more} more like these" if more > 0 else "")
 

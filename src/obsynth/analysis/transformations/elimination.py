@@ -30,7 +30,7 @@ from obsynth.proofs.exact_arithmetic import holds_computed
 
 #: Arrays of plants from this size on, with at most this share of entries that are not zero, are treated as sparse.
 MANY_VARIABLES = 500
-SPARSE_SHARE = 0.05
+SPARSE_PENCIL_SHARE = 0.05
 
 
 def eliminate_algebraic_states(plant: DescriptorSystem | Transformation) -> Transformation:
@@ -85,7 +85,7 @@ def _is_identity(e: Any) -> bool:
 def _has_few_entries(plant: DescriptorSystem) -> bool:
     """Whether a plant given as arrays is solved better by its sparsity."""
     stored = np.count_nonzero(plant.A) + np.count_nonzero(plant.E) if plant.nx >= MANY_VARIABLES else plant.nx**2
-    return bool(stored <= SPARSE_SHARE * plant.nx**2)
+    return bool(stored <= SPARSE_PENCIL_SHARE * plant.nx**2)
 
 
 def eliminated_by_sparsity(plant: DescriptorSystem) -> Transformation:

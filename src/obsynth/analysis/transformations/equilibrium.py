@@ -17,16 +17,16 @@ from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.validation import index_of
 
 #: Largest scaled residual of what counts as a root.
-ROOT = 1e-9
+ROOT_RESIDUAL = 1e-9
 #: Entries of a direction, and of a combination of equations, below this share of the largest are not named.
 NAMED = 1e-6
 #: Newton steps after the least squares; they square the error, so that a few reach rounding.
 POLISH = 8
 #: Derivatives satisfy the equations where the weighted residual is below this.
-CONSISTENT = 1e-3 * ROOT
+CONSISTENT = 1e-3 * ROOT_RESIDUAL
 #: Stands in a search for a residual that is not finite.
 HUGE = 1e10
-MOST_EVALUATIONS = 400
+MOST_ROOT_EVALUATIONS = 400
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +69,7 @@ def equilibrium(
         raise problem.undefined(residual, jacobian)
     left, values, right = np.linalg.svd(jacobian)
     rank = int((values > JACOBIAN_RANK_TOLERANCE * values.max()).sum()) if values.size else 0
-    if not np.abs(residual).max(initial=0.0) <= ROOT:
+    if not np.abs(residual).max(initial=0.0) <= ROOT_RESIDUAL:
         raise problem.without_root(residual, left[:, rank:])
     if rank < len(problem.names):
         raise problem.not_unique(right[rank:])
@@ -162,7 +162,7 @@ class _Problem:
                 xtol=exact,
                 ftol=exact,
                 gtol=exact,
-                max_nfev=MOST_EVALUATIONS,
+                max_nfev=MOST_ROOT_EVALUATIONS,
                 method="lm" if len(self.rows) >= len(self.names) else "trf",
             ).x
         )
@@ -197,7 +197,7 @@ class _Problem:
         rest = ", ".join(
             f"{self.rows[i]}: {residual[i] / self.weights[i]:.4g}"
             for i in np.argsort(-np.abs(residual))[:4]
-            if abs(residual[i]) > ROOT
+            if abs(residual[i]) > ROOT_RESIDUAL
         )
         unknowns = ", ".join(self.names) or "nothing"
         why = (
@@ -241,7 +241,7 @@ def consistent_point(model: DAEModel, point: Point, fixed: Collection[str] = ())
     """Return a near point with derivatives that satisfy the equations; ``fixed`` states stay, differentiated may."""
     x, rates, sizes = np.array(point.x), np.zeros(model.nx), model.state_scales
     movable = np.array([name not in fixed for name in model.state_names])
-    for _ in range(MOST_EVALUATIONS):
+    for _ in range(MOST_ROOT_EVALUATIONS):
         local = local_equations(model, rates, x, point.u, point.theta)
         if not local.is_defined:
             break
@@ -274,7 +274,7 @@ def _algebraic_step(constraint: FloatArray, right: FloatArray, E: FloatArray, mo
     if not constraint.size:
         return move
     for first, kept in ((True, (np.abs(E).max(axis=0) == 0.0) & movable), (False, movable)):
-        if first or np.abs(constraint @ move - right).max() > ROOT * max(1.0, np.abs(right).max()):
+        if first or np.abs(constraint @ move - right).max() > ROOT_RESIDUAL * max(1.0, np.abs(right).max()):
             move = np.zeros(E.shape[1])
             move[kept] = np.linalg.lstsq(constraint[:, kept], right, rcond=JACOBIAN_RANK_TOLERANCE)[0]
     return move

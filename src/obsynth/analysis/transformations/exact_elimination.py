@@ -26,8 +26,8 @@ MOST_STATES_EXACTLY = 64
 #: Digits (binary) in which coordinates that are not rational are changed.
 COORDINATE_BITS = 600
 
-_SIGNALS = ("B", "Bf", "Bd", "Bw")
-_DIRECT = ("D", "Df", "Dd", "Dw")
+_EXACT_INPUTS = ("B", "Bf", "Bd", "Bw")
+_EXACT_DIRECT = ("D", "Df", "Dd", "Dw")
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +66,7 @@ def exact_elimination(plant: DescriptorSystem) -> ExactElimination | None:
 
     if plant.nx > MOST_STATES_EXACTLY or plant.exact is not None:
         return None
-    computed = any(holds_computed(getattr(plant, name)) for name in ("E", "A", "C", *_SIGNALS, *_DIRECT))
+    computed = any(holds_computed(getattr(plant, name)) for name in ("E", "A", "C", *_EXACT_INPUTS, *_EXACT_DIRECT))
     found = _eliminated(plant, clean=computed)
     if found is None or not computed:
         return found
@@ -86,13 +86,13 @@ def _eliminated(plant: DescriptorSystem, *, clean: bool, sized: bool = True) -> 
     if not pivots:
         return None
     null, left = null_basis(e), null_basis(e.transpose()).transpose()
-    signals = [written_matrix(getattr(plant, name)) for name in _SIGNALS]
+    signals = [written_matrix(getattr(plant, name)) for name in _EXACT_INPUTS]
     keep, take = _units(plant.nx, pivots), _units(plant.nx, rows).transpose()
     right = blocks([[a * keep, *signals]])
     coupling = left * a * null
     if plant.nx > len(pivots) and coupling.det() == 0:
         return None
-    direct = blocks([[c * keep, *(written_matrix(getattr(plant, name)) for name in _DIRECT)]])
+    direct = blocks([[c * keep, *(written_matrix(getattr(plant, name)) for name in _EXACT_DIRECT)]])
     states = blocks([[keep, *(_zeros(plant.nx, int(signal.ncols())) for signal in signals)]])
     moving, leading = take * right, take * e * keep
     # The inverses are asked for their sizes alone.
@@ -109,13 +109,13 @@ def _eliminated(plant: DescriptorSystem, *, clean: bool, sized: bool = True) -> 
     moving = _solved(leading, moving, inverses[1] if clean else None)
     widths = [len(pivots), *(int(signal.ncols()) for signal in signals)]
     return ExactElimination(
-        dict(zip(("A", *_SIGNALS), _split(moving, widths), strict=True))
-        | dict(zip(("C", *_DIRECT), _split(direct, widths), strict=True)),
-        dict(zip(("A", *_SIGNALS), _split(states, widths), strict=True)),
+        dict(zip(("A", *_EXACT_INPUTS), _split(moving, widths), strict=True))
+        | dict(zip(("C", *_EXACT_DIRECT), _split(direct, widths), strict=True)),
+        dict(zip(("A", *_EXACT_INPUTS), _split(states, widths), strict=True)),
         tuple(pivots),
         clean,
-        dict(zip(("A", *_SIGNALS), np.split(sizes[0], np.cumsum(widths)[:-1], axis=1), strict=True))
-        | dict(zip(("C", *_DIRECT), np.split(sizes[1], np.cumsum(widths)[:-1], axis=1), strict=True)),
+        dict(zip(("A", *_EXACT_INPUTS), np.split(sizes[0], np.cumsum(widths)[:-1], axis=1), strict=True))
+        | dict(zip(("C", *_EXACT_DIRECT), np.split(sizes[1], np.cumsum(widths)[:-1], axis=1), strict=True)),
     )
 
 
@@ -169,7 +169,7 @@ def rounded_once(
                 return np.zeros((int(matrix.nrows()), int(matrix.ncols())))
             if name in ("A", "C"):
                 work = work * back
-            if not recovery and name in ("A", *_SIGNALS):
+            if not recovery and name in ("A", *_EXACT_INPUTS):
                 work = change * work
             return _doubles(work)
 
@@ -183,7 +183,7 @@ def rounded_once(
 def _moved_sizes(sizes: Mapping[str, FloatArray], change: FloatArray, back: FloatArray) -> dict[str, FloatArray]:
     """Return sizes of terms in other coordinates of the states."""
     found = {name: size @ back if name in ("A", "C") else size for name, size in sizes.items()}
-    return {name: change @ size if name in ("A", *_SIGNALS) else size for name, size in found.items()}
+    return {name: change @ size if name in ("A", *_EXACT_INPUTS) else size for name, size in found.items()}
 
 
 def _solved(matrix: fmpq_mat, right: fmpq_mat, inverse: FloatArray | None) -> fmpq_mat:

@@ -13,14 +13,13 @@ import numpy as np
 
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.pencil_points import GENERIC_POINTS
 from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.numerics.scaling import equilibrate_pencil
 from obsynth.numerics.sparse import CoarseStructure, Indices, blocks_of, coarse_structure, csr, unmatched_instead
 from obsynth.numerics.sparse_factor import SparseFactor, scales_by_all_entries, sparse_factor
 from obsynth.plants.descriptor import DescriptorSystem
 
-#: A point without meaning, at which a pencil has its normal rank.
-GENERIC_POINT = 0.7391
 #: Rank that a matrix may lack beyond what its shape says, to begin with.
 BORDER = 8
 #: How much rather a repeated equation is left out whose own variable is left out.
@@ -97,7 +96,7 @@ def _surplus_equations(plant: DescriptorSystem, coarse: CoarseStructure, e: Any,
     if c[:, coarse.under_columns].nnz or not _solvable(plant, coarse.under_rows, coarse.under_columns):
         return None
     rows = coarse.over_rows
-    combinations, scale = _left_null_space(csr(a - GENERIC_POINT * e)[rows][:, coarse.over_columns])
+    combinations, scale = _left_null_space(csr(a - GENERIC_POINTS[0] * e)[rows][:, coarse.over_columns])
     if not _say_nothing(plant, rows, scale, combinations):
         return None
     from scipy.linalg import qr
@@ -126,7 +125,7 @@ def _solvable(plant: DescriptorSystem, rows: Indices, columns: Indices) -> bool:
     """Whether equations can be solved for some of their variables, whatever the others are."""
     if not len(rows):
         return True
-    part = csr(csr(plant.A) - GENERIC_POINT * csr(plant.E))[rows][:, columns]
+    part = csr(csr(plant.A) - GENERIC_POINTS[0] * csr(plant.E))[rows][:, columns]
     if len(rows) == len(columns) and not sparse_factor(part).singular:
         return True
     arrays = part.toarray()
@@ -205,7 +204,7 @@ def _undetermined_blocks(
     several = np.flatnonzero(idle & (np.bincount(block, minlength=len(idle)) > 1))
     if not several.size:
         return []
-    pencil = csr(csr(plant.A) - GENERIC_POINT * csr(plant.E))
+    pencil = csr(csr(plant.A) - GENERIC_POINTS[0] * csr(plant.E))
     parts = ((number, rows[block_of_row == number], columns[block == number]) for number in several)
     return [int(number) for number, own, variables in parts if sparse_factor(pencil[own][:, variables]).singular]
 

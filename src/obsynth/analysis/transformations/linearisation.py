@@ -21,11 +21,11 @@ from obsynth.plants.uncertainty import Uncertainty
 from obsynth.plants.validation import index_of
 
 #: What E x' may be, in sizes of its row, where a point counts as resting.
-MOVING = 1e-9
+LARGEST_MOTION = 1e-9
 #: Input of a linear model at a moving point: it is one, always.
 DRIFT = "drift"
 #: Input of a linear model whose equilibrium depends on constants with tolerances: it is one, always.
-SHIFT = "shift"
+SHIFT_INPUT = "shift"
 
 
 def linearise(
@@ -187,7 +187,9 @@ def linear_model(
             signals=list(model.equation_names),
         )
     motion = local.E @ point.rates
-    moves = np.abs(motion) > MOVING * np.maximum(np.abs(local.by_state) @ model.state_scales, np.abs(motion).min())
+    moves = np.abs(motion) > LARGEST_MOTION * np.maximum(
+        np.abs(local.by_state) @ model.state_scales, np.abs(motion).min()
+    )
     if moves.any() and not drift:
         moved = {name: value for name, value, moving in zip(model.equation_names, motion, moves, strict=True) if moving}
         raise PreconditionError(
@@ -267,7 +269,7 @@ def _over_box(
             *linear.fault_names,
             *linear.disturbance_names,
         }
-        shift = SHIFT if SHIFT not in taken else f"equilibrium {SHIFT}"
+        shift = SHIFT_INPUT if SHIFT_INPUT not in taken else f"equilibrium {SHIFT_INPUT}"
         nu = linear.nu
         for name, found in (("B", moved), ("D", shown)):
             if found:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 #: Map of a recovery -> the signal that it maps.
-_MAPS = {
+_RECOVERED_SIGNALS = {
     "from_state": "state",
     "from_input": "input",
     "from_fault": "fault",
@@ -47,7 +47,7 @@ class StateRecovery:
     operating_point: Mapping[str, float] = field(default_factory=dict)  # of the source states
 
     def __post_init__(self) -> None:
-        for name in (*_MAPS, "noise_kept"):
+        for name in (*_RECOVERED_SIGNALS, "noise_kept"):
             object.__setattr__(self, name, read_only(getattr(self, name)))
         object.__setattr__(self, "operating_point", dict(self.operating_point))
 
@@ -65,9 +65,9 @@ class StateRecovery:
     def __getattr__(self, name: str) -> FloatArray:
         """Form a map of a recovery by sparse solutions when it is first asked for."""
         operator = self.__dict__.get("operator")
-        if operator is None or name not in _MAPS:
+        if operator is None or name not in _RECOVERED_SIGNALS:
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
-        matrix = read_only(operator.matrix(_MAPS[name]))
+        matrix = read_only(operator.matrix(_RECOVERED_SIGNALS[name]))
         object.__setattr__(self, name, matrix)
         return matrix
 
@@ -86,7 +86,9 @@ class StateRecovery:
     def then(self, later: StateRecovery) -> StateRecovery:
         """Return the recovery through two transformations, this one first."""
         if (operator := self.by_operator) is not None:
-            through = operator.then({signal: getattr(later, name) for name, signal in _MAPS.items()}, later.noise_kept)
+            through = operator.then(
+                {signal: getattr(later, name) for name, signal in _RECOVERED_SIGNALS.items()}, later.noise_kept
+            )
             kept = self.noise_kept @ later.noise_kept
             return StateRecovery.from_operator(self.names, through, kept, self.operating_point)
         step = self.from_state

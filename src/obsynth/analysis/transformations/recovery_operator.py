@@ -12,10 +12,10 @@ import numpy as np
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE
 from obsynth.numerics.sparse import csr
-from obsynth.numerics.sparse_factor import SAMPLED, SAMPLES, SparseFactor, sparse_factor
+from obsynth.numerics.sparse_factor import MEAN_FACTOR, SIZE_SAMPLES, SparseFactor, sparse_factor
 
 #: Signals in the order in which they stand in the algebraic equations.
-SIGNALS = ("state", "input", "fault", "disturbance", "noise")
+SIGNAL_ORDER = ("state", "input", "fault", "disturbance", "noise")
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +47,7 @@ class RecoveryOperator:
 
     def matrix(self, signal: str) -> FloatArray:
         """Return the dense map from one kind of signal, ``(nx, n)``."""
-        own = np.eye(self.counts[SIGNALS.index(signal)])
+        own = np.eye(self.counts[SIGNAL_ORDER.index(signal)])
         if signal == "noise" and self.noise_kept is not None:
             own = self.noise_kept
         if signal == "state":
@@ -59,7 +59,7 @@ class RecoveryOperator:
         ends = np.cumsum([0, *self.counts])
         terms = np.zeros((self.right.shape[0], xi.shape[1]))
         for name, columns in {"state": xi, **signals}.items():
-            place = SIGNALS.index(name)
+            place = SIGNAL_ORDER.index(name)
             terms = terms + self.right[:, ends[place] : ends[place + 1]] @ columns
         solution = without_rounding(self.factor, -self.factor.solve(terms))
         return np.asarray(self.dynamic @ xi + self.algebraic @ solution)
@@ -116,12 +116,12 @@ def without_rounding(factor: SparseFactor, solution: FloatArray) -> FloatArray:
         return solution
     found = solution.copy()
     part = np.ix_(rows, columns)
-    if len(rows) > SAMPLES * len(columns):
+    if len(rows) > SIZE_SAMPLES * len(columns):
         # Many rows: almost all of them are decided by an estimate.
         usual = CANCELLATION_TOLERANCE * factor.usual_size_of_terms(solution[:, columns])[rows]
-        nothing = np.abs(solution[part]) <= usual / SAMPLED
+        nothing = np.abs(solution[part]) <= usual / MEAN_FACTOR
         found[part] = np.where(nothing, 0.0, solution[part])
-        open_still = ~nothing & (np.abs(solution[part]) <= usual * SAMPLED * np.sqrt(factor.size))
+        open_still = ~nothing & (np.abs(solution[part]) <= usual * MEAN_FACTOR * np.sqrt(factor.size))
         rows = rows[open_still.any(axis=1)]
         if not rows.size:
             return found

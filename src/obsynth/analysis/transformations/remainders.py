@@ -30,7 +30,7 @@ from obsynth.proofs.affine_numbers import AffineNumber, affine_translation
 from obsynth.proofs.balls import UNIT_ROUNDOFF, gamma, rounded_up
 
 #: Parts of a sample over which what moves within it is bounded.
-PIECES = 32
+PARTS_OF_SAMPLE = 32
 #: Roundings of the coefficients of derivatives, which CasADi computes.
 COEFFICIENT_ROUNDINGS = 16.0
 
@@ -234,12 +234,12 @@ def _away(found: AffineMatrix, shipped: FloatArray) -> FloatArray:
 
 def _moving(a: AffineMatrix, sizes: FloatArray, step: float) -> FloatArray:
     """Return what disturbances of these sizes, which do anything within a sample, do to the states at its end."""
-    piece = step / PIECES
+    piece = step / PARTS_OF_SAMPLE
     # Within a piece e^(A s) is away from its begin by e^(|A| s) - 1 times that.
     spread = affine_exponential(AffineMatrix.exact(a.magnitude * (piece * (1.0 + 4.0 * UNIT_ROUNDOFF)), 0)).magnitude
     over = affine_exponential(a.scaled(piece))
     here, total = AffineMatrix.exact(np.eye(len(sizes)), 0), np.zeros(len(sizes))
-    for _ in range(PIECES):
+    for _ in range(PARTS_OF_SAMPLE):
         total = total + here.magnitude @ (spread @ sizes)
         here = here @ over
-    return rounded_up(total * piece, PIECES * (2 * len(sizes) + 4) + 8)
+    return rounded_up(total * piece, PARTS_OF_SAMPLE * (2 * len(sizes) + 4) + 8)

@@ -17,14 +17,12 @@ from obsynth.analysis.transformations.idle_variables import (
 from obsynth.analysis.transformations.recovery_operator import RecoveryOperator, without_rounding
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.pencil_points import GENERIC_POINTS
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, NAMED_SHARE, RANK_TOLERANCE
 from obsynth.numerics.scaling import power_of_two_below
 from obsynth.numerics.sparse import coarse_structure, components_of, csr, dense, selection
 from obsynth.numerics.sparse_factor import NullVectors, SolutionBounds, scales_by_all_entries, sparse_factor
 from obsynth.plants.descriptor import DescriptorSystem
-
-#: Points without meaning, at which a pencil has its normal rank.
-GENERIC_POINTS = (0.7391, -1.3247)
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,7 +229,7 @@ def not_index_one(
     null = factor.null_vectors()
     if not factor.exactly_singular and null.smallest > RANK_TOLERANCE:
         return said or PreconditionError("", condition="index")
-    generic = [sparse_factor(csr(part.A) - point * csr(part.E)) for point in GENERIC_POINTS]
+    generic = [sparse_factor(csr(part.A) - point * csr(part.E)) for point in GENERIC_POINTS[:2]]
     regular = any(not found.singular for found in generic)
     if regular:
         equations, variables = _leading(split.algebraic_rows, split.algebraic, null, inner)

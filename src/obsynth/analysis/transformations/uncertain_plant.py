@@ -26,9 +26,9 @@ from obsynth.proofs.affine import AffineMatrix, affine_block, affine_inverse, af
 #: Their coordinates are rounded to this many digits: any invertible change of coordinates is exact.
 COORDINATE_DIGITS = 9
 #: What one state does to a row counts as rounding below this share of all that the row holds.
-ROUNDING_SHARE = 1e-9
+ROW_ROUNDING_SHARE = 1e-9
 #: Inputs, in the order in which they stand side by side.
-_INPUTS, _DIRECT = ("B", "Bf", "Bd"), ("D", "Df", "Dd")
+_INPUT_MATRICES, _DIRECT = ("B", "Bf", "Bd"), ("D", "Df", "Dd")
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,10 +76,10 @@ def affine_plant(plant: DescriptorSystem, box: ConstantsBox | None = None) -> Af
     reduced, basis = reduced_family(plant, uncertain, box, inverted=not apart)
     for kind, size in uncertain.steps:
         if kind == SAMPLED:
-            inputs = affine_block([[reduced[name] for name in _INPUTS]])
+            inputs = affine_block([[reduced[name] for name in _INPUT_MATRICES]])
             a, held = affine_zero_order_hold(reduced["A"], inputs, size)
-            reduced = {**reduced, "A": a, **_split(held, reduced, _INPUTS)}
-    back = {name: reduced[name].after(basis) for name in ("E", "A", *_INPUTS)}
+            reduced = {**reduced, "A": a, **_split(held, reduced, _INPUT_MATRICES)}
+    back = {name: reduced[name].after(basis) for name in ("E", "A", *_INPUT_MATRICES)}
     return AffinePlant(plant, box, {**reduced, **back}, basis)
 
 
@@ -120,9 +120,9 @@ def moving_basis(plant: DescriptorSystem, box: ConstantsBox) -> FloatArray:
 
 def untouched_states(columns: FloatArray, sizes: FloatArray) -> list[int]:
     """Return states that drive none but each other: ``columns (m, n)`` of what they do, rows of A first.
-    ``sizes (m,)``: of the rows; what is below `ROUNDING_SHARE` of these is rounding."""
+    ``sizes (m,)``: of the rows; what is below `ROW_ROUNDING_SHARE` of these is rounding."""
     n = columns.shape[1]
-    acting = np.abs(columns) > ROUNDING_SHARE * np.maximum(sizes, np.finfo(np.float64).tiny)[:, None]
+    acting = np.abs(columns) > ROW_ROUNDING_SHARE * np.maximum(sizes, np.finfo(np.float64).tiny)[:, None]
     found = [j for j in range(n) if not acting[n:, j].any()]
     while True:
         others = [i for i in range(n) if i not in found]
@@ -190,7 +190,9 @@ def reduced_matrices(
     v = np.eye(nd) if basis is None else basis
     e = matrices["E"].after(rows)
     _require_algebraic(e[nd:, :], e @ algebraic)
-    whole = affine_block([[matrices["A"] @ np.hstack([dynamic @ v, algebraic]), *(matrices[k] for k in _INPUTS)]])
+    whole = affine_block(
+        [[matrices["A"] @ np.hstack([dynamic @ v, algebraic]), *(matrices[k] for k in _INPUT_MATRICES)]]
+    )
     a = whole.after(rows)
     state, inner = slice(0, nd), slice(nd, n)
     keep = [*range(nd), *range(n, a.shape[1])]
@@ -210,8 +212,11 @@ def reduced_matrices(
     else:
         left = back @ np.linalg.inv((rows @ divided_by @ dynamic)[state])
         top, ahead = top.after(left), (e @ (dynamic @ v))[state, :].after(left)
-    like = {"A": AffineMatrix.exact(np.zeros((nd, nd)), count), **{k: matrices[k] for k in (*_INPUTS, *_DIRECT)}}
-    found = _split(top, like, ("A", *_INPUTS))
+    like = {
+        "A": AffineMatrix.exact(np.zeros((nd, nd)), count),
+        **{k: matrices[k] for k in (*_INPUT_MATRICES, *_DIRECT)},
+    }
+    found = _split(top, like, ("A", *_INPUT_MATRICES))
     read = _split(outputs, {**like, "C": like["A"]}, ("C", *_DIRECT))
     return {"E": ahead, **found, **read}
 

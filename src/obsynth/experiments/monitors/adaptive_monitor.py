@@ -46,7 +46,7 @@ from obsynth.verification.error_structure import ErrorStructure, Tracking, error
 from obsynth.verification.responses import loop_radius
 
 #: Pieces of an interval in which a disturbance has a sign of its own.
-PIECES = 16
+SIGNED_PIECES = 16
 #: Covers the rounding of a matrix exponential in double precision, and of a few sums.
 SERIES_SLACK, SUM_SLACK = 1.0 + 1e-9, 1.0 + 1e-12
 #: The name under which what the sampled observer misses counts among the constants.
@@ -107,7 +107,7 @@ def sampled_problem(design: ObserverDesign, dt: float, bounds: FloatArray, noise
     pieces = _pieces(reduced["A"], reduced["Bd"], dt)
     nd, nf = plant.nd, plant.nf
     zero = AffineMatrix.exact(np.zeros((len(basis), nd)), moving.count)
-    blind = AffineMatrix.exact(np.zeros((plant.ny, nd * PIECES)), moving.count)
+    blind = AffineMatrix.exact(np.zeros((plant.ny, nd * SIGNED_PIECES)), moving.count)
     bd, dd = affine_block([[*pieces, zero]]), affine_block([[blind, reduced["Dd"]]])
     bw, dw = _noise(smooth, back, dt)
     matrices = {
@@ -147,7 +147,7 @@ def sampled_problem(design: ObserverDesign, dt: float, bounds: FloatArray, noise
         )
     unknown = np.abs(through_y) @ (reduced["Dd"].magnitude @ bounds + np.abs(dw).sum(axis=1) * noise_bound)
     first = -(through_u + through_y @ affine.D.center)
-    sizes = np.concatenate([np.tile(bounds, PIECES), bounds])
+    sizes = np.concatenate([np.tile(bounds, SIGNED_PIECES), bounds])
     empty = np.zeros((len(observer.Cz), len(basis)))
     return SampledProblem(
         affine, sample_observer(observer, dt), Tracking(t, empty), sizes, reading, first, through_y, unknown
@@ -166,13 +166,13 @@ def _pieces(a: AffineMatrix, bd: AffineMatrix, dt: float) -> list[AffineMatrix]:
     The remainder holds a change of sign inside a piece: at most a quarter of its length, squared, times the slope."""
     from scipy.linalg import expm
 
-    width = dt / PIECES
+    width = dt / SIGNED_PIECES
     step, gathered = affine_zero_order_hold(a, bd, width)
     size = a.magnitude
     # ``exp(S)`` bounds ``sum_k S^k / (k + 1)!`` for ``S >= 0``.
     growth = np.eye(len(size)) + size * width @ (expm(size * width) * SERIES_SLACK)
     found, piece, value = [], gathered, bd
-    for _ in range(PIECES):
+    for _ in range(SIGNED_PIECES):
         slope = size @ (growth @ value.magnitude)
         found.append(piece.enlarged(rounded_up(0.25 * width**2 * slope, 6)))
         piece, value = step @ piece, step @ value
@@ -198,9 +198,9 @@ def _noise(smooth: DescriptorSystem, back: FloatArray, dt: float) -> tuple[Float
 
 
 #: Radii of a set are made larger by this share: more than the rounding of their sums.
-OUTWARD = 1e-12
+RADIUS_OUTWARD = 1e-12
 #: What a statement adds where no tolerance is known.
-EXACT = f"; {EXACT_MODEL}"
+NO_TOLERANCE = f"; {EXACT_MODEL}"
 
 
 def adaptive_plan(
@@ -270,7 +270,7 @@ def _sampled_plan(
     structure = error_structure(
         problem.observer, problem.affine, problem.tracking, problem.bounds, noise, reading=problem.reading
     )
-    _require_bounds(structure, np.tile(bounds, PIECES + 1))
+    _require_bounds(structure, np.tile(bounds, SIGNED_PIECES + 1))
     z = np.zeros(observer.order) if observer_state is None else observer_state
     box = None if initial_set is None else initial_box(plant, initial_set)
     stated = Start(observer.order, norm=initial_error, state=z)
@@ -333,7 +333,7 @@ def start_of(
     followed = affine.E.after(tracking.T) @ back
     offset = followed.center @ center
     size = np.abs(followed.center) @ radius + (followed.spread + followed.radius) @ (np.abs(center) + radius)
-    return Start(len(z), center=z - offset, radius=size * (1.0 + OUTWARD), state=z)
+    return Start(len(z), center=z - offset, radius=size * (1.0 + RADIUS_OUTWARD), state=z)
 
 
 def initial_box(plant: DescriptorSystem, given: Mapping[str, Any]) -> tuple[FloatArray, FloatArray]:
@@ -376,7 +376,7 @@ def adaptive_statement(plan: AdaptivePlan, assumed: Assumptions) -> str:
     outside = "" if box is None else f": an alarm is a fault, or {box.sentence}"
     text = f"never passed without a fault since the start{f', with {kept}' if kept else ''}{outside}"
     if box is None:
-        return text + EXACT
+        return text + NO_TOLERANCE
     steps = () if uncertain is None else uncertain.steps
     sampled = any(kind == SAMPLED for kind, _ in steps)
     kept = ""

@@ -24,13 +24,13 @@ from obsynth.proofs.peak_sums import PeakSums, gathered, interval_pieces, peak_s
 from obsynth.proofs.products import exponential
 
 #: Modes of the plant that decay by less than this exponent in a sample are not followed until they have died out.
-LEAST_DECAY = 1e-4
+LEAST_EXPONENT = 1e-4
 #: Share of the terms of K that counts as rounding.
-ROUNDING = 1e-9
+TERM_ROUNDING = 1e-9
 #: Share of the bound that rounding on modes that do not die out may add.
 ADDED = 1e-3
 #: Share of what a disturbance does to the outputs below which it is held not to reach the residual.
-UNREACHED = 1e-11
+UNREACHED_RESIDUAL = 1e-11
 #: Share of its terms that rounding adds to a sum over a record of known length, where no tail has to be bounded.
 FINITE = 1e-12
 
@@ -136,7 +136,7 @@ class BetweenSamples:
         a, b = self.plant.A, self.plant.Bd
         held = np.abs(self.plant.C) @ (np.abs(b) * self.dt + np.abs(a @ b) * self.dt**2) + np.abs(self.plant.Dd)
         scale = np.abs(self.direct) @ held + np.abs(self.c[:, len(a) :]) @ (np.abs(self.second) @ held)
-        return np.asarray(self.per_unit > UNREACHED * np.linalg.norm(scale, axis=0))
+        return np.asarray(self.per_unit > UNREACHED_RESIDUAL * np.linalg.norm(scale, axis=0))
 
     def of_disturbances(self, sizes: FloatArray, steps: int) -> tuple[FloatArray, FloatArray]:
         """Return the bounds at samples ``0 .. steps - 1``, and for ever ``(nd,)``, for ``|d_i(t)| <= sizes_i``."""
@@ -206,7 +206,7 @@ class BetweenSamples:
             return np.inf
         others = np.eye(plant.nx) - projector
         second = plant.C @ plant.A @ plant.A
-        if np.any(np.abs(second @ others) > ROUNDING * (np.abs(second) @ np.abs(others))):
+        if np.any(np.abs(second @ others) > TERM_ROUNDING * (np.abs(second) @ np.abs(others))):
             return np.inf
         # The modes that last are straight: they are moved to where they die out, and nothing enters them.
         stable = plant.A @ projector - others
@@ -242,14 +242,14 @@ class InputResponse:
 def _kept(plant: DescriptorSystem, dt: float, k: Ball, terms: FloatArray) -> FloatArray:
     """Return the projector ``(n, n)`` onto the modes of a plant that die out; raise where others are not straight."""
     n = plant.nx
-    if not np.any(np.abs(k.midpoint) + k.radius > ROUNDING * terms):
+    if not np.any(np.abs(k.midpoint) + k.radius > TERM_ROUNDING * terms):
         return np.zeros((n, n))
     projector = _dying(plant.A, dt)
     others = np.eye(n) if projector is None else np.eye(n) - projector
     missed = np.abs(k.midpoint @ others)
-    if np.any(missed > ROUNDING * (terms @ np.abs(others))):
+    if np.any(missed > TERM_ROUNDING * (terms @ np.abs(others))):
         slow = np.linalg.eigvals(plant.A)
-        slow = slow[slow.real > -LEAST_DECAY / dt]
+        slow = slow[slow.real > -LEAST_EXPONENT / dt]
         pole = complex(slow[int(np.argmax(np.abs(slow)))]) if slow.size else 0j
         raise SpecError(
             f"The residual at the samples has no bound: the plant's mode at {pole:.4g} 1/s does not die out, and its "
@@ -265,7 +265,7 @@ def _dying(a: FloatArray, dt: float) -> FloatArray | None:
     from scipy.linalg import schur, solve_sylvester
 
     n = len(a)
-    form, basis, lasting = schur(a, sort=lambda re, im=0.0: re > -LEAST_DECAY / dt, output="real")
+    form, basis, lasting = schur(a, sort=lambda re, im=0.0: re > -LEAST_EXPONENT / dt, output="real")
     if lasting == n:
         return None
     if not lasting:

@@ -19,11 +19,11 @@ from obsynth.verification.error_system import ErrorModel
 #: States that are solved from the observer's own and the outputs are these, up to rounding.
 SOLVED_SHARE = 1e-9
 #: Largest share of a sample, in units of 1 / norm of A, in which a slope is bounded at once.
-PIECE = 0.1
+SLOPE_PIECE = 0.1
 #: Columns that are kept apart; more of them are put together to a box, which holds them.
-MOST_COLUMNS = 200
+MOST_APART = 200
 #: What is smaller, of what the error may be without a gap, is rounding of the threshold.
-ROUNDING = 2.0**-52
+GAP_ROUNDING = 2.0**-52
 
 
 class GapState(NamedTuple):
@@ -108,9 +108,9 @@ class GapGrowth:
     def _kept(self, columns: FloatArray) -> FloatArray:
         """Return columns that hold the same: none that are rounding, and not too many."""
         sizes = np.abs(columns).sum(axis=1)
-        if (sizes <= ROUNDING * self._size).all():
+        if (sizes <= GAP_ROUNDING * self._size).all():
             return columns[:, :0]
-        return columns if columns.shape[1] <= MOST_COLUMNS else np.diag(sizes)
+        return columns if columns.shape[1] <= MOST_APART else np.diag(sizes)
 
 
 def _disturbances(model: ResidualModel, errors: ErrorModel, sizes: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -124,7 +124,7 @@ def _disturbances(model: ResidualModel, errors: ErrorModel, sizes: FloatArray) -
     if sampled is None:
         return plant.Bd * sizes, plant.Dd * sizes
     a, h, none = sampled.plant.A, sampled.dt, np.zeros((plant.nx, plant.nd))
-    count = max(1, int(np.ceil(np.abs(a).sum(axis=1).max(initial=0.0) * h / PIECE)))
+    count = max(1, int(np.ceil(np.abs(a).sum(axis=1).max(initial=0.0) * h / SLOPE_PIECE)))
     from scipy.linalg import expm
 
     step, wider = expm(a * h / count), expm(np.abs(a) * h / count)

@@ -36,8 +36,8 @@ from obsynth.results.certificate_files import opened, sealed
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import digest_of, gain_set_digest, plain, restored
 
-KIND = "obsynth learned thresholds"
-SCHEMA_VERSION = 2
+LEARNED_KIND = "obsynth learned thresholds"
+LEARNED_VERSION = 2
 LEARNED = FileKind("learned thresholds of obsynth", rb'\A\s*\{\s*"kind":\s*"obsynth learned thresholds"')
 #: Columns that are watched at most, and the least share of a column's variance that others leave unexplained.
 MOST_WATCHED, LEAST_NEW = 8, 1e-6
@@ -55,7 +55,7 @@ UNITS = {
     "month": 2629800.0,
     "year": 31557600.0,
 }
-_RATE = re.compile(r"\s*([0-9.eE+-]+)\s*(?:per|/)\s*([0-9.eE+]*)\s*([a-z]+?)s?\s*")
+_WRITTEN_RATE = re.compile(r"\s*([0-9.eE+-]+)\s*(?:per|/)\s*([0-9.eE+]*)\s*([a-z]+?)s?\s*")
 
 
 def rows_per_alarm(rate: str | float, dt: float) -> float:
@@ -64,7 +64,7 @@ def rows_per_alarm(rate: str | float, dt: float) -> float:
     found: float | None = None
     if is_finite_number(rate):
         found = 1.0 / float(rate) if float(rate) > 0.0 else None
-    elif isinstance(rate, str) and (match := _RATE.fullmatch(rate.lower())) is not None:
+    elif isinstance(rate, str) and (match := _WRITTEN_RATE.fullmatch(rate.lower())) is not None:
         unit = 1.0 if match.group(3) in ("row", "sample") else UNITS.get(match.group(3), 0.0) / dt
         try:
             alarms, count = float(match.group(1)), float(match.group(2) or 1.0)
@@ -190,7 +190,7 @@ class LearnedThresholds:
         SpecError
             The file cannot be written.
         """
-        return write_atomically(path, sealed(KIND, SCHEMA_VERSION, plain(self.as_dict()), under="thresholds"))
+        return write_atomically(path, sealed(LEARNED_KIND, LEARNED_VERSION, plain(self.as_dict()), under="thresholds"))
 
 
 def _duration(seconds: float) -> str:
@@ -220,7 +220,9 @@ def load_thresholds(path: str | Path) -> LearnedThresholds:
     """
     file = Path(path)
     again = "learn the thresholds again (obsynth thresholds)"
-    _, body, intact = opened(file, (KIND,), SCHEMA_VERSION, "file of learned thresholds", again, under="thresholds")
+    _, body, intact = opened(
+        file, (LEARNED_KIND,), LEARNED_VERSION, "file of learned thresholds", again, under="thresholds"
+    )
     if not intact:
         raise SpecError(f"{file} was changed after it was written: its digest does not match.", path=str(file))
     try:

@@ -4,7 +4,7 @@ Residuals are whitened by their autoregression (Alwan & Roberts 1988).  Watched 
 weighted means (MEWMA, Lowry et al. 1992) and likelihood ratios of steps and ramps (Willsky & Jones 1976).  The
 bootstrap makes streams from blocks of the whitened rows (Politis & Romano 1994) whose largest follow a generalised
 Pareto tail; from each it fits everything again, so that the uncertainty of a short log is in the levels, which hold in
-`SURE` of the streams (after Gandy & Kvaloy 2013).
+`SURE_STREAMS` of the streams (after Gandy & Kvaloy 2013).
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.arrays import SMALLEST, FloatArray, read_only
 from obsynth.numerics.autoregression import Autoregression, fitted_autoregression
 
 #: An alarm ends when so many rows in a row were below the level.
@@ -26,10 +26,10 @@ FORGETTING = (0.3, 0.1)
 #: Rows at the begin of a stream in which the statistics are not those of a long one.
 SETTLING = 100
 #: Streams of the bootstrap, their share in which the rate is to hold, and the rows that each is judged on.
-STREAMS, SURE = 24, 0.8
-LEAST_ROWS, MOST_ROWS, ROWS_PER_ALARM = 4_000, 20_000, 4
+STREAMS, SURE_STREAMS = 24, 0.8
+LEAST_STREAM_ROWS, MOST_STREAM_ROWS, ROWS_PER_ALARM = 4_000, 20_000, 4
 #: Rows that the simulated streams are given to forget their start.
-FORGOTTEN = 200
+ROWS_TO_FORGET = 200
 #: Share of the radii that follow the Pareto tail, least number of them, and bounds of its shape: with a lighter tail
 #: than the least, logs of 500 white rows rang 2.7 times too often.
 TAIL_SHARE, LEAST_TAIL, SHAPES = 0.1, 20, (-0.05, 0.4)
@@ -37,8 +37,6 @@ TAIL_SHARE, LEAST_TAIL, SHAPES = 0.1, 20, (-0.05, 0.4)
 POSITION, NO_SHAPE = 0.35, 1e-6
 #: How many times rarer than all together each statistic may ring, tried in turn.
 RARER = (1.4, 2.0, 2.8, 4.0, 5.6, 8.0)
-#: Least sum of squares of a template.
-_NOTHING = 1e-300
 #: So many times the rows of a rate show it themselves: with 20 alarms in their second half, 1.5 times the rate is
 #: passed in 2 % of logs.
 CONFORMAL = 40
@@ -85,7 +83,7 @@ class Statistics:
         found = np.zeros((len(shapes), len(AGES), max(AGES), self.model.channels))
         for i, age in enumerate(AGES):
             part = long[:, :age]
-            size = np.sqrt(np.maximum(np.sum(part**2, axis=(1, 2)), _NOTHING))
+            size = np.sqrt(np.maximum(np.sum(part**2, axis=(1, 2)), SMALLEST))
             found[:, i, max(AGES) - age :] = part / size[:, None, None]
         return found
 
@@ -125,7 +123,7 @@ def _likelihood_ratios(e: FloatArray, shape: FloatArray, slope: FloatArray) -> F
         if slope.any():
             fit += weighted[:, age:] - weighted[:, :-age]
             fit -= np.arange(n - age + 1) * (rising[:, age:] - rising[:, :-age])
-        np.maximum(largest[:, age - 1 :], fit**2 / max(power[age - 1], _NOTHING), out=largest[:, age - 1 :])
+        np.maximum(largest[:, age - 1 :], fit**2 / max(power[age - 1], SMALLEST), out=largest[:, age - 1 :])
     return largest
 
 
@@ -260,14 +258,14 @@ def learned_levels(x: FloatArray, every: float, statistics: Statistics, seed: in
     """Return the levels for one alarm per ``every`` rows from rows ``(n, m)`` without faults."""
     rng = np.random.default_rng(seed)
     model, n = statistics.model, len(x)
-    rows = int(np.clip(ROWS_PER_ALARM * every, LEAST_ROWS, MOST_ROWS))
+    rows = int(np.clip(ROWS_PER_ALARM * every, LEAST_STREAM_ROWS, MOST_STREAM_ROWS))
     e = model.whitened(x)[model.order :]
     e = e[np.isfinite(e).all(axis=1)]
-    streams = model.simulated(drawn_rows(e - e.mean(axis=0), STREAMS, FORGOTTEN + n + rows, rng))
+    streams = model.simulated(drawn_rows(e - e.mean(axis=0), STREAMS, ROWS_TO_FORGET + n + rows, rng))
     known = np.asarray(np.isfinite(x).all(axis=1))
     found = []
     for stream in streams:
-        seen = np.where(known[:, None], stream[FORGOTTEN : FORGOTTEN + n], np.nan)
+        seen = np.where(known[:, None], stream[ROWS_TO_FORGET : ROWS_TO_FORGET + n], np.nan)
         again = fitted_autoregression(seen, order=model.order)
         judged = Statistics(again, statistics.signatures, statistics.told)
         found.append(judged.of_rows(again.whitened(stream[None, -rows:]))[:, 0])
@@ -279,7 +277,7 @@ def learned_levels(x: FloatArray, every: float, statistics: Statistics, seed: in
     # One stream alone shows less rare alarms than all of them.
     shown = min(seen_rate, rows / ROWS_PER_ALARM)
     each = np.array([level_of(stream, shown) for stream in union])
-    sure = max(1.0, float(np.quantile(each, SURE)) / level_of(union, shown))
+    sure = max(1.0, float(np.quantile(each, SURE_STREAMS)) / level_of(union, shown))
     if every > seen_rate:
         # Beyond what the streams show, levels rise by the same amount for each factor between rates.
         before = level_of(union, seen_rate / OBSERVED)

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from obsynth.experiments.benches import Runs
     from obsynth.experiments.monitors.residual_model import ResidualModel
 
-KINDS = ("paper", "pointwise", "window", "chi-square", "cusum")
+MONITOR_KINDS = ("paper", "pointwise", "window", "chi-square", "cusum")
 STATEMENTS: Mapping[str, str] = {
     "paper": "eq. (66) of Wang et al. 2015 with the norm of the power: not a pointwise bound, may be passed without a "
     "fault, and knows no sensor noise",
@@ -37,10 +37,10 @@ STATEMENTS: Mapping[str, str] = {
     "of {false_alarms} at most, for Gaussian noise, once the start is forgotten",
 }
 #: What a statement adds for a continuous design.
-BETWEEN_SAMPLES = "; disturbances move within their bounds between samples, which are {dt} s apart"
+BOUNDS_BETWEEN_SAMPLES = "; disturbances move within their bounds between samples, which are {dt} s apart"
 #: The assumption of a sampled design: what happens between its samples is not in its model.
 HELD = "; inputs and disturbances are held between samples"
-SAMPLED = BETWEEN_SAMPLES + "; known inputs are held between samples"
+BOUNDS_AND_HELD_INPUTS = BOUNDS_BETWEEN_SAMPLES + "; known inputs are held between samples"
 #: The other assumptions of every bound that is never passed.
 ASSUMED = "; the plant starts at rest, known inputs are held or straight lines between samples"
 #: Where the residual is made not to see the faults that are modelled.
@@ -55,8 +55,8 @@ def statement_of(
     ending = ""
     if kind in ("pointwise", "window"):
         # Of a sampled plant disturbances may move between samples where the continuous one behind it is known.
-        held = HELD if model.sampled is None else SAMPLED
-        ending = held if model.flow is None else BETWEEN_SAMPLES + ASSUMED
+        held = HELD if model.sampled is None else BOUNDS_AND_HELD_INPUTS
+        ending = held if model.flow is None else BOUNDS_BETWEEN_SAMPLES + ASSUMED
     known = {name: shown(value) for name, value in numbers.items()}
     kept = "" if assumed is None else assumed.bounds_phrase
     words = (STATEMENTS[kind] + "{kept}" + ending).format(kept=f", with {kept}" if kept else "", **known)

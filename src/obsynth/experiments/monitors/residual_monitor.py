@@ -12,13 +12,13 @@ from obsynth.errors import SpecError
 from obsynth.experiments.assumptions import Assumptions
 from obsynth.experiments.benches import Bench, make_bench
 from obsynth.experiments.monitors.adaptive_monitor import (
-    EXACT,
+    NO_TOLERANCE,
     noisy_design,
     over_box,
     tolerances_of,
 )
 from obsynth.experiments.monitors.guaranteed import is_guaranteed, record_monitor
-from obsynth.experiments.monitors.monitor import KINDS, Monitor, Rule, statement_of
+from obsynth.experiments.monitors.monitor import MONITOR_KINDS, Monitor, Rule, statement_of
 from obsynth.experiments.monitors.options import LINEAR_OPTIONS, checked_options
 from obsynth.experiments.monitors.residual_model import ResidualModel, residual_model, watches_estimates
 from obsynth.experiments.monitors.rules import NormRule, WhitenedRule
@@ -38,7 +38,7 @@ from obsynth.results.design import ObserverDesign
 from obsynth.simulation.scenario import Scenario
 
 #: What rounding may add to a residual, relative to the terms it is made of.
-ROUNDING_SHARE = 1e-10
+RESIDUAL_ROUNDING_SHARE = 1e-10
 
 
 def monitor(
@@ -122,8 +122,8 @@ def monitor(
     require_verified(design, unverified=unverified)
     require_kind(scenario, Scenario, "scenario", "an obsynth.Scenario")
     require_mapping(disturbance_bounds, "disturbance_bounds")
-    if kind not in KINDS:
-        raise SpecError(f"kind is {kind!r}: use one of {', '.join(KINDS)}.", path="kind")
+    if kind not in MONITOR_KINDS:
+        raise SpecError(f"kind is {kind!r}: use one of {', '.join(MONITOR_KINDS)}.", path="kind")
     given = {
         "disturbance_bounds": disturbance_bounds, "noise_bound": noise_bound, "initial_error": initial_error,
         "gamma": gamma, "window": window, "false_alarms": false_alarms, "change": change, "constants": constants,
@@ -170,7 +170,7 @@ def monitor(
     assumed = Assumptions(noisy.linear[0], bounds, noise_bound or 0.0, initial_error=start)
     numbers = {"window": window, "false_alarms": false_alarms, "change": change, "dt": bench.signals.dt}
     bounded = assumed if kind in ("pointwise", "window") else None
-    statement = statement_of(kind, model, bounded, estimates=estimates, **numbers) + EXACT
+    statement = statement_of(kind, model, bounded, estimates=estimates, **numbers) + NO_TOLERANCE
     if adaptive:
         rule, statement = over_box(design, noisy, scenario, rule, bounds, noise_bound, initial_error, initial_set)
     return Monitor(
@@ -227,7 +227,7 @@ def _floor(bench: Bench, scenario: Scenario, rows: slice) -> float:
     """Return what rounding may add to the norm of the residual, from the size of what it is made of."""
     runs, observer = bench.run([scenario.seed]), cast(LinearObserver, bench.observer)
     size = np.abs(runs.outputs) @ np.abs(observer.Dy[rows]).T + np.abs(runs.inputs) @ np.abs(observer.Du[rows]).T
-    return ROUNDING_SHARE * float(np.max(np.linalg.norm(size, axis=2)))
+    return RESIDUAL_ROUNDING_SHARE * float(np.max(np.linalg.norm(size, axis=2)))
 
 
 def _straight_lines(

@@ -25,11 +25,11 @@ from obsynth.plants.validation import index_of
 #: Share of an interval by which the data's sampling may differ from the one that a threshold is for.
 FITTING_SHARE = 0.01
 #: Share of an interval within which two of them are the same: stamps are rounded.
-SAME_SHARE = 1e-6
+SAME_INTERVAL = 1e-6
 #: What rounding may take from a number of samples, as a share of it.
-ROUNDING = 1e-9
+COUNT_ROUNDING = 1e-9
 #: What a rule says where nothing is decided.
-UNDECIDED = Judged(math.nan, math.nan)
+NOT_DECIDED = Judged(math.nan, math.nan)
 
 
 def share_of_look(look: int) -> float:
@@ -105,7 +105,7 @@ class NormRule(Rule):
         said: Any = sample.said
         late = 0.0 if state.last is None else (sample.time - state.last - self._dt) / self._dt
         begin = sample.time if state.begin is None else state.begin
-        regular = state.regular and abs(late) <= SAME_SHARE
+        regular = state.regular and abs(late) <= SAME_INTERVAL
         state = state._replace(
             # A window is a number of samples at the sampling that its bound is for.
             norms=() if self._window > 1 and abs(late) > FITTING_SHARE else state.norms,
@@ -116,7 +116,7 @@ class NormRule(Rule):
         )
         if self._driven is not None:
             state = self._with_inputs(self._driven, state, said)
-        k = math.floor((sample.time - begin) / self._dt * (1.0 + ROUNDING))
+        k = math.floor((sample.time - begin) / self._dt * (1.0 + COUNT_ROUNDING))
         table, limit = self._regular if regular or self.irregular is None else self.irregular
         threshold = float(table[k]) if k < len(table) else limit
         # Neither rows further apart than stated nor inputs that move at other stamps are in the bound.
@@ -215,10 +215,10 @@ class WhitenedRule(Rule):
             state = self.restart(state)
         state = state._replace(last=sample.time)
         if not sample.deciding:
-            return state, UNDECIDED
+            return state, NOT_DECIDED
         state, value = self.fold(state, sample.residuals)
         if state.filled < self._window:
-            return state, UNDECIDED
+            return state, NOT_DECIDED
         state = state._replace(looks=state.looks + 1)
         probability, degrees = self._probability * share_of_look(state.looks), len(self.whitener)
         if self._change is None:
@@ -280,7 +280,7 @@ class ParameterRule(Rule):
     def step(self, state: ParameterState, sample: Sample) -> tuple[ParameterState, Judged]:
         """Return the state after a sample, statistic, threshold, and the number of the parameter if it is known."""
         if not sample.deciding:
-            return state, UNDECIDED
+            return state, NOT_DECIDED
         found: Any = sample.said
         looked = state._replace(looks=state.looks + 1)
         share = self._probability * share_of_look(looked.looks)
@@ -301,7 +301,7 @@ class ParameterRule(Rule):
             gap = gap - found.regressor @ self._nominal
         squares, degrees = (*state.squares, float(gap @ gap))[-NIS_WINDOW:], (*state.degrees, len(gap))[-NIS_WINDOW:]
         if not sum(degrees):
-            return state._replace(squares=squares, degrees=degrees), UNDECIDED
+            return state._replace(squares=squares, degrees=degrees), NOT_DECIDED
         looked = looked._replace(squares=squares, degrees=degrees)
         return looked, Judged(sum(squares), float(chdtri(sum(degrees), share)))
 

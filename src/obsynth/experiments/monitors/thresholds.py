@@ -144,9 +144,9 @@ def window_threshold(model: ResidualModel, inputs: ScaledInputs, initial_error: 
 
 
 #: What is left of an error after the table.
-LEFT = 1e-3
+LEFT_AFTER_TABLE = 1e-3
 #: Longest table, and most numbers in its powers.
-MOST_SAMPLES, MOST_NUMBERS = 16_384, 20_000_000
+LONGEST_TABLE, MOST_NUMBERS = 16_384, 20_000_000
 
 
 class UnlimitedHorizonBound(NamedTuple):
@@ -157,12 +157,12 @@ class UnlimitedHorizonBound(NamedTuple):
 
 
 def samples_of(transition: FloatArray, window: int) -> int:
-    """Return how many samples a table needs until an error at the start has shrunk to `LEFT`; ``transition (n, n)``."""
+    """Return how many samples a table of ``transition (n, n)`` needs until `LEFT_AFTER_TABLE` of a start is left."""
     # Entries that cancel drown the eigenvalues in the powers of a matrix, but not in those of its Schur form.
     power, count = schur_form(transition)[0], 1
-    while len(power) and not np.linalg.norm(power, 2) <= LEFT:
+    while len(power) and not np.linalg.norm(power, 2) <= LEFT_AFTER_TABLE:
         power, count = np.triu(power @ power), 2 * count
-        if count > MOST_SAMPLES or count * power.size > MOST_NUMBERS or not np.isfinite(power).all():
+        if count > LONGEST_TABLE or count * power.size > MOST_NUMBERS or not np.isfinite(power).all():
             raise SpecError(
                 "Errors of the observer decay too slowly at this sampling for a bound for ever: use a statistical "
                 "monitor, or obsynth.monitor for a record of known length.",

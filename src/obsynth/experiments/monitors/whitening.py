@@ -11,11 +11,11 @@ from obsynth.numerics.norms import output_covariance, spectral_radius
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE
 
 #: The start counts as forgotten when its effect on the residual is below this share of the residual's deviation.
-START_SHARE = 0.05
+START_EFFECT_SHARE = 0.05
 #: A disturbance that moves the residual by less than this share of its noise is decoupled, but for rounding.
 NOTHING_FELT = 1e-6
 #: Whitened residuals count as white when their correlations sum up to no more than this.
-WHITE_SHARE = 0.01
+WHITE_CORRELATIONS = 0.01
 #: What may be left of a correlation, relative to where it began, when its sum ends; and after how many samples at most.
 CORRELATION_LEFT, MOST_LAGS = 1e-9, 200_000
 
@@ -109,7 +109,7 @@ def cusum_whitener(model: ResidualModel, window: int) -> tuple[FloatArray, bool]
     """Return what cumulative sums add up, n samples of no more variance than n, and whether it is white."""
     whitener = innovation_whitener(window_covariance(model, window), len(model.C))
     left = correlation_left(model, window, whitener)
-    return whitener / np.sqrt(1.0 + 2.0 * left), left <= WHITE_SHARE
+    return whitener / np.sqrt(1.0 + 2.0 * left), left <= WHITE_CORRELATIONS
 
 
 def whitened(kind: str, model: ResidualModel, window: int) -> tuple[FloatArray, bool]:
@@ -133,7 +133,7 @@ def settled(model: ResidualModel, initial_error: float, window: int) -> int:
     mean = np.linalg.norm(np.linalg.solve(np.eye(len(model.A)) - model.A, model.Bd @ model.means))
     size = initial_error + float(np.sqrt(np.trace(spread))) + float(mean)
     effects = np.array([np.linalg.norm(model.C @ power, 2) for power in model.powers()]) * size
-    late = np.flatnonzero(effects > START_SHARE * deviation)
+    late = np.flatnonzero(effects > START_EFFECT_SHARE * deviation)
     first = (int(late[-1]) + 1 if late.size else 0) + window - 1
     if spectral_radius(model.A) >= 1.0 or first >= model.steps:
         raise SpecError(

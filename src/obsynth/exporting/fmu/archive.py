@@ -208,14 +208,14 @@ class _Version(NamedTuple):
     abilities: dict[str, str]
 
 
-_STEPS = {"canHandleVariableCommunicationStepSize": "false"}
+_STEP_CAPABILITY = {"canHandleVariableCommunicationStepSize": "false"}
 _VERSIONS = {
     "2.0": _Version(
         "guid",
         "Real",
         ("Outputs", "InitialUnknowns"),
         {
-            **_STEPS,
+            **_STEP_CAPABILITY,
             "canNotUseMemoryManagementFunctions": "true",
             "canGetAndSetFMUstate": "true",
             "canSerializeFMUstate": "true",
@@ -226,7 +226,7 @@ _VERSIONS = {
         "Float64",
         ("Output", "InitialUnknown"),
         {
-            **_STEPS,
+            **_STEP_CAPABILITY,
             "fixedInternalStepSize": "",
             "canGetAndSetFMUState": "true",
             "canSerializeFMUState": "true",
@@ -318,7 +318,7 @@ VERSIONS = ("2.0", "3.0")
 #: Of every name in the C of the observer inside an FMU.
 _PREFIX = "observer"
 #: Archives of equal content are equal: the first day that a zip file can hold.
-_DAY = (1980, 1, 1, 0, 0, 0)
+_FIRST_DAY = (1980, 1, 1, 0, 0, 0)
 
 
 def write_fmu(
@@ -511,7 +511,7 @@ def _zipped(content: Mapping[str, bytes]) -> bytes:
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
         for name in sorted(content):
-            entry = zipfile.ZipInfo(name, date_time=_DAY)
+            entry = zipfile.ZipInfo(name, date_time=_FIRST_DAY)
             entry.compress_type, entry.external_attr = zipfile.ZIP_DEFLATED, 0o644 << 16
             archive.writestr(entry, content[name])
     return buffer.getvalue()

@@ -15,14 +15,6 @@ from obsynth.observers.recursive.settings import Form, Guard
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 
-CLAIMS = {
-    **RECURSIVE_CLAIMS,
-    "excitation": ClaimMeaning(
-        "", "least information on the parameters in a window, per parameter unit squared", "claims"
-    ),
-    "excitation_k": ClaimMeaning("samples", "sample that ends that window", "claims"),
-}
-
 
 @dataclass(frozen=True)
 class AdaptiveObserver(DescriptorKalman):
@@ -101,7 +93,13 @@ class AdaptiveObserver(DescriptorKalman):
     time: ClassVar[str] = "discrete, time-varying"
     summary: ClassVar[str] = "states and parameters with deviations from Q and R"
     source: ClassVar[str] = "Moussa Ali, Zhang 2013"
-    claims: ClassVar[Mapping[str, ClaimMeaning]] = CLAIMS
+    claims: ClassVar[Mapping[str, ClaimMeaning]] = {
+        **RECURSIVE_CLAIMS,
+        "excitation": ClaimMeaning(
+            "", "least information on the parameters in a window, per parameter unit squared", "claims"
+        ),
+        "excitation_k": ClaimMeaning("samples", "sample that ends that window", "claims"),
+    }
     purposes: ClassVar[frozenset[Purpose]] = frozenset({"parameters"})
 
     forgetting: ForgettingFactor = 0.98

@@ -18,13 +18,6 @@ from obsynth.results.design import ObserverDesign
 FormChoice: TypeAlias = Literal["forgetting", "random-walk", "augmented-kalman", "auto"]
 IntegrationChoice: TypeAlias = Literal["backward-euler", "radau", "auto"]
 
-CLAIMS = {
-    "index": ClaimMeaning("", "index of the plant", "claims"),
-    "condition": ClaimMeaning("", "largest condition number of (7) along the nominal run", "claims"),
-    "contraction": ClaimMeaning("", "spectral radius of F (I - K H) at its end", "claims"),
-    "steps": ClaimMeaning("samples", "steps of the nominal run", "claims"),
-}
-
 
 @dataclass(frozen=True)
 class DaeAdaptiveObserver(Method):
@@ -119,7 +112,12 @@ class DaeAdaptiveObserver(Method):
     time: ClassVar[str] = "discrete, nonlinear"
     summary: ClassVar[str] = "states and parameters of nonlinear plants"
     source: ClassVar[str] = "Moussa Ali, Zhang 2013 (differential-algebraic systems)"
-    claims: ClassVar[Mapping[str, ClaimMeaning]] = CLAIMS
+    claims: ClassVar[Mapping[str, ClaimMeaning]] = {
+        "index": ClaimMeaning("", "index of the plant", "claims"),
+        "condition": ClaimMeaning("", "largest condition number of (7) along the nominal run", "claims"),
+        "contraction": ClaimMeaning("", "spectral radius of F (I - K H) at its end", "claims"),
+        "steps": ClaimMeaning("samples", "steps of the nominal run", "claims"),
+    }
     purposes: ClassVar[frozenset[Purpose]] = frozenset({"parameters"})
     placeholders: ClassVar[Mapping[str, Any]] = {"dt": 1.0}
 

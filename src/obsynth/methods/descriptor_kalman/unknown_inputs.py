@@ -26,7 +26,7 @@ from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 
 #: Prior deviation of an unknown input at the first sample, relative to the one that moves a state by its own prior
 #: deviation: as good as none, and its square far from overflow.
-UNKNOWN = 1e4
+UNKNOWN_INPUT_PRIOR = 1e4
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +73,7 @@ class WithoutUnknownInputs:
             )
         whole = np.zeros((count + len(self.names),) * 2)
         whole[:count, :count] = own
-        deviation = UNKNOWN * self.scale * max(float(np.sqrt(np.max(np.diag(own)))), 1.0)
+        deviation = UNKNOWN_INPUT_PRIOR * self.scale * max(float(np.sqrt(np.max(np.diag(own)))), 1.0)
         whole[count:, count:] = np.diag(deviation**2)
         return whole
 

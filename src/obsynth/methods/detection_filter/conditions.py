@@ -15,7 +15,7 @@ from obsynth.proofs.exact_arithmetic import holds_computed
 from obsynth.proofs.exact_pencils import ExactPencil
 
 #: The zeros of pencils with more columns are left to the Riccati equation.
-MOST_COLUMNS = 70
+MOST_PENCIL_COLUMNS = 70
 _SOURCE = "Ding et al. 2000"
 
 
@@ -98,7 +98,7 @@ def _no_zero_on_the_axis(plant: DescriptorSystem) -> tuple[Condition, ...]:
     """Return whether ``[A - sE, B; C, D]`` of the unknown inputs keeps its rank on the axis, where that is decided."""
     b, d = unknown_inputs(plant)
     a = np.block([[plant.A, b], [plant.C, d]])
-    if a.shape[1] > MOST_COLUMNS or holds_computed(a) or holds_computed(plant.E):
+    if a.shape[1] > MOST_PENCIL_COLUMNS or holds_computed(a) or holds_computed(plant.E):
         return ()
     e = np.zeros_like(a)
     e[: plant.nx, : plant.nx] = plant.E

@@ -14,20 +14,8 @@ from obsynth.numerics.arguments import WrittenAs, is_finite_number
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.checks import Check
 from obsynth.results.design import ObserverDesign
-from obsynth.verification.claims import STATED
+from obsynth.verification.claims import STATED_BY_SEARCH
 from obsynth.verification.error_system import ErrorModel
-
-CLAIMS = {
-    "disturbance_gain": ClaimMeaning(
-        "", "bound on the H-infinity norm from unknown inputs and noise to the residuals", "disturbance gain"
-    ),
-    "fault_sensitivity": ClaimMeaning(
-        "", "least singular value from the faults to the residuals on the band: at least this", "fault sensitivity"
-    ),
-    "band_from": ClaimMeaning("rad/s", "where the band begins", "fault sensitivity"),
-    "band_to": ClaimMeaning("rad/s", "where the band ends", "fault sensitivity"),
-    "frequency": ClaimMeaning("rad/s", "where the faults show least on the band", STATED),
-}
 
 
 @dataclass(frozen=True)
@@ -80,7 +68,17 @@ class DetectionFilterMethod(Method):
     time: ClassVar[str] = "continuous"
     summary: ClassVar[str] = "residuals only, that show the faults most where unknown inputs reach every output"
     source: ClassVar[str] = "Ding, Jeinsch, Frank, Ding 2000"
-    claims: ClassVar[Mapping[str, ClaimMeaning]] = CLAIMS
+    claims: ClassVar[Mapping[str, ClaimMeaning]] = {
+        "disturbance_gain": ClaimMeaning(
+            "", "bound on the H-infinity norm from unknown inputs and noise to the residuals", "disturbance gain"
+        ),
+        "fault_sensitivity": ClaimMeaning(
+            "", "least singular value from the faults to the residuals on the band: at least this", "fault sensitivity"
+        ),
+        "band_from": ClaimMeaning("rad/s", "where the band begins", "fault sensitivity"),
+        "band_to": ClaimMeaning("rad/s", "where the band ends", "fault sensitivity"),
+        "frequency": ClaimMeaning("rad/s", "where the faults show least on the band", STATED_BY_SEARCH),
+    }
     witnesses: ClassVar[frozenset[str]] = frozenset({"P"})
 
     band: Annotated[Any, WrittenAs("pair")] = (0.0, 1e3)

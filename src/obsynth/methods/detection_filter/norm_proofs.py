@@ -23,7 +23,7 @@ from obsynth.proofs.extended_balls import Enclosed, block
 #: Intervals that a range may take, the share of an interval's reach that is used, and its first guess.
 MOST_INTERVALS, REACH, FIRST_SHARE = 20_000, 0.9, 1e-3
 #: Intervals this short, relative to where they are, end at a frequency at which the pencil is singular.
-SHORTEST = 1e-8
+SHORTEST_INTERVAL = 1e-8
 #: A range of frequencies that is shorter begins with intervals as if it had this length.
 LEAST_RANGE = 1e-9
 #: Weight of the equations that the frequency does not enter: a power of two.
@@ -132,7 +132,7 @@ def _is_never_singular(pencil: Ball, n: int, low: float, high: float) -> bool:
             return True
         middle = min(covered + 0.5 * length, high)
         reach = _regular_around(pencil, n, middle)
-        if max(length, reach) < SHORTEST * max(covered, SHORTEST * high):
+        if max(length, reach) < SHORTEST_INTERVAL * max(covered, SHORTEST_INTERVAL * high):
             return False
         if middle - reach > covered:
             # Too far: the interval around a nearer point.

@@ -29,7 +29,7 @@ PROOF_MARGIN, SENSITIVITY_MARGINS = 1e-6, (1e-4, 1e-3, 1e-2, 0.1, 0.5)
 #: Strictness of the equation that proves a gain, relative to what drives it.
 STRICTNESS = 1e-9
 #: Frequencies of the grid, and how often the least value is refined between its neighbours.
-GRID, GRID_REFINEMENTS = 400, 40
+GRID_FREQUENCIES, GRID_REFINEMENTS = 400, 40
 
 
 def synthesise(plant: DescriptorSystem, asked: DetectionFilterMethod, *, progress: Callable[[str], None]) -> Synthesis:
@@ -147,7 +147,12 @@ def _sensitivity(plant: DescriptorSystem, observer: LinearObserver, low: float, 
         return np.asarray(np.linalg.svd(found, compute_uv=False)[:, -1])
 
     grid = np.unique(
-        np.concatenate([np.linspace(low, high, GRID), np.geomspace(max(low, LEAST_FREQUENCY * high), high, GRID)])
+        np.concatenate(
+            [
+                np.linspace(low, high, GRID_FREQUENCIES),
+                np.geomspace(max(low, LEAST_FREQUENCY * high), high, GRID_FREQUENCIES),
+            ]
+        )
     )
     values = least(grid)
     at = int(np.argmin(values))

@@ -32,6 +32,7 @@ from obsynth.methods.fault_estimation_filter.injection_problem import (
 from obsynth.numerics.arrays import SMALLEST, FloatArray
 from obsynth.numerics.doubling import MOST_JUMPS, doubled_riccati_solution, is_positive
 from obsynth.numerics.norms import spectral_radius
+from obsynth.numerics.pencil_points import GENERIC_POINTS
 
 
 @dataclass(frozen=True, eq=False)
@@ -332,7 +333,7 @@ COARSE_NOISES = (1e-6, 1e-4)
 #: Distance below the best gain, in tolerances, at which another noise is tried.
 PROBE = 10.0
 #: The first level tried, relative to the start, for few and for many states: the margin near the start leads far down.
-START_SHARE = 0.5
+FIRST_LEVEL = 0.5
 COARSE_START_SHARE = 0.99
 #: Weights of the noise beside the disturbance, relative to their sizes, and levels of both together, relative to the
 #: gain of the disturbance alone.
@@ -351,9 +352,8 @@ DECOUPLED_GAIN = 1e-7
 DECOUPLING_ATTEMPTS = ((1e-4, 1e-6), (1e-2, 1e-6), (1e-4, 1e-8), (1e-2, 1e-8))
 #: The same share where states are many: no gain that is shipped is smaller than ten times that.
 COARSELY_DECOUPLED = 1e-4
-GENERIC_POINT = 1.3247
 #: Points so far out that a combination which waits for samples, or takes the last ones alone, is told by its growth.
-FAR_POINTS, MOST_GROWTH, LEAST_DECAY = (1e2, 1e3), 3.0, 0.3
+FAR_POINTS, MOST_FAR_GROWTH, LEAST_FAR_DECAY = (1e2, 1e3), 3.0, 0.3
 SAME_ROWS = 1e-8
 #: A level this far above anything a disturbance could do is no limit.
 WITHOUT_LIMIT = 1e4
@@ -400,7 +400,7 @@ def search_central_filter(
         close = start_is_good or best is not start
         equation = CentralEquation.of(problem, noise=noise)
         descent = GammaIteration(equation, low, gain, tolerance, expects_rounding=close)
-        share = START_SHARE if problem.order <= FEW_STATES else COARSE_START_SHARE
+        share = FIRST_LEVEL if problem.order <= FEW_STATES else COARSE_START_SHARE
         descent.run(max(low, gain * (1.0 - PROBE * tolerance if close else share)))
         found = descent.best()
         if found is None and descent.reached and descent.reached[0].level < gain * (1.0 - NEXT_TO):
@@ -437,11 +437,11 @@ def _decoupling_filter(problem: GainProblem, gain: float) -> tuple[Injection, fl
 
 def _follows_from_measurements(problem: GainProblem) -> bool:
     """Whether the rows of xi are combinations of those of state and measurements, without samples yet to come."""
-    if _combined(problem, GENERIC_POINT)[1] > SAME_ROWS:
+    if _combined(problem, -GENERIC_POINTS[1])[1] > SAME_ROWS:
         return False
     # A sample yet to come is a factor of z, and where no weight is free past ones alone are left: a factor of 1 / z.
     near, far = (_combined(problem, point * max(1.0, spectral_radius(problem.A)))[0] for point in FAR_POINTS)
-    return far <= (MOST_GROWTH if problem.weight_is_free else LEAST_DECAY) * near
+    return far <= (MOST_FAR_GROWTH if problem.weight_is_free else LEAST_FAR_DECAY) * near
 
 
 def _combined(problem: GainProblem, point: float) -> tuple[float, float]:

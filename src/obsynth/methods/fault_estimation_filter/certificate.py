@@ -18,13 +18,13 @@ from obsynth.verification.error_system import ErrorModel
 #: Levels, relative to the claimed one, at which coordinates are improved on the way to it.
 APPROACHES = ((1.05,), (1.5, 1.05, 1.001))
 #: Weights of what the output does not show, relative to the output's, tried in turn.
-TAILS = (1e-2, 1e-4, 1e-6, 1e-9, 1e-12, 1e-16, 1e-20)
+TAIL_WEIGHTS = (1e-2, 1e-4, 1e-6, 1e-9, 1e-12, 1e-16, 1e-20)
 #: Slack of the Riccati equation relative to the output weight, largest first: the first that proves is taken.
-SLACKS = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10)
+FILTER_SLACKS = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10)
 #: Steps towards coordinates in which the norm of the error dynamics is near one: how many, and down to which power.
 MOST_CONTRACTIONS = 60
 STEP_POWER = 0.75
-NEAR_ONE = 1.05
+GAMMA_ABOVE_ONE = 1.05
 
 
 def bounded_real_certificate(
@@ -49,7 +49,7 @@ def bounded_real_certificate(
         inverse = np.asarray(np.linalg.inv(change))
         moved_a, moved_b, moved_c = inverse @ a @ change, inverse @ b, c @ change
         weight = max(1.0, float(np.linalg.norm(moved_c, 2)) ** 2)
-        for slack in SLACKS:
+        for slack in FILTER_SLACKS:
             p = bounded_real_matrix(moved_a, moved_b, moved_c, d, 1.0, slack=slack * weight)
             if p is None:
                 continue
@@ -67,7 +67,7 @@ def _changes(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> Iter
         start = begin(a, b, c)
         inverse = np.asarray(np.linalg.inv(start))
         moved = (inverse @ a @ start, inverse @ b, c @ start)
-        for path, tail in product(APPROACHES, TAILS):
+        for path, tail in product(APPROACHES, TAIL_WEIGHTS):
             change = _coordinates(*moved, d, path=path, tail=tail)
             if change is not None:
                 yield start @ change
@@ -94,7 +94,7 @@ def _contracted(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
     for _ in range(MOST_CONTRACTIONS):
         level = max(min(0.5 * norm, norm**STEP_POWER), 1.0)
         p = output_covariance(moved.T / level, identity, identity, np.zeros_like(a))  # the sum of A'^k A^k
-        if norm <= NEAR_ONE or not np.all(np.isfinite(p)):
+        if norm <= GAMMA_ABOVE_ONE or not np.all(np.isfinite(p)):
             break
         change = change @ normalising_change(p)
         moved = np.linalg.solve(change, a @ change)

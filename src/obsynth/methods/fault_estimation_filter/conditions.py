@@ -17,7 +17,7 @@ import numpy as np
 
 from obsynth.analysis.conditions import Condition, up_to_failure
 from obsynth.analysis.existence.distance import ROUNDING_LEVEL
-from obsynth.analysis.existence.named_pencils import DIGITS
+from obsynth.analysis.existence.named_pencils import WITNESS_DIGITS
 from obsynth.analysis.existence.numbers import numbers_of
 from obsynth.analysis.existence.rational import SystemFacts, WrittenNumbers
 from obsynth.analysis.existence.statements import DECIDER, Evaluator, FullRank, NoZeroOutside, reconsidered
@@ -47,7 +47,7 @@ def index_doubt(judge: Evaluator, detectability: FaultDetectability) -> Unclear 
         return None
     plant, units, best = judge.plant, judge.units, None
     direction = _null_direction(detectability)
-    for digits in DIGITS:
+    for digits in WITNESS_DIGITS:
         found = _changed(plant, units, detectability.indexes, np.round(direction, digits))
         if found is not None and (best is None or found.size < best.size):
             best = found

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 MOST_CHOICES = 20
 #: Faults with at least this share of the largest in a dependence are named.
 DEPENDENT_SHARE = 0.1
-_SEED = 45
+_PENCIL_SEED = 45
 
 
 #: Indexes (``None``: the fault never reaches the outputs) and the rank of Upsilon (0 where one is missing).
@@ -112,7 +112,7 @@ def nonsingular_t(numbers: PlantNumbers) -> fmpq_mat | None:
     if stacked.rank() < order:
         return None
     inverse = (stacked.transpose() * stacked).solve(stacked.transpose())
-    free, rng = null_basis(stacked.transpose()).transpose(), random.Random(_SEED)
+    free, rng = null_basis(stacked.transpose()).transpose(), random.Random(_PENCIL_SEED)
     for size in range(MOST_CHOICES):
         mix = fmpq_mat(order, int(free.nrows()), [rng.randint(-size, size) for _ in range(order * int(free.nrows()))])
         both = inverse + mix * free
@@ -123,7 +123,7 @@ def nonsingular_t(numbers: PlantNumbers) -> fmpq_mat | None:
 
 
 #: A fault detectability matrix with a larger condition number is usable but noisy: a note says so.
-WARN_CONDITION = 1e4
+WARN_DETECTABILITY_CONDITION = 1e4
 #: Above this rounding of data and gains is as large as what tells the faults apart.
 REFUSE_CONDITION = 1e12
 

@@ -24,8 +24,8 @@ from obsynth.methods.fault_estimation_filter.injection_problem import (
 from obsynth.methods.fault_estimation_filter.least_gain_proof import (
     ALONE,
     LAST,
+    LEAST_GAIN_PAIRS,
     MOST_EXAMINED_STATES,
-    PAIRS,
     PROVED_SHARE,
     InvisiblePairs,
 )
@@ -170,7 +170,7 @@ CHEAP_STATES = 8
 #: Runs from rest have at most so many unknowns, and are long enough when less than this share of the gain is missing.
 MOST_RUN_UNKNOWNS = 96
 LONG_ENOUGH = 1e-5
-_PARTS = ("S", "top", "bottom", "image", "shown", "Z", "Zd")
+_BOUND_PARTS = ("S", "top", "bottom", "image", "shown", "Z", "Zd")
 
 
 def proved_lower_bound(
@@ -321,7 +321,7 @@ def least_gain_certificate(
     pairs = InvisiblePairs.of(work, gains)
     if pairs is None:
         return {}, 0.0
-    s, top, bottom, image, shown, z, zd = (nearest_doubles(getattr(pairs, name)) for name in _PARTS)
+    s, top, bottom, image, shown, z, zd = (nearest_doubles(getattr(pairs, name)) for name in _BOUND_PARTS)
     # Orthonormal coordinates: of the errors in the given sizes, of the pairs as they come.
     back = np.linalg.pinv(np.linalg.qr(factor @ s, mode="r")) if s.shape[1] else np.zeros((0, 0))
     whole = np.vstack([np.linalg.pinv(back) @ top, bottom]) if s.shape[1] else bottom
@@ -348,7 +348,7 @@ def least_gain_certificate(
             f, last, alone = attempt()
         except (SolverError, np.linalg.LinAlgError):
             continue
-        made = {PAIRS: turn @ f, LAST: last @ forth, ALONE: alone}
+        made = {LEAST_GAIN_PAIRS: turn @ f, LAST: last @ forth, ALONE: alone}
         found = {name: matrix for name, matrix in made.items() if np.any(matrix)}
         bound = pairs.bound(found, free_weight=free_weight)
         if bound > least:

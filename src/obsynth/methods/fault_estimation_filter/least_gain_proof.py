@@ -27,8 +27,8 @@ MOST_EXAMINED_STATES = 64
 #: Digits (bits) of the sums.
 SUM_BITS = 512
 #: Names of the certificate's matrices: F, K and M; one that is left out is zero.
-PAIRS, LAST, ALONE = "least_gain_pairs", "least_gain_last", "least_gain_alone"
-WITNESSES = frozenset({PAIRS, LAST, ALONE})
+LEAST_GAIN_PAIRS, LAST, ALONE = "least_gain_pairs", "least_gain_last", "least_gain_alone"
+LEAST_GAIN_WITNESSES = frozenset({LEAST_GAIN_PAIRS, LAST, ALONE})
 #: The least gain found counts as proved where the proved bound is below it by this share at most.
 PROVED_SHARE = 1e-4
 #: Norms are computed in double precision: a bound may be above one by this share.
@@ -96,7 +96,7 @@ class InvisiblePairs:
         from obsynth.proofs.extended_balls import arb_matrix
 
         k, s, nd = int(self.top.ncols()), int(self.S.ncols()), int(self.Zd.ncols())
-        empty = {PAIRS: np.zeros((k, 1)), LAST: np.zeros((nd, s)), ALONE: np.zeros((nd, 1))}
+        empty = {LEAST_GAIN_PAIRS: np.zeros((k, 1)), LAST: np.zeros((nd, s)), ALONE: np.zeros((nd, 1))}
         f, last, alone = (np.asarray(matrices.get(name, part)) for name, part in empty.items())
         if any(part.ndim != 2 or not np.all(np.isfinite(part)) for part in (f, last, alone)):
             return 0.0
@@ -132,7 +132,7 @@ def least_gain_row(
     """Return the row on the least gain: proved from the certificate, or named as the least that was found."""
     family = "these T and N" if free_weight else "these T, N and W"
     detail = "" if thorough else "prove_least = true asks for a proof"
-    if not WITNESSES & matrices.keys():
+    if not LEAST_GAIN_WITNESSES & matrices.keys():
         return information(
             "least gain",
             f"the least gain found of all filters with {family}; that none is below is not proved",

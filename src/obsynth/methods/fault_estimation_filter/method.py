@@ -10,7 +10,7 @@ from annotated_types import Ge
 
 from obsynth.analysis.conditions import Condition
 from obsynth.errors import SpecError
-from obsynth.methods.fault_estimation_filter.least_gain_proof import WITNESSES
+from obsynth.methods.fault_estimation_filter.least_gain_proof import LEAST_GAIN_WITNESSES
 from obsynth.methods.method import ClaimMeaning, Method, PlantKind, Purpose, Synthesis
 from obsynth.methods.own_terms import (
     OwnConstraints,
@@ -28,14 +28,6 @@ from obsynth.verification.error_system import ErrorModel
 
 #: The least relative distance to the optimum at which a proof can be expected: less leaves no room for one.
 LEAST_MARGIN = 1e-2
-
-CLAIMS = {
-    "gamma": ClaimMeaning("", "l2 gain from the disturbance to the fault error: shipped, proved", "LMI"),
-    "gamma_min": ClaimMeaning("", "least such gain found; proved where a row says so", "least gain"),
-    "gamma_bracket_low": ClaimMeaning("", "lower end of the bisection's bracket", "claimed gains"),
-    "gamma_bracket_high": ClaimMeaning("", "upper end of the bisection's bracket", "claimed gains"),
-    "state_lag": ClaimMeaning("samples", "samples by which the state estimate lags", "unbiased: state"),
-}
 
 
 @dataclass(frozen=True)
@@ -138,8 +130,14 @@ class FaultEstimationFilter(Method):
     time: ClassVar[str] = "discrete"
     summary: ClassVar[str] = "fault estimates with a bounded gain from the disturbances"
     source: ClassVar[str] = "Wang, Rodrigues, Theilliol, Shen 2015"
-    claims: ClassVar[Mapping[str, ClaimMeaning]] = CLAIMS
-    witnesses: ClassVar[frozenset[str]] = WITNESSES | {"P_factor", "tracking"}
+    claims: ClassVar[Mapping[str, ClaimMeaning]] = {
+        "gamma": ClaimMeaning("", "l2 gain from the disturbance to the fault error: shipped, proved", "LMI"),
+        "gamma_min": ClaimMeaning("", "least such gain found; proved where a row says so", "least gain"),
+        "gamma_bracket_low": ClaimMeaning("", "lower end of the bisection's bracket", "claimed gains"),
+        "gamma_bracket_high": ClaimMeaning("", "upper end of the bisection's bracket", "claimed gains"),
+        "state_lag": ClaimMeaning("samples", "samples by which the state estimate lags", "unbiased: state"),
+    }
+    witnesses: ClassVar[frozenset[str]] = LEAST_GAIN_WITNESSES | {"P_factor", "tracking"}
     averaged: ClassVar[bool] = True
     gone: ClassVar[Mapping[str, str]] = {
         "model_error": "the least thresholds over tolerances are those of the method guaranteed-test with a scenario; "

@@ -18,7 +18,7 @@ from obsynth.errors import SpecError
 from obsynth.methods.fault_estimation_filter.certificate import bounded_real_certificate
 from obsynth.methods.fault_estimation_filter.conditions import fault_filter_conditions
 from obsynth.methods.fault_estimation_filter.detectability_indexes import (
-    WARN_CONDITION,
+    WARN_DETECTABILITY_CONDITION,
     FaultDetectability,
     fault_detectability,
 )
@@ -111,7 +111,7 @@ def notes(
 ) -> tuple[str, ...]:
     """Return what a user should know; ``largest_zero`` is the largest modulus of a fault zero, where known already."""
     found = list(sampling_zero_warnings(plant)) if largest_zero > SLOW_ZERO_RADIUS else []
-    if detectability.condition_number > WARN_CONDITION:
+    if detectability.condition_number > WARN_DETECTABILITY_CONDITION:
         found.append(
             f"Upsilon has condition number {detectability.condition_number:.3g}: some combination of faults is "
             "estimated with much more noise than others."

@@ -19,11 +19,6 @@ from obsynth.results.checks import Check
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.error_system import ErrorModel
 
-CLAIMS = {
-    "order": ClaimMeaning("", "states of the filter", "order"),
-    "decay": ClaimMeaning("1/s", "rate of the slowest pole: every error decays at least like this in the end", "decay"),
-}
-
 
 @dataclass(frozen=True)
 class FunctionalFilter(Method):
@@ -98,7 +93,12 @@ class FunctionalFilter(Method):
         "the faults asked for and nothing else, untouched by any unknown input; needs not the whole state"
     )
     source: ClassVar[str] = "ours, after Frisk, Nyberg 2001 and Anderson, Moore 1979"
-    claims: ClassVar[Mapping[str, ClaimMeaning]] = CLAIMS
+    claims: ClassVar[Mapping[str, ClaimMeaning]] = {
+        "order": ClaimMeaning("", "states of the filter", "order"),
+        "decay": ClaimMeaning(
+            "1/s", "rate of the slowest pole: every error decays at least like this in the end", "decay"
+        ),
+    }
     witnesses: ClassVar[frozenset[str]] = frozenset(
         {"T", "T0", "Phi", "Cw", "walks", "stability", "tracking", "deviations"}
     )

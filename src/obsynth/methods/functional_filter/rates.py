@@ -25,9 +25,9 @@ from obsynth.verification.certificates import slowest_decay
 #: Modes slower than this share of the fastest one never settle.
 STANDING = 1e-6
 #: A step is to be seen to 90 % after so many time constants of the plant, but no sooner than so many samples.
-TIME_CONSTANTS, LEAST_SAMPLES = 7.0, 4.0
+STEP_TIME_CONSTANTS, LEAST_SAMPLES = 7.0, 4.0
 #: Estimates of a step within this of one count as there; asked at these multiples of the time.
-REACHED, ASKED_AT = 0.1, (1.0, 1.5, 2.5)
+RATE_REACHED, ASKED_AT = 0.1, (1.0, 1.5, 2.5)
 #: Where no walk shows a step in time: walks that miss it by so much more than the best are as good.
 AS_CLOSE = 0.05
 #: A walk that misses a step by more shows nothing of it in time: how much more than that is a matter of rounding.
@@ -35,7 +35,7 @@ NOTHING_SHOWN = 0.5
 #: Errors that need longer than so many settling times to die out would stay in any run: the gain moves such poles.
 FOR_GOOD = 1e5
 #: Decades of the search around a rate of the size of the noise, and its steps per decade at the end.
-DECADES, BISECTIONS = 8, 9
+DECADES, RATE_BISECTIONS = 8, 9
 
 
 def settling_time(plant: DescriptorSystem) -> float:
@@ -43,7 +43,7 @@ def settling_time(plant: DescriptorSystem) -> float:
     values = pencil_structure(plant.E, plant.A).finite_eigenvalues
     found = speeds(values, plant.dt)
     alive = found[np.isfinite(found) & (found > STANDING * np.max(found, initial=0.0))]
-    wanted = TIME_CONSTANTS / float(np.median(alive)) if alive.size else max(plant.dt, 1.0) * 10.0
+    wanted = STEP_TIME_CONSTANTS / float(np.median(alive)) if alive.size else max(plant.dt, 1.0) * 10.0
     return max(wanted, LEAST_SAMPLES * plant.dt)
 
 
@@ -68,7 +68,7 @@ def default_rates(model: FilterModel, seconds: float, *, lag: int) -> tuple[Floa
 
     def in_time(exponent: float) -> bool:
         found = gain(exponent)
-        return found is not None and step_misses(model, found, seconds) <= REACHED
+        return found is not None and step_misses(model, found, seconds) <= RATE_REACHED
 
     high = next((float(e) for e in range(-DECADES, DECADES + 1) if in_time(float(e))), None)
     if high is None:
@@ -80,7 +80,7 @@ def default_rates(model: FilterModel, seconds: float, *, lag: int) -> tuple[Floa
         high = min(e for e, miss in misses.items() if miss <= least + AS_CLOSE or least > NOTHING_SHOWN)
     else:
         low = high - 1.0
-        for _ in range(BISECTIONS):
+        for _ in range(RATE_BISECTIONS):
             middle = 0.5 * (low + high)
             low, high = (low, middle) if in_time(middle) else (middle, high)
     walks = 10.0**high * unit
@@ -124,7 +124,7 @@ def _known(gain: KalmanGain | None) -> KalmanGain:
 
 
 #: Lags in samples, and walks relative to the middle one.
-LAGS, FACTORS = (0, 1, 2, 5, 10, 25), (0.3, 1.0, 3.0)
+TRIED_LAGS, FACTORS = (0, 1, 2, 5, 10, 25), (0.3, 1.0, 3.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,7 +161,7 @@ def delay_curve(plant: DescriptorSystem, fault: int, rate: float | None = None) 
         rows = []
         for factor in FACTORS:
             walks = np.array([factor * middle])
-            gain = kalman_gain(model, walks, lag=max(LAGS))
+            gain = kalman_gain(model, walks, lag=max(TRIED_LAGS))
             states = np.diag(np.r_[np.ones(model.order), np.zeros(len(model.A) - model.order)])
             process = model.N @ model.N.T + (model.drive * walks**2) @ model.drive.T + gain.added**2 * states
             p = riccati_solution(model.A, model.C, process, model.M @ model.M.T, model.N @ model.M.T)
@@ -171,16 +171,16 @@ def delay_curve(plant: DescriptorSystem, fault: int, rate: float | None = None) 
     except ObsynthError:
         return None
     rates = tuple(factor * middle for factor in FACTORS)
-    return DelayCurve(plant.fault_names[fault], rates, LAGS, np.array(rows))
+    return DelayCurve(plant.fault_names[fault], rates, TRIED_LAGS, np.array(rows))
 
 
 def _smoothed(
     p: FloatArray, c: FloatArray, closed: FloatArray, estimate: FloatArray, gains: Sequence[FloatArray]
 ) -> list[float]:
-    """Return the deviation of the estimate at each of `LAGS`."""
+    """Return the deviation of the estimate at each of `TRIED_LAGS`."""
     known, moved, found = np.zeros_like(p), p.copy(), []
-    for gain in gains[: max(LAGS) + 1]:
+    for gain in gains[: max(TRIED_LAGS) + 1]:
         known = known + gain @ c @ moved
         moved = closed @ moved
         found.append(float(np.sqrt(max((estimate @ (p - known) @ estimate.T)[0, 0], 0.0))))
-    return [found[lag] for lag in LAGS]
+    return [found[lag] for lag in TRIED_LAGS]

@@ -224,7 +224,7 @@ def _stacked(matrices: Sequence[FloatArray], width: int) -> FloatArray:
 
 
 #: Errors that need longer than so many times the settling time are mentioned.
-SLOW = 20.0
+SLOW_ERRORS = 20.0
 
 
 def synthesise(plant: DescriptorSystem, asked: FunctionalFilter, *, progress: Callable[[str], None]) -> Synthesis:
@@ -415,7 +415,7 @@ def _notes(plant: DescriptorSystem, asked: FunctionalFilter, slowest: float, rat
             f"fault_rate was not given: a walk of {largest:.3g} {unit} is the slowest that shows a step after "
             f"{settling_time(plant):.3g} s. Delay buys less noise only against a rate that you state."
         )
-    if np.isfinite(slowest) and slowest * SLOW * settling_time(plant) < 1.0:
+    if np.isfinite(slowest) and slowest * SLOW_ERRORS * settling_time(plant) < 1.0:
         notes.append(
             f"The slowest pole has a time constant of {1.0 / slowest:.3g} s: errors of the state at "
             "the start stay that long where they show. Ask for decay= to be faster, at a price in noise."

@@ -28,7 +28,7 @@ SOURCE = "each test alone, cut out of the bank"
 #: What a certificate of a bank has a row of for each test, as wide as the widest.
 BY_TEST = ("multipliers", "multiplier_radius", "witness", "witness_radius", "rounding")
 #: Which faults an alarm of each test may mean; and the thresholds pair by pair, with what proves them.
-GROUPS, PAIRS, PAIR_MULTIPLIERS, PAIR_RADIUS = "groups", "pairs", "pair_multipliers", "pair_radius"
+BANK_GROUPS, BANK_PAIRS, PAIR_MULTIPLIERS, PAIR_RADIUS = "groups", "pairs", "pair_multipliers", "pair_radius"
 
 
 def blind_to(asked: Any, plant: DescriptorSystem, fault: int, group: Sequence[int]) -> Any:
@@ -83,7 +83,7 @@ def is_bank(design: ObserverDesign) -> bool:
 
 def groups_of(design: ObserverDesign) -> tuple[tuple[int, ...], ...]:
     """Return by test the numbers of the faults, its own among them, of which an alarm means that one is there."""
-    return tuple(tuple(np.flatnonzero(row).tolist()) for row in design.certificate.matrices[GROUPS])
+    return tuple(tuple(np.flatnonzero(row).tolist()) for row in design.certificate.matrices[BANK_GROUPS])
 
 
 def tests_of(design: ObserverDesign, read: Callable[[Mapping[str, Any]], Any]) -> tuple[ObserverDesign, ...]:
@@ -217,7 +217,7 @@ def _pairs(design: ObserverDesign, asked: Asked) -> Iterator[Check]:
     """Yield the row on the table pair by pair; of two faults it is that of the tests themselves."""
     plant, shipped = design.linear[0], design.certificate.matrices
     pairs, wrong = pairs_of(plant), []
-    table = shipped.get(PAIRS)
+    table = shipped.get(BANK_PAIRS)
     fits = table is not None and table.shape == (plant.nf, plant.nf)
     for place, (one, other) in enumerate(pairs if fits and table is not None else ()):
         own = blind_to_one(asked, plant, one, other)

@@ -12,11 +12,11 @@ import numpy as np
 from obsynth.analysis.conditions import Condition, require_all
 from obsynth.errors import SolverError
 from obsynth.methods.guaranteed_test.bank import (
+    BANK_GROUPS,
+    BANK_PAIRS,
     BY_TEST,
-    GROUPS,
     PAIR_MULTIPLIERS,
     PAIR_RADIUS,
-    PAIRS,
     blind_to,
     blind_to_one,
     joined,
@@ -50,7 +50,7 @@ def synthesise_bank(plant: DescriptorSystem, asked: Any, *, progress: Callable[[
     pairs = _pairs(plant, asked)
     matrices = _stacked([dict(test.certificate.matrices) for test in made]) | pairs
     matrices |= {
-        GROUPS: np.array([[float(k in group) for k in range(plant.nf)] for group in groups]),
+        BANK_GROUPS: np.array([[float(k in group) for k in range(plant.nf)] for group in groups]),
         TRADE_OFF: np.column_stack([tables[0][1][:, 0], *[table[:, 1] for _, table in tables]]),
     }
     claims = {
@@ -65,7 +65,7 @@ def synthesise_bank(plant: DescriptorSystem, asked: Any, *, progress: Callable[[
         for name, gain in test.gains.items()
     }
     observer = joined([test.observer for test in made], plant.fault_names)  # type: ignore[misc]
-    notes = tuple(_notes(plant, groups, reasons, claims, matrices[PAIRS]))
+    notes = tuple(_notes(plant, groups, reasons, claims, matrices[BANK_PAIRS]))
     return Synthesis(options, gains, observer, Certificate(matrices, claims), notes=notes)
 
 
@@ -128,9 +128,9 @@ def _pairs(plant: DescriptorSystem, asked: Any) -> dict[str, FloatArray]:
             table[one, other] = np.inf
             proofs.append({"multipliers": np.zeros(1), "multiplier_radius": np.zeros(1)})
     if not pairs:
-        return {PAIRS: table}
+        return {BANK_PAIRS: table}
     stacked = _stacked([dict(proof) for proof in proofs])
-    return {PAIRS: table, PAIR_MULTIPLIERS: stacked["multipliers"], PAIR_RADIUS: stacked["multiplier_radius"]}
+    return {BANK_PAIRS: table, PAIR_MULTIPLIERS: stacked["multipliers"], PAIR_RADIUS: stacked["multiplier_radius"]}
 
 
 def _stacked(given: list[dict[str, FloatArray]]) -> dict[str, FloatArray]:

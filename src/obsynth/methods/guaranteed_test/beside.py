@@ -22,7 +22,7 @@ from obsynth.verification.error_structure import error_structure
 #: The method whose observer runs beside a test: faults do not move its state estimate.
 BESIDE = "fault-estimation-filter"
 #: Samples of the scenario over which thresholds are compared, at most.
-MOST_SAMPLES = 500
+MOST_COMPARED_SAMPLES = 500
 
 
 def observer_beside(
@@ -49,7 +49,7 @@ def observer_beside(
     affine = affine_plant(plant)
     tracking = tracking_of(own, affine)
     observer = own.linear[1]
-    quiet = scenario.replace(faults={}, sensors={}, horizon=min(scenario.horizon, MOST_SAMPLES * plant.dt))
+    quiet = scenario.replace(faults={}, sensors={}, horizon=min(scenario.horizon, MOST_COMPARED_SAMPLES * plant.dt))
     nu = plant.nu
     start = np.array([quiet.initial_state.get(name, 0.0) for name in plant.state_names])
     _, outputs, inputs, _, _ = scenario_runs(

@@ -157,7 +157,7 @@ def _of_the_test(design: ObserverDesign, window: Window, test: Repaired) -> Iter
         "rounding",
         "what the running test may err for known signals of size one is at most what is shipped",
         share,
-        1.0 + SAME,
+        1.0 + SAME_SUM,
         source=SOURCE,
         kind="computed",
     )
@@ -182,9 +182,9 @@ def _over_tolerances(design: ObserverDesign, window: Window, test: Repaired) -> 
 
 
 #: Sums in another order differ by less than this share.
-SAME = 1e-12
+SAME_SUM = 1e-12
 #: Roundings that a product of multipliers and inputs may be away from another.
-ROUNDINGS = 4.0
+PRODUCT_ROUNDINGS = 4.0
 
 
 def known_room(window: Window, multipliers: FloatArray) -> float:
@@ -195,7 +195,7 @@ def known_room(window: Window, multipliers: FloatArray) -> float:
     sizes = [part @ np.abs(window.model.inputs(k)) for k, part in enumerate(equations)]
     size = float(np.max(sizes, initial=0.0))
     size += float(np.max(outputs.reshape(-1, ny) @ np.abs(window.model.D), initial=0.0))
-    return ROUNDINGS * (nx + ny) * UNIT_ROUNDOFF * size
+    return PRODUCT_ROUNDINGS * (nx + ny) * UNIT_ROUNDOFF * size
 
 
 def _misfit(shipped: object, implied: object, window: Window, multipliers: FloatArray) -> float:

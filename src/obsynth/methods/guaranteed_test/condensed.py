@@ -22,7 +22,9 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import decide_rank
 
 #: Bits of the balls: far more than any window that double precision solves loses.
-BITS = 512
+CONDENSED_BITS = 512
+#: Weights count at least this share of the largest one when those to correct, or a square part, are chosen.
+LEAST_WEIGHT = 1e-3
 #: Windows with fewer rows are proved by the inverse of a square part, which needs no structure.
 FEWEST_ROWS = 500
 
@@ -30,7 +32,7 @@ FEWEST_ROWS = 500
 @contextmanager
 def many_bits() -> Iterator[None]:
     """Compute in balls of many bits."""
-    before, ctx.prec = ctx.prec, BITS
+    before, ctx.prec = ctx.prec, CONDENSED_BITS
     try:
         yield
     finally:
@@ -239,7 +241,3 @@ class Condensed:
         labels = {label: k for k, label in enumerate(self.window.labels)}
         samples = range(self.window.question.samples)
         return np.array([[labels["w", k, int(i)] for i in self._noise_columns] for k in samples])
-
-
-#: Weights count at least this share of the largest one when those to correct are chosen.
-LEAST_WEIGHT = 1e-3

@@ -18,7 +18,7 @@ from obsynth.plants.descriptor import DescriptorSystem
 
 SOURCE = "duality of linear programmes"
 #: Values of a hidden course below this share of its largest are not told.
-TOLD = 1e-6
+TOLD_COURSE = 1e-6
 
 
 def conditions(plant: DescriptorSystem, asked: Asked, *, with_windows: bool = True) -> tuple[Condition, ...]:
@@ -162,20 +162,20 @@ def hidden(window: Window, point: FloatArray) -> str:
     largest = float(np.max(np.abs(point)))
     others = []
     for label, value in zip(window.labels, point, strict=True):
-        if label[0] == "f" and label[2] != question.fault and abs(value) > TOLD * largest:
+        if label[0] == "f" and label[2] != question.fault and abs(value) > TOLD_COURSE * largest:
             name = plant.fault_names[label[2]]
             if name not in others:
                 others.append(name)
     states = {
         plant.state_names[label[2]]
         for label, value in zip(window.labels, point, strict=True)
-        if label[0] == "x" and abs(value) > TOLD * largest
+        if label[0] == "x" and abs(value) > TOLD_COURSE * largest
     }
-    moving = f", while {', '.join(sorted(states))} move" if states and len(states) <= MOST_NAMED else ""
+    moving = f", while {', '.join(sorted(states))} move" if states and len(states) <= MOST_NAMED_STATES else ""
     if others:
         return f"{fault} and {' and '.join(others)} together give the same outputs as neither of them{moving}"
     return f"{fault} gives the same outputs as no fault{moving or ', from another start of the states'}"
 
 
 #: More states than these are not listed.
-MOST_NAMED = 8
+MOST_NAMED_STATES = 8

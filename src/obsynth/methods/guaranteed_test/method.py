@@ -25,17 +25,6 @@ NOMINAL_BANK = (
     "The thresholds are those of the nominal plant: tolerances are not in them. Design each test alone, with its "
     "fault, the others free and this scenario, for thresholds over them."
 )
-CLAIMS = {
-    "threshold": ClaimMeaning("", "never passed without the fault, in the fault's unit", "threshold"),
-    "least": ClaimMeaning("", "no function of these samples tells the fault within less", "least"),
-    "surely_found": ClaimMeaning("", "a fault of this size and course surely alarms", "surely found"),
-    "delay": ClaimMeaning("s", "after which it does so at the latest", "delay"),
-    "mean_threshold": ClaimMeaning(
-        "",
-        "mean over the shipped record of the threshold that holds for all constants in their tolerances",
-        "mean threshold",
-    ),
-}
 
 
 @dataclass(frozen=True)
@@ -144,7 +133,17 @@ class GuaranteedTestMethod(Asked, Method):
     time: ClassVar[str] = "discrete, time-varying"
     summary: ClassVar[str] = "a test of one fault whose threshold no other test on these samples can beat"
     source: ClassVar[str] = "ours, by duality of linear programmes"
-    claims: ClassVar[Mapping[str, ClaimMeaning]] = CLAIMS
+    claims: ClassVar[Mapping[str, ClaimMeaning]] = {
+        "threshold": ClaimMeaning("", "never passed without the fault, in the fault's unit", "threshold"),
+        "least": ClaimMeaning("", "no function of these samples tells the fault within less", "least"),
+        "surely_found": ClaimMeaning("", "a fault of this size and course surely alarms", "surely found"),
+        "delay": ClaimMeaning("s", "after which it does so at the latest", "delay"),
+        "mean_threshold": ClaimMeaning(
+            "",
+            "mean over the shipped record of the threshold that holds for all constants in their tolerances",
+            "mean threshold",
+        ),
+    }
     over_scenario: ClassVar[bool] = True
     witnesses: ClassVar[frozenset[str]] = frozenset(
         {"multipliers", "multiplier_radius", "witness", "witness_radius", "rounding", "trade_off"}

@@ -21,7 +21,7 @@ from obsynth.proofs.balls import UNIT_ROUNDOFF
 from obsynth.results.design import Certificate
 
 #: Room for what another processor finds for the remainder: a share, and roundings of the signals.
-SHARE_ROOM, ROUNDINGS = 1e-6, 1024.0
+SHARE_ROOM, REMAINDER_ROUNDINGS = 1e-6, 1024.0
 
 
 def nonlinear_conditions(model: DAEModel, asked: Any) -> tuple[Condition, ...]:
@@ -82,7 +82,10 @@ def _linear(model: DAEModel, asked: Any) -> tuple[DescriptorSystem, Any]:
         for name in (*model.state_names, *model.input_names)
     }
     largest = max(sizes.values(), default=1.0)
-    room = {name: value * (1.0 + SHARE_ROOM) + ROUNDINGS * UNIT_ROUNDOFF * largest for name, value in bounds.items()}
+    room = {
+        name: value * (1.0 + SHARE_ROOM) + REMAINDER_ROUNDINGS * UNIT_ROUNDOFF * largest
+        for name, value in bounds.items()
+    }
     own = replace(
         asked,
         fault=fault,

@@ -25,7 +25,7 @@ ATTEMPTS: tuple[tuple[str, dict[str, Any]], ...] = (
     ("highs-ipm", {"presolve": False}),
 )
 #: Statuses of `scipy.optimize.linprog`.
-SOLVED, UNBOUNDED = 0, 3
+SOLVED_STATUS, UNBOUNDED = 0, 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,11 +54,11 @@ def largest_hidden_fault(window: Window, right: FloatArray | None = None, *, sig
     given = {"A_eq": matrix.tocsr(), "b_eq": known, "bounds": np.stack([-ends, ends], axis=1)}
     for method, options in ATTEMPTS:
         found = linprog(cost, method=method, options=options, **given)
-        if found.status in (SOLVED, UNBOUNDED):
+        if found.status in (SOLVED_STATUS, UNBOUNDED):
             break
     if found.status == UNBOUNDED:
         return Optimum(np.inf * sign)
-    if found.status != SOLVED:
+    if found.status != SOLVED_STATUS:
         raise SolverError(
             f"HiGHS has no answer for the linear programme of {window.question.samples} samples (status "
             f"{found.status}): the result is inconclusive. "

@@ -14,26 +14,24 @@ from typing import Any
 import numpy as np
 from flint import arb, arb_mat, ctx, fmpq, fmpq_mat
 
-from obsynth.methods.guaranteed_test.condensed import Condensed
+from obsynth.methods.guaranteed_test.condensed import LEAST_WEIGHT, Condensed
 from obsynth.methods.guaranteed_test.problem import rounded_outward
 from obsynth.methods.guaranteed_test.windows import Window
 from obsynth.numerics.arrays import FloatArray
 from obsynth.proofs.balls import UNIT_ROUNDOFF, Ball, rounded_up
 
 #: Diagonal of the pivoted triangle, as a share of its first entry, below which rows are taken as dependent.
-DEPENDENT = 1e-13
-#: Entries of a solution count at least this share of the largest one when a square part is chosen.
-LEAST_WEIGHT = 1e-3
+DEPENDENT_ROW = 1e-13
 #: Newton steps towards the exact solution before it is rounded for the last time.
-REFINEMENTS = 4
+RATIONAL_REFINEMENTS = 4
 #: Bits of ball arithmetic where double precision proves no inverse, and the most rows for it.
-BITS, MOST_ROWS_IN_BALLS = 256, 700
+INVERSE_BITS, MOST_ROWS_IN_BALLS = 256, 700
 #: A bounded number so near to its bound, as a share of it, is at its bound.
-AT_BOUND = 1e-9
+AT_BOUND_SHARE = 1e-9
 #: Least room that a bounded number counts for when a square part is chosen, as a share of its bound.
 LEAST_ROOM = 1e-4
 #: Values below this share of the largest, in their units, are rounding of zeros.
-ROUNDED = 1e-13
+ROUNDED_VALUE = 1e-13
 #: Room for what another processor finds for the distance to the exact solution: a factor.
 RADIUS_ROOM = 8.0
 _MANTISSA = 53
@@ -169,7 +167,7 @@ class Square:
         if chosen.size != count:
             triangle, order = qr(scaled, mode="r", pivoting=True)
             diagonal = np.abs(np.diag(triangle))
-            if count and not diagonal[count - 1] > DEPENDENT * diagonal[0]:
+            if count and not diagonal[count - 1] > DEPENDENT_ROW * diagonal[0]:
                 return None
             chosen = np.sort(order[:count])
         columns = units[chosen]
@@ -206,7 +204,7 @@ class Square:
 
     def _in_balls(self, right: list[Fraction]) -> FloatArray | None:
         before = ctx.prec
-        ctx.prec = BITS
+        ctx.prec = INVERSE_BITS
         try:
             count = len(right)
             matrix = arb_mat(count, count, [arb(value) for value in self.part.midpoint.ravel().tolist()])
@@ -287,7 +285,7 @@ def repaired_point(
     bar, bounded = window.bar, window.bounded
     values = np.array(point)
     if refine:
-        near = bounded & (bar - np.abs(values) < AT_BOUND * bar)
+        near = bounded & (bar - np.abs(values) < AT_BOUND_SHARE * bar)
         values[near] = np.copysign(bar[near], values[near])
     condensed = Condensed.of(window)
     if condensed is not None:
@@ -331,7 +329,7 @@ def _repaired(
     given = values.copy()
     if refine:
         left = np.inf
-        for _ in range(REFINEMENTS):
+        for _ in range(RATIONAL_REFINEMENTS):
             lacking = np.array([float(value) for value in missing(values)])
             size = float(np.max(np.abs(square.step(lacking) / np.ldexp(1.0, square.columns)), initial=0.0))
             if not size < 0.5 * left:
@@ -339,7 +337,7 @@ def _repaired(
             left = size
             values[square.chosen] += square.step(lacking)
         sizes = np.abs(np.ldexp(values, -units))
-        values[sizes < ROUNDED * float(np.max(sizes, initial=0.0))] = 0.0
+        values[sizes < ROUNDED_VALUE * float(np.max(sizes, initial=0.0))] = 0.0
     bound = square.proved_step(missing(values))
     if bound is None:
         # Rows may depend on each other though rounding hides it; such a part has led values astray.
@@ -386,7 +384,7 @@ def _rational_step(
     scaled = scaled / np.where(largest > 0.0, largest, 1.0)[:, None]
     triangle, by_row = qr(scaled.T, mode="r", pivoting=True)
     diagonal = np.abs(np.diag(triangle))
-    rank = int(np.sum(diagonal > DEPENDENT * max(float(np.max(diagonal, initial=0.0)), np.finfo(float).tiny)))
+    rank = int(np.sum(diagonal > DEPENDENT_ROW * max(float(np.max(diagonal, initial=0.0)), np.finfo(float).tiny)))
     rows = np.sort(by_row[:rank])
     _, by_column = qr(scaled[rows], mode="r", pivoting=True)
     columns = np.sort(by_column[:rank])

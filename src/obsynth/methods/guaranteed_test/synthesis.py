@@ -40,7 +40,7 @@ from obsynth.results.design import Certificate
 from obsynth.simulation.scenario import Scenario
 
 #: A threshold below this share of what all bounds could do is tried as an exact zero.
-ZERO = 1e-9
+ZERO_THRESHOLD = 1e-9
 #: The table of samples against threshold in a certificate.
 TRADE_OFF = "trade_off"
 
@@ -112,19 +112,19 @@ def chosen_samples(problem: Problem, asked: Asked, beside: Beside | None) -> tup
 
 
 #: A programme of so many equations took so many seconds, and others about this power of their ratio as many.
-MEASURED_EQUATIONS, MEASURED_SECONDS, GROWTH = 1800, 2.3, 2.3
+MEASURED_EQUATIONS, MEASURED_SECONDS, TIME_GROWTH = 1800, 2.3, 2.3
 
 
 def in_time(states: int, samples: int) -> str:
     """Return about how long the linear programme of a window takes, in words."""
-    seconds = MEASURED_SECONDS * (states * samples / MEASURED_EQUATIONS) ** GROWTH
-    if seconds < SHORT:
+    seconds = MEASURED_SECONDS * (states * samples / MEASURED_EQUATIONS) ** TIME_GROWTH
+    if seconds < SHORT_SECONDS:
         return "a few seconds"
     return f"about {seconds:.0f} s" if seconds < MINUTES else f"about {seconds / 60.0:.0f} minutes"
 
 
 #: Seconds below which no number is given, and from which on minutes are.
-SHORT, MINUTES = 5.0, 120.0
+SHORT_SECONDS, MINUTES = 5.0, 120.0
 
 
 class Shipped:
@@ -141,7 +141,7 @@ def proved_test(window: Window, found: Optimum) -> Shipped:
     rows, columns = window.scales
     # What all bounds together could do to these weights.
     able = float(np.abs(window.matrix[:, window.bounded]).T @ np.abs(found.multipliers) @ window.bar[window.bounded])
-    if found.size <= ZERO * able and not window.standing:
+    if found.size <= ZERO_THRESHOLD * able and not window.standing:
         exact = repaired_multipliers(window, found.multipliers, refine=True, exact_zero=True)
         if exact is not None:
             return Shipped(exact.with_room(rows), 0.0, None, 0.0)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import ObsynthError
-from obsynth.methods.guaranteed_test.checks import SAME, SOURCE, excess, fits, known_room
+from obsynth.methods.guaranteed_test.checks import SAME_SUM, SOURCE, excess, fits, known_room
 from obsynth.methods.guaranteed_test.problem import delay_in_samples, rounding_of
 from obsynth.methods.guaranteed_test.proofs import (
     Repaired,
@@ -151,7 +151,7 @@ def _of_the_tests(
         "rounding",
         "what the running tests may err for known signals of size one is at most what is shipped",
         rounding,
-        1.0 + SAME,
+        1.0 + SAME_SUM,
         source=SOURCE,
         kind="computed",
     )

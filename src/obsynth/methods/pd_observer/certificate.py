@@ -25,7 +25,7 @@ GOOD_CONDITION = 1e3
 #: As many values of delta are tried.
 DELTA_TRIES = 12
 #: Slack of the Riccati equation relative to the output weight, largest first: the first that proves is taken.
-SLACKS = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8)
+PD_SLACKS = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8)
 
 
 def explicit_certificate(
@@ -94,7 +94,7 @@ def gain_certificate(a: FloatArray, b: Ball, c: FloatArray, gain: float) -> Floa
     entering, shown = b.midpoint / units[:, None], c * units
     weight = max(float(np.linalg.norm(shown, 2)) ** 2, np.finfo(np.float64).tiny)
     spare = None
-    for slack in SLACKS:  # the largest that gives a proof
+    for slack in PD_SLACKS:  # the largest that gives a proof
         out = shown.T @ shown + slack * weight * np.eye(len(a))
         p = continuous_solution(balanced.T, entering.T, out, -(gain**2) * np.eye(entering.shape[1]))
         if p is None:

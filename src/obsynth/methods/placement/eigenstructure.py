@@ -19,14 +19,14 @@ from obsynth.numerics.arrays import SMALLEST, ComplexArray, FloatArray
 from obsynth.numerics.spectra import SAME_POLE, decay_rates, spectrum_error
 
 #: Random starts of the search, and fewer for large pairs; each step costs two Sylvester equations.
-STARTS, FEW_STARTS, LARGE = 8, 2, 20
+STARTS, FEW_STARTS, LARGE_PAIR = 8, 2, 20
 #: Longest run of the search, and how often it is taken up again from where it ended, with eigenvectors of unit length,
 #: as long as the logarithm of the objective falls by more than this.
-MOST_SEARCH_STEPS, RESTARTS, LEAST_PROGRESS = 400, 8, 1e-3
+MOST_PLACEMENT_STEPS, RESTARTS, LEAST_PROGRESS = 400, 8, 1e-3
 #: First steps of a search for good conditioning, and how many of the starts that are ahead after these go on.
-FIRST_STEPS, FINALISTS = 40, 3
+FIRST_SEARCH_STEPS, FINALISTS = 40, 3
 #: Seed of the starts: the same question gives the same gains.
-SEED = 20240
+STARTS_SEED = 20240
 #: Spectra of F and L closer than this, relative to the size of F, make the Sylvester equation nearly singular: F is
 #: then shifted by a random gain first.
 OVERLAP = 1e-3
@@ -81,7 +81,7 @@ def place(
     if n == 0:
         return Placement(np.zeros((0, outputs)), 1.0, 0.0)
     target = jordan_form(poles)
-    rng = np.random.default_rng(SEED)
+    rng = np.random.default_rng(STARTS_SEED)
     size = max(float(np.linalg.norm(f, 2)), SMALLEST)
     distance = np.min(np.abs(np.linalg.eigvals(f)[:, None] - np.asarray(poles)[None, :]))
     first = np.zeros((n, outputs))
@@ -90,14 +90,14 @@ def place(
     scale = np.eye(n) if weight is None else weight
     problem = _Sylvester.of((f - first @ c).T, c.T, target, first.T, objective, scale.T @ scale)
     best: tuple[float, FloatArray] | None = None
-    starts = [rng.standard_normal((outputs, n)) for _ in range(STARTS if n <= LARGE else FEW_STARTS)]
+    starts = [rng.standard_normal((outputs, n)) for _ in range(STARTS if n <= LARGE_PAIR else FEW_STARTS)]
     if objective == "gain":
         # Well-conditioned eigenvectors are a good place to start from.
         other = replace(problem, objective="conditioning").minimised(starts[0])
         starts = starts if other is None else [other[1], *starts]
     if objective == "conditioning":
         # All go a short way, and the best of them to the end.  Small gains are not predicted as early.
-        tried = [problem.minimised(start, steps=FIRST_STEPS, restarts=1) for start in starts]
+        tried = [problem.minimised(start, steps=FIRST_SEARCH_STEPS, restarts=1) for start in starts]
         ahead = sorted((found for found in tried if found is not None), key=lambda found: found[0])
         starts = [start for _, start in ahead[:FINALISTS]]
     for start in starts:
@@ -184,7 +184,7 @@ class _Sylvester:
         return float(np.log(value)), np.asarray(gradient / value).ravel()
 
     def minimised(
-        self, start: FloatArray, *, steps: int = MOST_SEARCH_STEPS, restarts: int = RESTARTS
+        self, start: FloatArray, *, steps: int = MOST_PLACEMENT_STEPS, restarts: int = RESTARTS
     ) -> tuple[float, FloatArray] | None:
         """Return the least value found and its G; ``None`` when the equation is singular from the start."""
         from scipy.optimize import minimize
@@ -221,7 +221,7 @@ class _Sylvester:
 
 #: Poles given as numbers count as a conjugate pair when they agree to this, relative to their size.
 PAIR_TOLERANCE = 1e-9
-_POLES = "method.options.poles"
+_POLES_OPTION = "method.options.poles"
 
 
 def checked_poles(
@@ -252,7 +252,7 @@ def checked_poles(
     if lonely:
         problems.append(f"{', '.join(f'{pole:.6g}' for pole in lonely)} lack their conjugates.")
     if problems:
-        raise SpecError(f"Option poles of {of}:", path=_POLES, problems=problems)
+        raise SpecError(f"Option poles of {of}:", path=_POLES_OPTION, problems=problems)
     real = [pole for pole in listed if pole.imag == 0.0]
     return [*real, *(p for pole in upper for p in (pole, pole.conjugate()))]
 
@@ -262,7 +262,7 @@ def as_pole(pole: Any) -> complex:
     try:
         value = complex(*pole) if isinstance(pole, (list, tuple, np.ndarray)) and len(pole) == 2 else complex(pole)
     except (TypeError, ValueError):
-        raise SpecError(f"{pole!r} is no pole: give a number, or [re, im].", path=_POLES) from None
+        raise SpecError(f"{pole!r} is no pole: give a number, or [re, im].", path=_POLES_OPTION) from None
     if isinstance(pole, (bool, str)) or not np.isfinite(value):
-        raise SpecError(f"{pole!r} is no pole: give a finite number, or [re, im].", path=_POLES)
+        raise SpecError(f"{pole!r} is no pole: give a finite number, or [re, im].", path=_POLES_OPTION)
     return value

@@ -23,7 +23,7 @@ STATE_WEIGHT = 1e-3
 #: The matrix of the Lyapunov function stays above this multiple of the identity, in scaled states.
 LEAST_LYAPUNOV = 1e-6
 #: Above this many states the inequality moves only those poles that a Kalman gain leaves outside the region.
-LARGE = 20
+MOST_MOVED_STATES = 20
 
 
 @dataclass(frozen=True)
@@ -87,13 +87,14 @@ class Region:
 def region_gain(problem: KalmanProblem, region: Region, *, solver: str) -> tuple[FloatArray, dict[str, Any]]:
     """Return K ``(n, ny)`` with the poles of ``F - K C`` in the region and little noise, and the solver's record.
 
-    Above `LARGE` states a Kalman gain of the region's rate comes first, and the record is empty where it is enough.
+    Above `MOST_MOVED_STATES` states a Kalman gain of the region's rate comes first, and the record is empty where it
+    is enough.
     """
     n, dt = problem.F.shape[0], problem.dt
     if n == 0:
         return np.zeros((0, problem.C.shape[0])), {}
     # What one way cannot find, the other may.
-    ways = [_partly, _by_inequality] if n > LARGE else [_by_inequality, _partly]
+    ways = [_partly, _by_inequality] if n > MOST_MOVED_STATES else [_by_inequality, _partly]
     failures: list[SolverError] = []
     for way in ways:
         try:

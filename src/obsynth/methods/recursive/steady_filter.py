@@ -18,7 +18,7 @@ from obsynth.numerics.least_squares_step import least_squares_step, rank_reveali
 from obsynth.numerics.norms import spectral_radius
 from obsynth.numerics.pencils import finite_zeros
 from obsynth.numerics.ranks import BOUNDARY_TOLERANCE, CANCELLATION_TOLERANCE, covariance_factor, decide_rank
-from obsynth.observers.recursive.gain_schedule import MOST_STEPS
+from obsynth.observers.recursive.gain_schedule import MOST_SETTLING_STEPS
 from obsynth.observers.recursive.step_model import stacked_noise
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
@@ -26,7 +26,7 @@ from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 #: The solution must satisfy its equation to this share of its size: half the digits.
 RICCATI_TOLERANCE = 1e-8
 #: Newton steps after the recursion: each doubles the digits.
-MOST_NEWTON_STEPS = 50
+MOST_RICCATI_STEPS = 50
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,17 +183,17 @@ def _from_recursion(E: FloatArray, A: FloatArray, C: FloatArray, noise: FloatArr
 
     P, ne = np.eye(E.shape[1]), len(E)
     gain, following = _step(E, A, C, noise, _root(P))
-    for _ in range(MOST_STEPS):
+    for _ in range(MOST_SETTLING_STEPS):
         if spectral_radius(gain[:, :ne] @ A) < 1.0:
             break
         P = following
         gain, following = _step(E, A, C, noise, _root(P))
     else:
         raise SolverError(
-            f"The gains of the filter are not stable after {MOST_STEPS} steps: its convergence is too "
+            f"The gains of the filter are not stable after {MOST_SETTLING_STEPS} steps: its convergence is too "
             "slow for a steady state. Run the filter instead."
         )
-    for _ in range(MOST_NEWTON_STEPS):
+    for _ in range(MOST_RICCATI_STEPS):
         driven = gain @ noise
         last, P = P, solve_discrete_lyapunov(gain[:, :ne] @ A, driven @ driven.T)
         P = np.asarray(0.5 * (P + P.T))

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.analysis.plant_units import PlantUnits
-from obsynth.analysis.time_varying import WARN_CONDITION, HorizonRanks, horizon_ranks
+from obsynth.analysis.time_varying import WARN_MARKOV_CONDITION, HorizonRanks, horizon_ranks
 from obsynth.analysis.zeros import leading_names
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.methods.method import Synthesis
@@ -157,7 +157,7 @@ def _notes(
             f"No noise is stated: {' and '.join(missing)} taken as the identity{units if own_units else ''}, which "
             "sets gains and deviations."
         )
-    if ranks.condition > WARN_CONDITION:
+    if ranks.condition > WARN_MARKOV_CONDITION:
         yield (
             f"H_k has the condition number {ranks.condition:.3g} at k = {ranks.condition_k}: about "
             f"{np.log10(ranks.condition):.0f} digits of the estimate are lost there."

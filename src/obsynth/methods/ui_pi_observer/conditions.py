@@ -29,6 +29,7 @@ from obsynth.analysis.existence.named_pencils import named_augmented, unclear
 from obsynth.analysis.existence.rational import SystemFacts
 from obsynth.analysis.existence.statements import (
     DECIDER,
+    SCATTER,
     Evaluator,
     FullRank,
     NoZeroOutside,
@@ -291,13 +292,13 @@ _NOT_ELIMINATED = {
 }
 SOURCE = "Share Pasand, Lemma 4 (9.1), in a form without E#"
 #: The matrix of (D1).
-DECOUPLED = (("E", None, "Bd"), ("C", "Dd", None), (None, None, "Dd"))
+D1_BLOCKS = (("E", None, "Bd"), ("C", "Dd", None), (None, None, "Dd"))
 
 
 def decoupling_rank(judge: Evaluator) -> RankDecision:
     """Decide (D1): ``rank [E 0 Bd; C Dd 0; 0 0 Dd]``, with what it must be."""
     expected = judge.plant.nx + judge.rank_itself(FullRank([["Dd"]])) + disturbance_rank(judge)
-    return judge.rank(FullRank(DECOUPLED, rank=expected))
+    return judge.rank(FullRank(D1_BLOCKS, rank=expected))
 
 
 def disturbance_rank(judge: Evaluator) -> int:
@@ -415,7 +416,7 @@ def _decoupling_condition(judge: Evaluator, before: str, after: str) -> Conditio
 
 def _undecoupled(judge: Evaluator) -> tuple[str, ...]:
     """Return the unknown inputs that move what no output shows at once, or else the states in question."""
-    plant, matrix = judge.plant, judge.arranged(FullRank(DECOUPLED), judge.natural)
+    plant, matrix = judge.plant, judge.arranged(FullRank(D1_BLOCKS), judge.natural)
     pencil = equilibrate_pencil(np.zeros_like(matrix), matrix)
     hidden = np.linalg.svd(pencil.A)[2][decide_rank(matrix).rank :].T
     # Of all null vectors the one that moves the states most: some are there only because disturbances repeat.
@@ -426,9 +427,6 @@ def _undecoupled(judge: Evaluator) -> tuple[str, ...]:
         return leading_names(shares, plant.disturbance_names, most=MOST_NAMES)
     return leading_names(np.abs(direction[: plant.nx]), plant.state_names, most=MOST_NAMES)
 
-
-#: Drops of the augmented pencil this close to each other, relative to their size or one, may be one multiple mode.
-SCATTER = 1e-2
 
 __all__ = ["Existence", "decoupling_rank", "existence"]
 

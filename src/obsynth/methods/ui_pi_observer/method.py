@@ -18,7 +18,7 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.fault_models import Exosystem, exosystem
 from obsynth.results.checks import Check
 from obsynth.results.design import ObserverDesign
-from obsynth.verification.claims import STATED
+from obsynth.verification.claims import STATED_BY_SEARCH
 from obsynth.verification.error_system import ErrorModel
 
 if TYPE_CHECKING:
@@ -27,22 +27,6 @@ if TYPE_CHECKING:
 
 #: What to make of the freedom that poles leave.
 OBJECTIVES = ("conditioning", "gain")
-
-CLAIMS = {
-    "decay": ClaimMeaning("1/s", "rate of the slowest pole: every error decays at least like this in the end", "decay"),
-    "noise_amplification": ClaimMeaning(
-        "", "H2 norm from unit white noise on every output to the noisiest fault estimate", "noise amplification"
-    ),
-    "noise_price": ClaimMeaning(
-        "", "noise of the fault estimates against the quietest Kalman filter of the same plant", STATED
-    ),
-    "digits": ClaimMeaning(
-        "",
-        "significant digits in which Ahat has to be kept, where more than 9 are needed",
-        "stable with the claimed digits",
-    ),
-    "condition": ClaimMeaning("", "condition number of the (generalised) eigenvectors", STATED),
-}
 
 
 @dataclass(frozen=True)
@@ -128,7 +112,23 @@ class UiPiObserver(Method):
     time: ClassVar[str] = "both"
     summary: ClassVar[str] = "state and faults untouched by any unknown input"
     source: ClassVar[str] = "Share Pasand, Aliyari, Taghirad"
-    claims: ClassVar[Mapping[str, ClaimMeaning]] = CLAIMS
+    claims: ClassVar[Mapping[str, ClaimMeaning]] = {
+        "decay": ClaimMeaning(
+            "1/s", "rate of the slowest pole: every error decays at least like this in the end", "decay"
+        ),
+        "noise_amplification": ClaimMeaning(
+            "", "H2 norm from unit white noise on every output to the noisiest fault estimate", "noise amplification"
+        ),
+        "noise_price": ClaimMeaning(
+            "", "noise of the fault estimates against the quietest Kalman filter of the same plant", STATED_BY_SEARCH
+        ),
+        "digits": ClaimMeaning(
+            "",
+            "significant digits in which Ahat has to be kept, where more than 9 are needed",
+            "stable with the claimed digits",
+        ),
+        "condition": ClaimMeaning("", "condition number of the (generalised) eigenvectors", STATED_BY_SEARCH),
+    }
     witnesses: ClassVar[frozenset[str]] = frozenset({"tracking", "Phi", "Cw", "poles", "stability"})
     purposes: ClassVar[frozenset[Purpose]] = frozenset({"faults", "state despite unknown inputs"})
 

@@ -34,7 +34,7 @@ from obsynth.plants.fault_models import Exosystem
 #: Modes slower than this share of the fastest do not count for the plant's time scale: integrators and rounding.
 SLOW_SHARE = 1e-6
 #: Where all modes are slower than this share of the pair's size, they are integrators that rounding has scattered.
-SCATTER = 3e-5
+INTEGRATOR_SCATTER = 3e-5
 #: Poles of sampled plants are not asked to decay by more than this exponent in one sample: nearer to zero they cannot
 #: be told apart, and printed gains miss them.
 MOST_PER_SAMPLE = 2.0
@@ -157,7 +157,7 @@ def _own_rate(plant: DescriptorSystem, f: FloatArray) -> float:
         found = speeds(values, plant.dt)
         found = found[np.isfinite(found)]
         found = found[found > max(SLOW_SHARE * float(np.max(found, initial=0.0)), DEAD_BEAT)]
-        if found.size and (plant.dt > 0.0 or np.max(found) > SCATTER * size):
+        if found.size and (plant.dt > 0.0 or np.max(found) > INTEGRATOR_SCATTER * size):
             median = float(np.median(found))
             return min(median, MOST_PER_SAMPLE / plant.dt) if plant.dt > 0.0 else median
     return 1.0 / plant.dt if plant.dt > 0.0 else size or 1.0

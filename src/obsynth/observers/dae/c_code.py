@@ -28,7 +28,7 @@ from obsynth.numerics.ranks import DEPENDENT_BOUND
 from obsynth.observers.dae.settings import initial_memory
 from obsynth.observers.dae.step_graph import ObserverGraph
 from obsynth.observers.dae.steps import Steps
-from obsynth.observers.outliers import COMPARABLE, LONGEST, OVERFLOW, RESET_WINDOW, chi_square_limit
+from obsynth.observers.outliers import COMPARABLE, LONGEST_LEFT_OUT, NO_SQUARE, RESET_WINDOW, chi_square_limit
 from obsynth.plants.dae import step as implicit_step
 from obsynth.plants.dae.functions import DAEFunctions
 from obsynth.plants.dae.step import PROJECTION_NOTICE, PROJECTION_SHARE, step_graph
@@ -39,7 +39,7 @@ NUMBERS_PER_LINE = 4
 #: The beginning of a helper that CasADi writes, `casadi_fmax` say, which it leaves visible to the linker.
 _HELPER = re.compile(r"^((?:const )?(?:casadi_real|casadi_int|double|int|void)\*? casadi_\w+ ?\()", re.MULTILINE)
 #: A bound that is missed by less, in deviations of its state, is kept.
-SLACK = 1e-7
+BOUND_SLACK = 1e-7
 
 
 def observer_code(steps: Steps) -> str:
@@ -162,14 +162,14 @@ def _option_constants(steps: Steps) -> list[str]:
         "OUTLIERS": int(settings.outliers != "none"),
         "GATE": int(settings.outliers == "gate"),
         "OUTLIER_LIMIT": steps.limit if np.isfinite(steps.limit) else 0.0,
-        "OVERFLOW_LIMIT": OVERFLOW,
-        "LONGEST_REFUSAL": LONGEST,
+        "OVERFLOW_LIMIT": NO_SQUARE,
+        "LONGEST_REFUSAL": LONGEST_LEFT_OUT,
         "COMPARABLE": COMPARABLE,
         "RESETS": int(bool(settings.reset)),
         "RESET_WINDOW": RESET_WINDOW,
         "BOUNDS": len(ends),
         "DEPENDENT": DEPENDENT_BOUND,
-        "SLACK": SLACK,
+        "SLACK": BOUND_SLACK,
         "WAITS": int(not timing.is_plain),
         "LATEST": timing.longest,
     }

@@ -14,7 +14,7 @@ from obsynth.analysis.dae_structure import involved
 from obsynth.errors import SolverError
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.numerics.ranks import SINGULAR_CONDITION
-from obsynth.observers.estimates import NOTHING, STEP_RESIDUAL, Estimates
+from obsynth.observers.estimates import NO_NUMBERS, STEP_RESIDUAL, Estimates
 from obsynth.observers.running import named_estimates
 
 if TYPE_CHECKING:
@@ -144,7 +144,7 @@ class GatheredRows:
             self.projection = rows.moved
         # Copies, so that what is not kept can go.
         several = rows.several
-        self.parts.append({name: np.array(of(several)) for name, of in _COLUMNS.items()})
+        self.parts.append({name: np.array(of(several)) for name, of in _KEPT_COLUMNS.items()})
 
     def add_regular(self, rows: DAERow) -> None:
         """Keep some rows, unless the matrix of (7) was singular to working precision in one of them."""
@@ -176,7 +176,7 @@ def require_regular(observer: DAESettings, rows: DAERow, conditions: FloatArray)
 
 
 #: What the estimates keep of some samples, by its name there.
-_COLUMNS: Mapping[str, Callable[[DAERow], FloatArray]] = {
+_KEPT_COLUMNS: Mapping[str, Callable[[DAERow], FloatArray]] = {
     "states": lambda rows: rows.x,
     "state_deviations": lambda rows: rows.state_deviations,
     "state_covariances": lambda rows: rows.covariance,
@@ -202,13 +202,13 @@ class SampleEstimates(Estimates):
         """Keep the row, and the information (``(nq, nq)`` each) on the parameters of the latest samples."""
         vars(self).update(
             _observer=observer, _rows=row.several, _informations=informations,
-            residual_names=STEP_RESIDUAL, regressors=NOTHING,
+            residual_names=STEP_RESIDUAL, regressors=NO_NUMBERS,
         )  # fmt: skip
 
     def __getattr__(self, name: str) -> Any:
         made: Any
-        if name in _COLUMNS:
-            made = read_only(_COLUMNS[name](self._rows))
+        if name in _KEPT_COLUMNS:
+            made = read_only(_KEPT_COLUMNS[name](self._rows))
         elif name in ("state_names", "fault_names", "state_delays", "fault_delays"):
             made = getattr(self._observer, name)
         elif name == "excitation":

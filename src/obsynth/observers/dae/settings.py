@@ -160,7 +160,7 @@ class Layout:
     def shaped(self, flat: FloatArray, name: str) -> FloatArray:
         """Return one array of each of many parts of vectors (``flat (..., entries)``)."""
         rows, columns = self.shapes[name]
-        if columns == 1 and name not in MATRICES:
+        if columns == 1 and name not in MATRIX_SETTINGS:
             return flat
         return flat.reshape(*flat.shape[:-1], columns, rows).swapaxes(-1, -2)
 
@@ -185,7 +185,7 @@ class Layout:
 
 
 #: Arrays that stay matrices when they have one column.
-MATRICES = frozenset(
+MATRIX_SETTINGS = frozenset(
     {
         "P",
         "S",

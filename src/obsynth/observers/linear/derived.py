@@ -127,19 +127,19 @@ def unaveraged(observer: LinearObserver, mean: int) -> LinearObserver | None:
 
 
 #: The start counts as forgotten when the slowest part of it has shrunk to this share.
-FORGOTTEN = 0.02
+FORGOTTEN_SHARE = 0.02
 
 
 def transient(observer: LinearObserver) -> float:
-    """Return the seconds after which an observer has forgotten its start: the slowest mode at `FORGOTTEN`."""
+    """Return the seconds after which an observer has forgotten its start: the slowest mode at `FORGOTTEN_SHARE`."""
     if observer.order == 0:
         return 0.0
     slowest = abscissa(observer.Az, observer.dt)
     if observer.dt == 0.0:
-        return math.log(FORGOTTEN) / slowest if slowest < 0.0 else math.inf
+        return math.log(FORGOTTEN_SHARE) / slowest if slowest < 0.0 else math.inf
     if slowest >= 1.0:
         return math.inf
-    samples = math.ceil(math.log(FORGOTTEN) / math.log(slowest)) if slowest > 0.0 else 0
+    samples = math.ceil(math.log(FORGOTTEN_SHARE) / math.log(slowest)) if slowest > 0.0 else 0
     return observer.dt * (
         max(samples, _steps_remembered(observer.Az)) + max((*observer.state_delays, *observer.fault_delays), default=0)
     )
@@ -184,7 +184,7 @@ def checked_warm_up(asked: float | None, default: float) -> float:
 
 
 #: Frequencies of the grid, and how far it reaches beyond the slowest and the fastest pole of the observer.
-GRID_POINTS = 61
+RESPONSE_POINTS = 61
 GRID_REACH = 30.0
 
 
@@ -197,4 +197,4 @@ def frequency_grid(observer: LinearObserver) -> FloatArray:
     if observer.dt > 0.0:
         high = np.pi / observer.dt
         low = min(low, high / GRID_REACH)
-    return np.concatenate([[0.0], np.geomspace(low, high, GRID_POINTS)])
+    return np.concatenate([[0.0], np.geomspace(low, high, RESPONSE_POINTS)])

@@ -102,7 +102,7 @@ LONG_RECORD = 100_000
 #: Numbers in the state up to which the kernel is faster than LAPACK.
 SMALL_ORDER = 25
 #: Steps that are prepared together: bounds the memory of plants that vary.
-CHUNK = 4096
+PREPARED_STEPS = 4096
 #: Fewer complete samples in a row than this are faster step by step.
 SHORT_STRETCH = 8
 
@@ -152,7 +152,7 @@ def run_compiled(recursion: Recursion, y: FloatArray, u: FloatArray) -> Estimate
     pause, patience = 1, 1
     k = 0
     while k < samples:
-        count = min(int(stretches[k]), CHUNK)
+        count = min(int(stretches[k]), PREPARED_STEPS)
         if pause or count < SHORT_STRETCH or state.diffuse.shape[1]:
             state, row = recursion.advance(state, y[k], u[k])
             _fill(

@@ -92,7 +92,7 @@ def gain_steps(
 #: Gains of the steps of an observer: `gain_steps`, or what remembers them.
 Gains: TypeAlias = Callable[[RecursiveObserver, int], Iterable[GainStep]]
 #: Numbers of gains that are kept for a second look, of twenty megabytes.
-MOST_KEPT = 2**21
+MOST_KEPT_GAINS = 2**21
 
 
 def gains_once() -> Gains:
@@ -100,7 +100,7 @@ def gains_once() -> Gains:
     known: dict[tuple[RecursiveObserver, int], list[GainStep]] = {}
 
     def gains(observer: RecursiveObserver, steps: int) -> Iterable[GainStep]:
-        if steps * (observer.plant.nx + observer.plant.nq) * (observer.plant.ne + observer.plant.ny) > MOST_KEPT:
+        if steps * (observer.plant.nx + observer.plant.nq) * (observer.plant.ne + observer.plant.ny) > MOST_KEPT_GAINS:
             return gain_steps(observer, steps)
         if (observer, steps) not in known:
             known[observer, steps] = list(gain_steps(observer, steps))
@@ -153,9 +153,9 @@ def run_batch(observer: RecursiveObserver, y: ArrayLike, u: ArrayLike | None = N
 
 
 #: The gains have settled when what is left of their way is below this share of them.
-SETTLED = 1e-13
+SETTLED_GAINS = 1e-13
 #: Steps of the recursion before it is held to settle nowhere.
-MOST_STEPS = 20_000
+MOST_SETTLING_STEPS = 20_000
 #: Steps in a row that must have settled: at a turning point gains stand still, too.
 STILL_STEPS = 5
 
@@ -206,22 +206,26 @@ def _settled(observer: RecursiveObserver) -> tuple[GainStep, int]:
     """Return the first step whose gains have settled."""
     last: GainStep | None = None
     still, before = 0, np.inf
-    for k, found in enumerate(gain_steps(observer, MOST_STEPS)):
+    for k, found in enumerate(gain_steps(observer, MOST_SETTLING_STEPS)):
         # The correction of the start, which comes first with early constraints, has other rows.
         if last is not None and last.gain.shape == found.gain.shape:
             moved = max(_distance(now, then) for now, then in zip(_parts(found), _parts(last), strict=True))
             # What is left of a geometric series, from two of its terms.
             rate = min(moved / before, 1.0) if 0.0 < before < np.inf else 1.0
             left = moved / max(1.0 - rate, np.finfo(np.float64).eps) * rate
-            quiet = moved == 0.0 or (moved <= SETTLED and left <= SETTLED) or moved <= 4.0 * np.finfo(np.float64).eps
+            quiet = (
+                moved == 0.0
+                or (moved <= SETTLED_GAINS and left <= SETTLED_GAINS)
+                or moved <= 4.0 * np.finfo(np.float64).eps
+            )
             still, before = still + 1 if quiet else 0, moved
             if still == STILL_STEPS:
                 return found, k
         last = found
     raise SolverError(
-        f"The gains do not settle within {MOST_STEPS} steps: a mode is hardly seen, or hardly driven by noise. Run the "
-        "recursion itself (obsynth run), or state more noise in Q.",
-        record={"steps": MOST_STEPS},
+        f"The gains do not settle within {MOST_SETTLING_STEPS} steps: a mode is hardly seen, or hardly driven by "
+        "noise. Run the recursion itself (obsynth run), or state more noise in Q.",
+        record={"steps": MOST_SETTLING_STEPS},
     )
 
 

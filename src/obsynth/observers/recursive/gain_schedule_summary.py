@@ -17,7 +17,7 @@ from obsynth.observers.recursive.gain_schedule import Gains, gain_steps
 from obsynth.observers.recursive.observer import RecursiveObserver
 
 #: Errors that shrank below this are gone; the product starts anew from there, so that it does not underflow.
-UNDERFLOW = 1e-200
+GONE = 1e-200
 #: On shorter horizons an error need not have shrunk yet, so that the contraction only informs.
 STEPS_TO_CONTRACT = 50
 #: With more states, and a plant and noise that stay the same, fewer steps are followed, as work goes with the cube of
@@ -146,13 +146,13 @@ class ErrorProduct:
         self.product = factor @ self.product
         size = norm_or_bound(self.product)
         self.growth = max(self.growth, size * float(np.exp(min(self.logarithm, 0.0))))
-        if not size < 1.0 / UNDERFLOW:
+        if not size < 1.0 / GONE:
             self.ended = Contraction(float("inf"), float("inf"), "from the start", _shares(self.product))
             return
         if size == 0.0:
             self.ended = Contraction(0.0, self.growth, "from the start", _shares(self.product))
             return
-        if size < UNDERFLOW:
+        if size < GONE:
             self.product, self.logarithm = self.product / size, self.logarithm + float(np.log(size))
         if self.done == self.steps // 2:
             self.middle = self._length()

@@ -12,14 +12,14 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import is_finite_number, real_array
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.expressions import CONSTANTS, DECIDING_WORDS, FUNCTIONS, FUNCTIONS_OF_TWO
+from obsynth.numerics.expressions import DECIDING_WORDS, FUNCTIONS, FUNCTIONS_OF_TWO, NAMED_NUMBERS
 from obsynth.plants.dae.symbols import EQUALS, DAEFields, DAESymbols, symbols_of
 from obsynth.plants.validation import Problems, checked_names
 
 #: Names that mean something else in the language.
-RESERVED = frozenset({*CONSTANTS, *FUNCTIONS, *FUNCTIONS_OF_TWO, *DECIDING_WORDS, "der", "where"})
+RESERVED = frozenset({*NAMED_NUMBERS, *FUNCTIONS, *FUNCTIONS_OF_TWO, *DECIDING_WORDS, "der", "where"})
 #: An equation that is named by the derivative that it gives.
-_RATE = re.compile(r"der\(\w+\)")
+_DERIVATIVE_NAME = re.compile(r"der\(\w+\)")
 
 
 def checked_signals(values: Mapping[str, float] | None, what: str) -> dict[str, float]:
@@ -54,7 +54,7 @@ def checked_texts(texts: Mapping[str, str], what: str) -> dict[str, str]:
 def _whole_equation(name: str, text: str) -> str:
     """Return an equation; under the name ``der(x)`` a text without that and without '=' says what that is."""
     rate = "".join(name.split())
-    alone = _RATE.fullmatch(rate) and not EQUALS.search(text) and rate not in "".join(text.split())
+    alone = _DERIVATIVE_NAME.fullmatch(rate) and not EQUALS.search(text) and rate not in "".join(text.split())
     return f"{rate} = {text}" if alone else text
 
 

@@ -13,15 +13,15 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.dae.symbols import DAESymbols, symbols_of
 
-_ROOT = np.sqrt(6.0)
+_ROOT_OF_SIX = np.sqrt(6.0)
 #: Butcher matrices of the implicit methods whose last stage is the result (stiffly accurate).
 BUTCHER: dict[str, FloatArray] = {
     "backward-euler": np.array([[1.0]]),
     "radau": np.array(
         [
-            [(88 - 7 * _ROOT) / 360, (296 - 169 * _ROOT) / 1800, (-2 + 3 * _ROOT) / 225],
-            [(296 + 169 * _ROOT) / 1800, (88 + 7 * _ROOT) / 360, (-2 - 3 * _ROOT) / 225],
-            [(16 - _ROOT) / 36, (16 + _ROOT) / 36, 1 / 9],
+            [(88 - 7 * _ROOT_OF_SIX) / 360, (296 - 169 * _ROOT_OF_SIX) / 1800, (-2 + 3 * _ROOT_OF_SIX) / 225],
+            [(296 + 169 * _ROOT_OF_SIX) / 1800, (88 + 7 * _ROOT_OF_SIX) / 360, (-2 - 3 * _ROOT_OF_SIX) / 225],
+            [(16 - _ROOT_OF_SIX) / 36, (16 + _ROOT_OF_SIX) / 36, 1 / 9],
         ]
     ),
 }

@@ -36,21 +36,21 @@ from obsynth.simulation.dae import simulate_dae
 from obsynth.verification.plant import condition_rows
 
 #: Central differences over this share of a size leave about its square, and rounding over it.
-DIFFERENCE = 1e-5
+DERIVATIVE_DIFFERENCE = 1e-5
 #: So much may be left between differences and derivatives, in sizes of the signals.
 DERIVATIVE_TOLERANCE = 1e-6
 #: Runs and steps of the Monte Carlo: with one parameter the mean of 48 squares is wrong by the factor below one time in
 #: several hundred.
-TRIALS = 48
+MONTE_CARLO_RUNS = 48
 #: So many where those seem to refute the covariances.
 MORE_TRIALS = 240
 TRIAL_STEPS = 40
-SEED = 20130206
+MONTE_CARLO_SEED = 20130206
 #: A mean of normalised squares may be off by this factor: covariances of a nonlinear plant are first-order ones.  Less
 #: than this is left to the information in the row.
 CONSISTENCY_FACTOR = 2.0
 #: Between these probabilities lie 95 %.
-TAILS = (0.025, 0.975)
+TAIL_PROBABILITIES = (0.025, 0.975)
 
 
 def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
@@ -246,8 +246,8 @@ def _derivative_gap(observer: DAEObserver) -> float:
     centre, worst = np.concatenate([x, theta]), 0.0
     for j, size in enumerate(sizes):
         moved = np.zeros(len(sizes))
-        moved[j] = DIFFERENCE * size
-        slope = (both(centre + moved) - both(centre - moved)) / (2.0 * DIFFERENCE)
+        moved[j] = DERIVATIVE_DIFFERENCE * size
+        slope = (both(centre + moved) - both(centre - moved)) / (2.0 * DERIVATIVE_DIFFERENCE)
         gap = np.abs(slope - exact[:, j] * size) / rows
         worst = max(worst, float(gap.max()) / max(1.0, float(np.abs(exact[:, j] * size / rows).max())))
     return worst
@@ -256,10 +256,10 @@ def _derivative_gap(observer: DAEObserver) -> float:
 def _consistency_rows(design: ObserverDesign, shipped: DAEObserver) -> Iterator[Check]:
     """Run the shipped observer on noise, starts and parameters as they are stated in the options."""
     stated = dae_observer_from_options(design.nonlinear[0], design.options)
-    rng = np.random.default_rng(SEED)
+    rng = np.random.default_rng(MONTE_CARLO_SEED)
     errors, squares, degrees = np.zeros(0), 0.0, 0.0
     # What a few runs seem to refute, more of them decide: a right filter is not refused for its draws.
-    for trials in (range(TRIALS), range(TRIALS, MORE_TRIALS)):
+    for trials in (range(MONTE_CARLO_RUNS), range(MONTE_CARLO_RUNS, MORE_TRIALS)):
         more, nis, counted = _trials(stated, shipped, rng, trials)
         errors, squares, degrees = np.concatenate([errors, more]), squares + nis, degrees + counted
         if max(_ratio(float(np.mean(errors))), _ratio(squares / degrees)) <= CONSISTENCY_FACTOR:
@@ -327,7 +327,7 @@ def _trials(
             Q=stated.Q,
             R=stated.R,
             integration=stated.integration,
-            seed=SEED + trial,
+            seed=MONTE_CARLO_SEED + trial,
         )
         outputs.append(truth.outputs)
     # As C it would be faster, but the compiler takes longer than all of this.
@@ -342,5 +342,5 @@ def _band(count: float) -> tuple[float, float]:
     """Return where the mean of so many squares of standard normal numbers lies with 95 % (chi squared)."""
     from scipy.special import gammaincinv
 
-    low, high = (2.0 * float(gammaincinv(count / 2.0, share)) / count for share in TAILS)
+    low, high = (2.0 * float(gammaincinv(count / 2.0, share)) / count for share in TAIL_PROBABILITIES)
     return low, high

@@ -20,7 +20,7 @@ from obsynth.verification.plant import condition_rows, plant_information
 #: The row on the plant together with the stored filter.
 TOGETHER = "with stored numbers"
 _SOURCE = "Ding et al. 2000; proofs ours"
-_CLAIMS = ("disturbance_gain", "fault_sensitivity", "band_from", "band_to")
+_DETECTION_CLAIMS = ("disturbance_gain", "fault_sensitivity", "band_from", "band_to")
 
 
 def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
@@ -47,7 +47,7 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
 def _fits(design: ObserverDesign) -> bool:
     plant, observer = design.linear
     claims = design.certificate.claims
-    if any(name not in claims or not np.isfinite(float(claims[name])) for name in _CLAIMS):
+    if any(name not in claims or not np.isfinite(float(claims[name])) for name in _DETECTION_CLAIMS):
         return False
     band = [float(claims[name]) for name in ("band_from", "band_to")]
     witness = design.certificate.matrices.get("P")

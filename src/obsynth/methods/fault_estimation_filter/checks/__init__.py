@@ -13,7 +13,7 @@ from obsynth.errors import PreconditionError
 from obsynth.methods.fault_estimation_filter.checks.faults import Equations, fault_rows
 from obsynth.methods.fault_estimation_filter.checks.gains import gain_rows, gains_fit, printed_allowances
 from obsynth.methods.fault_estimation_filter.conditions import fault_filter_conditions
-from obsynth.methods.fault_estimation_filter.least_gain_proof import WITNESSES, least_gain_row
+from obsynth.methods.fault_estimation_filter.least_gain_proof import LEAST_GAIN_WITNESSES, least_gain_row
 from obsynth.methods.fault_estimation_filter.prepared_plant import with_sensor_faults_as_states
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.modal_response import Modes
@@ -31,7 +31,7 @@ from obsynth.verification.error_system import ErrorModel
 from obsynth.verification.identities import equality, tracking_identities
 from obsynth.verification.plant import condition_rows, plant_information
 
-_IDENTITIES = {
+_FILTER_IDENTITIES = {
     "dynamics": ("unbiased: dynamics", "Az V E + By C = V A", "Wang 2015, eqs. (7), (26)"),
     "inputs": ("unbiased: inputs", "Bu + By D = V B", "Wang 2015, eq. (23)"),
     "state estimate": (
@@ -74,7 +74,7 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
     allowances = yield from _gain_set_rows(design, work, scaling, tracking, printed_digits)
     errors = ErrorModel(plant, observer, tracking, lag=lag)
     for key, identity in tracking_identities(errors).items():
-        name, claim, source = _IDENTITIES[key]
+        name, claim, source = _FILTER_IDENTITIES[key]
         yield equality(name, claim, identity.residual(allowances.get(key)), source)
     yield from fault_rows(plant, observer, tracking, errors, scaling, allowances)
     modes = Modes.of(observer.Az)
@@ -122,7 +122,7 @@ def _gain_set_rows(
 def _least_gain(design: ObserverDesign, work: DescriptorSystem | None) -> Iterator[Check]:
     """Yield the row on the least gain; without gains there is no family of filters to prove anything of."""
     claims, matrices = design.certificate.claims, design.certificate.matrices
-    if "gamma_min" not in claims and not WITNESSES & matrices.keys():
+    if "gamma_min" not in claims and not LEAST_GAIN_WITNESSES & matrices.keys():
         return
     free = bool(design.options.get("free_residual_weight"))
     kept = matrices if work is not None else {}

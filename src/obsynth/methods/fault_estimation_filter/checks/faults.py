@@ -22,7 +22,7 @@ from obsynth.verification.error_system import ErrorModel, with_past
 from obsynth.verification.identities import Identity, equality, worst
 
 #: A trace of a fault in an observer state below this share of its largest one is held to be no trace.
-UNREACHED = 1e-4
+UNREACHED_STATE = 1e-4
 _SOURCE = "Wang 2015, eqs. (32), (44)"
 
 
@@ -116,7 +116,7 @@ def _trace_sizes(
         return np.asarray(sizes)  # a failed existence condition says so already
     units = np.append(scaling.states, np.tile(scaling.states[: plant.nx], lag))
     units = np.resize(units, len(sizes))[:, None]
-    return np.asarray(np.maximum(sizes, UNREACHED * units * np.max(sizes / units, axis=0)))
+    return np.asarray(np.maximum(sizes, UNREACHED_STATE * units * np.max(sizes / units, axis=0)))
 
 
 def _in_state_units(sizes: FloatArray, nx: int) -> FloatArray:
@@ -127,7 +127,7 @@ def _in_state_units(sizes: FloatArray, nx: int) -> FloatArray:
 
 
 #: The observer's matrices.
-MATRICES = ("Az", "Bu", "By", "Cz", "Du", "Dy")
+OBSERVER_MATRICES = ("Az", "Bu", "By", "Cz", "Du", "Dy")
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,7 +187,11 @@ class Equations:
         outputs = np.vstack([states[-1], shown, shown])
         columns = [nz, nz + self.B.shape[1]]
         return dict(
-            zip(MATRICES, [*np.split(following, columns, axis=1), *np.split(outputs, columns, axis=1)], strict=True)
+            zip(
+                OBSERVER_MATRICES,
+                [*np.split(following, columns, axis=1), *np.split(outputs, columns, axis=1)],
+                strict=True,
+            )
         )
 
     def tracking(self, t: FloatArray) -> FloatArray:

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from obsynth.methods.fault_estimation_filter.checks.faults import (
-    MATRICES,
+    OBSERVER_MATRICES,
     Equations,
     fault_identities,
     filter_of,
@@ -157,7 +157,10 @@ def _realisation_identities(
 ) -> list[Identity]:
     formed = equations.realised(gains)
     sizes = equations.absolute.realised({letter: np.abs(gains[letter]) for letter in "TNLW"}, minus=1.0)
-    found = [Identity((getattr(observer, name), -formed[name]), ((sizes[name],),), entrywise=True) for name in MATRICES]
+    found = [
+        Identity((getattr(observer, name), -formed[name]), ((sizes[name],),), entrywise=True)
+        for name in OBSERVER_MATRICES
+    ]
     return [*found, Identity((tracking, -equations.tracking(gains["T"])), entrywise=True)]
 
 

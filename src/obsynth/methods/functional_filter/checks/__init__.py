@@ -111,7 +111,7 @@ def noise_rows(design: ObserverDesign) -> Iterator[Check]:
             )
 
 
-_MATRICES = ("T", "T0", "Phi", "Cw", "walks", "stability", "tracking", "deviations")
+_FUNCTIONAL_MATRICES = ("T", "T0", "Phi", "Cw", "walks", "stability", "tracking", "deviations")
 _SOURCE = "identities of the error z - T E x, ours"
 
 
@@ -153,10 +153,10 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
 
 def _fits(design: ObserverDesign) -> bool:
     (plant, observer), matrices = design.linear, design.certificate.matrices
-    if any(name not in matrices for name in _MATRICES):
+    if any(name not in matrices for name in _FUNCTIONAL_MATRICES):
         return False
     # A deviation of which all digits are rounding is claimed as NaN: not at all.
-    if not all(np.all(np.isfinite(matrices[name])) for name in _MATRICES if name != "deviations"):
+    if not all(np.all(np.isfinite(matrices[name])) for name in _FUNCTIONAL_MATRICES if name != "deviations"):
         return False
     order, count = observer.order, len(matrices["Phi"])
     shapes = {

@@ -26,7 +26,7 @@ from obsynth.verification.error_system import ErrorModel
 from obsynth.verification.identities import ALIKE, equality, relative_tolerance, residual, tracking_identities, worst
 from obsynth.verification.plant import condition_rows, plant_information
 
-_IDENTITIES = {
+_PD_IDENTITIES = {
     "dynamics": ("unbiased: dynamics", "Az + By C = A, with the faults as states", "Filasova et al., eq. (29)"),
     "inputs": ("unbiased: inputs", "Bu + By D = B", "Filasova et al., eq. (4)"),
     "state estimate": (
@@ -61,8 +61,8 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
         observer, state_names=augmented.state_names, fault_names=(), state_delays=(0,) * augmented.nx, fault_delays=()
     )
     for key, identity in tracking_identities(ErrorModel(augmented, whole, np.eye(augmented.nx))).items():
-        if key in _IDENTITIES:
-            name, claim, source = _IDENTITIES[key]
+        if key in _PD_IDENTITIES:
+            name, claim, source = _PD_IDENTITIES[key]
             yield equality(name, claim, identity.residual(), source, bound=tolerance)
     errors = PdErrorSystem.of(augmented, observer, plant.nx)
     yield _gains_row(design, augmented, tolerance)

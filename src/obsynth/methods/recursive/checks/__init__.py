@@ -44,7 +44,7 @@ CLAIM_TOLERANCE = 1e-6
 #: The recursion may differ from the batch solution by this much, relative to standard deviations, times cond H.
 BATCH_TOLERANCE = 1e-9
 #: Gains smaller than this are compared as they are.
-LEAST_GAIN = 1e-12
+LEAST_GAIN_SIZE = 1e-12
 
 
 def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
@@ -209,7 +209,7 @@ def listed_gains(design: ObserverDesign, found: Mapping[str, FloatArray]) -> Che
         if listed.shape != matrix.shape:
             wrong.append(letter)
         elif matrix.size:
-            gap = max(gap, float(np.max(np.abs(listed - matrix)) / max(float(np.max(np.abs(matrix))), LEAST_GAIN)))
+            gap = max(gap, float(np.max(np.abs(listed - matrix)) / max(float(np.max(np.abs(matrix))), LEAST_GAIN_SIZE)))
     return upper_bound_check(
         "gains",
         "the listed gains are those of the run that is looked at",

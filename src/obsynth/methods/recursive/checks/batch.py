@@ -15,15 +15,15 @@ from obsynth.verification.consistency import data_deviations, state_terms
 #: Steps in the batch: enough for every matrix to matter, few enough for one dense problem.
 BATCH_STEPS = 6
 #: Of many states fewer: as many as keep the problem to this many rows, but two at least.
-MOST_ROWS = 1500
+MOST_BATCH_ROWS = 1500
 #: Seed of the record that both are given; the estimators are linear, so any record will do.
-SEED = 2013
+RECORD_SEED = 2013
 
 
 def batch_steps(stated: RecursiveObserver) -> int:
     """Return how many steps the size of a plant allows in one batch."""
     rows = len(stated.recursion.model.at(0).H)
-    return min(BATCH_STEPS, looked_at(stated), max(2, (MOST_ROWS - stated.plant.nx) // rows))
+    return min(BATCH_STEPS, looked_at(stated), max(2, (MOST_BATCH_ROWS - stated.plant.nx) // rows))
 
 
 def batch_residuals(stated: RecursiveObserver, shipped: RecursiveObserver) -> dict[str, float]:
@@ -67,7 +67,7 @@ def _record(observer: RecursiveObserver, samples: int) -> tuple[FloatArray, Floa
     """Return a random record, changed as little as is needed where equations without noise would contradict it."""
     from scipy.linalg import qr
 
-    plant, rng = observer.plant, np.random.default_rng(SEED)
+    plant, rng = observer.plant, np.random.default_rng(RECORD_SEED)
     y, u = rng.standard_normal((samples, plant.ny)), rng.standard_normal((samples, plant.nu))
     H, S, data = _problem(observer, y, u)
     # Directions without noise, by two factorisations that cost a tenth of the singular values.

@@ -34,7 +34,7 @@ from obsynth.verification.identities import EQUALITY_TOLERANCE
 #: An enclosure of variances that is wider than this share of the filter's says nothing about definiteness.
 WIDEST = 0.1
 #: So many deviations are listed in a row.
-LISTED = 6
+LISTED_DEVIATIONS = 6
 #: Both ends are told where the upper one is so many times the lower one.
 TOLD_APART = 1.001
 
@@ -134,9 +134,9 @@ def _steady_covariance(
     certain = bool(np.all(spread <= WIDEST * variances))
     listed = [
         f"{name} {low[i]:.4g} to {high[i]:.4g}" if high[i] > low[i] * TOLD_APART else f"{name} {high[i]:.4g}"
-        for i, name in enumerate(stated.plant.state_names[:LISTED])
+        for i, name in enumerate(stated.plant.state_names[:LISTED_DEVIATIONS])
     ]
-    more = f", and {len(low) - LISTED} more" if len(low) > LISTED else ""
+    more = f", and {len(low) - LISTED_DEVIATIONS} more" if len(low) > LISTED_DEVIATIONS else ""
     detail = (
         f"standard deviations {', '.join(listed)}{more}; the filter itself, whose gains move on, ends at these or below"
     )

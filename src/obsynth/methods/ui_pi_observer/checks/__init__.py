@@ -27,7 +27,7 @@ from obsynth.verification.plant import condition_rows, plant_information
 #: Estimates at a frequency may miss by this much, relative to terms that pass through the inverse of ``sI - Az``.
 DECOUPLING_TOLERANCE = 1e-8
 _PAPER = "Share Pasand, eq. (19)"
-_MATRICES = ("tracking", "Phi", "Cw", "poles", "stability")
+_UI_PI_MATRICES = ("tracking", "Phi", "Cw", "poles", "stability")
 
 
 def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
@@ -58,7 +58,7 @@ def _realisation_rows(design: ObserverDesign, printed_digits: int | None) -> Ite
     )
     if not fitting:
         return
-    tracking, phi, cw, poles, factor = (certificate.matrices[name] for name in _MATRICES)
+    tracking, phi, cw, poles, factor = (certificate.matrices[name] for name in _UI_PI_MATRICES)
     model = shipped_model(certificate.matrices, plant.nf)
     *conditions, last = existence_conditions(plant, model)
     yield from condition_rows(conditions)
@@ -86,7 +86,7 @@ def _realisation_rows(design: ObserverDesign, printed_digits: int | None) -> Ite
 
 def _fits(design: ObserverDesign) -> bool:
     (plant, observer), matrices = design.linear, design.certificate.matrices
-    if any(name not in matrices for name in _MATRICES):
+    if any(name not in matrices for name in _UI_PI_MATRICES):
         return False
     order = matrices["Phi"].shape[0]
     shapes = {

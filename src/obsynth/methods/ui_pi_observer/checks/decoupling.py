@@ -14,6 +14,7 @@ import numpy as np
 from obsynth.analysis.plant_units import PlantUnits
 from obsynth.methods.ui_pi_observer.pencils import equilibrated
 from obsynth.numerics.arrays import ComplexArray, FloatArray
+from obsynth.numerics.lapack import LAPACK_BLOCK
 from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.numerics.scaling import balancing_factors
 from obsynth.numerics.spectra import boundary_points
@@ -24,9 +25,7 @@ from obsynth.plants.descriptor import DescriptorSystem
 #: Equations whose reciprocal condition is above this are independent to the tolerance of every rank.
 FAR_FROM_SINGULAR = 1e3 * RANK_TOLERANCE
 #: A signal below this share of what a trajectory of unit size could make of it is held not to be moved.
-UNMOVED = 1e-4
-#: Columns that LAPACK turns at once: its room is so many times the columns.
-BLOCK = 64
+UNMOVED_SIGNAL = 1e-4
 
 
 @dataclass(frozen=True)
@@ -120,7 +119,7 @@ def _null_space(pencil: ComplexArray) -> tuple[ComplexArray, FloatArray, bool]:
         triangle = np.triu(packed[:equations])
         if zgecon(triangle, np.linalg.norm(triangle, 1))[0] > FAR_FROM_SINGULAR:
             last = np.eye(count, dtype=np.complex128)[:, equations:]
-            return zunmqr("L", "N", packed, factors, last, BLOCK * last.shape[1])[0], columns, True
+            return zunmqr("L", "N", packed, factors, last, LAPACK_BLOCK * last.shape[1])[0], columns, True
     _, values, right = np.linalg.svd(scaled)
     rank = int(np.sum(values > RANK_TOLERANCE * values[0]))
     return right[rank:].conj().T, columns, False
@@ -190,7 +189,7 @@ class _Passing:
         # A signal that a trajectory does not move is rounding: it is judged by what trajectories of its size could do.
         possible = passed @ (np.sum(np.abs(plant.C), axis=1) + np.sum(np.abs(dd), axis=1))
         possible[: len(states)] += 1.0
-        terms = np.maximum(np.max(size, axis=1), UNMOVED * possible)
+        terms = np.maximum(np.max(size, axis=1), UNMOVED_SIGNAL * possible)
         relative = float(np.max(np.max(np.abs(error), axis=1) / np.where(terms > 0.0, terms, 1.0), initial=0.0))
         faults = [place for place, row in enumerate(picked) if row in range(len(self.through))[self.shipped.faults]]
         return relative, float(np.max(np.linalg.norm(error[faults], axis=1), initial=0.0))

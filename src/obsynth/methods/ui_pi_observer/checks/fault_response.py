@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 #: A fault estimate counts as faithful up to the frequency where it misses by this share of the fault.
 FAITHFUL = 0.1
 #: A step counts as settled within this share, after this many time constants of the slowest pole.
-SETTLING_BAND, TIME_CONSTANTS = 0.02, 4.0
+SETTLING_BAND, SETTLING_TIME_CONSTANTS = 0.02, 4.0
 #: Eigenvalues of a fault model closer to constant courses than this, relative to the model's size, are constants.
 CONSTANT = 1e-9
 
@@ -179,7 +179,7 @@ def _undershoot(plant: DescriptorSystem, zero: complex, slowest: float) -> str:
     rate = np.log(zero.real) / plant.dt if plant.dt > 0.0 and zero.real > 0.0 else zero.real
     if (plant.dt > 0.0 and zero.real <= 1.0) or rate <= 0.0:
         return ""
-    settling = TIME_CONSTANTS / slowest
+    settling = SETTLING_TIME_CONSTANTS / slowest
     least = (1.0 - SETTLING_BAND) / np.expm1(rate * settling)
     return (
         f"inverse response: a step fault that is settled to {SETTLING_BAND:.0%} after {settling:.3g} s first shows at "

@@ -32,9 +32,9 @@ from obsynth.verification.identities import Residual, equality, residual, worst
 
 #: Recomputed poles may miss the claimed ones by this, relative to their size; claimed rates and norms likewise.
 SPECTRUM_TOLERANCE = 1e-4
-CLAIM_TOLERANCE = 1e-4
+POLE_CLAIM_TOLERANCE = 1e-4
 #: Poles that a row lists.
-LISTED = 8
+LISTED_POLES = 8
 
 
 def stability_rows(design: ObserverDesign, poles: FloatArray, factor: FloatArray) -> Iterator[Check]:
@@ -43,7 +43,7 @@ def stability_rows(design: ObserverDesign, poles: FloatArray, factor: FloatArray
     dt = plant.dt
     yield stability_row(observer.Az, factor, dt, "Share Pasand, eq. (7)")
     claimed = [complex(*row) for row in poles]
-    slowest = numbers(sorted(claimed, key=lambda pole: -pole.real))[:LISTED]
+    slowest = numbers(sorted(claimed, key=lambda pole: -pole.real))[:LISTED_POLES]
     yield upper_bound_check(
         "poles",
         "the eigenvalues of Ahat are the claimed ones, each within this share of its size",
@@ -102,7 +102,7 @@ def noise_rows(design: ObserverDesign) -> Iterator[Check]:
             "noise amplification",
             "H2 norm from white noise on every output to a fault estimate is at most the claimed one",
             largest,
-            claims["noise_amplification"] * (1.0 + CLAIM_TOLERANCE),
+            claims["noise_amplification"] * (1.0 + POLE_CLAIM_TOLERANCE),
             source="recomputed, Lyapunov equation",
             detail="outputs in their own units"
             + ("" if plant.dt else "; times the root of the sample time in s")
