@@ -18,6 +18,7 @@ from obsynth.numerics.pencils import FiniteZeros, pencil_structure
 from obsynth.numerics.ranks import RankDecision, decide_rank
 from obsynth.numerics.scaling import equilibrate_pencil
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.validation import listed
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,11 +136,10 @@ def _half_a_point(plant: DescriptorSystem) -> tuple[str, ...]:
     missing = [name for name in measured if name not in point]
     if not missing or not any(point.values()):
         return ()
-    listed = ", ".join(missing[:_MOST_QUESTIONED])
-    more = f" and {len(missing) - _MOST_QUESTIONED} more" if len(missing) > _MOST_QUESTIONED else ""
+    told = f"{', '.join(list(point)[:_MOST_QUESTIONED])}, but not {listed(missing, most=_MOST_QUESTIONED)}"
     return (
-        f"operating_point has {', '.join(list(point)[:_MOST_QUESTIONED])}, but not {listed}{more}: what a log holds of "
-        f"these is taken as a deviation. Give their values at that point as well{_rest(plant, missing)}.",
+        f"operating_point has {told}: what a log holds of these is taken as a deviation. "
+        f"Give their values at that point as well{_rest(plant, missing)}.",
     )
 
 

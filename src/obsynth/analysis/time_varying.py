@@ -69,21 +69,9 @@ def early_rows(plant: TimeVaryingDescriptorSystem, *, early: bool) -> IntArray:
     return algebraic_rows(plant, steps) if early else np.zeros(0, dtype=np.intp)
 
 
+@remembered
 def horizon_ranks(plant: TimeVaryingDescriptorSystem, *, early: bool = False) -> HorizonRanks:
     """Return rank and condition of H_k along the horizon."""
-    known = _ranks_of(plant)
-    if early not in known:
-        known[early] = _horizon_ranks(plant, early=early)
-    return known[early]
-
-
-@remembered
-def _ranks_of(_plant: TimeVaryingDescriptorSystem) -> dict[bool, HorizonRanks]:
-    """Return the cache of the ranks of a plant, with early constraints or not."""
-    return {}
-
-
-def _horizon_ranks(plant: TimeVaryingDescriptorSystem, *, early: bool) -> HorizonRanks:
     late = early_rows(plant, early=early)
     steps = plant.horizon or STEPS_WITHOUT_HORIZON
     if plant.E.is_constant and plant.C.is_constant and (plant.A.is_constant or not late.size):

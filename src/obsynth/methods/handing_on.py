@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from obsynth.errors import VerificationError
+from obsynth.plants.validation import listed
 from obsynth.results.design import ObserverDesign
 from obsynth.results.verification_report import VerificationReport
 
@@ -17,10 +18,7 @@ def unverified_mark(report: VerificationReport) -> str:
     names = [check.name for check in report.failures]
     if not names:
         return "UNVERIFIED: no check was made"
-    more = f" and {len(names) - _MOST_NAMED_CHECKS} more" if len(names) > _MOST_NAMED_CHECKS else ""
-    return (
-        f"UNVERIFIED: {len(names)} of {len(report.checks)} checks FAIL: {', '.join(names[:_MOST_NAMED_CHECKS])}{more}"
-    )
+    return f"UNVERIFIED: {len(names)} of {len(report.checks)} checks FAIL: {listed(names, most=_MOST_NAMED_CHECKS)}"
 
 
 def require_verified(design: ObserverDesign, *, unverified: bool = False) -> None:

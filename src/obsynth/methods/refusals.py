@@ -13,7 +13,7 @@ from fractions import Fraction
 import numpy as np
 
 from obsynth.analysis.conditions import Condition
-from obsynth.analysis.diagnosis.explanations import least_additions, listed, state_sensors
+from obsynth.analysis.diagnosis.explanations import least_additions, listed_sets, state_sensors
 from obsynth.analysis.existence.witnesses import EntryChange, Unclear, Witness
 from obsynth.errors import ObsynthError, PreconditionError
 from obsynth.methods.method import Method
@@ -56,7 +56,7 @@ def with_advice(error: PreconditionError, plant: DescriptorSystem, asked: Method
         return error
     sets = least_additions(plant, state_sensors(plant), holds, most=(MOST_FOR_ONE, MOST_FOR_PAIRS))
     if sets:
-        text = f"Add one of: {listed(sets)}."
+        text = f"Add one of: {listed_sets(sets)}."
     elif drops := _drops(plant, holds):
         text = f"Leave out one of: {', '.join(drops)}."
     elif error.condition in OF_THE_KIND:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import wraps
-from typing import Any, TypeAlias, TypeVar
+from inspect import Parameter, signature
+from typing import Any, Concatenate, ParamSpec, TypeAlias, TypeVar
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -17,18 +18,23 @@ ComplexArray: TypeAlias = NDArray[np.complex128]
 
 #: Stands for a size that may be zero, where something is divided by it.
 SMALLEST = 1e-300
+KEYWORD = Parameter.KEYWORD_ONLY
+Given = ParamSpec("Given")
 Made = TypeVar("Made")
 
 
-def remembered(make: Callable[[Any], Made]) -> Callable[[Any], Made]:
-    """Make something of an object that never changes once, for as long as it lives; it must not hold the object."""
-    known: WeakKeyDictionary[Any, Made] = WeakKeyDictionary()
+def remembered(make: Callable[Concatenate[Any, Given], Made]) -> Callable[Concatenate[Any, Given], Made]:
+    """Make something of an object that never changes once, for as long as it lives; it must not hold the object.
+    What else is given says what is made, and can be hashed."""
+    known: WeakKeyDictionary[Any, dict[object, Made]] = WeakKeyDictionary()
+    usual = {name: option.default for name, option in signature(make).parameters.items() if option.kind == KEYWORD}
 
     @wraps(make)
-    def once(item: Any) -> Made:
-        if item not in known:
-            known[item] = make(item)
-        return known[item]
+    def once(item: Any, /, *given: Given.args, **named: Given.kwargs) -> Made:
+        kept, key = known.setdefault(item, {}), (given, frozenset((usual | named).items()))
+        if key not in kept:
+            kept[key] = make(item, *given, **named)
+        return kept[key]
 
     return once
 

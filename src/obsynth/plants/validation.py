@@ -50,6 +50,12 @@ def index_of(name: str, names: Sequence[str], *, what: str) -> int:
     raise SpecError(f"{what} has no signal named {name!r}.{suggestion(name, names)}", path=what)
 
 
+def listed(texts: Sequence[str], *, most: int = 6) -> str:
+    """Return some names or numbers as one text, and how many more there are."""
+    more = f" and {len(texts) - most} more" if len(texts) > most else ""
+    return f"{', '.join(texts[:most])}{more}"
+
+
 def suggestion(name: str, names: Iterable[str]) -> str:
     """Return a question with the names closest to a wrong one, beginning with a space; empty where none is close."""
     close = difflib.get_close_matches(name, list(names), n=3)

@@ -22,6 +22,7 @@ from obsynth.observers.windows import WindowObserver
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.plants.validation import listed
 from obsynth.plotting.frequency import FaultGains
 from obsynth.report.designs import (
     FAR_FROM_ONE,
@@ -199,8 +200,7 @@ def _speed(design: ObserverDesign, steps: Mapping[str, FaultFigures]) -> Iterato
     reached = [(name, found.most) for name, found in steps.items() if found.reaches]
     told = [f"{name} {number(most, digits=4)} s" for name, most in reached if most > (late[name] + 0.5) * observer.dt]
     if told:
-        more = f" and {len(told) - _MOST_IN_SUMMARY} more" if len(told) > _MOST_IN_SUMMARY else ""
-        yield "step", f"90 % is shown after: {', '.join(told[:_MOST_IN_SUMMARY])}{more}"
+        yield "step", f"90 % is shown after: {listed(told, most=_MOST_IN_SUMMARY)}"
 
 
 def _assumptions(design: ObserverDesign) -> Iterator[str]:

@@ -19,6 +19,8 @@ from obsynth.results.gain_sets import design_as_dict
 
 #: A design without tolerances says this.
 EXACT_MODEL = "assumes an exact model"
+#: Constants that are blamed at most.
+MOST_BLAMED = 4
 #: What is to blame for less is left out.
 LISTED_BLAME_SHARE = 5e-3
 #: What a certificate of robustness claims.
@@ -235,8 +237,8 @@ def robustness_statement(claims: Mapping[str, Any], design: ObserverDesign, dige
     return f"For every plant with {box}: {', '.join(words)}{linear}. Gain set {digest[:SHOWN_DIGITS]}."
 
 
-def _top(shares: Mapping[str, float], most: int = 4) -> str:
-    found = sorted(shares.items(), key=lambda item: -item[1])[:most]
+def _top(shares: Mapping[str, float]) -> str:
+    found = sorted(shares.items(), key=lambda item: -item[1])[:MOST_BLAMED]
     return (
         ", ".join(f"{name} {100.0 * share:.0f} %" for name, share in found if share > LISTED_BLAME_SHARE) or "nothing"
     )

@@ -17,7 +17,7 @@ with balls K, U, J, L, zero in exact arithmetic: `errors_per_unit`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, TypeAlias
@@ -30,7 +30,7 @@ from obsynth.numerics.scaling import balance_by_least_squares
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.balls import Ball, rounded_up
-from obsynth.proofs.contraction import Contraction, prove_contraction, proved_contractions
+from obsynth.proofs.contraction import Contraction, prove_contraction
 from obsynth.proofs.extended_balls import ExtendedBall
 from obsynth.proofs.peak_sums import absolute_gains
 from obsynth.proofs.products import as_ball
@@ -392,11 +392,6 @@ def _as_ball(part: Ball | ExtendedBall) -> Ball:
     found = as_ball(part.content)
     nothing = np.reshape([entry.is_zero() for entry in part.content.entries()], found.shape)
     return Ball(np.where(nothing, 0.0, found.midpoint), np.where(nothing, 0.0, found.radius))
-
-
-def contractions_of(observer: LinearObserver) -> Iterator[Contraction]:
-    """Yield every contraction of a shipped observer's state that is proved: which comes first may hang on rounding."""
-    return proved_contractions(observer.Az, discrete=observer.dt > 0.0)
 
 
 def contraction_of(observer: LinearObserver) -> Contraction | None:

@@ -14,6 +14,7 @@ from obsynth.numerics.norms import hinf_norm
 from obsynth.numerics.pencils import FiniteZeros, PencilStructure, pencil_structure
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.validation import listed
 from obsynth.proofs.balls import Ball
 from obsynth.proofs.contraction import column_norms, prove_contraction
 from obsynth.proofs.peak_sums import gathered, interval_pieces, peak_sums
@@ -59,12 +60,9 @@ def plant_information(plant: DescriptorSystem, structure: PencilStructure | None
 
 
 def _eigenvalue_text(values: Iterable[complex]) -> str:
-    listed = sorted((complex(value) for value in values), key=abs, reverse=True)
-    shown = [
-        f"{v.real:.4g}" if abs(v.imag) < SHOWN_AS_REAL else f"{v.real:.4g}{v.imag:+.4g}j"
-        for v in listed[:MOST_EIGENVALUES]
-    ]
-    return ", ".join(shown) + (f", and {len(listed) - MOST_EIGENVALUES} more" if len(listed) > MOST_EIGENVALUES else "")
+    ordered = sorted((complex(value) for value in values), key=abs, reverse=True)
+    texts = [f"{v.real:.4g}" if abs(v.imag) < SHOWN_AS_REAL else f"{v.real:.4g}{v.imag:+.4g}j" for v in ordered]
+    return listed(texts, most=MOST_EIGENVALUES)
 
 
 def condition_rows(conditions: Iterable[Condition]) -> Iterator[Check]:

@@ -18,6 +18,7 @@ from obsynth.numerics.ranks import BOUNDARY_TOLERANCE
 from obsynth.numerics.spectra import boundary_points
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.proofs.balls import rounded_up
+from obsynth.proofs.contraction import proved_contractions
 from obsynth.results.checks import Check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.error_system import (
@@ -25,7 +26,6 @@ from obsynth.verification.error_system import (
     ErrorModel,
     RemainderChannel,
     contraction_of,
-    contractions_of,
 )
 
 #: Claimed bounds have room for what rounding of the contraction can do on another machine; at most this share of them.
@@ -94,7 +94,7 @@ class StoredErrors:
     def least(self, observer: LinearObserver) -> StoredErrors:
         """Return the least bounds by all contractions that are found: any of them is a proof."""
         bounds = self.bounds
-        for contraction in contractions_of(observer):
+        for contraction in proved_contractions(observer.Az, discrete=observer.dt > 0.0):
             others = self.channel.errors_per_unit(observer, contraction)
             bounds = tuple(np.fmin(one, other) for one, other in zip(bounds, others, strict=True))
         return replace(self, bounds=bounds)

@@ -17,7 +17,7 @@ from obsynth.analysis.diagnosis.explanations import (
     Sensor,
     hidden_motion,
     least_additions,
-    listed,
+    listed_sets,
     state_sensors,
 )
 from obsynth.analysis.diagnosis.fault_columns import Question, dc_point, others
@@ -43,7 +43,7 @@ MOST_ADDITIONS = 300
 #: Zeros that are named in a sentence; the others are counted.
 MOST_ZEROS = 4
 _PART_OF_THE_BANK = (
-    "Of {count} faults, the residuals listed see all faults, all but one, or one alone; others may exist. "
+    "Of {count} faults, the residuals listed_sets see all faults, all but one, or one alone; others may exist. "
     "diagnose(..., whole_bank=True) and obsynth check --whole-bank list all of up to 12 faults."
 )
 
@@ -106,7 +106,7 @@ def diagnose(
     whole_bank = truth(whole_bank, "whole_bank")
     if whole_bank and plant.nf > MOST_FAULTS_OF_WHOLE_BANK:
         raise SpecError(
-            f"The plant has {plant.nf} faults: the whole bank of residuals is listed for up to "
+            f"The plant has {plant.nf} faults: the whole bank of residuals is listed_sets for up to "
             f"{MOST_FAULTS_OF_WHOLE_BANK}. Leave faults out, or whole_bank.",
             path="whole_bank",
         )
@@ -256,14 +256,14 @@ def _suggestion(candidates: _Candidates, name: str, shown: Question, *, step: bo
     constant = () if step else candidates.additions(fault, rest, lambda changed: free(changed).shows_at_rest)
     texts = []
     if full:
-        texts.append(f"{name}: Add one of: {listed(full)}.")
+        texts.append(f"{name}: Add one of: {listed_sets(full)}.")
     elif constant:
-        texts.append(f"{name}: Add one of: {listed(constant)} (then it can be estimated as a step).")
+        texts.append(f"{name}: Add one of: {listed_sets(constant)} (then it can be estimated as a step).")
     if not shown.visible:
         showing = candidates.additions(fault, (), lambda changed: Question(changed, (), fault).visible)
         more = [names for names in showing if names not in (*full, *constant)]
         if more:
-            texts.append(f"{name}: {listed(more)} would show it, but not its size.")
+            texts.append(f"{name}: {listed_sets(more)} would show it, but not its size.")
     if not candidates.searched:
         texts.append(f"{name}: obsynth.sensor_sets searches which sensors would help.")
     elif not texts and plant.nx:

@@ -20,6 +20,8 @@ from obsynth.plants.descriptor import DescriptorSystem
 MOST_STATES_FOR_SENSOR_PAIRS = 24
 #: Plants with more states are not searched for suggestions at all.
 MOST_STATES_FOR_SENSORS = 120
+#: Sets of sensors that are listed; the others are counted.
+MOST_LISTED_CHOICES = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,10 +95,11 @@ def least_additions(
     return ()
 
 
-def listed(sets: Sequence[Sequence[str]], most: int = 6) -> str:
+def listed_sets(sets: Sequence[Sequence[str]]) -> str:
     """Return sensor sets as a text: ``theta l, or omega l with i``."""
-    texts = [" with ".join(names) for names in sets[:most]]
-    return ", ".join(texts) + (f", or {len(sets) - most} others" if len(sets) > most else "")
+    texts = [" with ".join(names) for names in sets[:MOST_LISTED_CHOICES]]
+    more = len(sets) - MOST_LISTED_CHOICES
+    return ", ".join(texts) + (f", or {more} others" if more > 0 else "")
 
 
 #: A motion is stated where it cancels the fault to this, relative to the fault's own column.

@@ -70,21 +70,14 @@ def zeros_at_rounding_level(
         value
         for value in map(complex, found)
         if not any(abs(value - other) <= SAME_ZERO_DISTANCE * max(1.0, abs(other)) for other in exact)
-        and relative_singular_value(E, A, value, nx=nx) <= ROUNDING_LEVEL
+        and relative_singular_values(E, A, [value], nx=nx)[0] <= ROUNDING_LEVEL
     ]
-
-
-def relative_singular_value(
-    E: FloatArray, A: FloatArray, point: complex, *, nx: int, sizes: FloatArray | None = None
-) -> float:
-    """Return the least singular value at a point over the largest, in units that suit A, or ``sizes`` of its terms."""
-    return float(relative_singular_values(E, A, [point], nx=nx, sizes=sizes)[0])
 
 
 def relative_singular_values(
     E: FloatArray, A: FloatArray, points: Sequence[complex], *, nx: int, sizes: FloatArray | None = None
 ) -> FloatArray:
-    """Return `relative_singular_value` at some points: one scaling for all of a size, many matrices at once."""
+    """Return the least singular value over the largest at each point, in units of A or of ``sizes`` of its terms."""
     found = np.full(len(points), 0.0 if A.shape[1] else np.inf)
     if A.shape[0] < A.shape[1] or not A.size:
         return found

@@ -18,7 +18,7 @@ from obsynth.analysis.existence.distance import (
     Distance,
     distance_to_loss,
     least_share,
-    relative_singular_value,
+    relative_singular_values,
     zeros_at_rounding_level,
 )
 from obsynth.analysis.existence.named_pencils import named_pencil, unclear
@@ -94,7 +94,8 @@ def _lost_in_computing(facts: SystemFacts, E: FloatArray, A: FloatArray, *, nx: 
         return None
     dt = 1.0 if discrete else 0.0
     values = [*facts.zeros, *map(complex, system_zeros(E, A, nx=nx).values)]
-    found = [Distance(relative_singular_value(E, A, value, nx=nx), value) for value in values if is_outside(value, dt)]
+    outside = [value for value in values if is_outside(value, dt)]
+    found = map(Distance, map(float, relative_singular_values(E, A, outside, nx=nx)), outside)
     best = min(found, key=lambda distance: distance.value, default=None)
     return best if best is not None and best.value <= COMPUTED else None
 

@@ -19,6 +19,7 @@ from obsynth.numerics.scaling import equilibrate_pencil
 from obsynth.numerics.sparse import CoarseStructure, Indices, blocks_of, coarse_structure, csr, unmatched_instead
 from obsynth.numerics.sparse_factor import SparseFactor, scales_by_all_entries, sparse_factor
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.validation import listed
 
 #: Rank that a matrix may lack beyond what its shape says, to begin with.
 BORDER = 8
@@ -215,8 +216,8 @@ def raise_structurally_singular(plant: DescriptorSystem, equations: Indices, var
     names = [plant.state_names[i] for i in variables]
     raise PreconditionError(
         "The plant is not regular, det(A - zE) is zero for every z and whatever the numbers are: "
-        + f"{listed(names)} {'is' if len(names) == 1 else 'are'} in too few equations, and equations "
-        + f"{listed([equation_name(plant, i) for i in equations], quoted=False)} hold too few variables. Check for a "
+        f"{listed([repr(name) for name in names])} {'is' if len(names) == 1 else 'are'} in too few equations, and "
+        f"equations {listed([equation_name(plant, i) for i in equations])} hold too few variables. Check for a "
         "missing or repeated equation.",
         condition="regularity",
         signals=names,
@@ -231,9 +232,3 @@ def own_first(places: Indices, others: Indices) -> Indices:
 def equation_name(plant: DescriptorSystem, row: int) -> str:
     """Return the number of an equation and the variable of the same number, whose equation it is by convention."""
     return f"{int(row) + 1} (of {plant.state_names[int(row)]!r})"
-
-
-def listed(names: list[str], *, most: int = 6, quoted: bool = True) -> str:
-    """Return some names in words, and how many more there are."""
-    shown = [repr(name) if quoted else name for name in names[:most]]
-    return ", ".join(shown) + (f" and {len(names) - most} more" if len(names) > most else "")

@@ -11,7 +11,6 @@ from obsynth.analysis.transformations.idle_variables import (
     ActiveVariables,
     active_part,
     equation_name,
-    listed,
     own_first,
 )
 from obsynth.analysis.transformations.recovery_operator import RecoveryOperator, without_rounding
@@ -23,6 +22,7 @@ from obsynth.numerics.scaling import power_of_two_below
 from obsynth.numerics.sparse import coarse_structure, components_of, csr, dense, selection
 from obsynth.numerics.sparse_factor import NullVectors, SolutionBounds, scales_by_all_entries, sparse_factor
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.validation import listed
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,9 +51,10 @@ class SparseReduction:
         """Return one sentence about derivatives that were taken as zero; empty where there are none."""
         if not self.neglected:
             return ""
+        states = listed([repr(name) for name in self.neglected])
         return (
             f"Taken as algebraic, since the coefficients of their derivatives in E are less than {RANK_TOLERANCE:g} of "
-            f"the largest in suitable units: {listed(list(self.neglected))}. Give E zeros there, or larger entries."
+            f"the largest in suitable units: {states}. Give E zeros there, or larger entries."
         )
 
 
@@ -240,9 +241,9 @@ def not_index_one(
     variables = active.columns[variables]
     equations = own_first(active.rows[equations], variables)
     names = tuple(plant.state_names[i] for i in variables)
-    numbers = listed([equation_name(plant, i) for i in equations], quoted=False)
+    numbers = listed([equation_name(plant, i) for i in equations])
     does = f"equation {numbers} does" if len(equations) == 1 else f"equations {numbers} do"
-    does = f"{does} not determine {listed(list(names))}"
+    does = f"{does} not determine {listed([repr(name) for name in names])}"
     if not regular:
         return PreconditionError(
             f"The plant is not regular: det(A - zE) is zero for every z, and {does}. Check for a missing or repeated "

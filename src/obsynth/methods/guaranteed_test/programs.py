@@ -37,9 +37,9 @@ class Optimum:
     point: FloatArray | None = None
 
 
-def largest_hidden_fault(window: Window, right: FloatArray | None = None, *, sign: float = 1.0) -> Optimum:
-    """Return the largest theta (``sign`` -1: the least) of the equations with these right sides, zero by default."""
-    if window.question.ellipsoid and right is None:
+def largest_hidden_fault(window: Window) -> Optimum:
+    """Return the largest theta of the equations with zero right sides."""
+    if window.question.ellipsoid:
         return _in_ellipsoids(window)
     from scipy.optimize import linprog
     from scipy.sparse import diags_array
@@ -47,24 +47,23 @@ def largest_hidden_fault(window: Window, right: FloatArray | None = None, *, sig
     rows, columns = window.scales
     matrix = diags_array(np.ldexp(1.0, rows)) @ window.matrix @ diags_array(np.ldexp(1.0, columns))
     cost = np.zeros(len(window.bar))
-    cost[0] = -sign
+    cost[0] = -1.0
     ends = np.ldexp(window.bar, -columns)
-    known = np.zeros(window.rows) if right is None else np.ldexp(right, rows)
 
-    given = {"A_eq": matrix.tocsr(), "b_eq": known, "bounds": np.stack([-ends, ends], axis=1)}
+    given = {"A_eq": matrix.tocsr(), "b_eq": np.zeros(window.rows), "bounds": np.stack([-ends, ends], axis=1)}
     for method, options in ATTEMPTS:
         found = linprog(cost, method=method, options=options, **given)
         if found.status in (SOLVED_STATUS, UNBOUNDED):
             break
     if found.status == UNBOUNDED:
-        return Optimum(np.inf * sign)
+        return Optimum(np.inf)
     if found.status != SOLVED_STATUS:
         raise SolverError(
             f"HiGHS has no answer for the linear programme of {window.question.samples} samples (status "
             f"{found.status}): the result is inconclusive. "
             "Fewer samples, or signals in units in which they are near one, may help."
         )
-    multipliers = np.ldexp(-sign * np.asarray(found.eqlin.marginals), rows)
+    multipliers = np.ldexp(-np.asarray(found.eqlin.marginals), rows)
     scale = float(window.matrix[:, [0]].toarray().ravel() @ multipliers)
     point = np.ldexp(np.asarray(found.x), columns)
     if abs(scale) > 0.0:

@@ -26,21 +26,10 @@ from obsynth.proofs.exact_arithmetic import holds_computed
 _SOURCE = "Filasova et al., eqs. (1), (2)"
 
 
+@remembered
 def pd_observer_conditions(plant: DescriptorSystem, *, exactly: bool = True) -> tuple[Condition, ...]:
     """Return the existence conditions of the PD observer, in order; the list ends at the first failure."""
-    known = _decided(plant)
-    if exactly not in known:
-        known[exactly] = _conditions(plant.dense(), exactly=exactly)
-    return known[exactly]
-
-
-@remembered
-def _decided(_plant: DescriptorSystem) -> dict[bool, tuple[Condition, ...]]:
-    """Return the cache of the conditions of a plant, decided exactly or not: synthesis and verification use it."""
-    return {}
-
-
-def _conditions(plant: DescriptorSystem, *, exactly: bool) -> tuple[Condition, ...]:
+    plant = plant.dense()
     first = up_to_failure(_form_conditions(Evaluator(plant, exactly)))
     if not all(condition.holds for condition in first):
         return first

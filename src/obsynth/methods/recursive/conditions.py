@@ -80,10 +80,7 @@ def identifiability_condition(
 ) -> Condition:
     """Return the condition that outputs tell the parameters from each other and from the state."""
     still = all(matrix.is_constant for matrix in (plant.E, plant.A, plant.C, plant.Phi, plant.Psi))
-    known = _traces_of(plant)
-    if early not in known:
-        known[early] = _steady(plant) if still else _along(plant, early=early)
-    decision, kernel = known[early]
+    decision, kernel = _steady(plant) if still else _along(plant, early=early)
     if still and constant is not None:
         decision = _settled_traces(constant, decision)
     wanted = "rank [A - E, Phi; C, Psi]" if still else "rank of the traces of all parameters"
@@ -111,12 +108,6 @@ def _settled_traces(judge: Evaluator, decision: RankDecision) -> RankDecision:
     return settled_rank(decision, numbers.rank_at_root(numbers.matrix("Bf"), numbers.matrix("Df"), fmpz_poly([-1, 1])))
 
 
-@remembered
-def _traces_of(_plant: TimeVaryingDescriptorSystem) -> dict[bool, tuple[RankDecision, _Kernel]]:
-    """Return the cache of the traces of a plant's parameters, with early constraints or not."""
-    return {}
-
-
 def _explained(kernel: _Kernel, names: tuple[str, ...], plant: TimeVaryingDescriptorSystem) -> str:
     hidden = ", ".join(map(repr, kernel.states))
     with_states = f" together with constant shifts of {hidden}" if hidden else ""
@@ -134,6 +125,7 @@ def _explained(kernel: _Kernel, names: tuple[str, ...], plant: TimeVaryingDescri
     return f"{text}. Estimate fewer parameters, or measure something that they act on."
 
 
+@remembered
 def _steady(plant: TimeVaryingDescriptorSystem) -> tuple[RankDecision, _Kernel]:
     """Decide about a time-invariant plant by its state and parameters at rest."""
     whole = np.block([[plant.A.at(0) - plant.E.at(1), plant.Phi.at(0)], [plant.C.at(1), plant.Psi.at(0)]])
@@ -146,6 +138,7 @@ def _steady(plant: TimeVaryingDescriptorSystem) -> tuple[RankDecision, _Kernel]:
     return decision, _kernel_of(parameters, pencil.columns[plant.nx :], involved)
 
 
+@remembered
 def _along(plant: TimeVaryingDescriptorSystem, *, early: bool) -> tuple[RankDecision, _Kernel]:
     """Decide along the horizon, by the whitened traces of the parameters for noise of unit size everywhere."""
     late = early_rows(plant, early=early)

@@ -20,12 +20,15 @@ from obsynth.numerics.ranks import RANK_TOLERANCE, rounding_rank
 from obsynth.numerics.scaling import balance_by_least_squares, balanced_matrix
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.validation import listed
 from obsynth.results.checks import Check, information, lower_bound_check, upper_bound_check
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.error_system import ErrorModel
 from obsynth.verification.identities import ALIKE, equality, relative_tolerance, residual, tracking_identities, worst
 from obsynth.verification.plant import condition_rows, plant_information
 
+#: Eigenvalues that a row lists; the others are counted.
+LISTED_EIGENVALUES = 8
 _PD_IDENTITIES = {
     "dynamics": ("unbiased: dynamics", "Az + By C = A, with the faults as states", "Filasova et al., eq. (29)"),
     "inputs": ("unbiased: inputs", "Bu + By D = B", "Filasova et al., eq. (4)"),
@@ -187,13 +190,13 @@ def _parts(plant: DescriptorSystem, errors: PdErrorSystem) -> Iterator[Check]:
     )
 
 
-def spectrum_text(matrix: FloatArray, most: int = 8) -> str:
+def spectrum_text(matrix: FloatArray) -> str:
     """Return the eigenvalues of a matrix as text, slowest first, conjugate pairs once."""
     if not np.all(np.isfinite(matrix)):
         return "not finite"
     values = sorted((complex(value) for value in np.linalg.eigvals(matrix)), key=lambda v: (-v.real, v.imag))
     shown = [f"{v.real:.4g}" if v.imag == 0.0 else f"{v.real:.4g} +- {v.imag:.4g}j" for v in values if v.imag >= 0.0]
-    return ", ".join(shown[:most]) + (f", and {len(shown) - most} more" if len(shown) > most else "")
+    return listed(shown, most=LISTED_EIGENVALUES)
 
 
 def _pencil_row(design: ObserverDesign, augmented: DescriptorSystem) -> Check:

@@ -25,6 +25,7 @@ from obsynth.observers.recursive.gain_schedule import GainStep
 from obsynth.observers.recursive.gain_schedule_summary import CLEARLY_STABLE
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.recursive.step_model import StepMatrices
+from obsynth.plants.validation import listed
 from obsynth.proofs.balls import Ball, rounded_up
 from obsynth.proofs.contraction import Contraction, column_norms, prove_contraction, proved_rate
 from obsynth.proofs.definiteness import prove_positive_definite
@@ -132,13 +133,13 @@ def _steady_covariance(
     low, high = np.sqrt(np.maximum(middle - spread, 0.0)), np.sqrt(rounded_up(np.abs(middle) + spread, 4))
     proof = prove_positive_definite(enclosed)
     certain = bool(np.all(spread <= WIDEST * variances))
-    listed = [
+    deviations = [
         f"{name} {low[i]:.4g} to {high[i]:.4g}" if high[i] > low[i] * TOLD_APART else f"{name} {high[i]:.4g}"
-        for i, name in enumerate(stated.plant.state_names[:LISTED_DEVIATIONS])
+        for i, name in enumerate(stated.plant.state_names)
     ]
-    more = f", and {len(low) - LISTED_DEVIATIONS} more" if len(low) > LISTED_DEVIATIONS else ""
     detail = (
-        f"standard deviations {', '.join(listed)}{more}; the filter itself, whose gains move on, ends at these or below"
+        f"standard deviations {listed(deviations, most=LISTED_DEVIATIONS)}; the filter itself, whose gains move on, "
+        "ends at these or below"
     )
     source = "P = L A P A' L' + L Q L' + K R K', outward rounded"
     if proof.proved:
