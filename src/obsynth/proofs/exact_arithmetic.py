@@ -40,6 +40,24 @@ def identity(order: int) -> fmpq_mat:
     return fmpq_mat(order, order, [int(i == j) for i in range(order) for j in range(order)])
 
 
+def picked_columns(matrix: fmpq_mat, columns: Sequence[int]) -> fmpq_mat:
+    """Return some columns."""
+    rows = int(matrix.nrows())
+    return fmpq_mat(rows, len(columns), [matrix[i, j] for i in range(rows) for j in columns])
+
+
+def picked_rows(matrix: fmpq_mat, rows: Sequence[int]) -> fmpq_mat:
+    """Return some rows."""
+    columns = int(matrix.ncols())
+    return fmpq_mat(len(rows), columns, [matrix[i, j] for i in rows for j in range(columns)])
+
+
+def row_basis(matrix: fmpq_mat) -> fmpq_mat:
+    """Return a basis of the rows, in reduced echelon form."""
+    reduced, rank = matrix.rref()
+    return picked_rows(reduced, range(rank))
+
+
 def pivot_columns(matrix: fmpq_mat) -> list[int]:
     """Return the columns, from the left, that are no combination of those before them."""
     return _leading(*matrix.rref())
@@ -60,6 +78,11 @@ def null_basis(matrix: fmpq_mat) -> fmpq_mat:
         for i, pivot in enumerate(pivots):
             basis[pivot, k] = -reduced[i, j]
     return basis
+
+
+def left_null_basis(matrix: fmpq_mat) -> fmpq_mat:
+    """Return a basis ``(m - rank, m)`` of the left null space, as rows."""
+    return null_basis(matrix.transpose()).transpose()
 
 
 def with_integer_entries(E: fmpq_mat, A: fmpq_mat) -> tuple[fmpz_mat, fmpz_mat]:

@@ -25,10 +25,14 @@ from obsynth.proofs.exact_arithmetic import (
     blocks,
     holds_computed,
     identity,
+    left_null_basis,
     locate_roots,
     null_basis,
+    picked_columns,
+    picked_rows,
     pivot_columns,
     primitive,
+    row_basis,
     written_fraction,
     written_matrix,
     zeros_matrix,
@@ -169,10 +173,10 @@ class ReducedQuestion(ExactQuestion):
         return _Parts(
             a,
             c,
-            _columns(right, [self.number]),
-            _columns(outputs, [self.number]),
-            _columns(right, rest),
-            _columns(outputs, rest),
+            picked_columns(right, [self.number]),
+            picked_columns(outputs, [self.number]),
+            picked_columns(right, rest),
+            picked_columns(outputs, rest),
         )
 
     @cached_property
@@ -198,15 +202,15 @@ class ReducedQuestion(ExactQuestion):
         (A, C, F, G, K, L), n = self._parts, self.order
         rows = blocks([[C, G, L]])
         for _ in range(n):
-            new = _left_null_basis(_columns(rows, range(n, rows.ncols()))) * _columns(rows, range(n))
+            new = left_null_basis(picked_columns(rows, range(n, rows.ncols()))) * picked_columns(rows, range(n))
             if new.rank() == 0:
                 break
             more = blocks([[rows], [blocks([[new * A, new * F, new * K]])]])
             if more.rank() == rows.rank():
                 break
             # Every pass adds rows that repeat others: only what they span counts.
-            rows = more if more.nrows() <= more.ncols() else _row_space(more)
-        c, direct, vector, order = _columns(rows, range(n)), _columns(rows, [n]), F, 0
+            rows = more if more.nrows() <= more.ncols() else row_basis(more)
+        c, direct, vector, order = picked_columns(rows, range(n)), picked_columns(rows, [n]), F, 0
         while _is_zero(direct) and order <= n:
             direct, vector = c * vector, A * vector
             order += 1
@@ -225,45 +229,28 @@ def _reduced(e: fmpq_mat, a: fmpq_mat, right: fmpq_mat) -> tuple[fmpq_mat, fmpq_
         if kernel.ncols() == 0:
             break
         kept = pivot_columns(e)
-        rest = _left_null_basis(a * kernel)
-        e, a, right = rest * _columns(e, kept), rest * _columns(a, kept), rest * right
+        rest = left_null_basis(a * kernel)
+        e, a, right = rest * picked_columns(e, kept), rest * picked_columns(a, kept), rest * right
     rows = pivot_columns(e.transpose())
-    free = _left_null_basis(e)
-    top, c, outputs = _rows(e, rows), free * a, free * right
+    free = left_null_basis(e)
+    top, c, outputs = picked_rows(e, rows), free * a, free * right
     if not rows:
         return zeros_matrix(0, 0), zeros_matrix(c.nrows(), 0), zeros_matrix(0, right.ncols()), outputs, fmpq_poly([1])
-    whole = top.solve(blocks([[_rows(a, rows), _rows(right, rows)]]))
+    whole = top.solve(blocks([[picked_rows(a, rows), picked_rows(right, rows)]]))
     n = len(rows)
-    a, right = _columns(whole, range(n)), _columns(whole, range(n, whole.ncols()))
-    seen = _row_space(c)
+    a, right = picked_columns(whole, range(n)), picked_columns(whole, range(n, whole.ncols()))
+    seen = row_basis(c)
     while True:
-        more = _row_space(blocks([[seen], [seen * a]]))
+        more = row_basis(blocks([[seen], [seen * a]]))
         if more.nrows() == seen.nrows():
             break
         seen = more
     if seen.nrows() == n:
         return a, c, right, outputs, fmpq_poly([1])
     pivots = pivot_columns(seen)
-    kept_a = _columns(seen * a, pivots)
+    kept_a = picked_columns(seen * a, pivots)
     zeros = a.charpoly() / kept_a.charpoly() if pivots else a.charpoly()
-    return kept_a, _columns(c, pivots), seen * right, outputs, fmpq_poly(zeros)
-
-
-def _row_space(matrix: fmpq_mat) -> fmpq_mat:
-    reduced, rank = matrix.rref()
-    return _rows(reduced, range(rank))
-
-
-def _columns(matrix: fmpq_mat, columns: Sequence[int]) -> fmpq_mat:
-    return fmpq_mat(matrix.nrows(), len(columns), [matrix[i, j] for i in range(matrix.nrows()) for j in columns])
-
-
-def _rows(matrix: fmpq_mat, rows: Sequence[int]) -> fmpq_mat:
-    return fmpq_mat(len(rows), matrix.ncols(), [matrix[i, j] for i in rows for j in range(matrix.ncols())])
-
-
-def _left_null_basis(matrix: fmpq_mat) -> fmpq_mat:
-    return null_basis(matrix.transpose()).transpose()
+    return kept_a, picked_columns(c, pivots), seen * right, outputs, fmpq_poly(zeros)
 
 
 def _is_zero(matrix: fmpq_mat) -> bool:

@@ -16,7 +16,7 @@ from flint import fmpq, fmpq_mat
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.pencil_points import full_svd, largest_singular_value
 from obsynth.numerics.ranks import RANK_TOLERANCE, TRACE_TOLERANCE
-from obsynth.proofs.exact_arithmetic import blocks, zeros_matrix
+from obsynth.proofs.exact_arithmetic import blocks, picked_columns, zeros_matrix
 
 
 def exact_residual_order(A: fmpq_mat, C: fmpq_mat, F: fmpq_mat, G: fmpq_mat, K: fmpq_mat, L: fmpq_mat) -> int | None:
@@ -32,7 +32,7 @@ def exact_residual_order(A: fmpq_mat, C: fmpq_mat, F: fmpq_mat, G: fmpq_mat, K: 
         free = without.nrows()
         z, f = _split(without, known, n)
         rows = blocks([[rows, zeros_matrix(rows.nrows(), 1)], [z * K, z * A, z * F, f]])
-    equations = _slice(rows, known, rows.ncols())
+    equations = picked_columns(rows, range(known, rows.ncols()))
     base = equations
     for order in range(n + 1):
         if _from_column(equations, n).nrows():
@@ -46,12 +46,8 @@ def exact_residual_order(A: fmpq_mat, C: fmpq_mat, F: fmpq_mat, G: fmpq_mat, K: 
     return None
 
 
-def _slice(rows: fmpq_mat, first: int, end: int) -> fmpq_mat:
-    return fmpq_mat(rows.nrows(), end - first, [value for row in rows.tolist() for value in row[first:end]])
-
-
 def _split(rows: fmpq_mat, known: int, n: int) -> tuple[fmpq_mat, fmpq_mat]:
-    return _slice(rows, known, known + n), _slice(rows, known + n, rows.ncols())
+    return picked_columns(rows, range(known, known + n)), picked_columns(rows, range(known + n, rows.ncols()))
 
 
 def _echelon(rows: fmpq_mat) -> list[list[fmpq]]:

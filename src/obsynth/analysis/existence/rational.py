@@ -202,14 +202,15 @@ class WrittenNumbers(PlantNumbers):
 
     def picked(self, matrix: fmpq_mat, columns: Sequence[int]) -> fmpq_mat:
         """Return some columns."""
-        from flint import fmpq_mat
+        from obsynth.proofs.exact_arithmetic import picked_columns
 
-        rows = int(matrix.nrows())
-        return fmpq_mat(rows, len(columns), [matrix[i, j] for i in range(rows) for j in columns])
+        return picked_columns(matrix, columns)
 
     def rows(self, matrix: fmpq_mat, rows: Sequence[int]) -> fmpq_mat:
         """Return some rows."""
-        return self.picked(matrix.transpose(), [int(row) for row in rows]).transpose()
+        from obsynth.proofs.exact_arithmetic import picked_rows
+
+        return picked_rows(matrix, [int(row) for row in rows])
 
     def pencil(self, inputs: fmpq_mat, direct: fmpq_mat) -> ExactPencil:
         """Return ``[A - s E, inputs; C, direct]``."""

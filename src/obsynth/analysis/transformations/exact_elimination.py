@@ -79,7 +79,16 @@ def exact_elimination(plant: DescriptorSystem) -> ExactElimination | None:
 def _eliminated(plant: DescriptorSystem, *, clean: bool, sized: bool = True) -> ExactElimination | None:
     """Return the elimination; with ``clean`` what rounding of computed data may have left is zero.
     Without ``sized`` the sizes of terms are left out."""
-    from obsynth.proofs.exact_arithmetic import blocks, null_basis, pivot_columns, written_matrix
+    from obsynth.proofs.exact_arithmetic import (
+        blocks,
+        identity,
+        null_basis,
+        picked_columns,
+        picked_rows,
+        pivot_columns,
+        written_matrix,
+        zeros_matrix,
+    )
 
     e, a, c = (written_matrix(matrix) for matrix in (plant.E, plant.A, plant.C))
     pivots, rows = pivot_columns(e), pivot_columns(e.transpose())
@@ -87,13 +96,14 @@ def _eliminated(plant: DescriptorSystem, *, clean: bool, sized: bool = True) -> 
         return None
     null, left = null_basis(e), null_basis(e.transpose()).transpose()
     signals = [written_matrix(getattr(plant, name)) for name in _EXACT_INPUTS]
-    keep, take = _units(plant.nx, pivots), _units(plant.nx, rows).transpose()
+    whole = identity(plant.nx)
+    keep, take = picked_columns(whole, pivots), picked_rows(whole, rows)
     right = blocks([[a * keep, *signals]])
     coupling = left * a * null
     if plant.nx > len(pivots) and coupling.det() == 0:
         return None
     direct = blocks([[c * keep, *(written_matrix(getattr(plant, name)) for name in _EXACT_DIRECT)]])
-    states = blocks([[keep, *(_zeros(plant.nx, int(signal.ncols())) for signal in signals)]])
+    states = blocks([[keep, *(zeros_matrix(plant.nx, int(signal.ncols())) for signal in signals)]])
     moving, leading = take * right, take * e * keep
     # The inverses are asked for their sizes alone.
     inverses = [_sizes(part.inv()) for part in (coupling, leading)] if clean or sized else []
@@ -146,7 +156,13 @@ def rounded_once(
     import flint
 
     from obsynth.proofs.enclosed_pencils import enclosed
-    from obsynth.proofs.exact_arithmetic import nearest_doubles, pivot_columns, written_matrix
+    from obsynth.proofs.exact_arithmetic import (
+        nearest_doubles,
+        picked_columns,
+        picked_rows,
+        pivot_columns,
+        written_matrix,
+    )
 
     if dynamic is None:
         return (
@@ -155,11 +171,11 @@ def rounded_once(
             dict(found.sizes),
         )
     e = written_matrix(plant.E)
-    rows = pivot_columns((e * _units(plant.nx, found.pivots)).transpose())
+    rows = pivot_columns((picked_columns(e, found.pivots)).transpose())
     with flint.ctx.workprec(COORDINATE_BITS):
         # E dynamic z = E (unit vectors) z_rational
-        change = flint.arb_mat(enclosed(_rows(e * written_matrix(dynamic), rows))).solve(
-            flint.arb_mat(enclosed(_rows(e * _units(plant.nx, found.pivots), rows)))
+        change = flint.arb_mat(enclosed(picked_rows(e * written_matrix(dynamic), rows))).solve(
+            flint.arb_mat(enclosed(picked_rows(picked_columns(e, found.pivots), rows)))
         )
         back = change.inv()
 
@@ -217,34 +233,11 @@ def _doubles(matrix: Any) -> FloatArray:
     return np.array(rows, dtype=np.float64)
 
 
-def _rows(matrix: fmpq_mat, chosen: list[int]) -> fmpq_mat:
-    from flint import fmpq_mat
-
-    columns = int(matrix.ncols())
-    return fmpq_mat(len(chosen), columns, [matrix[i, j] for i in chosen for j in range(columns)])
-
-
-def _units(order: int, chosen: list[int] | tuple[int, ...]) -> fmpq_mat:
-    from flint import fmpq_mat
-
-    return fmpq_mat(order, len(chosen), [int(i == j) for i in range(order) for j in chosen])
-
-
-def _zeros(rows: int, columns: int) -> fmpq_mat:
-    from obsynth.proofs.exact_arithmetic import zeros_matrix
-
-    return zeros_matrix(rows, columns)
-
-
 def _split(matrix: fmpq_mat, widths: list[int]) -> list[fmpq_mat]:
-    from flint import fmpq_mat
+    from obsynth.proofs.exact_arithmetic import picked_columns
 
-    found, start, rows = [], 0, int(matrix.nrows())
-    for width in widths:
-        entries = [matrix[i, j] for i in range(rows) for j in range(start, start + width)]
-        found.append(fmpq_mat(rows, width, entries))
-        start += width
-    return found
+    ends = np.cumsum(widths).tolist()
+    return [picked_columns(matrix, range(end - width, end)) for end, width in zip(ends, widths, strict=True)]
 
 
 def sampled_exact_numbers(smooth: DescriptorSystem, sample_time: float) -> ExactNumbers:

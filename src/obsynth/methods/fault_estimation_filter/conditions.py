@@ -89,10 +89,9 @@ def _exact(plant: DescriptorSystem) -> tuple[fmpq_mat, fmpq_mat, fmpq_mat, fmpq_
 
 def _moved(a: fmpq_mat, faults: fmpq_mat, fault: int, index: int | None) -> fmpq_mat:
     """Return the vector of a fault that becomes visible."""
-    from flint import fmpq_mat
+    from obsynth.proofs.exact_arithmetic import picked_columns
 
-    rows = int(faults.nrows())
-    vector = fmpq_mat(rows, 1, [faults[i, fault] for i in range(rows)])
+    vector = picked_columns(faults, [fault])
     for _ in range(int(index or 1) - 1):
         vector = a * vector
     return vector
@@ -134,16 +133,13 @@ def _changed(
 
 def _solution(maps: list[fmpq_mat], rest: fmpq_mat, order: list[int]) -> list[tuple[int, Fraction]] | None:
     """Return delta with ``maps[-1] delta = rest``, and zero for all maps before it, on few equations in this order."""
-    from flint import fmpq_mat
-
-    from obsynth.proofs.exact_arithmetic import blocks, pivot_columns
+    from obsynth.proofs.exact_arithmetic import blocks, picked_columns, pivot_columns, zeros_matrix
 
     whole = blocks([[part] for part in maps])
-    rows, outputs = int(whole.nrows()), int(rest.nrows())
-    picked = fmpq_mat(rows, len(order), [whole[i, j] for i in range(rows) for j in order])
-    right = fmpq_mat(rows, 1, [*([0] * (rows - outputs)), *(rest[i, 0] for i in range(outputs))])
+    picked = picked_columns(whole, order)
+    right = blocks([[zeros_matrix(int(whole.nrows()) - int(rest.nrows()), 1)], [rest]])
     pivots = pivot_columns(picked)
-    basis = fmpq_mat(rows, len(pivots), [picked[i, j] for i in range(rows) for j in pivots])
+    basis = picked_columns(picked, pivots)
     if not pivots or blocks([[basis, right]]).rank() > len(pivots):
         return None
     found = (basis.transpose() * basis).solve(basis.transpose() * right)

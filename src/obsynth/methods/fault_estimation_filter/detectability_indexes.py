@@ -42,18 +42,16 @@ ExactIndexes: TypeAlias = tuple[tuple[int | None, ...], int]
 
 def numbers_with_fault_states(plant: DescriptorSystem, numbers: PlantNumbers | None) -> PlantNumbers | None:
     """Return the numbers of a plant with its sensor faults appended as algebraic states."""
-    from flint import fmpq_mat
-
-    from obsynth.proofs.exact_arithmetic import blocks, identity, zeros_matrix
+    from obsynth.proofs.exact_arithmetic import blocks, identity, picked_columns, zeros_matrix
 
     chosen = [int(j) for j in np.flatnonzero(np.any(plant.Df != 0.0, axis=0))]
     if numbers is None or not chosen:
         return numbers
     nx, nf, count = plant.nx, plant.nf, len(chosen)
     across, down, square = zeros_matrix(nx, count), zeros_matrix(count, nx), zeros_matrix(count, count)
-    rows = fmpq_mat(count, nf, [int(i == j) for i in chosen for j in range(nf)])
-    kept = fmpq_mat(nf, nf, [int(i == j and i not in chosen) for i in range(nf) for j in range(nf)])
-    shown = fmpq_mat(nf, count, [int(i == j) for i in range(nf) for j in chosen])
+    shown = picked_columns(identity(nf), chosen)
+    rows = shown.transpose()
+    kept = identity(nf) - shown * rows
     own = numbers.as_own
     changed: dict[str, Any] = {
         "E": numbers.blocks([[numbers.matrix("E"), own(across)], [own(down), own(square)]]),
@@ -105,18 +103,18 @@ def nonsingular_t(numbers: PlantNumbers) -> fmpq_mat | None:
     """Return a rational nonsingular T with ``T E + N C = I``."""
     from flint import fmpq_mat
 
-    from obsynth.proofs.exact_arithmetic import blocks, null_basis
+    from obsynth.proofs.exact_arithmetic import blocks, left_null_basis, picked_columns
 
     e, c = numbers.rational["E"], numbers.rational["C"]
     stacked, order = blocks([[e], [c]]), int(e.ncols())
     if stacked.rank() < order:
         return None
     inverse = (stacked.transpose() * stacked).solve(stacked.transpose())
-    free, rng = null_basis(stacked.transpose()).transpose(), random.Random(_PENCIL_SEED)
+    free, rng = left_null_basis(stacked), random.Random(_PENCIL_SEED)
     for size in range(MOST_CHOICES):
         mix = fmpq_mat(order, int(free.nrows()), [rng.randint(-size, size) for _ in range(order * int(free.nrows()))])
         both = inverse + mix * free
-        t = fmpq_mat(order, order, [both[i, j] for i in range(order) for j in range(order)])
+        t = picked_columns(both, range(order))
         if t.det() != 0:
             return t
     return None

@@ -63,7 +63,14 @@ class InvisiblePairs:
     @classmethod
     @lru_cache(maxsize=2)
     def _of(cls, *numbers: tuple[tuple[int, ...], bytes]) -> InvisiblePairs:
-        from obsynth.proofs.exact_arithmetic import blocks, null_basis, stored_matrix, zeros_matrix
+        from obsynth.proofs.exact_arithmetic import (
+            blocks,
+            null_basis,
+            picked_rows,
+            row_basis,
+            stored_matrix,
+            zeros_matrix,
+        )
 
         t, n, feedback, w, upsilon, plain, c, bd, dd = (
             stored_matrix(np.frombuffer(data).reshape(shape)) for shape, data in numbers
@@ -73,19 +80,20 @@ class InvisiblePairs:
         z, zd = w * c, w * direct
         pairs = null_basis(blocks([[c, direct, upsilon]]))
         count, states, inputs = int(pairs.ncols()), int(plain.ncols()), int(bd.ncols())
-        tops, bottoms = _rows(pairs, 0, states), _rows(pairs, states, states + inputs)
+        tops, bottoms = picked_rows(pairs, range(states)), picked_rows(pairs, range(states, states + inputs))
         reached = zeros_matrix(states, 0)
         while True:
             # Pairs that start where others have ended.
-            chosen = _rows(null_basis(blocks([[tops, reached]])), 0, count)
+            chosen = picked_rows(null_basis(blocks([[tops, reached]])), range(count))
             starts, ends = tops * chosen, bottoms * chosen
             images = a * starts + b * ends
-            larger = _echelon(blocks([[reached, images]]))
+            # A basis of the range whose rows at `_pivot_rows` are the identity.
+            larger = row_basis(blocks([[reached, images]]).transpose()).transpose()
             if larger.ncols() == reached.ncols():
                 break
             reached = larger
         places = _pivot_rows(reached)
-        top, image = _picked(starts, places), _picked(images, places)
+        top, image = picked_rows(starts, places), picked_rows(images, places)
         return cls(reached, top, ends, image, z * starts + zd * ends, z * reached, zd)
 
     def bound(self, matrices: Mapping[str, FloatArray], *, free_weight: bool) -> float:
@@ -174,23 +182,6 @@ def _balls(matrix: Any) -> Any:
     import flint
 
     return flint.arb_mat(int(matrix.nrows()), int(matrix.ncols()), [flint.arb(value) for value in matrix.entries()])
-
-
-def _rows(matrix: Any, start: int, end: int) -> Any:
-    return _picked(matrix, range(start, end))
-
-
-def _picked(matrix: Any, rows: Any) -> Any:
-    from flint import fmpq_mat
-
-    width, places = int(matrix.ncols()), list(rows)
-    return fmpq_mat(len(places), width, [matrix[i, j] for i in places for j in range(width)])
-
-
-def _echelon(matrix: Any) -> Any:
-    """Return a basis of the range whose rows at `_pivot_rows` are the identity."""
-    reduced, rank = matrix.transpose().rref()
-    return _rows(reduced, 0, int(rank)).transpose()
 
 
 def _pivot_rows(basis: Any) -> list[int]:
