@@ -42,6 +42,14 @@ class Modes(NamedTuple):
         return float(np.max(np.abs(self.values), initial=0.0))
 
 
+class Peaks(NamedTuple):
+    """Angles in [0, pi], how far they may be off, and sizes, at most the eighth root of a sum of eighth powers."""
+
+    angles: FloatArray
+    widths: FloatArray
+    sizes: FloatArray
+
+
 @dataclass(frozen=True, eq=False)
 class ModalResponse:
     """``C (z I - A)^-1 B + D``, ``A = V diag(poles) V^-1``: ``shown`` is C V ``(p, n)``, ``driven`` V^-1 B."""
@@ -91,7 +99,7 @@ class ModalResponse:
                 gram = gram / unit
                 return np.asarray(np.sqrt(unit) * np.sum(np.abs(gram @ gram) ** 2, axis=(1, 2)) ** 0.125)
             return np.asarray(np.sqrt(np.linalg.eigvalsh(np.where(np.isfinite(gram), gram, 0.0))[:, -1]))
-        squares = np.sum(np.abs(response) ** 2, axis=2)
+        squares = np.sum(response.real**2 + response.imag**2, axis=2)
         if len(direct) == 1:
             return np.asarray(np.sqrt(squares[:, 0]))
         beside = np.abs(np.sum(response[:, 0] * response[:, 1].conj(), axis=1))
@@ -110,6 +118,10 @@ class ModalResponse:
 
     def peaks(self, points: int) -> FloatArray:
         """Return the angles in [0, pi] of the highest peaks on a grid of so many points and the poles, refined."""
+        return self.refined(self.rough_peaks(points))
+
+    def rough_peaks(self, points: int) -> Peaks:
+        """Return the highest peaks on a grid of so many points and the poles, the highest first."""
         near = self.poles[(self.poles.imag >= 0.0) & (np.abs(self.poles) > NEAR)]
         angles = np.concatenate([np.linspace(0.0, np.pi, points), np.angle(near)])
         order = np.argsort(angles, kind="stable")
@@ -122,7 +134,11 @@ class ModalResponse:
         widths = np.maximum(centres - neighbours[tops], neighbours[tops + 2] - centres)
         # A peak that a pole makes is as wide as the pole is far from the circle.
         reaches = np.concatenate([np.full(points, np.pi), 2.0 * (1.0 - np.abs(near))])[order]
-        widths = np.minimum(widths, reaches[tops])
+        return Peaks(centres, np.minimum(widths, reaches[tops]), sizes[tops])
+
+    def refined(self, peaks: Peaks) -> FloatArray:
+        """Return the angles of peaks, refined."""
+        centres, widths, _ = peaks
         steps, everyone = np.arange(-POINTS_BESIDE, POINTS_BESIDE + 1) / POINTS_BESIDE, np.arange(len(centres))
         for _ in range(MODE_REFINEMENTS):
             tried = np.minimum(np.maximum(centres[:, None] + widths[:, None] * steps, 0.0), np.pi)

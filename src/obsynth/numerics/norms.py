@@ -125,7 +125,10 @@ def norm_is_at_most(
     if verdict is not None:
         return verdict
     # A gain above the level that is attained is cheaper to find than the norm.
-    return largest_peak(a, b, c, d, modes=modes) <= level and hinf_norm(a, b, c, d, modes=modes).upper <= level
+    return (
+        largest_peak(a, b, c, d, modes=modes, enough=level) <= level
+        and hinf_norm(a, b, c, d, modes=modes).upper <= level
+    )
 
 
 def highest_gain_found(
@@ -136,15 +139,26 @@ def highest_gain_found(
     return largest_peak(a, b, c, d, modes=modes) if many else hinf_norm(a, b, c, d, modes=modes).upper
 
 
-def largest_peak(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, *, modes: Modes | None = None) -> float:
-    """Return the largest gain that a modal response shows, the H-infinity norm where that is not to be believed."""
+def largest_peak(
+    a: FloatArray,
+    b: FloatArray,
+    c: FloatArray,
+    d: FloatArray,
+    *,
+    modes: Modes | None = None,
+    enough: float = np.inf,
+) -> float:
+    """Return the largest gain that a modal response shows, the H-infinity norm where that is not to be believed.
+
+    A gain above ``enough`` ends the search.
+    """
     modes = Modes.of(a) if modes is None else modes
     if modes.radius >= 1.0:
         return float("inf")
     if all(part.size for part in (a, b, c)) and all(np.all(np.isfinite(part)) for part in (b, c, d)):
         points = MANY_GRID_POINTS if a.shape[0] > STATES_OF_PENCIL else GRID_POINTS
         balanced = _balanced(a, b, c, modes)
-        best, _ = _modal_peak(*balanced[:3], d, balanced[3], points=points)
+        best, _ = _modal_peak(*balanced[:3], d, balanced[3], points=points, enough=enough)
         if np.isfinite(best):
             return best
     return hinf_norm(a, b, c, d, modes=modes).upper
@@ -169,13 +183,21 @@ def _modal_peak(
     modes: Modes,
     *,
     points: int,
+    enough: float = np.inf,
 ) -> tuple[float, float]:
-    """Return the largest gain found in modal coordinates, and where; infinite where they are not to be believed."""
+    """Return the largest gain found in modal coordinates, and where; infinite where they are not to be believed.
+
+    A gain above ``enough`` that is attained ends the search."""
     with np.errstate(all="ignore"):
         response = ModalResponse.of(modes, b, c, d)
         if response is None:
             return np.inf, np.nan
-        angles = response.peaks(points)
+        peaks = response.rough_peaks(points)
+        if np.any(peaks.sizes[:1] > enough):
+            best, angle = _peak(a, b, c, d, peaks.angles[:1])
+            if enough < best < np.inf:
+                return best, angle
+        angles = response.refined(peaks)
         sizes = response.gains(angles)
         top = int(np.argmax(sizes))
     best, angle = _peak(a, b, c, d, angles[[top]])

@@ -136,7 +136,7 @@ def balance_by_least_squares(
     for matrix, rows, columns in ((E, equations, states), (A, equations, states), (c, shown, states)):
         problem.add(matrix, rows, columns)
     problem.add(b, equations, entering)
-    exponents = np.round(problem.solve(passes=0, ridge=SMALL_RIDGE)).astype(np.int64)
+    exponents = problem.solve(passes=0, ridge=SMALL_RIDGE, whole=True).astype(np.int64)
     return Scaling(*(read_only(np.ldexp(1.0, exponents[part])) for part in (equations, states, shown)))
 
 
@@ -172,6 +172,8 @@ WISH_WEIGHT = 1e-8
 HALF_SAY = 10.0
 #: Corrections by exact residuals, each of which takes four or five digits of rounding away.
 RESIDUAL_CORRECTIONS = 3
+#: Whole exponents need no further correction once the last is below this share of the distance to where they change.
+SETTLED_SHARE = 1e-2
 #: Passes in which small entries lose their say.
 PASSES = 3
 #: Up to so many unknowns lists of numbers are added up faster than arrays in pairs.
@@ -206,8 +208,8 @@ class LogBalance:
         """Ask for a value where the entries leave the unknown open."""
         self._wishes.append((unknown, exponent))
 
-    def solve(self, *, passes: int = PASSES, ridge: float = RIDGE) -> FloatArray:
-        """Return the exponents ``(count,)``, not rounded."""
+    def solve(self, *, passes: int = PASSES, ridge: float = RIDGE, whole: bool = False) -> FloatArray:
+        """Return the exponents ``(count,)``, rounded to whole numbers where these are wanted."""
         weights = [term.weights for term in self._terms]
         solved, found = self._solved(weights, ridge)
         for _ in range(passes):
@@ -218,7 +220,10 @@ class LogBalance:
             before, found = found, found + solved(self._missed(weights, found, ridge))
             if np.array_equal(before, found):
                 break
-        return np.asarray(found, dtype=np.float64)
+            to_a_half = np.abs(np.abs(found - np.round(found)) - 0.5)
+            if whole and np.all(np.abs(found - before) <= SETTLED_SHARE * np.min(to_a_half, initial=1.0)):
+                break
+        return np.asarray(np.round(found) if whole else found, dtype=np.float64)
 
     def _missed(self, weights: Sequence[FloatArray], found: FloatArray, ridge: float) -> FloatArray:
         """Return what is left of the normal equations, each sum as if with twice the digits, or rounded once."""
@@ -317,6 +322,9 @@ def doubled_sums(parts: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def _in_turn(parts: FloatArray) -> FloatArray:
     """Return the sum of numbers or rows, added up one after the other."""
+    if parts.ndim > 1 and parts.shape[1] > 1:
+        # Rows that follow each other in memory are added to the sum in turn; a single column would be added in pairs.
+        return np.asarray(np.add.reduce(np.ascontiguousarray(parts), axis=0))
     return np.asarray(np.add.accumulate(parts, axis=0)[-1] if len(parts) else np.zeros(parts.shape[1:]))
 
 

@@ -88,21 +88,20 @@ def left_null_basis(matrix: fmpq_mat) -> fmpq_mat:
 def with_integer_entries(E: fmpq_mat, A: fmpq_mat) -> tuple[fmpz_mat, fmpz_mat]:
     """Return two matrices ``(m, n)`` with common rows and columns multiplied by rationals, so that all are integers."""
     rows, columns = int(A.nrows()), int(A.ncols())
-    table = [_coprime(_over_one_denominator([*e, *a])) for e, a in zip(E.tolist(), A.tolist(), strict=True)]
+    # Over one denominator each row is a multiple of what it is over its own.
+    (e, own), (a, other) = E.numer_denom(), A.numer_denom()
+    common = lcm(int(own), int(other))
+    pairs = zip((e * (common // int(own))).tolist(), (a * (common // int(other))).tolist(), strict=True)
+    table = [_coprime([int(value) for part in pair for value in part]) for pair in pairs]
     for j in range(columns):
         common = gcd(*(row[k] for row in table for k in (j, columns + j)))
         if common > 1:
             for row in table:
                 row[j], row[columns + j] = row[j] // common, row[columns + j] // common
     table = [_coprime(row) for row in table]
-    e, a = ([value for row in table for value in row[part]] for part in (slice(columns), slice(columns, None)))
-    return fmpz_mat(rows, columns, e), fmpz_mat(rows, columns, a)
-
-
-def _over_one_denominator(values: Sequence[fmpq]) -> list[int]:
-    denominators = [int(value.q) for value in values]
-    common = lcm(*denominators)
-    return [int(value.p) * (common // own) for value, own in zip(values, denominators, strict=True)]
+    parts = ([value for row in table for value in row[part]] for part in (slice(columns), slice(columns, None)))
+    e, a = (fmpz_mat(rows, columns, part) for part in parts)
+    return e, a
 
 
 def _coprime(values: list[int]) -> list[int]:
@@ -149,20 +148,27 @@ def is_computed(value: float) -> bool:
 
 def holds_computed(matrix: FloatArray) -> bool:
     """Whether an entry of a matrix was computed."""
-    return any(map(is_computed, _long_entries(matrix)))
+    return any(map(is_computed, _split_entries(matrix)[1]))
 
 
-def _long_entries(matrix: FloatArray) -> list[float]:
-    """Return the entries that are no short multiple of a power of two: all others are as they were written."""
+def _split_entries(matrix: FloatArray) -> tuple[list[float], list[float]]:
+    """Return the entries that are short multiples of a power of two, which are as they were written, and all others."""
     parts = np.ldexp(np.frexp(matrix)[0], SHORT_BITS)
-    found: list[float] = matrix[parts != np.rint(parts)].tolist()
-    return found
+    short = parts == np.rint(parts)
+    return matrix[short].tolist(), matrix[~short].tolist()
 
 
 def written_matrix(matrix: FloatArray) -> fmpq_mat:
     """Return a matrix ``(m, n)`` of doubles as the rational numbers that were written."""
-    rows, columns = matrix.shape
-    return fmpq_mat(rows, columns, [fmpq(*_written(value)) for value in np.ravel(matrix).tolist()])
+    (rows, columns), values = matrix.shape, np.ravel(matrix).tolist()
+    decimals = {value: _decimal(value) for value in set(values)}
+    if any(len(decimals[value][0]) > LOSSLESS_DIGITS for value in _split_entries(matrix)[0]):
+        return fmpq_mat(rows, columns, [fmpq(*_written(value)) for value in values])
+    # Whole numbers of one power of ten.
+    least = min([0, *(power for _, power in decimals.values())])
+    whole = {value: int(digits) * 10 ** (power - least) for value, (digits, power) in decimals.items()}
+    found: fmpq_mat = fmpq_mat(fmpz_mat(rows, columns, [whole[value] for value in values])) / fmpz(10) ** -least
+    return found
 
 
 def stored_matrix(matrix: FloatArray) -> fmpq_mat:

@@ -246,11 +246,9 @@ def _regular_point(e: fmpz_mat, a: fmpz_mat, degree: int) -> int | None:
 
 def _largest_coefficient(e: fmpz_mat, a: fmpz_mat) -> int:
     """Return a bound on the coefficients of ``det(a - s e)``: on its size where s is of modulus one (Hadamard)."""
-    pairs = zip(a.tolist(), e.tolist(), strict=True)
-    rows = [[abs(int(x)) + abs(int(y)) for x, y in zip(*pair, strict=True)] for pair in pairs]
-    bounds = (prod(isqrt(sum(value * value for value in line)) + 1 for line in lines)
-              for lines in (rows, zip(*rows, strict=True)))  # fmt: skip
-    return min(bounds)
+    sizes = np.array([[abs(int(value)) for value in part.entries()] for part in (a, e)], dtype=object).sum(axis=0)
+    squares = (sizes * sizes).reshape(a.nrows(), a.ncols())
+    return min(prod(isqrt(total) + 1 for total in squares.sum(axis=axis).tolist()) for axis in (0, 1))
 
 
 @cache

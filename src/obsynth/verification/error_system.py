@@ -18,15 +18,15 @@ with balls K, U, J, L, zero in exact arithmetic: `errors_per_unit`.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, TypeAlias
+from typing import Any, Generic, TypeAlias
 
 import flint
 import numpy as np
 
-from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.scaling import balance_by_least_squares
+from obsynth.numerics.arrays import FloatArray, Made, remembered
+from obsynth.numerics.scaling import Scaling, balance_by_least_squares
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.balls import Ball, rounded_up
@@ -49,6 +49,12 @@ PRINTED_SHARE = 0.1
 #: Rows with terms below this share of the largest may be rounding of those: they are judged as if they were as large.
 LEAST_ROW = 1e-6
 Output: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
+
+
+@remembered
+def natural_scaling(plant: DescriptorSystem) -> Scaling:
+    """Return the scaling of a plant's equations, states and outputs that these suggest, without what drives them."""
+    return balance_by_least_squares(plant.E, plant.A, outputs=[plant.C])
 
 
 def with_past(plant: DescriptorSystem, lag: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -188,12 +194,10 @@ class ErrorModel:
             and not any(delay != self.lag for delay in observer.state_delays)
         )
 
-    def equals(self, other: ErrorModel) -> bool:
-        """Whether all numbers are the same."""
-        names = ("E", "A", "B", "C", "T", "T0", "goal", "Bd", "Dd")
-        pairs = [(getattr(self, name), getattr(other, name)) for name in names]
-        pairs.append((self.plant.D, other.plant.D))
-        return all(a is b or (a is not None and b is not None and np.array_equal(a, b)) for a, b in pairs)
+    @property
+    def numbers(self) -> tuple[FloatArray | None, ...]:
+        """All numbers beside the observer's."""
+        return (self.E, self.A, self.B, self.C, self.T, self.T0, self.goal, self.Bd, self.Dd, self.plant.D)
 
     # The error e = T E x - z, of the plant's own states, and what drives it.
 
@@ -253,6 +257,9 @@ class ErrorModel:
     @cached_property
     def remainder(self) -> RemainderChannel:
         """What the identities miss, in outward rounding."""
+        return _remainders_of(self.observer).of(self.numbers, self._new_remainder)
+
+    def _new_remainder(self) -> RemainderChannel:
         if not self.is_evaluated_exactly:
             return self._remainder(Ball)
         with flint.ctx.workprec(EXACT_BITS):
@@ -288,7 +295,10 @@ class ErrorModel:
     def _sizes(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Natural units of xa ``(na,)``, and in these the largest terms of each row of z and of the outputs."""
         size, observer = np.abs, self.observer
-        units = balance_by_least_squares(self.E, self.A, outputs=[self.C]).states
+        if self.lag or self.Phi is not None:
+            units = balance_by_least_squares(self.E, self.A, outputs=[self.C]).states
+        else:
+            units = natural_scaling(self.plant).states
         te, c = size(self.T) @ size(self.E), size(self.C)
         formed = size(observer.Az) @ te + size(observer.By) @ c + size(self.T) @ size(self.A)
         shown = size(observer.Cz) @ te + size(observer.Dy) @ c + size(self.goal)
@@ -329,6 +339,32 @@ class ErrorModel:
             left_over = size(self.T0 @ self.E) * units / np.where(largest > 0.0, largest, 1.0)
             found.append(float(np.max(left_over, initial=0.0)))
         return max(found) if np.all(np.isfinite(found)) else np.nan
+
+
+@dataclass(frozen=True, eq=False)
+class ByNumbers(Generic[Made]):
+    """What was made of an observer beside the numbers of an error model: a design is given it, and verified.
+
+    It must not hold the observer, beside which it is remembered."""
+
+    known: list[tuple[tuple[FloatArray | None, ...], Made]] = field(default_factory=list)
+
+    def of(self, numbers: tuple[FloatArray | None, ...], make: Callable[[], Made]) -> Made:
+        """Return what was made of the same numbers, or make it."""
+        for others, found in self.known:
+            if all(map(_same, numbers, others)):
+                return found
+        self.known.append((numbers, make()))
+        return self.known[-1][1]
+
+
+def _same(one: FloatArray | None, other: FloatArray | None) -> bool:
+    return one is other or (one is not None and other is not None and np.array_equal(one, other))
+
+
+@remembered
+def _remainders_of(_observer: LinearObserver) -> ByNumbers[RemainderChannel]:
+    return ByNumbers()
 
 
 def error_model_row(model: ErrorModel | None, printed_digits: int | None) -> Check:

@@ -14,7 +14,7 @@ from obsynth.numerics.arrays import FloatArray, remembered
 from obsynth.numerics.scaling import Scaling, balance_by_least_squares
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.checks import Check, upper_bound_check
-from obsynth.verification.error_system import ErrorModel
+from obsynth.verification.error_system import ErrorModel, natural_scaling
 
 #: Equalities may miss by this much, relative to the terms they are made of.
 EQUALITY_TOLERANCE = 1e-9
@@ -156,7 +156,7 @@ def tracking_totals(model: ErrorModel) -> dict[str, FloatArray]:
 def _balances(plant: DescriptorSystem) -> tuple[Scaling, Scaling]:
     """Return the sizes of a plant's states without what drives them, and with it."""
     # A state in small units must not hide behind one in large units.
-    alone = balance_by_least_squares(plant.E, plant.A, outputs=[plant.C])
+    alone = natural_scaling(plant)
     # States that do not touch each other have sizes beside each other only by what drives both.
     driven = balance_by_least_squares(plant.E, plant.A, inputs=[plant.B, plant.Bf, plant.Bd], outputs=[plant.C])
     return alone, driven

@@ -23,6 +23,7 @@ from obsynth.results.checks import Check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.error_system import (
     BOTH_BALLS,
+    ByNumbers,
     ErrorModel,
     RemainderChannel,
     contraction_of,
@@ -63,13 +64,7 @@ class StoredErrors:
     @classmethod
     def of(cls, model: ErrorModel) -> StoredErrors | None:
         """Return the bounds; ``None`` where no contraction of the observer can be proved."""
-        # A design is given them, and verified: the same realisation on the same plant is looked at once.
-        known = _bounds_of(model.observer)
-        for other, found in known:
-            if other.equals(model):
-                return found
-        known.append((model, cls._found(model)))
-        return known[-1][1]
+        return _bounds_of(model.observer).of(model.numbers, lambda: cls._found(model))
 
     @classmethod
     def _found(cls, model: ErrorModel) -> StoredErrors | None:
@@ -101,8 +96,8 @@ class StoredErrors:
 
 
 @remembered
-def _bounds_of(_observer: LinearObserver) -> list[tuple[ErrorModel, StoredErrors | None]]:
-    return []
+def _bounds_of(_observer: LinearObserver) -> ByNumbers[StoredErrors | None]:
+    return ByNumbers()
 
 
 def stored_number_rows(design: ObserverDesign, model: ErrorModel, gamma: float | None = None) -> Iterator[Check]:

@@ -37,8 +37,7 @@ class PencilUnits:
         rows, columns = range(m), range(m, m + n)
         balance.add(A, rows, columns)
         balance.add(E, rows, columns, common=m + n)
-        exponents = np.round(balance.solve())
-        factors = np.exp2(exponents)
+        factors = np.exp2(balance.solve(whole=True))
         found = cls(factors[:m], factors[m : m + n], float(factors[-1]))
         return found if n <= BY_LEAST_SQUARES else found._held_together(E, A)
 

@@ -12,12 +12,12 @@ from obsynth.methods.functional_filter.wanted_faults import residual_sets
 from obsynth.methods.ui_pi_observer.augmented_plant import shipped_model
 from obsynth.methods.ui_pi_observer.checks.decoupling import decoupling_norms
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.scaling import balance_by_least_squares
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.checks import Check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.certificates import decay_row, stability_row
+from obsynth.verification.error_system import natural_scaling
 from obsynth.verification.identities import Identity, equality, relative_tolerance
 from obsynth.verification.plant import condition_rows, plant_information
 
@@ -193,7 +193,7 @@ def _identities(
 ) -> Iterator[tuple[str, str, Identity]]:
     """Yield the identities that leave neither x, nor u, nor d in the error: name, claim, terms."""
     az, bu, by, cz, du, dy = observer.Az, observer.Bu, observer.By, observer.Cz, observer.Du, observer.Dy
-    scaling = balance_by_least_squares(plant.E, plant.A, outputs=[plant.C])
+    scaling = natural_scaling(plant)
     units = scaling.states
     # What cancels down to rounding is judged by the terms that it was formed of.
     size_t, size_t0 = (_in_equations(matrix, scaling.equations) for matrix in (t, t0))
