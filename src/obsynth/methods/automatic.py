@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import ObsynthError, PreconditionError, SpecError
-from obsynth.methods.fault_figures import DECOUPLED, FaultFigures, fault_figures, on_the_clock
+from obsynth.methods.fault_figures import DECOUPLED, SETTLING_SAMPLES, FaultFigures, fault_figures, on_the_clock
 from obsynth.methods.functional_filter.rates import settling_time
 from obsynth.methods.method import Method, Purpose
 from obsynth.methods.registry import REGISTRY, kind_of, method_class, methods_for
@@ -111,8 +111,8 @@ def linear_methods() -> Sequence[type[Method]]:
     return [found for found in map(method_class, REGISTRY) if "time-invariant" in found.plants]
 
 
-#: Samples of the plant's settling time, and how many settling times figures look ahead.
-SETTLING_SAMPLES, SETTLING_TIMES, MOST_FIGURE_SAMPLES = 200, 8, 2000
+#: How many settling times figures look ahead.
+SETTLING_TIMES, MOST_FIGURE_SAMPLES = 8, 2000
 
 
 Maker = Callable[[Any, str, Mapping[str, Any]], ObserverDesign]

@@ -15,7 +15,6 @@ from obsynth.analysis.conditions import Condition
 from obsynth.analysis.transformations.elimination import MANY_VARIABLES, eliminate_algebraic_states
 from obsynth.analysis.transformations.recovery import StateRecovery, Transformation, plant_and_recovery
 from obsynth.errors import PreconditionError, SolverError, SpecError, VerificationError
-from obsynth.methods.automatic import automatic_design
 from obsynth.methods.method import Method, Synthesis
 from obsynth.methods.refusals import require_above_rounding, rounding_notes, with_advice
 from obsynth.methods.registry import AUTO, REGISTRY, Plant, kind_conditions, kind_of, method_class
@@ -101,6 +100,8 @@ def design(
         return each(plant, asked)
 
     if method == AUTO:
+        from obsynth.methods.automatic import automatic_design
+
         report_stage("designing by every method that exists")
         kind_of(own)
         with failed_computations(), one_thread_if_small(own.nx):

@@ -20,6 +20,8 @@ from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.simulation.linear import stabilising_feedback
 
+#: Samples of a plant's settling time on a clock of its own.
+SETTLING_SAMPLES = 200
 #: Shares of a step at which its delay is read.
 DELAY_SHARE, NEARLY_ALL = 0.5, 0.9
 #: A fault estimate off its step by more than this at the horizon did not reach it.

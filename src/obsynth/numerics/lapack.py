@@ -29,9 +29,10 @@ _PACKAGE, _EXTENSION = "scipy.linalg", "scipy.linalg._flapack"
 def library() -> ModuleType:
     """Return the module of SciPy that has LAPACK's routines; its BLAS is loaded with it."""
     if _PACKAGE not in sys.modules:
-        import scipy
-
-        spec = PathFinder.find_spec(_EXTENSION, [str(Path(scipy.__file__).parent / "linalg")])
+        # Where it is, scipy itself not imported.
+        package = PathFinder.find_spec("scipy")
+        folders = [] if package is None else list(package.submodule_search_locations or ())
+        spec = PathFinder.find_spec(_EXTENSION, [str(Path(folder) / "linalg") for folder in folders])
         if spec is not None and spec.loader is not None:
             try:
                 found = module_from_spec(spec)

@@ -13,8 +13,7 @@ from obsynth.analysis.diagnosis.exact import question
 from obsynth.analysis.diagnosis.fault_columns import dc_point
 from obsynth.analysis.transformations.recovery import StateRecovery
 from obsynth.errors import ObsynthError, PreconditionError
-from obsynth.methods.automatic import SETTLING_SAMPLES
-from obsynth.methods.fault_figures import FaultFigures, fault_figures, on_the_clock
+from obsynth.methods.fault_figures import SETTLING_SAMPLES, FaultFigures, fault_figures, on_the_clock
 from obsynth.methods.functional_filter.rates import DelayCurve, delay_curve, settling_time
 from obsynth.methods.registry import REGISTRY, method_class
 from obsynth.observers.linear.derived import sample_observer

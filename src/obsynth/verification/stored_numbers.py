@@ -248,7 +248,7 @@ class _Composite:
         """Return the frequencies (rad per sample, or rad/s) of the plant's poles on the boundary or about it."""
         discrete, poles = self.plant.dt > 0.0, self.poles
         near = poles[np.abs(np.abs(poles) - 1.0 if discrete else poles.real / unit) <= ABOUT_THE_BOUNDARY]
-        angles = np.unique(np.abs(np.angle(near) if discrete else near.imag))
+        angles = sorted(set(np.abs(np.angle(near) if discrete else near.imag).tolist()))
         # Scattered multiple poles have angles next to each other.
         kept = [angle for i, angle in enumerate(angles) if not i or angle - angles[i - 1] > APART * unit]
         return np.asarray(kept[:MOST_ANGLES], dtype=np.float64)
