@@ -1,15 +1,15 @@
 """Existence on rational plants of which it is known: whether a design, a refusal or an unclear answer comes.
 
-A case draws an integer plant (some with a hidden or hardly seen mode, a masked fault, a fault that never shows), finds
-out whether an observer exists from all minors of its pencil, in fractions, and gives it to a method in other integer
-coordinates and in units from 2^-13 to 2^13, the filter without its algebraic states; 3 in 10 of the plants in discrete
-time are chains of integrators in continuous time, given with their algebraic states, which the package eliminates, and
-then samples.  Wrong is: a design for a plant that has none; one whose estimate of constant faults does not settle at
-them to 1e-4, in rational numbers; a refusal, other than an unclear one, of a plant that has one (of functional filters
-those are known to exist where an observer of the whole state does).  Columns: the answer; *coarse* is an error of 1e-6
-to 1e-4 (plants that one part in 1e11 makes unsolvable), or a larger one that the design tells in its notes, *no design*
-is exit code 4, 5 or 6, where nothing is claimed, *asks for noise* a plant whose outputs are bound to each other by its
-equations, for which a Kalman gain needs more to be stated.
+A case draws an integer plant (some with a hidden or hardly seen mode, a masked fault, a fault that reaches no output),
+finds out whether an observer exists from all minors of its pencil, in fractions, and gives it to a method in other
+integer coordinates and in units from 2^-13 to 2^13, the filter without its algebraic states; 3 in 10 of the plants in
+discrete time are chains of integrators in continuous time, given with their algebraic states, which the package
+eliminates, and then samples.  Wrong is: a design for a plant that has none; one whose estimate of constant faults does
+not settle at them to 1e-4, in rational numbers; a refusal, other than an unclear one, of a plant that has one (of
+functional filters those are known to exist where an observer of the whole state does).  Columns: the answer; *coarse*
+is an error of 1e-6 to 1e-4 (plants that one part in 1e11 makes unsolvable), or a larger one that the design tells in
+its notes, *no design* is exit code 4, 5 or 6, where nothing is claimed, *asks for noise* a plant whose outputs are
+bound to each other by its equations, for which a Kalman gain needs more to be stated.
 """
 
 from __future__ import annotations

@@ -454,14 +454,14 @@ PRECONDITIONS = [
         "fault that no output sees",
         plant(A=[[0.5, 0], [0, 0.5]], C=[[1, 0]], Bf=[[0], [1]]),
         "finite detectability indexes",
-        "'f1' never shows",
+        "'f1' reaches no output",
         signals=["f1"],
     ),
     impossible(
         "faults that look alike",
         plant(A=(0.5 * np.eye(3)).tolist(), C=[[1, 0, 0], [0, 1, 0]], Bf=[[1, 1], [0, 0], [1, 0]]),
         "rank Upsilon",
-        "'f1', 'f2' cannot be told apart",
+        "'f1', 'f2' cannot be distinguished",
     ),
     impossible(
         "fault that looks like a state",

@@ -69,7 +69,7 @@ CASES: dict[str, tuple[dict[str, Any] | None, dict[str, Any], int, tuple[str, ..
     "decay faster than a hidden mode": (HIDDEN_STABLE, {"decay": 0.6}, 4, ("-0.5", "0.6")),
     "disk beside a hidden mode": (HIDDEN_STABLE, {"disk": [10.0, 9.0]}, 4, ("-0.5",)),
     "too large a delta for Theorem 2": (HIDDEN_PAIR, {"theorem": 2, "delta": 0.5, "decay": 0}, 4, ("delta <", "0.4")),
-    "less noise than standstill takes": (None, {"noise_gain": 0.01}, 4, ("standstill", "noise_gain")),
+    "less noise than steady state has": (None, {"noise_gain": 0.01}, 4, ("steady state", "noise_gain")),
     "a delta that does not suit the disk": (None, {"disk": [5.0, 4.0], "delta": 20.0}, 4, ("-1/delta",)),
     # Nothing is known: 5.
     "gains far too small": (None, {"gain_bound": 0.001}, 5, ("gain_bound", "inconclusive")),

@@ -72,7 +72,7 @@ CASES: dict[str, tuple[dict, dict, str, int, tuple[str, ...], dict]] = {
         {"mode": [0.5, 0.0], "signals": ["f1", "d1"]}),
     "an unknown input that no output shows at once": (
         {"dt": 0.0, "A": [[0, 1], [0, -1]], "C": [[1, 0]], "Bf": [[1], [0]], "Bd": [[0], [1]]}, {},
-        "PreconditionError", 3, ("(D1) decoupling", "nothing but a derivative", "Also fails"),
+        "PreconditionError", 3, ("(D1) decoupling", "only a derivative", "Also fails"),
         {"signals": ["d1", "f1"]}),
     "an unknown fault model": (
         PAPER, {"fault_model": "wobble"}, "SpecError", 2, ("'wobble'", "step, ramp, parabola"), {}),
@@ -85,7 +85,7 @@ CASES: dict[str, tuple[dict, dict, str, int, tuple[str, ...], dict]] = {
         ("says nothing about 'f2'",), {}),
     "a fault model with a hidden state": (
         PAPER, {"fault_model": {"Phi": [[0, 0], [0, -1]], "Cw": [[1, 0]]}}, "SpecError", 2,
-        ("never shows in the fault",), {}),
+        ("is unobservable in the fault",), {}),
     "poles and a decay": (
         PAPER, {"poles": FIVE, "decay": 1.0}, "SpecError", 2, ("poles and decay are given",), {}),
     "poles and noise": (PAPER, {"poles": FIVE, "noise": {"process": 2.0}}, "SpecError", 2, ("noise weights",), {}),

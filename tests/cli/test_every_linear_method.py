@@ -92,7 +92,7 @@ def test_a_design_has_the_same_life_whatever_its_method(name, tmp_path, monkeypa
     design, simulated, found = lives(spec_of(name, tmp_path))
     assert len(found) == len(simulated)
     names = [column for column in simulated.columns if column.startswith(("xhat[", "fhat["))]
-    # The run begins at rest, the simulation where its scenario says: what is left of that is forgotten in the end.
+    # The run begins at rest, the simulation where its scenario says: what is left of that decays.
     late = slice(-len(found) // 4, None)
     for column in names:
         at = design.plant.operating_point.get(column[5:-1], 0.0)

@@ -112,7 +112,7 @@ def test_proved_never_stands_beside_fails(folder: Path, capsys: pytest.CaptureFi
     told = capsys.readouterr().out
     assert "gamma = 1.5" in told
     assert "NOT proved" in told
-    assert "promise" not in told
+    assert "claim   " not in told
     assert main(["report", "--gains", "wrong.gains.json", "--out", "page.html"]) == 6
     page = re.sub(r"<[^>]+>", " ", (folder / "page.html").read_text())
     assert "shipped, proved" not in page

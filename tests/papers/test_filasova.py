@@ -54,8 +54,8 @@ class TestPrinted:
         assert report.passed
         assert report["LMI"].kind == "proved"
         assert report["error system"].value == pytest.approx(-0.3117, abs=SPECTRUM_TOLERANCE)
-        assert report["state part"].value == pytest.approx(-0.4875, abs=SPECTRUM_TOLERANCE)
-        assert report["P part alone"].value == pytest.approx(3.2804, abs=SPECTRUM_TOLERANCE)
+        assert report["state error alone"].value == pytest.approx(-0.4875, abs=SPECTRUM_TOLERANCE)
+        assert report["proportional part alone"].value == pytest.approx(3.2804, abs=SPECTRUM_TOLERANCE)
         assert obsynth.verify(design, printed_digits=PRINTED["decimals"]).passed
         assert not printed_design(decay=0.32).report.passed
 
@@ -80,7 +80,8 @@ class TestPrinted:
     def test_norms(self, case: str) -> None:
         design = printed_design(adaptation_gain=None if case == "printed" else G)
         found = [
-            design.report[f"{name} in the fault estimate"].value for name in ("fault rate", "noise", "fast noise")
+            design.report[f"{name} in the fault estimate"].value for name in ("fault rate", "noise", "high-frequency "
+                                                                                                     "noise")
         ]  # fmt: skip
         np.testing.assert_allclose(found, TRUTH["norms"][case], rtol=3e-3)
 
@@ -118,7 +119,7 @@ class TestOurDesign:
         gain = scan.values("gain")
         expected = np.array([row[theorem] for row in rows])
         np.testing.assert_allclose(scan.values("error system"), expected[:, 0], rtol=0.02)
-        np.testing.assert_allclose(scan.values("P part alone"), expected[:, 3], rtol=0.02, atol=0.006)
+        np.testing.assert_allclose(scan.values("proportional part alone"), expected[:, 3], rtol=0.02, atol=0.006)
         assert np.all(gain >= np.maximum(expected[:, 1], expected[:, 2]) - 0.05)
         assert np.all(gain <= np.hypot(expected[:, 1], expected[:, 2]) + 0.05)
         assert np.max(gain[deltas <= 1.0]) < 10.0

@@ -55,7 +55,7 @@ def test_the_design_passes_and_its_claims_are_recomputed(design: obsynth.Observe
 
 
 def test_noise_against_gamma() -> None:
-    """The trade-off of the notes: less gain costs little noise, and below a knee it costs hours to forget the start."""
+    """The trade-off of the notes: less gain costs little noise, and below a knee the settling time is hours."""
     rows = EXPECTED["trade_off"]
     found = [obsynth.fault_estimation_filter(PLANT, gamma=row[0]) for row in rows]
     for design, (gamma, deviation, radius) in zip(found, rows, strict=True):

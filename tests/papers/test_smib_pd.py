@@ -43,7 +43,7 @@ def test_fast_with_moderate_gains(design: obsynth.ObserverDesign) -> None:
     assert design.report["error system"].value == pytest.approx(EXPECTED["abscissa"], abs=6e-3)
     assert np.linalg.norm(j, 2) == pytest.approx(EXPECTED["norm_J"], abs=0.2)
     assert design.certificate.claims["decay"] == pytest.approx(EXPECTED["decay"], abs=1e-3)
-    assert design.report["P part alone"].value == pytest.approx(EXPECTED["P_part"], abs=0.02)
+    assert design.report["proportional part alone"].value == pytest.approx(EXPECTED["P_part"], abs=0.02)
     for name, value in EXPECTED["norms"].items():
         assert design.report[f"{name} in the fault estimate"].value == pytest.approx(value, rel=0.02), name
 

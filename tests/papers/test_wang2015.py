@@ -346,7 +346,7 @@ def test_without_disturbance_the_printed_L_confuses_the_faults() -> None:
 
 def test_the_other_reading_adds_two_noise_samples_whatever_L_is() -> None:
     errors = errors_of(obsynth.fault_estimation_filter(PLANT_PSI), NOISE)
-    # The initial error has died out at 30.
+    # The initial error has decayed at 30.
     np.testing.assert_allclose(errors[30:, 0], NOISE[28:-2], atol=1e-9)
     np.testing.assert_allclose(errors[30:, 1], NOISE[29:-1], atol=1e-9)
 

@@ -71,7 +71,7 @@ def test_detectability_decides(seed: int, mode: float) -> None:
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("seed", range(6))
 def test_of_plants_that_change_the_product_decides(seed: int, mode: float) -> None:
-    """The same matrices as a stack, in units far apart: a hidden mode that stays is not taken for one that dies out."""
+    """The same matrices as a stack, in units far apart: a hidden mode that stays is not taken for one that decays."""
     found = case(seed, mode)
     plant = TimeVaryingDescriptorSystem(found.E, np.tile(found.A, (STEPS, 1, 1)), C=found.C, dt=1.0)
     if abs(mode) < 1.0:

@@ -316,7 +316,7 @@ class TestReset:
     def test_refusals(self) -> None:
         with pytest.raises(SpecError, match="reset is 1"):
             observer_for(varying(), adapt={"reset": 1.0})
-        with pytest.raises(SpecError, match="reset belongs to the forms that forget"):
+        with pytest.raises(SpecError, match="reset is for the forms with a forgetting factor"):
             observer_for(varying(), adapt={"form": "random-walk", "reset": 0.01})
         with pytest.raises(SpecError, match="run them one by one"):
             run_batch(observer_for(varying(), adapt={"reset": 0.01}), np.zeros((2, 5, 2)), np.zeros((5, 1)))

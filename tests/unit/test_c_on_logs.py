@@ -190,7 +190,7 @@ def test_every_shipped_design_is_one_of_these() -> None:
 
 @pytest.mark.parametrize("name", NONE)
 def test_what_has_no_c_says_why(name: str, tmp_path: Path) -> None:
-    refused = {"motor/one_encoder": "torque shows", "moussaali2013_ltv/as_printed": "residual directions"}
+    refused = {"motor/one_encoder": "torque detectable", "moussaali2013_ltv/as_printed": "residual directions"}
     if name in refused:
         with pytest.raises(obsynth.PreconditionError, match=refused[name]):
             designed(name)

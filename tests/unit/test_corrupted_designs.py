@@ -548,7 +548,7 @@ TABLE: dict[str, tuple[str, Callable[[ObserverDesign], ObserverDesign], tuple[st
         ("exists: rank [E; C]", STATE, GAINS)),
     "a sensor fault like an algebraic state": (
         "quiet", plant_entry("Df", 1, 0, 1.0), ("exists: rank [E 0; 0 0; C Df]", *WRONG_FAULT)),
-    "a fault that never shows": (
+    "a fault that reaches no output": (
         "quiet", with_hidden_fault, ("exists: finite detectability indexes", *WRONG_FAULT, *OTHER_GAINS)),
     "two faults alike at first sight": (
         "chain", plant_field(Bf=[[0, 0], [0, 1], [1, 0], [0, 0], [0, 0]]),
@@ -570,7 +570,7 @@ TABLE: dict[str, tuple[str, Callable[[ObserverDesign], ObserverDesign], tuple[st
     "a claimed error per unit of an input": ("direct", certificate_times("input_error", 0.9), (STORED_U,)),
     "a claimed error that is no number": ("paper", certificate_entry("state_error", 0, 0, np.nan), (STORED_X,)),
     "a claimed error of another shape": ("paper", certificate_cut("state_error", slice(1, None)), (STORED_X,)),
-    "a leak from a state that never forgets": (
+    "a gain from a state that never decays": (
         "metered", lambda d: without_stored_errors(entry("By", 1, 0, 2e-10)(d)), (COMPOSITE,)),
     "a matrix that nothing checks": ("paper", lambda d: with_certificate(d, more=np.eye(2)), (COVERED,)),
 }  # fmt: skip

@@ -23,8 +23,8 @@ FITS, STABILITY, ORDER, DECAY = "fits the plant", "stability", "order", "decay"
 MOTION, MODELS, LEAK = "motion with the fault model", "fault models", "unknown inputs"
 FREE_A, FREE_B, NOISE_A, NOISE_B = "free of others: a", "free of others: b", "noise in fhat[a]", "noise in fhat[b]"
 ERROR_A, ERROR_B = "error of fhat[a]", "error of fhat[b]"
-SHOWS_A, FOLLOWS_A = "exists: a shows", "exists: a follows its model"
-SHOWS_B, FOLLOWS_B = "exists: b shows", "exists: b follows its model"
+SHOWS_A, FOLLOWS_A = "exists: a detectable", "exists: a follows its model"
+SHOWS_B, FOLLOWS_B = "exists: b detectable", "exists: b follows its model"
 
 
 def plant() -> DescriptorSystem:

@@ -173,7 +173,8 @@ class TestSimulation:
 
 @pytest.mark.parametrize("adapt", [{}, {"form": "literal"}, {"form": "random-walk", "walk": 1e-4 * np.eye(2)}])
 def test_a_start_far_from_nominal_is_no_alarm(adapt: dict) -> None:
-    """The parameters are nominal, and the observer starts elsewhere: what it has not yet forgotten says nothing."""
+    """The parameters are nominal, and the observer starts elsewhere: what is left of its initial-condition response
+    says nothing."""
     for missing in (False, True):
         observer, found = run(1, missing=missing, adapt={**adapt, "initial_parameters": np.array([8.0, -9.0])})
         assert np.abs(found.parameters[0]).max() == 9.0
@@ -196,7 +197,7 @@ def test_a_reset_forgets_the_start_at_times_that_data_choose() -> None:
     assert decide(observer, found, nominal=[0.0, 0.0], statistic="glr", false_alarms=0.05).alarm is None
 
 
-def test_the_glr_where_excitation_dies_out() -> None:
+def test_the_glr_where_excitation_decays() -> None:
     """The information on a change sinks below what double precision holds; no warning, and no alarm."""
     plant = TimeVaryingDescriptorSystem(None, [["0.5 + 0 * k"]], C=[[1]], Phi=[["exp(-k)"]], dt=1.0)
     observer = observer_for(plant, adapt={})

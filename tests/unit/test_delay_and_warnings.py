@@ -53,6 +53,6 @@ def test_a_fault_that_cannot_be_told_is_said() -> None:
     plant = obsynth.discretise(load_spec(DESIGNS / "motor" / "one_encoder.yaml").plant, 0.005).plant
     design = obsynth.fault_estimation_filter(plant)
     told = design_warnings(design, followed_steps(design))
-    assert any(text.startswith("A constant torque cannot be told from load torque") for text in told)
+    assert any(text.startswith("A constant torque cannot be distinguished from load torque") for text in told)
     filter_ = obsynth.functional_filter(load_spec(DESIGNS / "motor" / "sampled.yaml").plant)
     assert design_warnings(filter_, followed_steps(filter_)) == ()

@@ -192,7 +192,7 @@ def test_stored_numbers_that_miss_nothing_prove_it_for_a_plant_that_does_not_for
 def test_a_stored_number_far_off_is_not_proved_together() -> None:
     found = with_input()
     observer = found.observer
-    # Far inside the tolerance of the identities, and too much for a margin of 1e-6 where the plant hardly forgets.
+    # Far inside the tolerance of the identities, and too much for a margin of 1e-6 where the plant is hardly stable.
     slow = obsynth.DescriptorSystem(
         None, [[-1e-7]], None, [[1.0]], Bf=[[1.0]], Bd=[[0.3, 0.0]], Dd=[[0.0, 0.7]],
     )  # fmt: skip

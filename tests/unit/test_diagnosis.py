@@ -56,9 +56,11 @@ def test_motor_with_one_encoder_names_the_load_and_the_sensor() -> None:
     assert found.exact
     assert (torque.detectable, torque.estimable, torque.step_estimable) == (False, False, False)
     text = str(found)
-    assert "a step of 1 in torque is hidden by a step of -1 in load torque with theta l = -0.02" in text
+    assert (
+        "a step of 1 in torque is output-nulling together with a step of -1 in load torque and states theta l = -0.02"
+    ) in text
     assert "Add one of: theta l." in text
-    assert "omega l would show it, but not its size." in text
+    assert "omega l would make it detectable, but not estimable." in text
 
 
 def test_motor_with_two_encoders() -> None:
@@ -91,7 +93,7 @@ def test_a_rank_at_the_point_is_not_enough() -> None:
     found = obsynth.diagnose(hidden)["f1"]
     assert found.detectable
     assert not found.detectable_at_rest
-    assert "hidden by" in found.sentences[0]
+    assert "a step of 1 in f1 is output-nulling" in found.sentences[0]
 
 
 def test_estimating_may_take_more_sensors_than_signals() -> None:
@@ -125,14 +127,14 @@ def test_multiple_zeros_on_the_boundary_are_exact(shift: float) -> None:
 
 
 def test_pairs_and_banks() -> None:
-    # Two faults through one path cannot be told apart; a third one can.
+    # Two faults through one path cannot be distinguished; a third one can.
     plant = obsynth.DescriptorSystem(
         None, np.diag([-1.0, -2.0]), None, np.eye(2), Bf=[[1, 2, 0], [0, 0, 1]], fault_names=["a", "b", "c"],
     )  # fmt: skip
     found = obsynth.diagnose(plant, suggest=False)
     assert found.isolable.tolist() == [[True, False, True], [False, True, True], [True, True, True]]
     assert {residual.sees for residual in found.bank} == {("c",), ("a", "b"), ("a", "b", "c")}
-    assert found["a"].sentences[0].startswith("a: it shows, but cannot be told from b, c")
+    assert found["a"].sentences[0].startswith("a: detectable, but not distinguishable from b, c")
 
 
 def test_singular_pencils_are_answered_by_name() -> None:

@@ -164,7 +164,7 @@ def drive() -> obsynth.ObserverDesign:
 
 @pytest.mark.parametrize("start", [{"initial_set": 0.2}, {"initial_error": 0.5}, {}])
 @pytest.mark.parametrize("gap", [["motor speed"], "row", "rows left out"])
-def test_nothing_is_decided_while_a_gap_is_forgotten_whatever_the_warm_up(start: dict[str, float], gap: Any) -> None:
+def test_nothing_is_decided_until_a_gap_has_settled_whatever_the_warm_up(start: dict[str, float], gap: Any) -> None:
     design, plant = drive(), drive().plant
     told: dict[str, Any] = dict(start)
     if "initial_set" in told:
@@ -258,7 +258,7 @@ def test_a_pointwise_threshold_waits_where_nothing_bounds_what_is_missing() -> N
     waits = obsynth.online_monitor(motor("spec"), sample_time=0.005, disturbance_bounds={"load torque": 1.0},
                                    noise_bound=3.0)  # fmt: skip
     assert "nothing is decided, as between samples of a continuous design" in waits.statement
-    assert "larger by what the plant's model may have missed" in monitor.statement
+    assert "it is larger by the possible error of the plant's model" in monitor.statement
 
 
 def test_a_bound_of_the_noise_needs_noise_that_is_stated() -> None:
@@ -390,12 +390,12 @@ def test_the_summary_lists_alarms_and_rows_that_could_not_alarm() -> None:
     assert sum(run.silent.values()) == len(table) - could
     printed = summary_of_run(run, None)
     assert "alarm by" in printed
-    assert f"{len(table) - could} of 160 rows could not alarm" in printed
+    assert f"{len(table) - could} of 160 rows were without a decision" in printed
     quiet = summary_of_run(obsynth.run_on_data(designed("ui-pi-observer"), log(), thresholds={"fhat[f]": 50.0}), None)
     assert "No alarm by any threshold in the" in quiet
     short = summary_of_run(obsynth.run_on_data(designed("ui-pi-observer"), log(rows=5), thresholds={"r[a]": 9.0}), None)
     assert "No alarm" not in short
-    assert "5 of 5 rows could not alarm: 5 warm-up" in short
+    assert "5 of 5 rows were without a decision: 5 warm-up" in short
 
 
 def test_a_stream_keeps_its_state_every_few_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -29,7 +29,7 @@ BAD: dict[str, tuple[dict[str, Any], int, str]] = {
     "an unknown fault": ({"fault": "lek"}, 2, "There is no fault 'lek'"),
     "a step that does not fit": ({"course": "step", "before": 5}, 2, "step does not fit in 5 samples"),
     "a lag that does not fit": ({"course": "any", "lag": 5}, 2, "any does not fit in 5 samples"),
-    "a lag of a constant": ({"lag": 1}, 2, "lag is for courses any, ramp and rate"),
+    "a lag of a constant": ({"lag": 1}, 2, "lag is for the courses any, ramp and rate"),
     "no rate": ({"course": "rate"}, 2, "course rate needs fault_rate"),
     "samples of none": ({"samples": 0}, 2, "samples is 0"),
     "a bank of one": ({"isolate": True}, 2, "leave fault and free out"),

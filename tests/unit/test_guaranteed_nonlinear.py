@@ -131,7 +131,7 @@ def test_it_says_what_it_rests_on_and_is_saved(tmp_path: Path) -> None:
     words = "level stays within 3.8 to 4.2 m"
     assert words in next(row.claim for row in test.report.checks if row.name == "threshold")
     assert words in obsynth.online_monitor(test).statement
-    assert any("leaves out is at most" in note for note in test.notes)
+    assert any("linear model is at most" in note for note in test.notes)
     kept = obsynth.load(test.save(tmp_path / "tank.json"))
     assert obsynth.verify(kept).passed
     _, readings, inflows = run(0.04, 1)

@@ -175,7 +175,7 @@ def test_without_constants_the_monitor_watches_the_test_and_not_the_state_beside
     statistic = table["statistic"].to_numpy(dtype=float)
     decided = np.isfinite(statistic)
     assert not decided[:19].any()
-    # The start of the state beside is forgotten first.
+    # The initial-condition response of the state beside settles first.
     assert decided[60:].all()
     residual = np.abs(design.residual(design.observer.run(y, u)))
     assert statistic[decided] == pytest.approx(residual[decided], rel=1e-12)

@@ -125,7 +125,7 @@ def test_each_row_has_the_threshold_of_its_gain() -> None:
     assert (test.surely_found, test.delay, test.samples) == (2.0 * test.threshold, 1.0, 2)
     assert test.hidden_course()["leak"] == pytest.approx([2.5, 2.5], rel=1e-9)
     assert any("1 rows have no verdict" in note for note in test.notes)
-    assert "the last 2 samples count" in str(test)
+    assert "the last 2 samples are used" in str(test)
 
 
 @pytest.mark.parametrize("singular", [False, True])
@@ -390,11 +390,11 @@ def test_what_is_for_constant_matrices_says_so(tmp_path: Path) -> None:
     refused = {
         "which no export holds": lambda: obsynth.export(test, tmp_path / "test.c"),
         "no bench": lambda: obsynth.simulate(test, scenario),
-        "is watched on data": lambda: obsynth.monitor(test, scenario),
+        "is for measured data": lambda: obsynth.monitor(test, scenario),
         "prove-alarm is for plants": lambda: obsynth.prove_alarm(test, log(), row=6),
         "the fixed test of each row": lambda: test.exact_interval(np.zeros((9, 1)), np.zeros((9, 1))),
         "for an exact model from any start": lambda: obsynth.online_monitor(test, initial_set={"x1": 1.0}),
-        "knows nothing but its window": lambda: obsynth.run_on_data(test, log(), warm_up=1.0),
+        "uses the samples of its window alone": lambda: obsynth.run_on_data(test, log(), warm_up=1.0),
         "outliers is for": lambda: obsynth.run_on_data(test, log(), outliers="gate"),
     }
     for words, call in refused.items():
@@ -429,6 +429,6 @@ def test_the_command_line_designs_verifies_runs_and_reports(tmp_path: Path, caps
     said = capsys.readouterr().out
     assert "never passed without leak" in said
     assert main(["report", "--gains", str(gains), "--out", str(tmp_path / "page.html")]) == 0
-    assert "Why no smaller one" in (tmp_path / "page.html").read_text()
+    assert "Why there is no smaller one" in (tmp_path / "page.html").read_text()
     with_log = ["report", "--gains", str(gains), "--data", str(tmp_path / "log.csv"), "--monitor", "pointwise"]
     assert main([*with_log, "--out", str(tmp_path / "log.html")]) == 0

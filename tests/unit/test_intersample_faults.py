@@ -118,10 +118,10 @@ def test_a_sine_is_estimated_by_its_weighted_mean() -> None:
 
 
 @pytest.mark.parametrize("late", [0.25, 0.75])
-def test_of_two_states_the_wrong_part_of_a_step_dies_out(late: float) -> None:
+def test_of_two_states_the_wrong_part_of_a_step_decays(late: float) -> None:
     """A late step moves the two states in another proportion than a constant fault does.
 
-    What of that the estimate cannot explain is an error of the state, and is forgotten: for short intervals the
+    What of that the estimate cannot explain is an error of the state, and decays: for short intervals the
     estimate in the interval of the change is the share of the interval, and afterwards the fault itself.
     """
     step, size = 1e-3, 2.0

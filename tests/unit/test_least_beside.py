@@ -25,7 +25,7 @@ def test_the_drive_s_filter_beside_the_least() -> None:
     # The residual of this filter is the estimate itself, and its monitor has a proved bound, with the start in it.
     watched = obsynth.monitor(design, scenario, noise_bound=3.0)
     assert bound == pytest.approx(watched.threshold[-1], rel=1e-3)
-    # Measured with the same bounds: a fault of any course, told one sample later.
+    # Measured with the same bounds: a fault of any time course, told one sample later.
     assert least == pytest.approx(1.1996048, rel=2e-4)
     assert "1.18 times the least" in in_words("loss of torque", bound, least)
 

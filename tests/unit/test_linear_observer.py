@@ -310,7 +310,8 @@ class TestToControl:
         assert np.allclose(design.observer.run(y, np.zeros((20, 1))).faults[:, 0], impulse, rtol=1e-10, atol=1e-12)
 
     def test_the_estimates_are_those_of_the_plant(self):
-        """Run against a simulated plant: the fault comes back delayed once the start is forgotten, names in order."""
+        """Run against a simulated plant: the fault comes back delayed once the initial-condition response has settled,
+        names in order."""
         design = designed()
         plant, observer_ = design.plant, design.observer
         rng = np.random.default_rng(3)

@@ -198,8 +198,8 @@ def test_a_picture_of_one_s_own_data(design, frame):
         plot_data(run.table)
 
 
-def test_a_fault_is_shaded_red_at_its_own_alarms_alone():
-    """Two faults, of which the second comes alone: the panel of the first stays white, both alarms are in the third."""
+def test_a_panel_is_shaded_red_at_its_own_alarms_alone():
+    """Only the second fault occurs: the panels of the first fault, and of residuals without a threshold, stay white."""
     plant = obsynth.DescriptorSystem(
         None, np.diag([0.8, 0.7]), None, ["level", "flow"], Bf=np.eye(2), dt=0.5, state_names=["level", "flow"],
         fault_names=["leak", "clog"],
@@ -210,10 +210,21 @@ def test_a_fault_is_shaded_red_at_its_own_alarms_alone():
         x = plant.A @ x + plant.Bf[:, 1] * (k >= 20)
     log = pd.DataFrame(rows, columns=["time", "level", "flow"])
     design = obsynth.fault_estimation_filter(plant)
-    run = obsynth.run_on_data(design, log, thresholds={"fhat[leak]": 0.25, "fhat[clog]": 0.25})
-    panels = plot_data(run, show=["faults", "residuals"], axes=list(Figure().subplots(3, 1)))
-    red = [sum(patch.get_alpha() == 0.15 for patch in panel.patches) for panel in panels]
-    assert red == [0, 1, 1]
+    faults = {"fhat[leak]": 0.25, "fhat[clog]": 0.25}
+    for thresholds, shaded in ((faults, [0, 1, 0]), ({**faults, "r[leak]": 0.25, "r[clog]": 0.25}, [0, 1, 1])):
+        run = obsynth.run_on_data(design, log, thresholds=thresholds)
+        panels = plot_data(run, show=["faults", "residuals"], axes=list(Figure().subplots(3, 1)))
+        assert [sum(patch.get_alpha() == 0.15 for patch in panel.patches) for panel in panels] == shaded
+
+
+@pytest.mark.parametrize(("zone", "label"), [(None, "time"), ("+02:00", "time (UTC+02:00)"), ("UTC", "time (UTC)")])
+def test_dates_are_drawn_in_the_zone_of_the_log(design, frame, zone, label):
+    dates = pd.Timestamp("2026-05-01T06:29:50").tz_localize(zone) + pd.to_timedelta(frame["time"], unit="s")
+    (panel, *_, last) = plot_data(obsynth.run_on_data(design, frame.assign(time=dates)), show=["outputs"])
+    last.figure.canvas.draw()
+    assert panel.get_shared_x_axes().joined(panel, last)
+    assert last.get_xlabel() == label
+    assert "06:30" in [text.get_text() for text in last.get_xticklabels()]
 
 
 def test_a_run_to_a_file_holds_no_table(design, frame, tmp_path):
@@ -247,7 +258,7 @@ def test_the_page_shows_one_s_own_data_first(design, frame, tmp_path, monkeypatc
         "--monitor", "chi-square", "--out", "page.html",
     ]) == 0  # fmt: skip
     page = Path("page.html").read_text(encoding="utf-8")
-    places = [page.index(text) for text in ("On your data", "In short", ">Pictures<", "What is promised", ">Checks<")]
+    places = [page.index(text) for text in ("On your data", "Summary", ">Pictures<", "Claims", ">Checks<")]
     assert places == sorted(places)
     assert "Statistics" in page
     assert "--data log.csv" in page

@@ -47,7 +47,7 @@ def test_gains_reproduce_a_run_with_gaps(form: str, early: bool) -> None:
         outputs = np.nan_to_num(y[k]) if k else np.zeros(0)
         before = u[k - 1] if k else np.zeros(1)
         data = np.concatenate([gains.step.A @ x + gains.step.B @ before, outputs, gains.step.Dn @ u[k]])
-        x, theta = gains.gain @ data, gains.forget @ theta + gains.learn @ data
+        x, theta = gains.gain @ data, gains.retain @ theta + gains.learn @ data
         np.testing.assert_allclose(theta, found.parameters[k], rtol=0, atol=1e-11)
         np.testing.assert_allclose(x + gains.Upsilon @ theta, found.states[k], rtol=0, atol=1e-10)
         np.testing.assert_allclose(gains.spread @ gains.spread.T, found.parameter_covariances[k], rtol=0, atol=1e-11)

@@ -299,7 +299,7 @@ def test_the_correlation_that_is_left_is_that_of_all_lags(machine):
     assert correlation_left(model, window, whitener) == pytest.approx(summed, rel=1e-6)
 
 
-def test_a_number_of_any_size_is_an_alarm_and_is_forgotten(noisy):
+def test_a_number_of_any_size_is_an_alarm_and_leaves_no_trace(noisy):
     scenario = obsynth.Scenario(horizon=60, noise=1)
     table = log_of(obsynth.simulate(noisy, scenario))
     for size in (1e200, -1e307):

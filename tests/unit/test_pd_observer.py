@@ -160,7 +160,7 @@ class TestOptions:
                 design.report["noise in the fault estimate"].value, rel=1e-3
             )
             fast = np.linalg.norm(np.linalg.solve(d, l)[PLANT.nx :], 2)
-            assert design.report["fast noise in the fault estimate"].value == pytest.approx(fast, rel=1e-9)
+            assert design.report["high-frequency noise in the fault estimate"].value == pytest.approx(fast, rel=1e-9)
 
     def test_noise_and_disturbance_as_the_plant_states_them(self) -> None:
         design = obsynth.pd_observer(rich(), noise_gain=0.5, fault_rate_gain=2.0)
@@ -224,7 +224,7 @@ class TestOptions:
             M=[[0.152, 0.777], [-0.002, 0]], N=np.zeros((2, 2)),
         )  # fmt: skip
         assert design.report.passed
-        assert design.report["P part alone"].value == pytest.approx(0.786, abs=2e-3)
+        assert design.report["proportional part alone"].value == pytest.approx(0.786, abs=2e-3)
         assert design.report["error system"].value == pytest.approx(-0.124, abs=2e-3)
         a, zero = loop(design)[0], np.zeros((1, 6))
         for delta in (0.01, 0.1):
@@ -279,7 +279,7 @@ class TestDefaults:
         assert design.report.passed
         assert design.certificate.claims["decay"] < 0.1
 
-    def test_a_fast_mode_that_dies_out_by_itself_does_not_set_the_pace(self) -> None:
+    def test_a_fast_mode_that_decays_by_itself_does_not_set_the_pace(self) -> None:
         """An unstable mode at 0.5 and a sensor at -1e5: gains are those of the slow plant."""
         a = np.diag([-1e5, -1.0, 0.5]) + 0.3 * np.triu(np.ones((3, 3)), 1)
         plant = obsynth.DescriptorSystem(None, a, C=[[0.1, 0.1, 1.1]], Bf=[[0.0], [1.0], [1.0]])
@@ -449,13 +449,13 @@ class TestRunning:
 
 
 class TestRefusals:
-    def test_a_noise_gain_below_what_standstill_takes(self) -> None:
+    def test_a_noise_gain_below_that_of_steady_state(self) -> None:
         least = least_noise_gain(PLANT)
-        # By hand: ny = nf, so at standstill f is read from y by one matrix alone.
+        # By hand: ny = nf, so in steady state f is read from y by one matrix alone.
         rosenbrock = np.block([[PLANT.A, PLANT.Bf], [PLANT.C, PLANT.Df]])
         by_hand = np.linalg.inv(rosenbrock)[4:, 4:]
         assert least == pytest.approx(np.linalg.norm(by_hand, 2))
-        with pytest.raises(obsynth.InfeasibleError, match="standstill") as caught:
+        with pytest.raises(obsynth.InfeasibleError, match="steady state") as caught:
             obsynth.pd_observer(PLANT, noise_gain=0.999 * least)
         assert (caught.value.necessary, caught.value.lower_bound) == (True, least)
         assert obsynth.pd_observer(PLANT, decay=0.0, noise_gain=2.0 * least).report.passed
@@ -484,7 +484,7 @@ class TestRefusals:
             obsynth.pd_observer(plant, decay=0.5)
         assert caught.value.necessary
         assert obsynth.pd_observer(plant, decay=0.45).report.passed
-        with pytest.raises(obsynth.InfeasibleError, match="stays where it is"):
+        with pytest.raises(obsynth.InfeasibleError, match="no gain moves it"):
             obsynth.pd_observer(plant, disk=[5.0, 4.0])
         assert obsynth.pd_observer(plant, disk=[5.0, 4.6]).report.passed
 

@@ -47,7 +47,7 @@ def test_where_a_bound_is_reached_the_record_says_that_there_is_nothing_to_polis
     design = obsynth.fault_estimation_filter(plant(nd=1), engine="lmi")
     last = [run for run in design.solver["runs"] if run["what"] == "least gain"][-1]
     assert last["solver"] == "lower bound"
-    assert "nothing to polish" in last["status"]
+    assert "the lower bound is reached" in last["status"]
     assert last["gain"] == pytest.approx(design.certificate.claims["gamma_min"])
     assert "lower bound" not in str(filtering(nd=1).solver["runs"])
 

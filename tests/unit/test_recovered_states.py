@@ -90,7 +90,7 @@ def test_inputs_faults_and_states_are_of_the_same_moment():
     for name, values in (("voltage", voltage + 1.02), ("power", 0.3 * speed + voltage + 1.0)):
         estimated = found[f"xhat[{name}]"].to_numpy()
         assert np.abs(estimated[1:] - values[:-1])[-100:].max() < 1e-6, name
-        # Any other moment would be told apart.
+        # Any other moment would be distinguished.
         assert np.abs(estimated - values)[-100:].max() > 1e-2, name
 
 

@@ -46,7 +46,7 @@ class TestDetectability:
         assert error.mode == pytest.approx(1.0)
         assert obsynth.descriptor_kalman(sampled(A, [[0.0, 1, 0]], E=E), **NOISE).report.passed
 
-    def test_modes_that_die_out_may_stay_hidden(self) -> None:
+    def test_modes_that_decay_may_stay_hidden(self) -> None:
         assert obsynth.descriptor_kalman(sampled(np.diag([0.5, 0.9]), [[1.0, 0]]), **NOISE).report.passed
 
     def test_constant_matrices_are_enough(self) -> None:
@@ -112,12 +112,12 @@ class TestParameters:
     def test_two_that_act_alike(self) -> None:
         error = refusal(self.plant(Bf=[[1, 2], [0, 0]], fault_names=["a", "b"]), "adaptive-observer")
         assert (error.condition, error.signals) == ("identifiable parameters", ("a", "b"))
-        assert "'a', 'b' cannot be told from each other: in the ratio 1 : -0.5" in str(error)
+        assert "'a', 'b' cannot be distinguished from each other: in the ratio 1 : -0.5" in str(error)
 
     def test_a_bias_of_a_sensor_of_an_integrator(self) -> None:
         error = refusal(self.plant(np.diag([1.0, 0.7]), Df=[[1], [0]], fault_names=["bias"]), "adaptive-observer")
         assert error.signals == ("bias",)
-        assert "cannot be told from constant shifts of 'x1'" in str(error)
+        assert "cannot be distinguished from constant shifts of 'x1'" in str(error)
         assert obsynth.adaptive_observer(self.plant(Df=[[1], [0]]), **NOISE).report.passed
 
     def test_one_that_enters_nowhere(self) -> None:
@@ -169,7 +169,7 @@ class TestParameters:
             assert rows["identifiable parameters"].holds
 
 
-def test_errors_that_die_out_beyond_the_horizon_are_unclear_not_impossible() -> None:
+def test_errors_that_decay_beyond_the_horizon_are_unclear_not_impossible() -> None:
     # Every state shows, exactly; as identities, Q and R hardly weigh x4 in these units.
     plant = obsynth.DescriptorSystem(
         np.diag([0.001, 0.1, 0.01, 1.0]),

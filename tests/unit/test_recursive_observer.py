@@ -108,7 +108,7 @@ def test_outputs_that_determine_the_state_end_a_gap_of_several_samples() -> None
     y[8:10] = np.nan
     found = observer.run(y)
     assert np.isinf(found.state_deviations[8:10]).all()
-    # At k = 10 the state is what the outputs alone say, C^-1 y(10); from there the gap is forgotten.
+    # At k = 10 the state is what the outputs alone say, C^-1 y(10); from there the gap has no effect.
     np.testing.assert_allclose(found.states[10], np.linalg.solve(plant.C.at(10), y[10]), atol=1e-13)
     alone = np.linalg.inv(plant.C.at(10)) @ observer.R.at(10) @ np.linalg.inv(plant.C.at(10)).T
     np.testing.assert_allclose(found.state_deviations[10], np.sqrt(np.diag(alone)), rtol=1e-13)
@@ -299,7 +299,7 @@ def test_early_constraints_and_a_random_walk_are_maximum_likelihood(missing: boo
 
 
 def test_early_constraints_and_parameters_that_stand_still() -> None:
-    """A walk of no length is least squares that forgets nothing."""
+    """A random walk of no variance is least squares without a forgetting factor."""
     plant = varying(horizon=30)
     data = record(plant, 20)
     still = observer_for(plant, adapt={"form": "random-walk"}, early_constraints=True).run(*data)

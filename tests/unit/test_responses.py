@@ -52,7 +52,7 @@ def test_a_gain_is_the_sum_of_absolute_values() -> None:
 
 
 def test_what_is_older_than_the_ring_counts() -> None:
-    """A ring of 8 samples forgets 0.5 to 0.4 %: without its tail the sum would be below the true one."""
+    """A ring of 8 samples decays from 0.5 to 0.4 %: without its tail the sum would be below the true one."""
     found = responses_of(one_state(0.5, into=0.25, own=2))
     assert found.length == 8
     within = 0.25 * (2.0 - 2.0**-7)

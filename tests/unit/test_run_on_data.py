@@ -263,7 +263,7 @@ def test_a_long_gap_starts_the_observer_again(continuous):
     assert np.array_equal(estimates(found, "xhat")[50:], estimates(fresh, "xhat"))
 
 
-def test_warm_up_is_until_the_slowest_mode_is_forgotten(sampled, continuous):
+def test_warm_up_is_until_the_slowest_mode_has_settled(sampled, continuous):
     table = random_log(continuous, 0.01 * np.arange(400))
     slowest = -np.linalg.eigvals(continuous.observer.Az).real.max()
     found = run_on_data(continuous, table).table
@@ -443,7 +443,7 @@ def test_options_are_checked(sampled, continuous):
         run_on_data(continuous, table, columns={"time": "time"}, scales={"time": 1e-3})
     with pytest.raises(SpecError, match="scale of 'y1'"):
         run_on_data(continuous, table, scales={"y1": 0.0})
-    with pytest.raises(SpecError, match="no column 'fhat' to watch"):
+    with pytest.raises(SpecError, match="no column 'fhat' to monitor"):
         run_on_data(continuous, table, thresholds={"fhat": 1.0})
     with pytest.raises(SpecError, match="give a positive number"):
         run_on_data(continuous, table, thresholds={"fhat[fault]": -1.0})
@@ -501,7 +501,7 @@ def test_rows_in_one_piece_are_those_of_single_steps_bit_for_bit(continuous, mon
     rows = single.estimates(times.tolist(), values)
     assert {row.status for row in rows} >= {"ok", "gap", "recovering"}
     for number, (ours, theirs) in enumerate(zip(whole, rows, strict=True)):
-        assert (ours.status, ours.skipped, ours.forgotten) == (theirs.status, theirs.skipped, theirs.forgotten), number
+        assert (ours.status, ours.skipped, ours.settled) == (theirs.status, theirs.skipped, theirs.settled), number
         np.testing.assert_array_equal(ours.values, theirs.values, err_msg=str(number))
     for name, value in run.as_dict()["observer"].items():
         np.testing.assert_array_equal(value, single.as_dict()["observer"][name], err_msg=name)

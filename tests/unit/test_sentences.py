@@ -53,7 +53,7 @@ def test_box_and_start_of_a_threshold_over_tolerances(design: obsynth.ObserverDe
     assert len(told.split()) <= MOST_WORDS
     wider = obsynth.online_monitor(design, constants={"p": "3 %"}, **BOUNDS).statement
     assert "p within 3 % of nominal" in wider
-    assert "once the start is forgotten" in wider
+    assert "once the initial-condition response has settled" in wider
 
 
 def test_probabilities_window_and_change_are_told(design: obsynth.ObserverDesign) -> None:

@@ -62,7 +62,7 @@ def test_a_stranger_with_a_thermal_plant_gets_to_an_alarm(battery, capsys):
     for command in (command for command in commands if "compare" not in command):
         assert main(shlex.split(command)[1:]) == 0
     printed = capsys.readouterr().out
-    assert "90 % is shown after: heater fault 730 s" in printed
+    assert "the estimate reaches 90 % after: heater fault 730 s" in printed
     assert "Alarm: fhat[heater fault] first above its threshold at 2026-01-12T07:16:00." in printed
     assert (battery / "battery.png").stat().st_size > 10_000
 

@@ -1,4 +1,4 @@
-"""Tolerances: what can never be told from a fault, and options of old."""
+"""Tolerances: what can never be distinguished from a fault, and options of old."""
 
 from __future__ import annotations
 
@@ -34,4 +34,4 @@ def test_what_acts_where_a_fault_acts_is_never_told_from_it(wang) -> None:
     assert "zero at 1" in rows["A[3,3]"].reason
     found = obsynth.robustness(obsynth.fault_estimation_filter(drive()))
     assert found.sharing == ("J1", "b")
-    assert "never told from a fault" in dict(found.facts())
+    assert "never distinguished from a fault" in dict(found.facts())

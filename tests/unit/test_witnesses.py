@@ -75,7 +75,8 @@ def functional(plant: DescriptorSystem) -> tuple[Condition, ...]:
 
 
 def test_what_floating_point_does_not_see_is_no_refusal_of_what_shows_on_paper() -> None:
-    """With so many digits numbers are taken to be computed; they still are not those of a fault that never shows."""
+    """With so many digits numbers are taken to be computed; they still are not those of a fault that reaches no
+    output."""
     plant = made(None, **NEARLY_MASKED)
     with pytest.raises(PreconditionError, match=r"^Unclear: .*Witness: the plant with entry"):
         functional_filter(plant)
@@ -180,7 +181,7 @@ def test_the_witness_has_the_other_answer(case: str) -> None:
         condition.require()
     changed = [found for found in conditions(doubt.witness.plant(plant)) if not found.holds]
     # Faults that are alike do not show at all, at no pole of their models.
-    assert {name, f"{name.split()[0]} shows"} & {found.name for found in changed}
+    assert {name, f"{name.split()[0]} detectable"} & {found.name for found in changed}
     assert all(found.unclear is None for found in changed)
 
 

@@ -86,7 +86,7 @@ def identifiability(
     state_scales: ArrayLike | None = None,
     parameter_scales: ArrayLike | None = None,
 ) -> Identifiability:
-    r"""Find which initial states and parameters can be told from the outputs along a nominal trajectory.
+    r"""Find which initial states and parameters can be distinguished from the outputs along a nominal trajectory.
 
     Parameters
     ----------

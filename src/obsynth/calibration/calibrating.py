@@ -475,7 +475,7 @@ def calibrate(
     .. [Ljung1999] L. Ljung, System Identification, 2nd ed., 1999, 7.2 and 10.1: prediction errors and their gradients.
     .. [Chung2013] Y. Chung et al., "A nondegenerate penalized likelihood estimator for variance parameters",
        Psychometrika 78, 2013: the weight that keeps variances from zero, which we give only to those that the log
-       cannot tell from it.
+       cannot distinguish from it.
     """
     chosen(method, "method", METHODS)
     chosen(integration, "integration", INTEGRATIONS)

@@ -105,7 +105,7 @@ def _said(objective: Objective, maximum: Maximum) -> Information:
 def guarded_maximum(
     objective: Objective, fits: list[Fit], note: Callable[[str], object]
 ) -> tuple[Maximum, Information]:
-    """Return the greatest likelihood, with variances that the log cannot tell from zero kept away from it."""
+    """Return the greatest likelihood, with variances that the log cannot distinguish from zero kept away from it."""
     maximum = greatest_likelihood(objective, fits, note)
     found = _said(objective, maximum)
     if not found.undetermined:

@@ -129,7 +129,7 @@ def profile_box(objective: Objective, maximum: Maximum, root: float, said: Infor
 
 
 def upper_limit(objective: Objective, maximum: Maximum, i: int) -> float:
-    """Return the one-sided limit of a logarithm of a variance that the log cannot tell from zero."""
+    """Return the one-sided limit of a logarithm of a variance that the log cannot distinguish from zero."""
     avoided = objective.avoided.copy()
     objective.avoided[:] = 0.0
     lowest = maximum.z.copy()

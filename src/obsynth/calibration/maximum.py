@@ -309,7 +309,7 @@ def _newton_step(
 
 
 def collapsed(objective: Objective, maximum: Maximum) -> BoolArray:
-    """Return which variances the log cannot tell from zero where they are, as truth values."""
+    """Return which variances the log cannot distinguish from zero where they are, as truth values."""
     found = np.zeros(objective.size, dtype=bool)
     for i in np.flatnonzero(objective.is_q | objective.is_r):
         z = maximum.z.copy()
@@ -326,7 +326,7 @@ def without_collapse(objective: Objective, maximum: Maximum, note: Callable[[str
         new = collapsed(objective, maximum) & (objective.avoided == 0.0)
         if not new.any():
             break
-        note("variances that the log cannot tell from zero")
+        note("variances that the log cannot distinguish from zero")
         objective.avoided[new] = 1.0
         best, value = maximum.z, np.inf
         for raised in RAISED:

@@ -279,7 +279,7 @@ def _fitted(
             f"The box does not stand: its {100 * box.level:g} % are those of white innovations, which these are not."
         )
     return found + [
-        f"The variance of {name} cannot be told from zero: its upper limit {values[name]:.3g} is used."
+        f"The variance of {name} cannot be distinguished from zero: its upper limit {values[name]:.3g} is used."
         for name in limited
     ]
 

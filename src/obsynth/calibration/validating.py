@@ -119,7 +119,7 @@ def _recorded(
 #: Nats that a variance of the design must cost, the others being free, before its ratio is told.
 CLEAR_NATS = 3.0
 #: Where something else explains coloured innovations, variances are told if they explain this many times as many nats:
-#: process noise and coloured sensor noise are hardly told apart on one log.
+#: process noise and coloured sensor noise are hardly distinguished on one log.
 CLEARLY_MORE = 1.25
 #: Ratios nearer to one than this factor are not told: nobody knows a variance better.
 TOLD_FACTOR = 1.5
@@ -218,7 +218,7 @@ def validate(
     columns: Mapping[str, str] | None = None,
     scales: Mapping[str, float] | None = None,
 ) -> Validation:
-    """Ask whether a recorded log without faults agrees with a design.
+    """Test whether a log without faults agrees with a design.
 
     Parameters
     ----------

@@ -201,14 +201,14 @@ SYSTEM = option("--system", "FILE", "the spec (YAML)", type=Path, required=True)
 GAINS = option("--gains", "FILE", "a gain set (JSON) that design wrote", type=Path, required=True)
 SPEC_GAINS = option("--gains", "FILE", "a gain set for the spec's plant: nothing is designed", type=Path)
 UNVERIFIED = Settings(
-    (flag("--unverified", "hand on what fails its verification all the same; whatever is written says so"),)
+    (flag("--unverified", "use a gain set that fails its verification; every file that is written says so"),)
 )
-JSON = flag("--json", "print JSON on stdout, for programs; errors too")
+JSON = flag("--json", "print JSON on stdout, for programs; errors as well")
 FORCE = flag("--force", "replace an existing file whatever it is; never an input")
 QUIET = flag("--quiet", "print no progress")
 JOBS = option("--jobs", "N", "processes (default: 1)", type=count)
-CLUSTER = option("--cluster", "ADDRESS", "of the scheduler of a Dask cluster, instead of --jobs")
-MAP = option("--map", "SIGNAL=COLUMN", "column of a signal (or of time) where the names differ; may be repeated")
+CLUSTER = option("--cluster", "ADDRESS", "of scheduler of a Dask cluster, instead of --jobs")
+MAP = option("--map", "SIGNAL=COLUMN", "column of a signal (or of the time) where the names differ; may be repeated")
 _SCALE = option(
     "--scale", "SIGNAL=FACTOR", "the column's value times the factor is in the signal's unit; may be repeated"
 )
@@ -222,7 +222,16 @@ TIME_COLUMN = option(
 LOG_OPTIONS = (
     MAP,
     SCALE,
-    Settings((option("--rows", "A:B", "rows of the log without faults, as Python counts (default: all)"), TIME_COLUMN)),
+    Settings(
+        (
+            option(
+                "--rows",
+                "A:B",
+                "rows of the log without faults: the first one, counted from 0, and one past the last (default: all)",
+            ),
+            TIME_COLUMN,
+        )
+    ),
 )
 #: What a monitor is made of.
 MONITOR = Group("monitor", (option("--monitor", "KIND", "watch the residual (or the parameters) by a threshold"),))
@@ -230,7 +239,7 @@ MONITOR = Group("monitor", (option("--monitor", "KIND", "watch the residual (or 
 MONITOR_SETTINGS = Settings(
     (
         option("--disturbance", "NAME=BOUND", "largest absolute value of a disturbance; may be repeated"),
-        option("--noise-bound", "N", "standard deviations that no noise exceeds", type=float),
+        option("--noise-bound", "N", "bound on the noise, in standard deviations", type=float),
         option(
             "--initial",
             "STATE=BOUND",
@@ -281,7 +290,7 @@ DATA_OPTIONS = (
             ),
             option("--sample-time", "SECONDS", "monitor of a continuous design: between the rows", type=float),
             option("--gap", "SECONDS", "continuous designs: longer intervals are gaps", type=float),
-            option("--warm-up", "SECONDS", "how long to mark the start, and after gaps", type=float),
+            option("--warm-up", "SECONDS", "seconds that count as warm-up, at the start and after gaps", type=float),
         )
     ),
 )

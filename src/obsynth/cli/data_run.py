@@ -205,14 +205,15 @@ def summary_of_run(found: DataRun, watched: Monitor | None) -> str:
         kinds = Counter(found.recovered.values())
         told = ", ".join(f"{count} {kind.replace('needs', 'with')}" for kind, count in kinds.items())
         count = len(found.recovered)
-        lines.append(f"Of the plant as written, {count} more state{'s are' if count > 1 else ' is'} estimated: {told}.")
+        states = "states of the plant as written are" if count > 1 else "state of the plant as written is"
+        lines.append(f"{count} {states} recovered as well: {told}.")
     if found.outliers:
         told = ", ".join(f"{count} of {name}" for name, count in found.outliers.items())
         lines.append(f"{sum(found.outliers.values())} outliers: {told}.")
     for name, time in found.alarms.items():
         first = next((event for event in found.events if event.by == name), None)
         clear = watched is not None and name == watched.kind and first is not None and first.clear
-        fault = f"; {first.fault} stands out" if clear and first is not None else ""
+        fault = f"; it points to {first.fault}" if clear and first is not None else ""
         lines.append(f"Alarm: {name} first above its threshold at {found.stamps.shown(time)}{fault}.")
     lines += _alarm_table(found)
     if watched is not None or found.thresholds:

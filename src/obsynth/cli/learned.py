@@ -46,9 +46,11 @@ def run_thresholds(options: argparse.Namespace) -> int:
         print(
             f"Warning: the rate needs {found.needed} rows without faults, and {found.rows} are given.", file=sys.stderr
         )
-    lines = [f"{found.statement[0].upper()}{found.statement[1:]}.", f"Watched: {', '.join(found.columns)}."]
+    lines = [f"{found.statement[0].upper()}{found.statement[1:]}.", f"Monitored: {', '.join(found.columns)}."]
     if found.left_out:
-        lines.append(f"Not watched, as the others explain it, or it remembers too long: {', '.join(found.left_out)}.")
+        lines.append(
+            f"Not monitored, as they depend on the others or are correlated for too long: {', '.join(found.left_out)}."
+        )
     answer(
         options,
         {

@@ -82,18 +82,18 @@ The data have a column 'time', in seconds or as dates and times (ISO 8601), and 
 by name. Columns of text are separated by commas, semicolons, tabs or bars; numbers may have a decimal comma where
 commas separate nothing.
 Each row of estimates has a status:
-  ok          all is well
-  warm-up     the start is not forgotten yet
+  ok          nothing is missing
+  warm-up     the initial-condition response has not settled yet
   gap         a sample is missing: fault estimates are held, the plant model stands in, no alarms
   partial     recursive and nonlinear designs: some outputs are missing, the others are used
-  recovering  after a gap; levels decide by as much more as it can have left
+  recovering  after a gap; a level decides where it is passed by more than the gap can have caused
   repeated stamp, out of order
               a stamp that does not rise: the row is left out (more than 10 in a row are an error)
 Of sampled designs, stamps may be off their sample by a fifth of the sampling time and more (.45 at once, .25 on
 average); of longer intervals, each whole number of samples is so many rows less one that are missing.
 An estimate that lags has a column 'time of ...', the time of which it is the estimate.
 
---monitor KIND adds columns 'statistic', 'threshold' and 'alarm', with the fault that stands out. The thresholds hold
+--monitor KIND adds columns 'statistic', 'threshold' and 'alarm', with the fault that it points to. The thresholds hold
 however long the data are. KIND is one of
   pointwise   linear designs: the residual's peak bound, for disturbances and noise within bounds; where the plant's
               constants have tolerances, it adapts to the signals and holds for every plant within them, with columns
@@ -102,8 +102,8 @@ however long the data are. KIND is one of
   paper       linear, discrete: eq. (66) of Wang et al. 2015; no bound
   chi-square  linear: a window of the residual against its covariance; recursive: the parameters against theirs
   cusum       small changes of the residual, or of a parameter
-  nis         recursive and nonlinear designs: innovations that the model does not explain
-  learned     every design: thresholds from rows without faults (--normal), whatever the model assumes of noise
+  nis         recursive and nonlinear designs: innovations too large for the model
+  learned     every design: thresholds from rows without faults (--normal), whatever noise the model assumes
 Where --gains is a folder, every gain set in it is run on --data, a log or a folder of logs, on --jobs processes or a
 cluster; a log with the name of a gain set is for that one alone.  --out is a folder then, with the estimates, table.csv
 and fleet.png; the same command goes on where another was stopped.
@@ -116,7 +116,7 @@ _EXPECTED_SCENARIO = option("--system", "FILE", "spec (YAML) whose scenario tell
 VERBS = {
     "design": Verb(
         "commands:run_design",
-        "Design an observer from a spec, prove it, print a report and write the gain set.",
+        "Design an observer from a spec, verify it, print a report and write the gain set.",
         (
             SYSTEM,
             option(
@@ -136,14 +136,14 @@ VERBS = {
         "Analyse the plant of a spec, and check for every method whether a design can exist.",
         (
             SYSTEM,
-            flag("--whole-bank", "look for every structured residual of more than 6 faults, up to 12"),
+            flag("--whole-bank", "list every structured residual for more than 6 faults, up to 12"),
             verbose("the structure of the plant and every condition"),
             JSON,
         ),
     ),
     "sensors": Verb(
         "commands:run_sensors",
-        "Find the cheapest sensors to add with which faults are told, or found above a size.",
+        "Find the cheapest sensors to add, so that faults can be detected, isolated or estimated.",
         (
             SYSTEM,
             option(
@@ -153,11 +153,16 @@ VERBS = {
                 "at most --below",
                 default="estimate",
             ),
-            option("--fault", "NAME", "which fault (default: all; for threshold: that of the spec's method)"),
+            option("--fault", "NAME", "the fault (default: all; for threshold: that of the spec's method)"),
             Settings(
                 (
-                    option("--below", "SIZE", "for threshold: half of the size that must surely be found", type=float),
-                    option("--noise", "DEVIATION", "of each candidate; threshold needs it", type=float),
+                    option(
+                        "--below",
+                        "SIZE",
+                        "for threshold: half of the size of a fault that must be detected for certain",
+                        type=float,
+                    ),
+                    option("--noise", "DEVIATION", "noise of each candidate; threshold needs it", type=float),
                     option("--largest", "N", "sensors to add at most", type=int),
                     option("--sample-time", "SECONDS", "of a continuous plant, for threshold", type=float),
                 )
@@ -168,7 +173,7 @@ VERBS = {
     ),
     "verify": Verb(
         "commands:run_verify",
-        "Verify a saved gain set or certificate of any kind again, to the end of what it rests on.",
+        "Verify a saved gain set, or a certificate of any kind with all files that it refers to, again.",
         (
             option(
                 "gains",
@@ -195,7 +200,7 @@ VERBS = {
                     option(
                         "--printed-digits",
                         "N",
-                        "judge the gains as numbers that were printed with N decimals",
+                        "take the gains as rounded to N decimals, as in a printed table",
                         type=digits,
                     ),
                 )
@@ -225,15 +230,21 @@ VERBS = {
             option("--data", "FILE", "a log, as for run, to replay through every method", type=Path),
             MAP,
             SCALE,
-            option("--out", "FILE", "write a page (HTML), or a certificate for verify (.json)", type=Path),
+            option("--out", "FILE", "write a page (HTML), or a certificate for obsynth verify (.json)", type=Path),
             Settings(
                 (
                     option("--runs", "N", "drawn runs of the scenario (default: 20)", type=int, default=20),
                     option(
-                        "--tolerance", "T", "relative error of parameters that is drawn (0.05)", type=float, default=0.0
+                        "--tolerance",
+                        "T",
+                        "relative error of the parameters that are drawn (default: 0.05)",
+                        type=float,
+                        default=0.0,
                     ),
-                    option("--within", "SECONDS", "90 %% of a step must be shown within this time", type=float),
-                    option("--sample-time", "SECONDS", "the clock of a continuous plant", type=float),
+                    option(
+                        "--within", "SECONDS", "the estimate of a step must reach 90 %% within this time", type=float
+                    ),
+                    option("--sample-time", "SECONDS", "sample time for a continuous plant", type=float),
                     TIME_COLUMN,
                     INPUT_DELAY,
                 )
@@ -250,13 +261,13 @@ VERBS = {
             SYSTEM,
             SPEC_GAINS,
             UNVERIFIED,
-            option("--runs", "N", "how many, each with its seed (default: 100)", type=int, default=100),
+            option("--runs", "N", "number of runs, each with its own seed (default: 100)", type=int, default=100),
             Settings(
                 (
                     option(
                         "--tolerances",
                         "LIST",
-                        "instead, a fixed bound beside the adaptive threshold for these tolerances, such as "
+                        "instead, compare a fixed bound with the adaptive threshold for these tolerances, such as "
                         "0,1%%,2%%,5%%",
                     ),
                     option("--confidence", "P", "of the intervals (default: 0.95)", type=float, default=0.95),
@@ -279,7 +290,7 @@ VERBS = {
     ),
     "sweep": Verb(
         "sweep:run_sweep",
-        "Design and verify for every combination of specs and values; what fails is a row of the table.",
+        "Design and verify for every combination of specs and values; a design that fails is a row of the table.",
         (
             option("--system", "FILE", "a spec (YAML), or several", type=Path, required=True, nargs="+"),
             option("--set", "PATH=LIST", "an entry of the specs and its values", action="append", default=[]),
@@ -295,7 +306,7 @@ VERBS = {
     ),
     "run": Verb(
         "data_commands:run_run",
-        "Run a design on measured data: a log, or a stream on standard input, a row in, a row out.",
+        "Run a design on measured data: a log, or a stream on standard input, with a row of estimates for each row.",
         (
             GAINS,
             UNVERIFIED,
@@ -322,8 +333,8 @@ VERBS = {
                     option(
                         "--outliers",
                         None,
-                        "recursive and nonlinear designs: leave out samples that their prediction "
-                        "excludes (default), pull them to its limit, or take them as they are",
+                        "recursive and nonlinear designs: leave out samples that are outliers (default), limit them, "
+                        "or use them as they are",
                         choices=("gate", "huber", "none"),
                     ),
                     option(
@@ -336,7 +347,7 @@ VERBS = {
                     option(
                         "--state-every",
                         "N",
-                        "rows of a stream after which --state is written anew (default: 100)",
+                        "rows of a stream after which --state is saved again (default: 100)",
                         type=int,
                         default=100,
                     ),
@@ -347,18 +358,17 @@ VERBS = {
                 (
                     flag(
                         "--smooth",
-                        "recursive and nonlinear designs: estimates from the whole log, not only from what came before",
+                        "recursive and nonlinear designs: smoothed estimates, from the whole log",
                     ),
                     option(
                         "--lag",
                         "N",
-                        "the same from the N samples after each row: rows come with N samples of delay, "
-                        "with their own time",
+                        "smoothed estimates, from the N samples after each row as well: rows are delayed by N samples",
                         type=int,
                     ),
                 ),
             ),
-            option("--state", "FILE", "go on from this saved state if it exists, and save the new one", type=Path),
+            option("--state", "FILE", "continue from this saved state if it exists, and save the new one", type=Path),
             JSON,
             FORCE,
             flag("--quiet", "print no progress and no summary"),
@@ -367,7 +377,7 @@ VERBS = {
     ),
     "thresholds": Verb(
         "learned:run_thresholds",
-        "Learn the thresholds of a design from a log without faults, for a rate of false alarms.",
+        "Find thresholds of a design from a log without faults, for a rate of false alarms.",
         (
             GAINS,
             UNVERIFIED,
@@ -385,7 +395,10 @@ VERBS = {
                     INPUT_DELAY,
                     option("--gap", "SECONDS", "continuous designs: longer intervals are gaps", type=float),
                     option(
-                        "--warm-up", "SECONDS", "how long to leave out the start, and what follows gaps", type=float
+                        "--warm-up",
+                        "SECONDS",
+                        "seconds that are left out as warm-up, at the start and after gaps",
+                        type=float,
                     ),
                 )
             ),
@@ -471,15 +484,17 @@ VERBS = {
             option(
                 "--out",
                 "FILE",
-                "the page (HTML), or what holds for every plant within its tolerances, as a certificate for verify "
-                "(.json)",
+                "the page (HTML), or a certificate (.json) for obsynth verify of what holds for every plant within "
+                "its tolerances",
                 type=Path,
                 required=True,
             ),
             option("--system", "SPEC", "show the design on the scenario of this spec", type=Path),
             option("--data", "FILE", "show the design on this log as well: text, Parquet, TDMS or MDF file"),
             *DATA_OPTIONS,
-            Settings((option("--rows", "A:B", "rows without faults, which are to agree (default: all)"),)),
+            Settings(
+                (option("--rows", "A:B", "rows without faults, which are compared with the design (default: all)"),)
+            ),
             FORCE,
             JSON,
         ),
@@ -535,7 +550,7 @@ VERBS = {
     ),
     "calibrate": Verb(
         "calibration:run_calibrate",
-        "Fit constants and noise of a plant to a log of rows without faults, with boxes and a verdict.",
+        "Fit constants and noise of a plant to a log without faults, with confidence intervals.",
         (
             SYSTEM,
             option("--data", "FILE", "the log, as for run", type=Path),
@@ -565,7 +580,7 @@ VERBS = {
     ),
     "validate": Verb(
         "calibration:run_validate",
-        "Ask whether a recorded log without faults agrees with a design.",
+        "Test whether a log without faults agrees with a design.",
         (
             GAINS,
             UNVERIFIED,
@@ -578,7 +593,7 @@ VERBS = {
     ),
     "prove-alarm": Verb(
         "data_commands:run_prove_alarm",
-        "Prove that data up to a row are not explained without a fault by any plant within its tolerances.",
+        "Prove that no plant within its tolerances explains the data up to a row without a fault.",
         (
             GAINS,
             UNVERIFIED,
@@ -601,7 +616,7 @@ VERBS = {
                         "STATE=BOUND",
                         "without initial: bound of a state in the window; may be repeated",
                     ),
-                    option("--noise-bound", "N", "standard deviations that no noise exceeds", type=float),
+                    option("--noise-bound", "N", "bound on the noise, in standard deviations", type=float),
                 )
             ),
             JSON,
@@ -613,9 +628,7 @@ VERBS = {
 
 def obsynth_parser(asked: Collection[str] | None = None) -> argparse.ArgumentParser:
     """Return the parser of ``obsynth`` with all its verbs; only those among the words ``asked`` have arguments."""
-    parser = _parser(
-        "obsynth", "Observers and fault-estimation filters for descriptor systems: designed, proved again, and run."
-    )
+    parser = _parser("obsynth", "Design, verify and run observers and fault-estimation filters for descriptor systems.")
     verbs: Any = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for name, verb in VERBS.items():
         own = verbs.add_parser(

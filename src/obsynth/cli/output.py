@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 _TITLES = {
-    "PreconditionError": "Precondition fails",
+    "PreconditionError": "Existence condition fails",
     "InfeasibleError": "Infeasible",
     "SolverError": "The solver gave up",
     "VerificationError": "Verification failed",

@@ -55,7 +55,7 @@ def thresholds_beside_least(
 def _least(
     plant: DescriptorSystem, fault: str, bounds: FloatArray, *, noisy: bool, lag: int | None, blind: list[str]
 ) -> float:
-    """Return the least threshold: of a fault of any course told after a lag, else of a constant one."""
+    """Return the least threshold: of a fault of any time course told after a lag, else of a constant one."""
     course = {"course": "constant"} if lag is None else {"course": "any", "lag": lag}
     samples = max(min(LONGEST_WINDOW, MOST_STATES // max(plant.nx, 1)), (lag or 0) + 2)
     try:

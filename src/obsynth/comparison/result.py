@@ -46,8 +46,8 @@ class FaultComparison:
         What the estimate never passes without a fault, with disturbances as large as in the scenario and three
         deviations of noise: sums of absolute values.
     least : float
-        The least such bound that any test with the same delay can have, linear or not: of a fault of any course where
-        the estimate is one sample of it, else of a constant one.
+        The least such bound that any test with the same delay can have, linear or not: of a fault of any time course
+        where the estimate is one sample of it, else of a constant one.
     """
 
     figures: FaultFigures

@@ -159,9 +159,9 @@ def sensor_sets(
     plant : DescriptorSystem or Transformation
         Either time; its outputs are there already.
     goal : {"detect", "isolate", "estimate-step", "estimate", "threshold"}, optional
-        What every fault asked for must be: shown free of the unknown inputs; told from each other fault as well;
-        estimated as a step, or whatever its course, free of all others.  ``threshold``: the least threshold of
-        ``fault`` without false alarms is at most ``below``, by `guaranteed_test`.
+        What every fault asked for must be: shown free of the unknown inputs; distinguished from each other fault as
+        well; estimated as a step, or whatever its time course, free of all others.  ``threshold``: the least threshold
+        of ``fault`` without false alarms is at most ``below``, by `guaranteed_test`.
     faults : sequence of str, optional
         All by default.
     candidates : sequence of str or mapping, optional
@@ -180,7 +180,8 @@ def sensor_sets(
     most : int, optional
         Sets returned at most.
     fault, below : str, float, optional
-        Of goal ``threshold``: which fault, and what its threshold must be, half of the size that surely alarms.
+        Of goal ``threshold``: which fault, and what its threshold must be, half of the size that is certain to raise an
+        alarm.
     sample_time : float or sequence of float, optional, seconds
         Of goal ``threshold`` and a continuous plant: sample times to try.
     test : mapping, optional

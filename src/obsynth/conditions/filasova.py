@@ -64,7 +64,7 @@ def filasova_theorem1(
     reading : {"safe", "printed"}, optional
         ``"printed"`` asks for (40)-(43) alone; ``"safe"`` keeps P3 from singular and minimises the gains.
     decay : float, optional, 1/seconds
-        Errors die out at least like ``exp(-decay t)``: (41) for ``A_o + decay I``, and ``J_o = J' + decay L_o``.
+        Errors decay at least like ``exp(-decay t)``: (41) for ``A_o + decay I``, and ``J_o = J' + decay L_o``.
     region : LMIRegion, optional
         Where all eigenvalues of the error system must lie (1/s): the constraint ``"region"``, with a P of its own.
     margin : float, optional

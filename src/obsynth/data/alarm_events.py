@@ -1,4 +1,5 @@
-"""Alarms as events: from when to when, which fault, how large, on what evidence; and rows that could not alarm."""
+"""Alarms as events: from when to when, which fault, how large, on what evidence; and rows that were without a
+decision."""
 
 from __future__ import annotations
 
@@ -21,7 +22,7 @@ REASONS = {
     GAP: "samples are missing",
     REPEATED_STAMP: "their stamps are those of the rows before",
     OUT_OF_ORDER: "their stamps are earlier than those of the rows before",
-    NO_DECISION: "the monitor decides nothing there, as it waits for its window, its start, or the end of a gap",
+    NO_DECISION: "the monitor takes no decision there: its window is not full, or a warm-up or a gap is not over",
 }
 
 
@@ -34,7 +35,7 @@ class AlarmEvent:
     by : str
         The column, or the kind of the monitor, whose threshold is passed.
     fault : str
-        The fault that stands out; empty where none does.
+        The fault that it points to; empty where there is none.
     start, end : float, seconds
         Times of the first and the last row above the threshold.
     first_row, last_row : int
@@ -119,7 +120,7 @@ class AlarmLog:
 
 
 def silent_rows(silent: Mapping[str, int]) -> list[str]:
-    """Return a text for each reason why rows could not alarm."""
+    """Return a text for each reason why rows were without a decision."""
     return [f"{count} {status}: {REASONS.get(status, status)}" for status, count in silent.items() if status != PARTIAL]
 
 
@@ -147,11 +148,11 @@ def alarm_rows(events: Sequence[AlarmEvent], shown: Callable[[float], str]) -> t
 
 
 def silence(run: Any, by: str) -> list[str]:
-    """Return what a run without alarms says, and how many rows could not alarm; ``by`` names what watched."""
+    """Return what a run without alarms says, and how many rows were without a decision; ``by`` names what watched."""
     silent, found = sum(run.silent.values()), list[str]()
     if not run.alarms and silent < run.rows:
         told = f" in the {run.rows - silent} rows that could alarm" if silent else ""
         found.append(f"No alarm by {by}{told}.")
     if silent:
-        found.append(f"{silent} of {run.rows} rows could not alarm: {'; '.join(silent_rows(run.silent))}.")
+        found.append(f"{silent} of {run.rows} rows were without a decision: {'; '.join(silent_rows(run.silent))}.")
     return found

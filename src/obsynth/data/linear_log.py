@@ -30,7 +30,7 @@ SAMPLED_GAP = "gap is for continuous-time designs: a sampled one knows which row
 #: What goes from row to row.
 SAVED = (
     *("z", "v", "row", "model", "fault", "inputs", "measured", "seen"),
-    *("forgotten_at", "begun", "changes", "counted", "left", "held", "excess", "carried", "known_from", "bridged"),
+    *("clear_at", "begun", "changes", "counted", "left", "held", "excess", "carried", "known_from", "bridged"),
 )
 _Part = TypeVar("_Part")
 
@@ -111,7 +111,9 @@ def _state_solver(design: ObserverDesign) -> FloatArray | None:
 def _running(part: _Part | None) -> _Part:
     """Return a part that is there while the observer runs."""
     if part is None:
-        raise ObsynthError("The run is in an impossible state: its observer or plant model is missing. Start it again.")
+        raise ObsynthError(
+            "The saved state is incomplete: its observer or plant model is missing. Start the run again."
+        )
     return part
 
 
@@ -149,8 +151,9 @@ class LinearLogObserver(LogObserver):
         width = len(self.observer.state_names) if self.solver is None else self.plant.nx
         self.seen = np.full(width, np.nan)
         # Since when nothing is left of a gap: bounds that are never passed hold from there on.
-        self.forgotten_at, self.begun = -math.inf, False
-        # Since when the start is forgotten, and whether the model has stood in for all that was missing from there on.
+        self.clear_at, self.begun = -math.inf, False
+        # Since when the initial-condition response has settled, and whether the model has stood in for all that was
+        # missing from there on.
         self.known_from, self.bridged = math.inf, False
         # Squares of changes of fault estimates and residuals from row to row, summed up, and how many there are.
         self.shown = slice(len(self.observer.state_names), None)
@@ -197,7 +200,7 @@ class LinearLogObserver(LogObserver):
                 self.z, self.settled_at, self.phase = np.zeros(self.observer.order), time + self.warm_up, WARM_UP
                 self.known_from = time + max(self.warm_up, self.transient)
                 if self.begun:
-                    self.forgotten_at = time + max(self.warm_up, self.transient)
+                    self.clear_at = time + max(self.warm_up, self.transient)
                 self.begun = True
                 self.inputs = self.inputs[:0]
                 seconds = 0.0
@@ -208,12 +211,12 @@ class LinearLogObserver(LogObserver):
                 found = self._measured(seconds, values)
                 if self.model is not None:
                     self.model, self.left = None, np.zeros_like(self.left)
-                    # The start is forgotten by as many measured rows as without a gap: what the gap adds is no larger
-                    # than what is left of the start then, and goes with it.
+                    # The initial-condition response settles in as many measured rows as without a gap: what the gap
+                    # adds is no larger than what is left of the start then, and goes with it.
                     self.settled_at += since * missing / (missing + 1)
                     if self.phase != WARM_UP or time >= self.settled_at:
                         self.settled_at, self.phase = time + recovered, RECOVERING
-                    self.forgotten_at = time + max(self.warm_up, self.transient)
+                    self.clear_at = time + max(self.warm_up, self.transient)
                 status = OK if time >= self.settled_at else self.phase
             else:
                 found, status = self._unmeasured(seconds, u, values), GAP
@@ -235,9 +238,9 @@ class LinearLogObserver(LogObserver):
         self, status: str, found: FloatArray, missing: int, sample: LinearSample, time: float, *, clear: bool = False
     ) -> Row:
         """Return a complete row; ``clear`` where it is known that gaps have left nothing."""
-        forgotten = time >= self.forgotten_at
-        self.bridged |= forgotten and time >= self.known_from
-        return Row(status, found, missing, sample, forgotten, None if clear else self._excess_in(status), self.bridged)
+        settled = time >= self.clear_at
+        self.bridged |= settled and time >= self.known_from
+        return Row(status, found, missing, sample, settled, None if clear else self._excess_in(status), self.bridged)
 
     def _excess_in(self, status: str) -> FloatArray | None:
         """Return what gaps can have left in the columns of a complete row, of one that is recovering."""

@@ -50,11 +50,11 @@ class Row(NamedTuple):
     values: FloatArray  # one for each column of the observer; deviations, NaN where nothing is known
     skipped: int = 0  # how many rows were missing before this one
     evidence: Evidence | LinearSample | None = None  # what was learnt from this row, for decisions
-    forgotten: bool = True  # whether nothing is left of gaps: bounds that are never passed hold
+    settled: bool = True  # whether nothing is left of gaps: bounds that are never passed hold
     # What a gap has left in each value of a row that is recovering, where the model missed by no more all through it
     # than at its end; infinite where that is not known.
     excess: FloatArray | None = None
-    bridged: bool = False  # whether the plant's model stood in for all that was missing since the start was forgotten
+    bridged: bool = False  # whether the plant's model stood in for all that was missing since the warm-up
     time: float = math.nan  # in seconds
     deviations: FloatArray | None = None  # ``(nu + ny,)`` as read
 

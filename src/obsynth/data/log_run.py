@@ -112,7 +112,7 @@ class LogRun:
         for name, level in thresholds.items():
             if name not in names:
                 raise SpecError(
-                    f"There is no column {name!r} to watch: there are {', '.join(names)}.", path="thresholds"
+                    f"There is no column {name!r} to monitor: there are {', '.join(names)}.", path="thresholds"
                 )
             if not (is_finite_number(level) and level > 0.0):
                 raise SpecError(f"The threshold of {name!r} is {level!r}: give a positive number.", path="thresholds")
@@ -261,7 +261,7 @@ class LogRun:
         cells: list[Any] = []
         undecided = not deciding and not above
         if self.monitor is not None:
-            deciding = deciding and (row.forgotten or not self.monitor.guarantees)
+            deciding = deciding and (row.settled or not self.monitor.guarantees)
             if self.monitor.rule.bridges and row.bridged:
                 deciding = row.status in (*DECIDING, RECOVERING)
             residuals, faults = row.values[self._residuals], row.values[self._faults]

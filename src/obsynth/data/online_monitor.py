@@ -39,11 +39,11 @@ from obsynth.plants.constants import shown
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.scenario import Scenario
 
-_AFTER_WARM_UP = ", once the start is forgotten (the warm-up)"
+_AFTER_WARM_UP = ", once the initial-condition response has settled (the warm-up)"
 _AFTER_A_GAP = " (after a gap likewise)"
-_FROM_THE_FIRST = "; from the first row on, after a gap once that is forgotten"
-_GROWS = "; after missing outputs larger by what the plant's model may have missed"
-_WAITS = "; while a gap is being forgotten nothing is decided, as {reason}"
+_FROM_THE_FIRST = "; from the first row on; after a gap, once settled"
+_GROWS = "; after missing outputs it is larger by the possible error of the plant's model"
+_WAITS = "; until the effect of a gap has settled nothing is decided, as {reason}"
 _NOT_CLOSER = "; rows are no closer than {dt} s"
 _REGULAR = "; no row is further than {dt} s from the last"
 
@@ -72,7 +72,7 @@ def online_monitor(
     Parameters
     ----------
     design : ObserverDesign
-        Of any method.  Linear ones are watched by their residual, recursive ones by their parameters and innovations,
+        Of any method.  Linear ones are monitored by their residual, recursive ones by their parameters and innovations,
         nonlinear ones likewise (to first order, as their covariances).
     kind : {"pointwise", "paper", "window", "chi-square", "cusum", "nis", "learned"}, optional
         The first three for linear designs, as for `obsynth.monitor`; ``nis`` for the others (all that the model does
@@ -84,8 +84,8 @@ def online_monitor(
     disturbance_bounds, noise_bound, gamma
         As for `obsynth.monitor`.
     initial_error : float, optional
-        Bound on the norm of the observer's error at the start, and after each gap; without one the bounds hold once it
-        is forgotten.
+        Bound on the norm of the observer's error at the start, and after each gap; without one the bounds hold once its
+        effect has settled.
     window : int, optional
         Samples that ``window``, ``chi-square`` and ``cusum`` of linear designs look back; 20 by default.
     false_alarms : float, optional
@@ -234,7 +234,8 @@ def _require_above_zero(limit: float) -> None:
     if not limit > 0.0:
         raise SpecError(
             "As stated, no disturbance and no noise reaches the residual: its bound would be zero, which rounding "
-            "passes. State noise (noise_bound, sensor_noise of the plant), or give a level of your own (thresholds).",
+            "errors exceed. State noise (noise_bound, sensor_noise of the plant), or give a threshold yourself "
+            "(thresholds).",
             path="noise_bound",
         )
 

@@ -71,7 +71,7 @@ class DataRun:
         All alarms: from when to when, which fault, how large.  Rows above a threshold that are less than 20 rows apart
         are one.
     silent : mapping of str to int
-        How many rows could not alarm, by their status; ``undecided`` where the monitor decides nothing.
+        How many rows were without a decision, by their status; ``undecided`` where the monitor decides nothing.
     statement : str
         What the threshold of its monitor promises, and what that rests on; empty without one.
     """
@@ -163,7 +163,7 @@ def run_on_data(
         suspended in rows that are not ``ok`` or ``partial``.
     monitor : Monitor, optional
         From `obsynth.online_monitor`: columns ``statistic`` and ``threshold``, and its alarms in ``alarm``, with the
-        fault that stands out.
+        fault that it points to.
     gap : float, optional, seconds
         Continuous-time designs: longer intervals are gaps; by default those ten times the longest one before.
     warm_up : float, optional, seconds

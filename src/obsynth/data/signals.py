@@ -117,7 +117,7 @@ class Stamps:
             self.is_dated, self.zone = True, found.tzinfo
         if (found.tzinfo is None) != (self.zone is None):
             raise SpecError(
-                f"Row {row}, column {column!r}: stamps with a time zone and without one stand in one log.",
+                f"Row {row}, column {column!r}: stamps with a time zone and without one cannot be mixed in one log.",
                 path=f"row {row}",
             )
         past = (found if found.tzinfo is not None else found.replace(tzinfo=UTC)) - _EPOCH

@@ -55,8 +55,8 @@ class SteppingLogObserver(LogObserver):
         late = ", ".join(name for name, entry in (self.observer.sensors or {}).items() if entry["delay"])
         if late:
             self.notes = (
-                f"Values of {late} arrive late: their innovations stand in no row, so that monitors see them "
-                "in the estimates only.",
+                f"Values of {late} are delayed: no row holds their innovations, and monitors use them through the "
+                "estimates alone.",
             )
         self.state: Any = self.observer.init()
         self.u: FloatArray | None = None

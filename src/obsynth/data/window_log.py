@@ -22,7 +22,8 @@ class WindowLogObserver(LogObserver):
     def __init__(self, design: ObserverDesign, observer: WindowObserver, *, warm_up: float | None = None) -> None:
         if warm_up is not None:
             raise SpecError(
-                "warm_up is for designs that forget their start: this test knows nothing but its window.",
+                "warm_up is for observers with an initial-condition response: this test uses the samples of its "
+                "window alone.",
                 path="warm_up",
             )
         super().__init__(observer, None, 0.0)

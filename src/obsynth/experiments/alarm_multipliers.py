@@ -109,8 +109,8 @@ def statement_of(test: GuaranteedTest, group: tuple[str, ...], row: int, log: Lo
     besides = f", whatever {' and '.join(others)} does" if others else ""
     one = " or ".join(group)
     return (
-        f"Proved: no course of {_assumed(window)} explains rows {row - rows_of_test(test) + 1} to {row} of {source} "
-        f"without {one}{besides}{while_inside(test)}: {one} is there, or a model that is not exact. "
+        f"Proved: rows {row - rows_of_test(test) + 1} to {row} of {source} cannot occur without "
+        f"{one}{besides}{while_inside(test)}, with {_assumed(window)}: {one} is present, or the model is not exact. "
         f"Gain set {gain_set[:SHOWN_DIGITS]}."
     )
 
@@ -130,7 +130,7 @@ def _assumed(window: Window) -> str:
         "" if window.question.disturbance == "jump" else f"disturbances that are {window.question.disturbance}",
     ]
     told = [part for part in parts if part]
-    return ", ".join(told) if told else "anything but faults"
+    return ", ".join(told) if told else "any disturbances and noise"
 
 
 def _listed(

@@ -126,14 +126,14 @@ def proved_alarm(
         return AlarmProof(False, row, length, 0.0, f"Cannot be proved: {error}", "", {})
     found = solved(programme)
     if found is None:
-        text = "Cannot be proved: the solver of linear programmes gave no multipliers."
+        text = "Cannot be proved: the linear-programming solver returned no multipliers."
         return AlarmProof(False, row, length, 0.0, text, origin, {})
     equal, below = found
     margin = float(programme.proved_least(equal, below))
     if not margin > 0.0:
         text = (
-            f"Cannot be proved: with {question.assumptions(design).phrase()}, some plant may explain the last {length} "
-            "samples without a fault (the relaxed programme has a solution)."
+            f"Cannot be proved: with {question.assumptions(design).phrase()}, some plant may produce the last "
+            f"{length} samples without a fault (the relaxed linear programme has a solution)."
         )
         return AlarmProof(False, row, length, margin, text, origin, {})
     margin *= 1.0 - MARGIN_SHARE
@@ -202,9 +202,9 @@ def statement(design: ObserverDesign, question: Question, row: int, origin: str,
     source = "a record" if log is None else f"{log.name} (sha256 {log.sha256[:SHOWN_DIGITS]})"
     first = row - min(question.window, row) + 1
     return (
-        f"Proved: no course of {assumed.phrase()} explains rows {first} to {row} of {source} without a fault {since}: "
-        f"a fault, or {outside}{linear}. Bounds of the state: {origin}. Assumptions {assumed.digest[:SHOWN_DIGITS]}, "
-        f"gain set {gain_set[:SHOWN_DIGITS]}."
+        f"Proved: rows {first} to {row} of {source} cannot occur without a fault {since}, with {assumed.phrase()}: "
+        f"there is a fault, or {outside}{linear}. Bounds of the state: {origin}. Assumptions "
+        f"{assumed.digest[:SHOWN_DIGITS]}, gain set {gain_set[:SHOWN_DIGITS]}."
     )
 
 

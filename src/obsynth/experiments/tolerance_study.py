@@ -49,7 +49,7 @@ class ToleranceStudy:
     false_alarms : FloatArray
         ``(n, 2)``: share of the runs without a fault that have an alarm: fixed bound, adaptive threshold.
     least_faults : FloatArray
-        ``(n, 2)``: least step of the fault that is told in every run, in its unit; infinite where none is.
+        ``(n, 2)``: least step of the fault that is found in every run, in its unit; infinite where none is.
     fault : str
         Which fault.
     unit : str
@@ -158,7 +158,7 @@ def study_statement(result: Mapping[str, Any], asked: Mapping[str, Any], digest:
     last = int(np.argmax(result["tolerances"]))
     unit = f" {result['unit']}" if result["unit"] else ""
     told = [
-        f"the {name} alarms without a fault in {100.0 * alarms:.4g} % of them and tells a step of {result['fault']} "
+        f"the {name} has a false alarm in {100.0 * alarms:.4g} % of them and detects a step of {result['fault']} "
         + ("of no size" if least is None else f"from {least:.4g}{unit} on")
         for name, alarms, least in zip(
             result["monitors"], result["false_alarms"][last], result["least_faults"][last], strict=True
@@ -293,7 +293,7 @@ def _together(found: list[Runs]) -> Runs:
 
 
 def _counted(watched: Monitor, without: Runs, with_one: Runs) -> tuple[float, float]:
-    """Return the share of false alarms, and the least size of the fault that is told in every run."""
+    """Return the share of false alarms, and the least size of the fault that is found in every run."""
     false = watched.passed_in(without)
 
     def told(size: float) -> bool:

@@ -44,7 +44,9 @@ class Alarms:
         watched = [*columns, *more]
         for name, level in (thresholds or {}).items():
             if name not in watched:
-                raise SpecError(f"There is no {name!r} to watch: there are {', '.join(watched)}.", path="thresholds")
+                raise SpecError(
+                    f"There is no output {name!r} to monitor: there are {', '.join(watched)}.", path="thresholds"
+                )
             if not is_finite_number(level) or level <= 0.0:
                 raise SpecError(f"The threshold of {name!r} is {level!r}: give a positive number.", path="thresholds")
         levels = {name: float((thresholds or {}).get(name, 0.0)) for name in watched}

@@ -183,7 +183,7 @@ def monitor_struct(alarms: Alarms, prefix: str) -> list[str]:
     return [
         "typedef struct {",
         "    /* Read these after a step: the largest statistic in units of its level (NaN where nothing is",
-        "     * decided), whether it passes 1, which fault stands out (-1: none), and an alarm that lasts. */",
+        "     * decided), whether it passes 1, which fault it points to (-1: none), and an alarm that lasts. */",
         "    REAL statistic;",
         "    int alarm, fault, event;",
         "    /* Everything else is the monitor's own. */",
@@ -541,7 +541,7 @@ def _signal_comments(
 ) -> Iterator[str]:
     for i, name in enumerate(names):
         at = f", operating point {float(point[i])!r}" if point is not None and point[i] else ""
-        late = f", {delays[i]} sample(s) late" if delays and delays[i] else ""
+        late = f", delayed by {delays[i]} sample(s)" if delays and delays[i] else ""
         unit = f", {quoted(units[name])}" if units.get(name) else ""
         yield comment(f"{array}[{i}]: {quoted(f'{column}[{name}]' if column else name)}{unit}{at}{late}")
 

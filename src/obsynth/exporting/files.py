@@ -243,7 +243,7 @@ def _learned_by(monitor: Monitor, design: ObserverDesign) -> LearnedThresholds |
     if isinstance(design.observer, RecursiveObserver):
         raise SpecError(
             "The steady state of a recursive design, which is what is exported, has other innovations than the "
-            "recursion that the thresholds were learned from: watch its outputs by levels (thresholds).",
+            "recursion that the thresholds were learned from: use levels of its outputs (thresholds).",
             path="monitor",
         )
     return learned

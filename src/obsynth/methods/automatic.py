@@ -73,7 +73,8 @@ def candidate(
         return _refused(method, one_line(str(error)), 1e3 * (perf_counter() - begun))
     spent = 1e3 * (perf_counter() - begun)
     if not observer.fault_names or any(name not in sampled.fault_names for name in observer.fault_names):
-        return _refused(method, "estimates the state, but no fault", spent)
+        what = "estimates the state, but no fault" if observer.state_names else "detects faults, but estimates none"
+        return _refused(method, what, spent)
     return Candidate(method, made, observer, fault_figures(sampled, observer, steps), spent, "")
 
 

@@ -20,7 +20,7 @@ from obsynth.verification.certificates import prove_stable
 LEAST_PROCESS = 1e-8
 #: Relative sizes of the fictitious process and measurement noise, tried in turn, that make the equation regular.
 REGULARISATIONS = (1e-6, 1e-4, 1e-2, 1.0)
-#: A starting filter with this spectral radius forgets fast enough.
+#: A starting filter with this spectral radius is fast enough.
 FAST_ENOUGH = 0.999
 #: Eigenvalues of a normalising matrix are kept above this fraction of the largest.
 CONDITION_LIMIT = 1e-20

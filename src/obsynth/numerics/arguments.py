@@ -123,7 +123,7 @@ def shown(value: Any) -> str:
 
 Positive = Annotated[float, Gt(0.0)]
 NonNegative = Annotated[float, Ge(0.0)]
-#: lambda: 1 forgets nothing.
+#: lambda: 1 weighs all samples alike.
 ForgettingFactor = Annotated[float, Gt(0.0), Le(1.0)]
 #: Per sample; 0 never.
 Probability = Annotated[float, Ge(0.0), Lt(1.0)]

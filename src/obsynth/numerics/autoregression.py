@@ -14,7 +14,7 @@ from obsynth.numerics.arrays import FloatArray, read_only
 
 #: Longest memory that is tried, and rows that each coefficient of an equation needs.
 MOST_ORDER, ROWS_PER_COEFFICIENT = 12, 20
-#: A fit forgets at least so fast: one that does not is shrunk by steps of the second number.
+#: A fit decays at least so fast: one that does not is shrunk by steps of the second number.
 SLOWEST_FIT, SHRINKING = 0.999, 0.99
 #: Shares of the mean variance that are added so that nothing is singular: to regressors, and to what is left.
 REGRESSOR_SHARE, NOISE_SHARE = 1e-10, 1e-12
@@ -106,7 +106,7 @@ def fitted_autoregression(x: FloatArray, order: int | None = None) -> Autoregres
 
 
 def _stable(a: FloatArray) -> FloatArray:
-    """Return coefficients ``(p, m, m)`` shrunk until the autoregression forgets."""
+    """Return coefficients ``(p, m, m)`` shrunk until the autoregression decays fast enough."""
     p, m = a.shape[:2]
     powers = SHRINKING ** np.arange(1, p + 1)[:, None, None]
     while p:

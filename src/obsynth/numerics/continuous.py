@@ -61,7 +61,7 @@ def continuous_hinf_norm(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatAr
     return ContinuousHinfNorm(found.value, found.upper, float(frequency))
 
 
-#: Intervals of each length; the length doubles after them, as fast modes have died out by then.
+#: Intervals of each length; the length doubles after them, as fast modes have decayed by then.
 INTERVALS_PER_LENGTH = 64
 #: First length, in units of one over the norm of A.
 FIRST_LENGTH = 0.02

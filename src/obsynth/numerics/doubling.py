@@ -111,7 +111,7 @@ class Lifts:
 #: Doubling stops when a step changes the solution by less than this, relative to it; each step squares the error.
 DOUBLING_TOLERANCE = 1e-14
 STAGNATION = 1e-9
-#: Below this change, that of the next step is told from the last two; and when it is far below rounding.
+#: Below this change, that of the next step is distinguished from the last two; and when it is far below rounding.
 SETTLED_CHANGE = 1e-8
 FAR_BELOW_ROUNDING = 1e-18
 #: Residual of a Riccati equation that counts as solved, relative to its terms.

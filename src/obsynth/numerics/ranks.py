@@ -24,7 +24,7 @@ BOUNDARY_TOLERANCE = 1e-8
 HIDDEN_MODE_TOLERANCE = 1e-9
 #: Relative size below which a Markov parameter of a fault counts as zero.
 MARKOV_TOLERANCE = 1e-9
-#: A chain ``(TA)^k T f`` that shrank below this fraction of its a-priori bound has died out.
+#: A chain ``(TA)^k T f`` that shrank below this fraction of its a-priori bound has decayed.
 DEAD_CHAIN_TOLERANCE = 1e-13
 #: An eigenvalue this close to the stability boundary is tested for lying on it (a multiple one scatters far).
 BOUNDARY_NEIGHBOURHOOD = 1e-2

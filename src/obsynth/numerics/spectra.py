@@ -13,7 +13,7 @@ from obsynth.numerics.norms import balanced_realisation, output_covariance
 #: Wanted poles closer than this, relative to their size, are compared as a group: rounding scatters a multiple
 #: eigenvalue by a root of the unit roundoff, but hardly moves the mean of the group.
 SAME_POLE = 1e-3
-#: Modulus below which a discrete eigenvalue counts as zero: it forgets in a few samples, and has no useful rate.
+#: Modulus below which a discrete eigenvalue counts as zero: its mode decays in a few samples, and has no useful rate.
 DEAD_BEAT = 1e-6
 #: Significant digits with which gains are commonly printed in full, and those with which a double is kept as it is.
 PRINTED_DIGITS, DOUBLE_DIGITS = 9, 17

@@ -174,7 +174,7 @@ def nothing_later(width: int, unknown: int, columns: int) -> Gaussian:
     return Gaussian(np.zeros((width + unknown, columns)), factor, diffuse)
 
 
-#: A direction is forgotten only where new data bring at least this share of what forgetting takes away.
+#: A direction is discounted only where new data bring at least this share of what forgetting takes away.
 WORTH_FORGETTING = 0.1
 
 

@@ -97,13 +97,13 @@ GLR_LOOKS = 1.0 / 4.0
 SMALLEST_INFORMATION = float(np.finfo(np.float64).tiny / np.finfo(np.float64).eps)
 
 
-def pull_of_the_start(observer: RecursiveObserver, estimates: Estimates, error: FloatArray) -> FloatArray:
+def initial_parameter_response(observer: RecursiveObserver, estimates: Estimates, error: FloatArray) -> FloatArray:
     """Return what is left at each sample of an error ``(nq,)`` of the initial parameters, ``(samples, nq)``."""
     adaptation, nx = observer.adaptation, observer.plant.nx
     if adaptation is not None and adaptation.reset:
         raise SpecError(
-            "chi-square with reset needs nominal parameters that are the observer's initial ones: what a "
-            "reset forgets of the start is not known. Use glr or cusum, or design with "
+            "chi-square with reset needs nominal parameters that equal the observer's initial ones: how a reset "
+            "changes the response to other initial values is not known. Use glr or cusum, or design with "
             "initial_parameters at their nominal values.",
             path="nominal",
         )
@@ -112,7 +112,7 @@ def pull_of_the_start(observer: RecursiveObserver, estimates: Estimates, error: 
     pulls = np.tile(error, (len(estimates.parameters), 1))
     begin = 0 if observer.early_constraints else 1
     for k, gains in enumerate(gain_steps(observer, len(pulls) - 1, received=estimates.received), begin):
-        left = gains.gain[:, : len(gains.step.A)] @ gains.step.A @ left if random_walk else gains.forget @ left
+        left = gains.gain[:, : len(gains.step.A)] @ gains.step.A @ left if random_walk else gains.retain @ left
         pulls[k] = left[-len(error) :]
     return pulls
 
@@ -155,7 +155,7 @@ def likelihood_ratio(
 
 def _doubled_log_ratios(information: FloatArray, scores: FloatArray) -> FloatArray:
     """Return ``s' M^+ s`` of each onset; zero where a change leaves less than double precision resolves. Each
-    information is scaled first: where excitation dies out it underflows, and its inverse would overflow."""
+    information is scaled first: where excitation decays it underflows, and its inverse would overflow."""
     sizes = np.einsum("oqq->oq", information).max(axis=1, initial=0.0)
     felt = sizes > SMALLEST_INFORMATION
     squares = np.where(felt, sizes, np.inf)

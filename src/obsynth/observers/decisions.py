@@ -18,8 +18,8 @@ from obsynth.observers.alarms import (
     Alarm,
     Decision,
     alone,
+    initial_parameter_response,
     likelihood_ratio,
-    pull_of_the_start,
     quantile,
     tail,
     two_sided_sums,
@@ -82,8 +82,8 @@ def decide(
         (RecursiveObserver, DAEObserver),
         "observer",
         "the recursive or nonlinear observer of a design (design.observer). Linear designs and guaranteed tests are "
-        "watched by their residual: obsynth.monitor(design, scenario) for a record, "
-        "obsynth.online_monitor(design, ...) for data of any length",
+        "monitored by their residual: obsynth.monitor(design, scenario) for a record, obsynth.online_monitor(design, "
+        "...) for data of any length",
     )
     require_kind(estimates, Estimates, "estimates", "the Estimates of a whole run, such as observer.run(y, u)")
     chosen(statistic, "statistic", STATISTICS)
@@ -99,7 +99,7 @@ def decide(
         raise SpecError(f"false_alarms is {false_alarms}: give a probability between 0 and 1.", path="false_alarms")
     if form in WALKING_FORMS and statistic in ("cusum", "glr"):
         raise SpecError(
-            f"{statistic} needs regressors, which form {form!r} does not have: use a form that forgets.",
+            f"{statistic} needs regressors, which form {form!r} does not have: use a form with a forgetting factor.",
             path="statistic",
         )
     if isinstance(observer, DAEObserver) and statistic == "glr":
@@ -201,7 +201,7 @@ def _chi_square(
                 "it with initial_parameters at what is nominal.",
                 path="nominal",
             )
-        gaps = gaps - pull_of_the_start(observer, estimates, start)
+        gaps = gaps - initial_parameter_response(observer, estimates, start)
     values = np.einsum("ki,kij,kj->k", gaps, np.linalg.pinv(estimates.parameter_covariances, hermitian=True), gaps)
     looks = len(values)
     thresholds = np.full(looks, float(quantile(np.array(float(nq)), false_alarms / looks)))

@@ -56,8 +56,9 @@ class Estimates:
         ``(samples, m, nq)``, recursive observers: innovations minus regressors times the true parameters are white,
         N(0, I).
     scores, informations : FloatArray
-        ``(samples, nq)`` and ``(samples, nq, nq)``, nonlinear observers that forget: what each sample says of the
-        parameters; to first order scores minus informations times the true parameters are white, N(0, informations).
+        ``(samples, nq)`` and ``(samples, nq, nq)``, nonlinear observers with a forgetting factor: what each sample says
+        of the parameters; to first order scores minus informations times the true parameters are white, N(0,
+        informations).
     innovation_covariances : FloatArray
         ``(samples, ny, ny)``, nonlinear observers: what is expected of the innovations; rows and columns of missing
         samples are those of the identity.

@@ -102,7 +102,7 @@ class StepObserver(Observer[Any, Any]):
 
     @cached_property
     def timing(self) -> SensorTiming:
-        """When each sensor is sampled, and how late its values are."""
+        """When each sensor is sampled, and by how much its values are delayed."""
         return SensorTiming.of(self.sensors, self.plant.output_names, self.plant.nu)
 
     @property

@@ -1,7 +1,7 @@
-"""Sensors that are sampled every so many rows, and whose values arrive late.
+"""Sensors that are sampled every so many rows, and whose values are delayed.
 
-A late value is put where it belongs: the observer keeps its states of the latest samples, and takes those samples again
-from the one that the value is about.  What it then knows is what it would know if everything had come in order.
+A delayed value is put where it belongs: the observer keeps its states of the latest samples, and takes those samples
+again from the one that the value is about.  What it then knows is what it would know if everything had come in order.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def checked_sensors(value: Any, names: Sequence[str]) -> dict[str, dict[str, int
 
 
 class WaitingState(NamedTuple):
-    """The state of an observer with late sensors."""
+    """The state of an observer with delayed sensors."""
 
     before: tuple[Any, ...]  # its states before each of the latest samples
     latest: Any  # after the last one
@@ -71,7 +71,7 @@ class WaitingState(NamedTuple):
         return np.asarray(self.latest.refused)
 
     def from_data(self, data: Mapping[str, Any], restored: Callable[[Any, Any], Any]) -> WaitingState:
-        """Return the state that data describe, by what restores that of an observer without late sensors."""
+        """Return the state that data describe, by what restores that of an observer without delayed sensors."""
         return WaitingState(
             tuple(restored(self.latest, part) for part in data["before"]),
             restored(self.latest, data["latest"]),
@@ -82,7 +82,7 @@ class WaitingState(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class SensorTiming:
-    """When each sensor is sampled, and how late its values are."""
+    """When each sensor is sampled, and by how much its values are delayed."""
 
     every: NDArray[np.int64]  # every, delays: ``(ny,)``, in rows
     delays: NDArray[np.int64]

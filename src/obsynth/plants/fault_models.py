@@ -224,7 +224,7 @@ def _observable(model: FaultModel) -> FaultModel:
         tested = np.vstack([balanced - value * np.eye(model.order), (size or 1.0) * shown.astype(complex)])
         if not decide_rank(tested, expected=model.order, equilibrated=False).full:
             raise _refused(
-                f"Some state of the fault model ({model.description}) never shows in the fault, at the "
+                f"Some state of the fault model ({model.description}) is unobservable in the fault, at the "
                 f"eigenvalue {value:.6g}: leave it out."
             )
     return model
@@ -274,7 +274,7 @@ def exosystem(data: Any, fault_names: Sequence[str], dt: float) -> Exosystem:
 
 
 def _require_below_nyquist(names: Sequence[str], models: Sequence[FaultModel], dt: float) -> None:
-    """Raise for a course in continuous time that samples cannot tell from a slower one."""
+    """Raise for a course in continuous time that samples cannot distinguish from a slower one."""
     if dt == 0.0:
         return
     problems = []

@@ -100,7 +100,7 @@ def plot_data(
     told = {"alarm"} if any(part == "faults" and name in run.alarms for part, name in plans) else set[str]()
     drawing = _Drawing(run, run.table, units, design)
     for panel, (part, name) in zip(panels, plans, strict=True):
-        _shade(panel, run.table, told, _alarm_rows(run.table, part, name))
+        _shade(panel, run.table, told, _alarm_rows(run, run.table, part, name))
         getattr(drawing, part)(panel, name)
         legend_above(panel)
         tidy(panel)
@@ -128,8 +128,7 @@ def plot_data(
             fontsize=7,
         )
     if panels and run.stamps.is_dated:
-        panels[-1].set_xlabel("time")
-        short_dates(panels[-1])
+        short_dates(panels[-1], run.stamps.zone)
     elif panels:
         label_time(panels[-1])
     return panels
@@ -264,19 +263,20 @@ def _limits(panel: Axes, centre: float, level: float, label: str, style: dict[st
         panel.axhline(centre + side, label=text, **style)
 
 
-def _alarm_rows(table: Any, part: str, column: str) -> Any:
-    """Return in which rows a panel shows an alarm: that of a fault when it is the one named, others at every alarm."""
+def _alarm_rows(run: DataRun, table: Any, part: str, column: str) -> Any:
+    """Return in which rows a panel shows an alarm: one of its own fault, of a residual, or of the monitor."""
     if part == "outputs" or "alarm" not in table:
         return np.zeros(len(table), dtype=bool)
-    if part != "faults":
-        return table["alarm"].to_numpy() != ""
 
-    def is_named(text: str) -> bool:
+    def concerns(alarm: str) -> bool:
         # "fhat[leak]; pointwise: leak or clog": what passed its threshold; a monitor and whom it names.
-        alarms = (alarm.split(": ", 1) for alarm in text.split("; "))
-        return any(words[0] == column or column[5:-1] in words[-1].split(" or ") for words in alarms)
+        by, _, named = alarm.partition(": ")
+        if part == "faults":
+            return by == column or column[5:-1] in named.split(" or ")
+        return bool(by) and (by not in run.thresholds or (part == "residuals" and by.startswith("r[")))
 
-    return table["alarm"].astype(str).map(is_named).to_numpy(bool)
+    texts = table["alarm"].astype(str)
+    return texts.map(lambda text: any(map(concerns, text.split("; ")))).to_numpy(bool)
 
 
 def _shade(panel: Axes, table: Any, told: set[str], alarms: Any) -> None:

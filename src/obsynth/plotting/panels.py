@@ -11,6 +11,8 @@ import numpy as np
 from obsynth.errors import SpecError
 
 if TYPE_CHECKING:
+    from datetime import tzinfo
+
     from matplotlib.axes import Axes
 
 #: Inches: the width of every figure, and the height of one panel.
@@ -20,7 +22,7 @@ PANEL_HEIGHT = 2.2
 RESOLUTION = 160
 #: The true signal lies under the estimate: wide, grey, solid.  The estimate on it: thin, dark, dashed.
 TRUE_STYLE: dict[str, Any] = {"color": "0.72", "linewidth": 4.0, "linestyle": "-", "solid_capstyle": "butt"}
-#: Colours that are told apart in print and by most eyes that see no red, by Okabe and Ito.
+#: Colours that are distinguished in print and by most eyes that see no red, by Okabe and Ito.
 LINE_COLOURS = ("black", "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00")
 ESTIMATE_STYLE: dict[str, Any] = {"color": "black", "linewidth": 1.1, "linestyle": "--"}
 RESIDUAL_STYLE: dict[str, Any] = {"color": "black", "linewidth": 1.0, "linestyle": "-"}
@@ -164,15 +166,17 @@ def _letters(labels: Sequence[str], columns: int) -> int:
     return widths
 
 
-def short_dates(panel: Axes) -> None:
-    """Write dates on the horizontal axis as short as can be told apart; what they share stands at its end."""
+def short_dates(panel: Axes, zone: tzinfo | None) -> None:
+    """Write dates on the horizontal axis in the zone of the log, which its label names; what they share stands at its
+    end."""
     from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 
     make_locator: Any = AutoDateLocator
     make_formatter: Any = ConciseDateFormatter
-    locator = make_locator()
+    locator = make_locator(tz=zone)
     panel.xaxis.set_major_locator(locator)
-    panel.xaxis.set_major_formatter(make_formatter(locator))
+    panel.xaxis.set_major_formatter(make_formatter(locator, tz=zone))
+    panel.set_xlabel("time" if zone is None else f"time ({zone})")
 
 
 def with_unit(name: str, units: Mapping[str, str] | None) -> str:

@@ -90,7 +90,7 @@ _MONITORS: tuple[dict[str, Any], ...] = (
 
 
 def plot_tolerances(study: ToleranceStudy, *, axes: Iterable[Axes] | None = None) -> list[Axes]:
-    """Plot false alarms, and the least fault that is told in every run, against the tolerance.
+    """Plot false alarms, and the least fault that is found in every run, against the tolerance.
 
     Parameters
     ----------
@@ -113,7 +113,7 @@ def plot_tolerances(study: ToleranceStudy, *, axes: Iterable[Axes] | None = None
     require_kind(study, ToleranceStudy, "study", "what obsynth.tolerance_study returns")
     panels = new_panels(axes, 2, size=(WIDTH, 2.0 * PANEL_HEIGHT + 0.8))
     unit = f" ({study.unit})" if study.unit else ""
-    labels = ("runs with a\nfalse alarm (%)", f"least {study.fault}\ntold in every run{unit}")
+    labels = ("runs with a\nfalse alarm (%)", f"least {study.fault}\nfound in every run{unit}")
     across = 100.0 * study.tolerances
     least = np.where(np.isfinite(study.least_faults), study.least_faults, np.nan)
     for panel, values, label in zip(panels, (100.0 * study.false_alarms, least), labels, strict=True):

@@ -68,7 +68,7 @@ def enclosed_noise_covariance(
 
 
 def _enclosed(a: Any, b: Any, dt: float, size: float) -> Any | None:
-    """Return the covariance of the states; ``None`` where the powers do not die out."""
+    """Return the covariance of the states; ``None`` where the powers do not decay."""
     n = a.nrows()
     states, power = b * b.transpose(), a
     if not dt > 0.0:

@@ -3,7 +3,8 @@
 A double holds a decimal of up to 15 digits, which ``repr`` gives back; one with more is a short multiple of a power of
 two, or was computed: the shortest decimal that rounds to it stands for it, known only to its last digit.
 A root on the boundary, and every pair that mirror each other (one is unstable), is a root of the greatest common
-divisor with ``p(-s)`` or ``z^n p(1/z)``; all others are told from the boundary by isolating them in enough digits.
+divisor with ``p(-s)`` or ``z^n p(1/z)``; all others are distinguished from the boundary by isolating them in enough
+digits.
 """
 
 from __future__ import annotations
@@ -290,7 +291,8 @@ def primitive(polynomial: fmpq_poly) -> fmpz_poly:
 
 
 def _isolated(polynomial: fmpz_poly, *, discrete: bool, may_lie_on_boundary: bool) -> list[Root]:
-    """Return the roots with their sides; more digits until each is told from the boundary, or shown to be on it."""
+    """Return the roots with their sides; more digits until each is distinguished from the boundary, or shown to be on
+    it."""
     if polynomial.degree() <= 0:
         return []
     bits = FIRST_BITS

@@ -78,7 +78,7 @@ def plant_facts(plant: DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel
 def design_report(design: ObserverDesign, *, console: Console) -> None:
     """Print a design with its report."""
     print_section(console, f"Design '{design.name}' by {design.method}", facts_table(plant_facts(design.plant)))
-    print_section(console, "What is promised", facts_table(promises(design)))
+    print_section(console, "Claims", facts_table(promises(design)))
     if design.observer.fault_names:
         headings, rows = fault_estimates(design, gains_if_linear(design))
         table = headed_table(*headings)
@@ -200,10 +200,10 @@ def fault_estimates(design: ObserverDesign, gains: FaultGains | None) -> tuple[t
         if plant.nd:
             gain = float(disturbance_gains.max())
             row += (
-                f"{number(gain)} of {plant.disturbance_names[int(disturbance_gains.argmax())]}" if gain else "none",
+                f"{number(gain)} from {plant.disturbance_names[int(disturbance_gains.argmax())]}" if gain else "none",
             )
         rows.append(row)
-    return ("fault", *delays, noise, *(("worst gain",) if plant.nd else ())), rows
+    return ("fault", *delays, noise, *(("largest gain",) if plant.nd else ())), rows
 
 
 #: Without a scenario steps are followed for so many settling times of the plant, at most so many samples.
@@ -252,8 +252,8 @@ def design_warnings(
     if pair is None:
         return ()
     missed = (
-        f"A unit step of {name} reads {_of_one(figures.at_horizon)} after {figures.horizon:.2g} s: the estimate does "
-        "not reach it by then."
+        f"A unit step of {name} gives an estimate of {_of_one(figures.at_horizon)} after {figures.horizon:.2g} s: it "
+        "has not reached the fault by then."
         for name, figures in steps.items()
         if not figures.reaches and name not in told
     )
@@ -274,6 +274,6 @@ def _undetectable(plant: DescriptorSystem, observer: LinearObserver) -> Iterator
             continue
         what = f"A constant {name}" if asked.visible else name
         yield (
-            f"{what} cannot be told from {unknown}: what the estimate shows may as well be that. See obsynth check for "
-            "the sensors that would tell them apart."
+            f"{what} cannot be distinguished from {unknown}: the estimate may be an effect of either. See obsynth "
+            "check for the sensors that would distinguish them."
         )

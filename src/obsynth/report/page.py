@@ -53,21 +53,20 @@ _CHECK_GROUPS = {"plant": "The plant", "exists": "Does such an observer exist?"}
 _SHIPPED = "The shipped observer"
 #: Characters of an option; a solver's log may be long.
 LONGEST_VALUE = 400
-#: What each kind of check is worth.
+#: What each kind of check means.
 CHECK_KINDS: dict[CheckKind, str] = {
     "proved": "an inequality that was proved, with bounds on every rounding error",
     "condition": "an existence condition of the method, on the plant alone",
-    "equality": "an identity: what is left of it, against a bound scaled by the size of its terms; it is not called "
-    "proved",
-    "computed": "a number that was found again by a second route",
-    "information": "a number worth knowing that no verdict depends on",
+    "equality": "an identity: its residual, against a bound scaled by the size of its terms; this is no proof",
+    "computed": "a number that was computed again by a second route",
+    "information": "information that no verdict depends on",
 }
 #: What each row is worth, whatever its kind.
 CHECK_STATUSES: dict[Status, str] = {
     "proved": "outward rounding, on the numbers that are stored",
     "computed twice": "double precision, by a route that shares no intermediate result with the design",
     "estimated": "statistics, with the interval in which chance alone puts the number",
-    "assumed": "stated by whoever made the design, and not checked",
+    "assumed": "stated in the gain set, and not checked",
 }
 
 
@@ -111,7 +110,7 @@ def check_rows(checks: Sequence[Check]) -> Iterator[str]:
         yield from map(_row, members)
         yield "</tbody>"
     yield "</table></div>"
-    yield "<h3>What each kind of check is worth</h3>"
+    yield "<h3>What each kind of check means</h3>"
     yield from fact_rows(
         [
             *((kind, meaning) for kind, meaning in CHECK_KINDS.items() if any(check.kind == kind for check in checks)),
@@ -204,7 +203,7 @@ def agreement_section(design: ObserverDesign, run: DataRun, rows: str | None) ->
     except ObsynthError as error:
         if rows is not None:
             raise
-        yield f"<p>Not asked of this log: {escape(str(error))}</p>"
+        yield f"<p>This log was not compared with the design: {escape(str(error))}</p>"
         return
     state = "holds" if found.passed else "fails"
     sentence = "The log agrees with the design." if found.passed else "The log does not agree with the design."
@@ -220,10 +219,15 @@ def agreement_section(design: ObserverDesign, run: DataRun, rows: str | None) ->
 
 def _facts(found: Validation, rows: str | None) -> Iterator[tuple[str, str]]:
     first, last = found.log["rows"]
-    every = "" if rows is not None else ", all: taken as free of faults; --rows names those that are"
+    every = (
+        "" if rows is not None else (", all of them: they are taken as free of faults; name those that are with --rows")
+    )
     yield "rows", f"{first} to {last - 1}{every}"
     nis = found.nis
-    yield "NIS", f"{nis.value:.3g} per degree of freedom; {nis.low:.2f} to {nis.high:.2f} in 95 % of logs like this one"
+    yield (
+        "NIS",
+        (f"{nis.value:.3g} per degree of freedom; {nis.low:.2f} to {nis.high:.2f} in 95 % of logs of this length"),
+    )
     if found.change is not None:
         yield "change", f"the mean of the innovations changes at row {found.change}"
 
@@ -250,7 +254,7 @@ def data_section(design: ObserverDesign, run: DataRun, statement: str) -> Iterat
     if count:
         text = (
             "Measured outputs and their estimates, fault estimates, residuals and the monitor's statistic, as far "
-            "as there are any. Nothing is decided in grey rows; rows with an alarm are red."
+            "as there are any. In grey rows nothing is decided; rows with an alarm are red."
         )
         yield stacked("", text, count, lambda axes: plot_data(run, design=design, axes=axes)).html()
     yield from fact_rows(_counts(run, statement))
@@ -351,7 +355,7 @@ def html_report(
     if run is not None:
         own = {
             "On your data": list(data_section(design, run, statement)),
-            "Does your data agree": list(agreement_section(design, run, rows)),
+            "Comparison with your data": list(agreement_section(design, run, rows)),
         }
     shown = design if report in (None, design.report) else design.replace(report=report)
     reproduction = list(_reproduction(shown, digest, gains_file, system_file, data_file))
@@ -366,11 +370,11 @@ def _page_text(
     state = "holds" if report.passed else "fails"
     sections = {
         **own,
-        "In short": list(_in_short(design)),
+        "Summary": list(_in_short(design)),
         "Pictures": list(_pictures(design, scenario)),
-        "What is promised": [*fact_rows(promises(design)), *_fault_estimates(design), *_recovered(design)],
+        "Claims": [*fact_rows(promises(design)), *_fault_estimates(design), *_recovered(design)],
         "Within the tolerances of the plant": list(_tolerances(design)),
-        "What delay buys": list(_delay(design)),
+        "Deviation against delay": list(_delay(design)),
         "Notes": list(_notes(design.notes)),
         "The plant": list(fact_rows(plant_facts(design.plant))),
         "Checks": list(check_rows(report.checks)) if report.checks else [],

@@ -76,16 +76,16 @@ def pictures_of(design: ObserverDesign, *, scenario: Scenario | None = None) -> 
         yield _gains(
             design,
             "faults",
-            "What reaches the fault estimates",
-            "Singular values over the frequency: from the faults, where 1 is faithful, and from disturbances and "
-            "noise, where less is better.",
+            "Gains to the fault estimates",
+            "Singular values over the frequency: from the faults, where 1 is ideal, and from disturbances and noise, "
+            "where small values are better.",
         )
     if design.observer.state_names:
         yield _gains(
             design,
             "states",
-            "What reaches the state estimates",
-            "Largest singular values over the frequency, to the errors of the states: less is better.",
+            "Gains to the errors of the state estimates",
+            "Largest singular values over the frequency, to the errors of the states: small values are better.",
         )
 
 
@@ -93,12 +93,13 @@ def _hidden(test: GuaranteedTest) -> Iterator[Picture]:
     """Yield how small a fault so many samples tell, and the courses that hide a fault from every test."""
     if len(test.tests) == 1:
         if len(test.trade_off) > 1:
-            text = "The least threshold of any test against the time that its samples take; the marked one is proved."
-            yield Picture("How small a fault", text, drawn((HALF_WIDTH, 4.2), 1, lambda axes: test.plot(axes=axes[0])))
+            text = "The least threshold of all tests against the duration of their samples; the marked one is proved."
+            yield Picture("Least threshold", text, drawn((HALF_WIDTH, 4.2), 1, lambda axes: test.plot(axes=axes[0])))
         if test.least > 0.0:
             yield Picture(
-                "Why no smaller one",
-                f"This course of {test.fault} with these disturbances, and the opposite of all of them, give the same "
+                "Why there is no smaller one",
+                f"This time course of {test.fault} with these disturbances, and the opposite of all of them, give the "
+                "same "
                 "samples: every equation and all bounds hold.",
                 drawn((HALF_WIDTH, 4.2), 1, lambda axes: plot_hidden_course(test, axes=axes[0])),
             )
@@ -107,7 +108,7 @@ def _hidden(test: GuaranteedTest) -> Iterator[Picture]:
         if len(group) > 1:
             yield Picture(
                 f"Why {own.fault} is not isolated",
-                "Together these courses change no output: every equation holds, without disturbance and noise.",
+                "Together these time courses change no output: every equation holds, without disturbance and noise.",
                 drawn((HALF_WIDTH, 4.2), 1, partial(_draw_hidden, test, own.fault)),
             )
 
@@ -178,8 +179,8 @@ def _story(scenario: Scenario, *, given: bool, linear: bool) -> str:
         return "a step of one initial standard deviation, with the stated noise. Bands hold 95 % while parameters stay."
     closed = " A stabilising state feedback was added, as the plant is unstable." if scenario.stabilise else ""
     return (
-        "a unit step, from rest and without noise. It shows how fast each estimate answers, and how little of the "
-        f"other faults is in it.{closed}"
+        "a unit step, from zero and without noise. It shows how fast each estimate follows its fault, and its gain "
+        f"from the other faults.{closed}"
     )
 
 

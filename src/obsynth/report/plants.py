@@ -52,6 +52,8 @@ def _existence_line(method: str, report: VerificationReport) -> Text:
     if report.passed:
         return Text(f"{method}: all conditions hold, so a design exists.", style="green")
     failed = ", ".join(check.name for check in report.failures) or "no condition was checked"
+    if {check.name for check in report.failures} & _ASKED:
+        return Text(f"{method}: needs more options: {failed}.", style="yellow")
     return Text(f"{method}: {_verdict(report.failures)} for this plant: {failed}.", style="bold red")
 
 
@@ -94,8 +96,10 @@ def _yes(value: bool) -> str:
 MOST_BANK_ROWS = 12
 #: What the columns of numbers mean.
 _COLUMN_MEANINGS = (
-    "delay: samples, or derivatives in continuous time; residual, filter: states of the smallest residual that shows "
-    "the fault, and of a filter that estimates it."
+    "detectable: some residual responds to the fault; steady state: also to a constant one. as a step, any signal: the "
+    "fault can be estimated if it is a step, or whatever its time course. delay: samples, or derivatives of the "
+    "outputs in continuous time. residual, filter: order of the smallest residual generator, and of a filter that "
+    "estimates the fault."
 )
 
 
@@ -107,7 +111,11 @@ def diagnosis_report(diagnosis: Diagnosis, *, console: Console, everything: bool
     console.print(Text(_COLUMN_MEANINGS, style="dim"))
     if everything and len(diagnosis.faults) > 1:
         rows = diagnosis.bank_rows()
-        print_section(console, "Which fault can be told from which", _table(diagnosis.isolability_rows()))
+        print_section(
+            console,
+            "Isolability: which fault (row) can be distinguished from which (column)",
+            _table(diagnosis.isolability_rows()),
+        )
         more = len(rows) - 1 - MOST_BANK_ROWS
         title = "Structured residuals" + (f" ({more} more are not shown; --json has them)" if more > 0 else "")
         if len(rows) > 1:
@@ -135,6 +143,8 @@ _TIME_CONDITIONS = {
     "and sample the observer afterwards (obsynth.sample_observer)",
     "exists: discrete time": "discrete only: sample the plant first (transform: {sample_time: ...})",
 }
+#: Conditions on what a spec says, which the plant cannot fail.
+_ASKED = {"exists: bounds stated", "exists: fault named", "exists: region stated"}
 _PLANT_KIND, _OF_THIS_KIND = "exists: kind of plant", "exists: plant of this kind"
 
 
@@ -154,6 +164,9 @@ def method_lines(methods: Mapping[str, VerificationReport], *, own: str = "") ->
         elif _OF_THIS_KIND in names:
             reason = next(check.detail for check in failed if check.name == _OF_THIS_KIND)
             yield method, f"not for this plant{asked}: {reason}".rstrip("."), "yellow"
+        elif names & _ASKED:
+            reason = " ".join(check.detail for check in failed if check.name in _ASKED)
+            yield method, f"needs more options{asked}: {reason}".rstrip("."), "yellow"
         else:
             yield method, f"{_verdict(failed)} for this plant{asked}: {_reason(failed)}", "bold red"
     if others:

@@ -17,7 +17,7 @@ from obsynth.analysis.structure import questions
 from obsynth.files.tables import html_table
 from obsynth.methods.fault_figures import FaultFigures
 from obsynth.methods.registry import REGISTRY, method_class
-from obsynth.observers.linear.derived import FORGOTTEN_SHARE, transient
+from obsynth.observers.linear.derived import SETTLED_SHARE, transient
 from obsynth.observers.windows import WindowObserver
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
@@ -37,8 +37,9 @@ from obsynth.results.layout import number, verdict_line
 
 #: Faults, warnings and notes that are listed; the others are counted.
 _MOST_IN_SUMMARY, _MOST_NOTES = 5, 1
-#: An unknown input that reaches a fault estimate in the fault's own unit with this gain or more looks like the fault.
-LOOKS_LIKE_FAULT = 0.5
+#: An unknown input that reaches a fault estimate in the fault's own unit with this gain or more is not separated from
+#: the fault.
+UNSEPARATED_GAIN = 0.5
 #: An estimate follows a step if in the end it misses it by no more than this share.
 FOLLOWS = 0.1
 _LABEL = 10
@@ -141,7 +142,7 @@ def _facts(design: ObserverDesign, steps: Mapping[str, FaultFigures]) -> Iterato
     yield "method", design.method + (f": {known.summary}" if known else "")
     yield "plant", _plant(design.plant)
     yield from _promise(design)
-    yield "slowest", _slowest(design)
+    yield "dynamics", _dynamics(design)
     yield from _speed(design, steps)
     yield "assumes", "; ".join(_assumptions(design))
 
@@ -155,7 +156,9 @@ def _plant(plant: DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel) -> 
     if isinstance(plant, DAEModel):
         return f"nonlinear; {_counted(counts)}"
     varying = [name for name, matrix in plant.matrices.items() if not matrix.is_constant]
-    change = f"change with k: {', '.join(varying)}" if varying else "constant matrices"
+    change = (
+        f"{', '.join(varying)} {'change' if len(varying) > 1 else 'changes'} with k" if varying else "constant matrices"
+    )
     return f"{plant.dt:g} s between samples; {change}; {_counted(counts)}"
 
 
@@ -170,22 +173,22 @@ def _promise(design: ObserverDesign) -> Iterator[tuple[str, str]]:
     for name in (name for name in _PROMISES if name in claims and name in known):
         unit = f" {known[name].unit}" if known[name].unit else ""
         label, meaning = (
-            ("promise", known[name].meaning)
+            ("claim", known[name].meaning)
             if design.report.passed
             else ("claimed", f"{unproved(known[name].meaning)} (NOT proved: checks fail)")
         )
         yield label, f"{name} = {number(claims[name])}{unit}, {meaning}"
 
 
-def _slowest(design: ObserverDesign) -> str:
-    """Return how long the observer remembers its start."""
+def _dynamics(design: ObserverDesign) -> str:
+    """Return how fast the initial-condition response settles, and the order of the observer."""
     if isinstance(design.observer, WindowObserver):
-        return f"the last {design.observer.samples} samples count, and nothing before them"
+        return f"the last {design.observer.samples} samples are used, and none before them"
     if isinstance(design.plant, DescriptorSystem):
         seconds = transient(design.linear[1])
         if not math.isfinite(seconds):
             return f"the initial-condition response does not decay; observer of order {design.observer.order}"
-        settling = f"{100.0 * FORGOTTEN_SHARE:g} % settling time {number(seconds, digits=2)} s"
+        settling = f"{100.0 * SETTLED_SHARE:g} % settling time {number(seconds, digits=2)} s"
         return f"{settling}; observer of order {design.observer.order}"
     factor = design.certificate.claims.get("contraction", math.nan)
     return f"errors shrink to {number(100.0 * factor)} % per step on average; observer of order {design.observer.order}"
@@ -200,20 +203,20 @@ def _speed(design: ObserverDesign, steps: Mapping[str, FaultFigures]) -> Iterato
     reached = [(name, found.most) for name, found in steps.items() if found.reaches]
     told = [f"{name} {number(most, digits=4)} s" for name, most in reached if most > (late[name] + 0.5) * observer.dt]
     if told:
-        yield "step", f"90 % is shown after: {listed(told, most=_MOST_IN_SUMMARY)}"
+        yield "step", f"the estimate reaches 90 % after: {listed(told, most=_MOST_IN_SUMMARY)}"
 
 
 def _assumptions(design: ObserverDesign) -> Iterator[str]:
     if isinstance(design.plant, DescriptorSystem):
         uncertain = design.plant.uncertainty
         some = uncertain is not None and bool(uncertain.box.names)
-        yield "an exact model, but in thresholds over its tolerances" if some else "an exact model"
+        yield "an exact model, except in thresholds over its tolerances" if some else "an exact model"
     else:
         bounded = isinstance(design.observer, WindowObserver)
         yield f"a model with the stated {'bounds' if bounded else 'noise'}"
     model = design.options.get("fault_model")
     if isinstance(model, str):
-        yield f"faults like the model '{model}'"
+        yield f"faults that follow the model '{model}'"
     if isinstance(design.plant, DescriptorSystem):
         noisy = sum(bool(row.any()) for row in design.plant.Dw)
         yield f"white noise on {noisy} of {design.plant.ny} sensors" if noisy else "no sensor noise stated"
@@ -231,16 +234,16 @@ def _warnings(design: ObserverDesign, gains: FaultGains | None, steps: Mapping[s
     for i, fault in enumerate(observer.fault_names):
         for j, name in enumerate(plant.disturbance_names):
             gain = float(gains.disturbance_gains[i, j])
-            if gain >= LOOKS_LIKE_FAULT and units.get(fault) == units.get(name):
+            if gain >= UNSEPARATED_GAIN and units.get(fault) == units.get(name):
                 yield (
-                    f"{name} reaches the estimate of {fault} with a gain of up to {number(gain)}: it looks like the "
-                    "fault."
+                    f"{name} reaches the estimate of {fault} with a gain of up to {number(gain)}: the estimate cannot "
+                    "separate it from the fault."
                 )
         followed = float(gains.steady[i])
         if abs(followed - 1.0) > FOLLOWS:
             share = f"{round(100.0 * followed)} %" if abs(followed) <= FAR_FROM_ONE else "many times the size"
             told.append(fault)
-            yield f"the estimate of {fault} does not follow a step: in the end it shows {share} of it."
+            yield f"the estimate of {fault} does not follow a step: its steady state is {share} of it."
     yield from design_warnings(design, steps, told=told)
     for check in design.report.checks:
         if check.name.startswith("limit at "):

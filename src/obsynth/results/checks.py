@@ -40,7 +40,7 @@ class Check:
     status : str, optional
         What the row is worth: ``proved`` (outward rounding, on the stored numbers), ``computed twice`` (double
         precision, by a route that shares no intermediate result with the design), ``estimated`` (statistics: see
-        ``interval``) or ``assumed`` (stated by whoever made the design, and not checked).  That of the kind by default.
+        ``interval``) or ``assumed`` (stated in the gain set, and not checked).  That of the kind by default.
     interval : tuple of float, optional
         Of an estimate: where it lies by chance alone, with the probability that ``detail`` says.
     unclear : bool, optional

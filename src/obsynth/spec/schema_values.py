@@ -210,7 +210,7 @@ class NoiseSection(Section):
 
 
 class SensorTimes(Section):
-    """When a sensor is sampled, and how late its values are, in rows."""
+    """When a sensor is sampled, and by how much its values are delayed, in rows."""
 
     every: Count = 1
     delay: Annotated[int, Field(ge=0)] = 0

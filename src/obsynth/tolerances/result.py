@@ -159,7 +159,7 @@ class Robustness:
         but = f", but for the mode at {lasting}, which no constant touches" if lasting else ""
         yield "plant stable", self.stable + where + (f" ({self.boxes} boxes)" if self.boxes else "") + but
         if self.sharing:
-            yield "never told from a fault", f"{', '.join(self.sharing)}: they act where a fault acts"
+            yield "never distinguished from a fault", f"{', '.join(self.sharing)}: they act where a fault acts"
         if self.reason:
             yield "bounds", f"none: {self.reason}"
         if self.loop_radius is None:
@@ -173,7 +173,7 @@ class Robustness:
         yield "to blame", _top(self.blame)
         yield "rows of the plant", _top(self.rows)
         for name, gain in self.vertex_gains.items():
-            yield f"worst gain, {name}", f"{gain:.4g} at a vertex, from the disturbances"
+            yield f"largest gain, {name}", f"{gain:.4g} at a vertex, from the disturbances"
 
     def _where(self) -> str:
         if not self.breaking:

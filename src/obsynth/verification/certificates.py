@@ -102,7 +102,7 @@ RATE_TOLERANCE = 1e-4
 
 
 def prove_stable(a: FloatArray, factor: FloatArray, dt: float) -> DefinitenessProof:
-    """Try to prove that every mode of ``a (n, n)`` dies out; ``factor (n, n)``."""
+    """Try to prove that every mode of ``a (n, n)`` decays; ``factor (n, n)``."""
     if factor.shape != a.shape or not np.all(np.isfinite(factor)) or not np.all(np.isfinite(a)):
         return unproved("the certificate does not fit, or a number is not finite")
     if a.shape[0] == 0:
@@ -126,8 +126,8 @@ def prove_stable(a: FloatArray, factor: FloatArray, dt: float) -> DefinitenessPr
 
 
 def stability_row(a: FloatArray, factor: FloatArray, dt: float, source: str) -> Check:
-    """Return the row that every mode of ``a (n, n)`` dies out, by a Lyapunov factor."""
-    claim = "every error dies out: the Lyapunov inequality is positive definite"
+    """Return the row that every mode of ``a (n, n)`` decays, by a Lyapunov factor."""
+    claim = "every error decays: the Lyapunov inequality is positive definite"
     return proof_row("stability", claim, prove_stable(a, factor, dt), source)
 
 

@@ -48,7 +48,7 @@ def consistency(stated: RecursiveObserver, shipped: RecursiveObserver, steps: in
         known[:, : len(true.A)] = x @ gains.step.A.T
         data = known + noise
         innovation = data @ gains.parity.T
-        x, theta = data @ gains.gain.T, theta @ gains.forget.T + data @ gains.learn.T
+        x, theta = data @ gains.gain.T, theta @ gains.retain.T + data @ gains.learn.T
         if innovation.shape[1]:
             nis.append(innovation)
             shared = min(before.shape[1], innovation.shape[1])

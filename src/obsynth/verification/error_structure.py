@@ -209,7 +209,8 @@ def _fault_columns(
     reached = direct.magnitude[nz:, late == 1]
     if reached.size and reached.max() > EFFECT_RANK_SHARE:
         raise PreconditionError(
-            "A fault that is estimated one sample late reaches the estimates at once: its estimate has no guaranteed "
+            "A fault that is estimated with a delay of one sample reaches the estimates at once: its estimate has no "
+            "guaranteed "
             "interval.",
             condition="fault interval",
         )

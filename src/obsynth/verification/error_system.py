@@ -213,7 +213,7 @@ class ErrorModel:
 
     @cached_property
     def fault(self) -> FloatArray:
-        """``(nz, nf)``: faults, whatever their course, to e."""
+        """``(nz, nf)``: faults, whatever their time course, to e."""
         return self._driven(self.plant.Bf, self.plant.Df)
 
     @cached_property

@@ -157,7 +157,7 @@ def _difference(first: object, second: object, names: tuple[str, ...]) -> float:
 def _sampling_rows(
     smooth: DescriptorSystem, dt: float, plant: DescriptorSystem, observer: LinearObserver, model: ErrorModel
 ) -> Iterator[Check]:
-    """Yield what the hold has to do with gains and delays, and the gain over disturbances of any course."""
+    """Yield what the hold has to do with gains and delays, and the gain over disturbances of any time course."""
     delays = ", ".join(f"{delay}" for delay in observer.fault_delays)
     yield information(
         "sampling: delay",
@@ -182,7 +182,7 @@ def _sampling_rows(
         norm = hinf_norm(observer.Az, t @ root, observer.Cz[rows], np.zeros((len(observer.Cz[rows]), plant.nx)))
         yield information(
             "gain over all d(t)",
-            "l2 gain from disturbances of any course to the fault error, in the norm h sum r^2 "
+            "l2 gain from disturbances of any time course to the fault error, in the norm h sum r^2 "
             "over the integral of d^2; gamma is of disturbances that are held between samples",
             float(np.sqrt(dt) * norm.upper),
             source="lifted system, from an enclosure of its energy",
@@ -192,7 +192,7 @@ def _sampling_rows(
     peak = _peak_gain(smooth, dt, observer, t, direct)
     yield information(
         "gain over all d(t)",
-        "peak gain from disturbances of any course to a fault error, |d(t)| <= 1 at all times: a "
+        "peak gain from disturbances of any time course to a fault error, |d(t)| <= 1 at all times: a "
         "disturbance reaches a sample at once, so that its l2 gain is infinite; gamma is of disturbances that are held",
         peak,
         source="sums over all samples, outward rounded",

@@ -78,7 +78,7 @@ def ring_length(az: FloatArray) -> int:
     length = SHORTEST_RING
     power = np.linalg.matrix_power(az, length)
     while not spectral_radius_bound(power) < CONTRACTION:
-        with np.errstate(over="ignore", invalid="ignore"):  # an observer that does not forget
+        with np.errstate(over="ignore", invalid="ignore"):  # an observer whose response does not decay
             length, power = 2 * length, power @ power
         if length > LONGEST_RING or not np.isfinite(power).all():
             raise PreconditionError(

@@ -22,4 +22,4 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
     yield upper_bound_check(
         "radius", "spectral radius as claimed", radius, claimed * (1.0 + 1e-9), source="Luenberger", detail=""
     )
-    yield upper_bound_check("stability", "the error dies out", radius, 1.0, source="Luenberger")
+    yield upper_bound_check("stability", "the error decays", radius, 1.0, source="Luenberger")

@@ -1,1 +1,1 @@
-"""What can be diagnosed on a plant: detected, told apart, estimated, and with which sensors."""
+"""What can be diagnosed on a plant: detected, distinguished, estimated, and with which sensors."""

@@ -112,7 +112,7 @@ def diagnose(
         )
     report_stage = progress or (lambda _: None)
     exactly = decided_exactly(plant)
-    report_stage("asking what shows each fault")
+    report_stage("deciding which faults are detectable")
     asked, candidates = Questions(plant, exactly), _Candidates(plant) if suggest else None
     shown = [asked.of((), i) for i in range(plant.nf)]
     free = [asked.of(others(plant, i), i) for i in range(plant.nf)]
@@ -120,7 +120,7 @@ def diagnose(
         _verdict(plant, own, alone, frequencies, model_points(model, i), candidates)
         for i, (own, alone) in enumerate(zip(shown, free, strict=True))
     )
-    report_stage("telling faults from each other")
+    report_stage("deciding which faults can be isolated")
     weak, strong, pairs = _isolability(plant, shown, asked)
     bank = residual_bank(asked, whole_bank)
     part = () if whole_bank or plant.nf <= MOST_PATTERN_FAULTS else (_PART_OF_THE_BANK.format(count=plant.nf),)
@@ -180,28 +180,32 @@ def _sentences(plant: DescriptorSystem, shown: Question, free: Question, candida
     step, texts = free.shows_at_rest, []
     if not shown.visible:
         unknown = ", ".join(plant.disturbance_names)
-        texts.append(f"{name}: nothing shows it" + (f" free of {unknown}." if unknown else "."))
+        texts.append(
+            f"{name}: not detectable by any residual" + (f" that is decoupled from {unknown}." if unknown else ".")
+        )
     elif not free.visible:
         others = ", ".join(plant.fault_names[j] for j in free.removed)
-        texts.append(f"{name}: it shows, but cannot be told from {others} and the unknown inputs together.")
+        texts.append(f"{name}: detectable, but not distinguishable from {others} and the unknown inputs together.")
     if not step:
         motion = hidden_motion(plant, shown.number, rest, () if not shown.visible else free.removed)
         if motion is not None:
             seen = shown.visible and (free.visible or not shown.shows_at_rest)
-            then = " Not estimable; seen only while it changes." if seen else ""
+            then = " It cannot be estimated; residuals respond only while it changes." if seen else ""
             texts.append(f"{name}: {motion} ({letter} = {_number(rest)}).{then}")
     hiding = [zero for zero in free.blocking if abs(zero - rest) > REST_TOLERANCE and zero.imag >= 0.0]
     for zero in hiding[:MOST_ZEROS]:
         motion = hidden_motion(plant, shown.number, complex(zero), free.removed)
         at = f"{letter} = {_number(zero)}"
-        how = f"hidden at {at}" if motion is None else f"{motion} ({at})"
-        texts.append(f"{name}: {how}. Not estimable for every course.")
+        how = f"output-nulling at {at}" if motion is None else f"{motion} ({at})"
+        texts.append(f"{name}: {how}. A fault with this time course cannot be estimated.")
     if len(hiding) > MOST_ZEROS:
-        texts.append(f"{name}: hidden at {len(hiding) - MOST_ZEROS} more points.")
+        texts.append(f"{name}: output-nulling at {len(hiding) - MOST_ZEROS} more points.")
     if free.visible and free.derivatives:
         more = "s" if free.derivatives > 1 else ""
         needed = f"sample{more} of delay" if plant.dt > 0.0 else f"derivative{more} of the outputs"
-        texts.append(f"{name}: needs {free.derivatives} {needed}{'; as a step, none' if step else ''}.")
+        texts.append(
+            f"{name}: the estimate needs {free.derivatives} {needed}{'; that of a step needs none' if step else ''}."
+        )
     if candidates is not None and not (step and free.estimable):
         texts += _suggestion(candidates, name, shown, step=step)
     return texts
@@ -258,12 +262,12 @@ def _suggestion(candidates: _Candidates, name: str, shown: Question, *, step: bo
     if full:
         texts.append(f"{name}: Add one of: {listed_sets(full)}.")
     elif constant:
-        texts.append(f"{name}: Add one of: {listed_sets(constant)} (then it can be estimated as a step).")
+        texts.append(f"{name}: Add one of: {listed_sets(constant)} (then a step of it can be estimated).")
     if not shown.visible:
         showing = candidates.additions(fault, (), lambda changed: Question(changed, (), fault).visible)
         more = [names for names in showing if names not in (*full, *constant)]
         if more:
-            texts.append(f"{name}: {listed_sets(more)} would show it, but not its size.")
+            texts.append(f"{name}: {listed_sets(more)} would make it detectable, but not estimable.")
     if not candidates.searched:
         texts.append(f"{name}: obsynth.sensor_sets searches which sensors would help.")
     elif not texts and plant.nx:

@@ -120,23 +120,23 @@ class HiddenMotion:
 
     def __str__(self) -> str:
         named = list(self.values.items())
-        inputs = [f"{self._course} of {_amplitude(value)} in {name}" for name, value in named[: self.causes]]
-        states = [f"{name} = {_amplitude(value)}" for name, value in named[self.causes :][:MOST_NAMED_SIGNALS]]
-        more = len(named) - self.causes - len(states)
-        rest = [*states, *([f"{more} more states"] if more else [])]
-        by = " and ".join(inputs) or "the initial state"
-        return f"{self._course} of 1 in {self.fault} is hidden by {by}" + (f" with {', '.join(rest)}" if rest else "")
+        inputs = [self._signal(name, value) for name, value in named[: self.causes]]
+        moving = [f"{name} = {_amplitude(value)}" for name, value in named[self.causes :][:MOST_NAMED_SIGNALS]]
+        more = len(named) - self.causes - len(moving)
+        rest = [*moving, *([f"{more} more states"] if more else [])]
+        others = [*inputs, *([f"states {', '.join(rest)}"] if rest else [])]
+        together = f"together with {' and '.join(others)}" if others else "from some initial state"
+        return f"{self._signal(self.fault, 1.0)} is output-nulling {together}"
 
-    @property
-    def _course(self) -> str:
-        point = self.point
+    def _signal(self, name: str, value: complex) -> str:
+        point, size = self.point, _amplitude(value)
         if point == dc_point(self.dt):
-            return "a step"
+            return f"a step of {size} in {name}"
         if self.dt > 0.0:
-            return f"a course {_amplitude(point)}^k"
+            return f"{name} = {size} * ({_amplitude(point)})^k"
         if point.real == 0.0:
-            return f"a sinusoid ({abs(point.imag):.4g} rad/s)"
-        return f"a course exp({_amplitude(point)} t)"
+            return f"a sinusoid of {size} at {abs(point.imag):.4g} rad/s in {name}"
+        return f"{name} = {size} * exp({_amplitude(point)} t)"
 
 
 def hidden_motion(plant: DescriptorSystem, fault: int, point: complex, removed: Sequence[int]) -> HiddenMotion | None:

@@ -86,24 +86,24 @@ class FaultDiagnosis:
     detectable_at : dict of float to bool
         The same for sinusoids, by frequency in rad/s.
     estimable : bool
-        Whether its value can be told, whatever its course and that of all other faults.
+        Whether its value can be told, whatever its time course and that of all other faults.
     step_estimable : bool
         Whether it can if it is a step (the other faults are arbitrary).
     model_estimable : bool
         Whether it can if it follows the fault model that was asked about.
     order : int or None
-        Derivatives of the outputs (samples of delay, for sampled plants) that an estimate of an arbitrary course needs;
-        a step needs none.  ``None`` where it cannot be told from the rest.
+        Derivatives of the outputs (samples of delay, for sampled plants) that an estimate of an arbitrary time course
+        needs; a step needs none.  ``None`` where it cannot be distinguished from the rest.
     residual_order : int or None
         Least order of a filter with one residual that shows it, blind to the unknown inputs.
     filter_order : int
         Order of the plant without unknown inputs and other faults; a filter that estimates the fault has one state
         more for each of its model.
     zeros : ComplexArray
-        ``(k,)``, 1/s (dimensionless for sampled plants): where it cannot be told from the unknown inputs and the other
-        faults.
+        ``(k,)``, 1/s (dimensionless for sampled plants): where it cannot be distinguished from the unknown inputs and
+        the other faults.
     blocking : ComplexArray
-        Those on or outside the boundary of stability: what forbids an estimate of an arbitrary course.
+        Those on or outside the boundary of stability: what forbids an estimate of an arbitrary time course.
     sentences : tuple of str
         What hides it, and what would help.
     exact : bool
@@ -149,7 +149,8 @@ class Diagnosis:
     faults : tuple of FaultDiagnosis
         In the order of the plant.
     isolable : NDArray
-        ``(nf, nf)`` of bool: entry (i, j) whether fault i can be told from fault j (the diagonal: whether it shows).
+        ``(nf, nf)`` of bool: entry (i, j) whether fault i can be distinguished from fault j (the diagonal: whether it
+        shows).
     isolable_at_rest : NDArray
         ``(nf, nf)`` of bool: the same for constant faults that leave constant traces.
     bank : tuple of StructuredResidual
@@ -187,7 +188,7 @@ class Diagnosis:
 
     def verdict_rows(self) -> tuple[tuple[str, ...], ...]:
         """Return the table of verdicts as texts: the header, then one row per fault."""
-        header = ("fault", "detectable", "constant", "as a step", "any course", "delay", "residual", "filter")
+        header = ("fault", "detectable", "steady state", "as a step", "any signal", "delay", "residual", "filter")
         rows = [
             (
                 fault.name,
@@ -213,7 +214,7 @@ class Diagnosis:
     def bank_rows(self) -> tuple[tuple[str, ...], ...]:
         """Return the bank of structured residuals as texts: what each sees, at rest, and its least order."""
         rows = [(", ".join(r.sees), ", ".join(r.at_rest) or "none", _count(r.order)) for r in self.bank]
-        return (("a residual that sees only", "constant values of", "least order"), *rows)
+        return (("residual sensitive only to", "in steady state to", "least order"), *rows)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the diagnosis as plain data."""
@@ -237,7 +238,7 @@ class Diagnosis:
         count = len(self.unknown_inputs)
         named = ", ".join(self.unknown_inputs) if count <= 4 else f"{count} unknown inputs"
         way = "decided exactly" if self.exact else "decided in floating point"
-        return f"What can be diagnosed ({f'free of {named}' if count else 'no unknown inputs'}; {way})"
+        return f"What can be diagnosed ({f'decoupled from {named}' if count else 'no unknown inputs'}; {way})"
 
     def __str__(self) -> str:
         if not self.faults:

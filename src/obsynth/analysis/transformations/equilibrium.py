@@ -203,7 +203,7 @@ class _Problem:
         why = (
             f"No unknown ({unknowns}) changes the combination {told} of the equations, which is not zero."
             if names
-            else f"The search over {unknowns} ends where its equations leave a rest."
+            else f"The search over {unknowns} ends where its equations have a residual."
         )
         return PreconditionError(
             f"There is no equilibrium: F(0, x, u, theta) = 0 has no root ({rest}). {why} Free an input or a parameter "

@@ -47,7 +47,7 @@ def with_noise(
         y = \dots + n_y + o_y .
 
     Every method takes the plant as any other; the plant's own states keep their names and come first.  What cannot be
-    told apart (an offset and a fault of the same sensor) is named by the existence conditions.
+    distinguished (an offset and a fault of the same sensor) is named by the existence conditions.
 
     Parameters
     ----------

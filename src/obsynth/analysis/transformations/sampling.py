@@ -101,7 +101,7 @@ def sampling_zero_warnings(plant: DescriptorSystem) -> tuple[str, ...]:
     found = fault_zeros(plant)
     inside = [zero.value for zero in found.zeros if not any(zero is other for other in found.outside)]
     texts = [
-        f"Fault zero at {_number(value)} (modulus {abs(value):.6g}): errors of a fault estimate die out there with a "
+        f"Fault zero at {_number(value)} (modulus {abs(value):.6g}): errors of a fault estimate decay there with a "
         f"time constant of {-plant.dt / math.log(abs(value)):.3g} s. Sample more slowly, or measure a signal nearer to "
         "the fault."
         for value in inside

@@ -2,8 +2,8 @@
 
 Thresholds over a box for continuous designs on samples, for ``eps = z - Gamma_1 v - T x`` at these.
 
-``eps+ = Az eps + (Az T + By C - T Phi) x + (Bu + By D - T Gamma) u + (By Dd d - T q) + By v``, q of d of any course;
-what the brackets leave at the nominal plant acts like one more constant, ``sampling``.
+``eps+ = Az eps + (Az T + By C - T Phi) x + (Bu + By D - T Gamma) u + (By Dd d - T q) + By v``, q of d of any time
+course; what the brackets leave at the nominal plant acts like one more constant, ``sampling``.
 """
 
 from __future__ import annotations

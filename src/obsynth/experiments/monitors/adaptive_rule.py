@@ -110,7 +110,7 @@ def _varying(bound: AdaptiveBound, state: AdaptiveState, v: FloatArray) -> _Firs
     return state, sizes[:, :rows].sum(axis=0) + tail, first, np.zeros(no)
 
 
-#: Rings after which an error that nothing is known of is forgotten to a millionth.
+#: Rings after which an error that nothing is known of has decayed to a millionth.
 FORGETTING_RINGS = 3
 
 
@@ -165,7 +165,7 @@ class AdaptiveRule(Rule):
             return self.restart(state), Judged(math.nan, math.nan, None, (math.nan,) * len(self.columns))
         last, state = state.last, state._replace(last=sample.time)
         if dt is not None and last is not None and abs(sample.time - last - dt) > FITTING_SHARE * dt:
-            # What the observer did over another interval is an error of its own, which must be forgotten first.
+            # What the observer did over another interval is an error of its own, which must decay first.
             state = self.restart(state)._replace(waiting=FORGETTING_RINGS * self._later.bound.length)
         plan = self.plan if state.first else self._later
         signals, bound = (said.inputs, said.outputs), plan.bound

@@ -1,7 +1,8 @@
-"""What disturbances of any course do to the residual of a continuous design at the samples of its data, from above.
+"""What disturbances of any time course do to the residual of a continuous design at the samples of its data, from
+above.
 
 The observer takes outputs as straight lines, which the plant does not follow.  x enters the error by what these miss of
-a free motion, as far as it dies out: the other modes leave rounding, or there is no bound.
+a free motion, as far as it decays: the other modes leave rounding, or there is no bound.
 """
 
 from __future__ import annotations
@@ -23,11 +24,11 @@ from obsynth.proofs.extended_balls import block
 from obsynth.proofs.peak_sums import PeakSums, gathered, interval_pieces, peak_sums
 from obsynth.proofs.products import exponential
 
-#: Modes of the plant that decay by less than this exponent in a sample are not followed until they have died out.
+#: Modes of the plant that decay by less than this exponent in a sample are not followed until they have decayed.
 LEAST_EXPONENT = 1e-4
 #: Share of the terms of K that counts as rounding.
 TERM_ROUNDING = 1e-9
-#: Share of the bound that rounding on modes that do not die out may add.
+#: Share of the bound that rounding on modes that do not decay may add.
 ADDED = 1e-3
 #: Share of what a disturbance does to the outputs below which it is held not to reach the residual.
 UNREACHED_RESIDUAL = 1e-11
@@ -37,7 +38,7 @@ FINITE = 1e-12
 
 @dataclass(frozen=True, eq=False)
 class BetweenSamples:
-    """A design on samples: ``s+ = M s``, ``r = c s``, ``s = [x; eps]`` with the part of x that is forgotten."""
+    """A design on samples: ``s+ = M s``, ``r = c s``, ``s = [x; eps]`` with the part of x that decays."""
 
     plant: DescriptorSystem
     dt: float
@@ -49,7 +50,7 @@ class BetweenSamples:
     second: FloatArray  # the same at the next sample
     direct: FloatArray
     rows: slice
-    left: float  # what modes that are not forgotten add per unit of each state, at most
+    left: float  # what modes that do not decay add per unit of each state, at most
 
     @classmethod
     def of(
@@ -63,7 +64,7 @@ class BetweenSamples:
         endless: bool = True,
     ) -> BetweenSamples:
         """Return the design at samples ``dt`` apart, for ``tracking V (nz, nx)``; raise `SpecError` without a bound.
-        Without ``endless`` a record of known length is bounded whether or not anything dies out."""
+        Without ``endless`` a record of known length is bounded whether or not anything decays."""
         try:
             done = eliminate_algebraic_states(plant)
         except PreconditionError as error:
@@ -84,16 +85,16 @@ class BetweenSamples:
         terms = np.abs(az) @ np.abs(t) + (np.abs(g0) + 2.0 * np.abs(g1)) @ np.abs(smooth.C) + np.abs(t)
         into = exact(g1) @ c - exact(t)
 
-        def split(kept: FloatArray, *, dies_out: bool) -> BetweenSamples:
-            found = _split(phi, k, j, into, kept, az, observer.Cz[rows], endless=dies_out)
+        def split(kept: FloatArray, *, decays: bool) -> BetweenSamples:
+            found = _split(phi, k, j, into, kept, az, observer.Cz[rows], endless=decays)
             return cls(smooth, dt, *found[:4], g1, earlier.midpoint, observer.Dy[rows], rows, found[4])
 
         try:
-            return split(_kept(smooth, dt, k, terms), dies_out=True)
+            return split(_kept(smooth, dt, k, terms), decays=True)
         except SpecError:
             if endless:
                 raise
-            return split(np.eye(smooth.nx), dies_out=False)
+            return split(np.eye(smooth.nx), decays=False)
 
     @classmethod
     def of_sampled(
@@ -191,7 +192,7 @@ class BetweenSamples:
         return InputResponse(self.M.midpoint, self.c, before, (rise, rise + into @ ramp))
 
     def lasting_words(self, limit: float) -> str:
-        """Return what to say of modes that do not die out: up to which state rounding on them does not matter."""
+        """Return what to say of modes that do not decay: up to which state rounding on them does not matter."""
         if not self.left > 0.0 or not np.isfinite(limit):
             return ""
         return f"; while no state of the plant exceeds {ADDED * limit / self.left:.2g} in its unit"
@@ -208,7 +209,7 @@ class BetweenSamples:
         second = plant.C @ plant.A @ plant.A
         if np.any(np.abs(second @ others) > TERM_ROUNDING * (np.abs(second) @ np.abs(others))):
             return np.inf
-        # The modes that last are straight: they are moved to where they die out, and nothing enters them.
+        # The modes that last are straight: they are moved to where they decay, and nothing enters them.
         stable = plant.A @ projector - others
         bent = np.array([np.sum(peak_gain(stable, projector @ plant.Bd * sizes, row[None])) for row in second])
         slope, turn = np.abs(plant.C @ plant.Bd) @ sizes, np.abs(plant.C @ plant.A @ plant.Bd) @ sizes
@@ -240,7 +241,7 @@ class InputResponse:
 
 
 def _kept(plant: DescriptorSystem, dt: float, k: Ball, terms: FloatArray) -> FloatArray:
-    """Return the projector ``(n, n)`` onto the modes of a plant that die out; raise where others are not straight."""
+    """Return the projector ``(n, n)`` onto the modes of a plant that decay; raise where others are not straight."""
     n = plant.nx
     if not np.any(np.abs(k.midpoint) + k.radius > TERM_ROUNDING * terms):
         return np.zeros((n, n))
@@ -252,7 +253,7 @@ def _kept(plant: DescriptorSystem, dt: float, k: Ball, terms: FloatArray) -> Flo
         slow = slow[slow.real > -LEAST_EXPONENT / dt]
         pole = complex(slow[int(np.argmax(np.abs(slow)))]) if slow.size else 0j
         raise SpecError(
-            f"The residual at the samples has no bound: the plant's mode at {pole:.4g} 1/s does not die out, and its "
+            f"The residual at the samples has no bound: the plant's mode at {pole:.4g} 1/s does not decay, and its "
             "outputs are not straight between samples, as the observer takes them. Sample the plant first "
             "(transform.sample_time) and design for the samples, sample faster, or use a statistical monitor.",
             path="sample_time",
@@ -261,7 +262,7 @@ def _kept(plant: DescriptorSystem, dt: float, k: Ball, terms: FloatArray) -> Flo
 
 
 def _dying(a: FloatArray, dt: float) -> FloatArray | None:
-    """Return the projector ``(n, n)`` onto the modes that die out, along the others; ``None`` where there are none."""
+    """Return the projector ``(n, n)`` onto the modes that decay, along the others; ``None`` where there are none."""
     from scipy.linalg import schur, solve_sylvester
 
     n = len(a)
@@ -289,7 +290,7 @@ def _split(
     if contraction is None and endless:
         raise SpecError(
             "The residual at the samples has no bound that double precision could prove: the observer, or a mode of "
-            "the plant that is not straight between samples, dies out too slowly. Sample the plant first "
+            "the plant that is not straight between samples, decays too slowly. Sample the plant first "
             "(transform.sample_time), or use a statistical monitor.",
             path="sample_time",
         )

@@ -87,17 +87,17 @@ def _statement(test: GuaranteedTest) -> str:
     course = test.options["course"]
     said = "; ".join(_promise(one, group) for one, group in zip(test.tests, test.groups, strict=True))
     ending = "; each row has the least interval for its own samples" if test.options.get("exact") else ""
-    return f"{said}, for the course {course}{ending}; for an exact model{while_inside(test)}"
+    return f"{said}, for a fault with the time course '{course}'{ending}; for an exact model{while_inside(test)}"
 
 
 def _promise(test: GuaranteedTest, group: tuple[str, ...]) -> str:
     # Bounds of states may show a fault of less than twice the least: that is then one of intervals.
     bounded = any(test.options.get(name) for name in ("state_bounds", "initial_bounds"))
-    words = "tells the fault within less than" if bounded else "has one below"
+    words = "estimates the fault to within less than" if bounded else "has a threshold below"
     least = "" if np.isnan(test.least) else f", and no function of these samples {words} {test.least:.6g}"
     return (
         f"never passed without {' or '.join(group)} while disturbances and noise keep the bounds of the design{least}; "
-        f"{test.fault} of {test.surely_found:.6g} alarms within {test.delay:g} s"
+        f"a fault {test.fault} of {test.surely_found:.6g} raises an alarm within {test.delay:g} s"
     )
 
 
@@ -107,7 +107,7 @@ def record_monitor(design: ObserverDesign, scenario: Scenario, kind: str, given:
     constants, initial_set = given["constants"], given["initial_set"]
     if isinstance(test.observer, WindowObserver):
         raise SpecError(
-            "A test whose weights change with k is watched on data: use obsynth.online_monitor, or alarms() and "
+            "A test whose weights change with k is for measured data: use obsynth.online_monitor, or alarms() and "
             "limits() of the test on what its observer says.",
             path="design",
         )
@@ -348,7 +348,7 @@ def data_monitor(design: ObserverDesign, kind: str, given: Mapping[str, Any]) ->
         assumed = Assumptions(changed.linear[0], bounds, 1.0, initial_set)
         statement, rule = adaptive_statement(first, assumed), AdaptiveRule(first, later, None)
         if initial_set is None:
-            statement += "; it holds once the error of the state at the start, which is not stated, is forgotten"
+            statement += "; it holds once the effect of the initial error, which is not stated, has settled"
     return Monitor(
         kind,
         statement,

@@ -78,7 +78,7 @@ def rows_per_alarm(rate: str | float, dt: float) -> float:
     if found < 2 * HOLD:
         raise SpecError(
             f"false_alarms is {rate!r}, one per {found:.3g} rows, but an alarm lasts {HOLD} rows at least: "
-            "ask for rarer ones.",
+            "ask for a lower rate.",
             path="false_alarms",
         )
     return found
@@ -139,18 +139,25 @@ class LearnedThresholds:
         model, lasting = self.statistics.model, self.every * self.dt
         text = (
             f"learned from {self.rows} rows without faults: at most one false alarm per {self.every:.6g} rows "
-            f"({_duration(lasting)}) on average, in {len(self.columns)} column(s) whitened by an autoregression of "
-            f"order {model.order}; alarms closer than {HOLD} rows are one"
-            + ("; the level is that of the second half of these rows" if is_conformal(self.rows, self.every) else "")
+            f"({_duration(lasting)}) on average, in {len(self.columns)} column(s), whitened by an autoregression of "
+            f"order {model.order}; alarms less than {HOLD} rows apart count as one"
+            + (
+                "; the level was found from the second half of these rows"
+                if is_conformal(self.rows, self.every)
+                else ""
+            )
         )
         if self.holds:
             return text
         rarest = min(self.rows, self.every)
-        other = f"the rate that {self.rows} rows can hold is one per {rarest:.6g} rows ({_duration(rarest * self.dt)})"
+        other = (
+            f"the lowest rate that {self.rows} rows can determine is one per {rarest:.6g} rows "
+            f"({_duration(rarest * self.dt)})"
+        )
         if rows_needed(model, 1.0) > self.rows:
-            other = "the residuals remember so long, or are so many, that these rows hold no rate"
+            other = "the residuals are correlated for so long, or are so many, that these rows determine no rate"
         return (
-            f"{text}. The rate is not sure: it needs {self.needed} rows without faults "
+            f"{text}. The rate is uncertain: it needs {self.needed} rows without faults "
             f"({_duration(self.needed * self.dt)}); {other}"
         )
 
@@ -267,7 +274,7 @@ def watched_names(design: ObserverDesign) -> tuple[str, ...]:
     observer = design.observer
     if isinstance(observer, WindowObserver):
         raise SpecError(
-            f"Design {design.name!r} is a test whose weights change with k: the threshold of each row is proved, and "
+            f"Design {design.name!r} is a test whose weights change with k: the threshold of each row is proved, so "
             "none is learned (use the monitor pointwise).",
             path="design",
         )
@@ -311,16 +318,14 @@ def thresholds_from_rows(
     count = int(known.sum())
     if count < LEAST_NORMAL:
         raise SpecError(
-            f"Only {count} rows of the log can be learned from, as warm-up and gaps do not count: give "
+            f"Only {count} rows of the log can be used, as warm-up and gaps do not count: give "
             f"{LEAST_NORMAL} and more.",
             path="normal",
         )
     faults = len(design.observer.fault_names)
     choices = [part for part in (independent(rows[known], 0), independent(rows[known], faults)) if part]
     if not choices:
-        raise SpecError(
-            "Nothing that is watched ever moves in these rows: there is no noise to learn from.", path="normal"
-        )
+        raise SpecError("No monitored signal changes in these rows: there is no noise to learn from.", path="normal")
     fits = [(kept, fitted_autoregression(np.where(known[:, None], rows[:, kept], np.nan))) for kept in choices]
     enough = [fit for fit in fits if rows_needed(fit[1], 1.0) <= count]
     kept, model = enough[0] if enough else min(fits, key=lambda fit: rows_needed(fit[1], 1.0))
@@ -401,7 +406,7 @@ class LearnedState(NamedTuple):
     means: FloatArray  # exponentially weighted, one row for each weight
     last: float | None = None
     taken: int = 0
-    waiting: int = 0  # rows until the last one in which something was missing is forgotten
+    waiting: int = 0  # rows until the effect of the last one in which something was missing has settled
 
 
 class LearnedRule(Rule):
@@ -499,7 +504,7 @@ def learned_monitor(design: ObserverDesign, learned: LearnedThresholds) -> Monit
     missing = [name for name in learned.columns if name not in names]
     if missing:
         raise SpecError(
-            f"The thresholds watch {missing[0]!r}, which the design does not say: learn them again for this design.",
+            f"The thresholds are for {missing[0]!r}, which the design does not have: learn them again for this design.",
             path="normal",
         )
     residuals = (

@@ -28,8 +28,8 @@ SETTLING = 100
 #: Streams of the bootstrap, their share in which the rate is to hold, and the rows that each is judged on.
 STREAMS, SURE_STREAMS = 24, 0.8
 LEAST_STREAM_ROWS, MOST_STREAM_ROWS, ROWS_PER_ALARM = 4_000, 20_000, 4
-#: Rows that the simulated streams are given to forget their start.
-ROWS_TO_FORGET = 200
+#: Rows until the simulated streams are stationary.
+BURN_IN_ROWS = 200
 #: Share of the radii that follow the Pareto tail, least number of them, and bounds of its shape: with a lighter tail
 #: than the least, logs of 500 white rows rang 2.7 times too often.
 TAIL_SHARE, LEAST_TAIL, SHAPES = 0.1, 20, (-0.05, 0.4)
@@ -261,11 +261,11 @@ def learned_levels(x: FloatArray, every: float, statistics: Statistics, seed: in
     rows = int(np.clip(ROWS_PER_ALARM * every, LEAST_STREAM_ROWS, MOST_STREAM_ROWS))
     e = model.whitened(x)[model.order :]
     e = e[np.isfinite(e).all(axis=1)]
-    streams = model.simulated(drawn_rows(e - e.mean(axis=0), STREAMS, ROWS_TO_FORGET + n + rows, rng))
+    streams = model.simulated(drawn_rows(e - e.mean(axis=0), STREAMS, BURN_IN_ROWS + n + rows, rng))
     known = np.asarray(np.isfinite(x).all(axis=1))
     found = []
     for stream in streams:
-        seen = np.where(known[:, None], stream[ROWS_TO_FORGET : ROWS_TO_FORGET + n], np.nan)
+        seen = np.where(known[:, None], stream[BURN_IN_ROWS : BURN_IN_ROWS + n], np.nan)
         again = fitted_autoregression(seen, order=model.order)
         judged = Statistics(again, statistics.signatures, statistics.told)
         found.append(judged.of_rows(again.whitened(stream[None, -rows:]))[:, 0])

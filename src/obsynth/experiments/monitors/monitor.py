@@ -27,14 +27,14 @@ if TYPE_CHECKING:
 
 MONITOR_KINDS = ("paper", "pointwise", "window", "chi-square", "cusum")
 STATEMENTS: Mapping[str, str] = {
-    "paper": "eq. (66) of Wang et al. 2015 with the norm of the power: not a pointwise bound, may be passed without a "
-    "fault, and knows no sensor noise",
+    "paper": "eq. (66) of Wang et al. 2015 with the norm of the power: not a pointwise bound, it may be passed "
+    "without a fault, and disregards sensor noise",
     "pointwise": "never passed without a fault",
     "window": "l2 norm of {window} samples: never passed without a fault",
     "chi-square": "{window} samples: passed in a run without a fault with a probability of {false_alarms} at most, for "
-    "Gaussian noise, once the start is forgotten",
+    "Gaussian noise, once the initial-condition response has settled",
     "cusum": "cumulative sum for a change of {change} deviations: passed in a run without a fault with a probability "
-    "of {false_alarms} at most, for Gaussian noise, once the start is forgotten",
+    "of {false_alarms} at most, for Gaussian noise, once the initial-condition response has settled",
 }
 #: What a statement adds for a continuous design.
 BOUNDS_BETWEEN_SAMPLES = "; disturbances move within their bounds between samples, which are {dt} s apart"
@@ -42,9 +42,9 @@ BOUNDS_BETWEEN_SAMPLES = "; disturbances move within their bounds between sample
 HELD = "; inputs and disturbances are held between samples"
 BOUNDS_AND_HELD_INPUTS = BOUNDS_BETWEEN_SAMPLES + "; known inputs are held between samples"
 #: The other assumptions of every bound that is never passed.
-ASSUMED = "; the plant starts at rest, known inputs are held or straight lines between samples"
+ASSUMED = "; the plant starts from zero, known inputs are held or straight lines between samples"
 #: Where the residual is made not to see the faults that are modelled.
-OF_ESTIMATES = "the norm of the fault estimates, as the residual does not see the faults that are modelled: "
+OF_ESTIMATES = "the norm of the fault estimates, as modelled faults have no effect on the residual: "
 
 
 def statement_of(
@@ -123,9 +123,9 @@ class Sample(NamedTuple):
     residuals: FloatArray  # ``(nr,)``
     faults: FloatArray  # ``(nf,)``
     said: Evidence | LinearSample | None  # by the observer; nothing in a gap
-    deciding: bool = True  # whether a decision may be taken: not in gaps, and not while a start is being forgotten
+    deciding: bool = True  # whether a decision may be taken: not in gaps, and not during the warm-up
     skipped: int = 0  # rows that were missing before this one
-    bridged: bool = False  # whether the plant's model stood in for all that was missing since the start was forgotten
+    bridged: bool = False  # whether the plant's model stood in for all that was missing since the warm-up
 
 
 class Judged(NamedTuple):
@@ -138,7 +138,7 @@ class Judged(NamedTuple):
 
 
 class Seen(NamedTuple):
-    """What a monitor says of one row: NaN where nothing is decided; no fault stands out without an alarm."""
+    """What a monitor says of one row: NaN where nothing is decided; without an alarm no fault is named."""
 
     statistic: float
     threshold: float
@@ -257,7 +257,8 @@ class Monitor:
 
     @property
     def guarantees(self) -> bool:
-        """Whether the threshold is never passed without a fault: nothing is decided while a gap is being forgotten."""
+        """Whether the threshold is never passed without a fault: nothing is decided until the effect of a gap has
+        settled."""
         return self.rule.GUARANTEES
 
     @property
@@ -385,7 +386,7 @@ class Monitor:
         return self.rule.passed_in(runs, norm, self.threshold + self.floor, onset)
 
     def isolated(self, faults: FloatArray, k: int) -> int:
-        """Return the number of the fault that stands out after an alarm at ``k``; with `groups` it is proved.
+        """Return the number of the fault that an alarm points to, at ``k``; with `groups` it is proved.
 
         Parameters
         ----------

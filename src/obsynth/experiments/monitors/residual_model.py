@@ -196,7 +196,7 @@ def residual_model(
     drive = resolve(plant, scenario)
     noisy = noisy_plant(plant, scenario, drive)
     if not observer.residual_names:
-        raise SpecError(f"Design {design.name!r} has no residual to watch.", path="observer")
+        raise SpecError(f"Design {design.name!r} has no residual to monitor.", path="observer")
     errors = replace(error_model(design), plant=noisy)
     start = np.array([scenario.initial_state.get(name, 0.0) for name in plant.state_names])
     initial = errors.own @ (plant.E @ start) - observer_start(scenario, observer.order)

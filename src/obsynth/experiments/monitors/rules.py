@@ -78,7 +78,8 @@ class NormRule(Rule):
         self._window, self._dt, self._watched, self._driven = window, dt, watched, driven
 
     def over_gaps(self, gaps: GapGrowth) -> NormRule:
-        """Return the rule that knows what missing outputs add after them: it need not wait until they are forgotten."""
+        """Return the rule that knows what missing outputs add after them: it need not wait until their effect has
+        settled."""
         found = copy(self)
         found.gaps, found.bridges, found.takes_gaps = gaps, True, True
         return found
@@ -251,7 +252,7 @@ _PARAMETER_STATEMENTS = {
     "run without a change with at most the stated probability, for Gaussian noise as stated",
     "cusum": "cumulative sum of the whitened innovation for a change of the stated size: passed in a run without a "
     "change with at most the stated probability, for Gaussian noise as stated",
-    "nis": "squared innovations of 20 samples: passed in a run that the model explains with at most the stated "
+    "nis": "squared innovations of 20 samples: passed in a run of the plant as modelled with at most the stated "
     "probability, for Gaussian noise as stated",
 }
 
@@ -346,7 +347,7 @@ def parameter_monitor(
             raise SpecError(f"The nominal value of {name!r} is {value!r}: give a finite number.", path="nominal")
         theta[place] = float(value)
     if kind != "nis" and not len(theta):
-        raise SpecError(f"{kind} watches parameters, and this design estimates none: use nis.", path="kind")
+        raise SpecError(f"{kind} monitors parameters, and this design estimates none: use nis.", path="kind")
     if kind == "cusum" and observer.form in WALKING_FORMS:
         raise SpecError(
             f"cusum needs regressors, which a {observer.form} design does not have: use chi-square or nis.", path="kind"

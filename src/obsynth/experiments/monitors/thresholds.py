@@ -42,8 +42,8 @@ def scaled_inputs(
         )
     if model.noisy and noise_bound is None:
         raise SpecError(
-            "Gaussian noise has no pointwise bound: say by noise_bound (--noise-bound) how many standard deviations "
-            "yours never exceeds, or use a statistical threshold (chi-square or cusum).",
+            "Gaussian noise has no pointwise bound: state noise_bound (--noise-bound), the number of standard "
+            "deviations that yours never exceeds, or use a statistical threshold (chi-square or cusum).",
             path="noise_bound",
         )
     sizes = np.where(reached, bounds, 0.0)

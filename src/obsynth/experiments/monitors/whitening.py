@@ -10,7 +10,8 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.norms import output_covariance, spectral_radius
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE
 
-#: The start counts as forgotten when its effect on the residual is below this share of the residual's deviation.
+#: The initial-condition response has settled when its effect on the residual is below this share of the residual's
+#: deviation.
 START_EFFECT_SHARE = 0.05
 #: A disturbance that moves the residual by less than this share of its noise is decoupled, but for rounding.
 NOTHING_FELT = 1e-6
@@ -36,7 +37,7 @@ def window_covariance(model: ResidualModel, window: int) -> FloatArray:
         lagged.append(model.C @ ahead)
         ahead = model.A @ ahead
     if not np.max(np.abs(lagged[0]), initial=0.0) > 0.0:
-        raise SpecError("No noise reaches the residual: any threshold would be a matter of rounding.", path="noise")
+        raise SpecError("No noise reaches the residual: any threshold would be one on rounding errors.", path="noise")
     return np.block([[lagged[i - j] if i >= j else lagged[j - i].T for j in range(window)] for i in range(window)])
 
 
@@ -77,7 +78,7 @@ def innovation_whitener(covariance: FloatArray, count: int) -> FloatArray:
     sizes, vectors = np.linalg.eigh((left + left.T) / 2.0)
     kept = sizes > CANCELLATION_TOLERANCE * float(np.max(np.abs(np.diag(covariance))))
     if not kept.any():
-        raise SpecError("The newest residual follows from the older ones: nothing is new in it.", path="window")
+        raise SpecError("The newest residual is determined by the older ones: it has no innovation.", path="window")
     return np.asarray((vectors[:, kept] / np.sqrt(sizes[kept])).T @ error)
 
 
@@ -102,7 +103,7 @@ def correlation_left(model: ResidualModel, window: int, whitener: FloatArray) ->
         driven = model.A @ driven
         if float(np.linalg.norm(driven)) <= left:
             return total
-    raise SpecError("The residual remembers for too long to be whitened: use chi-square.", path="kind")
+    raise SpecError("The residual is correlated for too long to be whitened: use chi-square.", path="kind")
 
 
 def cusum_whitener(model: ResidualModel, window: int) -> tuple[FloatArray, bool]:
@@ -137,7 +138,8 @@ def settled(model: ResidualModel, initial_error: float, window: int) -> int:
     first = (int(late[-1]) + 1 if late.size else 0) + window - 1
     if spectral_radius(model.A) >= 1.0 or first >= model.steps:
         raise SpecError(
-            f"The start still shows in the residual, or fills the window, at the end of {model.steps} samples: a "
+            f"The initial-condition response has not settled, or fills the window, at the end of {model.steps} "
+            "samples: a "
             "statistical threshold needs a longer horizon.",
             path="horizon",
         )

@@ -94,7 +94,7 @@ def _learned_outputs(alarms: Alarms) -> list[Output]:
     listed = ", ".join(f"{i + 1}: {name}" for i, name in enumerate(alarms.fault_names))
     return [
         Output(STATISTIC, None, "", f"largest statistic in units of its level: {alarms.learned.statement}"),
-        Output("isolated", None, "", f"number of the fault that stands out at an alarm, 0 for none ({listed})"),
+        Output("isolated", None, "", f"number of the fault that an alarm points to, 0 for none ({listed})"),
         Output("event", None, "", f"1 while an alarm lasts, {HOLD} rows more than the statistic is above its level"),
     ]
 
@@ -127,11 +127,11 @@ def signals_of_dae(design: ObserverDesign, alarms: Alarms) -> Signals:
 
 
 def _late(text: str, delay: int) -> str:
-    return f"{text}, {delay} sample(s) late" if delay else text
+    return f"{text}, delayed by {delay} sample(s)" if delay else text
 
 
 def _apart(known: Sequence[str], measured: Sequence[str]) -> tuple[str, ...]:
-    """Return names of the FMU's inputs: those of the signals, told apart where an input is called as an output."""
+    """Return names of the FMU's inputs: those of the signals, distinguished where an input is called as an output."""
     both = set(known) & set(measured)
     return (
         *(f"u[{name}]" if name in both else name for name in known),

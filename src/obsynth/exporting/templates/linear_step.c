@@ -421,7 +421,7 @@ static int measured(PREFIX_state *s, const REAL *v, REAL *states, REAL *shown)
     taken(s, v);
     if (was_gap) {
         s->is_gap = 0;
-        /* The start is forgotten by as many measured samples as without a gap. */
+        /* The initial-condition response settles in as many measured samples as without a gap. */
         if (s->phase != UPPER_WARM_UP || s->time >= s->from + s->warm_up) {
             s->from = s->time;
             s->waiting = waiting;

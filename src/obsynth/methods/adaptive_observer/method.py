@@ -20,8 +20,9 @@ from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 class AdaptiveObserver(DescriptorKalman):
     r"""Design an observer of states and parameters of a descriptor plant, time-varying or not.
 
-    While the parameters are constant and excited, their estimates are unbiased and forget their start at the rate of
-    the forgetting factor; a change is followed with a lag of about ``lambda / (1 - lambda)`` samples.
+    While the parameters are constant and excited, their estimates are unbiased and the effect of their initial values
+    decays at the rate of the forgetting factor; a change is followed with a lag of about ``lambda / (1 - lambda)``
+    samples.
 
     Parameters
     ----------
@@ -68,9 +69,10 @@ class AdaptiveObserver(DescriptorKalman):
     SpecError
         lambda outside (0, 1], a covariance that is not symmetric or indefinite, or an option of the wrong shape.
     PreconditionError
-        As for `descriptor_kalman`; no parameters; parameters that the outputs cannot tell from each other or from the
-        state (of a time-invariant plant: ``rank [A - E, Phi; C, Psi] < nx + nq``), which are named with the ratio in
-        which they leave no trace; or form ``literal`` where ``rank E + ny - nx`` is zero, so that it would never learn.
+        As for `descriptor_kalman`; no parameters; parameters that the outputs cannot distinguish from each other or
+        from the state (of a time-invariant plant: ``rank [A - E, Phi; C, Psi] < nx + nq``), which are named with the
+        ratio in which they leave no trace; or form ``literal`` where ``rank E + ny - nx`` is zero, so that it would
+        never learn.
     VerificationError
         The observer fails a check.
 
@@ -116,9 +118,9 @@ class AdaptiveObserver(DescriptorKalman):
         if self.form == "random-walk" and self.random_walk is None:
             yield "form 'random-walk' needs random_walk, the variance of one step of each parameter."
         if self.form != "random-walk" and self.random_walk is not None:
-            yield "random_walk belongs to form 'random-walk': the other forms forget instead."
+            yield "random_walk belongs to form 'random-walk': the other forms have a forgetting factor instead."
         if self.form == "random-walk" and self.reset:
-            yield "reset belongs to the forms that forget: the random walk follows by itself."
+            yield "reset is for the forms with a forgetting factor."
 
     def existence(
         self, plant: DescriptorSystem | TimeVaryingDescriptorSystem, *, exactly: bool = True

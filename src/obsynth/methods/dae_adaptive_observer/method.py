@@ -23,8 +23,8 @@ IntegrationChoice: TypeAlias = Literal["backward-euler", "radau", "auto"]
 class DaeAdaptiveObserver(Method):
     r"""Design an observer of states and parameters of a plant ``F(x', x, u, theta) = 0``, ``y = h(x, theta)``.
 
-    While the parameters are constant and excited, their estimates forget their start at the rate of the forgetting
-    factor; a change is followed with a lag of about ``lambda / (1 - lambda)`` samples.
+    While the parameters are constant and excited, the effect of their initial values decays at the rate of the
+    forgetting factor; a change is followed with a lag of about ``lambda / (1 - lambda)`` samples.
 
     Parameters
     ----------
@@ -98,8 +98,9 @@ class DaeAdaptiveObserver(Method):
     ``N_k = G_k - F_k K_{k-1} L_{k-1}``, where (24) prints ``L_k`` and (15) leaves N undefined.  (18) uses the
     covariance of the innovation where R is printed (option ``weight``): with lambda = 1 it is then the extended Kalman
     filter with constant parameters.  Reported is the state after the measurement of k, not a prediction.  S stays below
-    S_0 where excitation is missing (``guard``), parameters have bounds, missing samples do not forget, and the
-    covariance of theta is carried besides S.  Radau IIA beside backward Euler; stored quantities in conservative form.
+    S_0 where excitation is missing (``guard``), parameters have bounds, missing samples do not discount earlier ones,
+    and the covariance of theta is carried besides S.  Radau IIA beside backward Euler; stored quantities in
+    conservative form.
 
     References
     ----------
@@ -149,8 +150,8 @@ class DaeAdaptiveObserver(Method):
             yield "dt is missing: give the seconds between samples."
         if self.form == "forgetting" and self.random_walk is not None:
             yield (
-                "random_walk belongs to the forms 'random-walk' and 'augmented-kalman': form 'forgetting' forgets "
-                "instead."
+                "random_walk belongs to the forms 'random-walk' and 'augmented-kalman': form 'forgetting' has a "
+                "factor instead."
             )
 
     def existence(self, plant: DAEModel, *, exactly: bool = True) -> tuple[Condition, ...]:

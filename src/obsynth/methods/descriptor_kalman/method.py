@@ -49,7 +49,7 @@ class DescriptorKalman(Method):
         In standard deviations of the prediction: 6 for ``gate`` and 3 for ``huber`` by default.
     sensors : mapping, optional
         ``{name: {"every": N, "delay": D}}``: a sensor that is sampled every N rows (k = 0, N, 2 N, ...; what a log
-        holds in the other rows is not used), or whose values arrive D rows late: the value in row k is then that of
+        holds in the other rows is not used), or whose values are delayed by D rows: the value in row k is then that of
         ``k - D``, where the observer puts it, taking the rows after it again.
     state_bounds : mapping or array_like, optional
         ``{name: [low, high]}``, or ``(nx, 2)``: estimates are projected onto these bounds in the metric of their
@@ -70,7 +70,7 @@ class DescriptorKalman(Method):
         A covariance is not symmetric or indefinite, or an option has the wrong shape.
     PreconditionError
         ``rank [E_k; C_k] < nx`` at some k, which is named (with early constraints their rows count); where E, A and C
-        are constant, a mode with ``|z| >= 1`` that shows in no output; where they change, errors that do not die out
+        are constant, a mode with ``|z| >= 1`` that shows in no output; where they change, errors that do not decay
         along the horizon, or outgrow double precision at some k.
     VerificationError
         The observer fails a check.

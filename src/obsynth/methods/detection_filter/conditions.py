@@ -80,11 +80,15 @@ def conditions(plant: DescriptorSystem) -> tuple[Condition, ...]:
 
 def _detectable(plant: DescriptorSystem) -> Condition:
     lost = Evaluator(plant.dense()).hidden_modes().outside
-    detail = f"no output shows s = {complex(lost[0]):.4g}: measure more." if lost else "every mode shows, or dies out"
+    detail = (
+        f"the mode s = {complex(lost[0]):.4g} is undetectable: measure more."
+        if lost
+        else ("every mode is observable, or decays")
+    )
     mode = complex(lost[0]) if lost else None
     return Condition(
         "detectable",
-        "modes that show in no output die out",
+        "unobservable modes decay",
         not lost,
         float(len(lost)),
         0.0,

@@ -48,8 +48,8 @@ class DetectionFilterMethod(Method):
         The band is no range of frequencies.
     PreconditionError
         The plant is sampled or has no faults.  Or ``[Dd, Dw]`` has not full row rank: some residual is free of unknown
-        inputs, see `functional_filter`.  Or a mode that does not die out shows in no output, a zero from the unknown
-        inputs to the outputs lies on the imaginary axis (the filter would never forget), or the index is above one.
+        inputs, see `functional_filter`.  Or a mode that does not decay shows in no output, a zero from the unknown
+        inputs to the outputs lies on the imaginary axis (the filter would not be stable), or the index is above one.
     SolverError
         The Riccati equation has no stabilising solution in double precision, or no gain can be proved: such a zero is
         too close to the axis.
@@ -66,7 +66,9 @@ class DetectionFilterMethod(Method):
     id: ClassVar[str] = "detection-filter"
     plants: ClassVar[tuple[PlantKind, ...]] = ("time-invariant",)
     time: ClassVar[str] = "continuous"
-    summary: ClassVar[str] = "residuals only, that show the faults most where unknown inputs reach every output"
+    summary: ClassVar[str] = (
+        "residuals alone, as sensitive to the faults as possible where unknown inputs reach every output"
+    )
     source: ClassVar[str] = "Ding, Jeinsch, Frank, Ding 2000"
     claims: ClassVar[Mapping[str, ClaimMeaning]] = {
         "disturbance_gain": ClaimMeaning(

@@ -58,7 +58,7 @@ def index_doubt(judge: Evaluator, detectability: FaultDetectability) -> Unclear 
 
 
 def _is_in_doubt(judge: Evaluator, detectability: FaultDetectability) -> bool:
-    """Whether the faults can be told apart on paper, but not in numbers."""
+    """Whether the faults can be distinguished on paper, but not in numbers."""
     rank = detectability.rank
     if rank.full or rank.means != "tolerance":
         return rank.means == "unclear" or (
@@ -256,7 +256,7 @@ def _rank_conditions(judge: Evaluator) -> Iterator[Condition]:
         "" if enough else f"{plant.nf} faults and {plant.ny} output(s). Measure more, or leave a fault out.",
         signals=() if enough else plant.fault_names,
     )
-    alike = "some faults act nowhere, or in the same direction as others, and cannot be told apart."
+    alike = "some faults act nowhere, or in the same direction as others, and cannot be distinguished."
     acting = FullRank([["Bf"], ["Df"]])
     yield judge.full_rank("rank F", acting, lambda _: (alike, _dependent_columns(plant)), source=source)
     try:
@@ -264,7 +264,7 @@ def _rank_conditions(judge: Evaluator) -> Iterator[Condition]:
     except PreconditionError as error:
         yield Condition(
             error.condition,
-            "sensor faults can be told from the states",
+            "sensor faults can be distinguished from the states",
             False,
             np.nan,
             np.nan,
@@ -317,8 +317,8 @@ def _zero_failure(plant: DescriptorSystem, zero: Zero) -> Condition:
     if zero.is_unobservable_mode:
         signals = leading_names(np.abs(zero.state_direction), plant.state_names, most=MOST_NAMES)
         detail = (
-            f"the mode z = {value} (states {', '.join(map(repr, signals))}) never shows in the outputs and does "
-            "not decay: measure something it moves."
+            f"the mode z = {value} (states {', '.join(map(repr, signals))}) is undetectable: no output responds to "
+            "it, and it does not decay. Measure something that it moves."
         )
     else:
         signals = leading_names(np.abs(zero.input_direction), plant.fault_names, most=MOST_NAMES)

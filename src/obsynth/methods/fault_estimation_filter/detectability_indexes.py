@@ -122,7 +122,7 @@ def nonsingular_t(numbers: PlantNumbers) -> fmpq_mat | None:
 
 #: A fault detectability matrix with a larger condition number is usable but noisy: a note says so.
 WARN_DETECTABILITY_CONDITION = 1e4
-#: Above this rounding of data and gains is as large as what tells the faults apart.
+#: Above this rounding of data and gains is as large as what distinguishes the faults.
 REFUSE_CONDITION = 1e12
 
 
@@ -210,7 +210,7 @@ def detectability_conditions(
         float(largest),
         float(detectability.Psi.shape[0]),
         "Wang 2015, eq. (19)",
-        f"fault {', '.join(map(repr, hidden))} never shows in any output: measure something it acts on."
+        f"fault {', '.join(map(repr, hidden))} reaches no output: measure something that it acts on."
         if hidden
         else f"indexes {', '.join(map(str, detectability.indexes))}",
         signals=hidden,
@@ -223,14 +223,18 @@ def detectability_conditions(
     mixed = () if usable else _dependent_faults(detectability.Upsilon, fault_names)
     independent = Condition(
         "rank Upsilon",
-        "the faults first reach the outputs in independent directions (rank Upsilon = nf)",
+        "the first responses of the outputs to the faults are linearly independent (rank Upsilon = nf)",
         usable,
         detectability.condition_number,
         REFUSE_CONDITION,
         "Wang 2015, Theorem 2 (i)",
         f"{rank.describe()}, condition number {_told(detectability.condition_number)}, "
         f"||Upsilon|| = {float(np.linalg.norm(user_units, 2)):.3g}"
-        + (f"; {_names(mixed)} cannot be told apart at first sight. Leave one out, or measure more." if mixed else "."),
+        + (
+            f"; {_names(mixed)} cannot be distinguished at first sight. Leave one out, or measure more."
+            if mixed
+            else "."
+        ),
         signals=mixed,
     )
     return finite, independent

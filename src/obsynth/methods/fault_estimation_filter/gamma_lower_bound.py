@@ -381,7 +381,7 @@ def _best_run(dual: _DualProblem, enough: float) -> tuple[FloatArray, FloatArray
     while True:
         width = run[0].shape[1]
         if width == 0:
-            raise np.linalg.LinAlgError("no disturbance from rest is invisible")
+            raise np.linalg.LinAlgError("every disturbance from zero initial state has an effect on the outputs")
         sizes = np.linalg.inv(np.linalg.qr(np.vstack([dual.bottom @ pair for pair in run]), mode="r"))
         run = [pair @ sizes for pair in run]
         blocks = [[dual.shown @ pair, np.zeros((len(dual.shown), d.shape[1]))] for pair in run]

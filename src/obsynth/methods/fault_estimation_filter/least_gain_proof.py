@@ -159,7 +159,7 @@ def least_gain_row(
         claimed,
         min(claimed * (1.0 + BOUND_TOLERANCE) - found, found - claimed * (1.0 - PROVED_SHARE)),
         bool(holds),
-        "disturbances that no gain sees, exactly; sums in ball arithmetic",
+        "disturbances that no gain can attenuate, exactly; sums in ball arithmetic",
         "proved",
         f"proved: at least {found:.9g}",
     )

@@ -35,7 +35,7 @@ class FaultEstimationFilter(Method):
     r"""Design a fault-estimation filter with a guaranteed l2 gain from the disturbance to the fault error.
 
     Each fault estimate equals its fault delayed by its detectability index, untouched by the other faults and the
-    state; what is left is the effect of the disturbance, bounded by gamma, and of the initial error, which dies out.
+    state; what is left is the effect of the disturbance, bounded by gamma, and of the initial error, which decays.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ class FaultEstimationFilter(Method):
         them, where the filter always has some.  It shares P with the other inequalities, which may cost more than it
         must.
     decay : float, optional, 1/seconds
-        Errors die out at least like ``exp(-decay t)``: the disk of radius ``exp(-decay dt)``.
+        Errors decay at least like ``exp(-decay t)``: the disk of radius ``exp(-decay dt)``.
     tolerance : float, optional
         Relative width of the bracket at which bisection ends.
     prove_least : bool, optional
@@ -104,8 +104,8 @@ class FaultEstimationFilter(Method):
     SpecError
         An option is out of range or S has the wrong shape.
     PreconditionError
-        ``rank [E; C] < nx`` (eq. (2)), dependent outputs or faults, a fault that never shows, ``rank Upsilon < nf``
-        (Theorem 2 (i)), or an invariant zero from the faults to the outputs on or outside the unit circle.
+        ``rank [E; C] < nx`` (eq. (2)), dependent outputs or faults, a fault that reaches no output, ``rank Upsilon <
+        nf`` (Theorem 2 (i)), or an invariant zero from the faults to the outputs on or outside the unit circle.
     InfeasibleError
         No filter of this structure reaches ``gamma``, for this T, N and W.
     SolverError

@@ -63,8 +63,8 @@ def restricted_equivalent_from(e: FloatArray, c: FloatArray, s: FloatArray) -> t
     rank = decide_rank(t, expected=nx)
     if not rank.full:
         raise SpecError(
-            f"This S makes T singular ({rank.describe()}), which throws away algebraic "
-            "equations: choose another S, or leave it out for a T that is nonsingular by construction.",
+            f"This S makes T singular ({rank.describe()}), which discards algebraic equations: choose another S, or "
+            "leave it out for a T that is nonsingular by construction.",
             path="S",
         )
     return t, n

@@ -114,14 +114,14 @@ def notes(
     if detectability.condition_number > WARN_DETECTABILITY_CONDITION:
         found.append(
             f"Upsilon has condition number {detectability.condition_number:.3g}: some combination of faults is "
-            "estimated with much more noise than others."
+            "estimated with a much larger standard deviation than the others."
         )
     for name, row in zip(plant.fault_names, observer.Dy[observer.fault_rows], strict=True):
         amplification = float(np.linalg.norm(row))
         if amplification > WARN_AMPLIFICATION:
             found.append(
-                f"The estimate of {name!r} multiplies errors of the newest measurement by up to {amplification:.3g}: "
-                "the fault moves the outputs little within its delay."
+                f"The estimate of {name!r} amplifies errors of the newest measurement by up to {amplification:.3g}: "
+                "the outputs respond little to the fault within its delay."
             )
     radius = spectral_radius(observer.Az)
     if radius >= 1.0:

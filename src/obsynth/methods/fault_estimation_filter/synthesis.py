@@ -112,7 +112,7 @@ class Goal:
         return problem.reaches(injection, self.gain) if problem.disturbances else problem.radius(injection) < 1.0
 
     def is_fast(self, injection: Injection) -> bool:
-        """Return whether the filter forgets fast enough."""
+        """Return whether the filter decays fast enough."""
         return self.problem.radius(injection) <= self.slowest
 
     def met_fast(self, injection: Injection) -> bool:
@@ -213,12 +213,12 @@ def gains_by_inequality(goal: Goal, printed: PrintedInequality, records: list[di
     return found
 
 
-#: The error shall be forgotten at least this fast (spectral radius), or half as fast as the starting filter does: the
+#: The error shall decay at least this fast (spectral radius), or half as fast as that of the starting filter: the
 #: smallest gains alone would leave an observable mode at the very edge of stability.
 SLOWEST_DECAY = 0.999
 #: Up to so many states the whole inequality competes although nothing needs it.
 MOST_STATES_FOR_WHOLE = 12
-#: Noise on the states, relative to that of the plant, for filters that shall forget faster; and how much more variance
+#: Noise on the states, relative to that of the plant, for filters that shall decay faster; and how much more variance
 #: than the least of such filters that may cost.
 STATE_NOISE = (1e-4, 1e-3, 1e-2, 1e-1)
 PRICE_OF_SPEED = 1.04
@@ -252,7 +252,7 @@ def small_gain_design(
     fast = [] if not goal.noisy or any(map(goal.is_fast, central)) else _fast_filters(goal)
     quick = None
     if fast:
-        # The filter of least noise may forget slowly again: what was bought is not given back.
+        # The filter of least noise may decay slowly again: the rate that was gained is kept.
         quick = _towards(goal, fast[0], target, slowest=problem.radius(fast[0]))
         candidates.append(quick)
         central += fast
@@ -322,7 +322,7 @@ def _towards(goal: Goal, injection: Injection, target: Injection | None, *, slow
 #: A shipped gain is never asked to be smaller than this fraction of the starting filter's.
 SMALLEST_USEFUL_GAIN = 1e-3
 #: Why the inequality was not asked.
-NOTHING_TO_POLISH = "reached: the disturbance does as much before any measurement can help; nothing to polish"
+NOTHING_TO_POLISH = "the lower bound is reached: the disturbance has this effect before any measurement can counter it"
 #: Asking for a gain above this multiple of the starting filter's adds nothing but bad scaling.
 LARGEST_USEFUL_GAIN = 1e3
 #: The gains are designed for a slightly smaller gamma than claimed, so that the claim has a well-conditioned proof.
@@ -363,7 +363,7 @@ def found_gains(
 ) -> FoundGains:
     """Search the least gain, and small gains for a slightly larger one."""
     size = max(problem.disturbance_size, NOMINAL_GAIN)
-    progress("searching the least gain")
+    progress("searching for the least gain")
     noisy = printed.plant.nw > 0
     least = _least_gain(problem, asked)
     unfelt = problem.disturbances and least.starting_gain <= ROUNDING_GAIN * problem.disturbance_size
@@ -375,10 +375,10 @@ def found_gains(
         problem = problem.without_disturbance()
         least = replace(_least_gain(problem, asked), gain=least.starting_gain)
     elif engine == "lmi" or (engine == "auto" and _leaves_little(asked.gamma, least.gain, problem)):
-        progress("polishing the least gain")
+        progress("refining the least gain")
         least = _polished(problem, least, printed)
     gamma = _gain_to_ship(asked, problem, least, noisy=noisy)
-    progress("choosing small gains")
+    progress("reducing the observer gains")
     inner = gamma - min(CERTIFICATE_SHARE * (gamma - least.gain), CERTIFICATE_MARGIN * gamma)
     chosen, records = small_gain_design(problem, least, inner, printed=printed, engine=engine)
     return FoundGains(problem, least, gamma, chosen, records)
@@ -518,7 +518,7 @@ def synthesise(plant: DescriptorSystem, asked: FaultEstimationFilter, *, progres
         claims |= {"gamma_bracket_low": least.bracket[0], "gamma_bracket_high": least.bracket[1]}
     witnesses = {"P_factor": factor, "tracking": tracking}
     if plant.nd:
-        progress("proving that no filter does better")
+        progress("proving that no filter has a smaller gain")
         proof, proved = least_gain_certificate(
             problem,
             prepared.plant,
@@ -660,7 +660,8 @@ def _gamma_notes(asked: float | None, shipped: float) -> tuple[str, ...]:
     if asked is None or shipped >= asked:
         return ()
     return (
-        f"gamma = {asked:.6g} was asked for, and {shipped:.6g} is proved: gains for more would only be scaled worse.",
+        f"gamma = {asked:.6g} was asked for, and {shipped:.6g} is proved: a larger gamma would only make the gains "
+        "worse conditioned.",
     )
 
 

@@ -72,7 +72,7 @@ def fault_conditions(
 def _decided(plant: DescriptorSystem, model: Exosystem, fault: int, exactly: bool | None) -> tuple[Condition, ...]:
     name = plant.fault_names[fault]
     asked = question(plant, [j for j in range(plant.nf) if j != fault], fault, exactly)
-    seen = _shown(plant, asked, f"{name} shows", _rest(plant, fault))
+    seen = _shown(plant, asked, f"{name} detectable", _rest(plant, fault))
     if not asked.visible:
         return (seen,)
     points = model_points(model, fault)
@@ -80,7 +80,7 @@ def _decided(plant: DescriptorSystem, model: Exosystem, fault: int, exactly: boo
     doubtful = [point for point in lost if _may_show(asked, point)]
     shares = {point: _named(plant, asked).last_share(point) for point in points}
     least = min(points, key=lambda point: shares[point], default=dc_point(plant.dt))
-    share = f", {shares[least]:.2g} of it at least at the poles of its model" if shares else ""
+    share = f", at the poles of its model at least {shares[least]:.2g} of it reaches the outputs" if shares else ""
     kept = Condition(
         f"{name} follows its model",
         f"{name} has no zero at a pole of its model ({model.descriptions[fault]})",
@@ -99,7 +99,8 @@ def _decided(plant: DescriptorSystem, model: Exosystem, fault: int, exactly: boo
 
 
 def _may_show(asked: Question, point: complex | None = None) -> bool:
-    """Whether a fault that floating point does not see shows on paper (at a point), or may for all that can be told."""
+    """Whether a fault that floating point does not see shows on paper (at a point), or may for all that can be
+    isolated."""
     if asked.exactly:
         return False
     if not asked.clear:
@@ -130,7 +131,7 @@ def _in_doubt(condition: Condition, plant: DescriptorSystem, asked: Question, po
         decider=DECIDER,
         other=f"hides {name} at {'z' if plant.dt > 0.0 else 's'} = {_place(point)}, and no filter estimates it",
     )
-    detail = f"{share:.1g} of {name} shows at {_place(point)}: rounding of the data is as large."
+    detail = f"{share:.1g} of {name} reaches the outputs at {_place(point)}: rounding of the data is as large."
     return replace(condition, detail=detail, mode=point, signals=(name,)).in_doubt(doubt, plant)
 
 
@@ -142,7 +143,7 @@ def _residual_conditions(plant: DescriptorSystem, seen: Sequence[int], exactly: 
         asked = question(plant, removed, fault, exactly)
         blind = [*plant.disturbance_names, *(plant.fault_names[j] for j in removed)]
         without = f" without {', '.join(plant.fault_names[j] for j in removed)}" if removed else ""
-        name = f"{plant.fault_names[fault]} shows{without}"
+        name = f"{plant.fault_names[fault]} detectable{without}"
         found.append(_shown(plant, asked, name, ", ".join(blind) or "the initial state"))
     return found
 
@@ -175,7 +176,7 @@ def _gap(asked: Question) -> str:
 def _hidden(plant: DescriptorSystem, asked: Question, point: complex) -> str:
     motion = hidden_motion(plant, asked.number, point, asked.removed)
     if motion is None:
-        return "nothing shows it."
+        return "no output responds to it."
     return f"{motion} ({'z' if plant.dt > 0.0 else 's'} = {_place(point)})."
 
 

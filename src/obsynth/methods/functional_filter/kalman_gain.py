@@ -135,7 +135,7 @@ def require_noise(model: FilterModel, plant_outputs: tuple[str, ...], noise: Flo
     silent = [name for name, row in zip(plant_outputs, noise, strict=True) if not row.any()]
     which = f"no noise is stated for {', '.join(silent)}" if silent else "its noise cancels"
     raise PreconditionError(
-        f"A combination of the outputs is free of noise: {which}. A Kalman gain would trust it without limit; "
+        f"A combination of the outputs is free of noise: {which}. A Kalman gain would be infinite there; "
         "state the noise of every sensor (sensor_noise), or give poles.",
         condition="noise of every output",
         signals=silent or plant_outputs,

@@ -26,7 +26,7 @@ class FunctionalFilter(Method):
 
     The unknown inputs are taken out of the plant first, whatever its index; on what is left, whose known inputs are u
     and y, faults are walks of their models and a Kalman gain with correlated noise is chosen.  It exists for every
-    plant on which the fault can be told from the rest, also where no observer of the whole state does.
+    plant on which the fault can be distinguished from the rest, also where no observer of the whole state does.
 
     Parameters
     ----------
@@ -36,7 +36,7 @@ class FunctionalFilter(Method):
         Faults to estimate, all by default.  The others are treated like unknown inputs: no estimate sees them.
     joint : bool, optional
         One filter for all faults asked for: of lower order, and less noisy, but each estimate is free of the other
-        faults only where these follow their models.  By default each is free of all others whatever their course.
+        faults only where these follow their models.  By default each is free of all others whatever their time course.
     fault_model : str, mapping or FaultModel, optional
         How faults run, as for `ui_pi_observer`.
     fault_rate : float or mapping of str to float, optional
@@ -71,8 +71,8 @@ class FunctionalFilter(Method):
     SpecError
         An option is malformed, or ``delay`` or ``mean`` are asked for in continuous time.
     PreconditionError
-        A fault cannot be told from the rest: what hides it, and which sensors would help, is said.  Or an output has
-        no stated noise.
+        A fault cannot be distinguished from the rest: what hides it, and which sensors would help, is said.  Or an
+        output has no stated noise.
     SolverError
         The Riccati equation has no usable solution, or poles could not be placed.
     VerificationError
@@ -90,7 +90,8 @@ class FunctionalFilter(Method):
     plants: ClassVar[tuple[PlantKind, ...]] = ("time-invariant",)
     time: ClassVar[str] = "both"
     summary: ClassVar[str] = (
-        "the faults asked for and nothing else, untouched by any unknown input; needs not the whole state"
+        "estimates of the faults that are asked for alone, decoupled from every unknown input; the whole state need "
+        "not be observable"
     )
     source: ClassVar[str] = "ours, after Frisk, Nyberg 2001 and Anderson, Moore 1979"
     claims: ClassVar[Mapping[str, ClaimMeaning]] = {

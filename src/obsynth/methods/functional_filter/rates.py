@@ -32,7 +32,7 @@ RATE_REACHED, ASKED_AT = 0.1, (1.0, 1.5, 2.5)
 AS_CLOSE = 0.05
 #: A walk that misses a step by more shows nothing of it in time: how much more than that is a matter of rounding.
 NOTHING_SHOWN = 0.5
-#: Errors that need longer than so many settling times to die out would stay in any run: the gain moves such poles.
+#: Errors that need longer than so many settling times to decay would stay in any run: the gain moves such poles.
 FOR_GOOD = 1e5
 #: Decades of the search around a rate of the size of the noise, and its steps per decade at the end.
 DECADES, RATE_BISECTIONS = 8, 9
@@ -77,7 +77,7 @@ def default_rates(model: FilterModel, seconds: float, *, lag: int) -> tuple[Floa
         # Some zero keeps every estimate from a step for long: the slowest walk that comes about as close as any.
         misses = {e: step_misses(model, found, seconds) for e, found in tried.items() if found is not None}
         if not misses:
-            raise SolverError("No walk of the fault gives a stable filter: give fault_rate, or poles.")
+            raise SolverError("No random-walk intensity of the fault gives a stable filter: give fault_rate, or poles.")
         least = min(misses.values())
         high = min(e for e, miss in misses.items() if miss <= least + AS_CLOSE or least > NOTHING_SHOWN)
     else:
@@ -145,7 +145,8 @@ class DelayCurve:
         rate = self.rates[len(self.rates) // 2]
         at = {lag: float(value) for lag, value in zip(self.lags, row, strict=True)}
         return (
-            f"{self.fault}: for a walk of {rate:.3g} per sample one sample of delay takes the deviation from "
+            f"{self.fault}: for a random-walk intensity of {rate:.3g} per sample one sample of delay takes the "
+            "deviation from "
             f"{at[0]:.3g} to {at[1]:.3g}, five samples to {at[5]:.3g}."
         )
 

@@ -234,7 +234,7 @@ def synthesise(plant: DescriptorSystem, asked: FunctionalFilter, *, progress: Ca
     progress("checking the existence conditions")
     require_all_told(asked.existence(plant))
     noisy, notes = _with_noise(plant, asked)
-    progress("taking the unknown inputs out of the plant")
+    progress("decoupling the unknown inputs")
     models = _models(noisy, model, asked)
     progress("choosing the gains")
     parts, rates = _parts(noisy, models, asked)
@@ -289,7 +289,7 @@ def _with_noise(plant: DescriptorSystem, asked: FunctionalFilter) -> tuple[Descr
         Dw=np.hstack([plant.Dw[:, process] * 0.0, np.diag(deviations)]),
         noise_names=[*(plant.noise_names[i] for i in process), *(f"noise {name}" for name in plant.output_names)],
     )
-    note = "No noise is stated: every sensor is held to be as noisy as the others, with deviation 1 in its own unit."
+    note = "No noise is stated: every sensor is assumed to have the standard deviation 1 in its own unit."
     return noisy, () if given is not None else (note,)
 
 
@@ -334,8 +334,8 @@ def _gain(
                 walks[row != 0.0] = given[fault]
                 if not given[fault] and not asked.decay:
                     raise SpecError(
-                        f"fault_rate says nothing about {plant.fault_names[fault]}, which is to be estimated: a walk "
-                        "of 0 is a constant, and errors of its estimate would never decay.",
+                        f"fault_rate has no entry for {plant.fault_names[fault]}, which is to be estimated: with a "
+                        "random-walk intensity of 0 it is a constant, and errors of its estimate would never decay.",
                         path="method.options.fault_rate",
                     )
         return walks, kalman_gain(model, walks, lag=asked.delay, decay=asked.decay or 0.0)
@@ -412,12 +412,13 @@ def _notes(plant: DescriptorSystem, asked: FunctionalFilter, slowest: float, rat
     if asked.residuals is None and asked.fault_rate is None and asked.poles is None and asked.decay is None:
         largest = float(max((np.max(walk, initial=0.0) for walk in rates), default=0.0))
         notes.append(
-            f"fault_rate was not given: a walk of {largest:.3g} {unit} is the slowest that shows a step after "
-            f"{settling_time(plant):.3g} s. Delay buys less noise only against a rate that you state."
+            f"fault_rate was not given: a random-walk intensity of {largest:.3g} {unit} is the slowest with which a "
+            "step is estimated after "
+            f"{settling_time(plant):.3g} s. A delay reduces the noise only relative to a fault_rate that you state."
         )
     if np.isfinite(slowest) and slowest * SLOW_ERRORS * settling_time(plant) < 1.0:
         notes.append(
-            f"The slowest pole has a time constant of {1.0 / slowest:.3g} s: errors of the state at "
-            "the start stay that long where they show. Ask for decay= to be faster, at a price in noise."
+            f"The slowest pole has a time constant of {1.0 / slowest:.3g} s: initial errors of the state last that "
+            "long in the estimates. State decay= for a faster one, which has more noise."
         )
     return notes

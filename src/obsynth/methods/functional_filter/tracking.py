@@ -49,7 +49,8 @@ def _with_digits_to_spare(a: FloatArray, phi: FloatArray, entering: FloatArray) 
 def wanted_faults(
     plant: DescriptorSystem, observer: LinearObserver, matrices: Mapping[str, FloatArray], *, mean: int
 ) -> FloatArray:
-    """Return what rows should make of the models' states ``(rows, nw)``: the fault as late as claimed, or nothing."""
+    """Return what rows should make of the models' states ``(rows, nw)``: the fault with the claimed delay, or
+    nothing."""
     phi, cw = matrices["Phi"], matrices["Cw"]
     rows = np.zeros((len(observer.Cz), len(phi)))
     for row, (name, delay) in enumerate(zip(observer.fault_names, observer.fault_delays, strict=True)):

@@ -198,8 +198,8 @@ def _smallest_groups(design: ObserverDesign, asked: Asked) -> Iterator[Check]:
         name = plant.fault_names[fault]
         yield upper_bound_check(
             f"smallest group[{name}]",
-            f"no test of {name} is blind to more faults: others then hide it, by numbers that satisfy every equation "
-            "exactly",
+            f"no test of {name} is blind to more faults: the other faults can then hide it, by numbers that satisfy "
+            "every equation exactly",
             float(left),
             0.0,
             source=SOURCE,

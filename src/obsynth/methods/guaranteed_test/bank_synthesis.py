@@ -1,4 +1,5 @@
-"""Finding a bank of guaranteed tests: for each fault the smallest group that can be told, and the least threshold."""
+"""Finding a bank of guaranteed tests: for each fault the smallest group that can be isolated, and the least
+threshold."""
 
 from __future__ import annotations
 
@@ -35,13 +36,13 @@ from obsynth.results.design import Certificate
 def synthesise_bank(plant: DescriptorSystem, asked: Any, *, progress: Callable[[str], None]) -> Synthesis:
     """Return one observer with a row for each fault, its certificate, and what an alarm of each row means."""
     require_all(conditions(plant, replace(asked, isolate=False, fault=plant.fault_names[0]), with_windows=False))
-    progress("looking for the smallest groups that can be told")
+    progress("searching for the smallest groups that can be isolated")
     found = [_smallest(plant, asked, fault) for fault in range(plant.nf)]
     groups, lags, reasons = zip(*found, strict=True)
     if asked.course == "any" and asked.lag is None:
         asked = replace(asked, lag=max(lags))
     tests = [blind_to(asked, plant, fault, group) for fault, group in enumerate(groups)]
-    progress("looking for the least number of samples")
+    progress("searching for the least number of samples")
     tables = [_table(plant, test) for test in tests]
     samples = max(samples for samples, _ in tables)
     asked = replace(asked, samples=samples)
@@ -74,7 +75,7 @@ def _silent(_: str) -> None:
 
 
 def _smallest(plant: DescriptorSystem, asked: Any, fault: int) -> tuple[tuple[int, ...], int, str]:
-    """Return the smallest group with this fault that can be told, the lag, and why there is no smaller one."""
+    """Return the smallest group with this fault that can be isolated, the lag, and why there is no smaller one."""
     others = [other for other in range(plant.nf) if other != fault]
     why, first = "", None
     for size in range(len(others) + 1):
@@ -102,7 +103,7 @@ def _smallest(plant: DescriptorSystem, asked: Any, fault: int) -> tuple[tuple[in
 def _require_proved(plant: DescriptorSystem, own: Any, condition: Condition) -> None:
     if not proved_hidden(plant, own):
         raise SolverError(
-            f"Whether {own.fault} can be told apart from {', '.join(own.free)} is inconclusive: {condition.detail}"
+            f"Whether {own.fault} can be distinguished from {', '.join(own.free)} is inconclusive: {condition.detail}"
         )
 
 
@@ -152,7 +153,7 @@ def _notes(plant: DescriptorSystem, groups: Any, reasons: Any, claims: Mapping[s
         meant = " or ".join(names[k] for k in group)
         yield (
             f"An alarm of {names[fault]} means {meant}, as long as the bounds hold: threshold {size:.6g}, "
-            f"{found:.6g} is surely found.{f' No smaller group can be told: {why}' if why else ''}"
+            f"{found:.6g} is certain to be detected.{f' No smaller group can be isolated: {why}' if why else ''}"
         )
         listed = [
             f"{names[other]}: {'impossible' if np.isinf(pairs[fault, other]) else f'{pairs[fault, other]:.6g}'}"

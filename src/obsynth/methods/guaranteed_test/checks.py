@@ -111,7 +111,7 @@ def _of_the_test(design: ObserverDesign, window: Window, test: Repaired) -> Iter
     exact = repaired_multipliers(window, test.values, refine=False, exact_zero=zero, among=test.radius)
     yield upper_bound_check(
         "multipliers",
-        "exact multipliers that see the fault with weight one and nothing free lie within the shipped "
+        "exact multipliers that weigh the fault with one and every free signal with zero lie within the shipped "
         "distance of the shipped ones",
         excess(exact, test.radius),
         1.0,
@@ -126,7 +126,7 @@ def _of_the_test(design: ObserverDesign, window: Window, test: Repaired) -> Iter
         threshold,
         source=SOURCE,
         kind="proved",
-        detail="sum of all bounds times what the exact multipliers see of each",
+        detail="sum of all bounds, each times its weight by the exact multipliers",
     )
     found = float(claims.get("surely_found", np.nan))
     yield lower_bound_check(
@@ -144,7 +144,7 @@ def _of_the_test(design: ObserverDesign, window: Window, test: Repaired) -> Iter
     rounding = rounding_of(window, test.values, test.radius)
     yield upper_bound_check(
         "weights",
-        "what runs are the weights that the multipliers say",
+        "the weights that run are those of the multipliers",
         _misfit(observer, implied, window, test.values),
         1.0,
         source="shipped realisation",
@@ -155,7 +155,7 @@ def _of_the_test(design: ObserverDesign, window: Window, test: Repaired) -> Iter
     share = float(np.max(rounding / np.maximum(shipped, np.finfo(float).tiny), initial=0.0))
     yield upper_bound_check(
         "rounding",
-        "what the running test may err for known signals of size one is at most what is shipped",
+        "the rounding error of the running test for known signals of size one is at most the shipped one",
         share,
         1.0 + SAME_SUM,
         source=SOURCE,
@@ -172,8 +172,8 @@ def _over_tolerances(design: ObserverDesign, window: Window, test: Repaired) -> 
         reason = str(error)
     return upper_bound_check(
         "mean threshold",
-        "mean over the shipped record of what the residual never passes without a fault, whatever the constants are "
-        f"in their tolerances; to {MEAN_ROOM:.0%}, as each processor has its own bound",
+        "mean over the shipped record of the threshold that the residual never passes without a fault, for all "
+        f"constants in their tolerances; to {MEAN_ROOM:.0%}, as each processor has its own bound",
         found,
         float(design.certificate.claims["mean_threshold"]) * (1.0 + MEAN_ROOM),
         source="the observer's error over the box of the constants",
@@ -243,7 +243,8 @@ def _of_the_least(design: ObserverDesign, window: Window) -> Iterator[Check]:
         "no function of these samples has a threshold below this: a fault of twice this size, and none, give "
         "the same samples within all bounds"
         if window.twice_is_hidden
-        else "no function of these samples tells the fault within less: a fault of this size, and its opposite, give "
+        else "no function of these samples estimates the fault to within less: a fault of this size, and its "
+        "opposite, give "
         "the same samples within all bounds",
         found,
         float(least),

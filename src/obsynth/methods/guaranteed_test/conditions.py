@@ -44,10 +44,10 @@ def conditions(plant: DescriptorSystem, asked: Asked, *, with_windows: bool = Tr
 
 
 def fault_named(named: bool, names: Sequence[str], none: str) -> Condition:
-    """Return the condition that one fault is looked for; ``none`` says that the plant has none to choose from."""
+    """Return the condition that one fault is tested for; ``none`` says that the plant has none to choose from."""
     advice = f"name one of {', '.join(names)} (fault)." if names else none
     detail = "" if named else advice
-    return Condition("fault named", "one fault is looked for", named, float(len(names)), 1.0, SOURCE, detail)
+    return Condition("fault named", "one fault is tested for", named, float(len(names)), 1.0, SOURCE, detail)
 
 
 def bounds_stated(lacking: Sequence[str]) -> Condition:
@@ -121,8 +121,8 @@ def told_condition(window: Window, holds: bool, detail: str) -> Condition:
     """Return the condition that a window tells the fault, in words."""
     fault = window.model.fault_names[window.question.fault]
     return Condition(
-        "fault told",
-        f"{fault} changes samples as nothing free does",
+        "fault detectable",
+        f"{fault} changes the samples in a way that no free signal does",
         holds,
         float(holds),
         1.0,
@@ -139,7 +139,8 @@ def _why(problem: Problem, asked: Asked, window: Window) -> str:
     samples = window.question.samples
     if found is None:
         return (
-            f"no weights of {samples} samples see {fault} and nothing free, but a course that hides it could not be "
+            f"no test on {samples} samples responds to {fault} and to nothing that is free, but a time course that "
+            "hides it could not be "
             "proved: this is at the edge of double precision. Bounds of the states (state_bounds), however wide, help."
         )
     text = f"{hidden(window, found)} (proved for {samples} samples: every equation holds exactly)."

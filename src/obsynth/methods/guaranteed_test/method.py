@@ -85,7 +85,7 @@ class GuaranteedTestMethod(Asked, Method):
         (``online_monitor(design, constants=plant)``), and weights and samples make its mean over the scenario least.
     isolate : bool, optional
         A bank: one row for each fault, blind to all others.  Where that is impossible, the alarm of a row means one of
-        the smallest group that can be told, which is proved.  Without ``fault`` and ``free``.
+        the smallest group that can be isolated, which is proved.  Without ``fault`` and ``free``.
     exact : bool, optional
         On data: the least interval of the fault for the very samples of each row, by two linear programmes, in place
         of the fixed threshold; each end is proved.  It finds faults that the fixed test does not.  Where no course of
@@ -131,7 +131,7 @@ class GuaranteedTestMethod(Asked, Method):
     id: ClassVar[str] = "guaranteed-test"
     plants: ClassVar[tuple[PlantKind, ...]] = ("time-invariant", "time-varying", "nonlinear")
     time: ClassVar[str] = "discrete, time-varying"
-    summary: ClassVar[str] = "a test of one fault whose threshold no other test on these samples can beat"
+    summary: ClassVar[str] = "a test of one fault with the least threshold of all tests on these samples"
     source: ClassVar[str] = "ours, by duality of linear programmes"
     claims: ClassVar[Mapping[str, ClaimMeaning]] = {
         "threshold": ClaimMeaning("", "never passed without the fault, in the fault's unit", "threshold"),
@@ -155,7 +155,7 @@ class GuaranteedTestMethod(Asked, Method):
     def conflicts(self) -> Iterator[str]:
         """Yield a sentence for each rule across options that is broken."""
         if self.fault_rate is None and self.course == "rate":
-            yield "course rate needs fault_rate, the largest change of the fault from sample to sample."
+            yield "The course rate needs fault_rate, the largest change of the fault from sample to sample."
         if self.fault_rate is not None and self.course != "rate":
             yield f"fault_rate is for course rate, not {self.course}."
         if (self.disturbance_rate is None) == (self.disturbance == "rate"):
@@ -163,7 +163,7 @@ class GuaranteedTestMethod(Asked, Method):
         if self.after is not None and self.course != "step":
             yield f"after is for course step, not {self.course}: give samples."
         if self.lag and self.course in ("step", "constant"):
-            yield f"lag is for courses any, ramp and rate: a {self.course} is told of all its samples."
+            yield f"lag is for the courses any, ramp and rate: a {self.course} uses all samples of the window."
         if self.isolate and (self.fault is not None or self.free != "others"):
             yield "isolate makes a test for each fault: leave fault and free out."
         for name, asked in (("exact", self.exact), ("missing solve", self.missing == "solve")):

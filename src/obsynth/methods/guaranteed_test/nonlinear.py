@@ -34,7 +34,7 @@ def nonlinear_conditions(model: DAEModel, asked: Any) -> tuple[Condition, ...]:
         float(len(lacking)),
         0.0,
         SOURCE,
-        "" if not lacking else f"give {' and '.join(lacking)}: what the linear model leaves out is bounded there.",
+        "" if not lacking else f"give {' and '.join(lacking)}: the remainder of the linear model is bounded there.",
     )
     if lacking:
         return (stated,)
@@ -117,12 +117,12 @@ def synthesise_nonlinear(model: DAEModel, asked: Any, *, progress: Callable[[str
     lacking = [name for name in ("region", "sample_time") if getattr(asked, name) is None]
     if lacking:
         raise PreconditionError(
-            f"A nonlinear plant needs {' and '.join(lacking)}: what its linear model leaves out in the region counts "
-            "as a disturbance. Or linearise and sample it (obsynth.linearise, obsynth.discretise): the test is then as "
-            "good as the linear model.",
+            f"A nonlinear plant needs {' and '.join(lacking)}: the remainder of its linear model in the region counts "
+            "as a disturbance. Or linearise and sample it (obsynth.linearise, obsynth.discretise): the test is then "
+            "as good as the linear model.",
             condition="region stated",
         )
-    progress("bounding what the linear model leaves out")
+    progress("bounding the remainder of the linear model")
     plant, own = _linear(model, asked)
     found = synthesise(plant, own, progress=progress)
     kept = {name: part for name, part in found.certificate.matrices.items() if not name.startswith("witness")}
@@ -140,7 +140,7 @@ def synthesise_nonlinear(model: DAEModel, asked: Any, *, progress: Callable[[str
     notes = [note for note in found.notes if "no function" not in note and "least is not claimed" not in note]
     notes.insert(
         0,
-        f"The plant is nonlinear: what its linear model leaves out is at most {share.max():.3g} in a state or an "
+        f"The plant is nonlinear: the remainder of its linear model is at most {share.max():.3g} in a state or an "
         "output, while all signals stay in the region, between samples too; known inputs, faults and unknown inputs "
         "are held there. That there is no smaller threshold is not claimed, as the remainder is bounded and not known.",
     )

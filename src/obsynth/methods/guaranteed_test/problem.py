@@ -22,10 +22,11 @@ from obsynth.proofs.exact_pencils import ExactPencil
 
 #: What each course covers, and what not.
 COURSES: Mapping[str, str] = {
-    "constant": "a fault that is constant over the window: the interval holds once it fills the window, alarms always",
-    "step": "a step after healthy samples: an alarm is right whatever the course, but fades once "
-    "the fault fills the window, so it is latched",
-    "any": "a fault of any course, at one sample: the interval holds at every row",
+    "constant": "a fault that is constant over the window: the interval holds once it fills the window, an alarm is "
+    "always right",
+    "step": "a step after healthy samples: an alarm is right whatever the time course, but it ends once the fault "
+    "fills the window, so latch it",
+    "any": "a fault of any time course, at one sample: the interval holds at every row",
     "ramp": "a straight line over the window: the interval is of its value at one sample",
     "rate": "a fault that changes by at most fault_rate a sample: the interval is of its value at one sample",
 }
@@ -241,7 +242,7 @@ def delay_in_samples(window: Window, delay: int) -> int:
     question = window.question
     if question.course == "step":
         return question.samples - 1 - question.before + delay
-    # The fault must have followed its course over the whole window; one of any course needs only its own sample.
+    # The fault must have followed its course over the whole window; one of any time course needs only its own sample.
     return (question.lag if question.course == "any" else question.samples - 1) + delay
 
 

@@ -51,11 +51,11 @@ def remainder_check(design: ObserverDesign, read: Callable[[Mapping[str, Any]], 
         reason = str(error)
     return upper_bound_check(
         "remainder",
-        "what the linear model leaves out of the nonlinear plant is within the bounds of the disturbances that stand "
-        f"for it{while_inside(design)}",
+        "the remainder of the linear model is within the bounds of the disturbances that represent "
+        f"it{while_inside(design)}",
         worst,
         1.0,
-        source="affine arithmetic over the region; the exponential's series with its rest",
+        source="affine arithmetic over the region; the exponential's series with its remainder",
         kind="proved",
         detail=reason or "the largest ratio of what is proved to what is shipped",
     )

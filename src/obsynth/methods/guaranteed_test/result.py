@@ -142,7 +142,7 @@ class GuaranteedTest(ObserverDesign):
 
     @property
     def surely_found(self) -> float:
-        """The size from which a fault of the course surely alarms, in the fault's unit."""
+        """The size from which a fault of the course is certain to raise an alarm, in the fault's unit."""
         return float(self._single("a size").certificate.claims["surely_found"])
 
     @property

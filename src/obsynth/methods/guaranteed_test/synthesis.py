@@ -203,30 +203,35 @@ def _notes(
     question = window.question
     words = []
     if shipped.threshold == 0.0:
-        words.append("No disturbance and no noise is seen at all: compare the residual with what rounding does.")
+        words.append(
+            "No disturbance and no noise has an effect on the residual: compare it with the effect of rounding."
+        )
     elif np.isfinite(shipped.least):
         words.append(
             f"The threshold is {shipped.threshold:.9g}, and no function of {question.samples} samples has one below "
             f"{shipped.least:.9g}: they differ by {shipped.threshold - shipped.least:.1e}. A fault of twice "
-            "that surely alarms."
+            "that is certain to raise an alarm."
         )
         if not window.twice_is_hidden:
             words.append(
-                "As states have bounds, the latter is about intervals: no function tells the fault within less. That "
-                "none surely finds a fault of less than twice that is not claimed: bounds of states may show it."
+                "As states have bounds, the latter is about intervals: no function tells the fault within less. It is "
+                "not claimed that none detects every fault of less than twice that size: bounds of states may make "
+                "that possible."
             )
     else:
         words.append("That there is no smaller threshold could not be proved on these numbers: least is not claimed.")
     words.append(f"The course {question.course} is {COURSES[question.course]}.")
     if question.course == "any" and asked.lag is None:
-        words.append(f"The least lag with which {problem.plant.fault_names[question.fault]} is told is {question.lag}.")
+        words.append(
+            f"The least lag with which {problem.plant.fault_names[question.fault]} can be estimated is {question.lag}."
+        )
     if mean is not None:
         words.append(
             f"Over the tolerances of the constants the threshold follows the signals ({mean:.4g} in the mean over the "
             "scenario, for which the weights are made); that of the nominal plant is never above it, and no function "
-            "of these samples has one below least over the tolerances either. What is surely found is that of the "
-            "nominal plant: over the tolerances a fault of twice the threshold of its row may be needed, and more "
-            "where they move what the fault does."
+            "of these samples has one below least over the tolerances either. The size that is certain to be detected "
+            "is that of the nominal plant: over the tolerances a fault of twice the threshold of its row may be "
+            "needed, and more where they move what the fault does."
         )
     elif problem.plant.uncertainty is not None:
         words.append(

@@ -114,8 +114,8 @@ def _of_the_tests(
         most = np.fmax(most, _worst(claimed))
     yield upper_bound_check(
         "multipliers",
-        "at each row exact multipliers that see the fault with weight one and nothing free lie within the shipped "
-        "distance of the shipped ones",
+        "at each row exact multipliers that weigh the fault with one and every free signal with zero lie within the "
+        "shipped distance of the shipped ones",
         away,
         1.0,
         source=SOURCE,
@@ -149,7 +149,7 @@ def _of_the_tests(
     )
     yield upper_bound_check(
         "rounding",
-        "what the running tests may err for known signals of size one is at most what is shipped",
+        "the rounding error of the running tests for known signals of size one is at most the shipped one",
         rounding,
         1.0 + SAME_SUM,
         source=SOURCE,
@@ -158,7 +158,7 @@ def _of_the_tests(
 
 
 def _worst(value: float) -> float:
-    """Return a number that no comparison forgets: what is not known is infinite."""
+    """Return a number that every comparison takes into account: what is not known is infinite."""
     return np.inf if np.isnan(value) else float(value)
 
 
@@ -186,7 +186,7 @@ def _of_what_runs(
             worst = np.inf
     yield upper_bound_check(
         "weights",
-        "what runs are the weights that the multipliers say, each at its rows",
+        "the weights that run are those of the multipliers, each at its rows",
         worst,
         1.0,
         source="shipped realisation",

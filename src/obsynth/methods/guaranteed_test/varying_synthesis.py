@@ -71,7 +71,8 @@ def _why(window: Window, row: int) -> str:
     point = proved_ray(window)
     if point is None:
         return (
-            f"no weights of {window.question.samples} samples see {fault} and nothing free at the rows that were tried."
+            f"no weights of {window.question.samples} samples respond to {fault} and to nothing that is free at the "
+            "rows that were tried."
         )
     return f"{hidden(window, point)} (proved for the window that ends at k = {row}: every equation holds exactly)."
 
@@ -84,7 +85,7 @@ def synthesise_varying(plant: TimeVaryingDescriptorSystem, asked: Any, *, progre
     condition.require()
     problem = replace(problem, question=replace(problem.question, lag=lag))
     given = _given_samples(asked)
-    progress("looking for the least number of samples")
+    progress("searching for the least number of samples")
     samples, table = _chosen_samples(problem, given, lag)
     programmes = Programmes.of(problem, samples, lag)
     progress(f"solving and proving {len(programmes.windows)} linear programmes, one for each different window")
@@ -196,7 +197,8 @@ def _notes(
     )
     if without:
         yield (
-            f"{without} rows have no verdict: no weights of {question.samples} samples see the fault and nothing free."
+            f"{without} rows have no verdict: no weights of {question.samples} samples respond to the fault and to "
+            "nothing that is free."
         )
     if "least" not in claims:
         yield "That there is no smaller threshold is not claimed: equations after the window may say more."

@@ -122,7 +122,7 @@ def _explicit_conditions(judge: Evaluator) -> Iterator[Condition]:
     )
 
     def alike(columns: FloatArray) -> tuple[str, tuple[str, ...]]:
-        told = "some faults act nowhere, or in the same direction as others, and cannot be told apart."
+        told = "some faults act nowhere, or in the same direction as others, and cannot be distinguished."
         return told, _null_names(columns, plant.fault_names)
 
     def hidden(rosenbrock: FloatArray) -> tuple[str, tuple[str, ...]]:
@@ -157,7 +157,7 @@ def _condition(
     )
 
 
-_CLAIM = "every mode that does not decay shows in the outputs ((A, C) detectable)"
+_CLAIM = "every mode that does not decay is observable ((A, C) detectable)"
 _NEEDED_FOR = "necessary and sufficient with (3); Filasova et al. suppose observability"
 
 
@@ -173,8 +173,8 @@ def _hidden_mode(plant: DescriptorSystem, hidden: Sequence[complex]) -> Conditio
     signals = leading_names(_hidden_direction(plant, mode), plant.state_names, most=MOST_NAMES)
     value = f"{mode.real:.6g}" if mode.imag == 0.0 else f"{mode:.6g}"
     detail = (
-        f"the mode s = {value} (states {', '.join(map(repr, signals))}) never shows in the outputs and does not "
-        "decay: measure something it moves."
+        f"the mode s = {value} (states {', '.join(map(repr, signals))}) is undetectable: no output responds to it, "
+        "and it does not decay. Measure something that it moves."
     )
     return Condition(
         "detectability", _CLAIM, False, float(len(hidden)), 0.0, _NEEDED_FOR, detail, mode=mode, signals=signals

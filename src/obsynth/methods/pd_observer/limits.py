@@ -15,7 +15,7 @@ from obsynth.numerics.ranks import NEGLIGIBLE_MODE, decide_rank
 from obsynth.numerics.scaling import balanced_matrix, equilibrate_pencil
 from obsynth.plants.descriptor import DescriptorSystem
 
-#: Damping ratio from which a mode dies out by itself.
+#: Damping ratio from which a mode decays by itself.
 WELL_DAMPED = 0.5
 #: Well-damped modes this many times faster than the plant's pace are none of the observer's business.
 FAR_BEYOND = 100.0
@@ -60,8 +60,8 @@ def require_possible(plant: DescriptorSystem, asked: PdObserver, *, delta: float
     slowest = max((mode.real for mode in hidden), default=-math.inf)
     if -slowest <= decay:
         raise InfeasibleError(
-            f"No observer reaches a decay rate of {decay:.6g} 1/s: the mode with real part {slowest:.6g} never shows "
-            "in the outputs and keeps its own pace. Ask for less, or measure something it moves.",
+            f"No observer reaches a decay rate of {decay:.6g} 1/s: the mode with real part {slowest:.6g} is "
+            "unobservable, so that no gain moves it. Ask for less, or measure something it moves.",
             necessary=True,
         )
     if asked.disk_numbers is not None:
@@ -78,8 +78,8 @@ def require_possible(plant: DescriptorSystem, asked: PdObserver, *, delta: float
         least = least_noise_gain(plant)
         if asked.noise_gain <= least:
             raise InfeasibleError(
-                f"No observer has a noise gain of {asked.noise_gain:.6g}: already at standstill the fault has to be "
-                f"read from the outputs, which multiplies errors by {least:.6g} or more. Raise noise_gain.",
+                f"No observer has a noise gain of {asked.noise_gain:.6g}: already in steady state the fault has to be "
+                f"computed from the outputs, which multiplies errors by {least:.6g} or more. Raise noise_gain.",
                 necessary=True,
                 lower_bound=least,
             )
@@ -91,7 +91,7 @@ def _require_disk(disk: tuple[float, float], hidden: tuple[complex, ...], delta:
     if outside:
         raise InfeasibleError(
             f"No observer has all its eigenvalues within {radius:.6g} of {-centre:.6g}: the mode {outside[0]:.6g} "
-            "never shows in the outputs and stays where it is.",
+            "is unobservable, so that no gain moves it.",
             necessary=True,
         )
     if abs(-1.0 / delta + centre) >= radius:

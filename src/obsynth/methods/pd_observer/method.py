@@ -45,7 +45,7 @@ class PdObserver(Method):
         the inverse of the plant's fastest mode, well-damped ones far beyond all others left aside; the engine
         ``"riccati"`` may take less.
     decay : float, optional, 1/seconds
-        Errors die out at least like ``exp(-decay t)``.  By default nothing is imposed when the smallest gains give a
+        Errors decay at least like ``exp(-decay t)``.  By default nothing is imposed when the smallest gains give a
         tenth of the plant's fastest mode, else that rate, or as much of it as moderate gains allow; 0 imposes nothing.
     disk : array_like, optional, 1/seconds
         ``[c, r]``: every eigenvalue s of the error system has ``|s + c| < r``.
@@ -115,7 +115,9 @@ class PdObserver(Method):
     id: ClassVar[str] = "pd-observer"
     plants: ClassVar[tuple[PlantKind, ...]] = ("time-invariant",)
     time: ClassVar[str] = "continuous"
-    summary: ClassVar[str] = "states and faults by proportional and derivative action, no derivative taken"
+    summary: ClassVar[str] = (
+        "estimates of the states and the faults by proportional and derivative action, without differentiating a signal"
+    )
     source: ClassVar[str] = "Filasova, Krokavec, Serbak"
     claims: ClassVar[Mapping[str, ClaimMeaning]] = {
         "theorem": ClaimMeaning("", "theorem whose inequality is proved", "LMI"),

@@ -182,7 +182,7 @@ def _solved(
     back = np.linalg.inv(loop)
     gain_j, gain_l = (loop @ (states[:, None] * part / outputs) for part in (found.J / unit, found.L))
     if most is not None and not float(np.linalg.norm(np.hstack([gain_j, gain_l]), 2)) <= most:
-        raise SolverError("The gains are out of proportion for a rate that nobody asked for.", record=found.record)
+        raise SolverError("The gains are very large, and no decay rate was asked for.", record=found.record)
     p3, *p1 = (back.T @ (matrix / states[:, None] / states) @ back for matrix in (found.P3, *found.P1))
     return certified(plant, asked, PdSolution(gain_j, gain_l, tuple(p1), p3, found.record), delta=delta, decay=decay)
 
@@ -296,8 +296,9 @@ def notes(plant: DescriptorSystem, asked: PdObserver, gains: PdGains) -> tuple[s
         found.append(f"delta = {gains.asked_delta:.4g} s was chosen, from the plant's fastest mode{less}.")
     if asked.decay is None and gains.decay > 0.0:
         found.append(
-            f"A decay rate of {gains.decay:.4g} 1/s was imposed: a tenth of the plant's fastest mode, or what of it is "
-            "reachable with moderate gains; without it errors would die out more slowly. decay: 0 takes the smallest "
+            f"A decay rate of {gains.decay:.4g} 1/s was imposed: a tenth of that of the plant's fastest mode, or as "
+            "much of it as is "
+            "reachable with moderate gains; without it errors would decay more slowly. decay: 0 takes the smallest "
             "gains."
         )
     found += _engine_notes(asked, gains, plant.nx + plant.nf)
@@ -322,7 +323,8 @@ def _engine_notes(asked: PdObserver, gains: PdGains, states: int) -> list[str]:
 def _noise_notes(plant: DescriptorSystem, gains: PdGains) -> list[str]:
     direct = gains.observer.Dy[gains.observer.fault_rows]
     return [
-        f"The estimate of {name!r} multiplies fast errors of the measurements by up to {np.linalg.norm(row):.3g}."
+        f"The estimate of {name!r} amplifies high-frequency errors of the measurements by up to "
+        f"{np.linalg.norm(row):.3g}."
         for name, row in zip(plant.fault_names, direct, strict=True)
         if np.linalg.norm(row) > WARN_AMPLIFICATION
     ]

@@ -3,7 +3,7 @@
 Of a plant whose matrices are constant this is decided on the numbers as written; of others in floating point along the
 horizon, as the rows say.
 
-Whether constant parameters leave traces that can be told apart; plants with constant matrices, decided as written:
+Whether constant parameters leave traces that can be distinguished; plants with constant matrices, decided as written:
 
 up to 64 states in rational arithmetic (24 of a sampled plant, in enclosures); parameters stand where faults do.
 """
@@ -113,13 +113,14 @@ def _explained(kernel: _Kernel, names: tuple[str, ...], plant: TimeVaryingDescri
     with_states = f" together with constant shifts of {hidden}" if hidden else ""
     if len(names) == 1:
         text = f"the parameter {names[0]!r} leaves no trace in the outputs"
-        text += f": it cannot be told from constant shifts of {hidden}" if hidden else ""
+        text += f": it cannot be distinguished from constant shifts of {hidden}" if hidden else ""
     else:
         values = [kernel.parameters[plant.parameter_names.index(name)] for name in names]
         size = values[int(np.argmax(np.abs(values)))]
         ratio = " : ".join(f"{value / size:.4g}" for value in values)
         text = (
-            f"the parameters {', '.join(map(repr, names))} cannot be told from each other: in the ratio {ratio}"
+            f"the parameters {', '.join(map(repr, names))} cannot be distinguished from each other: in the ratio "
+            f"{ratio}"
             f"{with_states} they leave no trace in the outputs"
         )
     return f"{text}. Estimate fewer parameters, or measure something that they act on."
@@ -289,7 +290,7 @@ _DETECTABLE = "Nikoukhah, Willsky, Levy 1992"
 
 
 def detectability_condition(plant: TimeVaryingDescriptorSystem) -> Condition:
-    """Return the condition that every mode that does not die out by itself shows in the outputs."""
+    """Return the condition that every mode that does not decay by itself shows in the outputs."""
     E, A, C = plant.E.at(1), plant.A.at(0), plant.C.at(1)
     tall_e, tall_a = np.vstack([E, np.zeros_like(C)]), np.vstack([A, C])
     zeros = finite_zeros(tall_e, tall_a)
@@ -319,7 +320,7 @@ def _detectable(plant: TimeVaryingDescriptorSystem | DescriptorSystem) -> str:
 
 
 def _dying(count: int) -> str:
-    return f"{count} unobservable mode(s), all of which die out" if count else "observable"
+    return f"{count} unobservable mode(s), all of which decay" if count else "observable"
 
 
 def _hidden_modes(
@@ -333,7 +334,7 @@ def _hidden_modes(
     names = _open_states(tall_e, tall_a, mode, plant)
     others = [described_mode(z) for z in hidden[1:] if z.imag >= 0.0 and z != mode]
     detail = (
-        f"the mode z = {described_mode(mode)} of {_listed(names)} shows in no output"
+        f"the mode z = {described_mode(mode)} of {_listed(names)} is unobservable"
         + (f" (as the modes {', '.join(others)})" if others else "")
         + f", so that an error in it {'grows' if abs(mode) > 1.0 + RANK_TOLERANCE else 'stays'} for ever. Measure "
         "something that it moves, or leave it out of the model."

@@ -88,7 +88,7 @@ def _missing_noise(options: Mapping[str, Any]) -> list[str]:
 
 
 def _contracts(facts: GainScheduleSummary) -> bool:
-    """Whether errors die out along the horizon, or the horizon is too short to tell."""
+    """Whether errors decay along the horizon, or the horizon is too short to tell."""
     return facts.steps < STEPS_TO_CONTRACT or facts.contraction < 1.0
 
 
@@ -104,7 +104,8 @@ def _identities(plant: TimeVaryingDescriptorSystem, options: Mapping[str, Any]) 
 
 
 def _has_steady_state(observer: RecursiveObserver) -> bool:
-    """Whether a time-invariant plant is detectable, and Q reaches its modes: then the recursion forgets its start."""
+    """Whether a time-invariant plant is detectable, and Q reaches its modes: then its initial-condition response
+    decays."""
     if not (observer.plant.is_time_invariant and observer.Q.is_constant and observer.R.is_constant):
         return False
     roots = covariance_factor(observer.Q.at(0), "Q"), covariance_factor(observer.R.at(0), "R")
@@ -112,7 +113,7 @@ def _has_steady_state(observer: RecursiveObserver) -> bool:
 
 
 def _require_contraction(observer: RecursiveObserver, facts: GainScheduleSummary, options: Mapping[str, Any]) -> None:
-    """Raise `PreconditionError` where errors do not die out along the horizon."""
+    """Raise `PreconditionError` where errors do not decay along the horizon."""
     if _contracts(facts):
         return
     names = leading_names(facts.survivors, observer.state_names)
@@ -125,8 +126,8 @@ def _require_contraction(observer: RecursiveObserver, facts: GainScheduleSummary
         identity = _missing_noise(options)
         given = f" {' and '.join(identity)} taken as the identity weigh this plant in its units." if identity else ""
         raise PreconditionError(
-            "Unclear: the horizon does not tell whether errors die out fast enough. The outputs show every "
-            f"state, and with these Q and R the errors die out in the end; but over {facts.steps} steps the product of "
+            "Unclear: the horizon does not tell whether errors decay fast enough. The outputs observe every "
+            f"state, and with these Q and R the errors decay in the end; but over {facts.steps} steps the product of "
             f"L_k A_k {kept}, in {', '.join(map(repr, names))}.{given} State Q and R in the units of equations and "
             "outputs, or take units in which entries are near one.",
             condition="contraction",
@@ -134,10 +135,9 @@ def _require_contraction(observer: RecursiveObserver, facts: GainScheduleSummary
             unclear=True,
         )
     raise PreconditionError(
-        f"Errors do not die out: over {facts.steps} steps the product of L_k A_k {kept}, in "
-        f"{', '.join(map(repr, names))}. Either the outputs do not show these "
-        "states: measure more, or leave them out; or Q and initial_covariance claim that they are known exactly: give "
-        "them a variance.",
+        f"Errors do not decay: over {facts.steps} steps the product of L_k A_k {kept}, in "
+        f"{', '.join(map(repr, names))}. Either these states are unobservable: measure more, or leave them out; or Q "
+        "and initial_covariance claim that they are known exactly: give them a variance.",
         condition="contraction",
         signals=names,
     )
@@ -152,7 +152,7 @@ def _notes(
     own_units: bool,
 ) -> Iterator[str]:
     if missing:
-        units = ", in units in which the plant is near one (in those given errors do not die out along the horizon)"
+        units = ", in units in which the plant is near one (in those given errors do not decay along the horizon)"
         yield (
             f"No noise is stated: {' and '.join(missing)} taken as the identity{units if own_units else ''}, which "
             "sets gains and deviations."
@@ -179,7 +179,7 @@ def _notes(
     if facts.excitation < LOST_EXCITATION * prior:
         yield (
             f"The parameters are hardly excited in the window that ends at k = {facts.excitation_k} (information "
-            f"{facts.excitation:.3g}, the prior has {prior:.3g}): what is reported there is what was known before"
+            f"{facts.excitation:.3g}, the prior has {prior:.3g}): the values reported there are the prior ones"
             + (
                 "."
                 if adaptation.form == "random-walk" or adaptation.guard != "none"

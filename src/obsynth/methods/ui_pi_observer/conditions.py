@@ -11,7 +11,7 @@ In place of Share Pasand, Aliyari, Taghirad, Lemma 4, Theorems 1 and 2, Lemma 6 
 
 Source: Share Pasand, Aliyari, Taghirad, Lemma 4 (9.1), in the form of `obsynth.methods.ui_pi_observer.conditions`.
 
-Whether a fault model can be told from states and unknown inputs: (D3), and the order of the model.
+Whether a fault model can be distinguished from states and unknown inputs: (D3), and the order of the model.
 """
 
 from __future__ import annotations
@@ -226,16 +226,17 @@ def order_conditions(
         return []
     decision, point = worst[0], units.eigenvalue(worst[1])
     lost = (
-        f": at the zero {number(point)} of (f, d) -> y the fault model (order {model.order}) cannot be told from "
+        f": at the zero {number(point)} of (f, d) -> y the fault model (order {model.order}) cannot be distinguished "
+        "from "
         "nothing in double precision. Lower its order."
     )
     found = Condition(
         "order of the fault model",
-        "the augmented plant is observable in double precision where faults can hide longest",
+        "the augmented plant is observable in double precision at the points where it is least so",
         decision.full,
         float(decision.rank),
         float(decision.expected),
-        "ours: observable on paper is not enough",
+        "ours: exact observability is not enough in double precision",
         f"{decision.describe()} at {number(point)}" + ("" if decision.full else lost),
         mode=None if decision.full else point,
         signals=() if decision.full else plant.fault_names,
@@ -261,13 +262,14 @@ def lost_in_rounding(judge: Evaluator, model: Exosystem, units: PlantUnits, mode
     """Return the failing condition for a mode that seems fixed and unstable, against all other conditions."""
     found = Condition(
         "fault model in double precision",
-        "no mode of plant and fault model seems hidden by rounding alone",
+        "no mode of plant and fault model seems unobservable by rounding alone",
         False,
         order - 1.0,
         float(order),
-        "ours: observable on paper is not enough",
-        f"plant and fault model (order {model.order}) seem to hide an unstable mode at {number(mode)}, which the "
-        "conditions above exclude: in double precision the model is too long a chain. Lower its order.",
+        "ours: exact observability is not enough in double precision",
+        f"plant and fault model (order {model.order}) seem to have an unobservable unstable mode at {number(mode)}, "
+        "which the "
+        "conditions above exclude: in double precision the order of the model is too high. Lower it.",
         mode=mode,
         signals=judge.plant.fault_names,
     )
@@ -389,8 +391,9 @@ def _decoupling_condition(judge: Evaluator, before: str, after: str) -> Conditio
     if not decision.full:
         signals = _undecoupled(judge)
         detail += ": " + (
-            f"the unknown input {', '.join(map(repr, signals))} moves states that no output shows at once, so nothing "
-            "but a derivative of the outputs could remove it. Measure such a state, or leave the input out."
+            f"the unknown input {', '.join(map(repr, signals))} moves states that reach no output without a "
+            "derivative, so only a derivative of the outputs could decouple it. Measure such a state, or leave the "
+            "input out."
             if set(signals) & set(plant.disturbance_names)
             else f"the states {', '.join(map(repr, signals))} are neither dynamic nor measured."
         )

@@ -110,7 +110,7 @@ class UiPiObserver(Method):
     id: ClassVar[str] = "ui-pi-observer"
     plants: ClassVar[tuple[PlantKind, ...]] = ("time-invariant",)
     time: ClassVar[str] = "both"
-    summary: ClassVar[str] = "state and faults untouched by any unknown input"
+    summary: ClassVar[str] = "estimates of the state and the faults, decoupled from every unknown input"
     source: ClassVar[str] = "Share Pasand, Aliyari, Taghirad"
     claims: ClassVar[Mapping[str, ClaimMeaning]] = {
         "decay": ClaimMeaning(

@@ -36,7 +36,7 @@ SLOW_SHARE = 1e-6
 #: Where all modes are slower than this share of the pair's size, they are integrators that rounding has scattered.
 INTEGRATOR_SCATTER = 3e-5
 #: Poles of sampled plants are not asked to decay by more than this exponent in one sample: nearer to zero they cannot
-#: be told apart, and printed gains miss them.
+#: be distinguished, and printed gains miss them.
 MOST_PER_SAMPLE = 2.0
 
 

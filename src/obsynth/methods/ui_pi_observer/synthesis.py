@@ -64,10 +64,10 @@ def notes(
     default = asked.poles is None and asked.decay is None and asked.region is None
     if default and decay is not None and not fixed.size and decay * SLOW_DEFAULT < own:
         yield (
-            f"The slowest pole decays at {decay:.3g} 1/s, against {own:.3g} 1/s of the plant itself: what is faster "
-            f"costs more than {NOISE_PRICE:g} times the noise of a Kalman filter, or was not found. Parts of the fault "
-            f"models that can hardly be told apart ({', '.join(dict.fromkeys(problem.model.descriptions))}) do that: "
-            "leave one out, or give decay or poles."
+            f"The slowest pole decays at {decay:.3g} 1/s, against {own:.3g} 1/s of the plant itself: a faster one has "
+            f"more than {NOISE_PRICE:g} times the noise of a Kalman filter, or was not found. Parts of the fault "
+            f"models that can hardly be distinguished ({', '.join(dict.fromkeys(problem.model.descriptions))}) do "
+            "that: leave one out, or give decay or poles."
         )
     if "digits" in claims:
         # Fewer digits than a double has, but more than are commonly printed, keep Ahat stable.
@@ -156,8 +156,8 @@ def _chosen(
         if found is None:
             raise SolverError(
                 f"The Riccati equation for decay {asked.decay:g} 1/s has no solution that double precision could tell "
-                "from rounding, not even by way of slower rates: some mode shows too little for so much speed. Ask for "
-                "less, leave decay out, or give poles, which are placed without this equation."
+                "from rounding, not even by way of slower rates: some mode is too weakly observable for this rate. "
+                "Ask for a lower one, leave decay out, or give poles, which are placed without this equation."
             )
         gain = found
     else:
@@ -192,7 +192,7 @@ def _require_stable(problem: PlacementProblem) -> None:
     if unstable:
         raise PreconditionError(
             f"With these E_sharp, C_sharp and G the mode {number(unstable[0])} is fixed and not stable: U has lost "
-            "rank and with it equations of the plant. Leave E_sharp, C_sharp and G out.",
+            "rank, and equations of the plant are lost with it. Leave E_sharp, C_sharp and G out.",
             condition="fixed modes",
             mode=unstable[0],
         )

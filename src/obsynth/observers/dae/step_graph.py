@@ -184,7 +184,7 @@ class _Update:
         }
 
     def _learnt(self, found: Arrays) -> Arrays:
-        """Steps 7 to 9 and 11: (17)-(19); a sample of which nothing is seen changes nothing and forgets nothing."""
+        """Steps 7 to 9 and 11: (17)-(19); a sample without a measurement changes nothing."""
         import casadi as ca
 
         observer, Sigma, Omega = self.observer, found["Sigma"], found["Omega"]

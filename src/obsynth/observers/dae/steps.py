@@ -82,10 +82,10 @@ class Steps:
         surprises = with_surprise(state.surprises, float(row.nis), row.degrees) if state.k else state.surprises
         if not has_jumped(surprises, self.settings.reset):
             return after._replace(surprises=surprises), row
-        after, row = self.plain(state._replace(memory=self._forgetful(state)), y, u)
+        after, row = self.plain(state._replace(memory=self._with_initial_spread(state)), y, u)
         return after._replace(surprises=state.surprises[:0], resets=state.resets + 1), row
 
-    def _forgetful(self, state: DAEState) -> FloatArray:
+    def _with_initial_spread(self, state: DAEState) -> FloatArray:
         """Return what is remembered with the covariance that the parameters had at the start."""
         memory, layout, nq = state.memory.copy(), self.graph.memory, self.settings.model.nq
         spread = np.array(self.settings.initial_parameter_covariance)

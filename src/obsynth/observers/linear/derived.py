@@ -126,20 +126,20 @@ def unaveraged(observer: LinearObserver, mean: int) -> LinearObserver | None:
     return base if same else None
 
 
-#: The start counts as forgotten when the slowest part of it has shrunk to this share.
-FORGOTTEN_SHARE = 0.02
+#: The initial-condition response has settled when its slowest mode has decayed to this share.
+SETTLED_SHARE = 0.02
 
 
 def transient(observer: LinearObserver) -> float:
-    """Return the seconds after which an observer has forgotten its start: the slowest mode at `FORGOTTEN_SHARE`."""
+    """Return the settling time of an observer in seconds: after it the slowest mode has decayed to `SETTLED_SHARE`."""
     if observer.order == 0:
         return 0.0
     slowest = abscissa(observer.Az, observer.dt)
     if observer.dt == 0.0:
-        return math.log(FORGOTTEN_SHARE) / slowest if slowest < 0.0 else math.inf
+        return math.log(SETTLED_SHARE) / slowest if slowest < 0.0 else math.inf
     if slowest >= 1.0:
         return math.inf
-    samples = math.ceil(math.log(FORGOTTEN_SHARE) / math.log(slowest)) if slowest > 0.0 else 0
+    samples = math.ceil(math.log(SETTLED_SHARE) / math.log(slowest)) if slowest > 0.0 else 0
     return observer.dt * (
         max(samples, _steps_remembered(observer.Az)) + max((*observer.state_delays, *observer.fault_delays), default=0)
     )

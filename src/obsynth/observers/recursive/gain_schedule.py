@@ -34,7 +34,7 @@ class GainStep(NamedTuple):
     Upsilon: FloatArray  # ``(nx, nq)``, after the step
     factor: FloatArray  # ``(nx, nx)``: square root of the covariance of the state, the parameters being known
     learn: FloatArray  # ``(nq, rows)``: from data to the correction of the parameters
-    forget: FloatArray  # ``(nq, nq)``: ``theta^+ = forget theta + learn data``
+    retain: FloatArray  # ``(nq, nq)``: ``theta^+ = retain theta + learn data``
     spread: FloatArray  # ``(nq, nq)``: square root of the covariance of the parameters
 
 
@@ -71,7 +71,7 @@ def gain_steps(
         diffuse = found.diffuse
         gain, Upsilon, factor = found.estimate[:, :rows], found.estimate[:, rows:], found.factor
         parity, G = found.innovation[:, :rows], -found.innovation[:, rows:]
-        learn, forget = np.zeros((nq, rows)), np.eye(nq)
+        learn, retain = np.zeros((nq, rows)), np.eye(nq)
         if adaptation is not None and nq:
             seen, regressor, noise = parity, G, None
             if recursion.literal and len(H) > ne:
@@ -85,8 +85,8 @@ def gain_steps(
                 directional=recursion.directional,
                 noise=noise,
             )
-            learn, forget = theta_gain @ seen, np.eye(nq) - theta_gain @ regressor
-        yield GainStep(step, gain, parity, G, Upsilon, factor, learn, forget, parameters.spread)
+            learn, retain = theta_gain @ seen, np.eye(nq) - theta_gain @ regressor
+        yield GainStep(step, gain, parity, G, Upsilon, factor, learn, retain, parameters.spread)
 
 
 #: Gains of the steps of an observer: `gain_steps`, or what remembers them.
@@ -143,7 +143,7 @@ def run_batch(observer: RecursiveObserver, y: ArrayLike, u: ArrayLike | None = N
         step, arriving = gains.step, outputs[:, k] if k else outputs[:, k, :0]
         before = inputs[:, k - 1] if k else np.zeros((trials, observer.plant.nu))
         data = np.concatenate((x @ step.A.T + before @ step.B.T, arriving, inputs[:, k] @ step.Dn.T), axis=1)
-        x, theta = data @ gains.gain.T, theta @ gains.forget.T + data @ gains.learn.T
+        x, theta = data @ gains.gain.T, theta @ gains.retain.T + data @ gains.learn.T
         keep(k, gains.Upsilon)
         innovations.append(data @ gains.parity.T)
     padded = np.full((trials, samples, max(found.shape[1] for found in innovations)), np.nan)
@@ -231,7 +231,7 @@ def _settled(observer: RecursiveObserver) -> tuple[GainStep, int]:
 
 def _parts(found: GainStep) -> tuple[FloatArray, ...]:
     # The sign of a direction of the innovation is free, its square is not.
-    return found.gain, found.Upsilon, found.learn, found.forget, found.parity.T @ found.parity, found.G.T @ found.G
+    return found.gain, found.Upsilon, found.learn, found.retain, found.parity.T @ found.parity, found.G.T @ found.G
 
 
 def _distance(now: FloatArray, then: FloatArray) -> float:
@@ -245,13 +245,13 @@ def _realised(observer: RecursiveObserver, found: GainStep) -> tuple[LinearObser
     early, width = step.Dn, found.gain.shape[1]
     parts = slice(0, ne), slice(ne, ne + ny), slice(ne + ny, width)
     gain, parity = [found.gain[:, part] for part in parts], [found.parity[:, part] for part in parts]
-    learn, q = [found.learn[:, part] for part in parts], len(found.forget)
+    learn, q = [found.learn[:, part] for part in parts], len(found.retain)
     random_walk = found.gain.shape[0] - nx
     # With z(k) = A x(k-1) + B u(k-1) and the gains [L K M] of the rows [z; y; Dn u] (the last with early constraints):
-    # xbar = L z + K y + M Dn u, z(k+1) = A xbar + B u, and theta = forget theta(k-1) + learn [z; y; Dn u] by least
+    # xbar = L z + K y + M Dn u, z(k+1) = A xbar + B u, and theta = retain theta(k-1) + learn [z; y; Dn u] by least
     # squares, x = xbar + Upsilon theta.  States: z, then the parameters of one sample before.
     state = np.hstack([gain[0], np.zeros((len(gain[0]), q))])
-    theta = np.hstack([learn[0], found.forget])
+    theta = np.hstack([learn[0], found.retain])
     az = np.vstack([step.A @ state, theta])
     by = np.vstack([step.A @ gain[1], learn[1]])
     bu = np.vstack([step.B + step.A @ gain[2] @ early, learn[2] @ early])

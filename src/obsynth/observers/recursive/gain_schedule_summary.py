@@ -25,7 +25,7 @@ STEPS_TO_CONTRACT = 50
 MANY_STATES = 100
 FEWEST_STEPS = 60
 FOLLOW_FURTHER = 3
-#: Spectral radius below which gains that are kept make errors die out, whatever rounding did to it.
+#: Spectral radius below which gains that are kept make errors decay, whatever rounding did to it.
 CLEARLY_STABLE = 1.0 - 1e-6
 
 
@@ -37,7 +37,7 @@ class GainScheduleSummary:
     # ``norm(product of L_k A_k)^(1 / steps)``: the mean factor by which an error shrinks in a step; where that is not
     # below one, over the second half of the horizon
     contraction: float
-    growth: float  # the largest norm of the product on the way: how much an error may grow before it dies out
+    growth: float  # the largest norm of the product on the way: how much an error may grow before it decays
     span: str  # what the contraction was taken over
     # ``(nx,)``: size of the product in each state after the last step, relative to its largest: where errors last
     survivors: FloatArray

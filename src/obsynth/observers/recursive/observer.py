@@ -51,7 +51,7 @@ class RecursiveObserver(RecursiveSettings):
         In standard deviations of the prediction: 6 for ``gate`` and 3 for ``huber`` by default.
     sensors : mapping or None
         ``{name: {"every": rows, "delay": rows}}`` of the sensors that are sampled every so many rows, at k = 0, every,
-        2 every, ..., or whose values arrive so many rows late.
+        2 every, ..., or whose values are delayed by so many rows.
     state_bounds : FloatArray or None
         ``(nx, 2)``: lower and upper bounds of the states, infinite where there are none.
 

@@ -63,7 +63,7 @@ class Adaptation:
     def __post_init__(self) -> None:
         check_fields(self, Adaptation)
         if self.reset and self.form == "random-walk":
-            raise SpecError("reset belongs to the forms that forget: the random walk follows by itself.", path="reset")
+            raise SpecError("reset is for the forms with a forgetting factor.", path="reset")
         q = len(self.initial_parameters)
         object.__setattr__(self, "initial_parameters", read_only(self.initial_parameters))
         for field, option in (("initial_covariance", "initial_parameter_covariance"), ("walk", "random_walk")):

@@ -23,7 +23,7 @@ class Lesson(NamedTuple):
     v: FloatArray  # v, G: ``v = G theta + noise`` of this sample, ``(m,)`` and ``(m, nq)``
     G: FloatArray
     noise: FloatArray  # ``(m, any)``: square root of the covariance of that noise, in units of the weight
-    is_reset: bool = False  # whether what was learnt before this sample was forgotten at it
+    is_reset: bool = False  # whether what was learnt before this sample is discarded at it
 
 
 class Node(NamedTuple):

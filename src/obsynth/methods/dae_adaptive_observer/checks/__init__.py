@@ -87,7 +87,12 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
         yield from _consistency_rows(design, observer)
     except (ObsynthError, np.linalg.LinAlgError, ValueError, KeyError, TypeError) as error:
         yield upper_bound_check(
-            "runs", "the observer runs on its own model", 1.0, 0.0, source="shipped observer", detail=str(error)
+            "runs",
+            "the observer runs on the outputs of its own model",
+            1.0,
+            0.0,
+            source="shipped observer",
+            detail=str(error),
         )
 
 

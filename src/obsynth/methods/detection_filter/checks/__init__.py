@@ -96,7 +96,7 @@ def _norm_rows(design: ObserverDesign) -> Iterator[Check]:
     by_itself = gain_is_proved(felt, gain, witness), shows(sensitivity)
     yield Check(
         "disturbance gain",
-        "the error dies out, and the H-infinity norm from unknown inputs and noise to the "
+        "the error decays, and the H-infinity norm from unknown inputs and noise to the "
         "residuals is at most the claimed one",
         gain,
         gain,

@@ -39,11 +39,11 @@ _FILTER_IDENTITIES = {
         "the state estimate equals the state when the error is zero",
         "Wang 2015, eq. (7)",
     ),
-    "fault estimate": ("unbiased: fault", "the fault estimate does not see the state", "Wang 2015, eq. (25)"),
-    "residual": ("unbiased: residual", "the residual does not see the state", "Wang 2015, eq. (25)"),
+    "fault estimate": ("unbiased: fault", "the state has no effect on the fault estimate", "Wang 2015, eq. (25)"),
+    "residual": ("unbiased: residual", "the state has no effect on the residual", "Wang 2015, eq. (25)"),
     "input feedthrough": (
         "unbiased: feedthrough",
-        "no estimate sees the input directly (Du + Dy D = 0)",
+        "the input has no direct effect on any estimate (Du + Dy D = 0)",
         "our extension",
     ),
 }
@@ -132,7 +132,8 @@ def _least_gain(design: ObserverDesign, work: DescriptorSystem | None) -> Iterat
 
 
 def _with_sensor_faults(plant: DescriptorSystem) -> DescriptorSystem | None:
-    """Return the plant with its sensor faults as states; ``None`` where these cannot be told from the others."""
+    """Return the plant with its sensor faults as states; ``None`` where these cannot be distinguished from the
+    others."""
     try:
         return with_sensor_faults_as_states(plant)
     except PreconditionError:
@@ -194,7 +195,7 @@ def _norm_rows(
         norm.upper,
         gamma,
         source="Wang 2015, eq. (49)",
-        detail=f"peak at {norm.angle:.4g} rad/sample; the gain to quote is {reported:.6g}",
+        detail=f"peak at {norm.angle:.4g} rad/sample; the largest gain is {reported:.6g}",
     )
     state = highest_gain_found(errors.Az, errors.disturbance, states[0], -states[2], modes=modes)
     yield information(

@@ -69,7 +69,7 @@ def fault_rows(
     sizes = _trace_sizes(plant, observer, tracking, fault_traces(errors, observer.fault_delays), scaling)
     delays = ", ".join(map(str, observer.fault_delays))
     claims = {
-        "fault decoupled after its delay": "(TA - LC) Psi = 0: no trace of a fault in the error after its delay",
+        "fault decoupled after its delay": "(TA - LC) Psi = 0: a fault has no effect on the error after its delay",
         "fault estimate": f"fhat_i(k) = f_i(k - rho_i), rho = {delays} (W Upsilon = I)",
         "fault in the residual": "r(k) equals fhat(k)",
         "no fault in the state estimate": "the transfer from the faults to the state error is zero",

@@ -41,13 +41,13 @@ def leak_rows(design: ObserverDesign) -> Iterator[Check]:
     inputs = [[*known, *(plant.nd + plant.fault_names.index(fault) for fault in blind)] for _, _, blind in groups]
     norms = decoupling_norms(every, observer, [(rows, of) for (_, rows, _), of in zip(groups, inputs, strict=True)])
     for (name, _, blind), found in zip(groups, norms, strict=True):
-        claim = f"neither unknown inputs nor {', '.join(blind)} reach it, whatever their course"
+        claim = f"neither unknown inputs nor {', '.join(blind)} reach it, whatever their time course"
         yield upper_bound_check(
             name,
             claim if blind else "the unknown inputs reach neither estimates nor residuals",
             found.relative,
             LEAK_TOLERANCE,
-            source="measured on the plant, without T and T0",
+            source="computed from the transfer functions of plant and filter, without T and T0",
             detail=f"relative to the terms; worst at {found.frequency:.3g} rad/s",
         )
 
@@ -91,7 +91,7 @@ def noise_rows(design: ObserverDesign) -> Iterator[Check]:
                 "standard deviation under the stated noise",
                 alone,
                 source="recomputed, Lyapunov equation",
-                detail="all digits are rounding" + (": no deviation is claimed" if np.isnan(claimed) else ""),
+                detail="all digits are rounding errors" + (": no deviation is claimed" if np.isnan(claimed) else ""),
             )
             continue
         yield upper_bound_check(
@@ -104,7 +104,7 @@ def noise_rows(design: ObserverDesign) -> Iterator[Check]:
         if np.isfinite(total) and matrices["walks"].any():
             yield upper_bound_check(
                 f"error of fhat[{name}]",
-                f"standard deviation of the error with the walk of the fault{unit}",
+                f"standard deviation of the error with the random walk of the fault{unit}",
                 float(total),
                 float(claimed_total) * (1.0 + DEVIATION_TOLERANCE),
                 source="recomputed, Lyapunov equation",
@@ -155,7 +155,7 @@ def _fits(design: ObserverDesign) -> bool:
     (plant, observer), matrices = design.linear, design.certificate.matrices
     if any(name not in matrices for name in _FUNCTIONAL_MATRICES):
         return False
-    # A deviation of which all digits are rounding is claimed as NaN: not at all.
+    # A deviation of which all digits are rounding errors is claimed as NaN: not at all.
     if not all(np.all(np.isfinite(matrices[name])) for name in _FUNCTIONAL_MATRICES if name != "deviations"):
         return False
     order, count = observer.order, len(matrices["Phi"])

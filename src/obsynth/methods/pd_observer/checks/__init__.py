@@ -38,7 +38,11 @@ _PD_IDENTITIES = {
         "Filasova et al., eqs. (22), (23)",
     ),
     "residual": ("unbiased: residual", "the residual is zero when the error is", "ours: y - D u - C xhat - Df fhat"),
-    "input feedthrough": ("unbiased: feedthrough", "no estimate sees the input directly (Du + Dy D = 0)", "ours"),
+    "input feedthrough": (
+        "unbiased: feedthrough",
+        "the input has no direct effect on any estimate (Du + Dy D = 0)",
+        "ours",
+    ),
 }
 
 
@@ -147,7 +151,7 @@ def _spectra(design: ObserverDesign, errors: PdErrorSystem) -> Iterator[Check]:
     if decay > 0.0:
         yield upper_bound_check(
             "decay rate",
-            "errors die out at the claimed rate (largest real part of an eigenvalue, 1/s)",
+            "errors decay at the claimed rate (largest real part of an eigenvalue, 1/s)",
             abscissa,
             -decay,
             source="ours: the theorem for A + alpha I",
@@ -175,14 +179,14 @@ def _parts(plant: DescriptorSystem, errors: PdErrorSystem) -> Iterator[Check]:
     proportional = plant.A - errors.J[:nx] @ plant.C
     together = solved(np.eye(nx) + errors.L[:nx] @ plant.C, proportional)
     yield information(
-        "state part",
+        "state error alone",
         "spectral abscissa of (I + L C)^-1 (A - J C), 1/s",
         spectral_abscissa(together),
         source="Filasova et al., eq. (28)",
         detail=f"eigenvalues {spectrum_text(together)}",
     )
     yield information(
-        "P part alone",
+        "proportional part alone",
         "spectral abscissa of A - J C, 1/s: neither theorem promises that it is negative",
         spectral_abscissa(proportional),
         source="Filasova et al., eq. (27)",
@@ -245,7 +249,7 @@ def norm_rows(design: ObserverDesign, errors: PdErrorSystem) -> Iterator[Check]:
         unit,
     )
     yield information(
-        "fast noise in the fault estimate",
+        "high-frequency noise in the fault estimate",
         "gain from the noise to the fault error at high frequencies",
         _size(errors.noise[1][plant.nx :]),
         source="recomputed",
@@ -288,8 +292,8 @@ def _gain_rows(design: ObserverDesign, errors: PdErrorSystem) -> Iterator[Check]
         )
     large = not gain <= LARGE_GAIN * max(_size(design.linear[0].A), 1.0)
     warning = (
-        "WARNING: out of proportion to the plant: any error of the model or the sensors is multiplied by it. Ask for a "
-        "slower decay."
+        "WARNING: the gain is very large for this plant: it multiplies every error of the model and the "
+        "sensors. Ask for a slower decay."
     )
     claim = "spectral norm of [J L], with the rows of M and N"
     yield information("gain", claim, gain, source="recomputed", detail=warning if large else "")

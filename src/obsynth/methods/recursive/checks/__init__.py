@@ -81,7 +81,12 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
         yield from _dynamic_rows(design, plain_recursion(observer), plain_recursion(stated), same=not problem)
     except (ObsynthError, np.linalg.LinAlgError, ValueError) as error:
         yield upper_bound_check(
-            "runs", "the observer runs on its own model", 1.0, 0.0, source="shipped observer", detail=str(error)
+            "runs",
+            "the observer runs on the outputs of its own model",
+            1.0,
+            0.0,
+            source="shipped observer",
+            detail=str(error),
         )
 
 
@@ -107,7 +112,8 @@ def refinement_rows(observer: RecursiveObserver | DAEObserver) -> Iterator[Check
             "rows between its samples",
             float(entry["every"]),
             source="options: sensors",
-            detail=f"its values arrive {entry['delay']} row(s) late; the other rows of this report are about samples "
+            detail=f"its values are delayed by {entry['delay']} row(s); the other rows of this report are about "
+            "samples "
             "of every sensor at once",
         )
 

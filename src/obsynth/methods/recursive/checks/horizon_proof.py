@@ -164,14 +164,14 @@ def _transitions(pairs: list[tuple[StepMatrices, GainStep]]) -> tuple[_Stack, _S
     ne = pairs[0][0].A.shape[0]
     a = np.array([step.A for step, _ in pairs])
     middle, radius = _product([found.gain[:, :ne] for _, found in pairs], a)
-    nq, nx = pairs[0][1].forget.shape[0], middle.shape[1]
+    nq, nx = pairs[0][1].retain.shape[0], middle.shape[1]
     if not nq:
         return (middle, radius), None
     taken, taken_radius = _product([found.learn[:, :ne] for _, found in pairs], a)
     whole, whole_radius = (np.zeros((len(pairs), nx + nq, nx + nq)) for _ in range(2))
     whole[:, :nx, :nx], whole_radius[:, :nx, :nx] = middle, radius
     whole[:, nx:, :nx], whole_radius[:, nx:, :nx] = taken, taken_radius
-    whole[:, nx:, nx:] = np.array([found.forget for _, found in pairs])
+    whole[:, nx:, nx:] = np.array([found.retain for _, found in pairs])
     return (middle, radius), (whole, whole_radius)
 
 

@@ -1,6 +1,6 @@
 """What is proved of the listed gains of a recursive observer, were they kept, where plant and noise stay the same.
 
-The gains make errors of mean zero, errors die out, and the covariance that they reach is enclosed: the filter's own,
+The gains make errors of mean zero, errors decay, and the covariance that they reach is enclosed: the filter's own,
 whose gains move on, ends at or below it.
 """
 
@@ -64,7 +64,7 @@ def steady_rows(
     )
     transition = Ball.exact(L) @ Ball.exact(A)
     contraction = prove_contraction(transition, discrete=True)
-    claim = "errors die out with the listed gains, were they kept: modulus per step in a norm"
+    claim = "errors decay with the listed gains, were they kept: modulus per step in a norm"
     source = f"{SOURCE}, (13); Lyapunov inequality of L A"
     if contraction is None:
         radius = spectral_radius(transition.midpoint)

@@ -76,7 +76,7 @@ def _realisation_rows(design: ObserverDesign, printed_digits: int | None) -> Ite
         "the transfer functions from the unknown inputs to the errors of all estimates are zero",
         norm.relative,
         DECOUPLING_TOLERANCE if printed_digits is None else max(DECOUPLING_TOLERANCE, 10.0 * tolerance),
-        source="measured on the plant, without the tracking map",
+        source="computed from the transfer functions of plant and observer, without the tracking map",
         detail=f"relative to the terms; absolute gain to a fault estimate up to {norm.fault_gain:.1e}; "
         f"worst at {norm.frequency:.3g} rad/s",
     )
@@ -148,7 +148,7 @@ def _identities(
     )
     yield (
         "disturbance in the estimates",
-        "D_a Dd = 0: no estimate sees d directly",
+        "D_a Dd = 0: d has no direct effect on any estimate",
         residual(dy @ plant.Dd, factors=((dy, plant.Dd), (own_dy, plant.Dd))),
         "our extension",
     )
@@ -162,7 +162,7 @@ def _identities(
         "residual": (
             observer.residual_rows,
             np.zeros((len(observer.residual_names), augmented.order)),
-            "the residual sees neither state nor modelled fault",
+            "neither the state nor a modelled fault has an effect on the residual",
         ),
     }
     for name, (rows, goal, claim) in wanted.items():
@@ -170,7 +170,7 @@ def _identities(
         yield name, claim, residual(cz[rows] @ ve, dy[rows] @ augmented.C, -goal, factors=factors, units=units), _PAPER
     yield (
         "feedthrough",
-        "no estimate sees the input directly (Du + Dy D = 0)",
+        "the input has no direct effect on any estimate (Du + Dy D = 0)",
         residual(du, dy @ plant.D, factors=((dy, plant.D),)),
         "our extension",
     )
