@@ -272,7 +272,7 @@ def test_too_few_rows_are_told() -> None:
     assert "needs 864000 rows" in short.statement
     with pytest.raises(obsynth.SpecError, match="rows"):
         obsynth.learn_thresholds(heated(), log(90, 0))
-    with pytest.raises(obsynth.SpecError, match="moves"):
+    with pytest.raises(obsynth.SpecError, match="No monitored signal changes"):
         obsynth.learn_thresholds(heated(), log(400, 0) * [1.0, 0.0, 0.0, 0.0])
 
 

@@ -30,7 +30,7 @@ class TestDetectability:
         error = refusal(sampled(np.diag([0.5, mode]), [[1.0, 0]], state_names=["seen", "hidden"]))
         assert (error.condition, error.signals) == ("detectability", ("hidden",))
         assert error.mode == pytest.approx(mode)
-        assert f"the mode z = {mode:g} of the state 'hidden' shows in no output" in str(error)
+        assert f"the mode z = {mode:g} of the state 'hidden' is unobservable" in str(error)
 
     def test_a_pair_and_further_modes(self) -> None:
         A = np.zeros((4, 4))

@@ -42,7 +42,7 @@ def test_a_design_prints_as_about_twelve_lines_of_eighty_columns(network):
     text = " ".join(" ".join(lines).split())
     assert "fault-estimation-filter" in text
     assert "gamma = 0.3" in text
-    assert re.search(r"tm GENCLS 1 +1 +0\.02 +0\.04\d* pu +0\.\d+ of active power Bus 3", "\n".join(lines))
+    assert re.search(r"tm GENCLS 1 +1 +0\.02 +0\.04\d* pu +0\.\d+ from active power Bus 3", "\n".join(lines))
     assert "white noise on 3 of 3 sensors" in text
 
 
@@ -92,7 +92,7 @@ def test_an_estimate_that_does_not_follow_a_step_is_a_warning():
     halved = obsynth.LinearObserver(**{**observer.as_dict(), "Cz": rows * observer.Cz, "Dy": rows * observer.Dy,
                                        "Du": rows * observer.Du})  # fmt: skip
     texts = summary(design.replace(observer=halved)).warnings
-    assert any("does not follow a step" in text and "shows 50 % of it" in text for text in texts)
+    assert any("does not follow a step" in text and "its steady state is 50 % of it" in text for text in texts)
 
 
 def test_two_specs_of_one_name_keep_their_gain_sets(tmp_path, monkeypatch, capsys):
@@ -165,7 +165,7 @@ def test_figures_of_a_step_end_where_an_unstable_plant_is_let_go():
 def test_a_missed_step_is_told_to_the_digits_that_are_not_rounding(network, value, told):
     (name, figures), *_ = followed_steps(network).items()
     (text,) = design_warnings(network, {name: replace(figures, at_horizon=value)})
-    assert f"reads {told}" in text
+    assert f"gives an estimate of {told}" in text
 
 
 def test_a_fixed_pole_at_zero_is_zero():
