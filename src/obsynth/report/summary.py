@@ -17,7 +17,7 @@ from obsynth.analysis.structure import questions
 from obsynth.files.tables import html_table
 from obsynth.methods.fault_figures import FaultFigures
 from obsynth.methods.registry import REGISTRY, method_class
-from obsynth.observers.linear.derived import SETTLED_SHARE, transient
+from obsynth.observers.linear.derived import SETTLED_TO, transient
 from obsynth.observers.windows import WindowObserver
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
@@ -188,7 +188,7 @@ def _dynamics(design: ObserverDesign) -> str:
         seconds = transient(design.linear[1])
         if not math.isfinite(seconds):
             return f"the initial-condition response does not decay; observer of order {design.observer.order}"
-        settling = f"{100.0 * SETTLED_SHARE:g} % settling time {number(seconds, digits=2)} s"
+        settling = f"{100.0 * SETTLED_TO:g} % settling time {number(seconds, digits=2)} s"
         return f"{settling}; observer of order {design.observer.order}"
     factor = design.certificate.claims.get("contraction", math.nan)
     return f"errors shrink to {number(100.0 * factor)} % per step on average; observer of order {design.observer.order}"

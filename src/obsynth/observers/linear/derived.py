@@ -127,19 +127,19 @@ def unaveraged(observer: LinearObserver, mean: int) -> LinearObserver | None:
 
 
 #: The initial-condition response has settled when its slowest mode has decayed to this share.
-SETTLED_SHARE = 0.02
+SETTLED_TO = 0.02
 
 
 def transient(observer: LinearObserver) -> float:
-    """Return the settling time of an observer in seconds: after it the slowest mode has decayed to `SETTLED_SHARE`."""
+    """Return the settling time of an observer in seconds: after it the slowest mode has decayed to `SETTLED_TO`."""
     if observer.order == 0:
         return 0.0
     slowest = abscissa(observer.Az, observer.dt)
     if observer.dt == 0.0:
-        return math.log(SETTLED_SHARE) / slowest if slowest < 0.0 else math.inf
+        return math.log(SETTLED_TO) / slowest if slowest < 0.0 else math.inf
     if slowest >= 1.0:
         return math.inf
-    samples = math.ceil(math.log(SETTLED_SHARE) / math.log(slowest)) if slowest > 0.0 else 0
+    samples = math.ceil(math.log(SETTLED_TO) / math.log(slowest)) if slowest > 0.0 else 0
     return observer.dt * (
         max(samples, _steps_remembered(observer.Az)) + max((*observer.state_delays, *observer.fault_delays), default=0)
     )
