@@ -6,6 +6,7 @@ How a model is to be integrated on a log: what a step of backward Euler errs, ag
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -114,32 +115,13 @@ def reported(
     colours = {name: whiteness(column) for name, column in zip(problem.output_names, whitened.T, strict=True)}
     change = change_of_mean(whitened)
     nis = consistency(float((found.whitened[seen] ** 2).sum()), int(seen.sum()))
-    sides = dict(zip(names, found.sides[: len(names)], strict=True))
-    open_sides = tuple(
-        (name, side)
-        for name, pair in sides.items()
-        for side, end in zip(("low", "high"), pair, strict=True)
-        if end.is_open
-    )
-    nominal = {name: float(value) for name, value in zip(names, found.t[: len(names)], strict=True)}
-    box = CalibratedBox(
-        nominal,
-        {name: min(pair[0].value, nominal[name]) for name, pair in sides.items()},
-        {name: max(pair[1].value, nominal[name]) for name, pair in sides.items()},
-        open_sides,
-        level,
-        digest,
-        stands=all(colour.probability >= SIGNIFICANT for colour in colours.values()),
+    box = _box(
+        names, found, level, digest, stands=all(colour.probability >= SIGNIFICANT for colour in colours.values())
     )
     Q = {name: float(value) for name, value in zip(problem.noisy, found.Q, strict=True)} if fit is not None else {}
     R = {name: float(value) for name, value in zip(problem.output_names, found.R, strict=True)}
-    limited = [
-        name
-        for name, weak in zip(
-            (*problem.noisy, *problem.output_names), (*found.limited_Q, *found.limited_R), strict=True
-        )
-        if weak
-    ]
+    noises = zip((*problem.noisy, *problem.output_names), (*found.limited_Q, *found.limited_R), strict=True)
+    limited = [name for name, weak in noises if weak]
     row = None if change is None else problem.log.rows[0] + change
     at_end = tuple(name for name, there in zip(problem.unknown, found.at_bounds, strict=True) if there)
     verdict = [
@@ -152,7 +134,7 @@ def reported(
         *_told(problem, R, timing, error),
     ]
     return Calibration(
-        nominal,
+        box.nominal,
         read_only(covariance),
         read_only(correlation),
         box,
@@ -182,6 +164,26 @@ def reported(
         dict(zip(problem.plant.state_names, np.diag(problem.P0).tolist(), strict=True)),
         getattr(problem.plant, "inner", problem.plant).equation_names,
         _outlier_limit(problem.log.least_outlier),
+    )
+
+
+def _box(names: Sequence[str], found: InnovationsFit, level: float, digest: str, *, stands: bool) -> CalibratedBox:
+    """Return the box of the constants of a fit."""
+    nominal = {name: float(value) for name, value in zip(names, found.t[: len(names)], strict=True)}
+    sides = dict(zip(names, found.sides[: len(names)], strict=True))
+    return CalibratedBox(
+        nominal,
+        {name: min(pair[0].value, nominal[name]) for name, pair in sides.items()},
+        {name: max(pair[1].value, nominal[name]) for name, pair in sides.items()},
+        tuple(
+            (name, side)
+            for name, pair in sides.items()
+            for side, end in zip(("low", "high"), pair, strict=True)
+            if end.is_open
+        ),
+        level,
+        digest,
+        stands=stands,
     )
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from obsynth.analysis.transformations.noise import with_noise
 from obsynth.calibration.diagnostics import (
     SIGNIFICANT,
+    Consistency,
     SensorValidation,
     Validation,
     change_of_mean,
@@ -246,6 +247,59 @@ def validate(
     SolverError
         A step of a nonlinear plant has no solution along the log.
     """
+    found = _usable_log(design, log, rows=rows, columns=columns, scales=scales)
+    estimates = recorded_innovations(design, found).estimates
+    design, told = _as_far_as_it_walks(design, found)
+    far_off, near = _far(estimates, design, found.samples)
+    record = replace(recorded_innovations(design, found), estimates=estimates)
+    sensors = _sensors(record, design.plant.output_names)
+    whole, white = consistency(record.squares, record.degrees), _white(sensors)
+    place = change_of_mean(record.standardised if white else whitened(record.standardised))
+    change = None if place is None else found.rows[0] + place
+    ratios, others = _contradicted(design, found, record, sensors, whole)
+    sentences = _sentences(sensors, ratios, change, far_off, coloured=others is not None)
+    if others is not None:
+        sentences.append(_explained(others))
+    passed = whole.holds and not sentences
+    if not (passed or whole.holds or ratios) and others is None:
+        far = "small" if whole.value > whole.high else "large"
+        sentences.append(
+            f"Q and R are too {far} together: the innovations are {np.sqrt(whole.value):.2g} times what is expected."
+        )
+    if record.error is not None and record.error.matters:
+        sentences.append(
+            f"A step of backward Euler errs by up to {record.error.largest:.2g} deviations of "
+            f"{record.error.sensor} (row {found.rows[0] + record.error.row}): integration: radau does not, "
+            "which parameters may need."
+        )
+    if passed:
+        sentences.append("The innovations are as the design expects them: white, without offset, of the stated size.")
+    return Validation(
+        passed,
+        design.name,
+        whole,
+        sensors,
+        ratios,
+        change,
+        (*found.notes, *told, *near, *sentences),
+        read_only(record.innovations),
+        read_only(record.deviations),
+        read_only(np.array(found.y)),
+        read_only(found.y - record.innovations),
+        record.estimates,
+        found.described,
+    )
+
+
+def _usable_log(
+    design: ObserverDesign,
+    log: LogData,
+    *,
+    rows: str | slice | Sequence[int] | None,
+    columns: Mapping[str, str] | None,
+    scales: Mapping[str, float] | None,
+) -> Log:
+    """Return the log of a design whose innovations it can contradict, without samples that are clearly wrong."""
     require_kind(design, ObserverDesign, "design", "an ObserverDesign, such as obsynth.load(path)")
     if not states_innovations(design):
         raise SpecError(
@@ -264,62 +318,36 @@ def validate(
             path="rows",
             code="too-short",
         )
-    found = found.shifted(design.input_delay).without(wrong_samples(found.y))
-    estimates = recorded_innovations(design, found).estimates
-    design, told = _as_far_as_it_walks(design, found)
-    far_off, near = _far(estimates, design, found.samples)
-    notes = [*found.notes, *told, *near]
-    record = replace(recorded_innovations(design, found), estimates=estimates)
-    sensors = _sensors(record, plant.output_names)
-    whole = consistency(record.squares, record.degrees)
-    coloured = not _white(sensors)
-    place = change_of_mean(whitened(record.standardised) if coloured else record.standardised)
-    change = None if place is None else found.rows[0] + place
+    return found.shifted(design.input_delay).without(wrong_samples(found.y))
+
+
+def _contradicted(
+    design: ObserverDesign,
+    log: Log,
+    record: RecordedInnovations,
+    sensors: Mapping[str, SensorValidation],
+    whole: Consistency,
+) -> tuple[Mapping[str, float], tuple[Explanation, ...] | None]:
+    """Return the variances that a log contradicts, and what explains innovations that these leave coloured; ``None``
+    where they are white, as the design states its variances or with the likeliest ones."""
+    white, observer = _white(sensors), design.observer
     # What a gate leaves out is no sample of the stated noise.
-    passed_by_gate = replace(found, y=read_only(np.where(np.isfinite(record.innovations), found.y, np.nan)))
-    said = noise_ratios(design.observer, passed_by_gate) if isinstance(design.observer, DAEObserver) else None
-    agree = whole.holds and not coloured and all(item.nis.holds for item in sensors.values())
+    passed_by_gate = replace(log, y=read_only(np.where(np.isfinite(record.innovations), log.y, np.nan)))
+    said = noise_ratios(observer, passed_by_gate) if isinstance(observer, DAEObserver) else None
     # A variance that moves no innovation out of what is expected is no reason to change a design.
-    ratios = {} if said is None or agree else said.ratios
-    others = _explanations(design, found, record) if coloured else ()
-    if coloured and ratios and said is not None and isinstance(design.observer, DAEObserver):
-        # Wrong variances colour the innovations too: with the likeliest ones they are white, and nothing explains more.
-        likeliest = recorded_innovations(design.replace(observer=_with_variances(design.observer, said)), found)
-        rival = CLEARLY_MORE * others[0].gain if others else 0.0
-        coloured = not _white(_sensors(likeliest, plant.output_names)) or rival > said.gain
-        ratios = {} if coloured else ratios
-    verdict = [*notes, *_sentences(sensors, ratios, change, far_off, coloured=coloured)]
-    if coloured:
-        verdict.append(_explained(others))
-    passed = not verdict[len(notes) :] and whole.holds
-    if not passed and not whole.holds and not ratios and not coloured:
-        far = "small" if whole.value > whole.high else "large"
-        verdict.append(
-            f"Q and R are too {far} together: the innovations are {np.sqrt(whole.value):.2g} times what is expected."
-        )
-    if record.error is not None and record.error.matters:
-        verdict.append(
-            f"A step of backward Euler errs by up to {record.error.largest:.2g} deviations of "
-            f"{record.error.sensor} (row {found.rows[0] + record.error.row}): integration: radau does not, "
-            "which parameters may need."
-        )
-    if passed:
-        verdict.append("The innovations are as the design expects them: white, without offset, of the stated size.")
-    return Validation(
-        passed,
-        design.name,
-        whole,
-        sensors,
-        ratios,
-        change,
-        tuple(verdict),
-        read_only(record.innovations),
-        read_only(record.deviations),
-        read_only(np.array(found.y)),
-        read_only(found.y - record.innovations),
-        record.estimates,
-        found.described,
-    )
+    agree = whole.holds and white and all(item.nis.holds for item in sensors.values())
+    ratios: Mapping[str, float] = {} if said is None or agree else said.ratios
+    if white:
+        return ratios, None
+    others = _explanations(design, log, record)
+    if said is None or not ratios or not isinstance(observer, DAEObserver):
+        return ratios, others
+    # Wrong variances colour the innovations too: with the likeliest ones they are white, and nothing explains more.
+    likeliest = recorded_innovations(design.replace(observer=_with_variances(observer, said)), log)
+    rival = CLEARLY_MORE * others[0].gain if others else 0.0
+    if not _white(_sensors(likeliest, design.plant.output_names)) or rival > said.gain:
+        return {}, others
+    return ratios, None
 
 
 def _as_far_as_it_walks(design: ObserverDesign, log: Log) -> tuple[ObserverDesign, list[str]]:

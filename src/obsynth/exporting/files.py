@@ -135,12 +135,11 @@ def export(
     if isinstance(design, ObserverDesign):
         require_verified(design, unverified=unverified)
         require_fixed(design, suffix)
-    if isinstance(design, ObserverDesign) and isinstance(design.observer, RecursiveObserver):
-        require_plain(design.observer, "An export")
-    if precision is not None and suffix != ".c":
-        raise SpecError("precision is for C (.c): other files hold doubles.", path="precision")
-    if monitor is not None and suffix not in (".c", ".fmu"):
-        raise SpecError("A monitor is written as C (.c) or in an FMU (.fmu).", path="monitor")
+        if isinstance(design.observer, RecursiveObserver):
+            require_plain(design.observer, "An export")
+    _require_fitting_options(
+        suffix, fmi=fmi, thresholds=thresholds, warm_up=warm_up, monitor=monitor, precision=precision
+    )
     numbers = chosen(precision or "double", "precision", C_PRECISIONS)
     learned = None if monitor is None else _learned_by(monitor, design)
     if suffix == ".fmu":
@@ -152,30 +151,25 @@ def export(
                 "An FMU holds learned monitors and levels of outputs, not this monitor: write it as C (.c).",
                 path="monitor",
             )
-        return (
-            write_fmu(
-                design,
-                target,
-                version=fmi or "2.0",
-                sample_time=sample_time,
-                thresholds=thresholds,
-                warm_up=warm_up,
-                learned=learned,
-            ),
+        made = write_fmu(
+            design,
+            target,
+            version=fmi or "2.0",
+            sample_time=sample_time,
+            thresholds=thresholds,
+            warm_up=warm_up,
+            learned=learned,
         )
-    if fmi is not None:
-        raise SpecError("fmi is the version of an FMU (.fmu): other files have none.", path="fmi")
-    if suffix != ".c" and (thresholds or warm_up is not None):
-        raise SpecError(
-            "Thresholds and warm-up are for C (.c) and an FMU (.fmu): other files hold no alarms.", path="thresholds"
-        )
+        return (made,)
     if isinstance(design, ObserverDesign) and isinstance(design.observer, DAEObserver):
         if monitor is not None and learned is None:
             raise SpecError("Of nonlinear designs, learned monitors are written as C.", path="monitor")
         shipped, alarms = dae_alarms(design, thresholds, warm_up, learned)
         return write_dae_c(shipped, target, sample_time, alarms, numbers)
     found = Realisation.of(design, sample_time, numbers)
-    if suffix == ".c" and is_window(design):
+    if suffix != ".c":
+        return (write_atomically(target, _as_arrays(found, design, suffix)),)
+    if is_window(design):
         if monitor is not None or thresholds or warm_up is not None or numbers != "double":
             raise SpecError(
                 "A guaranteed test brings its threshold, in doubles: leave monitor, thresholds, warm-up and precision "
@@ -185,31 +179,53 @@ def export(
         prefix, header = c_identifier(target.stem), target.with_suffix(".h")
         source, declared = (in_precision(text, numbers) for text in window_c_texts(found, prefix, header.name))
         return write_together({target: source, header: with_c_linkage(declared, prefix)})
-    if suffix == ".c":
-        if found.observer.dt == 0.0:
-            raise SpecError(
-                "The observer is continuous in time: give the sample time, in seconds, for C.", path="sample_time"
-            )
-        bound = None if monitor is None or learned is not None else _bound_of(monitor, found)
-        return _write_c(found, target, linear_alarms(found, thresholds, warm_up, learned), bound)
-    buffer = io.BytesIO()
-    if suffix == ".npz":
-        np.savez(buffer, **found.as_arrays())
-    else:
-        from scipy.io import savemat
+    if found.observer.dt == 0.0:
+        raise SpecError(
+            "The observer is continuous in time: give the sample time, in seconds, for C.", path="sample_time"
+        )
+    bound = None if monitor is None or learned is not None else _bound_of(monitor, found)
+    return _write_c(found, target, linear_alarms(found, thresholds, warm_up, learned), bound)
 
-        arrays = found.as_arrays()
-        # Cell arrays of texts, and vectors as columns.
-        named = {
-            key: np.array(value, dtype=object) if isinstance(value, list) else value for key, value in arrays.items()
-        }
-        # Gains by the letters of the method's paper, and the matrices of the certificate, as structures.
-        for key, matrices in (("gains", design.gains), ("certificate", design.certificate.matrices)):
-            fields = {name: matrix for name, matrix in matrices.items() if name.isidentifier()}
-            if fields:
-                named[key] = fields
-        savemat(buffer, named, oned_as="column", long_field_names=True)
-    return (write_atomically(target, buffer.getvalue()),)
+
+def _require_fitting_options(
+    suffix: str,
+    *,
+    fmi: str | None,
+    thresholds: Mapping[str, float] | None,
+    warm_up: float | None,
+    monitor: Monitor | None,
+    precision: str | None,
+) -> None:
+    """Raise `SpecError` for what a file of this suffix does not take."""
+    if precision is not None and suffix != ".c":
+        raise SpecError("precision is for C (.c): other files hold doubles.", path="precision")
+    if monitor is not None and suffix not in (".c", ".fmu"):
+        raise SpecError("A monitor is written as C (.c) or in an FMU (.fmu).", path="monitor")
+    if fmi is not None and suffix != ".fmu":
+        raise SpecError("fmi is the version of an FMU (.fmu): other files have none.", path="fmi")
+    if suffix not in (".c", ".fmu") and (thresholds or warm_up is not None):
+        raise SpecError(
+            "Thresholds and warm-up are for C (.c) and an FMU (.fmu): other files hold no alarms.", path="thresholds"
+        )
+
+
+def _as_arrays(found: Realisation, design: ObserverDesign, suffix: str) -> bytes:
+    """Return the contents of a file of arrays for numpy or MATLAB."""
+    buffer, arrays = io.BytesIO(), found.as_arrays()
+    if suffix == ".npz":
+        np.savez(buffer, **arrays)
+        return buffer.getvalue()
+    from scipy.io import savemat
+
+    # Cell arrays of texts, and vectors as columns.
+    named = {key: np.array(value, dtype=object) if isinstance(value, list) else value for key, value in arrays.items()}
+    # Gains by the letters of the method's paper, and the matrices of the certificate, as structures.
+    for key, matrices in (("gains", design.gains), ("certificate", design.certificate.matrices)):
+        fields = {name: matrix for name, matrix in matrices.items() if name.isidentifier()}
+        if fields:
+            named[key] = fields
+    savemat(buffer, named, oned_as="column", long_field_names=True)
+    return buffer.getvalue()
 
 
 def exported_files(target: Path) -> dict[Path, FileKind | None]:

@@ -55,6 +55,10 @@ class AugmentedPlant:
         """Number of states."""
         return int(self.E.shape[0])
 
+    def below(self, matrix: FloatArray) -> FloatArray:
+        """Return what enters the equations ``(nx, any)`` of the plant, and nothing of the model: ``(na, any)``."""
+        return np.vstack([matrix, np.zeros((self.order - len(matrix), matrix.shape[1]))])
+
 
 def shipped_model(matrices: Mapping[str, FloatArray], faults: int) -> Exosystem:
     """Return the exosystem of a certificate, with ``Phi (nw, nw)`` and ``Cw (nf, nw)``."""

@@ -213,13 +213,9 @@ def order_conditions(
         return []
     points = [complex(value) for value in zeros.values if value.imag >= 0.0 and is_outside(value, plant.dt)]
     augmented = AugmentedPlant.of(plant, model)
-    own, shown = independent_disturbances(plant)
-    below = np.vstack([own, np.zeros((model.order, own.shape[1]))])
     worst: tuple[RankDecision, complex] | None = None
     for point in points:
-        matrix = np.block([[point * augmented.E - augmented.A, -below], [augmented.C.astype(complex), shown]])
-        scaled, _ = equilibrated(matrix)
-        decision = decide_rank(scaled, expected=matrix.shape[1], equilibrated=False)
+        decision = _rank_at(augmented, independent_disturbances(plant), point)
         if worst is None or (decision.rank, decision.smallest_kept) < (worst[0].rank, worst[0].smallest_kept):
             worst = (decision, point)
     if worst is None:
@@ -242,6 +238,14 @@ def order_conditions(
         signals=() if decision.full else plant.fault_names,
     )
     return [found if decision.full else found.in_doubt(_order_doubt(judge, courses, units, point), judge.plant)]
+
+
+def _rank_at(augmented: AugmentedPlant, disturbances: tuple[FloatArray, FloatArray], point: complex) -> RankDecision:
+    """Decide whether plant and fault model have a mode at a point that these disturbances can hide."""
+    entering, direct = disturbances
+    below = augmented.below(entering)
+    matrix = np.block([[point * augmented.E - augmented.A, -below], [augmented.C.astype(complex), direct]])
+    return decide_rank(equilibrated(matrix)[0], expected=matrix.shape[1], equilibrated=False)
 
 
 def _order_doubt(judge: Evaluator, model: Exosystem, units: PlantUnits, point: complex) -> Unclear:
@@ -592,11 +596,8 @@ def _shown_as_given(plant: DescriptorSystem, courses: Exosystem, units: PlantUni
     Along a plant of parts that hardly touch its own units drift apart, and rounding hides what they make small."""
     if not is_outside(drop, 1.0 if units.discrete else 0.0):
         return False
-    augmented, (inputs, direct) = AugmentedPlant.of(plant, courses), independent_disturbances(plant)
-    below = np.vstack([inputs, np.zeros((courses.order, inputs.shape[1]))])
-    point = units.eigenvalue(drop)
-    matrix = np.block([[point * augmented.E - augmented.A, -below], [augmented.C.astype(complex), direct]])
-    return decide_rank(equilibrated(matrix)[0], expected=matrix.shape[1], equilibrated=False).full
+    augmented = AugmentedPlant.of(plant, courses)
+    return _rank_at(augmented, independent_disturbances(plant), units.eigenvalue(drop)).full
 
 
 def _fixed_modes(
@@ -609,8 +610,7 @@ def _fixed_modes(
         inputs, direct = plant.Bd[:, exact[1]], plant.Dd[:, exact[1]]
     else:
         inputs, direct = independent_disturbances(plant)
-    below = np.vstack([inputs, np.zeros((model.order, inputs.shape[1]))])
-    pencil = system_pencil(augmented.E, augmented.A, below, augmented.C, direct)
+    pencil = system_pencil(augmented.E, augmented.A, augmented.below(inputs), augmented.C, direct)
     facts = None if exact is None else believed(exact[0].timed(units.rate), *pencil, nx=augmented.order)
     if facts is not None and facts.full and not facts.outside:
         # A mode that only rounding of the data moves is fixed as well.
