@@ -219,7 +219,7 @@ class Ours:
         self.design = ob.dae_adaptive_observer(
             made, dt=plant.dt, Q=found.Q, R=found.R, integration=found.integration, form="augmented-kalman",
             random_walk=np.diag(walk), initial_covariance=dict(found.initial_covariance), outliers="gate",
-            outlier_limit=found.outlier_limit,
+            outlier_sizes=found.outlier_sizes,
             initial_parameter_covariance=np.diag(np.array(plant.sizes) ** 2 / 100),
         )  # fmt: skip
 

@@ -92,9 +92,10 @@ def test_a_sample_that_stands_out_is_named() -> None:
 
     found = calibrate(circuit(), circuit_log(vm=wrong), WIDE, starts=1, input_delay=0)
     assert said(found, "Samples of vm stand out by more than 6 deviations (row 77)")
-    # The gate of a design stands between the samples that are none and this one.
-    assert found.outlier_limit is not None
-    assert 6.0 < found.outlier_limit <= 8.0
+    # The gate stands between the samples that are none and this one: in the middle, where it is the only one.
+    assert list(found.outlier_sizes) == ["vm"]
+    usual = 6.0 * float(np.median(found.deviations, axis=0)[found.output_names.index("vm")])
+    assert found.outlier_sizes["vm"] == pytest.approx((usual * 0.3) ** 0.5, rel=0.05)
 
 
 def test_a_sensor_of_another_sign_and_one_with_a_bias_are_named(share) -> None:

@@ -292,6 +292,79 @@ def test_every_kind_of_design_learns() -> None:
     assert set(watched_names(design)) <= set(run.table.columns)
 
 
+@functools.cache
+def filtered() -> obsynth.ObserverDesign:
+    plant = obsynth.DescriptorSystem(
+        E=np.eye(2), A=[[0.9, 0.1], [0.0, 0.95]], B=[[1.0], [0.1]], C=np.eye(2), dt=DT, state_names=["a", "b"],
+        input_names=["u"], output_names=["ya", "yb"], Bw=0.02 * np.eye(2), sensor_noise={"ya": 0.1, "yb": 0.1},
+    )  # fmt: skip
+    return obsynth.descriptor_kalman(plant)
+
+
+#: Rows of `wrong_log` in which a sample of yb alone is wrong.
+ALONE = range(37, 3_000, 61)
+
+
+@functools.cache
+def wrong_log(kind: str) -> pd.DataFrame:
+    """Return normal rows of `filtered`, where single samples are wrong by 30 deviations, and some come in a row."""
+    rng, rows, step = np.random.default_rng(8), 3_000, np.array([[0.9, 0.1], [0.0, 0.95]])
+    x, found = np.zeros(2), []
+    for k in range(rows):
+        u = np.array([np.sin(k / 30.0)])
+        found.append([k * DT, u[0], *(x + 0.1 * rng.standard_normal(2))])
+        x = step @ x + [u[0], 0.1 * u[0]] + 0.02 * rng.standard_normal(2)
+    table = pd.DataFrame(found, columns=["time", "u", "ya", "yb"])
+    table.loc[list(ALONE), "yb"] += 3.0 * rng.choice([-1.0, 1.0], len(ALONE))
+    pairs = {"pair": [1520], "pair and a blank": [1520], "many pairs": range(405, 3_000, 122)}.get(kind, [])
+    for row in pairs:
+        table.loc[[row, row + (2 if "blank" in kind else 1)], "yb"] += 3.0
+    if "blank" in kind:
+        table.loc[1521, "yb"] = np.nan
+    if kind == "gone":
+        table.loc[[1520, 1521], "yb"] = np.nan
+    if kind == "stays":
+        table.loc[1520:1550, "yb"] += 3.0
+    return table
+
+
+@functools.cache
+def learned_from(kind: str) -> obsynth.types.LearnedThresholds:
+    return obsynth.learn_thresholds(filtered(), wrong_log(kind), false_alarms="1 per 1000 rows")
+
+
+@pytest.mark.usefixtures("taken_as_verified")
+@pytest.mark.parametrize("kind", ["pair", "pair and a blank"])
+def test_two_wrong_samples_in_a_row_do_not_raise_the_levels(kind: str) -> None:
+    found, wanted = learned_from(kind), learned_from("gone")
+    assert (found.pairs.number, wanted.pairs.number) == (1, 0)
+    # Half the square of the share of wrong samples, those of the pair among them.
+    assert found.pairs.chance == pytest.approx(0.5 * ((len(ALONE) + 2) / 3_000) ** 2, rel=0.01)
+    assert "1 pair(s) of wrong samples in a row count as not measured" in found.statement
+    # Other alarms are rarer by a seventh, and the bootstrap draws other rows: a level moves by a tenth.
+    ratios = found.levels / wanted.levels
+    assert (ratios > 0.8).all()
+    assert (ratios < 1.2).all()
+
+
+@pytest.mark.usefixtures("taken_as_verified")
+@pytest.mark.parametrize("kind", ["stays", "many pairs"])
+def test_what_no_chance_explains_is_how_the_plant_is(kind: str) -> None:
+    assert learned_from(kind).pairs.number == 0
+    assert learned_from(kind).levels[0] > 2.0 * learned_from("gone").levels[0]
+
+
+def test_columns_that_follow_from_others_and_the_past_are_not_watched() -> None:
+    """A filter's estimate moves by gain times innovation: beside that only the change of the gain is new."""
+    rng = np.random.default_rng(2)
+    r = rng.standard_normal(3_000)
+    gains = 0.1 * (1.0 + 0.01 * rng.standard_normal(3_000))
+    follows = lfilter([1.0], [1.0, -0.9], gains * r)
+    own = lfilter([1.0], [1.0, -0.9], 0.1 * r + 0.05 * rng.standard_normal(3_000))
+    assert not fitted_autoregression(np.column_stack([follows, r])).is_regular
+    assert fitted_autoregression(np.column_stack([own, r])).is_regular
+
+
 def test_files_and_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     gains, normal, faulty, file = (tmp_path / name for name in ("g.json", "normal.csv", "faulty.csv", "t.json"))
     heated().save(gains)

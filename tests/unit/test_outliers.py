@@ -181,8 +181,29 @@ def test_a_gate_believes_a_second_sample_as_far_off_as_the_first_and_no_wild_one
     assert np.array_equal(again.x, row.x)
 
 
+@pytest.mark.parametrize("kind", ["recursive", "nonlinear"])
+def test_a_sample_nearer_than_outliers_are_is_believed_at_once(kind):
+    """A log told how far off its outliers are: what is nearer may be a fault, however many deviations it is."""
+    design, y, u, at, size, _ = gated(kind)
+    observer = replace(design.observer, outlier_sizes={design.plant.output_names[0]: 1.5 * size})
+    for steps, lost in ((1.0, 0.0), (2.0, 1.0)):
+        moved = y.copy()
+        moved[at:, 0] += steps * size
+        found = gate_counts(observer, moved[: at + 2], u[: at + 2])[0]
+        assert gate_counts(design.observer, moved[: at + 2], u[: at + 2])[0][at, 0] == 1.0
+        assert found[at].tolist() == [lost, *np.zeros(y.shape[1] - 1)]
+    # Huber's weight pulls a sample no nearer than that.
+    moved = y[: at + 1].copy()
+    moved[at, 0] += 2.0 * size
+    near, far = (replace(design.observer, outliers="huber", outlier_sizes=sizes).run(moved, u[: at + 1])
+                 for sizes in (None, [1.5 * size, *np.zeros(y.shape[1] - 1)]))  # fmt: skip
+    assert np.abs(far.innovations[at]).max() > 1.5 * np.abs(near.innovations[at]).max()
+
+
 def test_run_leaves_outliers_out_by_default_and_counts_them(tmp_path):
     design, u, true = tank_log()
+    # An observer that has run before is as good as a new one.
+    design.observer.run(true.outputs[:2], u[:2])
     table = pd.DataFrame({"time": np.arange(120.0), **dict(zip(("u1", "u3"), u.T, strict=True)),
                           **dict(zip(("v1", "v2", "v3"), np.array(true.outputs).T, strict=True))})  # fmt: skip
     clean = run_on_data(design, table)
@@ -202,13 +223,18 @@ def test_run_leaves_outliers_out_by_default_and_counts_them(tmp_path):
 
 
 def test_options_are_checked_and_kept(tmp_path):
-    design = filter_design(outliers="huber", outlier_limit=2.5)
+    design = filter_design(outliers="huber", outlier_limit=2.5, outlier_sizes=(0.0, 0.5))
     file = design.save(tmp_path / "gains.json")
     again = obsynth.load(file)
     assert (again.observer.outliers, again.observer.outlier_limit) == ("huber", 2.5)
-    for options in ({"outliers": "some"}, {"outliers": "gate", "outlier_limit": -1.0}):
+    assert again.observer.outlier_sizes.tolist() == [0.0, 0.5]
+    made = tank_design()
+    sized = replace(made, observer=replace(made.observer, outliers="gate", outlier_sizes={"v2": 0.5}))
+    assert obsynth.load(sized.save(tmp_path / "tank.json")).observer.outlier_sizes.tolist() == [0.0, 0.5, 0.0]
+    wrong = ({"outliers": "some"}, {"outlier_limit": -1.0}, {"outlier_sizes": [-1.0, 0.0]}, {"outlier_sizes": {"z": 1}})
+    for options in wrong:
         with pytest.raises(SpecError, match="outlier"):
-            filter_design(**options)
+            filter_design.__wrapped__(**options)
 
 
 @pytest.mark.parametrize("kind", ["gate", "huber"])

@@ -640,8 +640,8 @@ class _Fitting:
             if found.fit is None:
                 break
             problem = found.problem
-            sizes = standing_out(np.where(np.isfinite(problem.y), found.fit.whitened, np.nan))
-            wrong = sizes > 0.0
+            wrong = standing_out(np.where(np.isfinite(problem.y), found.fit.whitened, np.nan))
+            off = np.abs(found.fit.innovations).T
             if not wrong.any():
                 break
             self.note("without samples that stand out")
@@ -656,7 +656,10 @@ class _Fitting:
                 log,
                 y=read_only(np.where(wrong, np.nan, problem.y)),
                 notes=(*log.notes, *told),
-                least_outlier=min(log.least_outlier, float(sizes[wrong].min())),
+                outliers=tuple(
+                    np.concatenate([before, off[i, wrong[:, i]]])
+                    for i, before in enumerate(log.outliers or [np.zeros(0)] * len(names))
+                ),
             )
             found = self.refitted(replace(found, problem=problem.with_log(kept)))
         return found

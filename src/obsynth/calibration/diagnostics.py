@@ -136,14 +136,13 @@ def wrong_samples(y: FloatArray) -> BoolArray:
     return found
 
 
-def standing_out(whitened: FloatArray) -> FloatArray:
-    """Return by how much single whitened innovations ``(n, ny)`` stand out of what most of their sensor are: in
-    deviations of these, zero where they do not.
+def standing_out(whitened: FloatArray) -> BoolArray:
+    """Return which single whitened innovations ``(n, ny)`` stand out of what most of their sensor are.
 
     Those whose neighbours stand out too are no wrong samples, but something that happened; unless there are two, and
     the second is what a filter of coloured noise makes of the sample after a wrong one: less, to the other side.
     """
-    found = np.zeros(whitened.shape)
+    found = np.zeros(whitened.shape, dtype=bool)
     for i, column in enumerate(whitened.T):
         seen = np.isfinite(column)
         if seen.sum() < LEAST_DIAGNOSED_ROWS:
@@ -153,7 +152,7 @@ def standing_out(whitened: FloatArray) -> FloatArray:
         beside = np.concatenate([[False], far[:-1]]) | np.concatenate([far[1:], [False]])
         alone = far & (~beside | _answered(column, far))
         if alone.sum() <= MOST_OUTLIERS * seen.sum():
-            found[alone, i] = np.abs(column[alone]) / usual
+            found[alone, i] = True
     return found
 
 

@@ -64,7 +64,8 @@ class Log:
     rows: tuple[int, int]  # first row and one past the last, of the data that were given
     source: str = ""
     notes: tuple[str, ...] = ()  # what was noticed and repaired
-    least_outlier: float = np.inf  # of samples that stand out and count as not measured, in usual deviations
+    #: How far samples that stand out, and count as not measured, were from their prediction: ``(any,)`` of each output.
+    outliers: tuple[FloatArray, ...] = ()
 
     @property
     def samples(self) -> int:

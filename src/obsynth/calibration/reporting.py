@@ -23,7 +23,7 @@ from obsynth.calibration.diagnostics import (
 )
 from obsynth.calibration.innovations_fit import InnovationsFit, Timing
 from obsynth.calibration.intervals import Side, covariance_of, quantile
-from obsynth.calibration.logs import EVEN, TOLD_ROWS
+from obsynth.calibration.logs import EVEN, TOLD_ROWS, Log
 from obsynth.calibration.noise_states import PlantWithNoise, correlation_name
 from obsynth.calibration.problem import Problem
 from obsynth.calibration.result import CalibratedBox, Calibration
@@ -88,9 +88,6 @@ AT_QUANTISATION = 1.5
 NOTED_NATS = 2.0
 #: A variance of a sensor above this share of what its signal has stands for the signal.
 SIGNAL_SHARE = 0.1
-#: The widest gate, in deviations.  Faults of a design walk, which a calibration knows nothing of: its deviations are
-#: larger, and at 10 or more the outliers of a log passed (benchmarks/against_ekf.py: rms .0219 became .0285).
-LARGEST_LIMIT = 8.0
 #: A constant within this share of the bounds' width from one of them is at it.
 END_SHARE = 1e-6
 
@@ -163,7 +160,7 @@ def reported(
         *_noise_model(problem, found, Q, R),
         dict(zip(problem.plant.state_names, np.diag(problem.P0).tolist(), strict=True)),
         getattr(problem.plant, "inner", problem.plant).equation_names,
-        _outlier_limit(problem.log.least_outlier),
+        _outlier_sizes(problem.log, np.sqrt(np.median(found.variances, axis=0))),
     )
 
 
@@ -286,11 +283,18 @@ def _fitted(
     ]
 
 
-def _outlier_limit(least: float) -> float | None:
-    """Return the limit of a gate between samples that are none and the least outlier; nothing without outliers."""
-    if not np.isfinite(least):
-        return None
-    return float(min(np.sqrt(STANDS_OUT * least), LARGEST_LIMIT))
+def _outlier_sizes(log: Log, deviations: FloatArray) -> dict[str, float]:
+    """Return how far off an outlier of each output is at least, for innovations of ``deviations (ny,)``.
+
+    One more outlier is nearer than all of n with the probability 1 / (n + 1): the size stands that share of the way, on
+    a logarithmic scale, from the least of them to what no sample of the model reaches.
+    """
+    found = {}
+    for name, sizes, deviation in zip(log.output_names, log.outliers, deviations, strict=False):
+        if len(sizes):
+            usual, least, share = STANDS_OUT * float(deviation), float(sizes.min()), 1.0 / (len(sizes) + 1)
+            found[name] = usual**share * least ** (1.0 - share)
+    return found
 
 
 def _misfits(problem: Problem, start: Fit, whitened: FloatArray, R: dict[str, float]) -> list[str]:

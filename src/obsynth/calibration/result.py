@@ -160,9 +160,9 @@ class Calibration:
         Variances of the first states that were used.
     own_equations : tuple of str
         The equations of the plant as written: without those of noise, offsets and walks.
-    outlier_limit : float or None
-        Limit of a gate for outliers, in deviations, between the samples of this log that are none and its least
-        outlier (at most 12): a narrower one leaves out the onset of a fault. Nothing where there are no outliers.
+    outlier_sizes : mapping
+        How far from its prediction an outlier of each output is at least, in its unit, as the outliers of this log say;
+        nothing of outputs without any. What is nearer may be the onset of a fault.
     """
 
     nominal: Mapping[str, float]
@@ -196,7 +196,7 @@ class Calibration:
     walks: Mapping[str, float] = field(default_factory=dict)
     initial_covariance: Mapping[str, float] = field(default_factory=dict)
     own_equations: tuple[str, ...] = ()
-    outlier_limit: float | None = None
+    outlier_sizes: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -262,7 +262,7 @@ class Calibration:
             "offset": dict(self.offset),
             "walks": dict(self.walks),
             "initial_covariance": dict(self.initial_covariance),
-            "outlier_limit": self.outlier_limit,
+            "outlier_sizes": dict(self.outlier_sizes),
             "covariance": self.covariance.tolist(),
             "correlation": self.correlation.tolist(),
             "undetermined": [dict(direction) for direction in self.undetermined],

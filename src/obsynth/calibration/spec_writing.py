@@ -141,7 +141,7 @@ def _nonlinear_options(found: Calibration) -> dict[str, Any]:
         "R": {name: float(value) for name, value in found.R.items()},
         "integration": found.integration,
         "initial_covariance": {name: float(value) for name, value in found.initial_covariance.items()},
-        **({} if found.outlier_limit is None else {"outliers": "gate", "outlier_limit": found.outlier_limit}),
+        **({"outliers": "gate", "outlier_sizes": dict(found.outlier_sizes)} if found.outlier_sizes else {}),
     }
 
 

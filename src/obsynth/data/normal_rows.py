@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.data.log_estimator import DECIDING, STALE
+from obsynth.data.log_estimator import DECIDING, STALE, Row
 from obsynth.data.log_run import LogRun
 from obsynth.data.log_tables import parsed_rows
 from obsynth.data.signals import TIME_HEADER, Stamps
 from obsynth.data.sources import CHUNK_ROWS, Data, chunks
+from obsynth.data.step_log import SteppingLogObserver
+from obsynth.data.wrong_pairs import Pair, are_chance, believed_pairs, chance_of_pairs, taken_back, without
 from obsynth.errors import SpecError
 from obsynth.experiments.monitors.learned import (
     LEAST_NORMAL,
+    NO_PAIRS,
     LearnedThresholds,
+    WrongPairs,
     rows_per_alarm,
     settling_rows,
     thresholds_from_rows,
@@ -85,43 +90,88 @@ def learn_thresholds(
     rows_per_alarm(false_alarms, 1.0 if design.observer.dt == 0.0 else design.observer.dt)
     if time_column is not None:
         columns = {**(columns or {}), TIME_HEADER: time_column}
-    numbers, times, found = _said(design, data, columns, scales, gap, warm_up)
-    first, last = parsed_rows(rows, int(numbers[-1]) + 1)
-    chosen = (first <= numbers) & (numbers < last)
-    times, found = times[chosen], found[chosen]
-    dt = design.observer.dt or float(np.median(np.diff(times)))
-    return thresholds_from_rows(design, found, every=rows_per_alarm(false_alarms, dt), dt=dt, seed=seed)
+
+    def started() -> LogRun:
+        return LogRun(design, columns, scales, gap=gap, warm_up=warm_up)
+
+    first_run = started()
+    log = np.vstack(
+        [np.zeros((0, 1 + len(first_run.signals.names))), *chunks(data, first_run.signals, Stamps(), CHUNK_ROWS)]
+    )
+    if len(log) < LEAST_NORMAL:
+        raise SpecError(f"The log has {len(log)} rows: give {LEAST_NORMAL} and more.", path="normal")
+    said = _said(design, first_run, log)
+    dt = design.observer.dt or float(np.median(np.diff(said.times)))
+    every = rows_per_alarm(false_alarms, dt)
+    said, pairs = _without_pairs(design, started, log, said, every)
+    first, last = parsed_rows(rows, int(said.numbers[-1]) + 1)
+    chosen = (first <= said.numbers) & (said.numbers < last)
+    dt = design.observer.dt or float(np.median(np.diff(said.times[chosen])))
+    return thresholds_from_rows(
+        design, said.watched[chosen], every=rows_per_alarm(false_alarms, dt), dt=dt, seed=seed, pairs=pairs
+    )
 
 
-def _said(
-    design: ObserverDesign,
-    data: Data,
-    columns: Mapping[str, str] | None,
-    scales: Mapping[str, float] | None,
-    gap: float | None,
-    warm_up: float | None,
-) -> tuple[NDArray[np.int64], FloatArray, FloatArray]:
-    """Return numbers from 0 and times ``(n,)`` of rows, and what is watched ``(n, m)``: NaN where nothing is decided,
-    or rows are missing."""
-    run = LogRun(design, columns, scales, gap=gap, warm_up=warm_up)
+class _Said(NamedTuple):
+    """What a design says of a log."""
+
+    numbers: NDArray[np.int64]  # ``(n,)``: of rows, from 0
+    times: FloatArray  # ``(n,)`` seconds
+    watched: FloatArray  # ``(n, m)``: NaN where nothing is decided, or rows are missing
+    refused: list[FloatArray]  # ``(4, ny)`` each: what a gate remembers after each row; empty without a gate
+
+
+def _said(design: ObserverDesign, run: LogRun, log: FloatArray) -> _Said:
+    """Return what a design says of rows ``(n, 1 + nu + ny)``."""
     nothing = np.full(len(watched_names(design)), np.nan)
     residuals = [i for i, name in enumerate(run.observer.columns) if name.startswith("r[")]
-    numbers, times, rows = list[int](), list[float](), list[FloatArray]()
-    count, settling = 0, settling_rows(design)
-    for chunk in chunks(data, run.signals, Stamps(), CHUNK_ROWS):
-        for row in run.read(chunk):
-            if row.status in STALE:
-                count += 1
-                continue
-            said = watched_values(row.values[residuals], row.evidence)
-            if row.status not in DECIDING or count < settling:
-                said = None
-            # Longer gaps than the statistics look back are all the same.
-            missing = min(row.skipped, max(AGES))
-            rows += [nothing] * missing + [nothing if said is None else said]
-            times += [row.time] * (missing + 1)
-            numbers += [count] * (missing + 1)
-            count += 1
-    if count < LEAST_NORMAL:
-        raise SpecError(f"The log has {count} rows: give {LEAST_NORMAL} and more.", path="normal")
-    return np.array(numbers), np.array(times), np.array(rows)
+    numbers, times, rows, refused = list[int](), list[float](), list[FloatArray](), list[FloatArray]()
+    settling, observer = settling_rows(design), run.observer
+    gated = isinstance(observer, SteppingLogObserver) and observer.gates
+    for count, row in enumerate(_rows(run, log, CHUNK_ROWS if not gated else 1)):
+        if isinstance(observer, SteppingLogObserver) and gated:
+            refused.append(observer.state.refused)
+        if row.status in STALE:
+            continue
+        said = watched_values(row.values[residuals], row.evidence)
+        if row.status not in DECIDING or count < settling:
+            said = None
+        # Longer gaps than the statistics look back are all the same.
+        missing = min(row.skipped, max(AGES))
+        rows += [nothing] * missing + [nothing if said is None else said]
+        times += [row.time] * (missing + 1)
+        numbers += [count] * (missing + 1)
+    return _Said(np.array(numbers), np.array(times), np.array(rows), refused)
+
+
+def _rows(run: LogRun, log: FloatArray, together: int) -> Iterator[Row]:
+    """Yield the rows of a log, so many taken together."""
+    for begin in range(0, len(log), together):
+        yield from run.read(log[begin : begin + together])
+
+
+def _without_pairs(
+    design: ObserverDesign, started: Callable[[], LogRun], log: FloatArray, said: _Said, every: float
+) -> tuple[_Said, WrongPairs]:
+    """Return what a design says of rows without pairs of wrong samples, and what there was of these."""
+    if not said.refused:
+        return said, NO_PAIRS
+    before = log.shape[1] - said.refused[0].shape[1]
+    y = log[:, before:]
+    pairs = believed_pairs(said.refused, y)
+    if not pairs:
+        return said, NO_PAIRS
+
+    def again(chosen: Sequence[Pair]) -> _Said:
+        return _said(design, started(), np.hstack([log[:, :before], without(y, chosen)]))
+
+    hidden = again(pairs)
+    wrong = taken_back(pairs, hidden.refused, y)
+    seen = np.isfinite(y).sum(axis=0)
+    # All of a pair are wrong samples: those that were believed too.
+    chance = chance_of_pairs(
+        hidden.refused[-1][1] + 2.0 * np.bincount([p.output for p in wrong], minlength=len(seen)), seen
+    )
+    if not wrong or not are_chance(len(wrong), chance, len(y), every):
+        return said, NO_PAIRS
+    return hidden if len(wrong) == len(pairs) else again(wrong), WrongPairs(len(wrong), chance)

@@ -62,6 +62,11 @@ class SteppingLogObserver(LogObserver):
         self.u: FloatArray | None = None
 
     @property
+    def gates(self) -> bool:
+        """Whether a gate judges each sample in its own row."""
+        return self.observer.outliers == "gate" and self.observer.timing.is_plain
+
+    @property
     def outliers(self) -> dict[str, int]:
         """How many samples of each output were outliers, since the observer last started."""
         counts = self.state.refused[1]

@@ -18,6 +18,9 @@ MOST_ORDER, ROWS_PER_COEFFICIENT = 12, 20
 SLOWEST_FIT, SHRINKING = 0.999, 0.99
 #: Shares of the mean variance that are added so that nothing is singular: to regressors, and to what is left.
 REGRESSOR_SHARE, NOISE_SHARE = 1e-10, 1e-12
+#: Share of what is new of a signal that the others of the same row must leave: of less, the most is what no
+#: autoregression says (gains that change with inputs), and a single row of it is worth hundreds of deviations.
+LEAST_OWN = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +50,12 @@ class Autoregression:
     def longest_gain(self) -> float:
         """Largest gain from an innovation that stays to the signals."""
         return float(np.linalg.norm(np.linalg.inv(np.eye(self.channels) - self.A.sum(axis=0)), 2))
+
+    @property
+    def is_regular(self) -> bool:
+        """Whether what is new of each signal is new beside the others: none nearly follows from them and the past."""
+        precision = self.whitener.T @ self.whitener
+        return bool((np.diag(precision) * np.diag(np.linalg.inv(precision)) < 1.0 / LEAST_OWN).all())
 
     def whitened(self, x: FloatArray) -> FloatArray:
         """Return e of rows ``(..., n, m)``: zero in the first p of them, NaN where a row that is needed is NaN."""

@@ -1,7 +1,9 @@
 """What an observer does about samples that its prediction excludes, and about estimates beyond bounds of the states.
 
-Beyond the limit a sensor is left out (``gate``) or taken at the limit (``huber``; Huber 1964, Masreliez 1975).  A
-projection brings the error nowhere further in its metric: the covariance stays an upper bound (Simon, Chia 2002).
+Beyond the limit a sensor is left out (``gate``) or taken at the limit (``huber``; Huber 1964, Masreliez 1975).  Where
+the outliers of a log show how far off they are, what is nearer may be the onset of a fault, however many deviations it
+is.  A projection brings the error nowhere further in its metric: the covariance stays an upper bound (Simon, Chia
+2002).
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ from numpy.typing import NDArray
 from obsynth.errors import SolverError, SpecError
 from obsynth.numerics.arguments import chosen, is_finite_number
 from obsynth.numerics.arrays import FloatArray, read_only
-from obsynth.observers.records import named_bounds
+from obsynth.observers.records import named_bounds, named_vector
 
 BoolArray = NDArray[np.bool_]
 Outliers = Literal["none", "gate", "huber"]
@@ -52,6 +54,19 @@ def checked_limit(kind: str, limit: float | None) -> float:
     return float(limit)
 
 
+def checked_sizes(value: Any, names: Sequence[str]) -> FloatArray | None:
+    """Return how far off a sample of each output must be at least to be an outlier ``(ny,)``, in units of the sensor,
+    from these or from values by name; ``None`` where nothing is said."""
+    if value is None:
+        return None
+    found = named_vector(value, names, np.zeros(len(names)), "outlier_sizes")
+    for name, size in zip(names, found, strict=True):
+        if size < 0.0:
+            path = f"outlier_sizes.{name}"
+            raise SpecError(f"{path} is {size:g}: give how far off an outlier is at least, in its unit.", path=path)
+    return read_only(found)
+
+
 def no_refusals(outputs: int) -> FloatArray:
     """Return the memory of outliers at a start, ``(4, ny)``: how many samples in a row of each sensor were far from
     their prediction, negative where the last was below it; how many were left out or pulled at all; and how far off, in
@@ -62,6 +77,7 @@ def no_refusals(outputs: int) -> FloatArray:
 def robust_advance(
     kind: str,
     limit: float,
+    sizes: FloatArray | None,
     plain: Callable[[State, FloatArray, FloatArray], tuple[State, Row]],
     predicted: Callable[[State, FloatArray, FloatArray], tuple[FloatArray, FloatArray]],
     state: State,
@@ -70,32 +86,33 @@ def robust_advance(
     *,
     predicted_outputs: Callable[[State, FloatArray], tuple[FloatArray, FloatArray]] | None = None,
 ) -> tuple[State, Row]:
-    """Take a step; where its innovation is too long, ask each sensor and take the step again without the outliers.
+    """Take a step; where its innovation is too long, ask each sensor and take the step again without the outliers:
+    those further off than so many deviations, and than ``sizes (ny,)`` where these are known.
     ``predicted(state, received, u)``: mean and deviation of each output ``(ny,)`` from the samples that are received;
     ``predicted_outputs(state, u)``: of outputs that determine the state; these may be `BLIND` times further off."""
-    failed, mean, deviation, far = False, y, y, np.zeros(len(y), dtype=bool)
+    failed, mean, reach, far = False, y, y, np.zeros(len(y), dtype=bool)
+    least = np.zeros(len(y)) if sizes is None else sizes
     try:
         with np.errstate(all="ignore"):
             after, row = plain(state, y, u)
             passes = float(row.nis) <= limit**2
             if passes and predicted_outputs is not None:
                 mean, deviation = predicted_outputs(state, u)
-                far = np.abs(y - mean) > BLIND * limit * deviation + PREDICTION_ROUNDING * (
-                    np.abs(y) + np.abs(mean).max()
-                )
+                reach = np.maximum(limit * deviation, least)
+                far = np.abs(y - mean) > BLIND * reach + PREDICTION_ROUNDING * (np.abs(y) + np.abs(mean).max())
         if passes and not far.any():
             return after._replace(refused=_remembered(state.refused, y, far, far, y)), row
     except (SolverError, np.linalg.LinAlgError, ValueError):
         failed = True
     if not far.any():
-        mean, deviation, far = _judged(limit, predicted, state, y, u)
+        mean, reach, far = _judged(limit, least, predicted, state, y, u)
     off, gone = np.where(far, y - mean, 0.0), far
     if kind == "gate":
         # A wrong sample stands alone; of a sensor, or a plant, that has moved the next is on the same side, as far off.
         gone = far & (~_follows(state.refused, off) | (np.abs(y) > NO_SQUARE))
         received = np.where(gone, np.nan, y)
     else:
-        pulled = mean + limit * deviation * np.sign(y - mean)
+        pulled = mean + reach * np.sign(y - mean)
         received = np.where(gone, np.where(np.isfinite(pulled), pulled, np.nan), y)
     try:
         if failed or gone.any():
@@ -130,16 +147,18 @@ def _remembered(refused: FloatArray, y: FloatArray, far: BoolArray, gone: BoolAr
 
 def _judged(
     limit: float,
+    least: FloatArray,
     predicted: Callable[[State, FloatArray, FloatArray], tuple[FloatArray, FloatArray]],
     state: State,
     y: FloatArray,
     u: FloatArray,
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Return mean and deviation of each output, and which are too far from them. Where the model alone predicts nothing
-    of an output, the others of the same sample do."""
+    """Return the mean of each output, how far from it a sample may be, and which are further. Where the model alone
+    predicts nothing of an output, the others of the same sample do."""
     with np.errstate(all="ignore"):
         mean, deviation = predicted(state, np.full(len(y), np.nan), u)
-        far = (np.abs(y - mean) > limit * deviation) | (np.abs(y) > NO_SQUARE)
+        reach = np.maximum(limit * deviation, least)
+        far = (np.abs(y - mean) > reach) | (np.abs(y) > NO_SQUARE)
         ratios = np.zeros(len(y))
         for i in np.flatnonzero(np.isinf(deviation) & ~np.isnan(y) & ~far):
             others = np.where(far | (np.arange(len(y)) == i), np.nan, y)
@@ -147,12 +166,12 @@ def _judged(
                 means, deviations = predicted(state, others, u)
             except (SolverError, np.linalg.LinAlgError, ValueError):
                 continue
-            mean[i], deviation[i] = means[i], deviations[i]
-            ratios[i] = np.abs(y[i] - means[i]) / deviations[i]
+            mean[i], reach[i] = means[i], max(limit * deviations[i], least[i])
+            ratios[i] = np.abs(y[i] - means[i]) / reach[i]
         # Of those that accuse each other, the worst alone.
         worst = int(np.argmax(ratios))
-        far[worst] |= bool(ratios[worst] > limit)
-    return mean, deviation, far
+        far[worst] |= bool(ratios[worst] > 1.0)
+    return mean, reach, far
 
 
 def checked_state_bounds(value: Any, names: Sequence[str]) -> FloatArray | None:

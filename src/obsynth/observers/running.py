@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.observers.estimates import STEP_RESIDUAL, Estimates
-from obsynth.observers.outliers import Outliers, checked_limit, checked_state_bounds
+from obsynth.observers.outliers import Outliers, checked_limit, checked_sizes, checked_state_bounds
 from obsynth.observers.sensor_timing import SensorTiming, checked_sensors
 
 State = TypeVar("State")
@@ -62,11 +62,13 @@ class StepObserver(Observer[Any, Any]):
     plant: Any  # what it runs on
     outliers: Outliers
     outlier_limit: float | None
+    outlier_sizes: FloatArray | None
     sensors: Mapping[str, Mapping[str, int]] | None
     state_bounds: FloatArray | None
 
     def _check_options(self) -> None:
         checked_limit(self.outliers, self.outlier_limit)
+        object.__setattr__(self, "outlier_sizes", checked_sizes(self.outlier_sizes, self.plant.output_names))
         object.__setattr__(self, "sensors", checked_sensors(self.sensors, self.plant.output_names))
         object.__setattr__(self, "state_bounds", checked_state_bounds(self.state_bounds, self.state_names))
 

@@ -37,7 +37,7 @@ from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import digest_of, gain_set_digest, plain, restored
 
 LEARNED_KIND = "obsynth learned thresholds"
-LEARNED_VERSION = 2
+LEARNED_VERSION = 3
 LEARNED = FileKind("learned thresholds of obsynth", rb'\A\s*\{\s*"kind":\s*"obsynth learned thresholds"')
 #: Columns that are watched at most, and the least share of a column's variance that others leave unexplained.
 MOST_WATCHED, LEAST_NEW = 8, 1e-6
@@ -84,6 +84,20 @@ def rows_per_alarm(rate: str | float, dt: float) -> float:
     return found
 
 
+class WrongPairs(NamedTuple):
+    """Pairs of wrong samples in a row that count as not measured, as each of them would be an alarm."""
+
+    number: int
+    chance: float  # how many there are in a row, by chance
+
+    def others(self, every: float) -> float:
+        """Return how many rows there are for each alarm that is none of a pair, of one alarm per ``every`` rows."""
+        return 1.0 / (1.0 / every - self.chance)
+
+
+NO_PAIRS = WrongPairs(0, 0.0)
+
+
 @dataclass(frozen=True, eq=False)
 class LearnedThresholds:
     """Thresholds learned from rows without faults; made by `obsynth.learn_thresholds`.
@@ -112,6 +126,8 @@ class LearnedThresholds:
         Columns that are not watched, as they add nothing to the others.
     settling : int
         Rows at the start of a run in which nothing is decided, as nothing was learned from such rows.
+    pairs : WrongPairs
+        Pairs of wrong samples in a row that count as not measured.
     """
 
     columns: tuple[str, ...]
@@ -127,6 +143,7 @@ class LearnedThresholds:
     extrapolated: bool = False
     left_out: tuple[str, ...] = ()
     settling: int = 0
+    pairs: WrongPairs = NO_PAIRS
 
     @property
     def holds(self) -> bool:
@@ -143,10 +160,15 @@ class LearnedThresholds:
             f"order {model.order}; alarms less than {HOLD} rows apart count as one"
             + (
                 "; the level was found from the second half of these rows"
-                if is_conformal(self.rows, self.every)
+                if is_conformal(self.rows, self.pairs.others(self.every))
                 else ""
             )
         )
+        if self.pairs.number:
+            text += (
+                f"; {self.pairs.number} pair(s) of wrong samples in a row count as not measured: one alarms when it "
+                f"comes, which is once per {1.0 / self.pairs.chance:.3g} rows by chance, and is among the false alarms"
+            )
         if self.holds:
             return text
         rarest = min(self.rows, self.every)
@@ -182,6 +204,7 @@ class LearnedThresholds:
             "scales": self.scales,
             "extrapolated": self.extrapolated,
             "settling": self.settling,
+            "pairs": {"number": self.pairs.number, "chance": self.pairs.chance},
         }
 
     def save(self, path: str | Path) -> Path:
@@ -266,6 +289,7 @@ def _from_dict(data: Mapping[str, Any]) -> LearnedThresholds:
         bool(data["extrapolated"]),
         tuple(map(str, data["left_out"])),
         int(data["settling"]),
+        WrongPairs(int(data["pairs"]["number"]), float(data["pairs"]["chance"])),
     )
 
 
@@ -308,13 +332,16 @@ def watched_values(residuals: FloatArray, evidence: Any) -> FloatArray | None:
 
 
 def thresholds_from_rows(
-    design: ObserverDesign, rows: FloatArray, *, every: float, dt: float, seed: int = 0
+    design: ObserverDesign, rows: FloatArray, *, every: float, dt: float, seed: int = 0, pairs: WrongPairs = NO_PAIRS
 ) -> LearnedThresholds:
-    """Return thresholds from ``rows (n, m)`` of all that may be watched, NaN where nothing is known.
+    """Return thresholds from ``rows (n, m)`` of all that may be watched, NaN where nothing is known; ``pairs``: what
+    does not stand in them, but alarms.
 
-    Where the fault estimates remember more than the rows can tell, the residuals alone are watched.
+    Where the fault estimates remember more than the rows can tell, or nearly follow from the residuals (the gains of a
+    filter move them, and what is left is how these change with the inputs), the residuals alone are watched.
     """
     names, known = watched_names(design), np.asarray(np.isfinite(rows).all(axis=1))
+    others = pairs.others(every)
     count = int(known.sum())
     if count < LEAST_NORMAL:
         raise SpecError(
@@ -327,15 +354,15 @@ def thresholds_from_rows(
     if not choices:
         raise SpecError("No monitored signal changes in these rows: there is no noise to learn from.", path="normal")
     fits = [(kept, fitted_autoregression(np.where(known[:, None], rows[:, kept], np.nan))) for kept in choices]
-    enough = [fit for fit in fits if rows_needed(fit[1], 1.0) <= count]
+    enough = [fit for fit in fits if rows_needed(fit[1], 1.0) <= count and (fit is fits[-1] or fit[1].is_regular)]
     kept, model = enough[0] if enough else min(fits, key=lambda fit: rows_needed(fit[1], 1.0))
     x = np.where(known[:, None], rows[:, kept], np.nan)
     told = tuple(names[i] for i in kept)
     statistics = Statistics(model, *signatures(design, kept, np.sqrt(np.nanvar(x, axis=0))))
-    if is_conformal(count, every):
-        statistics, levels = conformal_levels(x, every, statistics)
+    if is_conformal(count, others):
+        statistics, levels = conformal_levels(x, others, statistics)
     else:
-        levels = learned_levels(x, every, statistics, seed)
+        levels = learned_levels(x, others, statistics, seed)
     centres, scales = rows[known, :faults].mean(axis=0), rows[known, :faults].std(axis=0)
     return LearnedThresholds(
         told,
@@ -351,6 +378,7 @@ def thresholds_from_rows(
         levels.extrapolated,
         tuple(name for i, name in enumerate(names) if i not in kept),
         settling_rows(design),
+        pairs,
     )
 
 

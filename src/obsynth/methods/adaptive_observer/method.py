@@ -52,7 +52,7 @@ class AdaptiveObserver(DescriptorKalman):
     reset : float, optional, dimensionless
         Detect and reset: when the innovations of 20 samples pass a threshold (with this probability per sample where
         nothing has changed, such as 1e-6), S and the covariance of theta start again from S_0.  0, the default, never.
-    outliers, outlier_limit, sensors, state_bounds
+    outliers, outlier_limit, outlier_sizes, sensors, state_bounds
         As for `descriptor_kalman`.
     name : str, optional
         Name of the design.

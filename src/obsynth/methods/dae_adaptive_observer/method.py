@@ -66,7 +66,7 @@ class DaeAdaptiveObserver(Method):
         the connected one is found.
     window : int, optional
         Samples over which excitation is watched.
-    outliers, outlier_limit, sensors, state_bounds
+    outliers, outlier_limit, outlier_sizes, sensors, state_bounds
         As for `descriptor_kalman`; but the next step begins at the states within their bounds.
     reset : float, optional, dimensionless
         Detect and reset: when the innovations of 20 samples pass a threshold (with this probability per sample where
@@ -140,6 +140,7 @@ class DaeAdaptiveObserver(Method):
     window: Count = 50
     outliers: Outliers = "none"
     outlier_limit: Positive | None = None
+    outlier_sizes: Annotated[Any, WrittenAs("named vector")] = None
     sensors: Annotated[Any, WrittenAs("sensor times")] = None
     state_bounds: Annotated[Any, WrittenAs("named pairs")] = None
     reset: Probability = 0.0

@@ -47,6 +47,9 @@ class DescriptorKalman(Method):
         of one sensor; or taken at the limit (Huber's weight).
     outlier_limit : float, optional
         In standard deviations of the prediction: 6 for ``gate`` and 3 for ``huber`` by default.
+    outlier_sizes : array_like or mapping, optional
+        ``(ny,)``, or values by name, in units of the sensors: a sample that is nearer than this to its prediction is no
+        outlier, however many deviations it is off. `calibrate` finds them where a log has outliers.
     sensors : mapping, optional
         ``{name: {"every": N, "delay": D}}``: a sensor that is sampled every N rows (k = 0, N, 2 N, ...; what a log
         holds in the other rows is not used), or whose values are delayed by D rows: the value in row k is then that of
@@ -101,6 +104,7 @@ class DescriptorKalman(Method):
     early_constraints: bool = False
     outliers: Outliers = "none"
     outlier_limit: Positive | None = None
+    outlier_sizes: Annotated[Any, WrittenAs("named vector")] = None
     sensors: Annotated[Any, WrittenAs("sensor times")] = None
     state_bounds: Annotated[Any, WrittenAs("named pairs")] = None
 

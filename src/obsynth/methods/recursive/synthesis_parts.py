@@ -71,7 +71,11 @@ def recursive_synthesis(plant: TimeVaryingDescriptorSystem, options: Mapping[str
         claims |= {"excitation": facts.excitation, "excitation_k": float(facts.excitation_k)}
     resolved = {**options, "Q": observer.Q, "R": observer.R}
     # By the names of the plant that is filtered, as they were understood.
-    resolved |= {"sensors": observer.sensors, "state_bounds": observer.state_bounds}
+    resolved |= {
+        "outlier_sizes": observer.outlier_sizes,
+        "sensors": observer.sensors,
+        "state_bounds": observer.state_bounds,
+    }
     return Synthesis(
         plain_options(resolved),
         {"L": facts.L, "K": facts.K},

@@ -54,6 +54,7 @@ AS_GIVEN = (
     "window",
     "outliers",
     "outlier_limit",
+    "outlier_sizes",
     "sensors",
     "state_bounds",
     "reset",

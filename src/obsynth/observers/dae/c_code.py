@@ -174,6 +174,9 @@ def _option_constants(steps: Steps) -> list[str]:
         "LATEST": timing.longest,
     }
     lines = [f"#define {name} {value!r}" for name, value in numbers.items()]
+    if settings.outliers != "none":
+        least = settings.outlier_sizes
+        lines += c_table("OUTLIER_SIZES", np.zeros(settings.model.ny) if least is None else least)
     if limits:
         lines += c_table("RESET_LIMITS", np.array(limits))
     if ends:

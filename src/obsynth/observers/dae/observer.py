@@ -124,7 +124,7 @@ class DAEObserver(DAESettings):
         In nominal sizes of the states; see `obsynth.plants.dae.step.ImplicitStep`.
     window : int
         Samples over which excitation is watched.
-    outliers, outlier_limit, sensors, state_bounds
+    outliers, outlier_limit, outlier_sizes, sensors, state_bounds
         As for `RecursiveObserver`.
     reset : float
         Detect and reset: probability, per sample, that innovations which no change has made larger pass the threshold

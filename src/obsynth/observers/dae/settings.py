@@ -50,6 +50,7 @@ class DAESettings(StepObserver):
     window: Count = 50
     outliers: Outliers = "none"
     outlier_limit: float | None = None
+    outlier_sizes: FloatArray | None = None
     sensors: Mapping[str, Mapping[str, int]] | None = None
     state_bounds: FloatArray | None = None
     reset: Probability = 0.0

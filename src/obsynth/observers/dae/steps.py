@@ -13,7 +13,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import covariance_factor
 from obsynth.observers.dae.estimates import DAERow
 from obsynth.observers.dae.settings import DAESettings, initial_memory
-from obsynth.observers.dae.step_graph import observer_graph
+from obsynth.observers.dae.step_graph import ObserverGraph, observer_graph
 from obsynth.observers.outliers import checked_limit, has_jumped, no_refusals, projected, robust_advance, with_surprise
 from obsynth.plants.dae.functions import Compiled
 from obsynth.plants.dae.step import ImplicitStep, onto_constraint
@@ -35,8 +35,8 @@ class DAEState(NamedTuple):
 class Steps:
     """The steps of an observer: what follows from it alone, once for all runs."""
 
-    def __init__(self, settings: DAESettings) -> None:
-        self.settings, self.graph = settings, observer_graph(settings)
+    def __init__(self, settings: DAESettings, graph: ObserverGraph | None = None) -> None:
+        self.settings, self.graph = settings, observer_graph(settings) if graph is None else graph
         self._compiled: dict[str, Compiled] = {}
         self.limit = checked_limit(settings.outliers, settings.outlier_limit)
         self.implicit = ImplicitStep(self.graph.functions, settings.dt, largest_move=settings.largest_move)
@@ -60,7 +60,9 @@ class Steps:
         if self.settings.outliers == "none":
             after, row = take(state, y, u)
         else:
-            after, row = robust_advance(self.settings.outliers, self.limit, take, self.predicted, state, y, u)
+            after, row = robust_advance(
+                self.settings.outliers, self.limit, self.settings.outlier_sizes, take, self.predicted, state, y, u
+            )
         return (after, row) if self.settings.state_bounds is None else self.within_bounds(after, row)
 
     def within_bounds(self, state: DAEState, row: DAERow) -> tuple[DAEState, DAERow]:

@@ -49,6 +49,8 @@ class RecursiveObserver(RecursiveSettings):
         of one sensor; or taken at the limit.
     outlier_limit : float or None
         In standard deviations of the prediction: 6 for ``gate`` and 3 for ``huber`` by default.
+    outlier_sizes : FloatArray or None
+        ``(ny,)``, in units of the sensors: a sample that is nearer than this to its prediction is no outlier.
     sensors : mapping or None
         ``{name: {"every": rows, "delay": rows}}`` of the sensors that are sampled every so many rows, at k = 0, every,
         2 every, ..., or whose values are delayed by so many rows.
@@ -169,6 +171,7 @@ def observer_from_options(plant: TimeVaryingDescriptorSystem, options: Mapping[s
         options["early_constraints"],
         options.get("outliers", "none"),
         options.get("outlier_limit"),
+        options.get("outlier_sizes"),
         options.get("sensors"),
         options.get("state_bounds"),
     )

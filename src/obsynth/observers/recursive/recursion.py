@@ -136,6 +136,7 @@ class Recursion:
         return robust_advance(
             self.settings.outliers,
             self.limit,
+            self.settings.outlier_sizes,
             self.plain,
             self.predicted,
             state,

@@ -89,6 +89,7 @@ class RecursiveSettings(StepObserver):
     early_constraints: bool = False
     outliers: Outliers = "none"
     outlier_limit: float | None = None
+    outlier_sizes: FloatArray | None = None
     sensors: Mapping[str, Mapping[str, int]] | None = None
     state_bounds: FloatArray | None = None
 

@@ -272,7 +272,7 @@ def misfit(design: ObserverDesign) -> str:
     stated = _stated(design)
     if stated is None:
         return "the options stand for no observer of this plant"
-    filters = ("early_constraints", "outliers", "outlier_limit", "sensors", "state_bounds")
+    filters = ("early_constraints", "outliers", "outlier_limit", "outlier_sizes", "sensors", "state_bounds")
     names = ("state_names", "input_names", "output_names", "parameter_names", "dt", "horizon")
     adaptation = ("form", "forgetting", "guard", "window", "reset", "initial_parameters", "initial_covariance", "walk")
     for ours, theirs, fields in (

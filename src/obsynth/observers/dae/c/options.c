@@ -122,8 +122,10 @@ static int robust(const struct observer *state, const double *u, const double *y
     }
     for (i = 0; i < NY; i++) {
         int huge = fabs(y[i]) > OVERFLOW_LIMIT;
-        double pulled = mean[i] + OUTLIER_LIMIT * deviation[i] * (y[i] > mean[i] ? 1.0 : -1.0);
-        far[i] = fabs(y[i] - mean[i]) > OUTLIER_LIMIT * deviation[i] || huge;
+        double most = OUTLIER_LIMIT * deviation[i];
+        double reach = most < OUTLIER_SIZES[i] ? OUTLIER_SIZES[i] : most;
+        double pulled = mean[i] + reach * (y[i] > mean[i] ? 1.0 : -1.0);
+        far[i] = fabs(y[i] - mean[i]) > reach || huge;
         off[i] = y[i] - mean[i];
         /* A wrong sample stands alone; of a sensor, or a plant, that has moved the next is on the same side, as far off. */
         gone[i] = far[i] && (!GATE || !follows(state, i, off[i]) || huge);
