@@ -27,10 +27,12 @@ SIZES = {"longdouble", "clongdouble", "float96", "float128", "complex256", "int_
 
 
 Nodes = Sequence[ast.AST]
+#: What the rules look at.
+KINDS = (ast.Call, ast.Attribute, ast.Constant, ast.Import, ast.ImportFrom)
 
 
 def nodes_of(text: str) -> Nodes:
-    return list(ast.walk(ast.parse(text)))
+    return [node for node in ast.walk(ast.parse(text)) if isinstance(node, KINDS)]
 
 
 def calls(nodes: Nodes) -> Iterator[tuple[ast.Call, str]]:

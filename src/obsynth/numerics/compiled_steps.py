@@ -186,6 +186,17 @@ def _note_spreads(factor: FloatArray, deviations: FloatArray, covariance: FloatA
             covariance[i - nx, c - nx] = total
 
 
+@compiled
+def _note_again(k: int, deviations: FloatArray, covariances: FloatArray) -> None:
+    """Write what was noted a step before, entry by entry: for whole slices numba compiles twice as long."""
+    nx, walking = deviations.shape[1], covariances.shape[1]
+    for i in range(nx):
+        deviations[k, i] = deviations[k - 1, i]
+    for i in range(walking):
+        for c in range(walking):
+            covariances[k, i, c] = covariances[k - 1, i, c]
+
+
 def _steps(
     x: FloatArray,
     factor: FloatArray,
@@ -235,8 +246,7 @@ def _steps(
                 settled = settled + 1 if _is_settled(triangle, before, factor, lengths, SETTLED_FACTOR) else 0
         else:
             _solve_estimate(right, top, x, states[k])
-            deviations[k] = deviations[k - 1]
-            covariances[k] = covariances[k - 1]
+            _note_again(k, deviations, covariances)
     return len(data)
 
 

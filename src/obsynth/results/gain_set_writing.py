@@ -171,12 +171,18 @@ def count_of_numbers(value: Any) -> int:
 
 def plain(value: Any, arrays: dict[str, FloatArray] | None = None) -> Any:
     """Return ``value`` as JSON data, arrays (large ones in ``arrays``), NaN, infinities marked for `restored`."""
+    kind = type(value)
+    if kind is str or (kind is float and math.isfinite(value)):
+        # Most values by far, and asking whether one is a mapping takes longest.
+        return value
     if isinstance(value, np.ndarray):
         if arrays is not None and value.size >= SMALL_ARRAY and value.dtype == np.float64:
             name = f"array{len(arrays):05d}"
             arrays[name] = value
             return {"member": name}
-        return {"shape": list(value.shape), "data": [plain(x) for x in value.ravel().tolist()]}
+        data = value.ravel().tolist()
+        finite = value.dtype == np.float64 and bool(np.isfinite(value).all())
+        return {"shape": list(value.shape), "data": data if finite else [plain(x) for x in data]}
     if isinstance(value, (np.floating, np.integer, np.bool_)):
         return plain(value.item())
     if isinstance(value, float) and not math.isfinite(value):
