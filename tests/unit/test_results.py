@@ -383,7 +383,7 @@ class TestAtomicWriting:
         before = json.dumps(design_as_dict(design))
         design.save(tmp_path / "a.json")
         assert json.dumps(design_as_dict(design)) == before
-        assert gain_sets.SCHEMA_VERSION == 2
+        assert gain_sets.GAIN_SET_VERSION == 2
 
 
 PROGRAM = """
