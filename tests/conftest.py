@@ -1,18 +1,20 @@
 """What all tests share: how many of the cases drawn at random a run looks at, and which tests other machines run.
 
-`.ci/run` takes the tests marked ``sampled`` once more with all their cases (``--whole``), and those marked ``numerics``
-with other processors' kernels and with the oldest dependencies.
+`.ci/run` takes the tests marked ``sampled`` once more with the cases that were left out (``--rest``), and those marked
+``numerics`` with other processors' kernels and with the oldest dependencies.
 """
 
 from __future__ import annotations
 
+import zlib
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-#: Without ``--whole`` one of so many cases that are drawn at random is looked at.
+#: Without ``--whole`` or ``--rest`` one of so many cases that are drawn at random is looked at.
 PARTS = 4
 #: Files of tests that decide something numerically.
 NUMERIC = frozenset({
@@ -33,8 +35,9 @@ NUMERIC = frozenset({
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--whole", action="store_true", help="all cases of the tests marked sampled, not a share of them")
     parser.addoption(
-        "--whole", action="store_true", help="all random cases of the tests marked sampled, not a share of them"
+        "--rest", action="store_true", help="the cases of the tests marked sampled that a run without it leaves out"
     )
 
 
@@ -44,13 +47,41 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
     return True if config.option.markexpr == "numerics" and is_test and collection_path.name not in NUMERIC else None
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     for item in items:
         if item.path.name in NUMERIC:
             item.add_marker(pytest.mark.numerics)
         drawn = getattr(getattr(item, "function", None), "is_hypothesis_test", False)
         if drawn or "share" in getattr(item, "fixturenames", ()):
             item.add_marker(pytest.mark.sampled)
+    left_out = _left_out(config, items)
+    config.hook.pytest_deselected(items=list(left_out))
+    items[:] = [item for item in items if item not in left_out]
+
+
+def _left_out(config: pytest.Config, items: Sequence[pytest.Item]) -> set[pytest.Item]:
+    """Return the cases of tests marked ``one_in`` that this run leaves out; mark these tests ``sampled``."""
+    cases: dict[str, list[pytest.Item]] = defaultdict(list)
+    for item in items:
+        if item.get_closest_marker("one_in"):
+            item.add_marker(pytest.mark.sampled)
+            cases[item.nodeid.partition("[")[0]].append(item)
+    found: set[pytest.Item] = set()
+    for test, same in cases.items():
+        parts = max(item.get_closest_marker("one_in").args[0] for item in same)
+        # Not the first of each test: these are often alike.
+        first = zlib.crc32(test.encode()) % parts
+        found.update(set(same) - set(looked_at(same[first:] + same[:first], parts, config)))
+    # A case that is named on the command line is run.
+    return {item for item in found if item.nodeid not in config.args}
+
+
+def looked_at(cases: Sequence[Any], parts: int, config: pytest.Config) -> Sequence[Any]:
+    """Return the cases of a family that this run looks at: one in ``parts``, the others (``--rest``) or all."""
+    if config.option.whole:
+        return cases
+    others = [case for number, case in enumerate(cases) if number % parts]
+    return others or cases if config.option.rest else cases[::parts]
 
 
 @pytest.fixture
@@ -65,10 +96,12 @@ def taken_as_verified(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="session")
 def share(pytestconfig: pytest.Config) -> Callable[..., Sequence[Any]]:
-    """Return the cases of a family that this run looks at: all with ``--whole``, else one in ``parts``."""
-    whole = pytestconfig.getoption("--whole")
+    """Return the cases of a family that this run looks at: one in ``parts``, the others (``--rest``) or all.
 
-    def taken(cases: Sequence[Any], parts: int = PARTS) -> Sequence[Any]:
-        return cases if whole else cases[::parts]
+    Where a test judges its cases ``together``, by a count, the others alone would be another test: it takes all.
+    """
+
+    def taken(cases: Sequence[Any], parts: int = PARTS, *, together: bool = False) -> Sequence[Any]:
+        return cases if together and pytestconfig.option.rest else looked_at(cases, parts, pytestconfig)
 
     return taken

@@ -139,6 +139,7 @@ def test_design_a_depends_on_q(variance: str) -> None:
     assert measured == pytest.approx(RMSE[f"A_with_Q_{variance}"]["exp50"], rel=6e-3, abs=6e-5)
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("start", ["1", "1e-4", "1e-5"])
 def test_the_transient_is_that_of_s0(start: str) -> None:
     observer = design("two_outputs", initial_parameter_covariance=float(start)).observer

@@ -42,6 +42,7 @@ def estimates(forgetting: float) -> np.ndarray:
     return np.array([observer.run(y, u).parameters for y in runs])
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("forgetting", [0.9, 0.95, 0.98])
 def test_transients_and_errors_are_those_of_the_notes(forgetting: float) -> None:
     """The paper: about 100 s.  The audit, on its own data: 12, 31 and 103 s to 90 % of a step of the bias."""

@@ -3,7 +3,7 @@
 import pytest
 from hypothesis import HealthCheck, settings
 
-#: Examples of each property with ``--whole``, and without: CI runs both.
+#: Examples of each property with ``--whole`` or ``--rest``, and without: CI runs both.
 EXAMPLES, FEWER = 15, 5
 
 
@@ -13,7 +13,7 @@ def pytest_configure(config: pytest.Config) -> None:
         deadline=None,
         derandomize=True,
         database=None,
-        max_examples=EXAMPLES if config.getoption("--whole") else FEWER,
+        max_examples=EXAMPLES if config.option.whole or config.option.rest else FEWER,
         suppress_health_check=[HealthCheck.too_slow],
     )
     settings.load_profile("obsynth")

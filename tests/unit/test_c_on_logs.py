@@ -233,6 +233,7 @@ def test_headers_say_what_a_controller_needs(shipped: SimpleNamespace) -> None:
         subprocess.run([cc, "-Wall", "-Werror", "-fsyntax-only", str(shipped.folder / "all.cpp")], check=True)
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("name", [*LINEAR, *NONLINEAR])
 def test_c_says_what_a_run_says(shipped: SimpleNamespace, name: str) -> None:
     design, log = shipped.designs[name], log_of(shipped.designs[name])

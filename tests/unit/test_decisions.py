@@ -45,7 +45,7 @@ def fresh(seed: int, jump: float, missing: bool, adapt: dict):
 @pytest.mark.parametrize("statistic", STATISTICS)
 def test_false_alarms_are_as_rare_as_asked(statistic: str, share: Callable[..., Any]) -> None:
     """At 5 % more than seven of forty runs without a change alarm with 0.0007, more than four of twenty with 0.003."""
-    alarms, seeds = 0, share(range(40), 2)
+    alarms, seeds = 0, share(range(40), 2, together=True)
     for seed in seeds:
         decision = decide(*run(seed), statistic=statistic, false_alarms=0.05)
         alarms += decision.alarm is not None

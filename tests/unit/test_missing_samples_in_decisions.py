@@ -97,7 +97,7 @@ def test_false_alarms_of_the_glr_with_gaps(gaps: str, share: Callable[..., Any])
     )
     shipped = observer_for(plant, Q=0.1 * np.eye(2), R=0.2 * np.eye(2), adapt={})
     alarms, found = 0, 0
-    runs = share(range(30), 3)
+    runs = share(range(30), 3, together=True)
     for _ in runs:
         for jump in (0.0, 1.5):
             x, y = rng.standard_normal(2), np.full((121, 2), np.nan)

@@ -61,7 +61,7 @@ def scattered(part: int) -> list[int]:
 
 
 def test_the_plants_have_short_and_long_indexes(share: Callable[..., Any]) -> None:
-    looked_at = [seed for part in range(4) for seed in share(scattered(part), 2)]
+    looked_at = [seed for part in range(4) for seed in share(scattered(part), 2, together=True)]
     assert {max(designed(seed).observer.fault_delays) for seed in looked_at} == {1, 2, 3}
     # Feedthrough and sensor faults are among them.
     assert {seed % 4 for seed in looked_at} == {0, 1, 2, 3}
@@ -127,7 +127,7 @@ def test_an_allowance_relative_to_the_terms_would_refuse_some_of_them() -> None:
 
 def test_a_gain_wrong_by_a_hundred_units_fails_in_nearly_all_entries(share: Callable[..., Any]) -> None:
     noticed = total = 0
-    for seed in share(scattered(0) + scattered(1) + scattered(2) + scattered(3), 6):
+    for seed in share(scattered(0) + scattered(1) + scattered(2) + scattered(3), 6, together=True):
         rng = np.random.default_rng(100 + seed)
         for letter in "TNLW":
             gains = rounded(seed, PERTURBED_DIGITS)

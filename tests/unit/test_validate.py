@@ -198,6 +198,7 @@ def walking_design(tank_design, walk: float, form: str = "augmented-kalman", R: 
     )  # fmt: skip
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("form", ["augmented-kalman", "random-walk"])
 @pytest.mark.parametrize("walk", [0.003, 0.3])
 def test_a_walk_that_is_stated_large_is_no_disagreement(tank_design, form, walk):
