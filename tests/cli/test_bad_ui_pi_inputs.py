@@ -82,7 +82,7 @@ CASES: dict[str, tuple[dict, dict, str, int, tuple[str, ...], dict]] = {
         PAPER, {"fault_model": {"f1": "step", "f2": "step"}}, "SpecError", 2, ("no signal named 'f2'",), {}),
     "no model for a fault": (
         {**PAPER, "Bf": [[1, 0], [1, 0], [1, 1]]}, {"fault_model": {"f1": "step"}}, "SpecError", 2,
-        ("says nothing about 'f2'",), {}),
+        ("has no entry for 'f2'",), {}),
     "a fault model with a hidden state": (
         PAPER, {"fault_model": {"Phi": [[0, 0], [0, -1]], "Cw": [[1, 0]]}}, "SpecError", 2,
         ("is unobservable in the fault",), {}),

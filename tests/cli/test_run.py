@@ -191,7 +191,7 @@ def test_files_that_are_not_there_or_not_right(gains, capsys):
     Path("bad.parquet").write_text("no parquet")
     refused("bad.parquet cannot be read", data="bad.parquet")
     refused("'high' is no number", "--scale", "x2=high")
-    refused("no signal that this observer reads", "--map", "x9=a")
+    refused("no input or output of this observer", "--map", "x9=a")
     refused("There is no column 'f'", "--threshold", "f=1")
     refused("gap is for continuous-time designs", "--gap", "2")
     refused("cannot both go to stdout", "--json", out="-")

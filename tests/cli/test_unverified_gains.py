@@ -93,9 +93,9 @@ def test_a_report_edited_to_pass_changes_nothing(folder: Path) -> None:
 
 def test_functions_refuse_what_fails_and_many_runs_say_so(folder: Path) -> None:
     design = failing()
-    with pytest.raises(obsynth.VerificationError, match="not handed on"):
+    with pytest.raises(obsynth.VerificationError, match="not used"):
         obsynth.export(design, folder / "out.c")
-    with pytest.raises(obsynth.VerificationError, match="not handed on"):
+    with pytest.raises(obsynth.VerificationError, match="not used"):
         obsynth.online_monitor(design, disturbance_bounds={"w": 1.0})
     assert obsynth.export(design, folder / "out.c", unverified=True)
     (folder / "many").mkdir()

@@ -84,7 +84,7 @@ def test_the_literal_observer_is_refused_on_the_literal_data(capsys: pytest.Capt
         obsynth.design(spec.plant, spec.method, **spec.options)
     assert caught.value.condition == "residual directions"
     assert main(["design", "--system", str(FOLDER / "as_printed.yaml"), "--quiet"]) == 3
-    assert "it never learns" in capsys.readouterr().err
+    assert "the parameters are never corrected" in capsys.readouterr().err
 
 
 def test_and_rightly_so() -> None:
@@ -125,7 +125,7 @@ def test_the_innovation_form_loses_excitation() -> None:
     found = design("spec", form="innovation", random_walk=None, forgetting=0.95, Q=1e-4)
     assert found.report.passed
     assert found.certificate.claims["excitation"] < 1e-20
-    assert "hardly excited" in found.notes[0]
+    assert "poorly excited" in found.notes[0]
     for profile, measured in rmse(found.observer, "spec").items():
         assert measured == pytest.approx(RMSE["innovation_regularised"][profile], rel=6e-3, abs=6e-5), profile
     unguarded = design("spec", form="innovation", random_walk=None, forgetting=0.95, Q=1e-4, guard="none")

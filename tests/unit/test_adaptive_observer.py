@@ -173,7 +173,7 @@ class TestLearning:
         assert np.abs(learning.parameters[-1]).max() > 0.1
 
     def test_the_refusal(self) -> None:
-        with pytest.raises(PreconditionError, match=r"sees only rank E \+ ny - nx = 0 residual directions") as caught:
+        with pytest.raises(PreconditionError, match=r"uses only rank E \+ ny - nx = 0 residual directions") as caught:
             residual_condition(horizon_ranks(printed(horizon=50))).require()
         assert "'innovation'" in str(caught.value)
         assert caught.value.condition == "residual directions"

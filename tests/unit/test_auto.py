@@ -86,4 +86,4 @@ def test_figures_are_what_a_simulation_gives() -> None:
     assert found.at_horizon == pytest.approx(estimate[399], rel=1e-9)
     assert found.most == pytest.approx(0.02 * np.argmax(estimate >= 0.9))
     assert found.deviation == pytest.approx(design.certificate.matrices["deviations"][0, 0], rel=0.02)
-    assert found.leak < 1e-9
+    assert found.unknown_input_gain < 1e-9

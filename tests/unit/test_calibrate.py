@@ -199,7 +199,7 @@ def test_one_sensor_in_other_units_is_refused_by_name():
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
-        ({"unknown": {}, "noisy": [], "R": {"y": 1e-4}}, "nothing is to be found"),
+        ({"unknown": {}, "noisy": [], "R": {"y": 1e-4}}, "there is nothing to estimate"),
         ({"unknown": {"Tau": (1, 2)}}, "Tau"),
         ({"unknown": {"T": (4, 9)}}, "outside its bounds"),
         ({"unknown": {"T": (9, 4)}}, "low, high"),

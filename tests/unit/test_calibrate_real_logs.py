@@ -174,7 +174,7 @@ def test_another_unit_of_one_sensor_of_a_linear_plant_is_refused() -> None:
     log = {"time": np.arange(150.0), "u1": u, "y1": y[:, 0], "y2": y[:, 1]}
     unknown = {"p": (0.1, 1.2), "c": (0.0, 2.0), "b": (0.1, 3.0)}
     assert calibrate(plant, log, unknown, starts=1, input_delay=0).box.holds({"p": 0.9, "c": 0.5, "b": 1.0})
-    with pytest.raises(PreconditionError, match=r"y1: .* times what the model says") as caught:
+    with pytest.raises(PreconditionError, match=r"y1: .* times that of the model") as caught:
         calibrate(plant, {**log, "y1": 1000.0 * y[:, 0]}, unknown, starts=1)
     assert caught.value.code == "explains-nothing"
 

@@ -87,7 +87,7 @@ def pendulum(**changes: object) -> obsynth.DescriptorSystem:
 
 def test_an_unstable_descriptor_plant_is_held_and_compared() -> None:
     found = obsynth.compare(pendulum(), runs=2, tolerance=0.02, methods=["functional-filter", "ui-pi-observer"])
-    assert "a state feedback holds the unstable plant" in found.setting
+    assert "a state feedback stabilises the plant" in found.setting
     for entry in found.methods:
         assert entry.faults[0].figures.at_horizon == pytest.approx(1.0, abs=0.05)
         assert entry.rms < 0.5

@@ -1,4 +1,4 @@
-"""Logs nobody cleaned: blanks, gaps and what monitors say after them."""
+"""Logs with flaws: blanks, gaps and what monitors say after them."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ def drive() -> obsynth.ObserverDesign:
 
 def test_the_step_is_found_and_nothing_before_it() -> None:
     watched = obsynth.monitor(drive(), spec().scenario)
-    assert "no function of these samples has one below 0.045456" in watched.statement
+    assert "no function of these samples has a threshold below 0.045456" in watched.statement
     found = watched.watch(obsynth.simulate(drive(), spec().scenario).estimates)
     # 0.1 N m are more than twice the threshold: found at the latest 19 samples after the step at 4 s.
     assert found.time is not None
@@ -88,7 +88,7 @@ def test_three_levels_isolate_three_faults() -> None:
     bank = three()
     assert bank.report.passed
     assert bank.groups == (("leak 1",), ("leak 2",), ("clog 13",))
-    with pytest.raises(obsynth.SpecError, match="Nothing hides this fault"):
+    with pytest.raises(obsynth.SpecError, match="No combination of signals hides this fault"):
         obsynth.plotting.plot_hidden_course(bank)
     assert set(bank.pairs) == {(one, two) for one in LEVELS for two in LEVELS if one != two}
     # Blind to less, a test is no worse; blind to all others it is that alone.

@@ -253,7 +253,7 @@ class TestPictures:
     def test_decoupled_disturbances_are_said_not_to_get_through(self, continuous):
         assert not estimate_gains(continuous).gains["disturbances"].any()
         labels = [text.get_text() for text in plot_gains(continuous).get_legend().get_texts()]
-        assert labels == ["faults to fault estimates", "disturbances: nothing gets through"]
+        assert labels == ["faults to fault estimates", "disturbances: zero gain"]
 
     def test_poles_are_those_of_the_observer(self, continuous):
         (points,) = [line for line in plot_poles(continuous).get_lines() if line.get_marker() == "x"]

@@ -43,7 +43,7 @@ def test_parameters_and_their_band(run) -> None:
         half = BAND_WIDTH * found.parameter_deviations[:, i]
         assert corners.max() == pytest.approx((found.parameters[:, i] + half).max())
         held = np.abs(found.parameters[:, i] - 1.0) <= half
-        label = f"95 % band of the model, holds the truth in {100 * held.mean():.0f} % of samples"
+        label = f"95 % band while the model holds, contains the truth in {100 * held.mean():.0f} % of samples"
         assert axes.collections[0].get_label() == label
     with pytest.raises(SpecError, match="true signals have shape"):
         plot_parameters(found, parameters=np.ones((29, 2)))

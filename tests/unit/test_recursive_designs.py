@@ -109,7 +109,7 @@ def test_callables_are_used_but_not_saved(tmp_path: Path) -> None:
 
 class TestRefusals:
     def test_the_printed_example_in_the_literal_form(self) -> None:
-        with pytest.raises(PreconditionError, match=r"sees only rank E \+ ny - nx = 0 residual directions") as caught:
+        with pytest.raises(PreconditionError, match=r"uses only rank E \+ ny - nx = 0 residual directions") as caught:
             obsynth.adaptive_observer(printed(horizon=100), form="literal", **NOISE)
         assert caught.value.condition == "residual directions"
 

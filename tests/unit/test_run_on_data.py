@@ -437,9 +437,9 @@ def test_options_are_checked(sampled, continuous):
         run_on_data(continuous, table, warm_up=-1.0)
     with pytest.raises(SpecError, match="chunk_rows"):
         run_on_data(continuous, table, chunk_rows=0)
-    with pytest.raises(SpecError, match="no signal that this observer reads"):
+    with pytest.raises(SpecError, match="no input or output of this observer"):
         run_on_data(continuous, table, columns={"speed": "y1"})
-    with pytest.raises(SpecError, match="'time' is no signal"):
+    with pytest.raises(SpecError, match="'time' is no input"):
         run_on_data(continuous, table, columns={"time": "time"}, scales={"time": 1e-3})
     with pytest.raises(SpecError, match="scale of 'y1'"):
         run_on_data(continuous, table, scales={"y1": 0.0})

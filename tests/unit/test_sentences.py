@@ -96,7 +96,7 @@ def test_a_box_is_told_in_per_cent_or_by_its_ends() -> None:
     mixed = constants_box({"a": {"nominal": 2.0, "tolerance": "5 %"}, "b": {"range": [-0.5, 0.5], "unit": "m"}})
     assert mixed.phrase == "constants (a in 1.9 .. 2.1, b in -0.5 .. 0.5 m; the same at all times)"
     around_zero = constants_box({"b": {"range": [-0.5, 0.5]}}, variation="varying")
-    assert around_zero.phrase == "constants (b in -0.5 .. 0.5; anything there at each sample)"
+    assert around_zero.phrase == "constants (b in -0.5 .. 0.5; they may change from sample to sample)"
     off = constants_box({"a": {"nominal": 2.0, "range": [1.9, 2.2]}})
     assert off.phrase == "constants (a in 1.9 .. 2.2; the same at all times)"
     many = constants_box({f"c{i}": {"nominal": 1.0, "range": [0.5, 1.0 + i]} for i in range(9)})

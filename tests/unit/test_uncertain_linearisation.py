@@ -172,7 +172,7 @@ def test_a_calibration_file_gives_the_box(tmp_path: Path) -> None:
     [
         ("constants: {b1: 2 %}", "constants: {b9: 2 %}", "no constant and no parameter"),
         ("constants: {b1: 2 %}", "constants: {leak: {range: [0.0, 0.04]}}, faults: [leak]", "is a fault"),
-        ("constants: {b1: 2 %}}\n    sample_time: 1.0", "constants: {b1: {range: [0.03, .inf]}}}", "open side"),
+        ("constants: {b1: 2 %}}\n    sample_time: 1.0", "constants: {b1: {range: [0.03, .inf]}}}", "needs both ends"),
         ("  transform:\n    linearise: {at: equilibrium, given: {leak: 0.03, h1: 0.7, h3: 0.65}, free: [u1, u3], "
          "constants: {b1: 2 %}}\n    sample_time: 1.0\n", "", "tolerances are for the linear model"),
         ("tolerance: 2 %, unit", "unit", "no constant|tolerances"),

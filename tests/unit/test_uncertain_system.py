@@ -33,9 +33,9 @@ def test_nominal_values_and_ranges() -> None:
     ("constants", "words"),
     [
         ({"k": {"nominal": 0.0, "tolerance": "5 %"}, "m": 1.0}, "zero, which has no per cent"),
-        ({"k": {"range": [1.0, float("inf")]}, "m": 1.0}, "open side"),
-        ({"k": {"range": [1.0]}, "m": 1.0}, "open side"),
-        ({"k": {"range": [1.0, None]}, "m": 1.0}, "open side"),
+        ({"k": {"range": [1.0, float("inf")]}, "m": 1.0}, "needs both ends"),
+        ({"k": {"range": [1.0]}, "m": 1.0}, "needs both ends"),
+        ({"k": {"range": [1.0, None]}, "m": 1.0}, "needs both ends"),
         ({"k": {"nominal": 2.0, "tolerance": 5}, "m": 1.0}, "5 %"),
         ({"k": {"nominal": 2.0, "tolerance": "five"}, "m": 1.0}, "per cent"),
         ({"k": {"nominal": 2.0, "tolerance": "-5 %"}, "m": 1.0}, "per cent"),
@@ -94,7 +94,7 @@ def test_tolerances_go_through_a_gain_set_and_are_dropped_with_other_matrices(tm
         lambda plant: plant_at(plant, {}),
         lambda plant: obsynth.robustness(design.replace(plant=plant)),
     ):
-        with pytest.raises(PreconditionError, match="left behind: A was changed"):
+        with pytest.raises(PreconditionError, match="not carried over: A was changed"):
             use(changed)
 
 
@@ -169,7 +169,7 @@ def test_a_method_that_eliminates_by_itself_keeps_the_tolerances() -> None:
     design = obsynth.ui_pi_observer(plant)
     assert design.plant.uncertainty.steps == (("eliminate", 0.0),)
     assert not design.plant.uncertainty.lost
-    assert not any("left behind" in note for note in design.notes)
+    assert not any("not carried over" in note for note in design.notes)
     kept = obsynth.ui_pi_observer(obsynth.eliminate_algebraic_states(plant).plant)
     assert kept.plant.uncertainty.box.names == ("p",)
     assert obsynth.robustness(kept).finite_for_ever

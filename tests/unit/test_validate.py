@@ -205,7 +205,7 @@ def test_a_walk_that_is_stated_large_is_no_disagreement(tank_design, form, walk)
     """A walk is what a fault may do: innovations of rows without one are smaller than with it, and not white."""
     found = validate(walking_design(tank_design, walk, form), walking_tank(0.0))
     assert found.passed, str(found)
-    assert any("no walk of clog" in sentence for sentence in found.verdict)
+    assert any("no random walk of clog" in sentence for sentence in found.verdict)
     # What is wrong beside the walk is still told, by its factor.
     wrong = validate(walking_design(tank_design, walk, form, R=1e-4 / 8.0), walking_tank(0.0))
     assert not wrong.passed

@@ -191,7 +191,7 @@ def test_a_no_that_holds_only_exactly_names_the_gain_it_would_take(units: float)
     hidden = made(None, NEARLY_HIDDEN["A"], C=[[units, -units]], Bf=[[1], [0]])
     lost = pd_observer_conditions(hidden)[-1]
     assert (lost.holds, lost.unclear) == (False, None)
-    told = re.search(r"any observer would need a gain of about (\S+) from 'y1' to 'x[12]'", lost.detail)
+    told = re.search(r"every observer needs a gain of about (\S+) from 'y1' to 'x[12]'", lost.detail)
     assert told is not None
     assert float(told[1]) * units == pytest.approx(1e16, rel=0.2)
     with pytest.raises(PreconditionError, match=r"^No observer of this kind exists: .*detectability"):
@@ -200,7 +200,7 @@ def test_a_no_that_holds_only_exactly_names_the_gain_it_would_take(units: float)
 
 def test_what_no_output_holds_anything_of_no_digits_would_show() -> None:
     plant = made(None, [[0.5, 0], [0, 1.5]], C=[[1, 0]], dt=0.1)
-    assert "No output holds anything of it" in kalman(plant)[-1].detail
+    assert "No output depends on it" in kalman(plant)[-1].detail
 
 
 def test_a_long_fault_model_has_a_witness_of_its_own() -> None:

@@ -130,7 +130,7 @@ def identifiability(
         raise SpecError(f"R is {noise.shape}, but ({model.ny}, {model.ny}) is needed.", path="R")
     root = covariance_factor(noise, "R")
     if not is_definite(noise, root):
-        raise SpecError("R must be positive definite: a sensor without noise would tell everything.", path="R")
+        raise SpecError("R must be positive definite: a sensor without noise has no likelihood.", path="R")
     x = finite_vector(initial_state, model.state_names, model.nominal_state, "initial_state")
     theta = finite_vector(parameters, model.parameter_names, model.nominal_parameters, "parameters")
     sizes = np.where(theta != 0.0, np.abs(theta), 1.0)
@@ -192,7 +192,7 @@ def _sensitivities(
 
 #: The step is shortened by these factors.  Short enough that dF/dx' rules, long enough that index 3 stays countable.
 SHORTENINGS = (1e-2, 1e-3)
-#: Equations and states with at least this share of the largest entry of a singular vector are named.
+#: Equations and states with at least this relative to its largest value entry of a singular vector are named.
 LEADING_SHARE = 0.1
 
 

@@ -113,7 +113,7 @@ class FaultZeros:
     zeros: tuple[Zero, ...]
     outside: tuple[Zero, ...]  # those not strictly stable
     normal_rank_full: bool  # rank nx + nf at almost every z
-    hidden_direction: FloatArray | None  # ``(nf,)``: never shows, unless that rank is full
+    hidden_direction: FloatArray | None  # ``(nf,)``: has no effect on the outputs, unless that rank is full
     hidden_faults: tuple[str, ...]
     decisions: tuple[RankDecision, ...]
 

@@ -136,7 +136,7 @@ def calibration_problem(
     variances = int(np.isnan(known_Q).sum() + np.isnan(known_R).sum())
     if not names and not variances:
         raise SpecError(
-            "unknown is empty, and Q and R are known: nothing is to be found. Name constants with their "
+            "unknown is empty, and Q and R are known: there is nothing to estimate. Name constants with their "
             "bounds, or leave variances out.",
             path="unknown",
         )
@@ -250,6 +250,6 @@ def require_variation(problem: Problem) -> None:
     if not np.nanstd(problem.y, axis=0).any() and not np.std(problem.u, axis=0).any():
         raise refused(
             "not-exciting",
-            "Nothing moves in these rows: every signal is constant, and no dynamics show.",
+            "Every signal is constant in these rows: they hold no information on the dynamics.",
             signals=list(problem.unknown),
         )

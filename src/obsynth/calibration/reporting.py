@@ -351,8 +351,8 @@ def _told(problem: Problem, R: dict[str, float], timing: Timing, error: Integrat
     for name, step in zip(problem.output_names, problem.quanta, strict=True):
         if step > 0.0 and R[name] < AT_QUANTISATION * step**2 / EVEN:
             found.append(
-                f"The noise of {name} is at its quantisation ({step:.3g} / sqrt 12): its R is no lower in "
-                "truth than what a ramp makes of it."
+                f"The noise of {name} is at its quantisation ({step:.3g} / sqrt 12): its R is at least that of the "
+                "quantisation."
             )
     if timing.delay and timing.losses:
         rows = "1 row" if timing.delay == 1 else f"{timing.delay} rows"

@@ -76,8 +76,8 @@ class CalibratedBox:
         if self.open_sides:
             name, side = self.open_sides[0]
             raise SpecError(
-                f"The box of {name!r} has an open {side} side: the log bounds nothing there. State its range, or take "
-                "a log that moves it.",
+                f"The box of {name!r} has an open {side} side: the log does not bound it there. State its range, or "
+                "take a log that excites it.",
                 path=f"constants.{name}",
             )
         return {

@@ -237,7 +237,7 @@ def _require_levels(problem: Problem, fit: Fit, simulated: FloatArray, judged: B
     far &= fit.deviations > UNEXPLAINED * np.nanstd(y, axis=0)
     far &= judged & (level | _shares(problem, fit.deviations)[1])
     if far.any():
-        told = ", ".join(f"{names[i]}: {1.0 / levels[i]:.3g} times what the model says" for i in np.flatnonzero(far))
+        told = ", ".join(f"{names[i]}: {1.0 / levels[i]:.3g} times that of the model" for i in np.flatnonzero(far))
         raise refused(
             "explains-nothing",
             f"The model cannot follow the log: {told}. Check units and scales (a factor of 1000?).",

@@ -456,7 +456,10 @@ def _explained(told: Sequence[Explanation]) -> str:
     if not told:
         return "No single offset, correlated noise, delay of an input or constant explains that: look at the residuals."
     listed = "; ".join(f"{item.text} ({item.gain:.3g} nats)" for item in told)
-    return f"What explains it best, by likelihood: {listed}. The factors of Q and R say nothing until then."
+    return (
+        f"What explains it best, by likelihood: {listed}. The factors of Q and R have no meaning until that is "
+        "corrected."
+    )
 
 
 def _far(

@@ -62,9 +62,9 @@ def told_shares(names: Sequence[str], walk: FloatArray, shares: FloatArray) -> l
     found = []
     for name, share, variance in zip(names, shares.tolist(), np.diag(walk).tolist(), strict=False):
         if variance > 0.0 and share == 0.0:
-            found.append(f"These rows show no walk of {name}: they are judged without it.")
+            found.append(f"These rows show no random walk of {name}: they are compared without it.")
         elif variance > 0.0 and share < 1.0:
             found.append(
-                f"These rows show {share:.2g} of the variance by which {name} may walk: they are judged with that."
+                f"These rows show {share:.2g} of the variance by which {name} may walk: they are compared with that."
             )
     return found

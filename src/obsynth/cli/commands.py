@@ -300,7 +300,9 @@ def _calibrated_again(options: argparse.Namespace) -> dict[str, Any]:
     plant, _ = load_plant(options.system)
     asked = read_json(options.gains).get("asked")
     if not isinstance(asked, dict):
-        raise SpecError(f"{options.gains} does not say what was asked: calibrate again.", path=str(options.gains))
+        raise SpecError(
+            f"{options.gains} does not hold the options of its calibration: calibrate again.", path=str(options.gains)
+        )
     return calibrate(plant, options.data, **restored(asked)).to_dict()
 
 

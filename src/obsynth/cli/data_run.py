@@ -168,7 +168,7 @@ def monitor_of(design: ObserverDesign, options: argparse.Namespace, *, has_scena
     """Return the monitor that is asked for."""
     if options.monitor is None:
         of_monitors = (*(() if has_scenario else ("system",)), "sample_time", *monitor_names())
-        refuse_given(options, of_monitors, "a monitor: say which one by --monitor")
+        refuse_given(options, of_monitors, "a monitor: name it with --monitor")
         return None
     from obsynth.data.online_monitor import online_monitor
     from obsynth.observers.linear.observer import LinearObserver

@@ -75,7 +75,7 @@ exit codes:
 _SWEEP_DETAILS = """\
 A value list is a YAML list: --set gamma='[0.1, 0.2]' --set plant.transform.sample_time='[0.01, 0.02]'
 --set plant.C.outputs='[[omega 1], [omega 1, omega 2]]'.  A name that begins with no section of a spec is an option of
-its method.  The folder keeps every gain set and result: the same command goes on where another was stopped.
+its method.  The folder keeps every gain set and result: the same command continues where an interrupted one ended.
 """
 _RUN_DETAILS = """\
 The data have a column 'time', in seconds or as dates and times (ISO 8601), and one for each known input and output,
@@ -224,7 +224,7 @@ VERBS = {
     ),
     "compare": Verb(
         "scenarios:run_compare",
-        "Design by every method that exists for a spec's plant, and show them side by side on its scenario.",
+        "Design by every method that exists for a spec's plant, and compare them on its scenario.",
         (
             SYSTEM,
             option("--data", "FILE", "a log, as for run, to replay through every method", type=Path),
@@ -428,7 +428,7 @@ VERBS = {
                     option(
                         "--precision",
                         None,
-                        "of the numbers in .c (default: double); the header says what floats change",
+                        "of the numbers in .c (default: double); the header states the error of floats",
                         choices=("double", "float"),
                     ),
                     option(
@@ -501,8 +501,8 @@ VERBS = {
     ),
     "linearise": Verb(
         "calibration:run_linearise",
-        "Linearise the nonlinear plant of a spec: exact matrices at an equilibrium (that of the spec's own transform, "
-        "unless an option says otherwise), or the reason why there is none.",
+        "Linearise the nonlinear plant of a spec: exact matrices at an equilibrium (by default that of the spec's "
+        "transform), or the reason why there is none.",
         (
             SYSTEM,
             Settings(

@@ -122,7 +122,7 @@ def run_evaluate(options: argparse.Namespace) -> int:
         return _run_tolerances(options)
     refuse_given(options, ("out", "force"), "the picture or certificate of --tolerances")
     if options.monitor is None:
-        refuse_given(options, monitor_names(), "a monitor: say which one by --monitor")
+        refuse_given(options, monitor_names(), "a monitor: name it with --monitor")
     with progress(quiet=options.quiet) as report_stage:
         spec, scenario, _, design = _prepared(options, report_stage)
         report_stage("running")

@@ -255,7 +255,7 @@ def compare(
     if unused:
         raise SpecError(f"{unused[0]} is for a log: give data.", path=unused[0])
     if scenario is not None and disturbance != 1.0:
-        raise SpecError("disturbance is for the scenario that is made up: one is given, which says its own.",
+        raise SpecError("disturbance is for the default scenario: the scenario that is given states its own.",
                         path="disturbance")  # fmt: skip
     if plant.dt and sample_time not in (None, plant.dt):
         raise SpecError(f"sample_time is for continuous plants: this one has {plant.dt:g} s.", path="sample_time")
@@ -338,8 +338,8 @@ def side_by_side(
         f"{runs} runs of {happening.horizon:g} s, sampled every {dt:g} s, disturbances and noise drawn"
         + (", constants within their tolerances" if plant.uncertainty is not None else "")
         + (f", parameters off by up to {tolerance:.0%}" if tolerance else "")
-        + (", a state feedback holds the unstable plant" if kept.feedback.any() else "")
-        + f"; 90 % of a step wanted within {limit:.3g} s"
+        + (", a state feedback stabilises the plant" if kept.feedback.any() else "")
+        + f"; 90 % of a step to be reached within {limit:.3g} s"
     )
     times = _clock(len(drawn.faults), dt) if log is None else log.times
     truth = drawn.faults if log is None else log.truth
@@ -388,7 +388,7 @@ def compared_again(
     return result, comparison_statement(body["result"], digests, body["log"]), others
 
 
-#: Entries of a plant that was sampled again agree to this share of the largest of their matrix.
+#: Entries of a plant that was sampled again agree to this relative to its largest value of their matrix.
 SAME_PLANT = 1e-9
 
 
@@ -549,12 +549,12 @@ def _reason(best: ComparedMethod | None, compared: Sequence[ComparedMethod], pla
     words = [f"rms error {best.rms:.3g}"]
     if others and is_finite_number(others[0].rms):
         words[0] += f" against {others[0].rms:.3g} of {others[0].method}"
-    leak = max(fault.figures.leak for fault in best.faults)
+    gain = max(fault.figures.unknown_input_gain for fault in best.faults)
     if plant.nd:
-        words.append("decoupled from unknown inputs" if leak <= DECOUPLED else f"gain from unknown inputs {leak:.2g}")
+        words.append("decoupled from unknown inputs" if gain <= DECOUPLED else f"gain from unknown inputs {gain:.2g}")
     if not best.fast_enough:
-        words.append("though none shows a step as fast as asked for")
+        words.append("though none reaches 90 % of a step within the time asked for")
     slow = [entry.method for entry in others if not entry.fast_enough] if best.fast_enough else []
     if slow:
-        words.append(f"too slow or never there: {', '.join(slow)}")
+        words.append(f"90 % of a step is reached too late or never: {', '.join(slow)}")
     return "; ".join(words)

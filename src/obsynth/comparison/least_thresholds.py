@@ -73,9 +73,9 @@ def in_words(fault: str, bound: float, least: float, unit: str = "") -> str:
     """Return a sentence on one fault."""
     own = f"Without a fault the estimate of {fault} stays within {bound:.4g}{f' {unit}' if unit else ''}"
     if not np.isfinite(least):
-        return f"{own}; no least threshold is known."
+        return f"{own}; its least threshold is not known."
     if least <= SAME_RESPONSE * bound:
-        return f"{own}; a test exists that sees no disturbance and no noise at all."
+        return f"{own}; a test exists on which disturbances and noise have no effect."
     return f"{own}, {bound / least:.2f} times the least that any test with its delay can have ({least:.4g})."
 
 

@@ -183,7 +183,7 @@ class Comparison:
                     figures.at_horizon,
                     figures.peak,
                     figures.deviation,
-                    figures.leak,
+                    figures.unknown_input_gain,
                     fault.bias,
                     fault.detection_delay,
                     fault.smallest_found,
@@ -343,7 +343,7 @@ def comparison_statement(claims: Mapping[str, Any], digests: Mapping[str, str], 
     }
     best = min(methods, key=lambda name: (not methods[name]["fast_enough"], errors[name]))
     others = ", ".join(f"{errors[name]:.4g} of {name}" for name in methods if name != best)
-    fast = "" if methods[best]["fast_enough"] else ", though none shows a step as fast as wanted"
+    fast = "" if methods[best]["fast_enough"] else ", though none reaches 90 % of a step within the time asked for"
     where = "" if log is None else f", errors on {log['name']} (sha256 {log['sha256'][:SHOWN_DIGITS]})"
     kept = ", ".join(f"{name} {digest[:SHOWN_DIGITS]}" for name, digest in digests.items())
     return (

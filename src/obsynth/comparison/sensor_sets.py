@@ -336,7 +336,7 @@ def _note(search: SensorSearch, exact: bool, bound: int, most: int, count: int) 
     if exact:
         return f"All inclusion-minimal sets of at most {bound} of {len(search.sensors)} candidates."
     if count >= most:
-        return f"The first {most} inclusion-minimal sets found, those that show most at a generic point first."
+        return f"The first {most} inclusion-minimal sets found, the most sensitive at a generic point first."
     plain = search.goal == "detect"
     size = f"; a least set has at most {search.plant.nd + 1} sensors for each fault" if plain else ""
     return f"Too many sets to try all: each one given is inclusion-minimal, others may be cheaper{size}."

@@ -26,7 +26,7 @@ KEPT_INTERVALS = 64
 #: A gap is over when what it can have left in fault estimates and residuals is below this share of their usual changes
 #: from row to row, which so many rows must have shown, or below what the stated noise of the sensors makes of them.
 GAP_LEFT_SHARE, LEAST_SHOWN = 1.0, 20
-SAMPLED_GAP = "gap is for continuous-time designs: a sampled one knows which rows are missing."
+SAMPLED_GAP = "gap is for continuous-time designs: for a sampled one missing rows follow from the time stamps."
 #: What goes from row to row.
 SAVED = (
     *("z", "v", "row", "model", "fault", "inputs", "measured", "seen"),

@@ -324,7 +324,7 @@ def _adaptive(
 def _endless_model(
     design: ObserverDesign, scenario: Scenario | None, window: int, sample_time: float | None, *, estimates: bool
 ) -> tuple[ResidualModel, float]:
-    """Return a model with as many samples as an error at the start needs to be forgotten, and their distance."""
+    """Return a model with as many samples as an error at the start needs to decay, and their distance."""
     plant, observer = design.linear
     if plant.is_discrete and sample_time is not None:
         raise SpecError("sample_time is for continuous designs: this one is sampled already.", path="sample_time")

@@ -157,7 +157,7 @@ class Signals:
         unknown += [name for name in factors if name not in names]
         if unknown:
             raise SpecError(
-                f"{unknown[0]!r} is no signal that this observer reads: it reads {', '.join(names)}.", path="columns"
+                f"{unknown[0]!r} is no input or output of this observer, which has {', '.join(names)}.", path="columns"
             )
         for name, factor in factors.items():
             if not is_finite_number(factor) or factor == 0.0:

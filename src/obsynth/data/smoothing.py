@@ -44,8 +44,8 @@ class LaterRows:
     def __init__(self, observer: LogObserver, lag: int | None) -> None:
         if not isinstance(observer, SteppingLogObserver):
             raise SpecError(
-                "Smoothing is for recursive and nonlinear designs, whose covariances say how much a later sample tells "
-                "of an earlier one: design a descriptor-kalman, adaptive-observer or dae-adaptive-observer.",
+                "Smoothing is for recursive and nonlinear designs, whose covariances relate later samples to earlier "
+                "ones: design a descriptor-kalman, adaptive-observer or dae-adaptive-observer.",
                 path="smooth",
             )
         self.logged, self.lag = observer, checked_lag(lag)

@@ -67,15 +67,15 @@ def _growth(plant: DescriptorSystem, horizon: float) -> float:
 def _of_recursive(observer: RecursiveObserver | DAEObserver) -> Scenario | None:
     if isinstance(observer, DAEObserver):
         spread, forgetting = observer.initial_parameter_covariance, observer.forgetting
-        longest, forgets = None, observer.form == "forgetting"
+        longest, discounts = None, observer.form == "forgetting"
     else:
         adaptation, longest = observer.adaptation, observer.plant.horizon
         # A Kalman filter has noise to show, and nothing else.
-        spread, forgetting, forgets = np.zeros((0, 0)), 1.0, False
+        spread, forgetting, discounts = np.zeros((0, 0)), 1.0, False
         if adaptation is not None:
             spread, forgetting = adaptation.initial_covariance, adaptation.forgetting
-            forgets = adaptation.form != "random-walk"
-    memory = min(forgetting, LONG_MEMORY) if forgets else LONG_MEMORY
+            discounts = adaptation.form != "random-walk"
+    memory = min(forgetting, LONG_MEMORY) if discounts else LONG_MEMORY
     samples = int(np.clip(np.log(SEGMENT_LEFT) / np.log(memory), SHORTEST_SEGMENT, LONGEST_SEGMENT))
     count = len(observer.fault_names) + 1
     if longest is not None:

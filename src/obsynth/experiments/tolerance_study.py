@@ -105,7 +105,7 @@ class ToleranceStudy:
         ]
         return (
             f"Take the {ADAPTIVE}: the {FIXED} has false alarms from {100.0 * min(alarming):.3g} % of tolerance on."
-            + (f" It finds no {self.fault} from {100.0 * min(blind):.3g} % on." if blind else "")
+            + (f" It detects no {self.fault} from {100.0 * min(blind):.3g} % on." if blind else "")
         )
 
     def as_dict(self) -> dict[str, Any]:
@@ -144,7 +144,7 @@ class ToleranceStudy:
             The design fails its own verification.
         """
         if self.design is None:
-            raise SpecError("The study does not know its design: there is nothing to certify.", path="design")
+            raise SpecError("The study holds no design: there is nothing to certify.", path="design")
         require_verified(self.design.replace(report=verify(self.design)))
         text = result_text(STUDY, {"design": self.design}, self.asked, self.as_dict(), self.statement)
         return write_atomically(path, text)

@@ -147,7 +147,7 @@ def header_text(found: Realisation, prefix: str, alarms: Alarms) -> str:
         "",
         comment("Take one sample of each signal, write the estimates at that sample, and advance."),
         comment("Signals are deviations from the operating point; a missing one is NaN. Returns 0; or 1 if a sample"),
-        comment("is missing: the model of the plant goes on then, faults are held, and residuals are NaN."),
+        comment("is missing: the model of the plant replaces it, fault estimates are held, and residuals are NaN."),
         *_signal_comments("u", "", found.inputs[: len(observer.input_names)], before, units),
         *_signal_comments("y", "", observer.output_names, before[len(observer.input_names) :], units),
         *_signal_comments("states", "xhat", observer.state_names, after, units, observer.state_delays),

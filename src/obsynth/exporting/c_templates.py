@@ -170,10 +170,11 @@ def _header(design: ObserverDesign, prefix: str, digest: str, alarms: Alarms) ->
     yield from (comment("Start as the design does."), f"void {prefix}_reset({prefix}_state *state);", "")
     yield comment("Take one sample: y at this sample, and u during the step that ends at it; what is missing is NaN.")
     yield comment(
-        "A missing output is predicted over, a missing input stays as it was. Returns 0; 1 where inputs or all"
+        "A missing output is replaced by its prediction, a missing input by its last value. Returns 0; 1 where inputs "
+        "or all"
     )
     yield comment(
-        "outputs are missing (status GAP), or before all inputs were ever known, which takes nothing; 2 if the"
+        "outputs are missing (status GAP), or before all inputs have been known, which changes nothing; 2 if the"
     )
     yield comment("step has no solution: state and estimates are left as they were then.")
     for array, column, names in (

@@ -172,7 +172,7 @@ def export(
     if is_window(design):
         if monitor is not None or thresholds or warm_up is not None or numbers != "double":
             raise SpecError(
-                "A guaranteed test brings its threshold, in doubles: leave monitor, thresholds, warm-up and precision "
+                "A guaranteed test has its own threshold, in doubles: leave monitor, thresholds, warm-up and precision "
                 "out.",
                 path="monitor",
             )

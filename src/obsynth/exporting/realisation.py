@@ -30,7 +30,7 @@ from obsynth.results.gain_sets import gain_set_digest
 #: What a file says about the steady state of a recursion.
 STEADY = (
     "The steady state of a recursive design: its estimates are those of the recursion once the covariances have "
-    "settled, and where a sample is missing the model alone goes on."
+    "settled, and where a sample is missing the model alone is used."
 )
 
 

@@ -56,7 +56,9 @@ def check_output(path: str | Path, *, option: str = "") -> Path:
         if not folder.is_dir():
             raise SpecError(f"The folder {folder} does not exist: {target} cannot be written.", path=where)
         if not os.access(folder, os.W_OK | os.X_OK):
-            raise SpecError(f"{target} cannot be written: nothing may be written to the folder {folder}.", path=where)
+            raise SpecError(
+                f"{target} cannot be written: there is no permission to write to the folder {folder}.", path=where
+            )
         # Asks the system about the name, which may be too long or hold a null character.
         special = special_kind(target) if _exists(target) else None
     except (OSError, ValueError) as error:

@@ -76,9 +76,7 @@ def from_matlab(
         float(np.squeeze(fields[name])) for name in _SAMPLE_TIME_NAMES if name in fields and np.size(fields[name]) == 1
     ]
     if dt is None and not times:
-        raise SpecError(
-            f"{source} does not say the sampling time (Ts): give dt in seconds, or 0 for continuous time.", path="dt"
-        )
+        raise SpecError(f"{source} has no sampling time (Ts): give dt in seconds, or 0 for continuous time.", path="dt")
     if dt is not None and times and dt != times[0]:
         raise SpecError(f"dt is {dt}, but {source} has {times[0]:g}: leave dt out.", path="dt")
     names = {ours: _texts(fields[theirs]) for theirs, ours in _MATLAB_NAMES.items() if theirs in fields}
@@ -125,7 +123,7 @@ def _fields(content: Mapping[str, Any], variable: str | None, source: Path) -> d
         return dict(content)
     if variable is None and len(structs) != 1:
         found = ", ".join(map(repr, structs)) or "none"
-        raise SpecError(f"{source}: say which struct is the plant (variable=...); it has: {found}.", path=str(source))
+        raise SpecError(f"{source}: name the struct of the plant (variable=...); it has: {found}.", path=str(source))
     name = structs[0] if variable is None else variable
     if name not in structs:
         raise SpecError(
@@ -226,7 +224,7 @@ def _matrix(body: str, rows: int, columns: int, name: str, source: Path) -> Floa
     lines = [line for line in body.strip("[]").split(";") if line.strip()]
     values = [[_number(entry, name, source) for entry in line.split(",")] for line in lines]
     if len(values) != rows or any(len(row) != columns for row in values):
-        raise SpecError(f"{source}: {name} is not {rows} by {columns}, as the file says.", path=name)
+        raise SpecError(f"{source}: {name} is not {rows} by {columns}, as the file states.", path=name)
     return np.array(values).reshape(rows, columns)
 
 

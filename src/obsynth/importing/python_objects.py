@@ -120,7 +120,7 @@ def from_scipy(
 def _sampling_time(own: Any, given: float | None) -> float:
     """Return the sampling time: ``None`` is continuous, ``True`` unsaid; two that differ are refused."""
     if own is True and given is None:
-        raise SpecError("The system is sampled, but does not say how fast: give dt in seconds.", path="dt")
+        raise SpecError("The system is sampled, but has no sampling time: give dt in seconds.", path="dt")
     if own is None or own is True:
         return 0.0 if given is None else given
     if given is not None and given != own:

@@ -42,7 +42,7 @@ class Candidate:
         if not self.figures:
             return (2.0, 0.0, 0.0, np.inf)
         missed = float(not all(found.reaches for found in self.figures))
-        coupled = float(has_unknown_inputs and any(found.leak > DECOUPLED for found in self.figures))
+        coupled = float(has_unknown_inputs and any(found.unknown_input_gain > DECOUPLED for found in self.figures))
         slow = float(any(found.most > SLOW_ESTIMATE * settling for found in self.figures))
         dt = self.observer.dt if self.observer is not None else 0.0
         # A mean over time T divides noise by the root of T: it cannot change deviation times the root of delay.
@@ -197,7 +197,7 @@ def reason(best: Candidate, others: list[Candidate], plant: DescriptorSystem) ->
     """Return in one sentence why a candidate is first."""
     if not others:
         return "no other method exists for this plant"
-    gain = max(found.leak for found in best.figures)
+    gain = max(found.unknown_input_gain for found in best.figures)
     words = ["it reaches every step"] if best.rank(False)[0] == 0.0 else []
     if plant.nd:
         words.append(f"gain from the unknown inputs {gain:.1e}")

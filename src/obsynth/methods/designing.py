@@ -348,7 +348,8 @@ SAME_ELIMINATION = 1e-9
 
 
 def _with_tolerances_of(given: Plant, shipped: Any) -> Any:
-    """Return the shipped plant with the tolerances of the given one, or with the note that they were left behind."""
+    """Return the shipped plant with the tolerances of the given one, or with the note that they are not carried
+    over."""
     if not (isinstance(given, DescriptorSystem) and isinstance(shipped, DescriptorSystem)):
         return shipped
     uncertain = given.uncertainty
@@ -373,12 +374,13 @@ def _agree(one: DescriptorSystem, other: DescriptorSystem) -> bool:
 
 
 def _lost_tolerances(shipped: Plant) -> tuple[str, ...]:
-    """Return a note where a plant's tolerances were left behind."""
+    """Return a note where a plant's tolerances are not carried over."""
     uncertain = shipped.uncertainty if isinstance(shipped, DescriptorSystem) else None
     if uncertain is None or not uncertain.lost:
         return ()
     return (
-        f"The tolerances of the constants ({', '.join(uncertain.box.names)}) were left behind: {uncertain.lost}. The "
+        f"The tolerances of the constants ({', '.join(uncertain.box.names)}) are not carried over: {uncertain.lost}. "
+        "The "
         "design is for the nominal plant, and thresholds and proofs over the box are refused. Eliminate algebraic "
         "states first (transform: eliminate_algebraic_states, obsynth.eliminate_algebraic_states).",
     )

@@ -6,6 +6,7 @@ one impulse at each input, so that plants with modes on the boundary need no sta
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -49,7 +50,7 @@ class FaultFigures:
         How long the step was followed: a shorter time where the plant is unstable and nothing holds it.
     deviation : float
         Standard deviation under the stated noise.
-    leak : float
+    unknown_input_gain : float
         Largest gain of a held sinusoidal unknown input to the estimate, per unit of the input.
     """
 
@@ -60,7 +61,13 @@ class FaultFigures:
     peak: float
     horizon: float
     deviation: float
-    leak: float
+    unknown_input_gain: float
+
+    @property
+    def leak(self) -> float:
+        """Deprecated: `unknown_input_gain`."""
+        warnings.warn("leak is now unknown_input_gain.", DeprecationWarning, stacklevel=2)
+        return self.unknown_input_gain
 
     @property
     def reaches(self) -> bool:

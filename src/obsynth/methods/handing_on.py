@@ -28,7 +28,7 @@ def require_verified(design: ObserverDesign, *, unverified: bool = False) -> Non
     if unverified or report.passed or not report.checks:
         return
     raise VerificationError(
-        f"{design.name!r} fails its verification ({unverified_mark(report).partition(': ')[2]}): it is not handed on. "
-        "Design it again, or ask for it as it is (--unverified, unverified=True): whatever is written then says so.",
+        f"{design.name!r} fails its verification ({unverified_mark(report).partition(': ')[2]}): it is not used. "
+        "Design it again, or allow it (--unverified, unverified=True): every file that is written then says so.",
         report=report,
     )

@@ -120,7 +120,7 @@ ROUNDING_POINTS = (0.0, 1e-2, 1e-1, 1.0)
 
 
 def require_above_rounding(plant: DescriptorSystem, observer: LinearObserver) -> None:
-    """Raise `PreconditionError` (unclear) where rounding of the outputs drowns the estimate of a unit fault."""
+    """Raise `PreconditionError` (unclear) where rounding of the outputs hides the estimate of a unit fault."""
     least = _least(plant, observer, own=False)
     if least is None:
         return
@@ -154,8 +154,7 @@ def _doubt(plant: DescriptorSystem, observer: LinearObserver, fault: int) -> Unc
         found,
         f"has an estimate of {plant.fault_names[fault]!r} that differs by {size:.2g} of the fault at "
         f"{'z' if plant.is_discrete else 's'} = {where}",
-        "Less asked of the gains (a slower decay, a larger gamma), or an output in which the fault shows more, would "
-        "decide it.",
+        "A slower decay, a larger gamma, or an output that is more sensitive to the fault would decide it.",
     )
 
 

@@ -27,7 +27,7 @@ SHARE = 0.5
 #: What they leave of a power, relative to it, that counts as rounding; its logarithm tells when to look
 #: again, since each squaring doubles it.
 POWER_ROUNDING = 4e-15
-#: Diagonal entries of a solution are taken to be at least this share of the largest when they set units.
+#: Diagonal entries of a solution are taken to be at least this relative to its largest value when they set units.
 LEAST_SIZE = 1e-20
 #: Directions in which that is measured, beside those that make the basis.
 PROBES = 6

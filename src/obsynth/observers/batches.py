@@ -45,7 +45,7 @@ def run_dae_batch(
     trials, samples = outputs.shape[:2]
     alone = observer.outside_graph
     if alone and compiled:
-        raise SpecError(f"The C knows no {alone}: leave compiled=True out, or leave {alone} out.", path="compiled")
+        raise SpecError(f"The C code has no {alone}: leave compiled=True out, or leave {alone} out.", path="compiled")
     if compiled is None and not alone:
         compiled = trials * samples >= WORTH_COMPILING and compiler() is not None
     take = _in_c if compiled else _in_casadi

@@ -165,5 +165,5 @@ def require_plain(observer: Any, what: str) -> None:
     for option in ("sensors", "state_bounds"):
         if getattr(observer, option) is not None:
             raise SpecError(
-                f"{what} knows no {option}: leave the option out of the design, or run it by obsynth run.", path=option
+                f"{what} has no {option}: leave the option out of the design, or run it by obsynth run.", path=option
             )

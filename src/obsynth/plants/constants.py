@@ -60,8 +60,7 @@ class Constant:
         for key, value in (("nominal", self.nominal), ("range", self.low), ("range", self.high)):
             if not is_finite_number(value):
                 raise SpecError(
-                    f"The {key} of {self.name!r} is {value!r}: give finite numbers. A box with an open side bounds "
-                    "nothing.",
+                    f"The {key} of {self.name!r} is {value!r}: give finite numbers. A box needs both ends.",
                     path=path,
                 )
         if not self.low <= self.nominal <= self.high:
@@ -202,7 +201,7 @@ class ConstantsBox:
             )
         else:
             text = f"{names} within their ranges"
-        kept = "the same at all times" if self.variation == "constant" else "anything there at each sample"
+        kept = "the same at all times" if self.variation == "constant" else "they may change from sample to sample"
         origin = "" if self.source == "stated" else f"; {self.origin}"
         return f"constants ({text}; {kept}{origin})"
 
@@ -268,9 +267,7 @@ def tolerance_share(value: Any, path: str) -> float:
             raise SpecError(f"The tolerance {value!r} is no per cent: write it as '5 %'.", path=path)
         return float(found.group(1)) / 100.0
     if not (is_finite_number(value) and value >= 0.0):
-        raise SpecError(
-            f"The tolerance is {value!r}: write it as '5 %' (a box with an open side bounds nothing).", path=path
-        )
+        raise SpecError(f"The tolerance is {value!r}: write it as '5 %' (a box needs both ends).", path=path)
     if value >= 1.0:
         raise SpecError(
             f"The tolerance is {value!r}, a share of {100.0 * value:g} %: write it as '5 %' or 0.05.", path=path
@@ -308,8 +305,8 @@ def _with_range(name: str, given: Mapping[str, Any], middle: Any, unit: str) -> 
         two = not isinstance(ends, str) and hasattr(ends, "__len__") and len(ends) == 2
         if not (two and all(map(is_finite_number, ends)) and ends[0] <= ends[1]):
             raise SpecError(
-                f"The range of {name!r} is {ends!r}: give [low, high], finite and the lower one first. A box with an "
-                "open side bounds nothing.",
+                f"The range of {name!r} is {ends!r}: give [low, high], finite and the lower one first. A box needs "
+                "both ends.",
                 path=f"{path}.range",
             )
         low, high = map(float, ends)

@@ -439,7 +439,7 @@ class DescriptorSystem:
         """Return a plant with some fields changed, checked again as a whole.
 
         Tolerances and exact numbers are those of the matrices as they were: with a change of one of these they are
-        left behind, and whatever would use tolerances refuses (``uncertainty=None`` says that the model is exact).
+        not carried over, and whatever would use tolerances refuses (``uncertainty=None`` says that the model is exact).
         Units and other labels of signals that are gone, such as those of ``disturbance_names=None``, go with them.
 
         Parameters

@@ -283,8 +283,8 @@ def _require_below_nyquist(names: Sequence[str], models: Sequence[FaultModel], d
         if fastest * dt >= np.pi:
             problems.append(
                 f"the model of {name!r} ({model.description}) oscillates with {fastest:.6g} rad/s, but samples every "
-                f"{dt:g} s show only what is slower than {np.pi / dt:.6g} rad/s (Nyquist): sample faster, or give the "
-                "frequency that the samples show."
+                f"{dt:g} s represent only frequencies below {np.pi / dt:.6g} rad/s (Nyquist): sample faster, or give "
+                "the frequency of the samples."
             )
     if problems:
         raise SpecError("fault_model:", path="fault_model", problems=problems)
@@ -299,7 +299,7 @@ def _by_fault(data: Any, fault_names: Sequence[str]) -> list[FaultModel]:
     missing = [name for name in fault_names if name not in data]
     if missing:
         raise _refused(
-            f"fault_model says nothing about {', '.join(map(repr, missing))}: give a model for each fault, "
+            f"fault_model has no entry for {', '.join(map(repr, missing))}: give a model for each fault, "
             "or one for all."
         )
     return [fault_model(data[name]) for name in fault_names]

@@ -226,9 +226,9 @@ def require_carried(uncertain: Uncertainty | None) -> None:
     if uncertain is not None and uncertain.lost:
         names = ", ".join(uncertain.box.names)
         raise PreconditionError(
-            f"The tolerances of the constants ({names}) were left behind: {uncertain.lost}. Nothing over the box is "
-            "known of this plant. Let obsynth eliminate and sample it (transform) without other changes, or leave the "
-            "tolerances out for an exact model (plant.replace(uncertainty=None)).",
+            f"The tolerances of the constants ({names}) are not carried over: {uncertain.lost}. No bounds over the "
+            "box exist for this plant. Let obsynth eliminate and sample it (transform) without other changes, or "
+            "leave the tolerances out for an exact model (plant.replace(uncertainty=None)).",
             condition="tolerances carried",
         )
 

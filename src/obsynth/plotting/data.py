@@ -15,6 +15,7 @@ from obsynth.errors import SpecError
 from obsynth.methods.handing_on import unverified_mark
 from obsynth.numerics.arguments import require_kind
 from obsynth.observers.estimates import BAND_WIDTH
+from obsynth.plotting.estimates import MODEL_BAND
 from obsynth.plotting.panels import (
     BAND_STYLE,
     ESTIMATE_STYLE,
@@ -183,7 +184,9 @@ class _Drawing:
             panel.fill_between(times, low, high, label="guaranteed interval", **BAND_STYLE)
         elif deviation is not None and not adaptive:
             low, high = values - BAND_WIDTH * deviation, values + BAND_WIDTH * deviation
-            panel.fill_between(times, low, high, label="95 % interval of the stated noise", **BAND_STYLE)
+            own = f"sd {column}" in table
+            label = MODEL_BAND if own else "95 % interval of the stated noise"
+            panel.fill_between(times, low, high, label=label, **BAND_STYLE)
         panel.plot(times, values, label="estimate", **{**ESTIMATE_STYLE, "linestyle": "-"})
         if adaptive:
             limit = table[f"threshold {column}"].to_numpy(float)

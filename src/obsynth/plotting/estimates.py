@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 #: Of the model: a parameter that moves faster than the model says leaves it.
-MODEL_BAND = "95 % band of the model"
+MODEL_BAND = "95 % band while the model holds"
 CROSSING_MARKERS = ("o", "s", "^")
 #: Around what is drawn there is this share of its range, and room for this many usual half-widths of the band.
 ROOM_SHARE, USUAL_BANDS = 0.2, 3.0
@@ -231,7 +231,7 @@ def _share_within(true: FloatArray, low: FloatArray, high: FloatArray) -> str:
     """Return how often the truth lies in a band, in words: a parameter that moves leaves that of its model."""
     known = np.isfinite(true) & np.isfinite(low)
     held = np.count_nonzero((low <= true) & (true <= high) & known)
-    return f", holds the truth in {100.0 * held / np.count_nonzero(known):.0f} % of samples" if known.any() else ""
+    return f", contains the truth in {100.0 * held / np.count_nonzero(known):.0f} % of samples" if known.any() else ""
 
 
 def _matching(given: ArrayLike | None, shape: tuple[int, ...], what: str) -> FloatArray | None:

@@ -23,9 +23,9 @@ from obsynth.results.design import ObserverDesign
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-#: A gain below this share of what is subtracted from one another in it is rounding: nothing gets through.
+#: A gain below this share of what is subtracted from one another in it is rounding: zero gain.
 GAIN_ROUNDING_SHARE = 1e-9
-#: The least singular value is drawn where it is below this share of the largest one somewhere.
+#: The least singular value is drawn where it is below this relative to its largest value one somewhere.
 VISIBLE_SHARE = 0.99
 TARGETS = {"faults": "fault estimates", "states": "errors of the states", "residuals": "residual"}
 _STYLES: dict[str, dict[str, Any]] = {
@@ -201,7 +201,7 @@ def plot_gains(design: ObserverDesign, *, to: str = "faults", axes: Axes | None 
             ending = "" if np.all(gain > 0.0) else " (elsewhere only rounding)"
             panel.plot(found.frequencies, _positive(gain), label=f"{name} to {target}{ending}", **_STYLES[name])
         else:
-            panel.plot([], [], label=f"{name}: nothing gets through", **_STYLES[name])
+            panel.plot([], [], label=f"{name}: zero gain", **_STYLES[name])
     largest = found.gains.get("faults", found.least)
     if to != "states" and np.any(found.least < VISIBLE_SHARE * largest):
         panel.plot(found.frequencies, _positive(found.least), label="faults, least singular value", **_LEAST_LINE)

@@ -15,7 +15,7 @@ from obsynth.results.design import ObserverDesign
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-#: Courses below this share of the largest number are zero but for rounding.
+#: Courses below this relative to its largest value number are zero but for rounding.
 ROUNDED_COURSE = 1e-12
 #: From this ratio of largest to smallest threshold on, its axis is logarithmic.
 WIDE_THRESHOLDS = 5.0
@@ -50,7 +50,7 @@ def plot_least_thresholds(design: ObserverDesign, *, axes: Axes | None = None) -
     seconds = (table[:, 0] - 1 - before) * found.observer.dt
     unit = plant.units.get(found.fault, "")
     panel.plot(seconds, table[:, 1], color="black", marker="o", markersize=4, label="least threshold of any test")
-    panel.fill_between(seconds, 0.0, table[:, 1], color="0.9", label="no test without false alarms goes here")
+    panel.fill_between(seconds, 0.0, table[:, 1], color="0.9", label="no test without false alarms exists here")
     panel.plot(
         (found.samples - 1 - before) * found.observer.dt,
         found.threshold,
@@ -143,7 +143,7 @@ def plot_hidden_course(design: ObserverDesign, *, fault: str | None = None, axes
     found = GuaranteedTest.of(design)
     plant, courses = found.plant, found.hidden_course(fault)
     if not courses:
-        raise SpecError("Nothing hides this fault: there is no course to draw.", path="fault")
+        raise SpecError("No combination of signals hides this fault: there is none to draw.", path="fault")
     (panel,) = new_panels(None if axes is None else [axes], 1, size=(WIDTH, 1.6 * PANEL_HEIGHT))
     styles = dict.fromkeys(courses, "--")
     styles |= dict.fromkeys(plant.state_names, ":") | dict.fromkeys(found.fault_names, "-")
@@ -164,7 +164,7 @@ def plot_hidden_course(design: ObserverDesign, *, fault: str | None = None, axes
         )
     panel.axhline(0.0, color="0.4", linewidth=0.8)
     panel.set_xlabel("time (s)")
-    panel.set_ylabel("share of the largest")
+    panel.set_ylabel("relative to its largest value")
     legend_above(panel)
     tidy(panel)
     return panel

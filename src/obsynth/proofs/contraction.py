@@ -217,7 +217,7 @@ def _lyapunov_factor(a: FloatArray, rate: float, *, discrete: bool) -> FloatArra
 
     one = np.eye(len(a))
     with warnings.catch_warnings(), np.errstate(all="ignore"):
-        # Scales of very different units are cast to positions of a permutation that nobody asked for.
+        # Scales of very different units are cast to positions of a permutation.
         warnings.simplefilter("ignore")
         balanced, scale = balanced_matrix(a)
         try:

@@ -108,7 +108,8 @@ MOST_CURVES, MOST_STATES_OF_CURVES = 3, 80
 
 
 def delay_curves(design: ObserverDesign) -> list[DelayCurve]:
-    """Return what delay buys on the plant of a design, for each fault that it estimates, where noise is stated."""
+    """Return the deviation against the delay on the plant of a design, for each fault that it estimates, where noise is
+    stated."""
     plant, observer = design.plant, design.observer
     if (
         not isinstance(plant, DescriptorSystem)

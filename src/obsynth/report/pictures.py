@@ -176,7 +176,10 @@ def _story(scenario: Scenario, *, given: bool, linear: bool) -> str:
     if given:
         return f"{scenario.horizon:g} s, seed {scenario.seed}."
     if not linear:
-        return "a step of one initial standard deviation, with the stated noise. Bands hold 95 % while parameters stay."
+        return (
+            "a step of one initial standard deviation, with the stated noise. The 95 % bands hold while the "
+            "parameters are constant."
+        )
     closed = " A stabilising state feedback was added, as the plant is unstable." if scenario.stabilise else ""
     return (
         "a unit step, from zero and without noise. It shows how fast each estimate follows its fault, and its gain "

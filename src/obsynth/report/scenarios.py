@@ -147,9 +147,9 @@ def simulation_report(
         title, rows = _worst(title, list(zip(summary[kind].items(), lasts, strict=True)), lambda row: row[0][1]["rmse"])
         for (signal, row), last in rows:
             table.add_row(Text(signal), number(row["rmse"]), number(row["largest"]), last, Text(units.get(signal, "")))
-        told = "errors are of the whole record, start included"
+        told = "errors of the whole record"
         if linear and (end := summary[f"{kind[:-1]}_warm_up"]) is None:
-            told = "the start still shows at the end: errors are of the whole record"
+            told = "the initial-condition response has not settled: errors of the whole record"
         elif linear:
             told = f"warm-up ended at {end:g} s, errors are of what follows"
         print_section(console, f"{title} ({told})", table)

@@ -507,8 +507,8 @@ def _calibrated(name: str, item: Mapping[str, Any]) -> dict[str, Any]:
     """Return nominal value, range and unit of a calibrated constant."""
     if item["open"]:
         raise SpecError(
-            f"The box of {name!r} has an open {item['open'][0]} side: the log bounds nothing there. State its range, "
-            "or take a log that moves it.",
+            f"The box of {name!r} has an open {item['open'][0]} side: the log does not bound it there. State its "
+            "range, or take a log that excites it.",
             path=f"constants.{name}",
         )
     return {"nominal": item["nominal"], "range": list(item["range"]), "unit": item["unit"]}

@@ -82,7 +82,8 @@ def condition_rows(conditions: Iterable[Condition]) -> Iterator[Check]:
         )
 
 
-#: Matrices found again may differ by this share of the largest entry of their row or column: another order of sums.
+#: Matrices found again may differ by this relative to its largest value entry of their row or column: another order of
+#: sums.
 DERIVED_TOLERANCE = 1e-9
 PLANT_MATRICES = ("E", "A", "B", "C", "D", "Bf", "Df", "Bd", "Dd")
 _STORED_MAPS = ("from_state", "from_input", "from_fault", "from_disturbance")

@@ -30,7 +30,8 @@ def tolerance_rows(design: ObserverDesign) -> Iterator[Check]:
     if uncertain.lost:
         yield information(
             "tolerances",
-            f"left behind ({uncertain.lost}): the design is for the nominal plant, and whatever would use them refuses",
+            f"not carried over ({uncertain.lost}): the design is for the nominal plant, and whatever would use them "
+            "refuses",
             np.nan,
             source="the plant",
             status="assumed",

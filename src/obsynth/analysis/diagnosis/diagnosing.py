@@ -299,7 +299,7 @@ def _warnings(plant: DescriptorSystem, asked: Sequence[Question]) -> tuple[str, 
         worst = min(thin, key=lambda question: question.gap)
         texts.append(
             f"{plant.fault_names[worst.number]}: the least clear decision has a gap of {worst.gap:.1e} only; orders, "
-            "and in the worst case a verdict, may hang on the last digits of the data."
+            "and in the worst case a verdict, may depend on the last digits of the data."
         )
     return tuple(texts)
 

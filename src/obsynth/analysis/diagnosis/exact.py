@@ -113,7 +113,8 @@ class ExactQuestion(Question):
 
     @cached_property
     def polynomial(self) -> fmpz_poly:
-        """The fault polynomial, with coprime integer coefficients; zero where nothing shows the fault."""
+        """The fault polynomial, with coprime integer coefficients; zero where the fault has no effect on the
+        outputs."""
         without, whole = self._exact_removal.pencil(), self._exact_removal.pencil(self.number)
         if whole.normal_rank == without.normal_rank:
             return fmpz_poly([])

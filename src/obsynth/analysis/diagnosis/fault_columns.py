@@ -181,7 +181,8 @@ class Question:
 
     @cached_property
     def derivatives(self) -> int | None:
-        """Derivatives of y and u (samples of delay) that an estimate needs; ``None`` where nothing shows."""
+        """Derivatives of y and u (samples of delay) that an estimate needs; ``None`` where the fault has no effect on
+        them."""
         f, g = self._scaled
         return _order_at_infinity(self.plant, f / self.trace, g / self.trace) if self.leaves_trace else None
 

@@ -20,7 +20,7 @@ from obsynth.numerics.norms import MOST_ENTRIES_AT_ONCE
 from obsynth.numerics.scaling import equilibrate_pencil, power_of_two_below
 
 #: Below this distance, relative to the data, rounding of the data is as large as what a unit fault moves: gains of its
-#: inverse would be needed, which double precision drowns.
+#: inverse would be needed, which is below rounding in double precision.
 ROUNDING_LEVEL = 2e-14
 #: Zeros closer than this, relative to their size, may be one that rounding has moved.
 SAME_ZERO_DISTANCE = 1e-3

@@ -52,7 +52,7 @@ def settled_rank(decision: RankDecision, exact_rank: int | None, share: float = 
 
 
 #: What decides what rounding of the data leaves open.
-DECIDER = "Data with more digits, or an output in which this shows more, would decide it."
+DECIDER = "Data with more digits, or an output that is more sensitive to it, would decide it."
 #: Computed data hold more than one rounding: below this distance a zero of theirs is one.
 COMPUTED = 1e-12
 #: Rounding scatters a multiple zero by up to this, relative to its size or one.
@@ -373,10 +373,10 @@ class Evaluator:
         shares = np.abs(scaled) * (faults if np.any(np.abs(scaled[faults]) > NAMED_SHARE) else ~faults)
         wanted, shown = int(np.argmax(shares)), int(np.argmax(terms))
         if terms[shown] == 0.0:
-            return "No output holds anything of it: no digits of the data would show it."
+            return "No output depends on it: more digits of the data would not help."
         gain = signals[wanted] / (UNIT_ROUNDOFF * terms[shown])
         return (
-            "This holds exactly, on the numbers as written: were their last digits off, any observer would need a "
+            "This holds exactly, on the numbers as written: if their last digits are wrong, every observer needs a "
             f"gain of about {gain:.0e} from {plant.output_names[shown]!r} to {names[wanted]!r}."
         )
 

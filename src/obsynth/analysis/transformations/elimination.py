@@ -141,7 +141,7 @@ def _description(plant: DescriptorSystem, count: int, dropped: Sequence[str] = (
     done = f"eliminated {plant.nx - count} algebraic states" if count < plant.nx else "multiplied by the inverse of E"
     if not dropped:
         return done
-    return f"left out {len(dropped)} variable(s) that act on nothing ({', '.join(dropped)}); {done}"
+    return f"left out {len(dropped)} variable(s) that have no effect ({', '.join(dropped)}); {done}"
 
 
 def eliminated_exactly(plant: DescriptorSystem, basis: FloatArray | None = None) -> Transformation | None:

@@ -41,9 +41,10 @@ class ActiveVariables:
         if not self.dropped:
             return ""
         return (
-            f"Left out, since they act on nothing that stays and no output: {', '.join(map(repr, self.dropped))} (with "
+            "Left out, as they have no effect on the other variables and the outputs: "
+            f"{', '.join(map(repr, self.dropped))} (with "
             f"{'equations' if len(self.equations) > 1 else 'equation'} {', '.join(map(str, self.equations))}); "
-            "nothing else changes, and their values are not estimated."
+            "the rest of the plant is the same, and their values are not estimated."
         )
 
 
@@ -215,7 +216,7 @@ def raise_structurally_singular(plant: DescriptorSystem, equations: Indices, var
     equations, variables = own_first(equations, variables), own_first(variables, equations)
     names = [plant.state_names[i] for i in variables]
     raise PreconditionError(
-        "The plant is not regular, det(A - zE) is zero for every z and whatever the numbers are: "
+        "The plant is not regular, det(A - zE) is zero for every z and all values of the entries: "
         f"{listed([repr(name) for name in names])} {'is' if len(names) == 1 else 'are'} in too few equations, and "
         f"equations {listed([equation_name(plant, i) for i in equations])} hold too few variables. Check for a "
         "missing or repeated equation.",

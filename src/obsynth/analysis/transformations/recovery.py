@@ -228,10 +228,12 @@ def _require_visible(stacked: FloatArray, plant: DescriptorSystem, faults: Seque
     shares = np.linalg.norm(np.linalg.svd(scaled)[2][decision.rank :], axis=0)
     if np.max(shares[plant.nx :]) > NEGLIGIBLE_INPUT:
         signals = leading_names(shares[plant.nx :], faults)
-        culprit = f"Faults {', '.join(signals)} look like algebraic states, or like each other, in the outputs."
+        culprit = (
+            f"Faults {', '.join(signals)} have the same effect on the outputs as algebraic states, or as each other."
+        )
     else:
         signals = leading_names(shares[: plant.nx], plant.state_names)
-        culprit = f"States {', '.join(signals)} show neither in E nor in the outputs."
+        culprit = f"States {', '.join(signals)} are neither dynamic nor measured."
     raise PreconditionError(
         f"Faults cannot be appended as states: {decision.describe()}. {culprit} Leave faults out, or add an output.",
         condition="rank [E 0; 0 0; C Df]",

@@ -92,8 +92,8 @@ def sampled_problem(design: ObserverDesign, dt: float, bounds: FloatArray, noise
     uncertain = plant.uncertainty if plant.uncertainty is not None else Uncertainty(ConstantsBox({}), {})
     if uncertain.box.variation == "varying":
         raise PreconditionError(
-            "The constants may vary, and the design is continuous in time: between samples nothing is known of them. "
-            "Sample the plant first (transform: sample_time), or state constants that stay the same.",
+            "The constants may vary, and the design is continuous in time: their values between samples have no "
+            "bound. Sample the plant first (transform: sample_time), or state constants that stay the same.",
             condition="discrete time",
         )
     exact = AffinePlant(plant, uncertain.box, {}, np.eye(plant.nx))

@@ -252,7 +252,9 @@ class Monitor:
     def threshold(self) -> FloatArray:
         """Thresholds ``(horizon,)`` of a record; infinite where nothing is decided yet."""
         if self.horizon is None or self.rule.table is None:
-            raise SpecError("This monitor is for data of any length: only `step` knows its threshold.", path="monitor")
+            raise SpecError(
+                "This monitor is for data of any length: its threshold is computed by `step`.", path="monitor"
+            )
         return read_only(self.rule.table)
 
     @property

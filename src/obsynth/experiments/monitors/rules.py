@@ -231,7 +231,7 @@ class WhitenedRule(Rule):
         return state, Judged(float(value), math.log(2 * degrees * ending / probability))
 
     def restart(self, state: WindowState, skipped: int = 0) -> WindowState:
-        """Forget window and sums; looks that were taken stay taken."""
+        """Clear window and sums; the decisions that were taken stay counted."""
         return self.init()._replace(looks=state.looks)
 
     def options(self) -> list[float]:
@@ -307,7 +307,7 @@ class ParameterRule(Rule):
         return looked, Judged(sum(squares), float(chdtri(sum(degrees), share)))
 
     def restart(self, state: ParameterState, skipped: int = 0) -> ParameterState:
-        """Forget sums; the filter itself knows what missing rows cost."""
+        """Clear the sums; the covariance of the filter accounts for missing rows."""
         return self.init()._replace(looks=state.looks)
 
     def options(self) -> list[Any]:

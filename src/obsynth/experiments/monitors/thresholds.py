@@ -158,7 +158,7 @@ class UnlimitedHorizonBound(NamedTuple):
 
 def samples_of(transition: FloatArray, window: int) -> int:
     """Return how many samples a table of ``transition (n, n)`` needs until `LEFT_AFTER_TABLE` of a start is left."""
-    # Entries that cancel drown the eigenvalues in the powers of a matrix, but not in those of its Schur form.
+    # Entries that cancel hide the eigenvalues in the powers of a matrix, but not in those of its Schur form.
     power, count = schur_form(transition)[0], 1
     while len(power) and not np.linalg.norm(power, 2) <= LEFT_AFTER_TABLE:
         power, count = np.triu(power @ power), 2 * count

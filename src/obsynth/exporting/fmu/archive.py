@@ -189,7 +189,7 @@ def _variables(signals: Signals) -> Iterator[_Variable]:
         yield _Variable(name, "real", "parameter", "tunable", "exact", value, unit, told)
     flags = [(f"alarm[{name}]", f"{name} is above its threshold") for name in signals.alarms.levels]
     flags.append(("alarm", "any alarm"))
-    flags.append(("sample_used", "the last sample was complete enough to be used; else the model went on alone"))
+    flags.append(("sample_used", "the last sample was used; otherwise the estimates are those of the model alone"))
     for name, told in flags:
         yield _Variable(name, "flag", "output", "discrete", "calculated", None, "", told)
 

@@ -44,9 +44,9 @@ static int status_of(PREFIX_state *s, const double *seen, const int *refused, in
     }
     for (i = 0; i < NY; i++) {
         int is_refused = GATE && latest_of(&s->running)->refused[i] > refused[i];
-        int is_heard = !is_due(latest_of(&s->running)->k - 1, i) || (!isnan(seen[i]) && !is_refused);
-        known = known || is_heard;
-        all = all && is_heard;
+        int is_received = !is_due(latest_of(&s->running)->k - 1, i) || (!isnan(seen[i]) && !is_refused);
+        known = known || is_received;
+        all = all && is_received;
     }
     if (!inputs_known || !known) {
         return UPPER_GAP;
@@ -63,7 +63,7 @@ int PREFIX_step(PREFIX_state *s, ARGUMENTSconst double y[NY], PREFIX_estimates *
     double used[LENGTH(NU)];
     double seen[NY];
     double none[NY];
-    double heard[NY];
+    double received[NY];
     double said[ROW];
     double shown[UPPER_WATCHED];
     const double *after;
@@ -85,18 +85,18 @@ int PREFIX_step(PREFIX_state *s, ARGUMENTSconst double y[NY], PREFIX_estimates *
         none[i] = NAN;
         refused[i] = latest_of(&s->running)->refused[i];
     }
-    failed = advance(&s->running, used, seen, heard, said);
+    failed = advance(&s->running, used, seen, received, said);
     if (failed && !is_first) {
         /* A sample without a solution is predicted over; where that has none either, the observer starts again. */
-        failed = advance(&s->running, used, none, heard, said);
+        failed = advance(&s->running, used, none, received, said);
         if (failed) {
             struct PREFIX_observer before = s->running;
             begin(&s->running);
             is_first = 1;
-            failed = advance(&s->running, used, seen, heard, said);
+            failed = advance(&s->running, used, seen, received, said);
             if (failed) {
                 copy(seen, none, NY);
-                failed = advance(&s->running, used, seen, heard, said);
+                failed = advance(&s->running, used, seen, received, said);
             }
             if (failed) {
                 s->running = before;
@@ -106,7 +106,7 @@ int PREFIX_step(PREFIX_state *s, ARGUMENTSconst double y[NY], PREFIX_estimates *
         }
     } else if (failed) {
         copy(seen, none, NY);
-        failed = advance(&s->running, used, seen, heard, said);
+        failed = advance(&s->running, used, seen, received, said);
     }
     if (failed) {
         return 2;
@@ -127,7 +127,7 @@ int PREFIX_step(PREFIX_state *s, ARGUMENTSconst double y[NY], PREFIX_estimates *
         estimates->fault_deviations[i] = sqrt(fmax(after[AT_SPREAD + i * (NQ + 1)], 0.0));
     }
     for (i = 0; i < NY; i++) {
-        estimates->residuals[i] = isnan(heard[i]) ? NAN : said[AT_INNOVATION + i];
+        estimates->residuals[i] = isnan(received[i]) ? NAN : said[AT_INNOVATION + i];
     }
     estimates->nis = said[AT_NIS];
     estimates->step_residual = said[AT_RESIDUAL];

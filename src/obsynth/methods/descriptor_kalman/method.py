@@ -73,7 +73,7 @@ class DescriptorKalman(Method):
         A covariance is not symmetric or indefinite, or an option has the wrong shape.
     PreconditionError
         ``rank [E_k; C_k] < nx`` at some k, which is named (with early constraints their rows count); where E, A and C
-        are constant, a mode with ``|z| >= 1`` that shows in no output; where they change, errors that do not decay
+        are constant, a mode with ``|z| >= 1`` that is unobservable; where they change, errors that do not decay
         along the horizon, or outgrow double precision at some k.
     VerificationError
         The observer fails a check.

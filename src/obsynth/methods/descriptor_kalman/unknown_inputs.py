@@ -122,10 +122,10 @@ def without_unknown_inputs(plant: DescriptorSystem) -> WithoutUnknownInputs:
     if rank:
         parts.append(f"{', '.join(map(repr, names))} {'is' if rank == 1 else 'are'} estimated with the states")
     if moved:
-        parts.append(f"{moved} of {count} equations went with what no output shows at once")
+        parts.append(f"{moved} of {count} equations were removed with the unknown inputs that reach no output directly")
     note = f"Nothing is assumed about the unknown inputs {', '.join(map(repr, plant.disturbance_names))}: "
     return WithoutUnknownInputs(
-        taken, equations, shown, names, scale, note + ("; ".join(parts) or "they act on nothing") + "."
+        taken, equations, shown, names, scale, note + ("; ".join(parts) or "they have no effect") + "."
     )
 
 

@@ -38,7 +38,7 @@ def conditions(plant: DescriptorSystem) -> tuple[Condition, ...]:
         ),
         Condition(
             "faults",
-            "a fault to show",
+            "at least one fault",
             plant.nf > 0,
             float(plant.nf),
             1.0,

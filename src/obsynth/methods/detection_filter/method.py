@@ -39,8 +39,8 @@ class DetectionFilterMethod(Method):
     -------
     DetectionFilter
         An `ObserverDesign` with ``ny`` residuals, and the two norms by name.  Both are proved on the error's own
-        equations, and on the plant together with the stored numbers where that has a finite gain: a plant that does
-        not forget has none unless the stored numbers meet the equations exactly, and ``proved`` is false then.
+        equations, and on the plant together with the stored numbers where that has a finite gain: a plant that is
+        not stable has none unless the stored numbers meet the equations exactly, and ``proved`` is false then.
 
     Raises
     ------
@@ -48,7 +48,7 @@ class DetectionFilterMethod(Method):
         The band is no range of frequencies.
     PreconditionError
         The plant is sampled or has no faults.  Or ``[Dd, Dw]`` has not full row rank: some residual is free of unknown
-        inputs, see `functional_filter`.  Or a mode that does not decay shows in no output, a zero from the unknown
+        inputs, see `functional_filter`.  Or a mode that does not decay is unobservable, a zero from the unknown
         inputs to the outputs lies on the imaginary axis (the filter would not be stable), or the index is above one.
     SolverError
         The Riccati equation has no stabilising solution in double precision, or no gain can be proved: such a zero is
@@ -79,7 +79,9 @@ class DetectionFilterMethod(Method):
         ),
         "band_from": ClaimMeaning("rad/s", "where the band begins", "fault sensitivity"),
         "band_to": ClaimMeaning("rad/s", "where the band ends", "fault sensitivity"),
-        "frequency": ClaimMeaning("rad/s", "where the faults show least on the band", STATED_BY_SEARCH),
+        "frequency": ClaimMeaning(
+            "rad/s", "where the sensitivity to the faults is least on the band", STATED_BY_SEARCH
+        ),
     }
     witnesses: ClassVar[frozenset[str]] = frozenset({"P"})
 

@@ -129,7 +129,7 @@ def _gains(plant: DescriptorSystem) -> tuple[FloatArray, FloatArray]:
     if gain is None or not np.all(np.isfinite(gain)) or not abscissa(plant.A - gain @ plant.C, 0.0) < 0.0:
         raise SolverError(
             "The Riccati equation of the detection filter has no stabilising solution: a zero from the unknown inputs "
-            "to the outputs lies on the imaginary axis, or a mode shows in no output. State noise of the states (Bw)."
+            "to the outputs lies on the imaginary axis, or a mode is unobservable. State noise of the states (Bw)."
         )
     sizes, directions = np.linalg.eigh(measured)
     return np.asarray(gain), np.asarray((directions / np.sqrt(sizes)) @ directions.T)

@@ -304,7 +304,9 @@ def _zero_condition(judge: Evaluator) -> Condition:
     def lost(facts: SystemFacts) -> Condition:
         if not facts.full:
             names = hidden_direction(plant, missing=facts.columns - facts.normal_rank)[1]
-            detail = f"faults {', '.join(map(repr, names))} are together output-nulling: no output shows them."
+            detail = (
+                f"faults {', '.join(map(repr, names))} are together output-nulling: they have no effect on the outputs."
+            )
             return _fault_zeros(holds=False, value=np.inf, detail=detail, signals=names)
         point = max(facts.outside, key=abs)
         return _zero_failure(plant, zero_at(plant.E, plant.A, point, plant.Bf, plant.C, plant.Df))
@@ -323,8 +325,8 @@ def _zero_failure(plant: DescriptorSystem, zero: Zero) -> Condition:
     else:
         signals = leading_names(np.abs(zero.input_direction), plant.fault_names, most=MOST_NAMES)
         detail = (
-            f"at the zero z = {value} the fault {', '.join(map(repr, signals))} is output-nulling along z^k: "
-            "no output shows it, so no filter can estimate it. Measure another signal."
+            f"at the zero z = {value} the fault {', '.join(map(repr, signals))} is output-nulling along z^k: it has "
+            "no effect on the outputs, so no filter can estimate it. Measure another signal."
         )
     return _fault_zeros(holds=False, value=abs(zero.value), detail=detail, mode=zero.value, signals=signals)
 

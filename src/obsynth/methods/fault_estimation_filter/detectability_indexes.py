@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 #: Random choices of T after which none is taken to be nonsingular.
 MOST_CHOICES = 20
-#: Faults with at least this share of the largest in a dependence are named.
+#: Faults with at least this relative to its largest value in a dependence are named.
 DEPENDENT_SHARE = 0.1
 _PENCIL_SEED = 45
 
@@ -128,7 +128,8 @@ REFUSE_CONDITION = 1e12
 
 @dataclass(frozen=True, eq=False)
 class FaultDetectability:
-    """Indexes ``rho_i`` (``None``: never shows) and matrices of ``(TA, C)`` for the fault directions ``TF``.
+    """Indexes ``rho_i`` (``None``: no effect on the outputs) and matrices of ``(TA, C)`` for the fault directions
+    ``TF``.
 
     ``Psi (nx, nf)``: columns ``(TA)^(rho_i - 1) T f_i``, else zero; ``Upsilon = C Psi``.
     """

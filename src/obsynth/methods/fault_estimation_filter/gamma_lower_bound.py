@@ -164,7 +164,7 @@ NEGLIGIBLE_DISTURBANCES = (1e-3, 3e-2)
 #: Errors that invisible disturbances reach from rest: with more of them the inequalities take seconds.
 MOST_REACHED = 24
 #: Where two steps show less than this share of the gain in double precision, they prove nothing exactly either.
-HOPEFUL_SHARE = 0.99
+PROMISING_SHARE = 0.99
 #: Filters of so many states are examined in any case: exact null spaces cost next to nothing there.
 CHEAP_STATES = 8
 #: Runs from rest have at most so many unknowns, and are long enough when less than this share of the gain is missing.
@@ -365,7 +365,7 @@ def _is_hopeless(problem: GainProblem, gain: float, *, thorough: bool) -> bool:
         return False
     _, both = _first_two(top, bottom, image, problem.Z @ top + problem.Zd @ bottom, problem.Z, problem.Zd)
     most = both[:, : both.shape[1] - problem.Zd.shape[1]] if problem.weight_is_free else both
-    return not most.size or float(np.linalg.norm(most, 2)) < HOPEFUL_SHARE * gain
+    return not most.size or float(np.linalg.norm(most, 2)) < PROMISING_SHARE * gain
 
 
 def _best_run(dual: _DualProblem, enough: float) -> tuple[FloatArray, FloatArray, FloatArray]:

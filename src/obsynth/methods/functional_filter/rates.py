@@ -1,7 +1,7 @@
 """Random-walk intensity of a fault that is not stated: slowly, but so that a step is seen in the plant's own time.
 
-And what delay buys: one Riccati equation for each walk, as smoothing over L samples takes ``sum_j G_j C M_j`` from the
-error covariance.
+And the deviation against the delay: one Riccati equation for each walk, as smoothing over L samples takes ``sum_j G_j C
+M_j`` from the error covariance.
 """
 
 from __future__ import annotations

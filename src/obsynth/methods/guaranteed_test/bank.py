@@ -163,7 +163,7 @@ def bank_checks(design: ObserverDesign, read: Callable[[Mapping[str, Any]], Any]
         for name, value in again.as_dict().items()
     )  # fmt: skip
     yield upper_bound_check(
-        "joined", "what runs is the rows of all tests side by side, and nothing else", float(not same), 0.0,
+        "joined", "the rows that run are those of all tests", float(not same), 0.0,
         source="shipped realisation",
     )  # fmt: skip
     for test in tests:
@@ -198,7 +198,8 @@ def _smallest_groups(design: ObserverDesign, asked: Asked) -> Iterator[Check]:
         name = plant.fault_names[fault]
         yield upper_bound_check(
             f"smallest group[{name}]",
-            f"no test of {name} is blind to more faults: the other faults can then hide it, by numbers that satisfy "
+            f"no test of {name} is insensitive to more faults: the other faults can then hide it, by numbers that "
+            "satisfy "
             "every equation exactly",
             float(left),
             0.0,
@@ -231,7 +232,7 @@ def _pairs(design: ObserverDesign, asked: Asked) -> Iterator[Check]:
             holds = exact is not None and bool(np.all(exact.radius <= test.radius))
             holds = holds and proved_threshold(window, test, exact_zero=size == 0.0) <= size
         if not holds:
-            wrong.append(f"{plant.fault_names[one]} blind to {plant.fault_names[other]}")
+            wrong.append(f"{plant.fault_names[one]} insensitive to {plant.fault_names[other]}")
     yield lower_bound_check(
         "pairs",
         "thresholds pair by pair, and the pairs without a test, hold",

@@ -161,4 +161,7 @@ def _notes(plant: DescriptorSystem, groups: Any, reasons: Any, claims: Mapping[s
             if other != fault
         ]
         if len(listed) > 1:
-            yield f"Thresholds of {names[fault]} by a test that is blind to one other fault alone: {'; '.join(listed)}."
+            yield (
+                f"Thresholds of {names[fault]} by a test that is insensitive to one other fault alone: "
+                f"{'; '.join(listed)}."
+            )

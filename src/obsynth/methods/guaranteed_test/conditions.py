@@ -141,7 +141,7 @@ def _why(problem: Problem, asked: Asked, window: Window) -> str:
         return (
             f"no test on {samples} samples responds to {fault} and to nothing that is free, but a time course that "
             "hides it could not be "
-            "proved: this is at the edge of double precision. Bounds of the states (state_bounds), however wide, help."
+            "proved: this is at the edge of double precision. Bounds of the states (state_bounds) help, even wide ones."
         )
     text = f"{hidden(window, found)} (proved for {samples} samples: every equation holds exactly)."
     lag = window.question.lag

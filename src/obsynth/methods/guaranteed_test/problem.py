@@ -152,7 +152,8 @@ def missing_bounds(plant: DescriptorSystem, asked: Asked) -> Iterator[str]:
             yield f"disturbance_bounds: the largest absolute value of {', '.join(lacking)} is missing."
     if asked.noise_bound is None and np.any(np.hstack([plant.Bw.ravel(), plant.Dw.ravel()])):
         yield (
-            "noise_bound: a standard deviation is no bound; say how many of them the noise never exceeds, or the bound "
+            "noise_bound: a standard deviation is no bound; state how many of them the noise never exceeds, or the "
+            "bound "
             "of each output by name."
         )
 

@@ -28,7 +28,7 @@ from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 TRIED_ROWS = 8
 #: What is for plants with constant matrices, and what to do instead.
 REFUSED: Mapping[str, str] = {
-    "isolate": "design one test for each fault, blind to the others (free: others)",
+    "isolate": "design one test for each fault, insensitive to the others (free: others)",
     "exact": "leave it out: the fixed tests, one a row, are proved",
     "missing": "leave it out (missing: wait)",
 }

@@ -201,7 +201,7 @@ def _notes(
             "nothing that is free."
         )
     if "least" not in claims:
-        yield "That there is no smaller threshold is not claimed: equations after the window may say more."
+        yield "That there is no smaller threshold is not claimed: equations after the window may reduce it."
     elif np.isnan(leasts).any():
         yield "At some rows it is not claimed that there is no smaller threshold."
     yield f"The course {question.course} is {COURSES[question.course]}."

@@ -128,8 +128,8 @@ def _explicit_conditions(judge: Evaluator) -> Iterator[Condition]:
     def hidden(rosenbrock: FloatArray) -> tuple[str, tuple[str, ...]]:
         names = leading_names(_null_vector(rosenbrock)[plant.nx :], plant.fault_names, most=MOST_NAMES)
         told = (
-            f"there is a zero at s = 0, where a constant fault {', '.join(map(repr, names))} does not show in the "
-            "outputs once the states have settled. Measure another signal."
+            f"there is a zero at s = 0, where a constant fault {', '.join(map(repr, names))} has no effect on the "
+            "outputs in steady state. Measure another signal."
         )
         return told, names
 

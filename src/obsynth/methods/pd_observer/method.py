@@ -122,7 +122,7 @@ class PdObserver(Method):
     claims: ClassVar[Mapping[str, ClaimMeaning]] = {
         "theorem": ClaimMeaning("", "theorem whose inequality is proved", "LMI"),
         "delta": ClaimMeaning("s", "the theorem's parameter in the certificate", "LMI"),
-        "decay": ClaimMeaning("1/s", "rate at which errors die out: imposed, proved (0: stability alone)", "LMI"),
+        "decay": ClaimMeaning("1/s", "rate at which errors decay: imposed, proved (0: stability alone)", "LMI"),
         "disk_centre": ClaimMeaning("1/s", "c of the disk |s + c| < r that holds every eigenvalue", "disk"),
         "disk_radius": ClaimMeaning("1/s", "r of that disk", "disk"),
         "gain_bound": ClaimMeaning("", "bound on the norm of the gains", "gain bound"),

@@ -66,7 +66,7 @@ def design_gains(plant: DescriptorSystem, asked: PdObserver) -> tuple[PdGains, l
             records.append(error.record)
             continue
         except InfeasibleError:
-            continue  # nobody asked for this rate
+            continue  # this rate was not asked for
         records.append(faster.record)
         if faster.size <= DECAY_PRICE * plain.size:
             return faster, records
@@ -82,7 +82,7 @@ def _faster_at_little_cost(plant: DescriptorSystem, asked: PdObserver, plain: Pd
         try:
             found = gains_for(plant, asked, decay=share * target, most=DECAY_PRICE * plain.size)
         except (SolverError, InfeasibleError):
-            break  # nobody asked for this rate
+            break  # this rate was not asked for
     return found
 
 

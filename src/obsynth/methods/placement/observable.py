@@ -71,8 +71,8 @@ def observable_split(f: FloatArray, c: FloatArray, fixed_modes: ComplexArray, *,
             continue
         if found == 0 or (found > len(cluster) and is_outside(value, dt)):
             raise PreconditionError(
-                f"By the zeros of plant and fault model {value:.6g} is a fixed mode, but the pair (U A, C) shows it: "
-                "double precision cannot tell. Lower the order of the fault model, or rescale the plant.",
+                f"By the zeros of plant and fault model {value:.6g} is a fixed mode, but it is observable in the pair "
+                "(U A, C): double precision cannot decide. Lower the order of the fault model, or rescale the plant.",
                 condition="fixed modes",
                 mode=value,
             )

@@ -163,10 +163,10 @@ def _along(plant: TimeVaryingDescriptorSystem, *, early: bool) -> tuple[RankDeci
         found = least_squares_step(H, noise, right) or rank_revealing_step(H, noise, right, np.zeros((len(H), 0)))
         regressor, factor = found.estimate, found.factor
         if not max(np.max(np.abs(regressor)), np.max(np.abs(factor))) < OUTGROWN:
-            # What nothing shows grows without bound: what has been seen until here decides.
+            # What is unobservable grows without bound: what has been seen until here decides.
             break
         here = np.linalg.norm(right, axis=0)
-        # A regressor that grows in a state which nothing shows must not drown what was seen before.
+        # A regressor that grows in an unobservable state must not hide what was measured before.
         weight = 1.0 / max(1.0, float(np.max(here / direct)))
         gathered = np.asarray(np.linalg.qr(np.vstack([gathered, weight * found.innovation]), mode="r"))
         sizes = np.hypot(sizes, weight * here)
@@ -353,12 +353,12 @@ def residual_condition(ranks: HorizonRanks) -> Condition:
         float(ranks.directions),
         1.0,
         "our finding: missing in Moussa Ali, Zhang 2013",
-        f"at k = {ranks.directions_k} (18) sees only rank E + ny - nx = {ranks.directions} residual directions"
+        f"at k = {ranks.directions_k} (18) uses only rank E + ny - nx = {ranks.directions} residual directions"
         + (
             ""
             if ranks.directions >= 1
-            else ": y - C xhat is zero whatever the parameters are, so it never learns. Use "
-            "form 'innovation', which sees all the parity directions."
+            else ": y - C xhat is zero whatever the parameters are, so the parameters are never corrected. Use form "
+            "'innovation', which uses all parity directions."
         ),
     )
 

@@ -182,7 +182,7 @@ def _notes(
     prior = float(np.linalg.eigvalsh(np.linalg.inv(adaptation.initial_covariance))[0])
     if facts.excitation < LOST_EXCITATION * prior:
         yield (
-            f"The parameters are hardly excited in the window that ends at k = {facts.excitation_k} (information "
+            f"The parameters are poorly excited in the window that ends at k = {facts.excitation_k} (information "
             f"{facts.excitation:.3g}, the prior has {prior:.3g}): the values reported there are the prior ones"
             + (
                 "."
@@ -192,6 +192,6 @@ def _notes(
         )
     if adaptation.form == "literal" and ranks.directions < observer.plant.ny:
         yield (
-            f"The literal form (18) sees {ranks.directions} residual direction(s) of {observer.plant.ny} output(s); "
-            "the innovation form sees all parity directions."
+            f"The literal form (18) uses {ranks.directions} residual direction(s) of {observer.plant.ny} output(s); "
+            "the innovation form uses all parity directions."
         )

@@ -166,7 +166,8 @@ def _model_condition(
         alone = len(faults) == 1
         who = f"the fault {faults[0]!r}" if alone else f"a combination of the faults {', '.join(map(repr, faults))}"
         detail += (
-            f": at {where} {who}{masked or ' is output-nulling'}: no output shows it, so no observer can estimate "
+            f": at {where} {who}{masked or ' is output-nulling'}: it has no effect on the outputs, so no observer can "
+            "estimate "
             f"{'it' if alone else 'them'}. Measure another signal, or leave one of them out."
         )
     return Condition(
@@ -257,7 +258,7 @@ def _order_doubt(judge: Evaluator, model: Exosystem, units: PlantUnits, point: c
         of_the_model=True,
         tolerance=RANK_TOLERANCE,
         moving=True,
-        other=f"hides a motion of plant and fault model at {number(point)}, and no observer sees it",
+        other=f"hides a motion of plant and fault model at {number(point)}, and no observer estimates it",
         decider="A fault model of lower order, or an output nearer to the fault, would decide it.",
     )
 
@@ -583,8 +584,8 @@ def _zero_failure(
     where = f"{'s' if plant.dt == 0.0 else 'z'} = {number(value)}"
     masked = f" under the unknown input {', '.join(map(repr, disturbances))}" if disturbances else ""
     detail = (
-        f"at {where} the states {', '.join(map(repr, states))} move{masked} along an undetectable mode: no output "
-        "shows it, and it does not decay. Measure something that they move."
+        f"at {where} the states {', '.join(map(repr, states))} move{masked} along an undetectable mode: it has no "
+        "effect on the outputs, and does not decay. Measure something that they move."
     )
     found = _zeros(False, instability(value, plant.dt), 0.0, detail)
     return replace(found, mode=value, signals=(*states, *disturbances))

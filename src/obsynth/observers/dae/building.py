@@ -126,8 +126,8 @@ def _default_parameter_variances(model: DAEModel, given: Any) -> FloatArray:
     if given is None and not sizes.all():
         name = model.parameter_names[int(np.argmin(sizes))]
         raise SpecError(
-            f"initial_parameter_covariance is missing, and the nominal value of {name!r} is zero: say how large it may "
-            "be.",
+            f"initial_parameter_covariance is missing, and the nominal value of {name!r} is zero: state how large it "
+            "may be.",
             path="initial_parameter_covariance",
         )
     return np.asarray((DEFAULT_PARAMETER_SHARE * sizes) ** 2)

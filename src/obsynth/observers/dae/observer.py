@@ -51,7 +51,9 @@ def _in_c(
         if len(after) < len(received):
             # Go there again where the message is written.
             advanced(steps, y, u, bool, note)
-            raise SolverError(f"The C stops at k = {begin + len(after)}, but CasADi goes on: leave compiled=True out.")
+            raise SolverError(
+                f"The C code stops at k = {begin + len(after)}, but CasADi does not: leave compiled=True out."
+            )
         if begin == 0:
             moved = steps.projected(steps.first, u[0])[1]
         keep(DAERow(steps.graph, begin, after, said, ~np.isnan(received[: len(after)]), moved))
@@ -227,11 +229,13 @@ class DAEObserver(DAESettings):
         alone = self.outside_graph
         if compiled and not self.is_plain:
             raise SpecError(
-                "The C knows neither sensors of their own times nor state_bounds: leave compiled=True out.",
+                "The C code has neither sensors with their own times nor state_bounds: leave compiled=True out.",
                 path="compiled",
             )
         if compiled and alone:
-            raise SpecError(f"The C knows no {alone}: leave compiled=True out, or leave {alone} out.", path="compiled")
+            raise SpecError(
+                f"The C code has no {alone}: leave compiled=True out, or leave {alone} out.", path="compiled"
+            )
         library = self.library if compiled else None
         found = GatheredRows(self)
         found.add(_nothing(self.steps))

@@ -114,7 +114,7 @@ def kernel_is_chosen(observer: RecursiveSettings, samples: int, compiled: bool |
     if observer.outliers != "none":
         if compiled:
             raise SpecError(
-                "compiled=True: the kernel knows no outliers: leave it out, or take outliers='none'.", path="compiled"
+                "compiled=True: the kernel has no outlier test: leave it out, or take outliers='none'.", path="compiled"
             )
         return False
     # The recursion of a filter, with parameters as a random walk or none.

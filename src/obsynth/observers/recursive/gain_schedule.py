@@ -178,8 +178,8 @@ def steady_observer(observer: RecursiveObserver) -> SteadyObserver:
     radius = abscissa(realisation.Az, observer.dt)
     if not radius < 1.0:
         raise PreconditionError(
-            f"The steady filter is not stable (spectral radius {radius:.6g}): a mode is neither seen by the outputs "
-            "nor damped, or parameters are not excited by a plant at rest. Run the recursion itself (obsynth run).",
+            f"The steady filter is not stable (spectral radius {radius:.6g}): a mode is neither observable nor "
+            "damped, or the parameters are not excited in steady state. Run the recursion itself (obsynth run).",
             condition="stable steady filter",
         )
     return SteadyObserver(realisation, read_only(start), steps)
@@ -223,8 +223,8 @@ def _settled(observer: RecursiveObserver) -> tuple[GainStep, int]:
                 return found, k
         last = found
     raise SolverError(
-        f"The gains do not settle within {MOST_SETTLING_STEPS} steps: a mode is hardly seen, or hardly driven by "
-        "noise. Run the recursion itself (obsynth run), or state more noise in Q.",
+        f"The gains do not settle within {MOST_SETTLING_STEPS} steps: a mode is almost unobservable, or has almost no "
+        "process noise. Run the recursion itself (obsynth run), or state more noise in Q.",
         record={"steps": MOST_SETTLING_STEPS},
     )
 

@@ -120,7 +120,7 @@ class RecursiveObserver(RecursiveSettings):
         require_horizon(self.plant.horizon, len(outputs), early=self.early_constraints)
         if compiled and not self.is_plain:
             raise SpecError(
-                "compiled=True: the kernel knows neither sensors of their own times nor state_bounds: leave it out.",
+                "compiled=True: the kernel has neither sensors with their own times nor state_bounds: leave it out.",
                 path="compiled",
             )
         if self.is_plain and kernel_is_chosen(self, len(outputs), compiled):

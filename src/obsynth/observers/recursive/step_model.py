@@ -86,8 +86,9 @@ def require_in_range(S: FloatArray, factor: FloatArray, k: int, state_names: Seq
     sizes = np.max(np.abs(np.nan_to_num(factor[: len(state_names)])), axis=1, initial=0.0)
     names = leading_names(sizes, state_names)
     raise PreconditionError(
-        f"The errors outgrow double precision at k = {k}: the outputs do not show, or not often enough, what grows in "
-        f"{', '.join(map(repr, names))}. Measure more, shorten the horizon, or leave out what grows unseen.",
+        f"The errors outgrow double precision at k = {k}: they grow in states that the outputs do not observe, or not "
+        "often enough: "
+        f"{', '.join(map(repr, names))}. Measure more, shorten the horizon, or leave these states out.",
         condition="bounded errors",
         signals=names,
     )

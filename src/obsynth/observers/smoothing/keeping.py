@@ -312,7 +312,7 @@ class Chain:
         return self.rows[k - self.begin]
 
     def drop_before(self, k: int) -> None:
-        """Forget the samples before one, which are not asked for any more."""
+        """Drop the samples before one, which are not needed any more."""
         count = min(max(k - self.begin, 0), len(self.nodes) - 1)
         del self.nodes[:count], self.rows[:count]
         self.begin += count

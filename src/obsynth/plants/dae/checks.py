@@ -180,7 +180,7 @@ def _every_signal_used(model: DAEFields, symbols: DAESymbols, problems: Problems
             "outputs",
             model.output_names,
             seen,
-            "The output {!r} contains neither a state nor a parameter: it tells nothing.",
+            "The output {!r} contains neither a state nor a parameter: remove it.",
         ),
     ):
         idle = [name for name, enters in zip(names, used, strict=False) if not enters]

@@ -148,7 +148,7 @@ def _model_rows(observer: DAEObserver, facts: DAEFacts) -> Iterator[Check]:
         told = "the outputs alone do not tell it" if not np.isfinite(bound) else f"Cramer-Rao {bound:.3g} {unit}"
         yield information(
             f"excitation: {name}",
-            "what nominal constant inputs say, in prior deviations to the power -2",
+            "information from nominal constant inputs, in prior deviations to the power -2",
             float((prior / bound) ** 2),
             source=f"{SOURCE}, (26)",
             detail=told,

@@ -1,4 +1,4 @@
-"""Checks of a functional filter, from the plant, the shipped realisation and T, T0 alone; leaks without T and T0."""
+"""Checks of a functional filter, from the plant, the shipped realisation and T, T0 alone; gains without T and T0."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from obsynth.verification.identities import Identity, equality, relative_toleran
 from obsynth.verification.plant import condition_rows, plant_information
 
 #: Estimates at a frequency may miss by this much, relative to terms that pass through the inverse of ``sI - Az``.
-LEAK_TOLERANCE = 1e-7
+DECOUPLING_LEVEL = 1e-7
 
 
-def leak_rows(design: ObserverDesign) -> Iterator[Check]:
-    """Yield the measured leaks: of d into everything, of other faults into each estimate or set of residuals."""
+def decoupling_rows(design: ObserverDesign) -> Iterator[Check]:
+    """Yield the measured gains: of d to everything, of other faults into each estimate or set of residuals."""
     plant, observer = design.linear
     groups = [("unknown inputs", list(range(len(observer.Cz))), list[str]())] if plant.nd else []
     groups += [(f"free of others: {name}", rows, blind) for name, rows, blind in _blind_to(design) if blind]
@@ -46,7 +46,7 @@ def leak_rows(design: ObserverDesign) -> Iterator[Check]:
             name,
             claim if blind else "the unknown inputs reach neither estimates nor residuals",
             found.relative,
-            LEAK_TOLERANCE,
+            DECOUPLING_LEVEL,
             source="computed from the transfer functions of plant and filter, without T and T0",
             detail=f"relative to the terms; worst at {found.frequency:.3g} rad/s",
         )
@@ -147,7 +147,7 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
         yield equality(
             name, claim, identity.residual(), "regulator equation, ours", bound=max(tolerance, TRACKING_TOLERANCE)
         )
-    yield from leak_rows(design)
+    yield from decoupling_rows(design)
     yield from noise_rows(design)
 
 

@@ -187,7 +187,7 @@ def _parts(plant: DescriptorSystem, errors: PdErrorSystem) -> Iterator[Check]:
     )
     yield information(
         "proportional part alone",
-        "spectral abscissa of A - J C, 1/s: neither theorem promises that it is negative",
+        "spectral abscissa of A - J C, 1/s: neither theorem guarantees that it is negative",
         spectral_abscissa(proportional),
         source="Filasova et al., eq. (27)",
         detail=f"eigenvalues {spectrum_text(proportional)}",

@@ -133,7 +133,7 @@ def _dynamic_rows(
     )
     yield information(
         "residual directions",
-        "least rank E_k + ny - nx: what (18f) can see",
+        "least rank E_k + ny - nx: what (18f) can use",
         float(ranks.directions),
         source="our finding",
         detail=f"at k = {ranks.directions_k}",

@@ -37,7 +37,7 @@ WIDEST = 0.1
 #: So many deviations are listed in a row.
 LISTED_DEVIATIONS = 6
 #: Both ends are told where the upper one is so many times the lower one.
-TOLD_APART = 1.001
+BOTH_ENDS = 1.001
 
 
 def steady_rows(
@@ -134,7 +134,7 @@ def _steady_covariance(
     proof = prove_positive_definite(enclosed)
     certain = bool(np.all(spread <= WIDEST * variances))
     deviations = [
-        f"{name} {low[i]:.4g} to {high[i]:.4g}" if high[i] > low[i] * TOLD_APART else f"{name} {high[i]:.4g}"
+        f"{name} {low[i]:.4g} to {high[i]:.4g}" if high[i] > low[i] * BOTH_ENDS else f"{name} {high[i]:.4g}"
         for i, name in enumerate(stated.plant.state_names)
     ]
     detail = (

@@ -183,6 +183,6 @@ def _undershoot(plant: DescriptorSystem, zero: complex, slowest: float) -> str:
     settling = SETTLING_TIME_CONSTANTS / slowest
     least = (1.0 - SETTLING_BAND) / np.expm1(rate * settling)
     return (
-        f"inverse response: a step fault that is settled to {SETTLING_BAND:.0%} after {settling:.3g} s first shows at "
+        f"inverse response: a step fault that is settled to {SETTLING_BAND:.0%} after {settling:.3g} s first has at "
         f"least {least:.3g} of its size in the wrong direction"
     )

@@ -70,7 +70,7 @@ def _digits_rows(ahat: FloatArray, dt: float, poles: list[complex], claims: Mapp
         bound,
         bound - found,
         bool(found < bound),
-        "ours: gains of high-order placements do not survive short printing",
+        "ours: gains of high-order placements do not keep their poles when they are printed with few digits",
     )
     yield information(
         "digits needed",

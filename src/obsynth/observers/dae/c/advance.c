@@ -203,7 +203,7 @@ static int attempt(const double *given, const struct observer *state, const doub
 {
     double memory[MEMORY];
     double X[NX * STAGES];
-    double heard[NY];
+    double received[NY];
     double seen[NY];
     double residual = 0.0;
     const double *inputs[5];
@@ -211,7 +211,7 @@ static int attempt(const double *given, const struct observer *state, const doub
     int failed, i;
     for (i = 0; i < NY; i++) {
         seen[i] = isnan(y[i]) ? 0.0 : 1.0;
-        heard[i] = isnan(y[i]) ? 0.0 : y[i];
+        received[i] = isnan(y[i]) ? 0.0 : y[i];
     }
     copy(memory, given, MEMORY);
     outputs[0] = after;
@@ -223,14 +223,14 @@ static int attempt(const double *given, const struct observer *state, const doub
         }
         inputs[1] = X;
         inputs[2] = u;
-        inputs[3] = heard;
+        inputs[3] = received;
         inputs[4] = seen;
         failed = call(sample, inputs, 5, outputs, 2);
     } else {
         if (!put_on_constraint(memory, u)) {
             return 2;
         }
-        inputs[1] = heard;
+        inputs[1] = received;
         inputs[2] = seen;
         failed = call(first, inputs, 3, outputs, 2);
     }

@@ -30,15 +30,15 @@ static int watched(const struct observer *state, const double *u, const double *
             all += (int)after->surprises[2 * i + 1];
         }
         if (all > 0 && !(total <= RESET_LIMITS[all])) {
-            double forgetful[MEMORY];
-            copy(forgetful, state->memory, MEMORY);
-            copy(forgetful + AT_SPREAD, START + AT_SPREAD, NQ * NQ);
+            double respread[MEMORY];
+            copy(respread, state->memory, MEMORY);
+            copy(respread + AT_SPREAD, START + AT_SPREAD, NQ * NQ);
 #if AT_CROSS >= 0
-            copy(forgetful + AT_CROSS, START + AT_CROSS, NX * NQ);
+            copy(respread + AT_CROSS, START + AT_CROSS, NX * NQ);
 #else
-            copy(forgetful + AT_S, START + AT_S, NQ * NQ);
+            copy(respread + AT_S, START + AT_S, NQ * NQ);
 #endif
-            if (attempt(forgetful, state, u, y, after->memory, said) != 0) {
+            if (attempt(respread, state, u, y, after->memory, said) != 0) {
                 return 2;
             }
             after->watched = 0;
@@ -97,7 +97,7 @@ static void remember(const struct observer *state, struct observer *after, int i
 }
 
 /* Take a step; where its innovation is too long, ask each sensor and take the step again without the outliers. */
-static int robust(const struct observer *state, const double *u, const double *y, double *heard, struct observer *after,
+static int robust(const struct observer *state, const double *u, const double *y, double *received, struct observer *after,
                   double *said)
 {
     double mean[NY];
@@ -107,7 +107,7 @@ static int robust(const struct observer *state, const double *u, const double *y
     int gone[NY];
     int failed, any = 0;
     int i;
-    copy(heard, y, NY);
+    copy(received, y, NY);
     failed = watched(state, u, y, after, said);
     if (!failed && said[AT_NIS] <= OUTLIER_LIMIT * OUTLIER_LIMIT) {
         for (i = 0; i < NY; i++) {
@@ -130,18 +130,18 @@ static int robust(const struct observer *state, const double *u, const double *y
         /* A wrong sample stands alone; of a sensor, or a plant, that has moved the next is on the same side, as far off. */
         gone[i] = far[i] && (!GATE || !follows(state, i, off[i]) || huge);
         if (gone[i]) {
-            heard[i] = !GATE && isfinite(pulled) ? pulled : NAN;
+            received[i] = !GATE && isfinite(pulled) ? pulled : NAN;
         }
         any = any || gone[i];
     }
     if (failed || any) {
-        if (watched(state, u, heard, after, said) != 0) {
+        if (watched(state, u, received, after, said) != 0) {
             /* A sample that nothing predicts, and with which there is no step. */
             for (i = 0; i < NY; i++) {
                 gone[i] = !isnan(y[i]);
-                heard[i] = NAN;
+                received[i] = NAN;
             }
-            if (watched(state, u, heard, after, said) != 0) {
+            if (watched(state, u, received, after, said) != 0) {
                 return 2;
             }
         }
@@ -343,16 +343,16 @@ static void reset(struct observer *state)
     state->resets = 0;
 }
 
-/* Take one sample by all that the observer does with it; `heard` is what was used of it. */
-static int taken(const struct observer *state, const double *u, const double *y, double *heard, struct observer *after,
+/* Take one sample by all that the observer does with it; `received` is what was used of it. */
+static int taken(const struct observer *state, const double *u, const double *y, double *received, struct observer *after,
                  double *said)
 {
 #if OUTLIERS
-    if (robust(state, u, y, heard, after, said) != 0) {
+    if (robust(state, u, y, received, after, said) != 0) {
         return 2;
     }
 #else
-    copy(heard, y, NY);
+    copy(received, y, NY);
     if (watched(state, u, y, after, said) != 0) {
         return 2;
     }
@@ -390,7 +390,7 @@ static const struct observer *latest_of(const struct waiting *state)
 }
 
 /* Take a row as it arrives: what is late is put where it belongs, and all samples from there are taken again. */
-static int advance(struct waiting *state, const double *u, const double *y, double *heard, double *said)
+static int advance(struct waiting *state, const double *u, const double *y, double *received, double *said)
 {
     struct waiting after = *state;
     struct observer at;
@@ -414,7 +414,7 @@ static int advance(struct waiting *state, const double *u, const double *y, doub
         }
     }
     for (t = earliest; t <= kept; t++) {
-        if (taken(&after.before[t], after.u + t * NU, after.y + t * NY, heard, &at, said) != 0) {
+        if (taken(&after.before[t], after.u + t * NU, after.y + t * NY, received, &at, said) != 0) {
             return 2;
         }
         if (t < kept) {
@@ -443,13 +443,13 @@ static const struct observer *latest_of(const struct observer *state)
 }
 
 /* Take one sample: 0; 1 if an input is not finite or an output infinite; 2 if the step has no solution. */
-static int advance(struct observer *state, const double *u, const double *y, double *heard, double *said)
+static int advance(struct observer *state, const double *u, const double *y, double *received, double *said)
 {
     struct observer after;
     if (!is_sample(u, y)) {
         return 1;
     }
-    if (taken(state, u, y, heard, &after, said) != 0) {
+    if (taken(state, u, y, received, &after, said) != 0) {
         return 2;
     }
     *state = after;

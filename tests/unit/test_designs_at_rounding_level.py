@@ -1,4 +1,4 @@
-"""Gains so large that rounding of the outputs drowns a unit fault are no design."""
+"""Gains so large that rounding of the outputs hides a unit fault are no design."""
 
 from dataclasses import replace
 from fractions import Fraction
