@@ -184,9 +184,8 @@ class _Drawing:
             panel.fill_between(times, low, high, label="guaranteed interval", **BAND_STYLE)
         elif deviation is not None and not adaptive:
             low, high = values - BAND_WIDTH * deviation, values + BAND_WIDTH * deviation
-            own = f"sd {column}" in table
-            label = MODEL_BAND if own else "95 % interval of the stated noise"
-            panel.fill_between(times, low, high, label=label, **BAND_STYLE)
+            band = MODEL_BAND if f"sd {column}" in table else "95 % interval of the stated noise"
+            panel.fill_between(times, low, high, label=band, **BAND_STYLE)
         panel.plot(times, values, label="estimate", **{**ESTIMATE_STYLE, "linestyle": "-"})
         if adaptive:
             limit = table[f"threshold {column}"].to_numpy(float)
