@@ -17,19 +17,18 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.experiments.assumptions import Log
 from obsynth.methods.guaranteed_test.exact import Programmes
-from obsynth.methods.guaranteed_test.problem import rounded_outward
 from obsynth.methods.guaranteed_test.proofs import (
     columns_of_exact,
     down,
     exact_multipliers,
     exact_right_sides,
+    sum_in_ellipsoids,
 )
 from obsynth.methods.guaranteed_test.regions import while_inside
 from obsynth.methods.guaranteed_test.result import GuaranteedTest
 from obsynth.methods.guaranteed_test.windows import Window
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.constants import MOST_LISTED, shown
-from obsynth.proofs.balls import rounded_up
 from obsynth.results.certificate_files import SHOWN_DIGITS
 from obsynth.results.design import ObserverDesign
 
@@ -90,10 +89,7 @@ def margin_of(window: Window, values: list[Fraction], y: FloatArray, u: FloatArr
     parts = [Fraction(float(window.bar[j])) * abs(seen[j]) for j in bounded]
     allowed = sum(parts, start=Fraction(0))
     if window.question.ellipsoid:
-        sizes, groups = np.array([rounded_outward(part) for part in parts]), window.group[bounded]
-        norms = [float(np.sqrt(np.sum(sizes[groups == group] ** 2))) for group in np.unique(groups[groups >= 0])]
-        norms += sizes[groups < 0].tolist()
-        allowed = Fraction(float(rounded_up(np.array(sum(norms)), 2 * len(sizes) + 8)))
+        allowed = Fraction(sum_in_ellipsoids(window, parts))
     if allowed == 0:
         # No disturbance and no noise at all: the rounding of the samples themselves would be a proof.
         return 0.0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any
@@ -158,12 +158,17 @@ def missing_bounds(plant: DescriptorSystem, asked: Asked) -> Iterator[str]:
         )
 
 
-def bounds_of(plant: DescriptorSystem, asked: Asked) -> Bounds:
-    """Return the bounds that are given."""
-    lacking = list(missing_bounds(plant, asked))
+def require_bounds(missing: Iterable[str]) -> None:
+    """Raise `SpecError` where bounds are missing, as sentences that begin with an option."""
+    lacking = list(missing)
     if lacking:
         first = lacking[0].partition(":")[0]
         raise SpecError("A guaranteed test needs bounds.", path=f"method.options.{first}", problems=lacking)
+
+
+def bounds_of(plant: DescriptorSystem, asked: Asked) -> Bounds:
+    """Return the bounds that are given."""
+    require_bounds(missing_bounds(plant, asked))
     names, middle = plant.disturbance_names, np.zeros(plant.nw)
     disturbance, disturbance_middle = between(asked.disturbance_bounds, names, "disturbance_bounds", every=False)
     if isinstance(asked.noise_bound, Mapping):

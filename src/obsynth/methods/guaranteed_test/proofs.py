@@ -113,13 +113,18 @@ def exact_right_sides(window: Window, y: FloatArray, u: FloatArray) -> list[Frac
     return found
 
 
+def _weights(window: Window, multipliers: FloatArray) -> FloatArray:
+    """Return how readily each equation's multiplier is corrected: the larger ones first."""
+    rows, _ = window.scales
+    sizes = np.ldexp(np.abs(multipliers), -rows)
+    return np.asarray(np.ldexp(np.maximum(sizes, LEAST_WEIGHT * float(np.max(sizes, initial=0.0))), rows))
+
+
 def exact_multipliers(window: Window, multipliers: FloatArray) -> list[Fraction] | None:
     """Return fractions next to multipliers that see no free column at all; ``None`` where none are found."""
     told = np.flatnonzero(window.free)
     seen = columns_of(window, multipliers)
-    rows, _ = window.scales
-    sizes = np.ldexp(np.abs(multipliers), -rows)
-    weight = np.ldexp(np.maximum(sizes, LEAST_WEIGHT * float(np.max(sizes, initial=0.0))), rows)
+    weight = _weights(window, multipliers)
     dense, _ = _dense(window, told)
     corrected = _rational_step(dense.T, weight, [-seen[column] for column in told])
     if corrected is None:
@@ -272,8 +277,7 @@ def repaired_multipliers(
 
     matrix, radius = _dense(window, np.array(told))
     rows, _ = window.scales
-    sizes = np.ldexp(np.abs(multipliers), -rows)
-    weight = np.ldexp(np.maximum(sizes, LEAST_WEIGHT * float(np.max(sizes, initial=0.0))), rows)
+    weight = _weights(window, multipliers)
     weight = weight if among is None else np.where(among > 0.0, weight, 0.0)
     return _repaired(matrix.T, radius.T, (weight, rows), np.array(multipliers), missing, refine=refine)
 
@@ -425,10 +429,14 @@ def proved_threshold(window: Window, repaired: Repaired, *, exact_zero: bool = F
     parts = [Fraction(float(window.bar[j])) * (abs(seen[j]) + away[j]) for j in bounded]
     if not window.question.ellipsoid:
         return rounded_outward(sum(parts, start=standing))
-    sizes, groups = np.array([rounded_outward(part) for part in parts]), window.group[bounded]
+    return sum_in_ellipsoids(window, parts, rounded_outward(standing))
+
+
+def sum_in_ellipsoids(window: Window, parts: Sequence[Fraction], more: float = 0.0) -> float:
+    """Return an upper bound of the sum of what each bounded column can do at most; those of one ellipsoid together."""
+    sizes, groups = np.array([rounded_outward(part) for part in parts]), window.group[window.bounded]
     norms = [float(np.sqrt(np.sum(sizes[groups == group] ** 2))) for group in np.unique(groups[groups >= 0])]
-    norms += [*sizes[groups < 0].tolist(), rounded_outward(standing)]
-    return float(rounded_up(np.array(sum(norms)), 2 * len(sizes) + 8))
+    return float(rounded_up(np.array(sum([*norms, *sizes[groups < 0].tolist(), more])), 2 * len(sizes) + 8))
 
 
 def _absolute(window: Window, radius: FloatArray) -> list[Fraction]:

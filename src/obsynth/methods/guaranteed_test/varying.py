@@ -17,7 +17,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.methods.guaranteed_test.options import Asked
-from obsynth.methods.guaranteed_test.problem import LADDER, MOST_STATES, between, by_name, question_of
+from obsynth.methods.guaranteed_test.problem import LADDER, MOST_STATES, between, by_name, question_of, require_bounds
 from obsynth.methods.guaranteed_test.windows import Bounds, Question, Window, stacked
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import decide_rank
@@ -164,10 +164,7 @@ def varying_problem(plant: TimeVaryingDescriptorSystem, asked: Asked) -> Varying
             "many steps as the log has.",
             path="plant.horizon",
         )
-    lacking = list(missing_varying_bounds(plant, asked))
-    if lacking:
-        first = lacking[0].partition(":")[0]
-        raise SpecError("A guaranteed test needs bounds.", path=f"method.options.{first}", problems=lacking)
+    require_bounds(missing_varying_bounds(plant, asked))
     names = disturbance_names(plant)
     question = question_of(asked, plant.parameter_names, names)
     disturbance, disturbance_middle = between(asked.disturbance_bounds, names, "disturbance_bounds", every=True)
