@@ -25,7 +25,7 @@ from obsynth.plants.sequences import MatrixSequence
 
 def stacked_matrices(model: StepModel, first: int, count: int) -> StepMatrices:
     """Return the matrices of steps, each with a new first axis: one entry if it is the same for all, or ``count``."""
-    if not isinstance(model, PlantSteps):
+    if not isinstance(model, PlantSteps) or model.walk is not None:
         steps = [model.at(k) for k in range(first, first + count)]
         same = all(step is steps[0] for step in steps)
         return StepMatrices(*(np.array(matrices[:1] if same else matrices) for matrices in zip(*steps, strict=True)))

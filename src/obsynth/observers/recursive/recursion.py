@@ -26,10 +26,8 @@ from obsynth.observers.recursive.step_model import (
     EarlyConstraintSteps,
     PlantSteps,
     PreparedStep,
-    RandomWalkParameterSteps,
     StepMatrices,
     StepModel,
-    WalkingEarlySteps,
     right_side,
     spreads,
 )
@@ -44,16 +42,14 @@ def walk_of(settings: RecursiveSettings) -> FloatArray | None:
 
 def early_steps(settings: RecursiveSettings, rows: IntArray) -> EarlyConstraintSteps:
     """Return the steps of an observer whose algebraic equations ``rows`` are used one step earlier."""
-    parts, walk = (settings.plant, settings.Q, settings.R, rows), walk_of(settings)
-    return EarlyConstraintSteps(*parts) if walk is None else WalkingEarlySteps(*parts, walk)
+    return EarlyConstraintSteps(settings.plant, settings.Q, settings.R, rows, walk=walk_of(settings))
 
 
 def step_model_of(settings: RecursiveSettings) -> StepModel:
     """Return the steps that an observer runs on, with its plant rewritten as its options ask."""
     if settings.early_constraints:
         return early_steps(settings, early_rows(settings.plant, early=True))
-    steps, walk = PlantSteps(settings.plant, settings.Q, settings.R), walk_of(settings)
-    return steps if walk is None else RandomWalkParameterSteps(steps, walk)
+    return PlantSteps(settings.plant, settings.Q, settings.R, walk=walk_of(settings))
 
 
 def posterior_residual(

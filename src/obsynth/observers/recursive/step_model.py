@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -42,18 +42,6 @@ class StepMatrices(NamedTuple):
     Psi: FloatArray  # ``(ny, nq)``
     Dn: FloatArray  # ``(ny - measured, nu)``: outputs that are made of the next input
     noise: FloatArray  # ``(ne + ny, any)``: square root of the covariance of q and r
-
-
-class StepModel(ABC):
-    """Something that knows the matrices of every step."""
-
-    @abstractmethod
-    def at(self, k: int) -> StepMatrices:
-        """Return the matrices of the step from k to k + 1."""
-
-    def first(self) -> StepMatrices | None:
-        """Return the correction of x(0) by the algebraic equations of step 0, where these are used early."""
-        return None
 
 
 def right_side(
@@ -107,24 +95,59 @@ def spreads(
 
 
 @dataclass
-class PlantSteps(StepModel):
-    """The steps of a plant as it is."""
+class StepModel(ABC):
+    """The matrices of every step, with the parameters among the states where these walk at random.
 
-    plant: TimeVaryingDescriptorSystem  # the plant
+    Then ``[x(k+1); theta(k)]`` is the state at k + 1: theta(k) acted in the step to k + 1, and its increment is noise
+    of its own equation, not correlated in time. An algebraic equation used early holds for theta(k + 1), so that the
+    state is ``[x(k+1); theta(k+1)]``; the outputs still hold theta(k), which is theta(k + 1) without its last
+    increment: that noise they share.
+    """
+
+    plant: TimeVaryingDescriptorSystem
     Q: MatrixSequence  # Q, R: ``(ne, ne)`` and ``(ny, ny)`` for each k
     R: MatrixSequence
+    #: ``(nq, nq)``: square root of the covariance of one step of the walk.
+    walk: FloatArray | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         self._constant: StepMatrices | None = None
         self._noise: FloatArray | None = None
-        self._H: FloatArray | None = None
-        self._Dn = np.zeros((0, self.plant.nu))
+        self._last: tuple[StepMatrices, StepMatrices] | None = None
         self._noise_is_constant = self.Q.is_constant and self.R.is_constant
-        self._H_is_constant = self.plant.E.is_constant and self.plant.C.is_constant
-        self._is_constant = self._noise_is_constant and self._H_is_constant and self.plant.is_time_invariant
+        self._is_constant = self._noise_is_constant and self.plant.is_time_invariant
+
+    @abstractmethod
+    def without_walk(self, k: int) -> StepMatrices:
+        """Return the matrices of the step from k to k + 1, as if the parameters did not walk."""
 
     def at(self, k: int) -> StepMatrices:
-        """Return the matrices of the step from k to k + 1."""
+        """Return the matrices of the step from k to k + 1; the same object for the same step."""
+        step, last = self.without_walk(k), self._last
+        if self.walk is None:
+            return step
+        if last is None or last[0] is not step:
+            early = isinstance(self, EarlyConstraintSteps)
+            self._last = last = (step, with_walking_parameters(step, self.walk, early=early))
+        return last[1]
+
+    def first(self) -> StepMatrices | None:
+        """Return the correction of x(0) by the algebraic equations of step 0, where these are used early."""
+        return None
+
+
+@dataclass
+class PlantSteps(StepModel):
+    """The steps of a plant as it is."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._H: FloatArray | None = None
+        self._Dn = np.zeros((0, self.plant.nu))
+        self._H_is_constant = self.plant.E.is_constant and self.plant.C.is_constant
+
+    def without_walk(self, k: int) -> StepMatrices:
+        """Return the matrices of the step from k to k + 1, as if the parameters did not walk."""
         if self._constant is not None:
             return self._constant
         plant = self.plant
@@ -144,11 +167,8 @@ class PlantSteps(StepModel):
 
 @dataclass
 class EarlyConstraintSteps(StepModel):
-    """The steps of a plant with its algebraic equations used as outputs one step earlier."""
+    """The steps of a plant with its algebraic equations, of independent noise, used as outputs one step earlier."""
 
-    plant: TimeVaryingDescriptorSystem  # the plant
-    Q: MatrixSequence  # Q, R: covariances; Q must not couple algebraic equations with the others
-    R: MatrixSequence
     rows: IntArray  # the algebraic equations, see `obsynth.analysis.time_varying.algebraic_rows`
 
     def __post_init__(self) -> None:
@@ -158,12 +178,9 @@ class EarlyConstraintSteps(StepModel):
                 "k): this plant has none. Bring E into that form, or leave the option out.",
                 path="method.options.early_constraints",
             )
+        super().__post_init__()
         self.others = np.setdiff1d(np.arange(self.plant.ne), self.rows)
-        self._constant: StepMatrices | None = None
         self._correction: StepMatrices | None = None
-        self._noise: FloatArray | None = None
-        self._noise_is_constant = self.Q.is_constant and self.R.is_constant
-        self._is_constant = self._noise_is_constant and self.plant.is_time_invariant
 
     def _factors(self, k: int) -> tuple[FloatArray, FloatArray]:
         covariance = self.Q.at(k)
@@ -179,8 +196,8 @@ class EarlyConstraintSteps(StepModel):
             covariance_factor(covariance[np.ix_(self.rows, self.rows)], name),
         )
 
-    def at(self, k: int) -> StepMatrices:
-        """Return the matrices of the step from k to k + 1."""
+    def without_walk(self, k: int) -> StepMatrices:
+        """Return the matrices of the step from k to k + 1, as if the parameters did not walk."""
         if self._constant is not None:
             return self._constant
         plant, late, others = self.plant, self.rows, self.others
@@ -203,11 +220,17 @@ class EarlyConstraintSteps(StepModel):
         return found
 
     def first(self) -> StepMatrices:
-        """Return the correction of x(0) by the algebraic equations of step 0."""
-        return self.correction(0)
+        """Return the correction of x(0), and of parameters that walk, by the algebraic equations of step 0."""
+        step = self._correction_without_walk(0)
+        return step if self.walk is None else with_walking_parameters(step, np.zeros_like(self.walk), early=True)
 
     def correction(self, k: int) -> StepMatrices:
-        """Return the correction of x(k) by the algebraic equations of step k: what is known is the 'equation'."""
+        """Return the correction of x(k) by the algebraic equations of step k, of parameters that walk until there."""
+        step = self._correction_without_walk(k)
+        return step if self.walk is None else with_walking_parameters(step, self.walk, early=True)
+
+    def _correction_without_walk(self, k: int) -> StepMatrices:
+        """Return the correction as if the parameters did not walk: what is known is the 'equation'."""
         if self._correction is not None:
             return self._correction
         plant, late = self.plant, self.rows
@@ -224,52 +247,6 @@ class EarlyConstraintSteps(StepModel):
         )
         self._correction = found if self._is_constant else None
         return found
-
-
-@dataclass
-class RandomWalkParameterSteps(StepModel):
-    """The steps of a model with its parameters among the states, as a random walk: ``[x(k+1); theta(k)]`` at k + 1.
-    theta(k) acted in the step to k + 1: its increment is noise of its own equation, not correlated in time."""
-
-    model: StepModel  # with parameters
-    walk: FloatArray  # ``(nq, nq)``: square root of the covariance of one step of the walk
-
-    def __post_init__(self) -> None:
-        self._last: tuple[StepMatrices, StepMatrices] | None = None
-
-    def at(self, k: int) -> StepMatrices:
-        """Return the matrices of the step from k to k + 1; the same object for the same step of the model."""
-        step, last = self.model.at(k), self._last
-        if last is None or last[0] is not step:
-            self._last = last = (step, with_walking_parameters(step, self.walk))
-        return last[1]
-
-
-@dataclass
-class WalkingEarlySteps(EarlyConstraintSteps):
-    """Both: an early equation of k + 1 holds for theta(k + 1), so the state at k + 1 is ``[x(k+1); theta(k+1)]``.
-    The outputs still hold theta(k), which is theta(k + 1) without its last increment: that noise they share."""
-
-    walk: FloatArray  # ``(nq, nq)``: square root of the covariance of one step of the walk
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self._last: tuple[StepMatrices, StepMatrices] | None = None
-
-    def at(self, k: int) -> StepMatrices:
-        """Return the matrices of the step from k to k + 1; the same object for the same step of the model."""
-        step, last = super().at(k), self._last
-        if last is None or last[0] is not step:
-            self._last = last = (step, with_walking_parameters(step, self.walk, early=True))
-        return last[1]
-
-    def first(self) -> StepMatrices:
-        """Return the correction of x(0) and theta(0) by the algebraic equations of step 0."""
-        return with_walking_parameters(super().correction(0), np.zeros_like(self.walk), early=True)
-
-    def correction(self, k: int) -> StepMatrices:
-        """Return the correction of x(k) by the algebraic equations of step k, of parameters that walk until there."""
-        return with_walking_parameters(super().correction(k), self.walk, early=True)
 
 
 def with_walking_parameters(step: StepMatrices, walk: FloatArray, *, early: bool = False) -> StepMatrices:
