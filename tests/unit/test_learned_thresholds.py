@@ -34,7 +34,7 @@ from obsynth.experiments.monitors.learned_levels import (
     level_of,
     rows_needed,
 )
-from obsynth.experiments.monitors.monitor import LinearSample, Sample
+from obsynth.experiments.monitors.monitor import Evidence, LinearSample, Sample
 from obsynth.numerics.autoregression import Autoregression, fitted_autoregression
 
 DT = 0.1
@@ -363,6 +363,32 @@ def test_columns_that_follow_from_others_and_the_past_are_not_watched() -> None:
     own = lfilter([1.0], [1.0, -0.9], 0.1 * r + 0.05 * rng.standard_normal(3_000))
     assert not fitted_autoregression(np.column_stack([follows, r])).is_regular
     assert fitted_autoregression(np.column_stack([own, r])).is_regular
+
+
+@pytest.mark.parametrize("by_sensor", [True, False])
+def test_a_row_without_one_sensor_decides_by_the_others(by_sensor: bool) -> None:
+    """An innovation that is there has its own variance, whatever stands in its row; the estimate beside it has none."""
+    covariance = np.array([[0.5, 0.2, 0.1], [0.2, 1.0, 0.6], [0.1, 0.6, 2.0]])
+    model = Autoregression(np.zeros(3), 0.3 * np.eye(3)[None], np.linalg.inv(np.linalg.cholesky(covariance)))
+    names = ("fhat[f]", "r[a]", "r[b]")
+    statistics, none = Statistics(model, np.eye(3), names), np.zeros(0)
+    learned = obsynth.types.LearnedThresholds(
+        names, statistics, np.full(9, 10.0), 500.0, 4_000, 500, DT, np.zeros(1), np.ones(1), "", settling=2
+    )
+    rule = LearnedRule(learned, names, ("f",), by_sensor=by_sensor)
+    state, found = rule.init(), []
+    for k, row in enumerate([[0.0, 0.0], [0.0, 0.0], [0.0, 0.0], [7.0, np.nan], [0.0, 0.0]]):
+        innovation = np.array([2.0])
+        evidence = Evidence(np.array([0.4 * (k == 3)]), np.eye(1), innovation, none, none, none)
+        state, judged = rule.step(state, Sample(k * DT, np.array(row), np.zeros(1), evidence))
+        found.append(judged.statistic)
+    if by_sensor:
+        assert found[3] == pytest.approx(7.0**2 / covariance[1, 1] / 10.0)
+    else:
+        assert np.isnan(found[3])
+    # The next row is predicted from that one, and counts by what the observer makes of its own innovation.
+    assert state.white[-1] @ state.white[-1] <= 4.0 + 1e-12
+    assert state.past[0].tolist() == [0.0, 0.0, 0.0]
 
 
 def test_files_and_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

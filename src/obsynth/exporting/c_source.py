@@ -224,6 +224,7 @@ def monitor_source(alarms: Alarms, prefix: str) -> str:
         "monitor_offset": model.offset[None],
         "monitor_A": model.A.reshape(-1, model.channels),
         "monitor_whitener": model.whitener,
+        "monitor_precision": model.whitener.T @ model.whitener,
         "monitor_shares": shares[None],
         "monitor_sizes": ((2.0 - shares) / shares)[None],
         "monitor_levels": found.levels[None],

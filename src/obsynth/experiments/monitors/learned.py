@@ -313,6 +313,11 @@ def settling_rows(design: ObserverDesign) -> int:
     return 0 if isinstance(design.observer, LinearObserver) else SETTLING
 
 
+def has_innovations_by_sensor(observer: Any) -> bool:
+    """Whether each residual is the innovation of one sensor, which says the same where another one is missing."""
+    return not isinstance(observer, (LinearObserver, RecursiveObserver, WindowObserver))
+
+
 def innovation_names(observer: Any) -> tuple[str, ...]:
     """Return the names of the innovations of a recursive or nonlinear observer, as columns of runs have them."""
     if isinstance(observer, RecursiveObserver):
@@ -442,11 +447,21 @@ class LearnedRule(Rule):
     be decided, is as the autoregression predicts it: it adds no evidence, and takes none away.
 
     Where the gain follows what is measured (all but linear observers, which recover from a gap first), a missing sample
-    moves the estimates otherwise than was learned.  Nothing is decided in that row, and rows that are predicted from it
-    count by no more than the observer's own covariance, which has grown, makes of their innovation."""
+    moves the estimates otherwise than was learned.  Rows that are predicted from it count by no more than the
+    observer's own covariance, which has grown, makes of their innovation.  In that row itself the innovations of
+    ``by_sensor`` residuals are what they always are: those that are there decide, and the rest is as they make it most
+    likely."""
 
-    def __init__(self, learned: LearnedThresholds, names: Sequence[str], faults: Sequence[str] = ()) -> None:
-        self.learned = learned
+    def __init__(
+        self,
+        learned: LearnedThresholds,
+        names: Sequence[str],
+        faults: Sequence[str] = (),
+        *,
+        by_sensor: bool = False,
+    ) -> None:
+        self.learned, self.by_sensor = learned, by_sensor
+        self._residual = np.array([not name.startswith("fhat[") for name in learned.columns])
         self._faults = {f"fault {name}": i for i, name in enumerate(faults)}
         self._places = np.array([names.index(name) for name in learned.columns])
         templates = learned.statistics.templates()
@@ -467,16 +482,19 @@ class LearnedRule(Rule):
         state = state._replace(last=sample.time, taken=state.taken + 1)
         found = watched_values(sample.residuals, sample.said)
         whole = found is not None and sample.deciding and bool(np.isfinite(found).all())
-        counts = whole and state.taken > self.learned.settling
+        shown = None if found is None or not sample.deciding else self._completed(state, found, whole=whole)
+        counts = shown is not None and state.taken > self.learned.settling
         most, varying = math.inf if counts else 0.0, isinstance(sample.said, Evidence)
         if counts and state.waiting and isinstance(sample.said, Evidence):
             most = float(np.linalg.norm(sample.said.innovation))
         if not whole and varying:
             state = state._replace(waiting=self._model.order + 1)
         state = state._replace(waiting=max(state.waiting - 1, 0))
-        if found is None or not (whole or (varying and np.isfinite(found[self._places]).all())):
+        if found is None or not (whole or (varying and (counts or np.isfinite(found[self._places]).all()))):
             return self._added(state, None), Judged(math.nan, math.nan)
-        state = self._added(state, found[self._places], most)
+        seen = found[self._places]
+        kept = seen if shown is None else np.where(np.isfinite(seen), seen, shown)
+        state = self._added(state, kept, most, shown)
         if not counts:
             return state, Judged(math.nan, math.nan)
         # Products of numbers that overflow have passed any level.
@@ -500,14 +518,35 @@ class LearnedRule(Rule):
             return None
         return int(np.argmax(np.abs(found[:count] - self.learned.centres) / self.learned.scales))
 
-    def _added(self, state: LearnedState, x: FloatArray | None, most: float = 0.0) -> LearnedState:
-        """Return the state after a row, or after one that is as predicted (`None`), of a norm of ``most`` at most."""
+    def _predicted(self, state: LearnedState) -> FloatArray:
+        """Return what the autoregression says of the next row."""
         model = self._model
-        predicted = model.offset + sum(
-            (a @ row for a, row in zip(model.A, state.past, strict=True)), np.zeros(model.channels)
-        )
+        rows = zip(model.A, state.past, strict=True)
+        return np.asarray(model.offset + sum((a @ row for a, row in rows), np.zeros(model.channels)))
+
+    def _completed(self, state: LearnedState, found: FloatArray, *, whole: bool) -> FloatArray | None:
+        """Return the watched values of a row; where some are missing, as those of sensors that are there make them most
+        likely, and `None` without any."""
+        x = found[self._places]
+        seen = self._residual & np.isfinite(x)
+        if whole or not (self.by_sensor and seen.any()):
+            return x if whole else None
+        predicted, precision = self._predicted(state), self._model.whitener.T @ self._model.whitener
+        away = (x - predicted)[seen]
+        rest = np.linalg.solve(precision[np.ix_(~seen, ~seen)], -precision[np.ix_(~seen, seen)] @ away)
+        completed = np.where(seen, x, predicted)
+        completed[~seen] += rest
+        return completed
+
+    def _added(
+        self, state: LearnedState, x: FloatArray | None, most: float = 0.0, shown: FloatArray | None = None
+    ) -> LearnedState:
+        """Return the state after a row, or after one that is as predicted (`None`): of a norm of ``most`` at most, with
+        what is ``shown`` of it for evidence (``(m,)``, as it is by default)."""
+        model, predicted = self._model, self._predicted(state)
+        shown = x if shown is None else shown
         with np.errstate(over="ignore", invalid="ignore"):
-            e = np.zeros(model.channels) if x is None or not most else model.whitener @ (x - predicted)
+            e = np.zeros(model.channels) if shown is None or not most else model.whitener @ (shown - predicted)
             size = float(np.linalg.norm(e))
             e = e * (most / size) if size > most else e
         shares = np.array(FORGETTING)[:, None]
@@ -541,7 +580,7 @@ def learned_monitor(design: ObserverDesign, learned: LearnedThresholds) -> Monit
     return Monitor(
         "learned",
         learned.statement,
-        LearnedRule(learned, names, observer.fault_names),
+        LearnedRule(learned, names, observer.fault_names, by_sensor=has_innovations_by_sensor(observer)),
         residuals=residuals,
         fault_names=observer.fault_names,
         fault_scales=learned.scales,

@@ -24,12 +24,9 @@ static void monitor_reset(PREFIX_monitor *m)
     m->fault = -1;
 }
 
-/* Take a row of what is watched, whose evidence has a norm of `most` at most; `x` is NULL for one as predicted. */
-static void monitor_add(PREFIX_monitor *m, const REAL *x, REAL most)
+/* What the autoregression says of the next row. */
+static void monitor_predict(const PREFIX_monitor *m, REAL *predicted)
 {
-    REAL predicted[CHANNELS];
-    REAL *e;
-    REAL size = 0;
     int i, j, k;
     for (i = 0; i < CHANNELS; i++) {
         REAL sum = 0;
@@ -40,6 +37,57 @@ static void monitor_add(PREFIX_monitor *m, const REAL *x, REAL most)
         }
         predicted[i] = monitor_offset[0][i] + sum;
     }
+}
+
+/* Let the values that are not seen be what those that are make most likely. */
+static void monitor_complete(const PREFIX_monitor *m, const int *seen, REAL *x)
+{
+    REAL predicted[CHANNELS];
+    REAL away[CHANNELS];
+    REAL rows[CHANNELS][CHANNELS];
+    int i, j, k;
+    monitor_predict(m, predicted);
+    for (i = 0; i < CHANNELS; i++) {
+        away[i] = seen[i] ? x[i] - predicted[i] : 0;
+    }
+    for (i = 0; i < CHANNELS; i++) {
+        for (j = 0; j < CHANNELS; j++) {
+            rows[i][j] = seen[i] || seen[j] ? (REAL)(i == j) : monitor_precision[i][j];
+        }
+        if (!seen[i]) {
+            for (j = 0; j < CHANNELS; j++) {
+                away[i] -= seen[j] ? monitor_precision[i][j] * (x[j] - predicted[j]) : 0;
+            }
+        }
+    }
+    /* Positive definite: no pivots are needed. */
+    for (i = 0; i < CHANNELS; i++) {
+        for (j = i + 1; j < CHANNELS; j++) {
+            REAL share = rows[j][i] / rows[i][i];
+            for (k = i; k < CHANNELS; k++) {
+                rows[j][k] -= share * rows[i][k];
+            }
+            away[j] -= share * away[i];
+        }
+    }
+    for (i = CHANNELS - 1; i >= 0; i--) {
+        for (j = i + 1; j < CHANNELS; j++) {
+            away[i] -= rows[i][j] * away[j];
+        }
+        away[i] /= rows[i][i];
+        x[i] = seen[i] ? x[i] : predicted[i] + away[i];
+    }
+}
+
+/* Take a row of what is watched, whose evidence has a norm of `most` at most; `x` is NULL for one as predicted, and
+ * `kept` is what later rows are predicted from. */
+static void monitor_add(PREFIX_monitor *m, const REAL *x, const REAL *kept, REAL most)
+{
+    REAL predicted[CHANNELS];
+    REAL *e;
+    REAL size = 0;
+    int i, j, k;
+    monitor_predict(m, predicted);
     m->at = (m->at + 1) % OLDEST;
     e = m->white + m->at * CHANNELS;
     for (i = 0; i < CHANNELS; i++) {
@@ -63,7 +111,7 @@ static void monitor_add(PREFIX_monitor *m, const REAL *x, REAL most)
         m->past[i] = m->past[i - CHANNELS];
     }
     for (i = 0; ORDER > 0 && i < CHANNELS; i++) {
-        m->past[i] = x != NULL ? x[i] : predicted[i];
+        m->past[i] = x != NULL ? kept[i] : predicted[i];
     }
 }
 
@@ -118,24 +166,40 @@ static REAL likelihood_ratio(const PREFIX_monitor *m, int shape)
 static void monitor_take(PREFIX_monitor *m, const REAL *shown, int deciding, REAL innovation)
 {
     REAL x[CHANNELS];
+    REAL kept[CHANNELS];
     REAL ratio, statistic;
     REAL best = -1;
     int which = 0;
     int is_said = 1;
     int is_whole = deciding;
+    int is_partly = 0;
+    int seen[CHANNELS];
     REAL most = (REAL)HUGE_VAL;
     int known, i;
     m->taken += m->taken <= MONITOR_SETTLING;
     for (i = 0; i < CHANNELS; i++) {
         x[i] = shown[monitor_places[i]];
         is_said = is_said && isfinite(x[i]);
+        seen[i] = monitor_places[i] >= MONITOR_FAULTS && isfinite(x[i]);
+        is_partly = is_partly || seen[i];
     }
     for (i = 0; i < MONITOR_WATCHED; i++) {
         is_whole = is_whole && isfinite(shown[i]);
     }
-    known = is_whole && m->taken > MONITOR_SETTLING;
+    is_partly = is_partly && deciding && !is_whole && innovation >= 0;
+    for (i = 0; i < CHANNELS; i++) {
+        kept[i] = x[i];
+    }
+    if (is_partly) {
+        monitor_complete(m, seen, x);
+        for (i = 0; i < CHANNELS; i++) {
+            kept[i] = isfinite(kept[i]) ? kept[i] : x[i];
+        }
+    }
+    known = (is_whole || is_partly) && m->taken > MONITOR_SETTLING;
     /* Where the gain follows what is measured, a missing sample moves the estimates otherwise than was learned: rows
-     * that are predicted from that one count by no more than the observer's own covariance, which has grown, says. */
+     * that are predicted from that one count by no more than the observer's own covariance, which has grown, says. In
+     * that row itself the innovations that are there are what they always are. */
     if (m->waiting > 0) {
         most = innovation;
     }
@@ -143,7 +207,8 @@ static void monitor_take(PREFIX_monitor *m, const REAL *shown, int deciding, REA
         m->waiting = ORDER + 1;
     }
     m->waiting -= m->waiting > 0;
-    monitor_add(m, is_whole || (is_said && innovation >= 0) ? x : NULL, known ? most : 0);
+    is_said = is_whole || (innovation >= 0 && (is_said || known));
+    monitor_add(m, is_said ? x : NULL, kept, known ? most : 0);
     m->statistic = NAN;
     m->alarm = 0;
     m->fault = -1;
