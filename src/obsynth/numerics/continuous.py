@@ -8,11 +8,13 @@ decays with the transition over all intervals. Everything but rounding is accoun
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.modal_response import Modes
 from obsynth.numerics.norms import hinf_norm
 from obsynth.numerics.scaling import balanced_matrix, power_of_two_below
 
@@ -43,22 +45,45 @@ def continuous_hinf_norm(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatAr
 
     w is the geometric mean of the moduli of the eigenvalues.
     """
-    if b.shape[1] == 0 or c.shape[0] == 0:
-        return ContinuousHinfNorm(0.0, 0.0, 0.0)
-    n = a.shape[0]
-    if not all(np.all(np.isfinite(part)) for part in (a, b, c, d)) or (n and spectral_abscissa(a) >= 0.0):
-        return ContinuousHinfNorm(np.inf, np.inf, np.nan)
-    if n == 0:
-        size = float(np.linalg.norm(d, 2))
-        return ContinuousHinfNorm(size, size, 0.0)
-    w = float(np.exp(np.mean(np.log(np.abs(np.linalg.eigvals(a))))))
-    resolvent = np.linalg.inv(w * np.eye(n) - a)
-    through = resolvent @ b
-    found = hinf_norm(
-        resolvent @ (w * np.eye(n) + a), np.sqrt(2.0 * w) * through, np.sqrt(2.0 * w) * c @ resolvent, d + c @ through
-    )
-    frequency = np.inf if found.angle >= np.pi else w * float(np.tan(0.5 * found.angle))
-    return ContinuousHinfNorm(found.value, found.upper, float(frequency))
+    return ContinuousNorms(a).between(b, c, d)
+
+
+@dataclass(frozen=True, eq=False)
+class ContinuousNorms:
+    """Norms of systems with one ``A (n, n)``: what depends on that alone is found once."""
+
+    a: FloatArray
+
+    @cached_property
+    def _turned(self) -> tuple[float, FloatArray, FloatArray, Modes] | None:
+        """w, ``(w I - A)^-1``, the matrix in discrete time and its modes; ``None`` where A is not stable."""
+        a, one = self.a, np.eye(len(self.a))
+        values = np.linalg.eigvals(a)
+        if np.max(values.real) >= 0.0:
+            return None
+        w = float(np.exp(np.mean(np.log(np.abs(values)))))
+        resolvent: FloatArray = np.asarray(np.linalg.inv(w * one - a), dtype=np.float64)
+        turned = resolvent @ (w * one + a)
+        return w, resolvent, turned, Modes.of(turned)
+
+    def between(self, b: FloatArray, c: FloatArray, d: FloatArray) -> ContinuousHinfNorm:
+        """Return the norm with other matrices ``(n, m)``, ``(p, n)``, ``(p, m)``; see `continuous_hinf_norm`."""
+        if b.shape[1] == 0 or c.shape[0] == 0:
+            return ContinuousHinfNorm(0.0, 0.0, 0.0)
+        if not all(np.all(np.isfinite(part)) for part in (self.a, b, c, d)):
+            return ContinuousHinfNorm(np.inf, np.inf, np.nan)
+        if not len(self.a):
+            size = float(np.linalg.norm(d, 2))
+            return ContinuousHinfNorm(size, size, 0.0)
+        if self._turned is None:
+            return ContinuousHinfNorm(np.inf, np.inf, np.nan)
+        w, resolvent, turned, modes = self._turned
+        through = resolvent @ b
+        found = hinf_norm(
+            turned, np.sqrt(2.0 * w) * through, np.sqrt(2.0 * w) * c @ resolvent, d + c @ through, modes=modes
+        )
+        frequency = np.inf if found.angle >= np.pi else w * float(np.tan(0.5 * found.angle))
+        return ContinuousHinfNorm(found.value, found.upper, float(frequency))
 
 
 #: Intervals of each length; the length doubles after them, as fast modes have decayed by then.

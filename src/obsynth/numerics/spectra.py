@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.norms import balanced_realisation, output_covariance
@@ -17,6 +18,9 @@ SAME_POLE = 1e-3
 DEAD_BEAT = 1e-6
 #: Significant digits with which gains are commonly printed in full, and those with which a double is kept as it is.
 PRINTED_DIGITS, DOUBLE_DIGITS = 9, 17
+#: Powers of ten that are doubles, and whole numbers up to which every one is.
+EXACT_POWERS = np.array([float(10**power) for power in range(23)])
+LARGEST_WHOLE = 2**53
 
 
 def eigenvalues(matrix: FloatArray) -> ComplexArray:
@@ -82,8 +86,32 @@ def abscissa(matrix: FloatArray, dt: float) -> float:
 def as_printed(matrix: FloatArray, digits: int) -> FloatArray:
     """Return each entry as it is when printed with so many significant digits."""
     form, found, there = f"%.{digits - 1}e", np.zeros(matrix.shape), matrix != 0.0
-    found[there] = [float(form % value) for value in matrix[there].tolist()]
+    values = matrix[there]
+    printed, sure = _printed(values, digits)
+    printed[~sure] = [float(form % value) for value in values[~sure].tolist()]
+    found[there] = printed
     return found
+
+
+def _printed(values: FloatArray, digits: int) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """Return numbers ``(n,)``, none of them zero, as printed, and for which of these that is certain.
+
+    A whole number of so many digits times or over an exact power of ten is rounded once, as a decimal that is read.
+    """
+    with np.errstate(all="ignore"):
+        sizes = np.where(np.isfinite(values), np.abs(values), 1.0)
+        powers = np.floor(np.log10(sizes)) - (digits - 1)
+        tens = EXACT_POWERS[np.minimum(np.abs(powers), len(EXACT_POWERS) - 1).astype(np.intp)]
+        scaled = np.where(powers < 0.0, sizes * tens, sizes / tens)
+        whole = np.rint(scaled)
+        printed = np.copysign(np.where(powers < 0.0, whole / tens, whole * tens), values)
+        # The quotient is off by half a unit in its last place: near a tie the digits themselves decide.
+        clear = np.isfinite(values) & (
+            np.abs(np.abs(scaled - np.floor(scaled)) - 0.5) > np.finfo(np.float64).eps * scaled
+        )
+        exact = np.abs(powers) < len(EXACT_POWERS)
+        within = (whole > 10 ** (digits - 1)) & (whole <= min(10**digits, LARGEST_WHOLE))
+        return printed, clear & exact & within
 
 
 def digits_needed(matrix: FloatArray, dt: float) -> int:

@@ -14,11 +14,12 @@ Any K and S with ``I - S C`` nonsingular come from gains: ``L = (I - S C)^-1 S``
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.continuous import ContinuousHinfNorm, continuous_hinf_norm
+from obsynth.numerics.continuous import ContinuousHinfNorm, ContinuousNorms, continuous_hinf_norm
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.verification.error_system import ErrorModel
@@ -116,13 +117,17 @@ class PdErrorSystem:
             nx,
         )
 
+    @cached_property
+    def _norms(self) -> ContinuousNorms:
+        return ContinuousNorms(self.Az)
+
     def fault_norm(self, driven: tuple[FloatArray, FloatArray]) -> ContinuousHinfNorm:
         """Return the H-infinity norm to the fault error from one of ``rate``, ``disturbance``, ``noise``."""
-        return continuous_hinf_norm(self.Az, driven[0], self.estimate[self.nx :], driven[1][self.nx :])
+        return self._norms.between(driven[0], self.estimate[self.nx :], driven[1][self.nx :])
 
     def state_norm(self, driven: tuple[FloatArray, FloatArray]) -> ContinuousHinfNorm:
         """Return the same to the error of the state estimate."""
-        return continuous_hinf_norm(self.Az, driven[0], self.estimate[: self.nx], driven[1][: self.nx])
+        return self._norms.between(driven[0], self.estimate[: self.nx], driven[1][: self.nx])
 
     def separate_noise_norm(self, process: FloatArray, sensor: FloatArray) -> ContinuousHinfNorm:
         """Return the H-infinity norm from ``[w; w']``, both free, with ``process (nx, nw)`` and ``sensor (ny, nw)``."""
