@@ -100,12 +100,13 @@ def projected_step(
     right = np.empty((n, columns + n), order="F")
     innovation = data[:m]
     if m:
-        if abs(triangle.diagonal()[:m]).min() <= suspect:
+        diagonal = triangle.diagonal()[:m]
+        if min(map(abs, diagonal.tolist())) <= suspect:
             return None
         innovation = lapack.dtrtrs(triangle[:m, :m], innovation, trans=1)[0]
-        right[:, :columns] = data[m:] - triangle[:m, m:rows].T @ innovation
+        right[:, :columns] = data[m:] - triangle[:m, m:rows].T.dot(innovation)
         # A reflection goes by the sign of what may be rounding of zero: that of a positive diagonal is the one taken.
-        innovation = innovation * np.sign(triangle.diagonal()[:m])[:, None]
+        innovation = innovation * np.sign(diagonal)[:, None]
     else:
         right[:, :columns] = data
     np.multiply(triangle[m:rows, m:rows].T, projection.lower, out=right[:, columns:])

@@ -214,9 +214,12 @@ class RunningObserver(Generic[State, Row]):
 
 
 def named_estimates(observer: StepObserver, *, states: FloatArray, faults: FloatArray, **known: Any) -> Estimates:
-    """Return the estimates of an observer without delays; arrays are made read-only."""
+    """Return the estimates of an observer without delays; arrays are made read-only, copied where they are not yet."""
     residuals = known.pop("residuals", np.zeros((*states.shape[:-1], 0)))
-    arrays: dict[str, Any] = {name: value if value.dtype == bool else read_only(value) for name, value in known.items()}
+    arrays: dict[str, Any] = {
+        name: value if value.dtype == bool or (value.flags.owndata and not value.flags.writeable) else read_only(value)
+        for name, value in known.items()
+    }
     return Estimates(
         read_only(states),
         read_only(faults),

@@ -130,12 +130,18 @@ def _alike(rows: Sequence[RawEstimate], name: str) -> Iterator[tuple[NDArray[np.
     return _groups([getattr(row, name) for row in rows])
 
 
+#: Rows whose arrays are put together at once: more would leave the processor's cache, and their room be made anew.
+ROWS_AT_ONCE = 256
+
+
 def _groups(arrays: Sequence[FloatArray]) -> Iterator[tuple[NDArray[np.intp], FloatArray]]:
     places = defaultdict[tuple[int, ...], list[int]](list)
     for place, array in enumerate(arrays):
         places[array.shape].append(place)
-    for chosen in places.values():
-        yield np.array(chosen), np.array([arrays[place] for place in chosen])
+    for alike in places.values():
+        for begin in range(0, len(alike), ROWS_AT_ONCE):
+            chosen = alike[begin : begin + ROWS_AT_ONCE]
+            yield np.array(chosen), np.array([arrays[place] for place in chosen])
 
 
 def _spreads(rows: Sequence[RawEstimate], nx: int, nq: int) -> dict[str, FloatArray]:
@@ -147,7 +153,7 @@ def _spreads(rows: Sequence[RawEstimate], nx: int, nq: int) -> dict[str, FloatAr
     for chosen, factor in _alike(rows, "factor"):
         deviations[chosen] = np.sqrt(np.einsum("kij,kij->ki", factor, factor))
         states[chosen] = np.matmul(factor, factor.transpose(0, 2, 1))
-        for spread_of, spread in _groups([spreads[place] for place in chosen]):
+        for spread_of, spread in _groups([spreads[place] for place in chosen] if nq else []):
             shared = factor[spread_of][:, :, factor.shape[2] - spread.shape[2] :]
             parameters[chosen[spread_of]] = np.matmul(spread, spread.transpose(0, 2, 1))
             cross[chosen[spread_of]] = np.matmul(shared, spread.transpose(0, 2, 1))
@@ -157,6 +163,8 @@ def _spreads(rows: Sequence[RawEstimate], nx: int, nq: int) -> dict[str, FloatAr
             deviations[place, unknown] = np.inf
             states[place, unknown], states[place][:, unknown] = np.nan, np.nan
             states[place, unknown, unknown] = np.inf
+    for made in (deviations, states, cross):
+        made.setflags(write=False)
     return {
         "state_deviations": deviations,
         "faults": np.array([row.theta for row in rows]).reshape(count, nq),

@@ -200,7 +200,11 @@ class Recursion:
             after, v, G = state, np.zeros(0), np.zeros((0, state.Upsilon.shape[1]))
         gap = v - G @ theta if len(theta) else v
         row = self._estimate(after, v, G, gap, y)
-        return after._replace(k=state.k + 1, u=u, regressors=(*state.regressors, G)[-self.window :]), row
+        k, regressors = state.k + 1, (*state.regressors, G)[-self.window :]
+        # By place: `_replace` of two or three fields takes as long as a product.
+        _, x, factor, Upsilon, diffuse, parameters, _, _, surprises, resets, refused = after
+        taken = RecursiveState(k, x, factor, Upsilon, diffuse, parameters, u, regressors, surprises, resets, refused)
+        return taken, row
 
     def _stepped(
         self, state: RecursiveState, step: StepMatrices, y: FloatArray, u: FloatArray
@@ -236,14 +240,18 @@ class Recursion:
                 directional=self.directional,
                 noise=noise,
             )
-        after = state._replace(
-            x=found.estimate[:, 0],
-            Upsilon=found.estimate[:, 1:],
-            factor=found.factor,
-            diffuse=found.diffuse,
-            parameters=parameters,
-            surprises=surprises,
-            resets=resets,
+        after = RecursiveState(
+            state.k,
+            found.estimate[:, 0],
+            found.factor,
+            found.estimate[:, 1:],
+            found.diffuse,
+            parameters,
+            state.u,
+            state.regressors,
+            surprises,
+            resets,
+            state.refused,
         )
         return after, v, G
 
