@@ -63,7 +63,7 @@ class TestPrinted:
         np.testing.assert_allclose(
             np.sort(np.linalg.eigvals(PLANT.A).real), sorted(TRUTH["open_loop"]), rtol=0, atol=5.1e-5
         )
-        zeros = np.array([zero.value for zero in fault_zeros(PLANT).zeros])
+        zeros = np.array([zero.value for zero in fault_zeros(PLANT)[0]])
         assert miss(zeros, TRUTH["zeros"]) < 0.01
         assert np.linalg.matrix_rank(PLANT.C @ PLANT.Bf) == 2
 

@@ -37,7 +37,7 @@ def test_the_plant_is_what_the_notes_say() -> None:
     assert PLANT.output_names == ("omega GENCLS 1", "a Bus 1", "v Bus 1")
     np.testing.assert_allclose(PLANT.Dd[:, 0], EXPECTED["plant"]["Dd"], atol=5e-5)
     np.testing.assert_array_equal(PLANT.Dw, np.diag([1e-4, 1e-3, 1e-3]))
-    assert [zero.value for zero in fault_zeros(PLANT).zeros] == EXPECTED["plant"]["fault_zeros"]
+    assert [zero.value for zero in fault_zeros(PLANT)[0]] == EXPECTED["plant"]["fault_zeros"]
 
 
 def test_the_design_passes_and_its_claims_are_recomputed(design: obsynth.ObserverDesign) -> None:

@@ -113,7 +113,7 @@ def test_the_text_says_F_equals_B_but_that_gives_other_matrices() -> None:
 @BOTH
 def test_indexes_and_fault_zeros(plant, expected) -> None:
     assert list(prepare(plant, S).detectability.indexes) == EXPECTED["printed"]["indexes"]["value"]
-    zeros = [zero.value for zero in fault_zeros(plant).zeros]
+    zeros = [zero.value for zero in fault_zeros(plant)[0]]
     np.testing.assert_allclose(zeros, expected["truth"]["fault_zeros"], atol=1e-12)
 
 

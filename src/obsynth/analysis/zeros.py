@@ -27,7 +27,6 @@ from obsynth.numerics.ranks import (
     NAMED_SHARE,
     NEGLIGIBLE_INPUT,
     RANK_TOLERANCE,
-    RankDecision,
 )
 from obsynth.numerics.scaling import EquilibratedPencil, equilibrate_pencil, power_of_two_below
 from obsynth.plants.descriptor import DescriptorSystem
@@ -106,18 +105,6 @@ class Zero:
         return self.input_share <= NEGLIGIBLE_INPUT
 
 
-@dataclass(frozen=True, eq=False)
-class FaultZeros:
-    """What faults a plant can hide from its outputs: zeros of ``[A - z E, Bf; C, Df]``."""
-
-    zeros: tuple[Zero, ...]
-    outside: tuple[Zero, ...]  # those not strictly stable
-    normal_rank_full: bool  # rank nx + nf at almost every z
-    hidden_direction: FloatArray | None  # ``(nf,)``: has no effect on the outputs, unless that rank is full
-    hidden_faults: tuple[str, ...]
-    decisions: tuple[RankDecision, ...]
-
-
 def is_outside(value: complex, dt: float) -> bool:
     """Whether an eigenvalue or zero counts as not strictly stable, by its distance from the boundary alone."""
     if dt > 0.0:
@@ -156,13 +143,10 @@ def invariant_zeros(
     return _with_directions(wide_e, wide_a, system_zeros(wide_e, wide_a, nx=E.shape[0]), nx=E.shape[0])
 
 
-def fault_zeros(plant: DescriptorSystem) -> FaultZeros:
-    """Return the invariant zeros from the faults of ``plant`` to its outputs."""
+def fault_zeros(plant: DescriptorSystem) -> tuple[tuple[Zero, ...], tuple[Zero, ...]]:
+    """Return the invariant zeros from the faults of ``plant`` to its outputs, and those not strictly stable."""
     plant = plant.dense()
-    found, zeros, outside = zeros_of_system(plant.E, plant.A, plant.Bf, plant.C, plant.Df, dt=plant.dt)
-    missing = plant.nx + plant.nf - found.normal_rank
-    direction, names = hidden_direction(plant, missing=missing) if missing else (None, ())
-    return FaultZeros(zeros, outside, missing == 0, direction, names, found.decisions)
+    return zeros_of_system(plant.E, plant.A, plant.Bf, plant.C, plant.Df, dt=plant.dt)[1:]
 
 
 def zero_at(E: FloatArray, A: FloatArray, value: complex, B: FloatArray, C: FloatArray, D: FloatArray) -> Zero:
@@ -174,8 +158,8 @@ def zero_at(E: FloatArray, A: FloatArray, value: complex, B: FloatArray, C: Floa
     return _zero_along(basis[:, 0], value, pencil.columns, nx=nx)
 
 
-def hidden_direction(plant: DescriptorSystem, *, missing: int) -> tuple[FloatArray, tuple[str, ...]]:
-    """Return the faults that never show, and their direction ``(nf,)`` in the null space at a generic point."""
+def hidden_faults(plant: DescriptorSystem, *, missing: int) -> tuple[str, ...]:
+    """Return the faults that never show, of a plant whose rank lacks so many at almost every point."""
     pencil = equilibrate_pencil(*system_pencil(plant.E, plant.A, plant.Bf, plant.C, plant.Df))
     kernels = []
     for point in GENERIC_POINTS:
@@ -183,10 +167,7 @@ def hidden_direction(plant: DescriptorSystem, *, missing: int) -> tuple[FloatArr
         kernels.append((float(singular_values[plant.nx + plant.nf - missing - 1]), right[-missing:].T))
     _, kernel = max(kernels, key=lambda pair: pair[0])
     ordered = _smallest_part_first(kernel, slice(plant.nx, None))
-    direction = pencil.columns[plant.nx :] * ordered[plant.nx :, -1]
-    size = float(np.linalg.norm(direction))
-    names = leading_names(np.linalg.norm(ordered[plant.nx :], axis=1), plant.fault_names)
-    return read_only(direction / size if size > 0.0 else direction), names
+    return leading_names(np.linalg.norm(ordered[plant.nx :], axis=1), plant.fault_names)
 
 
 def zeros_of_system(

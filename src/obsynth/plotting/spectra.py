@@ -71,7 +71,7 @@ def plot_poles(design: ObserverDesign, *, axes: Axes | None = None) -> Axes:
     if axes is None:
         (axes,) = new_panels(None, 1, size=(5.0, 5.4) if sampled else (WIDTH, 4.4))
     poles = np.asarray(eigenvalues(observer.Az), dtype=complex)
-    zeros = np.array([zero.value for zero in fault_zeros(plant).zeros], dtype=complex)
+    zeros = np.array([zero.value for zero in fault_zeros(plant)[0]], dtype=complex)
     axes.axhline(0.0, color="0.85", linewidth=0.8, zorder=0)
     if sampled:
         _discrete_plane(axes, poles, zeros)

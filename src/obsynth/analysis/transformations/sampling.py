@@ -98,8 +98,8 @@ def sampling_zero_warnings(plant: DescriptorSystem) -> tuple[str, ...]:
     """Return a text for every fault zero inside, but near, the unit circle: estimates ring ``dt / -ln abs(z)`` s."""
     if not plant.is_discrete:
         return ()
-    found = fault_zeros(plant)
-    inside = [zero.value for zero in found.zeros if not any(zero is other for other in found.outside)]
+    zeros, outside = fault_zeros(plant)
+    inside = [zero.value for zero in zeros if not any(zero is other for other in outside)]
     texts = [
         f"Fault zero at {_number(value)} (modulus {abs(value):.6g}): errors of a fault estimate decay there with a "
         f"time constant of {-plant.dt / math.log(abs(value)):.3g} s. Sample more slowly, or measure a signal nearer to "

@@ -23,7 +23,7 @@ from obsynth.analysis.existence.rational import SystemFacts, WrittenNumbers
 from obsynth.analysis.existence.statements import DECIDER, Evaluator, FullRank, NoZeroOutside, reconsidered
 from obsynth.analysis.existence.witnesses import EntryChange, Unclear, Witness, rational_matrices
 from obsynth.analysis.plant_units import PlantUnits
-from obsynth.analysis.zeros import MOST_NAMES, Zero, hidden_direction, leading_names, zero_at
+from obsynth.analysis.zeros import MOST_NAMES, Zero, hidden_faults, leading_names, zero_at
 from obsynth.errors import PreconditionError
 from obsynth.methods.fault_estimation_filter.detectability_indexes import (
     REFUSE_CONDITION,
@@ -303,7 +303,7 @@ def _zero_condition(judge: Evaluator) -> Condition:
 
     def lost(facts: SystemFacts) -> Condition:
         if not facts.full:
-            names = hidden_direction(plant, missing=facts.columns - facts.normal_rank)[1]
+            names = hidden_faults(plant, missing=facts.columns - facts.normal_rank)
             detail = (
                 f"faults {', '.join(map(repr, names))} are together output-nulling: they have no effect on the outputs."
             )
