@@ -53,7 +53,14 @@ def test_numbers_of_the_table_are_those_of_a_simulation(bicycle: obsynth.Compari
 def test_texts_and_picture(bicycle: obsynth.Comparison) -> None:
     assert "Take functional-filter" in str(bicycle)
     assert "<table>" in bicycle._repr_html_()
-    assert len(bicycle.plot().axes) == 2
+    step, scenario = bicycle.plot().axes
+    assert step.get_xlabel() == "time (s)"
+    # What does not fit into the panel lies faintly behind what does.
+    reach = scenario.get_ylim()[1]
+    for line in scenario.get_lines()[1:]:
+        noisy = np.quantile(np.abs(line.get_ydata()), 0.98) > reach
+        assert ((line.get_alpha() or 1.0) < 0.5) == noisy
+        assert (line.get_zorder() < 2.0) == noisy
     assert 'content="obsynth compare"' in bicycle.page()
     json.dumps(bicycle.to_dict())
 

@@ -36,15 +36,17 @@ def test_compare_and_evaluate_say_how_far_from_the_least_each_method_is(capsys: 
     fault = found["fault-estimation-filter"].faults[0]
     assert 1.0 <= fault.bound / fault.least < 2.0
     header, row = found.rows()
-    assert row[header.index("x least")] == f"{fault.bound / fault.least:.3g}"
+    assert row[header.index("/ least")] == f"{fault.bound / fault.least:.3g}"
     # No number is cut on a terminal of eighty columns.
     printed = io.StringIO()
     comparison_report(found, console=Console(file=printed, width=80))
-    for name in ("deviation", "gain from d", "bound", "x least", "rms"):
+    for name in ("deviation", "gain from d", "bound", "/ least", "rms"):
         assert f"  {name}" in printed.getvalue()
         assert f" {row[header.index(name)]}" in printed.getvalue()
     assert main(["evaluate", "--system", str(DRIVE), "--runs", "2", "--quiet"]) == 0
-    assert "times the least that any test with its delay can have" in " ".join(capsys.readouterr().out.split())
+    assert "times the least of all tests with its delay on at most 32 samples" in " ".join(
+        capsys.readouterr().out.split()
+    )
 
 
 def test_the_command_line_says_which_sensor_finds_a_fault(capsys: pytest.CaptureFixture[str]) -> None:

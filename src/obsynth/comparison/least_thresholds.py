@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from obsynth.comparison.result import LONGEST_WINDOW
 from obsynth.errors import ObsynthError
 from obsynth.experiments.monitors.residual_model import largest_disturbances
 from obsynth.methods.automatic import SETTLING_TIMES
@@ -22,8 +23,6 @@ from obsynth.simulation.scenario import Scenario
 
 #: Noise counts as within so many deviations.
 DEVIATIONS = 3.0
-#: Samples of the window on which the least threshold is looked for, at most.
-LONGEST_WINDOW = 32
 #: What a response may differ from one sample of the fault, and be taken as it.
 SAME_RESPONSE = 1e-6
 #: A response is followed for `SETTLING_TIMES`, and for so many steps at most.
@@ -76,7 +75,10 @@ def in_words(fault: str, bound: float, least: float, unit: str = "") -> str:
         return f"{own}; its least threshold is not known."
     if least <= SAME_RESPONSE * bound:
         return f"{own}; a test exists on which disturbances and noise have no effect."
-    return f"{own}, {bound / least:.2f} times the least that any test with its delay can have ({least:.4g})."
+    return (
+        f"{own}, {bound / least:.2f} times the least of all tests with its delay on at most {LONGEST_WINDOW} "
+        f"samples ({least:.4g})."
+    )
 
 
 def design_beside_least(design: ObserverDesign, scenario: Scenario) -> dict[str, tuple[float, float]]:

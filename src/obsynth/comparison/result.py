@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
 from pathlib import Path
@@ -46,8 +46,9 @@ class FaultComparison:
         What the estimate never passes without a fault, with disturbances as large as in the scenario and three
         deviations of noise: sums of absolute values.
     least : float
-        The least such bound that any test with the same delay can have, linear or not: of a fault of any time course
-        where the estimate is one sample of it, else of a constant one.
+        The least such bound that any test with the same delay on at most `LONGEST_WINDOW` samples can have, linear or
+        not: of a fault of any time course where the estimate is one sample of it, else of a constant one.  An observer
+        uses all samples before, and its bound may be smaller.
     """
 
     figures: FaultFigures
@@ -102,8 +103,12 @@ class ComparedMethod:
         return float(np.sqrt(np.mean([found.rms**2 for found in self.faults]))) if self.faults else float("inf")
 
 
+#: Samples of the window on which the least threshold is looked for, at most.
+LONGEST_WINDOW = 32
 #: A picture of estimates reaches as far as this share of their samples.
 SHOWN_SAMPLES = 0.98
+#: Opacity of an estimate that reaches beyond its panel.
+FAINT = 0.25
 #: What the page of a comparison begins with.
 COMPARISON_PAGE = FileKind("a comparison of obsynth", rb'name="generator" content="obsynth compare"')
 _HEADER = (
@@ -120,10 +125,27 @@ _HEADER = (
     "s to alarm",
     "smallest",
     "bound",
-    "x least",
+    "/ least",
     "rms",
     "ms",
 )
+#: What the columns of numbers mean.
+_FIGURE_MEANINGS = {
+    "order": "states of the observer",
+    "s to 50 %": "time until the estimate of a unit step reaches 50 %",
+    "s to 90 %": "time until the estimate of a unit step reaches 90 %",
+    "at horizon": "the estimate of a unit step at the end",
+    "peak": "its largest absolute value",
+    "deviation": "standard deviation of the estimate",
+    "gain from d": "largest gain from an unknown input to the estimate",
+    "bias": "largest mean of the estimate without a fault",
+    "s to alarm": "median detection delay",
+    "smallest": "step that half of the runs detect",
+    "bound": "what the estimate never exceeds without a fault",
+    "/ least": f"the bound, divided by the least of all tests with this delay on at most {LONGEST_WINDOW} samples",
+    "rms": "root mean square error in the runs",
+    "ms": "milliseconds to design and verify",
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,6 +224,10 @@ class Comparison:
                 )
         return (_HEADER, *rows)
 
+    def meanings(self, columns: Sequence[str] = _HEADER) -> str:
+        """Return what columns of numbers of the table mean, in one sentence."""
+        return "; ".join(f"{name}: {_FIGURE_MEANINGS[name]}" for name in columns if name in _FIGURE_MEANINGS) + "."
+
     @property
     def refusals(self) -> tuple[str, ...]:
         """Methods that do not exist, each with the reason in one line."""
@@ -268,43 +294,59 @@ class Comparison:
         return write_atomically(path, text)
 
     def plot(self) -> Figure:
-        """Return a figure: for each fault, what each method makes of a unit step, and its estimate on the scenario."""
+        """Return a figure: for each fault, each method's estimate of a unit step, and its estimate on the scenario.
+
+        An estimate that is too noisy for the range of its panel lies faintly behind the others.
+        """
         from matplotlib.figure import Figure
 
+        from obsynth.plotting.panels import LINE_COLOURS, TRUE_STYLE, label_time, legend_above, tidy, with_unit
+
         shown = [entry for entry in self.methods if entry.faults]
+        units = next((dict(entry.design.plant.units) for entry in shown if entry.design is not None), {})
         count = max(len(self.fault_names), 1)
         figure = Figure(figsize=(11.0, 2.8 * count), layout="constrained")
         axes = figure.subplots(count, 2, squeeze=False)
         for row, name in enumerate(self.fault_names):
             left, right = axes[row]
-            right.plot(self.times, self.truth[:, row], color="0.3", linewidth=1.5, label="fault")
+            right.plot(self.times, self.truth[:, row], label="fault", **TRUE_STYLE)
             left.axhline(1.0, color="0.8", linewidth=0.8)
+            reach = self._reach(shown, row)
             for rank, entry in enumerate(shown):
-                # The best lies on top.
-                height = 3.0 + len(shown) - rank
                 names = [fault.figures.fault for fault in entry.faults]
                 if name not in names:
                     continue
-                column = names.index(name)
-                response = np.clip(entry.responses[:, column], -1.0, 3.0)
-                left.plot(np.arange(len(response)) * self.sample_time, response, label=entry.method, zorder=height)
-                right.plot(self.times, entry.estimates[:, column], linewidth=0.8, zorder=height)
-            left.set(xlabel="s after a unit step", ylabel=f"estimate of {name}")
+                column, colour = names.index(name), LINE_COLOURS[rank % len(LINE_COLOURS)]
+                # The best lies on top.
+                style: dict[str, Any] = {"color": colour, "zorder": 3.0 + len(shown) - rank}
+                response, estimate = np.clip(entry.responses[:, column], -1.0, 3.0), entry.estimates[:, column]
+                left.plot(np.arange(len(response)) * self.sample_time, response, label=entry.method, **style)
+                noisy = float(np.nanquantile(np.abs(estimate), SHOWN_SAMPLES)) > reach
+                faint = {"alpha": FAINT, "linewidth": 0.4, "zorder": 1.0} if noisy else {"linewidth": 0.8}
+                right.plot(self.times, estimate, **{**style, **faint})
             times = [f.figures.most for entry in shown for f in entry.faults if np.isfinite(f.figures.most)]
             length = max((len(entry.responses) for entry in shown), default=2) * self.sample_time
             left.set_xlim(0.0, min(max([3.0 * max(times, default=length), 10.0 * self.sample_time]), length))
-            right.set(xlabel="s", ylabel=name)
-            spread = float(np.max(np.abs(self.truth[:, row]), initial=0.0)) or 1.0
-            best = shown[0].estimates[:, 0] if shown else self.truth[:, row]
-            reach = (
-                max(2.5 * spread, 1.5 * float(np.quantile(np.abs(best), SHOWN_SAMPLES))) if row == 0 else 2.5 * spread
-            )
+            left.set_ylabel(f"estimate of a unit step\nof {name}")
+            right.set_ylabel(with_unit(name, units))
             right.set_ylim(-reach, reach)
-        axes[0, 0].legend(fontsize=8)
+            for panel in (left, right):
+                label_time(panel)
+                tidy(panel)
+        if len(self.fault_names):
+            legend_above(axes[0, 0])
+            legend_above(axes[0, 1])
         return figure
 
+    def _reach(self, shown: Sequence[ComparedMethod], row: int) -> float:
+        """Return how far the panel of a fault reaches on both sides of zero: what the best estimate needs."""
+        reach = 2.5 * (float(np.max(np.abs(self.truth[:, row]), initial=0.0)) or 1.0)
+        if row or not shown:
+            return reach
+        return max(reach, 1.5 * float(np.nanquantile(np.abs(shown[0].estimates[:, 0]), SHOWN_SAMPLES)))
+
     def __str__(self) -> str:
-        return "\n".join([self.setting, *text_table(self.rows(), left=2), *self.refusals, self.advice])
+        return "\n".join([self.setting, *text_table(self.rows(), left=2), self.meanings(), *self.refusals, self.advice])
 
     @property
     def advice(self) -> str:
@@ -313,7 +355,7 @@ class Comparison:
 
     def _repr_html_(self) -> str:
         return f"<p>{escape(self.setting)}</p>{html_table(self.rows())}" + "".join(
-            f"<p>{escape(text)}</p>" for text in (*self.refusals, self.advice)
+            f"<p>{escape(text)}</p>" for text in (self.meanings(), *self.refusals, self.advice)
         )
 
     def page(self) -> str:
@@ -328,6 +370,7 @@ class Comparison:
             f'<p class="verdict {"holds" if self.recommended else "fails"}">{escape(self.advice)}</p>',
             f"<p>{escape(self.setting)}</p>",
             f'<div class="scroll">{html_table(self.rows())}</div>',
+            f'<p class="soft">{escape(self.meanings())}</p>',
             *(f"<p>{escape(text)}</p>" for text in self.refusals),
             f'<figure><img alt="Estimates of each method" src="data:image/png;base64,{encoded}"></figure>',
         ]

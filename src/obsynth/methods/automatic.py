@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from time import perf_counter
@@ -88,13 +89,15 @@ def _refused(method: str, reason: str, spent: float = 0.0) -> Candidate:
     return Candidate(method, None, None, (), spent, reason)
 
 
+#: The condition that a refusal names, and what stands between it and what was found.
+_REFUSED_CONDITION = re.compile(r"(the condition '[^']+' fails) .*? Found: ")
 #: Letters of a message that are shown.
 MOST_LETTERS = 160
 
 
 def one_line(text: str) -> str:
     """Return the start of a message in one line, with what would help, which stands at its end."""
-    flat = " ".join(text.split())
+    flat = _REFUSED_CONDITION.sub(r"\1: ", " ".join(text.split()))
     for mark in ("Add one of:", "Leave out one of:"):
         head, found, tail = flat.rpartition(mark)
         if found:

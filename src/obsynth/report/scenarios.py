@@ -116,6 +116,7 @@ def comparison_report(found: Comparison, *, console: Console, file: Path | None 
     console.print(Text(found.setting))
     if rows:
         print_section(console, "", table)
+        console.print(Text(found.meanings([header[i] for i in kept]), style="dim"))
     for refusal in found.refusals:
         console.print(Text(refusal, style="yellow"))
     console.print(Text(found.advice, style="bold"))

@@ -97,7 +97,7 @@ class FunctionalFilter(Method):
     claims: ClassVar[Mapping[str, ClaimMeaning]] = {
         "order": ClaimMeaning("", "states of the filter", "order"),
         "decay": ClaimMeaning(
-            "1/s", "rate of the slowest pole: every error decays at least like this in the end", "decay"
+            "1/s", "rate of the slowest pole: asymptotically every error decays at least at this rate", "decay"
         ),
     }
     witnesses: ClassVar[frozenset[str]] = frozenset(

@@ -114,7 +114,7 @@ class UiPiObserver(Method):
     source: ClassVar[str] = "Share Pasand, Aliyari, Taghirad"
     claims: ClassVar[Mapping[str, ClaimMeaning]] = {
         "decay": ClaimMeaning(
-            "1/s", "rate of the slowest pole: every error decays at least like this in the end", "decay"
+            "1/s", "rate of the slowest pole: asymptotically every error decays at least at this rate", "decay"
         ),
         "noise_amplification": ClaimMeaning(
             "", "H2 norm from unit white noise on every output to the noisiest fault estimate", "noise amplification"
