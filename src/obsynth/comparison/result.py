@@ -225,7 +225,18 @@ class Comparison:
         return (_HEADER, *rows)
 
     def meanings(self, columns: Sequence[str] = _HEADER) -> str:
-        """Return what columns of numbers of the table mean, in one sentence."""
+        """Return what columns of numbers of the table mean, in one sentence.
+
+        Parameters
+        ----------
+        columns : sequence of str, optional
+            Headers of the columns: all by default.
+
+        Returns
+        -------
+        str
+            Each header with its meaning.
+        """
         return "; ".join(f"{name}: {_FIGURE_MEANINGS[name]}" for name in columns if name in _FIGURE_MEANINGS) + "."
 
     @property
