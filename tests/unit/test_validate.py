@@ -160,6 +160,19 @@ def test_white_noise_of_the_stated_size_agrees(tank_design):
     assert validate(tank_design, emptying_tank(400)).passed
 
 
+def test_missing_rows_are_predicted_as_a_run_does(tank_design):
+    """The inflow changes while five rows are missing: nobody knows when, and both hold the last one that is known."""
+    log = pd.DataFrame(emptying_tank(100)).drop(index=range(58, 63))
+    found = validate(tank_design, log)
+    shown = obsynth.run_on_data(tank_design, log, outliers="none").table["r[gauge]"].to_numpy()
+    whole = found.innovations[:, 0]
+    assert np.isnan(whole[58:63]).all()
+    np.testing.assert_allclose(np.delete(whole, range(58, 63))[1:], shown[1:], rtol=0.0, atol=1e-12)
+    assert any(
+        "5 rows are missing: their outputs count as not measured and the inputs" in line for line in found.verdict
+    )
+
+
 def test_coloured_noise_is_called_so_and_no_variance_is_blamed(tank_design):
     found = validate(tank_design, emptying_tank(400, correlation=0.9))
     assert not found.passed

@@ -203,8 +203,8 @@ def _on_grid(
     rows: tuple[int, int],
     source: str,
 ) -> Log:
-    """Return the log on its grid; missing rows become rows without outputs whose inputs are those that follow.
-    Rows whose stamps do not rise are left out, and inputs that are missing are held."""
+    """Return the log on its grid; missing rows become rows without outputs whose inputs are those before, as runs hold
+    them.  Rows whose stamps do not rise are left out, and inputs that are missing are held."""
     notes = []
     stale = np.isfinite(time) & (time <= np.maximum.accumulate(np.concatenate([[-np.inf], time[:-1]])))
     if stale.any() and not _longest(stale) > MOST_STALE:
@@ -253,9 +253,10 @@ def _on_grid(
             raise bad_log("nan", f"The output {name!r} is {what} in these rows.", path=f"log.{name}")
     places = np.concatenate([[0], np.cumsum(counts)])
     if (counts > 1).any():
-        notes.append(f"{int((counts - 1).sum())} rows are missing: their outputs count as not measured.")
+        held = " and the inputs before them are held" if inputs else ""
+        notes.append(f"{int((counts - 1).sum())} rows are missing: their outputs count as not measured{held}.")
         whole = np.arange(places[-1] + 1)
-        u = u[np.searchsorted(places, whole)]
+        u = u[np.searchsorted(places, whole, side="right") - 1]
         wide = np.full((len(whole), y.shape[1]), np.nan)
         wide[places] = y
         y, time = wide, time[0] + step * whole
