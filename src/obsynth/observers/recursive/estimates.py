@@ -131,7 +131,7 @@ def _alike(rows: Sequence[RawEstimate], name: str) -> Iterator[tuple[NDArray[np.
 
 
 #: Rows whose arrays are put together at once: more would leave the processor's cache, and their room be made anew.
-ROWS_AT_ONCE = 256
+ROWS_TOGETHER = 256
 
 
 def _groups(arrays: Sequence[FloatArray]) -> Iterator[tuple[NDArray[np.intp], FloatArray]]:
@@ -139,8 +139,8 @@ def _groups(arrays: Sequence[FloatArray]) -> Iterator[tuple[NDArray[np.intp], Fl
     for place, array in enumerate(arrays):
         places[array.shape].append(place)
     for alike in places.values():
-        for begin in range(0, len(alike), ROWS_AT_ONCE):
-            chosen = alike[begin : begin + ROWS_AT_ONCE]
+        for begin in range(0, len(alike), ROWS_TOGETHER):
+            chosen = alike[begin : begin + ROWS_TOGETHER]
             yield np.array(chosen), np.array([arrays[place] for place in chosen])
 
 
