@@ -718,14 +718,8 @@ def spec_of(
     ``with_states``: whether the plant gets states for noise that is not white, offsets and walks.
     """
     checked, raw_options = checked_spec(document, source)
-    section: Any = checked.plant
-    plant_source, prefix = source, "plant"
-    reference = section if hasattr(section, "file") else None
-    from_mat = None if reference is None else matlab_plant(reference, source)
-    if reference is not None and from_mat is None:
-        plant_source, prefix = source.parent / reference.file, ""
-        plant_document = changed_document(read_yaml(plant_source, where="plant.file"), plant_changes or {})
-        section = checked_plant(plant_document, plant_source)
+    reference: Any = checked.plant if hasattr(checked.plant, "file") else None
+    section, plant_source, prefix, from_mat = _plant_section(checked.plant, source, plant_changes or {})
     problems = DocumentProblems(source, what="spec")
     options = {
         name: read_value(value, source.parent, f"method.options.{name}", problems)
@@ -769,13 +763,6 @@ def spec_of(
             "remove it.",
             path="plant.transform",
         )
-    inputs = None if checked.inputs is None else checked.inputs.model_dump()
-    if inputs is not None and inputs["hold"] and isinstance(plant, DescriptorSystem) and not plant.is_discrete:
-        raise SpecError(
-            f"{source}: inputs.hold is for plants on samples, and a continuous design takes inputs as straight lines "
-            "between rows: sample the plant (transform: sample_time).",
-            path="inputs.hold",
-        )
     return Spec(
         name=checked.name,
         description=checked.description or "",
@@ -788,8 +775,29 @@ def spec_of(
         model=model,
         calibrate=None if checked.calibrate is None else checked.calibrate.model_dump(exclude_none=True),
         noise=noise or None,
-        inputs=inputs,
+        inputs=_checked_inputs(checked.inputs, plant, source),
     )
+
+
+def _plant_section(section: Any, source: Path, changes: Mapping[str, Any]) -> tuple[Any, Path, str, Any]:
+    """Return the section of a plant, the file and place in it where it stands, and the plant where MATLAB wrote it."""
+    from_mat = matlab_plant(section, source) if hasattr(section, "file") else None
+    if from_mat is not None or not hasattr(section, "file"):
+        return section, source, "plant", from_mat
+    place = source.parent / section.file
+    return checked_plant(changed_document(read_yaml(place, where="plant.file"), changes), place), place, "", None
+
+
+def _checked_inputs(section: Any, plant: object, source: Path) -> dict[str, Any] | None:
+    """Return how a log tells the known inputs, as plain data; ``None`` where nothing is said of that."""
+    inputs: dict[str, Any] | None = None if section is None else section.model_dump()
+    if inputs is not None and inputs["hold"] and isinstance(plant, DescriptorSystem) and not plant.is_discrete:
+        raise SpecError(
+            f"{source}: inputs.hold is for plants on samples, and a continuous design takes inputs as straight lines "
+            "between rows: sample the plant (transform: sample_time).",
+            path="inputs.hold",
+        )
+    return inputs
 
 
 def _placed_noise(plant: Any, noise: Mapping[str, Any], source: Path, prefix: str, **more: Any) -> Any:

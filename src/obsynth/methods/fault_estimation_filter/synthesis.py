@@ -26,7 +26,7 @@ Small gains by the whole inequality, and what a filter must meet: true gain, var
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -509,31 +509,14 @@ def synthesise(plant: DescriptorSystem, asked: FaultEstimationFilter, *, progres
         if not replace(found.problem, judged_exactly=True).reaches(found.chosen, shipped.level):
             found = search(exactly=True)  # a peak was missed
         shipped = _Shipped.of(plant, prepared, parts, found, nominal, tries=None)
-    problem, least, records = found.problem, found.least, found.records
     gains, observer, tracking, lag, level, factor = shipped[:6]
-    claims = (
-        {"gamma": level, "gamma_min": least.gain, "state_lag": float(lag)} if plant.nd else {"state_lag": float(lag)}
-    )
-    if plant.nd and asked.gamma_search == "bisection":
-        claims |= {"gamma_bracket_low": least.bracket[0], "gamma_bracket_high": least.bracket[1]}
-    witnesses = {"P_factor": factor, "tracking": tracking}
+    claims, witnesses = {"state_lag": float(lag)}, {"P_factor": factor, "tracking": tracking}
     if plant.nd:
         progress("proving that no filter has a smaller gain")
-        proof, proved = least_gain_certificate(
-            problem,
-            prepared.plant,
-            gains,
-            factor,
-            gain=least.gain,
-            free_weight=free,
-            solver=asked.solver,
-            thorough=asked.prove_least,
-        )
+        least, proof = _least(found, prepared, asked, gains, factor, level=level, free_weight=free)
+        claims = {"gamma": level, "gamma_min": least["gamma_min"]} | claims | least
         witnesses |= proof
-        # The search may end below what is proved, by its tolerance: no filter is there.
-        claims["gamma_min"] = min(max(least.gain, proved), level)
-        if "gamma_bracket_high" in claims:
-            claims["gamma_bracket_high"] = max(claims["gamma_bracket_high"], claims["gamma_min"])
+    records = [*found.least.records, *found.records]
     resolved = asked.as_plain() | {"free_residual_weight": free, "S": None if s is None else s.tolist()}
     if asked.mean > 1:
         # Registers hold estimates, which see no state: nothing of the plant is tracked there.
@@ -545,12 +528,42 @@ def synthesise(plant: DescriptorSystem, asked: FaultEstimationFilter, *, progres
         gains,
         observer,
         Certificate(witnesses, claims),
-        {"engine": _engine_of([*least.records, *records]), "runs": [*least.records, *records]},
+        {"engine": _engine_of(records), "runs": records},
         (
             *_gamma_notes(asked.gamma, level if plant.nd else np.inf),
             *notes(plant, prepared.detectability, observer, largest_zero=held[-1].value),
         ),
     )
+
+
+def _least(
+    found: FoundGains,
+    prepared: PreparedPlant,
+    asked: FaultEstimationFilter,
+    gains: Mapping[str, FloatArray],
+    factor: FloatArray,
+    *,
+    level: float,
+    free_weight: bool,
+) -> tuple[dict[str, float], dict[str, FloatArray]]:
+    """Return what is claimed of the least gain of any filter, and the witnesses."""
+    least = found.least
+    proof, proved = least_gain_certificate(
+        found.problem,
+        prepared.plant,
+        gains,
+        factor,
+        gain=least.gain,
+        free_weight=free_weight,
+        solver=asked.solver,
+        thorough=asked.prove_least,
+    )
+    # The search may end below what is proved, by its tolerance: no filter is there.
+    claims = {"gamma_min": min(max(least.gain, proved), level)}
+    if asked.gamma_search == "bisection":
+        low, high = least.bracket
+        claims |= {"gamma_bracket_low": low, "gamma_bracket_high": max(high, claims["gamma_min"])}
+    return claims, proof
 
 
 def _found(
