@@ -22,6 +22,7 @@ WANG = ROOT / "designs" / "wang2015" / "spec.yaml"
 WANG_OTHER_FAULTS = ROOT / "designs" / "wang2015_printed_psi" / "spec.yaml"
 SMIB = ROOT / "designs" / "smib" / "spec.yaml"
 
+FILES = ("--gains", "a.json", "--data", "b.csv")
 IMPOSSIBLE = """\
 schema_version: 1
 name: impossible
@@ -278,6 +279,33 @@ class TestEndings:
         printed = capsys.readouterr()
         assert printed.out == ""
         assert "usage:" in printed.err
+
+    @pytest.mark.parametrize(
+        ("command", "arguments", "told"),
+        [
+            (main, ["thresholds", *FILES, "--false-alarm-rate", "1"], "Did you mean --false-alarms"),
+            (main, ["run", *FILES, "--qqqq=7"], "there is no option --qqqq. See obsynth run"),
+            (main, ["plot", *FILES, "more"], "it does not take 'more': see obsynth plot --help."),
+            (design_command, ["--system", "spec.yaml", "--outptu=x"], "Did you mean --output"),
+        ],
+    )  # fmt: skip
+    def test_an_unknown_option_is_told_with_the_usage_of_its_verb(
+        self, command: Any, arguments: list[str], told: str, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        with pytest.raises(SystemExit) as end:
+            command(arguments)
+        assert end.value.code == 2
+        printed = capsys.readouterr().err
+        assert told in " ".join(printed.split())
+        assert printed.startswith("usage: design" if command is design_command else f"usage: obsynth {arguments[0]}")
+
+    def test_verify_takes_a_gain_set_by_name_or_by_gains(self, capsys: pytest.CaptureFixture[str]) -> None:
+        gains = "nothing.gains.json"
+        assert main(["verify", "--gains", gains]) == main(["verify", gains]) == 2
+        first, second = capsys.readouterr().err.splitlines()
+        assert first == second
+        assert gains in first
+        assert main(["verify", f"--gains={gains}"]) == 2
 
     @pytest.mark.parametrize("command", [main, design_command])
     def test_version(self, command: Any, capsys: pytest.CaptureFixture[str]) -> None:

@@ -16,7 +16,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from importlib import import_module
 from pathlib import Path
 from textwrap import fill
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
 from obsynth.cli.arguments import (
     CLUSTER,
@@ -179,7 +179,7 @@ VERBS = {
                 "gains",
                 "FILE",
                 "a gain set, what calibrate wrote, or the certificate of an alarm, a robustness analysis, a tolerance "
-                "study or a comparison",
+                "study or a comparison (--gains FILE, as for other commands, is the same)",
                 type=Path,
             ),
             option("--data", "FILE", "the log that an alarm, a comparison or a calibration names", type=Path),
@@ -760,11 +760,29 @@ def _run(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> in
 
 def _options(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> argparse.Namespace:
     """Return the arguments of a command line, settings among them."""
-    options, rest = parser.parse_known_args(arguments)
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    if words[:1] == ["verify"]:
+        # The other commands take a gain set by this option.
+        words = [word.removeprefix("--gains=") for word in words if word != "--gains"]
+    options, rest = parser.parse_known_args(words)
     rest = read_settings(parser.prog, VERBS[options.verb].arguments, options, rest)
     if rest:
-        parser.error(f"unrecognized arguments: {' '.join(rest)}")
+        _refuse_words(parser.prog, options.verb, rest)
     return options
+
+
+def _refuse_words(prog: str, verb: str, rest: Sequence[str]) -> NoReturn:
+    """End the program as words that a verb does not take do: with its usage, and what may be meant."""
+    from difflib import get_close_matches
+
+    own = _fill(verb, argparse.ArgumentParser(prog=prog if prog == verb else f"{prog} {verb}"))
+    known = [*own._option_string_actions, *(name for one in settings_of(VERBS[verb].arguments) for name in one.names)]
+    wrong = [word.partition("=")[0] for word in rest if word.startswith("-") and word != "-"]
+    if not wrong:
+        own.error(f"it does not take {' '.join(map(repr, rest))}: see {own.prog} --help.")
+    close = get_close_matches(wrong[0], known, n=3)
+    meant = f" Did you mean {' or '.join(close)}?" if close else ""
+    own.error(f"there is no option {wrong[0]}.{meant} See {own.prog} --help.")
 
 
 def _require_written(options: argparse.Namespace) -> None:
