@@ -140,35 +140,17 @@ def monitor(
     bounds, bench = bounds_of(design, model, disturbance_bounds), make_bench(design, scenario)
     observer = cast(LinearObserver, bench.observer)
     rows = observer.fault_rows if estimates else observer.residual_rows
+    numbers: dict[str, Any] = {"window": window, "false_alarms": false_alarms, "change": change, "dt": bench.signals.dt}
     rule: Rule
     if kind in ("chi-square", "cusum"):
-        # A window that outlasts the scenario is refused before its covariance is factorised.
-        first = settled(model, start, window)
-        whitener, white = whitened(kind, model, window)
-        rule = WhitenedRule(
-            whitener,
-            steady_mean(model),
-            window=window,
-            change=None if kind == "chi-square" else float(change),
-            false_alarms=false_alarms,
-            dt=bench.signals.dt,
-            white=white,
-            table=_statistical(kind, model, len(whitener), first, false_alarms, white=white),
-        )
+        rule = _whitened_rule(kind, model, start, **numbers)
     else:
-        if kind == "paper":
-            threshold = paper_threshold(model, bounds, start, gamma)
-        else:
-            inputs = scaled_inputs(model, bounds, noise_bound)
-            threshold = pointwise_threshold(model, inputs, start)
-            if kind == "window":
-                threshold = window_threshold(model, inputs, start, window)
+        threshold = _norm_threshold(kind, model, bounds, start, gamma=gamma, noise_bound=noise_bound, window=window)
         if model.flow is not None:
             threshold = threshold + _straight_lines(design, scenario, model, kind, window, rows)
         rule = NormRule(threshold, np.inf, window=window if kind == "window" else 1, dt=bench.signals.dt)
     noisy = noisy_design(design, scenario)
     assumed = Assumptions(noisy.linear[0], bounds, noise_bound or 0.0, initial_error=start)
-    numbers = {"window": window, "false_alarms": false_alarms, "change": change, "dt": bench.signals.dt}
     bounded = assumed if kind in ("pointwise", "window") else None
     statement = statement_of(kind, model, bounded, estimates=estimates, **numbers) + NO_TOLERANCE
     if adaptive:
@@ -186,6 +168,43 @@ def monitor(
         isolation_delay=isolation_delay,
         watches_estimates=estimates,
     )
+
+
+def _whitened_rule(
+    kind: str, model: ResidualModel, start: float, *, window: int, false_alarms: float, change: float, dt: float
+) -> WhitenedRule:
+    """Return the rule of a statistical kind."""
+    # A window that outlasts the scenario is refused before its covariance is factorised.
+    first = settled(model, start, window)
+    whitener, white = whitened(kind, model, window)
+    return WhitenedRule(
+        whitener,
+        steady_mean(model),
+        window=window,
+        change=None if kind == "chi-square" else float(change),
+        false_alarms=false_alarms,
+        dt=dt,
+        white=white,
+        table=_statistical(kind, model, len(whitener), first, false_alarms, white=white),
+    )
+
+
+def _norm_threshold(
+    kind: str,
+    model: ResidualModel,
+    bounds: FloatArray,
+    start: float,
+    *,
+    gamma: float | None,
+    noise_bound: float | None,
+    window: int,
+) -> FloatArray:
+    """Return the threshold of a norm at each sample, for what acts on the samples."""
+    if kind == "paper":
+        return paper_threshold(model, bounds, start, gamma)
+    inputs = scaled_inputs(model, bounds, noise_bound)
+    threshold = pointwise_threshold(model, inputs, start)
+    return threshold if kind == "pointwise" else window_threshold(model, inputs, start, window)
 
 
 def bounds_of(design: ObserverDesign, model: ResidualModel, given: Mapping[str, float] | None) -> FloatArray:
