@@ -50,10 +50,11 @@ def record(plant: obsynth.TimeVaryingDescriptorSystem, rng: np.random.Generator)
     return run.outputs, run.states[0] + rng.standard_normal(plant.nx)
 
 
-def alarms(plant: obsynth.TimeVaryingDescriptorSystem, runs: int, missing: float) -> dict[str, list[float]]:
+def alarms(
+    plant: obsynth.TimeVaryingDescriptorSystem, observer: obsynth.RecursiveObserver, runs: int, missing: float
+) -> dict[str, list[float]]:
     """Return, for each statistic, the share of runs with a false alarm at each probability asked for."""
     rng = np.random.default_rng(20130703)
-    observer = obsynth.adaptive_observer(plant, Q=1.0, R=1.0, forgetting=0.97).observer
     count = {name: np.zeros(len(ASKED)) for name in STATISTICS}
     for _ in range(runs):
         y, mean = record(plant, rng)
@@ -77,8 +78,9 @@ def main() -> None:
     print("| plant | " + " | ".join(STATISTICS) + " |")
     print("| --- |" + " --- |" * len(STATISTICS))
     for name, plant in PLANTS.items():
+        observer = obsynth.adaptive_observer(plant, Q=1.0, R=1.0, forgetting=0.97).observer
         for missing in (0.0, MISSING):
-            found = alarms(plant, runs, missing)
+            found = alarms(plant, observer, runs, missing)
             label = name + (f", {missing:.0%} missing" if missing else "")
             cells = [" / ".join(f"{100 * share:.1f}" for share in found[statistic]) for statistic in STATISTICS]
             print(f"| {label} | " + " | ".join(cells) + " |", flush=True)

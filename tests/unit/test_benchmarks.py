@@ -81,6 +81,7 @@ def test_the_fault_filter_benchmark_runs(printed):
     assert [line[4] for line in networks[1:]] == ["True"]
 
 
+@pytest.mark.usefixtures("taken_as_verified")
 def test_the_false_alarm_benchmark_runs(printed):
     rows = [line.strip("| ").split(" | ") for line in printed("false_alarms", "1").splitlines()[3:]]
     assert len(rows) == 6
