@@ -73,6 +73,7 @@ def image_of(
     count: int, draw: Callable[[list[Axes]], Any], *, size: tuple[float, float] | None = None, kind: str = "png"
 ) -> bytes:
     """Return a picture of panels one above the other as it stands in a file; ``draw`` fills them, without a window."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     shown = max(count, 1)
@@ -82,9 +83,14 @@ def image_of(
     for panel in axes:
         names_as_they_are(panel)
     buffer = io.BytesIO()
-    # Without a date the same data give the same picture.
-    undated = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(kind)
-    figure.savefig(buffer, format=kind, dpi=RESOLUTION, metadata=undated)
+    if kind == "png":
+        # What `savefig` does without a pass of its own for the layout, which drawing finds as well.
+        figure.dpi = RESOLUTION
+        FigureCanvasAgg(figure).print_png(buffer)
+    else:
+        # Without a date the same data give the same picture.
+        undated = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(kind)
+        figure.savefig(buffer, format=kind, dpi=RESOLUTION, metadata=undated)
     return buffer.getvalue()
 
 

@@ -150,24 +150,38 @@ def _begins(places: NDArray[np.int64]) -> NDArray[np.int64]:
 def level_of(values: FloatArray, every: float) -> float:
     """Return the level with one alarm per ``every`` rows in streams ``(runs, n)``; the largest value where these are
     too few."""
-    streams = _apart(values)
-    rows = np.atleast_2d(values)[:, SETTLING:].size
-    allowed = rows / every
-    order = _highest(streams, max(min(int(4 * HOLD * allowed), rows), 1))
-    if allowed < 1.0:
-        return float(streams[order[0]])
+    return _Ordered(values, every).level(every)
 
-    def alarms(count: int) -> int:
-        return len(_begins(np.sort(order[:count])))
 
-    # The first descent of the level at which there are too many: alarms grow nearly always with the rows above.
-    low, high = int(allowed), int(allowed)
-    while high < len(order) and alarms(high) <= allowed:
-        low, high = high, min(len(order), int(1.2 * high) + 1)
-    while high - low > 1:
-        middle = (low + high) // 2
-        low, high = (middle, high) if alarms(middle) <= allowed else (low, middle)
-    return float(streams[order[high - 1]])
+class _Ordered:
+    """Streams ``(runs, n)`` in one, with the places of their highest values in order: for levels of alarms that are as
+    rare as ``every`` or rarer."""
+
+    def __init__(self, values: FloatArray, every: float) -> None:
+        self.streams = _apart(values)
+        self.rows = int(np.atleast_2d(values)[:, SETTLING:].size)
+        self.order = _highest(self.streams, self._looked_at(every))
+
+    def _looked_at(self, every: float) -> int:
+        return max(min(int(4 * HOLD * (self.rows / every)), self.rows), 1)
+
+    def level(self, every: float) -> float:
+        """Return the level with one alarm per ``every`` rows; the largest value where the rows are too few."""
+        allowed, order = self.rows / every, self.order[: self._looked_at(every)]
+        if allowed < 1.0:
+            return float(self.streams[order[0]])
+
+        def alarms(count: int) -> int:
+            return len(_begins(np.sort(order[:count])))
+
+        # The first descent of the level at which there are too many: alarms grow nearly always with the rows above.
+        low, high = int(allowed), int(allowed)
+        while high < len(order) and alarms(high) <= allowed:
+            low, high = high, min(len(order), int(1.2 * high) + 1)
+        while high - low > 1:
+            middle = (low + high) // 2
+            low, high = (middle, high) if alarms(middle) <= allowed else (low, middle)
+        return float(self.streams[order[high - 1]])
 
 
 def _highest(values: FloatArray, count: int) -> NDArray[np.int64]:
@@ -289,8 +303,9 @@ def _union(runs: FloatArray, every: float, total: int) -> tuple[FloatArray, Floa
     """Return levels of each statistic at one rarer rate, the least rare with which all together keep theirs, and the
     largest statistic in units of its level ``(runs, n)``."""
     own, union = np.ones(runs.shape[1]), runs[:, 0]
+    ordered = [_Ordered(runs[:, i], every * RARER[0]) for i in range(runs.shape[1])]
     for rarer in RARER:
-        own = np.array([level_of(runs[:, i], every * rarer) for i in range(runs.shape[1])])
+        own = np.array([streams.level(every * rarer) for streams in ordered])
         union = (runs / own[None, :, None]).max(axis=1)
         if count_alarms(union, 1.0) <= total / every:
             break
