@@ -152,7 +152,7 @@ def test_the_report_on_a_log_says_whether_it_agrees(folder, gains, capsys):
         arguments = ["report", "--gains", str(gains), *columns, *rows, "--out", str(page), "--force"]
         assert main(arguments) == 0
         text = page.read_text(encoding="utf-8")
-        shown.append(text[text.index('id="does-your-data-agree"') :].partition("</section>")[0])
+        shown.append(text[text.index('id="comparison-with-your-data"') :].partition("</section>")[0])
     assert "The log agrees" in shown[0]
     assert "NIS" in shown[0]
     assert shown[0].count("<img") == 1
