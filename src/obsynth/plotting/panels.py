@@ -86,7 +86,8 @@ def image_of(
     if kind == "png":
         # What `savefig` does without a pass of its own for the layout, which drawing finds as well.
         figure.dpi = RESOLUTION
-        FigureCanvasAgg(figure).print_png(buffer)
+        canvas: Any = FigureCanvasAgg(figure)
+        canvas.print_png(buffer)
     else:
         # Without a date the same data give the same picture.
         undated = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(kind)
