@@ -138,6 +138,21 @@ class ExactPencil:
     def _degree(self) -> int:
         return int(self.E.rank())
 
+    def _most_degree(self, rank: int) -> int:
+        """Return a bound on the degree of all minors of the order of the normal rank, and of their combinations.
+
+        A minor of all columns has the columns in which E is zero. Where A is zero in them too in the rows without E,
+        each takes up one of the rows with E."""
+        found, columns = min(self._degree, rank), self.shape[1]
+        if rank < columns:
+            return found
+        e, a = (part.tolist() for part in self._integers)
+        moving = [any(row) for row in e]
+        still = [j for j in range(columns) if not any(row[j] for row in e)]
+        if any(row[j] for row, moves in zip(a, moving, strict=True) if not moves for j in still):
+            return found
+        return min(found, sum(moving) - len(still))
+
     @cached_property
     def _rng(self) -> random.Random:
         return random.Random(POINTS_SEED)
@@ -149,7 +164,7 @@ class ExactPencil:
         shift = self._rng.randrange(_PRIMES[0])
         first, second = (self._determinant_modulo(rank, shift) for _ in range(2))
         # A common factor keeps its degree where the leading coefficient that it divides is not zero.
-        full = first is not None and first.degree() == min(self._degree, rank)
+        full = first is not None and first.degree() == self._most_degree(rank)
         return bool(full and first and second and first.gcd(second).degree() == 0)
 
     def _is_coprime_modulo(self, known: fmpz_poly, rank: int) -> bool:
