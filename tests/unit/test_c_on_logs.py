@@ -81,7 +81,7 @@ def told(design: obsynth.ObserverDesign) -> LearnedThresholds:
     levels = np.linspace(8.0, 20.0, len(statistics.names))
     dt = design.observer.dt or SAMPLE_TIME
     return LearnedThresholds(columns, statistics, levels, 500.0, 1000, 500, dt, np.zeros(nf), np.ones(nf),
-                             gain_set_digest(design), settling=0 if m == 1 else 30)  # fmt: skip
+                             gain_set_digest(design), settling=0 if m == 1 else 30, innovation=0.7)  # fmt: skip
 
 
 def designed(name: str) -> obsynth.ObserverDesign:

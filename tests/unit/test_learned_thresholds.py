@@ -373,11 +373,22 @@ def test_a_row_without_one_sensor_decides_by_the_others(by_sensor: bool) -> None
     names = ("fhat[f]", "r[a]", "r[b]")
     statistics, none = Statistics(model, np.eye(3), names), np.zeros(0)
     learned = obsynth.types.LearnedThresholds(
-        names, statistics, np.full(9, 10.0), 500.0, 4_000, 500, DT, np.zeros(1), np.ones(1), "", settling=2
+        names,
+        statistics,
+        np.full(9, 10.0),
+        500.0,
+        4_000,
+        500,
+        DT,
+        np.zeros(1),
+        np.ones(1),
+        "",
+        settling=2,
+        innovation=0.5,
     )
     rule = LearnedRule(learned, names, ("f",), by_sensor=by_sensor)
     state, found = rule.init(), []
-    for k, row in enumerate([[0.0, 0.0], [0.0, 0.0], [0.0, 0.0], [7.0, np.nan], [0.0, 0.0]]):
+    for k, row in enumerate([[0.0, 0.0], [0.0, 0.0], [0.0, 0.0], [7.0, np.nan], [9.0, 0.0]]):
         innovation = np.array([2.0])
         evidence = Evidence(np.array([0.4 * (k == 3)]), np.eye(1), innovation, none, none, none)
         state, judged = rule.step(state, Sample(k * DT, np.array(row), np.zeros(1), evidence))
@@ -386,9 +397,10 @@ def test_a_row_without_one_sensor_decides_by_the_others(by_sensor: bool) -> None
         assert found[3] == pytest.approx(7.0**2 / covariance[1, 1] / 10.0)
     else:
         assert np.isnan(found[3])
-    # The next row is predicted from that one, and counts by what the observer makes of its own innovation.
-    assert state.white[-1] @ state.white[-1] <= 4.0 + 1e-12
-    assert state.past[0].tolist() == [0.0, 0.0, 0.0]
+    # The next row is predicted from that one, and counts by what the observer makes of its own innovation, two
+    # deviations that are twice too large.
+    assert (state.white[-1] @ state.white[-1]) ** 0.5 == pytest.approx(4.0)
+    assert state.past[0].tolist() == [0.0, 9.0, 0.0]
 
 
 def test_files_and_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -28,6 +28,7 @@ from obsynth.experiments.monitors.learned import (
     watched_values,
 )
 from obsynth.experiments.monitors.learned_levels import AGES
+from obsynth.experiments.monitors.monitor import Evidence
 from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import FloatArray
 from obsynth.results.design import ObserverDesign
@@ -108,8 +109,20 @@ def learn_thresholds(
     chosen = (first <= said.numbers) & (said.numbers < last)
     dt = design.observer.dt or float(np.median(np.diff(said.times[chosen])))
     return thresholds_from_rows(
-        design, said.watched[chosen], every=rows_per_alarm(false_alarms, dt), dt=dt, seed=seed, pairs=pairs
+        design,
+        said.watched[chosen],
+        every=rows_per_alarm(false_alarms, dt),
+        dt=dt,
+        seed=seed,
+        pairs=pairs,
+        innovation=_usual_innovation(said.squares[chosen]),
     )
+
+
+def _usual_innovation(squares: FloatArray) -> float:
+    """Return the root mean square of innovations in the observer's own deviations, from mean squares of rows."""
+    known = squares[np.isfinite(squares) & (squares > 0.0)]
+    return float(np.sqrt(known.mean())) if known.size else 1.0
 
 
 class _Said(NamedTuple):
@@ -118,6 +131,7 @@ class _Said(NamedTuple):
     numbers: NDArray[np.int64]  # ``(n,)``: of rows, from 0
     times: FloatArray  # ``(n,)`` seconds
     watched: FloatArray  # ``(n, m)``: NaN where nothing is decided, or rows are missing
+    squares: FloatArray  # ``(n,)``: mean squares of innovations in the observer's own deviations, where it has these
     refused: list[FloatArray]  # ``(4, ny)`` each: what a gate remembers after each row; empty without a gate
 
 
@@ -126,6 +140,7 @@ def _said(design: ObserverDesign, run: LogRun, log: FloatArray) -> _Said:
     nothing = np.full(len(watched_names(design)), np.nan)
     residuals = [i for i, name in enumerate(run.observer.columns) if name.startswith("r[")]
     numbers, times, rows, refused = list[int](), list[float](), list[FloatArray](), list[FloatArray]()
+    squares = list[float]()
     settling, observer = settling_rows(design), run.observer
     gated = isinstance(observer, SteppingLogObserver) and observer.gates
     for count, row in enumerate(_rows(run, log, CHUNK_ROWS if not gated else 1)):
@@ -139,9 +154,14 @@ def _said(design: ObserverDesign, run: LogRun, log: FloatArray) -> _Said:
         # Longer gaps than the statistics look back are all the same.
         missing = min(row.skipped, max(AGES))
         rows += [nothing] * missing + [nothing if said is None else said]
+        square = np.nan
+        if said is not None and isinstance(row.evidence, Evidence) and np.isfinite(said).all():
+            own = row.evidence.innovation
+            square = float(np.mean(own**2)) if own.size else np.nan
+        squares += [np.nan] * missing + [square]
         times += [row.time] * (missing + 1)
         numbers += [count] * (missing + 1)
-    return _Said(np.array(numbers), np.array(times), np.array(rows), refused)
+    return _Said(np.array(numbers), np.array(times), np.array(rows), np.array(squares), refused)
 
 
 def _rows(run: LogRun, log: FloatArray, together: int) -> Iterator[Row]:

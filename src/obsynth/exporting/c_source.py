@@ -234,6 +234,7 @@ def monitor_source(alarms: Alarms, prefix: str) -> str:
         "monitor_weights": 1.0 / np.maximum(powers, SMALLEST),
         "monitor_centres": found.centres[None],
         "monitor_scales": found.scales[None],
+        "monitor_innovation": np.array([[found.innovation]]),
     }
     faults = {f"fhat[{name}]": i for i, name in enumerate(alarms.fault_names)}
     faults |= {f"fault {name}": i for i, name in enumerate(alarms.fault_names)}

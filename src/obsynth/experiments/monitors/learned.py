@@ -37,7 +37,7 @@ from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import digest_of, gain_set_digest, plain, restored
 
 LEARNED_KIND = "obsynth learned thresholds"
-LEARNED_VERSION = 3
+LEARNED_VERSION = 4
 LEARNED = FileKind("learned thresholds of obsynth", rb'\A\s*\{\s*"kind":\s*"obsynth learned thresholds"')
 #: Columns that are watched at most, and the least share of a column's variance that others leave unexplained.
 MOST_WATCHED, LEAST_NEW = 8, 1e-6
@@ -128,6 +128,8 @@ class LearnedThresholds:
         Rows at the start of a run in which nothing is decided, as nothing was learned from such rows.
     pairs : WrongPairs
         Pairs of wrong samples in a row that count as not measured.
+    innovation : float
+        Root mean square of the innovations in the observer's own deviations: one where its covariances are right.
     """
 
     columns: tuple[str, ...]
@@ -144,6 +146,7 @@ class LearnedThresholds:
     left_out: tuple[str, ...] = ()
     settling: int = 0
     pairs: WrongPairs = NO_PAIRS
+    innovation: float = 1.0
 
     @property
     def holds(self) -> bool:
@@ -205,6 +208,7 @@ class LearnedThresholds:
             "extrapolated": self.extrapolated,
             "settling": self.settling,
             "pairs": {"number": self.pairs.number, "chance": self.pairs.chance},
+            "innovation": self.innovation,
         }
 
     def save(self, path: str | Path) -> Path:
@@ -290,6 +294,7 @@ def _from_dict(data: Mapping[str, Any]) -> LearnedThresholds:
         tuple(map(str, data["left_out"])),
         int(data["settling"]),
         WrongPairs(int(data["pairs"]["number"]), float(data["pairs"]["chance"])),
+        float(data["innovation"]),
     )
 
 
@@ -337,10 +342,17 @@ def watched_values(residuals: FloatArray, evidence: Any) -> FloatArray | None:
 
 
 def thresholds_from_rows(
-    design: ObserverDesign, rows: FloatArray, *, every: float, dt: float, seed: int = 0, pairs: WrongPairs = NO_PAIRS
+    design: ObserverDesign,
+    rows: FloatArray,
+    *,
+    every: float,
+    dt: float,
+    seed: int = 0,
+    pairs: WrongPairs = NO_PAIRS,
+    innovation: float = 1.0,
 ) -> LearnedThresholds:
     """Return thresholds from ``rows (n, m)`` of all that may be watched, NaN where nothing is known; ``pairs``: what
-    does not stand in them, but alarms.
+    does not stand in them, but alarms; ``innovation``: how large innovations are in the observer's own deviations.
 
     Where the fault estimates remember more than the rows can tell, or nearly follow from the residuals (the gains of a
     filter move them, and what is left is how these change with the inputs), the residuals alone are watched.
@@ -384,6 +396,7 @@ def thresholds_from_rows(
         tuple(name for i, name in enumerate(names) if i not in kept),
         settling_rows(design),
         pairs,
+        innovation,
     )
 
 
@@ -448,7 +461,8 @@ class LearnedRule(Rule):
 
     Where the gain follows what is measured (all but linear observers, which recover from a gap first), a missing sample
     moves the estimates otherwise than was learned.  Rows that are predicted from it count by no more than the
-    observer's own covariance, which has grown, makes of their innovation.  In that row itself the innovations of
+    observer's own covariance, which has grown, makes of their innovation, by as much as it was wrong in the rows that
+    were learned from.  In that row itself the innovations of
     ``by_sensor`` residuals are what they always are: those that are there decide, and the rest is as they make it most
     likely."""
 
@@ -486,7 +500,7 @@ class LearnedRule(Rule):
         counts = shown is not None and state.taken > self.learned.settling
         most, varying = math.inf if counts else 0.0, isinstance(sample.said, Evidence)
         if counts and state.waiting and isinstance(sample.said, Evidence):
-            most = float(np.linalg.norm(sample.said.innovation))
+            most = float(np.linalg.norm(sample.said.innovation)) / self.learned.innovation
         if not whole and varying:
             state = state._replace(waiting=self._model.order + 1)
         state = state._replace(waiting=max(state.waiting - 1, 0))

@@ -201,7 +201,7 @@ static void monitor_take(PREFIX_monitor *m, const REAL *shown, int deciding, REA
      * that are predicted from that one count by no more than the observer's own covariance, which has grown, says. In
      * that row itself the innovations that are there are what they always are. */
     if (m->waiting > 0) {
-        most = innovation;
+        most = innovation / monitor_innovation[0][0];
     }
     if (!is_whole && innovation >= 0) {
         m->waiting = ORDER + 1;
