@@ -176,6 +176,9 @@ def test_files_that_are_not_there_or_not_right(gains, capsys):
     def refused(fragment: str, *more: str, **places: str) -> None:
         assert run(gains, *more, **places) == 2
         assert fragment in capsys.readouterr().err
+        assert main(["run", "--gains", str(gains), "--data", "nowhere.csv"]) == 2
+        printed = capsys.readouterr()
+        assert (printed.out, "nowhere.csv cannot be read" in printed.err) == ("", True)
         assert {path.name for path in Path().iterdir()} <= {"log.csv", "folder", "folder.csv", "bad.parquet", "log.txt"}
 
     refused("log.csv cannot be read: No such file")

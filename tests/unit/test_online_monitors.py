@@ -399,7 +399,7 @@ def test_quiet_runs_have_no_alarm(kind, share):
         (lambda wang, noisy: obsynth.online_monitor(None), "design is a NoneType"),
         (lambda wang, noisy: obsynth.online_monitor(wang, "nis"), "for this design use one of"),
         (lambda wang, noisy: obsynth.online_monitor(wang, "glr"), "cusum is nearest to it"),
-        (lambda wang, noisy: obsynth.online_monitor(wang), "has no bound"),
+        (lambda wang, noisy: obsynth.online_monitor(wang), "No bound is given on w "),
         (lambda wang, noisy: obsynth.online_monitor(wang, disturbance_bounds={"w": 0.0}), "its bound would be zero"),
         (lambda wang, noisy: obsynth.online_monitor(wang, disturbance_bounds={"v": 0.0}), "no signal named 'v'"),
         (lambda wang, noisy: obsynth.online_monitor(wang, "chi-square"), "needs to know what disturbances"),

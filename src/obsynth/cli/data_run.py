@@ -209,7 +209,8 @@ def summary_of_run(found: DataRun, watched: Monitor | None) -> str:
         lines.append(f"{count} {states} recovered as well: {told}.")
     if found.outliers:
         told = ", ".join(f"{count} of {name}" for name, count in found.outliers.items())
-        lines.append(f"{sum(found.outliers.values())} outliers: {told}.")
+        count = sum(found.outliers.values())
+        lines.append(f"{count} outlier{'s' if count != 1 else ''}: {told}.")
     for name, time in found.alarms.items():
         first = next((event for event in found.events if event.by == name), None)
         clear = watched is not None and name == watched.kind and first is not None and first.clear

@@ -223,9 +223,9 @@ def _require_noise(model: ResidualModel, noise_bound: float | None) -> None:
     """Refuse a bound of noise in measured data where no noise is stated: zero deviations, however many, stay zero."""
     if noise_bound and not model.noisy:
         raise SpecError(
-            "noise_bound says how many standard deviations the noise never exceeds, but no noise is stated that "
-            "reaches what is watched, so there is nothing to multiply: state the noise of the sensors (sensor_noise of "
-            "the plant, or Bw and Dw), or leave noise_bound out where there is none.",
+            "noise_bound is a number of standard deviations, but no noise is stated that reaches the monitored "
+            "signals, so there is nothing to multiply: state the noise of the sensors (sensor_noise of the plant, or "
+            "Bw and Dw), or leave noise_bound out.",
             path="noise_bound",
         )
 
@@ -257,9 +257,10 @@ def _norm_rule(
     if kind == "paper":
         table, limit = unlimited_paper(model, bounds, start, gamma)
     else:
-        table, limit = unlimited_bound(kind, model, scaled_inputs(model, bounds, noise_bound), start, window)
+        names = design.linear[0].disturbance_names
+        table, limit = unlimited_bound(kind, model, scaled_inputs(model, bounds, noise_bound, names), start, window)
         if model.flow is not None:
-            inputs = scaled_inputs(model, bounds, noise_bound, any_stamps=True)
+            inputs = scaled_inputs(model, bounds, noise_bound, names, any_stamps=True)
             irregular = unlimited_bound(kind, model, inputs, start, window)
     driven = None
     if kind != "paper" and model.continuous is not None and design.linear[0].nu:

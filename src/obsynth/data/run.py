@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import chain, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
@@ -265,8 +266,12 @@ def run_on_data(
     save = None
     if not (state is None or out is None or isinstance(out, str | Path)):
         save = partial(save_state, Path(state), run, digest)
+    rows = chunks(data, run.signals, stamps, chunk_rows)
+    if not hasattr(data, "readline"):
+        # What cannot be read leaves no header behind; of a stream the header comes before the first row.
+        rows = chain(list(islice(rows, 1)), rows)
     with sink_for(out, run.header, stamps) as sink:
-        _run_rows(run, chunks(data, run.signals, stamps, chunk_rows), sink, kept, save, progress or bool, state_every)
+        _run_rows(run, rows, sink, kept, save, progress or bool, state_every)
         if state is None and not hasattr(data, "readline"):
             _require_a_window(design, run.rows)
     if state is not None:

@@ -152,7 +152,7 @@ def simulation_report(
         if linear and (end := summary[f"{kind[:-1]}_warm_up"]) is None:
             told = "the initial-condition response has not settled: errors of the whole record"
         elif linear:
-            told = f"warm-up ended at {end:g} s, errors are of what follows"
+            told = f"errors after the warm-up, which ended at {end:g} s"
         print_section(console, f"{title} ({told})", table)
     for note in summary["notes"]:
         console.print(Text(note))

@@ -224,7 +224,7 @@ def adaptive_plan(
     noise = noise_bound if plant.nw else 0.0
     sizes = np.where(np.isfinite(bounds), bounds, 0.0)
     structure = structure_of(design, affine, tracking, bounds=sizes, noise_bound=noise)
-    _require_bounds(structure, bounds)
+    _require_bounds(structure, bounds, plant)
     z = np.zeros(observer.order) if observer_state is None else observer_state
     start = start_of(affine, tracking, initial_error, initial_set, z)
     later = Start(observer.order, norm=initial_error, state=z)
@@ -270,7 +270,7 @@ def _sampled_plan(
     structure = error_structure(
         problem.observer, problem.affine, problem.tracking, problem.bounds, noise, reading=problem.reading
     )
-    _require_bounds(structure, np.tile(bounds, SIGNED_PIECES + 1))
+    _require_bounds(structure, np.tile(bounds, SIGNED_PIECES + 1), plant)
     z = np.zeros(observer.order) if observer_state is None else observer_state
     box = None if initial_set is None else initial_box(plant, initial_set)
     stated = Start(observer.order, norm=initial_error, state=z)
@@ -294,12 +294,14 @@ def _sampled_plan(
     return plan(problem.start(stated, box)), plan(problem.start(stated, None))
 
 
-def _require_bounds(structure: ErrorStructure, bounds: FloatArray) -> None:
+def _require_bounds(structure: ErrorStructure, bounds: FloatArray, plant: DescriptorSystem) -> None:
     """Raise `SpecError` where a disturbance without a bound reaches the error."""
     reached = structure.disturbances.magnitude.max(axis=0, initial=0.0)[: len(bounds)] > 0.0
-    if np.any(reached & ~np.isfinite(bounds)):
+    lacking = sorted({int(i) % plant.nd for i in np.flatnonzero(reached & ~np.isfinite(bounds))})
+    if lacking:
+        names = ", ".join(plant.disturbance_names[i] for i in lacking)
         raise SpecError(
-            "A disturbance has no bound: give disturbance_bounds (--disturbance).", path="disturbance_bounds"
+            f"No bound is given on {names}: give disturbance_bounds (--disturbance).", path="disturbance_bounds"
         )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
 import numpy as np
@@ -145,7 +145,9 @@ def monitor(
     if kind in ("chi-square", "cusum"):
         rule = _whitened_rule(kind, model, start, **numbers)
     else:
-        threshold = _norm_threshold(kind, model, bounds, start, gamma=gamma, noise_bound=noise_bound, window=window)
+        threshold = _norm_threshold(
+            kind, model, bounds, start, design.linear[0].disturbance_names, gamma, noise_bound, window
+        )
         if model.flow is not None:
             threshold = threshold + _straight_lines(design, scenario, model, kind, window, rows)
         rule = NormRule(threshold, np.inf, window=window if kind == "window" else 1, dt=bench.signals.dt)
@@ -194,7 +196,7 @@ def _norm_threshold(
     model: ResidualModel,
     bounds: FloatArray,
     start: float,
-    *,
+    disturbances: Sequence[str],
     gamma: float | None,
     noise_bound: float | None,
     window: int,
@@ -202,7 +204,7 @@ def _norm_threshold(
     """Return the threshold of a norm at each sample, for what acts on the samples."""
     if kind == "paper":
         return paper_threshold(model, bounds, start, gamma)
-    inputs = scaled_inputs(model, bounds, noise_bound)
+    inputs = scaled_inputs(model, bounds, noise_bound, disturbances)
     threshold = pointwise_threshold(model, inputs, start)
     return threshold if kind == "pointwise" else window_threshold(model, inputs, start, window)
 

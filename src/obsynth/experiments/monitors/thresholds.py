@@ -5,6 +5,7 @@ For records of known length, and of any length: a table for the start, and one n
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -28,16 +29,22 @@ class ScaledInputs(NamedTuple):
 
 
 def scaled_inputs(
-    model: ResidualModel, bounds: FloatArray, noise_bound: float | None, *, any_stamps: bool = False
+    model: ResidualModel,
+    bounds: FloatArray,
+    noise_bound: float | None,
+    disturbances: Sequence[str],
+    *,
+    any_stamps: bool = False,
 ) -> ScaledInputs:
     """Return what drives the residual, with every input scaled to at most one in absolute value; ``bounds (nd,)``."""
     between = None if model.continuous is None else model.continuous.between
     sampled = np.any(model.Bd != 0.0, axis=0) | np.any(model.Dd != 0.0, axis=0)
     reached = sampled if between is None else between.reached
-    if np.any(reached & ~np.isfinite(bounds)):
+    if np.any(lacking := reached & ~np.isfinite(bounds)):
+        names = ", ".join(disturbances[int(i)] for i in np.flatnonzero(lacking))
         raise SpecError(
-            "A disturbance has no bound (a Gaussian one has none): give disturbance_bounds (--disturbance), or use "
-            "a statistical threshold.",
+            f"No bound is given on {names} (a Gaussian disturbance has none): give disturbance_bounds (--disturbance), "
+            "or use a statistical threshold.",
             path="disturbance_bounds",
         )
     if model.noisy and noise_bound is None:
