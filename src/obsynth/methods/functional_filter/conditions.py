@@ -47,35 +47,22 @@ def conditions(
     return tuple(
         condition
         for fault in chosen_faults(faults, plant)
-        for condition in fault_conditions(plant, model, fault, exactly)
+        for condition in _fault_conditions(
+            plant, tuple(model_points(model, fault)), model.descriptions[fault], fault, exactly
+        )
     )
 
 
 @remembered
-def _known(_plant: DescriptorSystem) -> dict[tuple[object, ...], tuple[Condition, ...]]:
-    """Return the cache of the conditions of a plant's faults: synthesis and verification ask for them."""
-    return {}
-
-
-def fault_conditions(
-    plant: DescriptorSystem, model: Exosystem, fault: int, exactly: bool | None = None
+def _fault_conditions(
+    plant: DescriptorSystem, points: tuple[complex, ...], description: str, fault: int, exactly: bool | None
 ) -> tuple[Condition, ...]:
-    """Return whether one fault can be estimated, free of the unknown inputs and of every other fault."""
-    poles = tuple(model_points(model, fault))
-    key = (fault, exactly, poles, model.descriptions[fault])
-    known = _known(plant)
-    if key not in known:
-        known[key] = _decided(plant, model, fault, exactly)
-    return known[key]
-
-
-def _decided(plant: DescriptorSystem, model: Exosystem, fault: int, exactly: bool | None) -> tuple[Condition, ...]:
+    """Return whether one fault, whose model has these poles, can be estimated, free of others and unknown inputs."""
     name = plant.fault_names[fault]
     asked = question(plant, [j for j in range(plant.nf) if j != fault], fault, exactly)
     seen = _shown(plant, asked, f"{name} detectable", _rest(plant, fault))
     if not asked.visible:
         return (seen,)
-    points = model_points(model, fault)
     lost = [point for point in points if not asked.shows_at(point)]
     doubtful = [point for point in lost if _may_show(asked, point)]
     shares = {point: _named(plant, asked).last_share(point) for point in points}
@@ -83,7 +70,7 @@ def _decided(plant: DescriptorSystem, model: Exosystem, fault: int, exactly: boo
     share = f", at the poles of its model at least {shares[least]:.2g} of it reaches the outputs" if shares else ""
     kept = Condition(
         f"{name} follows its model",
-        f"{name} has no zero at a pole of its model ({model.descriptions[fault]})",
+        f"{name} has no zero at a pole of its model ({description})",
         not lost,
         float(len(lost)),
         0.0,
