@@ -64,7 +64,7 @@ class Robustness:
     reason : str
         Why there is no bound; empty where there is one.
     sharing : tuple of str
-        Constants that act where a fault acts: no observer can ever tell their tolerance from it.
+        Constants that act where a fault acts: no observer can distinguish their tolerance from it.
     untouched : tuple of complex
         Modes of the plant that no constant touches and that are not stable: ``stable`` is about all others.
     not_covered : str
