@@ -18,6 +18,8 @@ from obsynth.cli.main import main
 from obsynth.plants.dae.functions import Compiled
 from obsynth.spec import load_spec
 
+pytestmark = pytest.mark.usefixtures("taken_as_verified")
+
 FLAGS = ["-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", "-O1", "-ffp-contract=off"]
 
 HARNESS = """\

@@ -18,6 +18,8 @@ from obsynth.exporting.c_source import c_identifier
 from obsynth.numerics.continuous import first_order_hold
 from obsynth.spec import load_spec
 
+pytestmark = pytest.mark.usefixtures("taken_as_verified")
+
 ROOT = Path(__file__).parents[2]
 STEPS = 10_000
 FLAGS = ["-Wall", "-Wextra", "-Werror", "-std=c99", "-pedantic", "-ffp-contract=off", "-O2"]

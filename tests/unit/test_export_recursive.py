@@ -12,6 +12,8 @@ import obsynth
 from obsynth import PreconditionError, SolverError, SpecError, TimeVaryingDescriptorSystem
 from obsynth.observers.recursive.gain_schedule import steady_observer
 
+pytestmark = pytest.mark.usefixtures("taken_as_verified")
+
 PLANT = TimeVaryingDescriptorSystem(
     E=[[1, 0, 0], [0, 1, 0], [0, 0, 0]], A=[[0.9, 0.1, 0], [-0.2, 0.7, 0.1], [1, 0.5, -1]], B=[[0], [1], [0.3]],
     C=[[1, 0, 0], [0, 0, 1]], Phi=[[0], [1], [0]], dt=0.1, parameter_names=["leak"],

@@ -14,6 +14,8 @@ import obsynth
 from obsynth import SolverError, SpecError, run_on_data, simulate_dae
 from obsynth.observers.running import state_as_data, state_from_data
 
+pytestmark = pytest.mark.usefixtures("taken_as_verified")
+
 #: Samples of the records of a recursive observer: its gains are asked for no further.
 RECORD = 110
 

@@ -16,6 +16,8 @@ import obsynth
 from obsynth.plotting import plot_detection, plot_simulation
 from obsynth.spec import load_spec
 
+pytestmark = pytest.mark.usefixtures("taken_as_verified")
+
 DESIGNS = Path(__file__).parents[2] / "designs"
 
 

@@ -16,6 +16,8 @@ from obsynth.experiments.benches import bench_of
 from obsynth.experiments.simulation import Simulation
 from obsynth.spec import load_spec
 
+pytestmark = pytest.mark.usefixtures("taken_as_verified")
+
 DESIGNS = Path(__file__).parents[2] / "designs"
 
 

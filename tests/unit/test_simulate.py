@@ -17,6 +17,8 @@ from obsynth.simulation.linear import make_stepper, simulate_plant
 from obsynth.simulation.signals import resolve
 from obsynth.spec import load_spec
 
+pytestmark = pytest.mark.usefixtures("taken_as_verified")
+
 DESIGNS = Path(__file__).parents[2] / "designs"
 
 

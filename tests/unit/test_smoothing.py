@@ -28,6 +28,8 @@ from obsynth.cli.main import main
 from obsynth.observers.recursive.observer import observer_from_options
 from obsynth.observers.smoothing.keeping import smoothed_record
 
+pytestmark = pytest.mark.usefixtures("taken_as_verified")
+
 E = np.diag([1.0, 1.0, 0.0])
 A = np.array([[0.9, 0.2, 0.1], [0.0, 0.7, 0.3], [1.0, 1.0, -2.0]])
 B = np.array([[1.0], [0.0], [1.0]])

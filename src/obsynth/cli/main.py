@@ -634,6 +634,7 @@ def obsynth_parser(asked: Collection[str] | None = None) -> argparse.ArgumentPar
         own = verbs.add_parser(
             name,
             help=verb.told,
+            add_help=asked is None or name in asked,
             description=verb.told,
             epilog=verb.epilog,
             formatter_class=argparse.RawDescriptionHelpFormatter if verb.epilog else argparse.HelpFormatter,
