@@ -268,5 +268,5 @@ def test_notes_say_what_is_not_told_and_what_is_slow() -> None:
     units = {name: unit for name, unit in exchanger().units.items() if name != "temperature"}
     model = exchanger(outputs={"pressure": "p2 + psi"}, units=units)
     design = dae_adaptive_observer(model, **{**OPTIONS, "R": {"pressure": 1e4}, "forgetting": 0.5})
-    assert any("do not tell this direction" in note and "psi" in note for note in design.notes)
+    assert any("do not distinguish this direction" in note and "psi" in note for note in design.notes)
     assert any("decay in" in note for note in design.notes)

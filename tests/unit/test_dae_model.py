@@ -279,9 +279,9 @@ def test_bad_questions_of_identifiability_are_named(arguments, words) -> None:
 @pytest.mark.parametrize(
     ("model", "words"),
     [
-        (exchanger(), ["tell every direction"]),
-        (printed(f"{FLUX} = 0"), ["do not tell", "phi (", "psi ("]),
-        (printed(f"{FLUX} + A ** 2 / R * (p1 - p2) = 0"), ["do not tell", "Energy (", "psi ("]),
+        (exchanger(), ["determine every direction"]),
+        (printed(f"{FLUX} = 0"), ["do not determine", "phi (", "psi ("]),
+        (printed(f"{FLUX} + A ** 2 / R * (p1 - p2) = 0"), ["do not determine", "Energy (", "psi ("]),
     ],
 )  # fmt: skip
 def test_the_check_before_any_design_says_what_the_outputs_do_not_tell(model, words) -> None:

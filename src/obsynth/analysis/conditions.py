@@ -31,7 +31,8 @@ class Condition:
         """Raise `PreconditionError` when the condition fails."""
         if not self.holds:
             opening = (
-                f"Unclear: whether the condition {self.name!r} holds ({self.source}) is below what the data can tell. "
+                f"Unclear: whether the condition {self.name!r} holds ({self.source}) cannot be decided from the "
+                "digits of the data. "
                 if self.unclear
                 else f"No observer of this kind exists: the condition {self.name!r} fails ({self.source}). "
             )

@@ -253,8 +253,8 @@ def _fitted(
     for direction in fit.information.undetermined:
         told = ", ".join(f"{name} {share:+.2g}" for name, share in direction.items())
         found.append(
-            f"This log does not determine the direction ({told}), in widths of the bounds: move "
-            "what excites it, state a prior, or fix one of them."
+            f"This log does not determine the direction ({told}), in widths of the bounds: excite it, state a prior, "
+            "or fix one of them."
         )
     found += [
         f"The box of {name} is open on its {side} side: the bound stands there, not the log."
@@ -307,7 +307,7 @@ def _misfits(problem: Problem, start: Fit, whitened: FloatArray, R: dict[str, fl
             + (
                 "its sign, its unit or its equation is another, and its R stands for the signal itself."
                 if R[name] > SIGNAL_SHARE * signal
-                else "noise of the equations moves it, more than the inputs do."
+                else "noise of the equations drives it more than the inputs do."
             )
         )
     for name, column in zip(problem.output_names, whitened.T, strict=True):
@@ -330,7 +330,7 @@ def _misfits(problem: Problem, start: Fit, whitened: FloatArray, R: dict[str, fl
 def _checked(nis: Consistency, colours: dict[str, Whiteness], row: int | None, simulated: bool) -> list[str]:
     found = [
         f"The innovations of {name} are not white (p = {test.probability:.2g}, first autocorrelation "
-        f"{test.first:+.2f}): something that moves {name} is not in the model."
+        f"{test.first:+.2f}): a signal that acts on {name} is not in the model."
         for name, test in colours.items()
         if test.probability < SIGNIFICANT
     ]

@@ -303,7 +303,8 @@ def _usable_log(
     require_kind(design, ObserverDesign, "design", "an ObserverDesign, such as obsynth.load(path)")
     if not states_innovations(design):
         raise SpecError(
-            f"The method {design.method} states no covariance of its residual, which a log could contradict: validate "
+            f"The method {design.method} states no covariance of its residual, that a log could be compared with: "
+            "validate "
             "a recursive or nonlinear design, or run the log with a monitor.",
             path="design",
         )
@@ -412,7 +413,7 @@ def _sentences(
     for name, deviation in far.items():
         found.append(
             f"The estimate of {name} ends {deviation:.1f} deviations from its nominal value: a constant is "
-            f"wrong, {'coloured noise moves it, ' if coloured else ''}or the rows are not free of faults."
+            f"wrong, {'coloured noise acts on it, ' if coloured else ''}or the rows are not free of faults."
         )
     return found
 
@@ -454,7 +455,7 @@ def _explanations(design: ObserverDesign, log: Log, record: RecordedInnovations)
 
 def _explained(told: Sequence[Explanation]) -> str:
     if not told:
-        return "No single offset, correlated noise, delay of an input or constant explains that: look at the residuals."
+        return "No single offset, correlated noise, delay of an input or constant explains that: plot the residuals."
     listed = "; ".join(f"{item.text} ({item.gain:.3g} nats)" for item in told)
     return (
         f"What explains it best, by likelihood: {listed}. The factors of Q and R have no meaning until that is "

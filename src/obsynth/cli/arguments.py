@@ -193,7 +193,7 @@ def delay(text: str) -> int | str:
 INPUT_DELAY = option(
     "--input-delay",
     "ROWS",
-    "rows of the log by which inputs act later than the design takes them (default: what the spec says by inputs.hold; "
+    "rows of the log by which inputs act later than in the design (default: that of inputs.hold in the spec; "
     "calibrate: or 'auto')",
     type=delay,
 )

@@ -111,7 +111,9 @@ and fleet.png; the same command goes on where another was stopped.
 What disturbances and noise are to be expected comes from the scenario of --system, or from the options.
 """
 _LOG = "text (.csv, .tsv), Parquet, TDMS or MDF file; - for text on standard input"
-_EXPECTED_SCENARIO = option("--system", "FILE", "spec (YAML) whose scenario tells what is to be expected", type=Path)
+_EXPECTED_SCENARIO = option(
+    "--system", "FILE", "spec (YAML) whose scenario states the disturbances and noise to expect", type=Path
+)
 
 VERBS = {
     "design": Verb(

@@ -227,7 +227,7 @@ def sensor_sets(
     lost = [task for task in search.tasks(plant, chosen) if task not in wanted]
     if not wanted:
         raise PreconditionError(
-            f"Not even all {len(sensors)} candidates together let any fault be had: to {goal} is out of reach. Give "
+            f"Not even all {len(sensors)} candidates together suffice for any fault: to {goal} is not possible. Give "
             "other candidates, or a weaker goal.",
             condition="sensors",
             signals=tuple(plant.fault_names[i] for i in chosen),
@@ -251,7 +251,7 @@ def sensor_sets(
     for task in lost:
         others = ", ".join(plant.fault_names[j] for j in task.beside)
         said = f" (from {others})." if others else "."
-        out_of_reach.append(f"{plant.fault_names[task.fault]}: out of reach of all candidates{said}")
+        out_of_reach.append(f"{plant.fault_names[task.fault]}: not possible with all candidates{said}")
     return SensorSets(goal, ranked, exact, tuple(out_of_reach), kept, failing, tuple(notes))
 
 
@@ -282,7 +282,7 @@ def _by_threshold(
     everything = tuple(range(len(sensors)))
     if question.best(everything) is None:
         raise PreconditionError(
-            f"Not even all {len(sensors)} candidates together let a threshold of {size:g} be had: the least is "
+            f"Not even all {len(sensors)} candidates together suffice for a threshold of {size:g}: the least is "
             f"{question.least(everything):.4g}. Give other candidates, sample times, or a larger size.",
             condition="sensors",
             signals=(fault,),

@@ -341,7 +341,7 @@ def _differentiates(fmpy: Any, path: Path) -> bool:
     exchange = root.find("ModelExchange")
     if exchange is None:
         raise SpecError(
-            f"{path} is for co-simulation only: its states and derivatives cannot be asked for. Export it "
+            f"{path} is for co-simulation only: it does not give its states and derivatives. Export it "
             "for model exchange.",
             path=str(path),
         )

@@ -133,7 +133,7 @@ def _designed(
         except PreconditionError as error:
             if not isinstance(plant, DescriptorSystem) or not advise:
                 raise
-            progress("looking for what would make it possible")
+            progress("searching for sensors that would make it possible")
             raise with_advice(error, plant, asked) from None
         if notes:
             found = replace(found, notes=(*notes, *found.notes))
@@ -264,7 +264,7 @@ def verified(
     if not report.passed:
         raise VerificationError(
             f"Gains were found, but the shipped realisation fails: {failed_rows(report)}. Nothing was shipped; "
-            "the plant may be badly scaled, or what was asked may be at the edge of what can be had: ask for less."
+            "the plant may be badly scaled, or the options may be at the limit of what is possible: relax them."
             + "".join(f" {note}" for note in draft.notes),
             report=report,
         )

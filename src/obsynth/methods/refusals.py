@@ -106,7 +106,7 @@ def _drops(plant: DescriptorSystem, holds: Callable[[DescriptorSystem], bool]) -
 def _nothing(plant: DescriptorSystem) -> str:
     if plant.nx > MOST_FOR_ONE:
         return f"With {plant.nx} states, ask obsynth.sensor_sets which sensors would help."
-    return "No state measured besides, and no unknown input or fault left out, would help."
+    return "Neither one more measured state nor one unknown input or fault less would help."
 
 
 #: Share of a unit fault that rounding of the outputs may be of its estimate.
@@ -193,7 +193,7 @@ def rounding_notes(plant: DescriptorSystem, observer: LinearObserver) -> tuple[s
         ()
         if found is None
         else tuple(
-            f"The numbers of the observer cancel each other: their last digits alone may move the estimate of {name!r}"
+            f"The entries of the observer cancel: their last digits alone may change the estimate of {name!r}"
             f" by {share:.2g} of the fault, and by more at some frequencies. State the noise of the sensors, or ask "
             "for a larger gamma."
             for name, share in zip(plant.fault_names, found, strict=True)

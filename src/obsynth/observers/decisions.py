@@ -91,7 +91,7 @@ def decide(
     if not len(start) and statistic != "nis":
         raise SpecError(
             "A decision on parameters needs an observer that estimates them; of a filter alone, statistic "
-            "'nis' tells whether the model still explains the data.",
+            "'nis' tests whether the model still fits the data.",
             path="observer",
         )
     false_alarms = real_number(false_alarms, "false_alarms", "a probability between 0 and 1")

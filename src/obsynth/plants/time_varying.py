@@ -178,7 +178,7 @@ class TimeVaryingDescriptorSystem:
             raise SpecError("The plant has feedthrough: pass y - D u as its output, with D = 0.", path="D")
         if plant.nd:
             raise SpecError(
-                "The plant has unknown disturbances, which these methods do not know: remove Bd and Dd, or call them "
+                "The plant has unknown disturbances, which these methods do not cover: remove Bd and Dd, or make them "
                 "faults.",
                 path="Bd",
             )

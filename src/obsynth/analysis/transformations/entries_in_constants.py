@@ -32,7 +32,8 @@ def promoted(model: DAEModel, names: Sequence[str]) -> DAEModel:
         return model
     if not model.is_data:
         raise SpecError(
-            f"{new[0]!r} is a constant of Python functions, which only texts can give up: make it a parameter.",
+            f"{new[0]!r} is a constant of Python functions, and only equations given as texts can replace a constant: "
+            "make it a parameter.",
             path=f"unknown.{new[0]}",
         )
     return model.replace(

@@ -61,8 +61,8 @@ def bounded_model(
     found = discretise(linear, sample_time).plant
     if any(name.startswith("xi ") for name in found.state_names):
         raise PreconditionError(
-            "Derivatives of algebraic states stand in the equations, so that the dynamic states are combinations: "
-            "write the equations with derivatives of the states that move alone.",
+            "The equations hold derivatives of algebraic states, so that the dynamic states are combinations of "
+            "states: write the equations with derivatives of the dynamic states alone.",
             condition="remainder",
         )
     at = np.maximum(np.abs(middles - halves), np.abs(middles + halves))

@@ -184,7 +184,7 @@ def _noise(smooth: DescriptorSystem, back: FloatArray, dt: float) -> tuple[Float
     process, sensors = smooth.Bw.any(axis=0), smooth.Dw.any(axis=0)
     if (process & sensors).any():
         raise PreconditionError(
-            "A noise drives the plant and a sensor at once, which is not known between samples.", condition="noise"
+            "One noise acts on the plant and on a sensor, which has no model between samples.", condition="noise"
         )
     gathered = np.zeros((smooth.nx, 0))
     if process.any():

@@ -108,7 +108,7 @@ def record_monitor(design: ObserverDesign, scenario: Scenario, kind: str, given:
     if isinstance(test.observer, WindowObserver):
         raise SpecError(
             "A test whose weights change with k is for measured data: use obsynth.online_monitor, or alarms() and "
-            "limits() of the test on what its observer says.",
+            "limits() of the test on the estimates of its observer.",
             path="design",
         )
     bench = make_bench(design, scenario)

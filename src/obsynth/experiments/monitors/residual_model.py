@@ -64,7 +64,7 @@ def sampled_errors(errors: ErrorModel, dt: float) -> SampledErrors:
     process, sensors = plant.Bw.any(axis=0), plant.Dw.any(axis=0)
     if (process & sensors).any():
         raise SpecError(
-            "A noise drives the plant and a sensor at once, which is not known between samples: state two.",
+            "One noise acts on the plant and on a sensor, which has no model between samples: state two.",
             path="noise",
         )
     held = sample_observer(observer, dt)

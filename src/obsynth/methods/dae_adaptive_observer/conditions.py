@@ -81,11 +81,11 @@ def _told(model: DAEModel, dt: float) -> str:
     if not found.unidentifiable:
         faintest = found.singular_values[-1] / found.singular_values[0]
         return (
-            "; at nominal constant inputs the outputs tell every direction of parameters and initial state, the "
-            f"faintest {faintest:.1e} times as strongly as the clearest"
+            "; at nominal constant inputs the outputs determine every direction of parameters and initial state, the "
+            f"weakest {faintest:.1e} times as strongly as the strongest"
         )
     listed = "; ".join(", ".join(f"{name} ({share:+.3g})" for name, share in row.items()) for row in found.unseen)
     return (
-        f"; at nominal constant inputs the outputs do not tell these directions: {listed}. Ask "
+        f"; at nominal constant inputs the outputs do not determine these directions: {listed}. Ask "
         "obsynth.identifiability whether other inputs excite them, or add a sensor"
     )

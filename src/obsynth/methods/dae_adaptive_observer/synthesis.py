@@ -70,7 +70,7 @@ def _notes(observer: DAEObserver, facts: DAEFacts) -> Iterator[str]:
     for direction in facts.identifiable.faint:
         shares = ", ".join(f"{name} ({share:+.3g})" for name, share in direction.items())
         yield (
-            "At nominal constant inputs the outputs do not tell this direction from noise, in prior deviations "
+            "At nominal constant inputs the outputs do not distinguish this direction from noise, in prior deviations "
             f"and nominal sizes: {shares}. Excite the plant, or add a sensor."
         )
     window = 1.0 / (1.0 - observer.forgetting) if observer.forgetting < 1.0 else np.inf

@@ -112,8 +112,8 @@ def _no_zero_on_the_axis(plant: DescriptorSystem) -> tuple[Condition, ...]:
         "none, exactly"
         if not found
         else (
-            f"s = {found[0]:.4g}: the unknown inputs do not reach some residual there, and the filter that makes them "
-            "all alike would not be stable. State noise of the states (Bw)."
+            f"s = {found[0]:.4g}: the unknown inputs do not reach some residual there, and the filter that gives all "
+            "residuals the same gain would not be stable. State noise of the states (Bw)."
         )
     )
     return (

@@ -40,8 +40,8 @@ def observer_beside(
         )
     if list(problem_of(plant, asked).bounds.middles):
         raise PreconditionError(
-            "Bounds [low, high] and tolerances do not go together: what constants make of the middle is not known. "
-            "Give the larger end.",
+            "Bounds [low, high] and tolerances do not go together: the effect of the constants on the middle is not "
+            "known. Give the larger end.",
             condition="tolerances",
         )
     progress("designing the observer of the state beside the test")

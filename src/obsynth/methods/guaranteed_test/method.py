@@ -135,7 +135,7 @@ class GuaranteedTestMethod(Asked, Method):
     source: ClassVar[str] = "ours, by duality of linear programmes"
     claims: ClassVar[Mapping[str, ClaimMeaning]] = {
         "threshold": ClaimMeaning("", "never passed without the fault, in the fault's unit", "threshold"),
-        "least": ClaimMeaning("", "no function of these samples tells the fault within less", "least"),
+        "least": ClaimMeaning("", "no function of these samples estimates the fault to within less", "least"),
         "surely_found": ClaimMeaning("", "a fault of this size and course surely alarms", "surely found"),
         "delay": ClaimMeaning("s", "after which it does so at the latest", "delay"),
         "mean_threshold": ClaimMeaning(

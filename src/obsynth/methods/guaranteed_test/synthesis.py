@@ -214,7 +214,8 @@ def _notes(
         )
         if not window.twice_is_hidden:
             words.append(
-                "As states have bounds, the latter is about intervals: no function tells the fault within less. It is "
+                "As states have bounds, the latter is about intervals: no function estimates the fault to within "
+                "less. It is "
                 "not claimed that none detects every fault of less than twice that size: bounds of states may make "
                 "that possible."
             )

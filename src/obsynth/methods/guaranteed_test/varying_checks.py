@@ -244,8 +244,8 @@ def _of_the_least(
     )
     yield lower_bound_check(
         "least",
-        "at some row no function of its samples has a threshold below this: by a course of the fault that these do not "
-        "tell from another",
+        "at some row no function of its samples has a threshold below this: by a time course of the fault that these "
+        "do not distinguish from another",
         best,
         float(claimed),
         source=SOURCE,

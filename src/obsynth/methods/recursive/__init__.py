@@ -9,5 +9,5 @@ RECURSIVE_CLAIMS = {
     "condition_k": ClaimMeaning("samples", "step at which it is", "claims"),
     "residual_directions": ClaimMeaning("", "least rank E_k + ny - nx: what the literal form (18) uses", "claims"),
     "contraction": ClaimMeaning("", "mean factor per step by which an error shrinks", "claims"),
-    "steps": ClaimMeaning("samples", "steps that were looked at", "claims"),
+    "steps": ClaimMeaning("samples", "steps that were checked", "claims"),
 }

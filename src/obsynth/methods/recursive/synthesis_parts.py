@@ -41,7 +41,7 @@ def with_stated_noise(
     if np.any(plant.Bw @ plant.Dw.T):
         raise SpecError(
             "The plant's noise drives equations and outputs at once (Bw Dw' is not zero), which these methods do not "
-            "know: state independent noises, or give Q and R.",
+            "cover: state independent noises, or give Q and R.",
             path="Dw",
         )
     for name, matrix in (("Q", plant.Bw), ("R", plant.Dw)):
@@ -130,7 +130,7 @@ def _require_contraction(observer: RecursiveObserver, facts: GainScheduleSummary
         identity = _missing_noise(options)
         given = f" {' and '.join(identity)} taken as the identity weigh this plant in its units." if identity else ""
         raise PreconditionError(
-            "Unclear: the horizon does not tell whether errors decay fast enough. The outputs observe every "
+            "Unclear: the horizon is too short to decide whether errors decay fast enough. The outputs observe every "
             f"state, and with these Q and R the errors decay in the end; but over {facts.steps} steps the product of "
             f"L_k A_k {kept}, in {', '.join(map(repr, names))}.{given} State Q and R in the units of equations and "
             "outputs, or take units in which entries are near one.",

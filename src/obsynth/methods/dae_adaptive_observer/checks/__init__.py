@@ -145,7 +145,7 @@ def _model_rows(observer: DAEObserver, facts: DAEFacts) -> Iterator[Check]:
     deviations = facts.identifiable.deviations[observer.model.nx :]
     for name, prior, bound, deviation in zip(names, priors, deviations, facts.deviations, strict=True):
         unit = observer.model.units.get(name, "")
-        told = "the outputs alone do not tell it" if not np.isfinite(bound) else f"Cramer-Rao {bound:.3g} {unit}"
+        told = "the outputs alone do not determine it" if not np.isfinite(bound) else f"Cramer-Rao {bound:.3g} {unit}"
         yield information(
             f"excitation: {name}",
             "information from nominal constant inputs, in prior deviations to the power -2",

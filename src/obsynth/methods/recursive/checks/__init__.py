@@ -218,7 +218,7 @@ def listed_gains(design: ObserverDesign, found: Mapping[str, FloatArray]) -> Che
             gap = max(gap, float(np.max(np.abs(listed - matrix)) / max(float(np.max(np.abs(matrix))), LEAST_GAIN_SIZE)))
     return upper_bound_check(
         "gains",
-        "the listed gains are those of the run that is looked at",
+        "the listed gains are those of the run that is checked",
         np.inf if wrong else gap,
         CLAIM_TOLERANCE,
         source="gain set",

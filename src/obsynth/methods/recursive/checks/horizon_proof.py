@@ -276,7 +276,7 @@ def definite_by_its_noise(name: str, claim: str, gain: FloatArray, H: FloatArray
         "P >= L Q L' + K R K' with definite Q and R, outward rounded",
         "proved",
         "value: least singular value of [L K] [E; C] in natural units, which is to be "
-        "above zero; the covariance as computed is too near a singular one to tell",
+        "above zero; the computed covariance is too near a singular one to decide",
     )
 
 
