@@ -42,19 +42,21 @@ class Compiled:
             self._buffer.set_arg(i, memoryview(argument.data))
         for i, result in enumerate(self._results):
             self._buffer.set_res(i, memoryview(result.data))
+        self._given = [argument[:size] for argument, size in zip(self._arguments, self._sizes, strict=True)]
+        self._found = [
+            result[: rows * columns].reshape((rows, columns), order="F")
+            for result, (rows, columns) in zip(self._results, self._shapes, strict=True)
+        ]
 
     def __call__(self, *values: FloatArray) -> tuple[FloatArray, ...]:
         """Return fresh arrays, NaN or infinite where there is no value."""
-        for argument, size, value in zip(self._arguments, self._sizes, values, strict=True):
-            argument[:size] = value
+        for argument, value in zip(self._given, values, strict=True):
+            argument[:] = value
         self._run()
         if self._buffer.ret():
             # A factorisation inside met a singular matrix; what is in the buffers belongs to another call.
             return tuple(np.full(shape, np.nan) for shape in self._shapes)
-        return tuple(
-            np.array(result[: shape[0] * shape[1]]).reshape(shape, order="F")
-            for result, shape in zip(self._results, self._shapes, strict=True)
-        )
+        return tuple([found.copy(order="F") for found in self._found])
 
 
 class DAEFunctions:
