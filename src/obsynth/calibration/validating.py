@@ -303,9 +303,8 @@ def _usable_log(
     require_kind(design, ObserverDesign, "design", "an ObserverDesign, such as obsynth.load(path)")
     if not states_innovations(design):
         raise SpecError(
-            f"The method {design.method} states no covariance of its residual, that a log could be compared with: "
-            "validate "
-            "a recursive or nonlinear design, or run the log with a monitor.",
+            f"The method {design.method} states no covariance of its residual with which a log could be compared: "
+            "validate a recursive or nonlinear design, or run the log with a monitor.",
             path="design",
         )
     plant = design.plant

@@ -380,8 +380,7 @@ def _lost_tolerances(shipped: Plant) -> tuple[str, ...]:
         return ()
     return (
         f"The tolerances of the constants ({', '.join(uncertain.box.names)}) are not carried over: {uncertain.lost}. "
-        "The "
-        "design is for the nominal plant, and thresholds and proofs over the box are refused. Eliminate algebraic "
+        "The design is for the nominal plant, and thresholds and proofs over the box are refused. Eliminate algebraic "
         "states first (transform: eliminate_algebraic_states, obsynth.eliminate_algebraic_states).",
     )
 

@@ -99,8 +99,7 @@ def _hidden(test: GuaranteedTest) -> Iterator[Picture]:
             yield Picture(
                 "Why there is no smaller one",
                 f"This time course of {test.fault} with these disturbances, and the opposite of all of them, give the "
-                "same "
-                "samples: every equation and all bounds hold.",
+                "same samples: every equation and all bounds hold.",
                 drawn((HALF_WIDTH, 4.2), 1, lambda axes: plot_hidden_course(test, axes=axes[0])),
             )
         return

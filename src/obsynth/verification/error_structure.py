@@ -210,8 +210,7 @@ def _fault_columns(
     if reached.size and reached.max() > EFFECT_RANK_SHARE:
         raise PreconditionError(
             "A fault that is estimated with a delay of one sample reaches the estimates at once: its estimate has no "
-            "guaranteed "
-            "interval.",
+            "guaranteed interval.",
             condition="fault interval",
         )
     chosen = [moved[:, [j]] if late[j] else direct[:, [j]] for j in range(nf)]

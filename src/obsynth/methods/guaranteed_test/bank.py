@@ -199,8 +199,7 @@ def _smallest_groups(design: ObserverDesign, asked: Asked) -> Iterator[Check]:
         yield upper_bound_check(
             f"smallest group[{name}]",
             f"no test of {name} is insensitive to more faults: the other faults can then hide it, by numbers that "
-            "satisfy "
-            "every equation exactly",
+            "satisfy every equation exactly",
             float(left),
             0.0,
             source=SOURCE,

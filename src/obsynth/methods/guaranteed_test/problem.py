@@ -153,8 +153,7 @@ def missing_bounds(plant: DescriptorSystem, asked: Asked) -> Iterator[str]:
     if asked.noise_bound is None and np.any(np.hstack([plant.Bw.ravel(), plant.Dw.ravel()])):
         yield (
             "noise_bound: a standard deviation is no bound; state how many of them the noise never exceeds, or the "
-            "bound "
-            "of each output by name."
+            "bound of each output by name."
         )
 
 

@@ -167,8 +167,7 @@ def _model_condition(
         who = f"the fault {faults[0]!r}" if alone else f"a combination of the faults {', '.join(map(repr, faults))}"
         detail += (
             f": at {where} {who}{masked or ' is output-nulling'}: it has no effect on the outputs, so no observer can "
-            "estimate "
-            f"{'it' if alone else 'them'}. Measure another signal, or leave one of them out."
+            f"estimate {'it' if alone else 'them'}. Measure another signal, or leave one of them out."
         )
     return Condition(
         f"(D3) fault model at {number(own)}",
@@ -224,8 +223,7 @@ def order_conditions(
     decision, point = worst[0], units.eigenvalue(worst[1])
     lost = (
         f": at the zero {number(point)} of (f, d) -> y the fault model (order {model.order}) cannot be distinguished "
-        "from "
-        "nothing in double precision. Lower its order."
+        "from nothing in double precision. Lower its order."
     )
     found = Condition(
         "order of the fault model",

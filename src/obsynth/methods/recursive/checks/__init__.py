@@ -113,8 +113,7 @@ def refinement_rows(observer: RecursiveObserver | DAEObserver) -> Iterator[Check
             float(entry["every"]),
             source="options: sensors",
             detail=f"its values are delayed by {entry['delay']} row(s); the other rows of this report are about "
-            "samples "
-            "of every sensor at once",
+            "samples of every sensor at once",
         )
 
 
