@@ -46,7 +46,8 @@ def test_a_step_that_is_not_reached_is_said() -> None:
     source = load_spec(DESIGNS / "smib" / "functional.yaml").transformation.source
     design = obsynth.ui_pi_observer(obsynth.eliminate_algebraic_states(source).plant)
     assert design.report.passed
-    assert any("gives an estimate of 4.38 after 20 s" in text for text in design_warnings(design, followed_steps(design)))
+    told = design_warnings(design, followed_steps(design))
+    assert any("gives an estimate of 4.38 after 20 s" in text for text in told)
 
 
 def test_a_fault_that_cannot_be_told_is_said() -> None:
