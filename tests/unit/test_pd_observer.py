@@ -160,7 +160,7 @@ class TestOptions:
                 design.report["noise in the fault estimate"].value, rel=1e-3
             )
             fast = np.linalg.norm(np.linalg.solve(d, l)[PLANT.nx :], 2)
-            assert design.report["high-frequency noise in the fault estimate"].value == pytest.approx(fast, rel=1e-9)
+            assert design.report["fast noise in the fault estimate"].value == pytest.approx(fast, rel=1e-9)
 
     def test_noise_and_disturbance_as_the_plant_states_them(self) -> None:
         design = obsynth.pd_observer(rich(), noise_gain=0.5, fault_rate_gain=2.0)

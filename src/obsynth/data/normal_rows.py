@@ -88,6 +88,8 @@ def learn_thresholds(
     Alwan & Roberts (1988), Lowry et al. (1992), Willsky & Jones (1976), Politis & Romano (1994), Gandy & Kvaloy (2013).
     """
     require_kind(design, ObserverDesign, "design", "an ObserverDesign, such as obsynth.load(path)")
+    # Both are refused before the log is read.
+    watched_names(design)
     rows_per_alarm(false_alarms, 1.0 if design.observer.dt == 0.0 else design.observer.dt)
     if time_column is not None:
         columns = {**(columns or {}), TIME_HEADER: time_column}

@@ -249,7 +249,7 @@ def norm_rows(design: ObserverDesign, errors: PdErrorSystem) -> Iterator[Check]:
         unit,
     )
     yield information(
-        "high-frequency noise in the fault estimate",
+        "fast noise in the fault estimate",
         "gain from the noise to the fault error at high frequencies",
         _size(errors.noise[1][plant.nx :]),
         source="recomputed",
