@@ -201,7 +201,7 @@ def case(seed: int) -> Outcome:
         except PreconditionError:
             return Outcome(group, "no plant")
         design = designed(truth, plant)
-        if design is None or design.plant.uncertainty is None:
+        if design is None or design.plant.uncertainty is None or design.plant.uncertainty.lost:
             # A method that eliminates algebraic states itself says that it left the tolerances behind.
             told = design is not None and any("tolerances" in note for note in design.notes)
             wrong = "" if design is None or told else "the tolerances are lost without a word"
@@ -224,8 +224,9 @@ def _sampled(truth: Truth, design: Any, group: str) -> Outcome:
         return Outcome(group, "no bound")
     size, no, count = len(truth.rows["A"]), plan.bound.counts[4], len(box.names)
     u = rng.uniform(-1.0, 1.0, (STEPS, truth.nu)) * float(rng.choice([1.0, 10.0]))
-    # The state of an eliminated plant is not that of the plant as written: it begins at zero.
-    x = np.zeros(size) if truth.kind == "eliminated" else np.array(list(start.values())) * rng.choice([-1.0, 1.0], size)
+    # A plant that was eliminated, by us or by its method, has other states than were written: they begin at zero.
+    written = truth.kind != "eliminated" and len(start) == size
+    x = np.array(list(start.values())) * rng.choice([-1.0, 1.0], size) if written else np.zeros(size)
     largest, wrong = 0.0, ""
     for point in _points(truth, count):
         q = rng.choice([-1.0, 1.0], (STEPS, count)) if truth.varying else np.tile(point, (STEPS, 1))

@@ -15,6 +15,7 @@ from obsynth.plants.uncertainty import UNCERTAIN_MATRICES
 from obsynth.proofs.affine import AffineMatrix, affine_exponential, affine_inverse
 from obsynth.proofs.affine_numbers import AffineNumber, affine_translation
 from obsynth.tolerances.exact_plant import drawn_points, plant_at
+from obsynth.tolerances.subdivision import index_one_on_box
 
 ONE = {"E": None, "A": [["1 - 0.1 * k / m"]], "C": [[1]], "dt": 0.1}
 
@@ -89,10 +90,14 @@ def test_tolerances_go_through_a_gain_set_and_are_dropped_with_other_matrices(tm
     assert again.steps == (("eliminate", 0.0), ("sample", 0.02))
     changed = design.plant.replace(A=2.0 * design.plant.A)
     assert changed.uncertainty.lost == "A was changed"
+    names = {"disturbance_bounds": changed.disturbance_names, "initial_set": changed.state_names}
+    bounds = {option: dict.fromkeys(given, 1.0) for option, given in names.items()}
     for use in (
         affine_plant,
         lambda plant: plant_at(plant, {}),
+        index_one_on_box,
         lambda plant: obsynth.robustness(design.replace(plant=plant)),
+        lambda plant: obsynth.online_monitor(design.replace(plant=plant), noise_bound=3.0, **bounds),
     ):
         with pytest.raises(PreconditionError, match="not carried over: A was changed"):
             use(changed)

@@ -262,5 +262,7 @@ def matrices_of(plant: Any) -> dict[str, FloatArray]:
 
 
 def as_written(plant: Any, uncertain: Uncertainty) -> Mapping[str, FloatArray]:
-    """Return the matrices that may hold constants as they were written, before any transformation."""
+    """Return the matrices that may hold constants as they were written, before any transformation; refused where the
+    tolerances did not follow what was done to the plant."""
+    require_carried(uncertain)
     return matrices_of(plant) if uncertain.written is None else uncertain.written

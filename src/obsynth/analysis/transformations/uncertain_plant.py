@@ -97,7 +97,6 @@ def reduced_family(
 ) -> tuple[dict[str, AffineMatrix], FloatArray]:
     """Return a plant over its box (or another) without algebraic states, and its coordinates.
     ``inverted``: E is inverted at each point of the box; else only at the nominal values, and E stays a family."""
-    require_carried(uncertain)
     written = as_written(plant, uncertain)
     box = uncertain.box if box is None else box
     matrices, values = uncertain.affine(written, box), None
