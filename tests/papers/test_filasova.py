@@ -79,10 +79,8 @@ class TestPrinted:
     @pytest.mark.parametrize("case", ["printed", "with_printed_G"])
     def test_norms(self, case: str) -> None:
         design = printed_design(adaptation_gain=None if case == "printed" else G)
-        found = [
-            design.report[f"{name} in the fault estimate"].value for name in ("fault rate", "noise", "high-frequency "
-                                                                                                     "noise")
-        ]  # fmt: skip
+        names = ("fault rate", "noise", "fast noise")
+        found = [design.report[f"{name} in the fault estimate"].value for name in names]
         np.testing.assert_allclose(found, TRUTH["norms"][case], rtol=3e-3)
 
     def test_the_printed_G_happens_to_be_stable(self) -> None:
