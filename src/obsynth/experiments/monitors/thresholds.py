@@ -16,6 +16,7 @@ from obsynth.experiments.monitors.residual_model import ResidualModel, schur_for
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import peak_gain
 from obsynth.numerics.norms import hinf_norm
+from obsynth.verification.responses import OUTWARD
 
 
 class ScaledInputs(NamedTuple):
@@ -99,12 +100,13 @@ def paper_threshold(model: ResidualModel, bounds: FloatArray, initial_error: flo
 
 
 def pointwise_threshold(model: ResidualModel, inputs: ScaledInputs, initial_error: float) -> FloatArray:
-    """Return what the norm of the residual never passes: exact initial-error term and l1 (peak) gains of each input."""
+    """Return what the norm of the residual never passes: exact initial-error term and l1 (peak) gains of each input.
+    Larger by more than rounding of these sums and of the residual: noise may be at its bounds with the worst signs."""
     shown = [model.C @ power for power in model.powers()]
     start = np.array([np.linalg.norm(c, 2) for c in shown]) * initial_error
     start += np.array([_columns(c @ inputs.start) for c in shown])
     earlier = np.concatenate([[0.0], np.cumsum([_columns(c @ inputs.B) for c in shown])[:-1]])
-    return np.asarray(start + earlier + _columns(inputs.D) + inputs.between)
+    return np.asarray((start + earlier + _columns(inputs.D) + inputs.between) * OUTWARD)
 
 
 def _columns(matrix: FloatArray) -> float:
@@ -193,12 +195,12 @@ def unlimited_bound(
     begins = initial_error + _columns(inputs.start)
     start = max(shown) * left * begins
     if kind == "pointwise":
-        return UnlimitedHorizonBound(_start_added(model, bare, initial_error), pointwise + start)
+        return UnlimitedHorizonBound(_start_added(model, bare, initial_error) * OUTWARD, (pointwise + start) * OUTWARD)
     table = window_threshold(model, inputs, initial_error, window)
     # No window has more energy than its samples one by one; for a sampled plant its own bound may be smaller.
     # Such a window may begin in the table, where more is left of the start.
     start = max(max(shown[-window:]), max(shown) * left) * begins
-    limit = float(np.sqrt(window)) * (pointwise + start)
+    limit = float(np.sqrt(window)) * (pointwise + start) * OUTWARD
     if model.flow is None and model.sampled is None:
         limit = min(limit, _window_limit(model, inputs, (initial_error, left, last), window))
     return UnlimitedHorizonBound(table, limit)
