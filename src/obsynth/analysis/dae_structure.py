@@ -192,7 +192,7 @@ def _sensitivities(
 
 #: The step is shortened by these factors.  Short enough that dF/dx' rules, long enough that index 3 stays countable.
 SHORTENINGS = (1e-2, 1e-3)
-#: Equations and states with at least this relative to its largest value entry of a singular vector are named.
+#: Equations and states with at least this share of the largest entry of a singular vector are named.
 LEADING_SHARE = 0.1
 
 

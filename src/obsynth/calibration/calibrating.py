@@ -37,7 +37,7 @@ from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 
 #: A discrete plant is stepped as it is.
 EXACT_STEP = "exact"
-#: The least effect of a state on the outputs, as a relative to its largest value, by which it is sized.
+#: The least effect of a state on the outputs, as a share of the largest, by which it is sized.
 LEAST_EFFECT = 1e-6
 #: What the matrices of varying and of invariant plants are called here; G and L are of constant effects.
 MATRIX_LETTERS = {"E": "E", "A": "A", "B": "B", "C": "C", "Phi": "G", "Psi": "L"}

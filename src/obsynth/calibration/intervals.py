@@ -25,7 +25,7 @@ LIMIT_ROOT = 1.645
 #: A profile ends when its root is within this share of what is sought.
 PROFILE_TOLERANCE = 0.02
 MOST_PROFILE_STEPS = 12
-#: Curvatures below this relative to its largest value count as this much: rounding of the Hessian.
+#: Curvatures below this share of the largest count as this much: rounding of the Hessian.
 LEAST_CURVATURE_SHARE = 1e-8
 #: Of the search for the others along a profile: the gain in nats that ends it, and its steps.
 PROFILE_SEARCH_TOLERANCE, MOST_PROFILE_SEARCHES = 1e-4, 60

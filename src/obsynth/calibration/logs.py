@@ -45,7 +45,7 @@ QUANTUM_SLACK = 0.02
 DISTINCT_SHARE = 0.7
 #: Rows of wrong values that are named.
 TOLD_ROWS = 5
-#: Decimals to which values of a column are compared, and the relative to its largest value below which a step is
+#: Decimals to which values of a column are compared, and the share of the largest below which a step is
 #: rounding.
 VALUE_DIGITS, SAME_VALUE = 12, 1e-9
 #: The variance of what rounding takes away, even over a step, is the step squared over this.

@@ -42,7 +42,7 @@ ACROSS_STEPS, STEEP, VALUE_ROUNDING = 4, 1e3, 1e-13
 #: Differences of the gradient: the longest, as a share of a deviation, and the shortest.
 GRADIENT_DIFFERENCE, DIFFERENCE_SHARE, LEAST_DIFFERENCE = 1e-4, 0.03, 1e-6
 #: Longer ones, where a kink of the model bends the likelihood the wrong way: of logarithms of variances, and what share
-#: of them of constants; curvatures below zero that are rounding, and as a relative to its largest value.
+#: of them of constants; curvatures below zero that are rounding, and as a share of the largest.
 LONGER_DIFFERENCES, CONSTANT_STEP, DOWNWARDS, DOWNWARDS_SHARE = (1e-3, 1e-2, 1e-1), 0.1, 1e-2, 1e-6
 #: A variance counts as indistinguishable from zero if making it smaller by this logarithm costs fewer nats than this.
 COLLAPSE, COLLAPSE_NATS = 3.0, 0.05

@@ -388,7 +388,7 @@ def compared_again(
     return result, comparison_statement(body["result"], digests, body["log"]), others
 
 
-#: Entries of a plant that was sampled again agree to this relative to its largest value of their matrix.
+#: Entries of a plant that was sampled again agree to this share of the largest of their matrix.
 SAME_PLANT = 1e-9
 
 

@@ -143,11 +143,11 @@ def _said(design: ObserverDesign, run: LogRun, log: FloatArray) -> _Said:
     residuals = [i for i, name in enumerate(run.observer.columns) if name.startswith("r[")]
     numbers, times, rows, refused = list[int](), list[float](), list[FloatArray](), list[FloatArray]()
     squares = list[float]()
-    settling, observer = settling_rows(design), run.observer
-    gated = isinstance(observer, SteppingLogObserver) and observer.gates
-    for count, row in enumerate(_rows(run, log, CHUNK_ROWS if not gated else 1)):
-        if isinstance(observer, SteppingLogObserver) and gated:
-            refused.append(observer.state.refused)
+    settling = settling_rows(design)
+    gate = run.observer if isinstance(run.observer, SteppingLogObserver) and run.observer.gates else None
+    for count, row in enumerate(_rows(run, log, CHUNK_ROWS if gate is None else 1)):
+        if gate is not None:
+            refused.append(gate.state.refused)
         if row.status in STALE:
             continue
         said = watched_values(row.values[residuals], row.evidence)

@@ -27,7 +27,7 @@ SHARE = 0.5
 #: What they leave of a power, relative to it, that counts as rounding; its logarithm tells when to look
 #: again, since each squaring doubles it.
 POWER_ROUNDING = 4e-15
-#: Diagonal entries of a solution are taken to be at least this relative to its largest value when they set units.
+#: Diagonal entries of a solution are taken to be at least this share of the largest when they set units.
 LEAST_SIZE = 1e-20
 #: Directions in which that is measured, beside those that make the basis.
 PROBES = 6
@@ -111,7 +111,7 @@ class Lifts:
 #: Doubling stops when a step changes the solution by less than this, relative to it; each step squares the error.
 DOUBLING_TOLERANCE = 1e-14
 STAGNATION = 1e-9
-#: Below this change, that of the next step is distinguished from the last two; and when it is far below rounding.
+#: Below this change, that of the next step follows from the last two; and when it is far below rounding.
 SETTLED_CHANGE = 1e-8
 FAR_BELOW_ROUNDING = 1e-18
 #: Residual of a Riccati equation that counts as solved, relative to its terms.

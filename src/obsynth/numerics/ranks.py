@@ -46,22 +46,22 @@ SYMMETRY_TOLERANCE = 1e-10
 DEFINITENESS_TOLERANCE = 1e-12
 #: Share of a diffuse direction below which a state is held to be determined: rounding of an orthonormal basis.
 UNDETERMINED_SHARE = 1e-8
-#: Singular values of a scaled exact Jacobian below this relative to its largest value are zero.
+#: Singular values of a scaled exact Jacobian below this share of the largest are zero.
 JACOBIAN_RANK_TOLERANCE = 1e-9
 #: Directions of a Riccati solution below this share are not told from zero.
 NEGLIGIBLE_SHARE = 1e-12
-#: Singular values of a set of directions below this relative to its largest value are no direction of their own.
+#: Singular values of a set of directions below this share of the largest are no direction of their own.
 DIRECTION_SHARE = 1e-9
 #: A zero nearer than this to the point at which a constant fault stands is that point.
 REST_TOLERANCE = 1e-6
 #: Singular values of a constant's effect below this share count as zero; what is left out goes into the remainder.
 EFFECT_RANK_SHARE = 1e-12
-#: Singular values below this relative to its largest value are zero: the sensitivities carry rounding of 1e-16 times
+#: Singular values below this share of the largest are zero: the sensitivities carry rounding of 1e-16 times
 #: the condition of (7), which stays below 1e5 in models that can be used.
 IDENTIFIABLE_SHARE = 1e-10
 #: Directions of the state that no constant touches are found down to this share of the others.
 UNTOUCHED_SHARE = 1e-7
-#: Eigenvalues of the variances' information below this relative to its largest value are left out.
+#: Eigenvalues of the variances' information below this share of the largest are left out.
 LEAST_INFORMATION = 1e-10
 #: Deviations below this share of the terms they are computed from are zero: rounding is seven orders smaller, so that
 #: what is kept has seven digits.
@@ -72,7 +72,7 @@ TRACE_TOLERANCE = 1e-9
 PERFECT_PARITY = 1e-14
 #: A matrix of (7) whose condition is above this is singular: three digits are left of sixteen.
 SINGULAR_CONDITION = 1e13
-#: A value below this relative to its largest value of its range is zero but for rounding.
+#: A value below this share of the largest of its range is zero but for rounding.
 ROUNDED_ZERO = 1e-12
 #: Bounds of states whose moves differ by less than this share are dependent.
 DEPENDENT_BOUND = 1e-13

@@ -221,18 +221,6 @@ class Uncertainty:
         return {**plain, **more, **({"lost": self.lost} if self.lost else {})}
 
 
-def require_carried(uncertain: Uncertainty | None) -> None:
-    """Raise `PreconditionError` where a plant's tolerances did not follow what was done to the plant."""
-    if uncertain is not None and uncertain.lost:
-        names = ", ".join(uncertain.box.names)
-        raise PreconditionError(
-            f"The tolerances of the constants ({names}) are not carried over: {uncertain.lost}. No bounds over the "
-            "box exist for this plant. Let obsynth eliminate and sample it (transform) without other changes, or "
-            "leave the tolerances out for an exact model (plant.replace(uncertainty=None)).",
-            condition="tolerances carried",
-        )
-
-
 def uncertainty_of(data: Any) -> Uncertainty | None:
     """Return what `Uncertainty.as_dict` described; `None` and an `Uncertainty` stay as they are."""
     if data is None or isinstance(data, Uncertainty):
@@ -262,7 +250,14 @@ def matrices_of(plant: Any) -> dict[str, FloatArray]:
 
 
 def as_written(plant: Any, uncertain: Uncertainty) -> Mapping[str, FloatArray]:
-    """Return the matrices that may hold constants as they were written, before any transformation; refused where the
-    tolerances did not follow what was done to the plant."""
-    require_carried(uncertain)
+    """Return the matrices that may hold constants as they were written, before any transformation; raise
+    `PreconditionError` where the tolerances did not follow what was done to the plant."""
+    if uncertain.lost:
+        names = ", ".join(uncertain.box.names)
+        raise PreconditionError(
+            f"The tolerances of the constants ({names}) are not carried over: {uncertain.lost}. No bounds over the "
+            "box exist for this plant. Let obsynth eliminate and sample it (transform) without other changes, or "
+            "leave the tolerances out for an exact model (plant.replace(uncertainty=None)).",
+            condition="tolerances carried",
+        )
     return matrices_of(plant) if uncertain.written is None else uncertain.written

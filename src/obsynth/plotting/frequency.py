@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 #: A gain below this share of what is subtracted from one another in it is rounding: zero gain.
 GAIN_ROUNDING_SHARE = 1e-9
-#: The least singular value is drawn where it is below this relative to its largest value one somewhere.
+#: The least singular value is drawn where it is below this share of the largest one somewhere.
 VISIBLE_SHARE = 0.99
 TARGETS = {"faults": "fault estimates", "states": "errors of the states", "residuals": "residual"}
 _STYLES: dict[str, dict[str, Any]] = {

@@ -15,7 +15,7 @@ from obsynth.results.design import ObserverDesign
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-#: Courses below this relative to its largest value number are zero but for rounding.
+#: Courses below this share of the largest number are zero but for rounding.
 ROUNDED_COURSE = 1e-12
 #: From this ratio of largest to smallest threshold on, its axis is logarithmic.
 WIDE_THRESHOLDS = 5.0

@@ -26,7 +26,7 @@ from obsynth.proofs.extended_balls import arb_matrix
 
 #: Digits in which exponentials are formed, in bits.
 EXPONENTIAL_BITS = 160
-#: With more states double precision comes first, where its radius is below this relative to its largest value entry;
+#: With more states double precision comes first, where its radius is below this share of the largest entry;
 #: with few, where python-flint takes no second, it must be as good as nothing.
 MOST_STATES_FOR_BALLS, LARGEST_RADIUS_SHARE = 60, 1e-7
 FEW_STATES_FOR_BALLS, LARGEST_SHARE_OF_FEW = 8, 1e-12

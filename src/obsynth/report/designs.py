@@ -23,6 +23,7 @@ from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.plotting.frequency import FaultGains, fault_gains
+from obsynth.results.checks import FITS
 from obsynth.results.design import ObserverDesign
 from obsynth.results.layout import facts_table, headed_table, name_list, number, print_checks, print_section
 
@@ -101,8 +102,6 @@ def design_report(design: ObserverDesign, *, console: Console) -> None:
         console.print(Text(f"Note: {note}"))
 
 
-#: The check without which observer and plant say nothing of one another.
-FITS = "fits the plant"
 #: Curves of at most so many faults; plants with more states have none, and no steps are followed there.
 MOST_CURVES, MOST_STATES_OF_CURVES = 3, 80
 

@@ -29,7 +29,6 @@ from obsynth.methods.registry import REGISTRY, method_class
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plotting.data import panel_count, plot_data
 from obsynth.report.designs import (
-    FITS,
     delay_curves,
     delay_table,
     fault_estimates,
@@ -41,7 +40,7 @@ from obsynth.report.designs import (
 )
 from obsynth.report.pictures import pictures_of, stacked
 from obsynth.report.summary import summary
-from obsynth.results.checks import Check, CheckKind, Status
+from obsynth.results.checks import FITS, Check, CheckKind, Status
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import gain_set_digest
 from obsynth.results.layout import headed_table, number, verdict, verdict_line, worth

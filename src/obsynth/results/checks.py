@@ -77,6 +77,17 @@ def upper_bound_check(
     )
 
 
+#: The check without which observer and plant say nothing of one another.
+FITS = "fits the plant"
+
+
+def fitting_check(
+    claim: str, *, fits: bool, source: str = "shipped realisation", kind: CheckKind = "computed", detail: str = ""
+) -> Check:
+    """Return the check `FITS`, that what is shipped belongs to the plant."""
+    return upper_bound_check(FITS, claim, float(not fits), 0.0, source=source, kind=kind, detail=detail)
+
+
 def nothing_wrong(name: str, claim: str, wrong: Sequence[Any], *, source: str) -> Check:
     """Return a check that passes where nothing is wrong; its detail says what is."""
     detail = f"wrong: {', '.join(map(str, wrong))}" if wrong else ""

@@ -24,8 +24,6 @@ from obsynth.plants.uncertainty import (
     UNCERTAIN_MATRICES,
     Uncertainty,
     as_written,
-    matrices_of,
-    require_carried,
 )
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.error_structure import Tracking
@@ -36,9 +34,8 @@ def plant_at(plant: DescriptorSystem, values: Mapping[str, float]) -> Descriptor
     uncertain = plant.uncertainty
     if uncertain is None:
         return plant
-    require_carried(uncertain)
     if uncertain.written is None:
-        found = plant.replace(**uncertain.filled(matrices_of(plant), values), uncertainty=None)
+        found = plant.replace(**uncertain.filled(as_written(plant, uncertain), values), uncertainty=None)
     else:
         bare = _written_at(plant, uncertain, values)
         for kind, size in uncertain.steps:

@@ -22,7 +22,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.constants import ConstantsBox
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.uncertain_system import uncertain_system
-from obsynth.plants.uncertainty import Uncertainty, as_written, require_carried
+from obsynth.plants.uncertainty import Uncertainty, as_written
 from obsynth.proofs.affine import AffineMatrix
 from obsynth.results.design import ObserverDesign
 from obsynth.tolerances.exact_plant import (
@@ -121,7 +121,6 @@ def robustness(
     if uncertain is None or not uncertain.box.names:
         empty = ConstantsBox({}) if uncertain is None else uncertain.box
         return Robustness(empty, True, "open", {}, None, None, {}, {}, {}, {}, "open", 0, EXACT_MODEL)
-    require_carried(uncertain)
     told("regularity over the box")
     regular = index_one_on_box(plant)
     reason = ""

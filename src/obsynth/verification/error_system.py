@@ -46,7 +46,7 @@ BOTH_BALLS = 3.0
 IDENTITY_SHARE = 1e-7
 #: Gains that were printed to some decimals leave less than this of them; that is judged by the rows of the method.
 PRINTED_SHARE = 0.1
-#: Rows with terms below this relative to its largest value may be rounding of those: they are judged as if they were as
+#: Rows with terms below this share of the largest may be rounding of those: they are judged as if they were as
 #: large.
 LEAST_ROW = 1e-6
 Output: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray]

@@ -82,7 +82,7 @@ def condition_rows(conditions: Iterable[Condition]) -> Iterator[Check]:
         )
 
 
-#: Matrices found again may differ by this relative to its largest value entry of their row or column: another order of
+#: Matrices found again may differ by this share of the largest entry of their row or column: another order of
 #: sums.
 DERIVED_TOLERANCE = 1e-9
 PLANT_MATRICES = ("E", "A", "B", "C", "D", "Bf", "Df", "Bd", "Dd")

@@ -18,7 +18,7 @@ from obsynth.plants.validation import index_of
 
 #: Largest scaled residual of what counts as a root.
 ROOT_RESIDUAL = 1e-9
-#: Entries of a direction, and of a combination of equations, below this relative to its largest value are not named.
+#: Entries of a direction, and of a combination of equations, below this share of the largest are not named.
 NAMED = 1e-6
 #: Newton steps after the least squares; they square the error, so that a few reach rounding.
 POLISH = 8

@@ -19,7 +19,6 @@ from obsynth.plants.uncertainty import (
     Uncertainty,
     as_written,
     matrices_of,
-    require_carried,
 )
 from obsynth.proofs.affine import AffineMatrix, affine_block, affine_inverse, affine_zero_order_hold
 
@@ -63,7 +62,6 @@ def affine_plant(plant: DescriptorSystem, box: ConstantsBox | None = None) -> Af
     if uncertain is None:
         exact = {name: AffineMatrix.exact(matrix, 0) for name, matrix in matrices_of(plant).items()}
         return AffinePlant(plant, ConstantsBox({}), exact, np.eye(plant.nx))
-    require_carried(uncertain)
     box = uncertain.box if box is None else box
     if not uncertain.steps:
         matrices = uncertain.affine(as_written(plant, uncertain), box)

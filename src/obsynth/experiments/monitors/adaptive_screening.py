@@ -20,7 +20,7 @@ from obsynth.verification.adaptive_record import AdaptivePlan, filtered, thresho
 
 #: Share of a bound within which a value is not decided here: more than rounding can change.
 UNDECIDED_SHARE = 1e-9
-#: What rounding may change in the first order, as a relative to its largest value it can be.
+#: What rounding may change in the first order, as a share of the largest it can be.
 FIRST_ORDER_ROUNDING = 1e-10
 #: Samples of the first window after something went wrong; each next one is as long as all before.
 FIRST_WINDOW = 8

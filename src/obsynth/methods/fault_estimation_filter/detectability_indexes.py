@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 #: Random choices of T after which none is taken to be nonsingular.
 MOST_CHOICES = 20
-#: Faults with at least this relative to its largest value in a dependence are named.
+#: Faults with at least this share of the largest in a dependence are named.
 DEPENDENT_SHARE = 0.1
 _PENCIL_SEED = 45
 

@@ -23,7 +23,7 @@ from obsynth.numerics.ranks import decide_rank
 
 #: Bits of the balls: far more than any window that double precision solves loses.
 CONDENSED_BITS = 512
-#: Weights count at least this relative to its largest value one when those to correct, or a square part, are chosen.
+#: Weights count at least this share of the largest one when those to correct, or a square part, are chosen.
 LEAST_WEIGHT = 1e-3
 #: Windows with fewer rows are proved by the inverse of a square part, which needs no structure.
 FEWEST_ROWS = 500

@@ -30,7 +30,7 @@ INVERSE_BITS, MOST_ROWS_IN_BALLS = 256, 700
 AT_BOUND_SHARE = 1e-9
 #: Least room that a bounded number counts for when a square part is chosen, as a share of its bound.
 LEAST_ROOM = 1e-4
-#: Values below this relative to its largest value, in their units, are rounding of zeros.
+#: Values below this share of the largest, in their units, are rounding of zeros.
 ROUNDED_VALUE = 1e-13
 #: Room for what another processor finds for the distance to the exact solution: a factor.
 RADIUS_ROOM = 8.0

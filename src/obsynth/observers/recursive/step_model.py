@@ -8,7 +8,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -109,6 +109,8 @@ class StepModel(ABC):
     R: MatrixSequence
     #: ``(nq, nq)``: square root of the covariance of one step of the walk.
     walk: FloatArray | None = field(default=None, kw_only=True)
+    #: Whether algebraic equations are used one step earlier.
+    early: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         self._constant: StepMatrices | None = None
@@ -127,8 +129,7 @@ class StepModel(ABC):
         if self.walk is None:
             return step
         if last is None or last[0] is not step:
-            early = isinstance(self, EarlyConstraintSteps)
-            self._last = last = (step, with_walking_parameters(step, self.walk, early=early))
+            self._last = last = (step, with_walking_parameters(step, self.walk, early=self.early))
         return last[1]
 
     def first(self) -> StepMatrices | None:
@@ -170,6 +171,7 @@ class EarlyConstraintSteps(StepModel):
     """The steps of a plant with its algebraic equations, of independent noise, used as outputs one step earlier."""
 
     rows: IntArray  # the algebraic equations, see `obsynth.analysis.time_varying.algebraic_rows`
+    early = True
 
     def __post_init__(self) -> None:
         if not self.rows.size:

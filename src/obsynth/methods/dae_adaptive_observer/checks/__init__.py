@@ -11,7 +11,7 @@ import numpy as np
 
 from obsynth.errors import ObsynthError
 from obsynth.methods.dae_adaptive_observer.conditions import SOURCE, dae_conditions
-from obsynth.methods.recursive.checks import claims_row, listed_gains, refinement_rows
+from obsynth.methods.recursive.checks import claims_row, failed_run, listed_gains, refinement_rows
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.newton import LARGEST_RESIDUAL
 from obsynth.numerics.ranks import SINGULAR_CONDITION, covariance_factor
@@ -30,7 +30,7 @@ from obsynth.proofs.balls import Ball
 from obsynth.proofs.contraction import proved_rate
 from obsynth.proofs.definiteness import prove_positive_definite
 from obsynth.proofs.products import logarithm_of_product
-from obsynth.results.checks import Check, information, upper_bound_check
+from obsynth.results.checks import Check, fitting_check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.dae import simulate_dae
 from obsynth.verification.plant import condition_rows
@@ -61,11 +61,9 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
     if not all(condition.holds for condition in conditions):
         return
     problem = misfit(design)
-    yield upper_bound_check(
-        "fits the plant",
+    yield fitting_check(
         "observer, options and plant hold the same model and numbers",
-        float(bool(problem)),
-        0.0,
+        fits=not problem,
         source="shipped observer",
         kind="equality",
         detail=problem,
@@ -86,14 +84,7 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
         yield claims_row(design, found, rough=found)
         yield from _consistency_rows(design, observer)
     except (ObsynthError, np.linalg.LinAlgError, ValueError, KeyError, TypeError) as error:
-        yield upper_bound_check(
-            "runs",
-            "the observer runs on the outputs of its own model",
-            1.0,
-            0.0,
-            source="shipped observer",
-            detail=str(error),
-        )
+        yield failed_run(error)
 
 
 def misfit(design: ObserverDesign) -> str:

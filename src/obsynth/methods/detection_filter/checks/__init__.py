@@ -12,7 +12,7 @@ from obsynth.methods.detection_filter.transfers import added_gain, error_transfe
 from obsynth.numerics.spectra import abscissa
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.results.checks import Check, information, upper_bound_check
+from obsynth.results.checks import Check, fitting_check, information
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.identities import Identity, equality, relative_tolerance
 from obsynth.verification.plant import condition_rows, plant_information
@@ -28,13 +28,7 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
     plant, observer = design.linear
     yield from plant_information(plant)
     fitting = _fits(design)
-    yield upper_bound_check(
-        "fits the plant",
-        "observer, claims, options and plant have matching signals, shapes and bands",
-        float(not fitting),
-        0.0,
-        source="shipped realisation",
-    )
+    yield fitting_check("observer, claims, options and plant have matching signals, shapes and bands", fits=fitting)
     if not fitting:
         return
     yield from condition_rows(conditions(plant))

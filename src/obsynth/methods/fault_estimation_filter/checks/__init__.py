@@ -23,7 +23,7 @@ from obsynth.numerics.scaling import Scaling, balance_by_least_squares
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.covariances import certain_noise_covariance
-from obsynth.results.checks import Check, information, upper_bound_check
+from obsynth.results.checks import Check, fitting_check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.certificates import prove_bounded_real
 from obsynth.verification.claims import UNCERTAIN, claim_rows, claimed, recovery_rows
@@ -60,13 +60,7 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
     tracking, factor = design.certificate.matrices.get("tracking"), design.certificate.matrices.get("P_factor")
     lag = _whole(claimed(claims, "state_lag"))
     fitting = _fits(plant, observer, tracking, factor, lag)
-    yield upper_bound_check(
-        "fits the plant",
-        "observer, certificate and plant have matching signals and shapes",
-        0.0 if fitting else 1.0,
-        0.0,
-        source="shipped realisation",
-    )
+    yield fitting_check("observer, certificate and plant have matching signals and shapes", fits=fitting)
     if not fitting or tracking is None or factor is None:
         return
     work = _with_sensor_faults(plant)

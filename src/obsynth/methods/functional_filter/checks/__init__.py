@@ -14,7 +14,7 @@ from obsynth.methods.ui_pi_observer.checks.decoupling import decoupling_norms
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.results.checks import Check, information, upper_bound_check
+from obsynth.results.checks import Check, fitting_check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.certificates import decay_row, stability_row
 from obsynth.verification.error_system import natural_scaling
@@ -120,13 +120,7 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
     (plant, observer), matrices = design.linear, design.certificate.matrices
     yield from plant_information(plant)
     fitting = _fits(design)
-    yield upper_bound_check(
-        "fits the plant",
-        "observer, certificate and plant have matching signals and shapes",
-        float(not fitting),
-        0.0,
-        source="shipped realisation",
-    )
+    yield fitting_check("observer, certificate and plant have matching signals and shapes", fits=fitting)
     if not fitting:
         return
     options = design.options

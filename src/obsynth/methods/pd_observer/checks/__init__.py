@@ -21,7 +21,7 @@ from obsynth.numerics.scaling import balance_by_least_squares, balanced_matrix
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.validation import listed
-from obsynth.results.checks import Check, information, lower_bound_check, upper_bound_check
+from obsynth.results.checks import Check, fitting_check, information, lower_bound_check, upper_bound_check
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.error_system import ErrorModel
 from obsynth.verification.identities import ALIKE, equality, relative_tolerance, residual, tracking_identities, worst
@@ -52,13 +52,7 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
     yield from plant_information(plant)
     yield from condition_rows(pd_observer_conditions(plant))
     fitting = _fits(plant, observer) and fitting_claims(design)
-    yield upper_bound_check(
-        "fits the plant",
-        "observer, gains, certificate and plant have matching signals and shapes",
-        0.0 if fitting else 1.0,
-        0.0,
-        source="shipped realisation",
-    )
+    yield fitting_check("observer, gains, certificate and plant have matching signals and shapes", fits=fitting)
     if not fitting:
         return
     tolerance = relative_tolerance(printed_digits, plant.nx + plant.nf + plant.ny)

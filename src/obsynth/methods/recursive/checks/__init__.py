@@ -34,7 +34,7 @@ from obsynth.observers.recursive.observer import RecursiveObserver, observer_fro
 from obsynth.observers.running import plain_recursion
 from obsynth.plants.sequences import MatrixSequence
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
-from obsynth.results.checks import Check, information, upper_bound_check
+from obsynth.results.checks import Check, fitting_check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.consistency import consistency
 from obsynth.verification.plant import condition_rows
@@ -63,11 +63,9 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
     if not all(condition.holds for condition in conditions):
         return
     problem = misfit(design)
-    yield upper_bound_check(
-        "fits the plant",
+    yield fitting_check(
         "observer, options and plant hold the same matrices at every k",
-        float(bool(problem)),
-        0.0,
+        fits=not problem,
         source="shipped observer",
         kind="equality",
         detail=problem,
@@ -80,14 +78,19 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
         # What is checked is the recursion; records that no plant made would seem full of outliers.
         yield from _dynamic_rows(design, plain_recursion(observer), plain_recursion(stated), same=not problem)
     except (ObsynthError, np.linalg.LinAlgError, ValueError) as error:
-        yield upper_bound_check(
-            "runs",
-            "the observer runs on the outputs of its own model",
-            1.0,
-            0.0,
-            source="shipped observer",
-            detail=str(error),
-        )
+        yield failed_run(error)
+
+
+def failed_run(error: Exception) -> Check:
+    """Return the row of an observer that does not run."""
+    return upper_bound_check(
+        "runs",
+        "the observer runs on the outputs of its own model",
+        1.0,
+        0.0,
+        source="shipped observer",
+        detail=str(error),
+    )
 
 
 def refinement_rows(observer: RecursiveObserver | DAEObserver) -> Iterator[Check]:

@@ -19,7 +19,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.fault_models import Exosystem
-from obsynth.results.checks import Check, information, upper_bound_check
+from obsynth.results.checks import Check, fitting_check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.identities import ALIKE, Residual, equality, relative_tolerance, residual
 from obsynth.verification.plant import condition_rows, plant_information
@@ -49,13 +49,7 @@ def _realisation_rows(design: ObserverDesign, printed_digits: int | None) -> Ite
     (plant, observer), certificate = design.linear, design.certificate
     yield from plant_information(plant)
     fitting = _fits(design)
-    yield upper_bound_check(
-        "fits the plant",
-        "observer, certificate and plant have matching signals and shapes",
-        float(not fitting),
-        0.0,
-        source="shipped realisation",
-    )
+    yield fitting_check("observer, certificate and plant have matching signals and shapes", fits=fitting)
     if not fitting:
         return
     tracking, phi, cw, poles, factor = (certificate.matrices[name] for name in _UI_PI_MATRICES)
