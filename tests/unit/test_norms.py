@@ -93,7 +93,7 @@ class TestHinfNorm:
         """|b c / (z - a)| is largest at z = 1 for a > 0 and at z = -1 for a < 0."""
         found = hinf_norm(*system(a, 2.0, 3.0, 0.0))
         check_encloses(found, 6.0 / (1.0 - abs(a)), slack=1e-10)
-        assert a == 0.0 or found.angle == pytest.approx(0.0 if a > 0 else np.pi, abs=1e-9)
+        assert a == 0.0 or found.frequency == pytest.approx(0.0 if a > 0 else np.pi, abs=1e-9)
 
     @pytest.mark.parametrize("a", [-0.99, -0.5, 0.7, 0.99999])
     def test_all_pass(self, a):
@@ -114,7 +114,7 @@ class TestHinfNorm:
         taps = np.array([1.0, 0.5, -1.0, 0.25, 2.0, 0.1])
         n = len(taps) - 1
         found = hinf_norm(np.eye(n, k=-1), np.eye(n)[:, :1], taps[None, 1:], np.array([[taps[0]]]))
-        angles = np.linspace(found.angle - 1e-3, found.angle + 1e-3, 200001)
+        angles = np.linspace(found.frequency - 1e-3, found.frequency + 1e-3, 200001)
         near = np.abs(np.polyval(taps[::-1], np.exp(-1j * angles))).max()
         everywhere = np.abs(np.fft.fft(taps, 2**18)).max()
         check_encloses(found, max(near, everywhere))
@@ -123,10 +123,10 @@ class TestHinfNorm:
         shift, first = np.eye(3, k=-1), np.eye(3)[:, :1]
         low = hinf_norm(shift, first, np.full((1, 3), 0.25), np.full((1, 1), 0.25))
         check_encloses(low, 1.0)
-        assert low.angle == pytest.approx(0.0, abs=1e-6)
+        assert low.frequency == pytest.approx(0.0, abs=1e-6)
         high = hinf_norm(shift, first, np.array([[-1.0, 1.0, -1.0]]), np.ones((1, 1)))
         check_encloses(high, 4.0)
-        assert high.angle == pytest.approx(np.pi, abs=1e-6)
+        assert high.frequency == pytest.approx(np.pi, abs=1e-6)
 
     @pytest.mark.parametrize("angle", [0.01, 1.234567, 3.0])
     @pytest.mark.parametrize("damping", [1e-1, 1e-3, 1e-6])
@@ -134,7 +134,7 @@ class TestHinfNorm:
         """With x' rotated and B, C complex-diagonal the response is 1 / (z - r e^{jw}) and its conjugate."""
         found = hinf_norm(rotation(angle, 1.0 - damping), np.eye(2), np.eye(2), np.zeros((2, 2)))
         check_encloses(found, 1.0 / damping, slack=1e-9)
-        assert found.angle == pytest.approx(angle, abs=1e-6)
+        assert found.frequency == pytest.approx(angle, abs=1e-6)
 
     def test_the_higher_of_two_narrow_peaks(self):
         """Peaks of width 1e-5, far narrower than the starting grid, and one per mille apart in height."""
@@ -145,7 +145,7 @@ class TestHinfNorm:
             c = np.kron(np.diag(heights), np.eye(2))
             found = hinf_norm(a, np.eye(4), c, np.zeros((4, 4)))
             check_encloses(found, 1.001 / damping, slack=1e-9)
-            assert found.angle == pytest.approx((0.777, 2.222)[int(np.argmax(heights))], abs=1e-6)
+            assert found.frequency == pytest.approx((0.777, 2.222)[int(np.argmax(heights))], abs=1e-6)
 
     def test_a_peak_that_is_not_at_a_pole(self):
         """Random sums and poles far inside: the peak lies where SLICOT's iteration finds it."""
@@ -187,7 +187,7 @@ class TestHinfNorm:
         for _ in range(100):
             realisation = random_system(rng, damping=10.0 ** rng.uniform(-3, -0.1), scaled=True)
             found = hinf_norm(*realisation)
-            near = found.angle + np.linspace(-1e-3, 1e-3, 501)
+            near = found.frequency + np.linspace(-1e-3, 1e-3, 501)
             response = frequency_response(*realisation, np.concatenate([np.linspace(0.0, np.pi, 2001), near]))
             assert np.linalg.norm(response, 2, axis=(1, 2)).max() <= found.upper * (1.0 + 1e-11)
 

@@ -54,8 +54,8 @@ def _is_singular(E: FloatArray, A: FloatArray, value: complex, normal_rank: int,
     for _ in range(ZERO_STEPS):
         matrix = pencil.A - point * pencil.E
         if matrix.shape[0] >= matrix.shape[1] == normal_rank >= FEW_COLUMNS:
-            found = smallest_singular(matrix)
-            largest, smallest, v = found.largest, float(found.values[0]), found.right[:, 0]
+            values, vectors, largest = smallest_singular(matrix)
+            smallest, v = float(values[0]), vectors[:, 0]
             u = (matrix @ v).conj()
             u = u / (float(np.linalg.norm(u)) or 1.0)
         else:
@@ -69,7 +69,7 @@ def _is_singular(E: FloatArray, A: FloatArray, value: complex, normal_rank: int,
             return True
         slope = u @ pencil.E @ v
         # A zero far out is known only to the rounding of the largest: Newton's method on u' (A - z E) v finds the rest.
-        step = (u @ (pencil.A - point * pencil.E) @ v) / slope if slope != 0.0 else 0.0
+        step: Any = (u @ (pencil.A - point * pencil.E) @ v) / slope if slope != 0.0 else 0.0
         if abs(point + step - value) > CLUSTER_TOLERANCE * abs(value):
             break
         point = point + step
@@ -228,9 +228,9 @@ def _kernel(pencil: EquilibratedPencil, value: complex, *, least: int) -> NDArra
     """Return an orthonormal null basis of the pencil at ``value``, with ``least`` columns or more."""
     matrix = pencil.A - (value if value.imag else value.real) * pencil.E
     if matrix.shape[0] >= matrix.shape[1] >= FEW_COLUMNS and least <= MOST_DIRECTIONS:
-        found = smallest_singular(matrix, MOST_DIRECTIONS)
-        count = max(least, int(np.sum(found.values <= RANK_TOLERANCE * found.largest)))
-        return np.asarray(found.right[:, :count])
+        values, vectors, largest = smallest_singular(matrix, MOST_DIRECTIONS)
+        count = max(least, int(np.sum(values <= RANK_TOLERANCE * largest)))
+        return np.asarray(vectors[:, :count])
     _, singular_values, right = np.linalg.svd(matrix)
     kept = int(np.sum(singular_values > RANK_TOLERANCE * singular_values[0])) if singular_values.size else 0
     return np.asarray(right[min(kept, matrix.shape[1] - least) :].conj().T)

@@ -15,20 +15,8 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.modal_response import Modes
-from obsynth.numerics.norms import hinf_norm
+from obsynth.numerics.norms import HinfNorm, hinf_norm
 from obsynth.numerics.scaling import balanced_matrix, power_of_two_below
-
-
-@dataclass(frozen=True)
-class ContinuousHinfNorm:
-    """The H-infinity norm in continuous time: ``value`` is attained, at ``frequency`` in rad/s (infinite: feedthrough).
-
-    ``upper``: not exceeded as far as double precision can tell (computed, not proved).
-    """
-
-    value: float
-    upper: float
-    frequency: float
 
 
 def spectral_abscissa(a: FloatArray) -> float:
@@ -40,7 +28,7 @@ def spectral_abscissa(a: FloatArray) -> float:
     return float(np.max(np.linalg.eigvals(a).real))
 
 
-def continuous_hinf_norm(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> ContinuousHinfNorm:
+def continuous_hinf_norm(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> HinfNorm:
     """Return the H-infinity norm of a continuous-time system, by ``s = w (z - 1) / (z + 1)``, which keeps every gain.
 
     w is the geometric mean of the moduli of the eigenvalues.
@@ -66,24 +54,24 @@ class ContinuousNorms:
         turned = resolvent @ (w * one + a)
         return w, resolvent, turned, Modes.of(turned)
 
-    def between(self, b: FloatArray, c: FloatArray, d: FloatArray) -> ContinuousHinfNorm:
+    def between(self, b: FloatArray, c: FloatArray, d: FloatArray) -> HinfNorm:
         """Return the norm with other matrices ``(n, m)``, ``(p, n)``, ``(p, m)``; see `continuous_hinf_norm`."""
         if b.shape[1] == 0 or c.shape[0] == 0:
-            return ContinuousHinfNorm(0.0, 0.0, 0.0)
+            return HinfNorm(0.0, 0.0, 0.0)
         if not all(np.all(np.isfinite(part)) for part in (self.a, b, c, d)):
-            return ContinuousHinfNorm(np.inf, np.inf, np.nan)
+            return HinfNorm(np.inf, np.inf, np.nan)
         if not len(self.a):
             size = float(np.linalg.norm(d, 2))
-            return ContinuousHinfNorm(size, size, 0.0)
+            return HinfNorm(size, size, 0.0)
         if self._turned is None:
-            return ContinuousHinfNorm(np.inf, np.inf, np.nan)
+            return HinfNorm(np.inf, np.inf, np.nan)
         w, resolvent, turned, modes = self._turned
         through = resolvent @ b
         found = hinf_norm(
             turned, np.sqrt(2.0 * w) * through, np.sqrt(2.0 * w) * c @ resolvent, d + c @ through, modes=modes
         )
-        frequency = np.inf if found.angle >= np.pi else w * float(np.tan(0.5 * found.angle))
-        return ContinuousHinfNorm(found.value, found.upper, float(frequency))
+        frequency = np.inf if found.frequency >= np.pi else w * float(np.tan(0.5 * found.frequency))
+        return HinfNorm(found.value, found.upper, float(frequency))
 
 
 #: Intervals of each length; the length doubles after them, as fast modes have decayed by then.

@@ -42,14 +42,6 @@ class Modes(NamedTuple):
         return float(np.max(np.abs(self.values), initial=0.0))
 
 
-class Peaks(NamedTuple):
-    """Angles in [0, pi], how far they may be off, and sizes, at most the eighth root of a sum of eighth powers."""
-
-    angles: FloatArray
-    widths: FloatArray
-    sizes: FloatArray
-
-
 @dataclass(frozen=True, eq=False)
 class ModalResponse:
     """``C (z I - A)^-1 B + D``, ``A = V diag(poles) V^-1``: ``shown`` is C V ``(p, n)``, ``driven`` V^-1 B."""
@@ -118,10 +110,11 @@ class ModalResponse:
 
     def peaks(self, points: int) -> FloatArray:
         """Return the angles in [0, pi] of the highest peaks on a grid of so many points and the poles, refined."""
-        return self.refined(self.rough_peaks(points))
+        return self.refined(*self.rough_peaks(points)[:2])
 
-    def rough_peaks(self, points: int) -> Peaks:
-        """Return the highest peaks on a grid of so many points and the poles, the highest first."""
+    def rough_peaks(self, points: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the highest peaks on a grid of so many points and the poles, the highest first: angles in [0, pi],
+        how far they may be off, and sizes, at most the eighth root of a sum of eighth powers."""
         near = self.poles[(self.poles.imag >= 0.0) & (np.abs(self.poles) > NEAR)]
         angles = np.concatenate([np.linspace(0.0, np.pi, points), np.angle(near)])
         order = np.argsort(angles, kind="stable")
@@ -134,11 +127,10 @@ class ModalResponse:
         widths = np.maximum(centres - neighbours[tops], neighbours[tops + 2] - centres)
         # A peak that a pole makes is as wide as the pole is far from the circle.
         reaches = np.concatenate([np.full(points, np.pi), 2.0 * (1.0 - np.abs(near))])[order]
-        return Peaks(centres, np.minimum(widths, reaches[tops]), sizes[tops])
+        return centres, np.minimum(widths, reaches[tops]), sizes[tops]
 
-    def refined(self, peaks: Peaks) -> FloatArray:
-        """Return the angles of peaks, refined."""
-        centres, widths, _ = peaks
+    def refined(self, centres: FloatArray, widths: FloatArray) -> FloatArray:
+        """Return the angles of peaks, refined from angles that may be off by the widths."""
         steps, everyone = np.arange(-POINTS_BESIDE, POINTS_BESIDE + 1) / POINTS_BESIDE, np.arange(len(centres))
         for _ in range(MODE_REFINEMENTS):
             tried = np.minimum(np.maximum(centres[:, None] + widths[:, None] * steps, 0.0), np.pi)

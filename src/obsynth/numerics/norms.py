@@ -35,16 +35,17 @@ MAXIMUM_DOUBLINGS = 64
 
 @dataclass(frozen=True)
 class HinfNorm:
-    """The H-infinity norm of a stable discrete-time system: ``value`` is attained, at ``angle`` in radians per sample.
+    """The H-infinity norm of a system: ``value`` is attained, at ``frequency`` in rad/s (infinite: feedthrough).
 
-    ``upper``: level at which the symplectic pencil has no eigenvalue on the circle, or a Riccati equation a solution
-    (computed, not proved); ``distance``: of the closest eigenvalue from the circle, NaN without a pencil.
+    In discrete time in radians per sample. ``upper``: level at which the symplectic pencil has no eigenvalue on the
+    circle, or a Riccati equation a solution (computed, not proved); ``distance``: of the closest eigenvalue from the
+    circle, NaN without a pencil of its own.
     """
 
     value: float
     upper: float
-    angle: float
-    distance: float
+    frequency: float
+    distance: float = np.nan
 
 
 def spectral_radius(a: FloatArray) -> float:
@@ -171,7 +172,7 @@ def _norm_of_many_states(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatAr
         return None
     for tolerance in WIDER_TOLERANCES:
         if compared_gain(a, b, c, d, best * (1.0 + tolerance)):
-            return HinfNorm(best, best * (1.0 + tolerance), angle, np.nan)
+            return HinfNorm(best, best * (1.0 + tolerance), angle)
     return None
 
 
@@ -192,12 +193,12 @@ def _modal_peak(
         response = ModalResponse.of(modes, b, c, d)
         if response is None:
             return np.inf, np.nan
-        peaks = response.rough_peaks(points)
-        if np.any(peaks.sizes[:1] > enough):
-            best, angle = _peak(a, b, c, d, peaks.angles[:1])
+        rough, widths, sizes = response.rough_peaks(points)
+        if np.any(sizes[:1] > enough):
+            best, angle = _peak(a, b, c, d, rough[:1])
             if enough < best < np.inf:
                 return best, angle
-        angles = response.refined(peaks)
+        angles = response.refined(rough, widths)
         sizes = response.gains(angles)
         top = int(np.argmax(sizes))
     best, angle = _peak(a, b, c, d, angles[[top]])

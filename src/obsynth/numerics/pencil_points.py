@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,33 +24,29 @@ FEW_COLUMNS = 80
 NULL_DIRECTION_STEPS = 4
 
 
-class SmallestSingular(NamedTuple):
-    """``values (count,)``, smallest first, and ``right (n, count)``; ``largest`` is a bound on the largest value."""
-
-    values: FloatArray
-    right: NDArray[Any]
-    largest: float
+#: Singular values, smallest first, right singular vectors as columns, and a bound on the largest value.
+Smallest: TypeAlias = tuple[FloatArray, NDArray[Any], float]
 
 
-def smallest_singular(matrix: NDArray[Any], count: int = 1) -> SmallestSingular:
+def smallest_singular(matrix: NDArray[Any], count: int = 1) -> Smallest:
     """Return the smallest singular values of a matrix ``(m, n)``, ``m >= n``, or more, with right singular vectors."""
     if matrix.shape[1] < FEW_COLUMNS:
         _, values, right = np.linalg.svd(matrix)
         order = slice(None, -count - 1, -1)
-        return SmallestSingular(values[order], right[order].conj().T, float(values[0]))
+        return values[order], right[order].conj().T, float(values[0])
     from scipy.linalg import qr
 
     return iterated(np.asarray(qr(matrix, mode="r", check_finite=False)[0][: matrix.shape[1]]), count)
 
 
-def iterated(triangle: NDArray[Any], count: int) -> SmallestSingular:
+def iterated(triangle: NDArray[Any], count: int) -> Smallest:
     """Return the smallest singular values of an upper triangular matrix by inverse iteration."""
     from scipy.linalg import solve_triangular
 
     size = triangle.shape[0]
     norm = float(np.sqrt(np.linalg.norm(triangle, 1) * np.linalg.norm(triangle, np.inf)))
     if norm == 0.0:
-        return SmallestSingular(np.zeros(count), np.eye(size, count), 0.0)
+        return np.zeros(count), np.eye(size, count), 0.0
     work = np.array(triangle)
     diagonal = np.einsum("ii->i", work)
     # An exact zero would be divided by: as small as rounding, it does as well.
@@ -63,7 +59,7 @@ def iterated(triangle: NDArray[Any], count: int) -> SmallestSingular:
             inner /= np.max(np.abs(inner), axis=0, initial=0.0) + np.finfo(float).tiny
             basis = np.linalg.qr(solve_triangular(work, inner, check_finite=False))[0]
     _, values, turned = np.linalg.svd(triangle @ basis, full_matrices=False)
-    return SmallestSingular(values[::-1], basis @ turned[::-1].conj().T, norm)
+    return values[::-1], basis @ turned[::-1].conj().T, norm
 
 
 #: Above this condition of its leading part the Schur basis is not orthonormal enough to judge the pencil in it.
@@ -91,11 +87,10 @@ class PencilPoints:
             values = np.linalg.svd(self.A - point * self.E, compute_uv=False)
             return int(np.sum(values <= bound))
         count = min(MOST_DIRECTIONS, self.E.shape[1])
-        found = iterated(self._triangle(point), 1)
         # In the basis of the Schur form values are those of the pencil up to the condition of E.
-        if found.values[0] > bound * self._schur[3]:
+        if iterated(self._triangle(point), 1)[0][0] > bound * self._schur[3]:
             return 0
-        vectors = self._schur[1] @ iterated(self._triangle(point), count).right
+        vectors = self._schur[1] @ iterated(self._triangle(point), count)[1]
         basis = np.linalg.qr(vectors)[0]
         values = np.linalg.svd((self.A - point * self.E) @ basis, compute_uv=False)
         return int(np.sum(values <= bound))
@@ -103,10 +98,10 @@ class PencilPoints:
     def smallest(self, point: complex) -> float:
         """Return the smallest singular value at a point relative to the largest, up to the condition of E."""
         if self.E.shape[1] < FEW_COLUMNS or self._schur is None:
-            found = smallest_singular(self.A - point * self.E)
+            values, _, largest = smallest_singular(self.A - point * self.E)
         else:
-            found = iterated(self._triangle(point), 1)
-        return float(found.values[0]) / found.largest if found.largest else 0.0
+            values, _, largest = iterated(self._triangle(point), 1)
+        return float(values[0]) / largest if largest else 0.0
 
     def confirmed(self, point: complex) -> complex | None:
         """Return a computed zero, improved where that is needed; ``None`` where the pencil has full rank all around."""

@@ -190,10 +190,10 @@ def _in_more_digits(formula: Formula, exponents: NDArray[np.int64], first: Defin
         change = kind.exact(units)
         return change @ formula(kind) @ change
 
-    found = prove_by_ball_arithmetic(scaled)
-    if not found.proved:
-        return replace(first, reason=f"{first.reason}; {found.reason}")
-    return DefinitenessProof(True, found.lower_bound, first.error_bound, "ball arithmetic", f"{found.bits} bits")
+    bound, told = prove_by_ball_arithmetic(scaled)
+    if bound is None:
+        return replace(first, reason=f"{first.reason}; {told}")
+    return DefinitenessProof(True, bound, first.error_bound, "ball arithmetic", told)
 
 
 def _factorisation_bound(symmetric: FloatArray) -> float:

@@ -243,30 +243,14 @@ class Root:
 
     value: complex
     multiplicity: int
-    side: str
+    side: str  # stable, boundary or unstable
 
 
-@dataclass(frozen=True)
-class RootLocation:
-    """The roots of a polynomial, by decreasing instability; `side` is 'stable', 'boundary' or 'unstable'."""
-
-    roots: tuple[Root, ...]
-
-    @property
-    def stable(self) -> bool:
-        """Whether every root is strictly inside the region of stability."""
-        return all(root.side == "stable" for root in self.roots)
-
-    @property
-    def outside(self) -> tuple[Root, ...]:
-        """Those on or outside its boundary."""
-        return tuple(root for root in self.roots if root.side != "stable")
-
-
-def locate_roots(polynomial: fmpz_poly, *, discrete: bool) -> RootLocation:
-    """Return the roots of a nonzero polynomial and where they are: exact, however close to the stability boundary."""
+def locate_roots(polynomial: fmpz_poly, *, discrete: bool) -> tuple[Root, ...]:
+    """Return the roots of a nonzero polynomial, by decreasing instability, and where they are: exact, however close to
+    the stability boundary."""
     if polynomial.degree() <= 0:
-        return RootLocation(())
+        return ()
     coefficients = polynomial.coeffs()
     at_minus = [(-1) ** power * coefficient for power, coefficient in enumerate(coefficients)]
     mirror = fmpz_poly(coefficients[::-1] if discrete else at_minus)
@@ -277,7 +261,7 @@ def locate_roots(polynomial: fmpz_poly, *, discrete: bool) -> RootLocation:
     for part, may_lie_on_boundary in ((common, True), (others, False)):
         found += _isolated(part, discrete=discrete, may_lie_on_boundary=may_lie_on_boundary)
     found.sort(key=lambda root: -(abs(root.value) if discrete else root.value.real))
-    return RootLocation(tuple(found))
+    return tuple(found)
 
 
 def primitive(polynomial: fmpq_poly) -> fmpz_poly:

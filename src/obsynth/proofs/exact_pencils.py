@@ -21,7 +21,7 @@ from flint import fmpq, fmpq_mat, fmpq_poly, fmpz, fmpz_mat, fmpz_poly, nmod_mat
 
 from obsynth.numerics.arrays import FloatArray
 from obsynth.proofs.exact_arithmetic import (
-    RootLocation,
+    Root,
     blocks,
     identity,
     locate_roots,
@@ -88,7 +88,7 @@ class ExactPencil:
                 break
         return found
 
-    def zeros(self, *, discrete: bool) -> RootLocation:
+    def zeros(self, *, discrete: bool) -> tuple[Root, ...]:
         """Return the finite zeros and where they are: exact, however close to the stability boundary."""
         return locate_roots(self.zero_polynomial, discrete=discrete)
 

@@ -38,23 +38,15 @@ PRECISION_BITS = (128, 512, 2048)
 LARGEST_ORDER = 128
 
 
-@dataclass(frozen=True)
-class ExtendedProof:
-    """What ball arithmetic found out: ``bits`` decided, or are the last that were tried; ``lower_bound`` is proved."""
-
-    proved: bool
-    lower_bound: float
-    bits: int
-    reason: str = ""
-
-
 #: Digits (bits) in which all eigenvalues of a matrix are enclosed, and the largest order of which they are: .8 s at 57.
 EIGENVALUE_BITS = (212, 848)
 MOST_ENCLOSED = 80
 
 
-def prove_by_ball_arithmetic(formula: Formula) -> ExtendedProof:
-    """Try to prove that every symmetric member of a matrix is positive definite, with as many digits as it takes."""
+def prove_by_ball_arithmetic(formula: Formula) -> tuple[float | None, str]:
+    """Try to prove that every symmetric member of a matrix is positive definite, with as many digits as it takes.
+
+    Returns a proved lower bound and the digits that decided; ``None`` and the reason without a proof."""
     reason = ""
     for bits in PRECISION_BITS:
         # A local precision: the one in python-flint's context is for the whole process.
@@ -62,14 +54,14 @@ def prove_by_ball_arithmetic(formula: Formula) -> ExtendedProof:
             matrix = formula(ExtendedBall)
             pivot = undecided_pivot(matrix.entries())
             if pivot is None:
-                return ExtendedProof(True, _lower_bound(matrix), bits)
+                return _lower_bound(matrix), f"{bits} bits"
         place, is_certain, is_hopeless = pivot
         if is_certain:
-            return ExtendedProof(False, 0.0, bits, f"pivot {place} is not positive: not positive definite")
+            return None, f"pivot {place} is not positive: not positive definite"
         reason = f"{bits} bits of ball arithmetic leave the sign of pivot {place} open: singular, or next to it"
         if is_hopeless:
             break
-    return ExtendedProof(False, 0.0, bits, reason)
+    return None, reason
 
 
 def enclosed_eigenvalues(matrix: FloatArray) -> tuple[Any, ...] | None:

@@ -187,7 +187,7 @@ def _sampling_rows(
             "over the integral of d^2; gamma is of disturbances that are held between samples",
             float(np.sqrt(dt) * norm.upper),
             source="lifted system, from an enclosure of its energy",
-            detail=f"largest at {norm.angle:.4g} rad per sample",
+            detail=f"largest at {norm.frequency:.4g} rad per sample",
         )
         return
     peak = _peak_gain(smooth, dt, observer, t, direct)

@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from flint import fmpq, fmpq_mat, fmpq_poly, fmpz_poly
@@ -21,7 +20,6 @@ from obsynth.numerics.arrays import ComplexArray
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.exact_arithmetic import (
     Root,
-    RootLocation,
     blocks,
     holds_computed,
     identity,
@@ -126,18 +124,18 @@ class ExactQuestion(Question):
         return not self.polynomial.is_zero()
 
     @cached_property
-    def _location(self) -> RootLocation:
+    def _roots(self) -> tuple[Root, ...]:
         return locate_roots(self.polynomial, discrete=self.source.dt > 0.0)
 
     @cached_property
     def zeros(self) -> ComplexArray:
         """The zeros with multiplicity, 1/s (or dimensionless)."""
-        return _values(self._location.roots)
+        return _values(self._roots)
 
     @cached_property
     def blocking(self) -> ComplexArray:
         """Those on or outside the boundary of stability."""
-        return _values(self._location.outside)
+        return _values([root for root in self._roots if root.side != "stable"])
 
     def shows_at(self, point: complex) -> bool:
         """Whether the fault polynomial has no root at a point, whose parts are taken as they are written."""
@@ -152,38 +150,23 @@ class ExactQuestion(Question):
         return float("inf")
 
 
-class _Parts(NamedTuple):
-    """``z+ = A z + F f + K [u; y]``, ``0 = C z + G f + L [u; y]`` with (A, C) observable, over the rationals."""
-
-    A: fmpq_mat
-    C: fmpq_mat
-    F: fmpq_mat
-    G: fmpq_mat
-    K: fmpq_mat
-    L: fmpq_mat
-
-
 class ReducedQuestion(ExactQuestion):
     """A fault on the plant without its unknown inputs, which is reduced exactly."""
 
     @cached_property
-    def _parts(self) -> _Parts:
+    def _parts(self) -> tuple[fmpq_mat, ...]:
+        """A, C, F, G, K, L of ``z+ = A z + F f + K [u; y]``, ``0 = C z + G f + L [u; y]`` with (A, C) observable, over
+        the rationals."""
         a, c, right, outputs = self._exact_removal.reduction
         nf = self.source.nf
         rest = range(nf, right.ncols())
-        return _Parts(
-            a,
-            c,
-            picked_columns(right, [self.number]),
-            picked_columns(outputs, [self.number]),
-            picked_columns(right, rest),
-            picked_columns(outputs, rest),
-        )
+        parts = (picked_columns(part, of) for of in ([self.number], rest) for part in (right, outputs))
+        return a, c, *parts
 
     @cached_property
     def order(self) -> int:
         """Order of the decoupled plant."""
-        return int(self._parts.A.nrows())
+        return int(self._parts[0].nrows())
 
     @cached_property
     def polynomial(self) -> fmpz_poly:

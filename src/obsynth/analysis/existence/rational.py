@@ -229,7 +229,7 @@ class WrittenNumbers(PlantNumbers):
         """Decide facts on ``[A - s E, inputs; C, direct]``."""
         pencil = self.pencil(inputs, direct)
         rank, columns = pencil.normal_rank, pencil.shape[1]
-        found = pencil.zeros(discrete=self.discrete).roots if rank == columns else ()
+        found = pencil.zeros(discrete=self.discrete) if rank == columns else ()
         values = tuple(root.value for root in found for _ in range(root.multiplicity))
         outside = tuple(root.value for root in found if root.side != "stable")
         return SystemFacts(rank, columns, outside, values, True, self.computed)

@@ -15,7 +15,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import NamedTuple
+from typing import TypeAlias
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
 
@@ -139,37 +139,34 @@ def _apart(known: Sequence[str], measured: Sequence[str]) -> tuple[str, ...]:
     )
 
 
-@dataclass(frozen=True)
-class Model:
-    """What a description is about: identifier, token, name, a sentence, and the signals."""
-
-    identifier: str
-    token: str
-    name: str
-    description: str
-    signals: Signals
+#: Whether a variable is a number (or a flag), its attributes in XML, and its start and unit where it has any.
+_Variable: TypeAlias = tuple[bool, dict[str, str], dict[str, str]]
 
 
-@dataclass(frozen=True)
-class _Variable:
-    name: str
-    kind: str
-    causality: str
-    variability: str
-    initial: str | None
-    start: float | None
-    unit: str
-    description: str
+def _variable(
+    name: str,
+    causality: str,
+    variability: str,
+    told: str,
+    *,
+    initial: str = "",
+    start: float | None = None,
+    unit: str = "",
+    is_number: bool = True,
+) -> _Variable:
+    attributes = {"name": name, "causality": causality, "variability": variability, "description": told}
+    shown = {} if start is None else {"start": repr(float(start))}
+    return is_number, attributes | ({"initial": initial} if initial else {}), shown | ({"unit": unit} if unit else {})
 
 
 def _variables(signals: Signals) -> Iterator[_Variable]:
     """Yield the variables in the order of their value references, which are 0, 1, 2, ..."""
-    yield _Variable("time", "real", "independent", "continuous", None, None, "s", "time")
+    yield _variable("time", "independent", "continuous", "time", unit="s")
     for name, signal in zip(signals.inputs, signals.input_signals, strict=True):
         start, unit = signals.points.get(signal, 0.0), signals.units.get(signal, "")
-        yield _Variable(name, "real", "input", "discrete", None, start, unit, f"signal {signal}")
+        yield _variable(name, "input", "discrete", f"signal {signal}", start=start, unit=unit)
     for output in signals.outputs:
-        yield _Variable(output.name, "real", "output", "discrete", "calculated", None, output.unit, output.description)
+        yield _variable(output.name, "output", "discrete", output.description, initial="calculated", unit=output.unit)
     units = {output.name: output.unit for output in signals.outputs}
     parameters = [
         (f"operating_point[{name}]", value, signals.units.get(name, ""), f"{name} where the linear model was taken")
@@ -186,31 +183,18 @@ def _variables(signals: Signals) -> Iterator[_Variable]:
     ]
     parameters.append(("warm_up", signals.alarms.warm_up, "s", "no alarm in these seconds after the start"))
     for name, value, unit, told in parameters:
-        yield _Variable(name, "real", "parameter", "tunable", "exact", value, unit, told)
+        yield _variable(name, "parameter", "tunable", told, initial="exact", start=value, unit=unit)
     flags = [(f"alarm[{name}]", f"{name} is above its threshold") for name in signals.alarms.levels]
     flags.append(("alarm", "any alarm"))
     flags.append(("sample_used", "the last sample was used; otherwise the estimates are those of the model alone"))
     for name, told in flags:
-        yield _Variable(name, "flag", "output", "discrete", "calculated", None, "", told)
-
-
-def start_values(signals: Signals) -> list[float]:
-    """Return the start value of each real variable, by value reference."""
-    return [variable.start or 0.0 for variable in _variables(signals) if variable.kind == "real"]
-
-
-class _Version(NamedTuple):
-    """How a version of FMI spells what both have: elements, attributes and the first reference."""
-
-    token: str
-    real: str
-    outputs: tuple[str, str]
-    abilities: dict[str, str]
+        yield _variable(name, "output", "discrete", told, initial="calculated", is_number=False)
 
 
 _STEP_CAPABILITY = {"canHandleVariableCommunicationStepSize": "false"}
+#: How a version of FMI spells what both have: the token, a number, what lists the outputs, and what the FMU can do.
 _VERSIONS = {
-    "2.0": _Version(
+    "2.0": (
         "guid",
         "Real",
         ("Outputs", "InitialUnknowns"),
@@ -221,7 +205,7 @@ _VERSIONS = {
             "canSerializeFMUstate": "true",
         },
     ),
-    "3.0": _Version(
+    "3.0": (
         "instantiationToken",
         "Float64",
         ("Output", "InitialUnknown"),
@@ -235,47 +219,45 @@ _VERSIONS = {
 }
 
 
-def model_description(model: Model, version: str, sources: list[str]) -> bytes:
-    """Return ``modelDescription.xml`` of a version of FMI."""
-    spelled, step = _VERSIONS[version], repr(model.signals.dt)
+def model_description(
+    signals: Signals, version: str, sources: list[str], *, identifier: str, token: str, name: str, told: str
+) -> bytes:
+    """Return ``modelDescription.xml`` of a version of FMI; ``told``: what the model is, in a sentence."""
+    (token_name, number, lists, abilities), step = _VERSIONS[version], repr(signals.dt)
     root = Element(
         "fmiModelDescription",
         {
             "fmiVersion": version,
-            "modelName": model.name,
-            spelled.token: model.token,
-            "description": model.description,
+            "modelName": name,
+            token_name: token,
+            "description": told,
             "generationTool": "obsynth",
             "variableNamingConvention": "flat",
         },
     )
-    abilities = {name: value or step for name, value in spelled.abilities.items()}
-    simulation = SubElement(root, "CoSimulation", {"modelIdentifier": model.identifier, **abilities})
+    able = {ability: value or step for ability, value in abilities.items()}
+    simulation = SubElement(root, "CoSimulation", {"modelIdentifier": identifier, **able})
     if version == "2.0":
         files = SubElement(simulation, "SourceFiles")
-        for name in sources:
-            SubElement(files, "File", {"name": name})
-    variables = list(_variables(model.signals))
-    _units(root, variables)
+        for source in sources:
+            SubElement(files, "File", {"name": source})
+    variables = list(_variables(signals))
+    units = dict.fromkeys(shown["unit"] for _, _, shown in variables if "unit" in shown)
+    definitions = SubElement(root, "UnitDefinitions") if units else root
+    for unit in units:
+        SubElement(definitions, "Unit", {"name": unit})
     SubElement(root, "DefaultExperiment", {"startTime": "0", "stepSize": step})
     listed = SubElement(root, "ModelVariables")
-    for reference, variable in enumerate(variables):
-        kind = spelled.real if variable.kind == "real" else "Boolean"
-        attributes = {
-            "name": variable.name,
-            "valueReference": str(reference),
-            "causality": variable.causality,
-            "variability": variable.variability,
-            "description": variable.description,
-            **({"initial": variable.initial} if variable.initial else {}),
-        }
+    for reference, (is_number, own, shown) in enumerate(variables):
+        kind = number if is_number else "Boolean"
+        attributes = {"name": own["name"], "valueReference": str(reference), **own}
         if version == "2.0":
-            SubElement(SubElement(listed, "ScalarVariable", attributes), kind, _value(variable))
+            SubElement(SubElement(listed, "ScalarVariable", attributes), kind, shown)
         else:
-            SubElement(listed, kind, {**attributes, **_value(variable)})
+            SubElement(listed, kind, attributes | shown)
     structure = SubElement(root, "ModelStructure")
-    outputs = [reference for reference, variable in enumerate(variables) if variable.causality == "output"]
-    for part in spelled.outputs:
+    outputs = [reference for reference, (_, own, _) in enumerate(variables) if own["causality"] == "output"]
+    for part in lists:
         # FMI 2 counts variables from one, and lists them inside an element.
         unknowns = SubElement(structure, part) if version == "2.0" else structure
         for reference in outputs:
@@ -286,27 +268,14 @@ def model_description(model: Model, version: str, sources: list[str]) -> bytes:
     return _text(root)
 
 
-def build_description(model: Model, sources: list[str]) -> bytes:
+def build_description(identifier: str, sources: list[str]) -> bytes:
     """Return ``sources/buildDescription.xml`` of FMI 3.0."""
     root = Element("fmiBuildDescription", {"fmiVersion": "3.0"})
-    build = SubElement(root, "BuildConfiguration", {"modelIdentifier": model.identifier})
+    build = SubElement(root, "BuildConfiguration", {"modelIdentifier": identifier})
     files = SubElement(build, "SourceFileSet", {"language": "C99"})
     for name in sources:
         SubElement(files, "SourceFile", {"name": name})
     return _text(root)
-
-
-def _units(root: Element, variables: list[_Variable]) -> None:
-    names = list(dict.fromkeys(variable.unit for variable in variables if variable.unit))
-    if names:
-        units = SubElement(root, "UnitDefinitions")
-        for name in names:
-            SubElement(units, "Unit", {"name": name})
-
-
-def _value(variable: _Variable) -> dict[str, str]:
-    given = {} if variable.start is None else {"start": repr(float(variable.start))}
-    return {**given, **({"unit": variable.unit} if variable.unit else {})}
 
 
 def _text(root: Element) -> bytes:
@@ -339,16 +308,17 @@ def write_fmu(
     sentence = f"Observer of {design.name} by {design.method}, written by obsynth; sha256 of the gain set {digest}"
     mark = unverified_mark(design.report)
     sentence = f"{mark}. {sentence}" if mark else f"{sentence}. {verification_words(design)}"
-    model = Model(identifier, token, design.name, sentence, signals)
     wrapper = f"fmi{version[0]}.c"
-    sources = {f"{_PREFIX}.c": texts[0], f"{_PREFIX}.h": texts[1], "layout.h": _layout(design, model)}
+    sources = {f"{_PREFIX}.c": texts[0], f"{_PREFIX}.h": texts[1], "layout.h": _layout(design, signals, token)}
     folder = files("obsynth.exporting.fmu")
     sources |= {name: folder.joinpath(name).read_text(encoding="utf-8") for name in ("instance.h", "common.h", wrapper)}
     compiled = [f"{_PREFIX}.c", wrapper]
     content: dict[str, bytes] = {f"sources/{name}": text.encode() for name, text in sources.items()}
-    content["modelDescription.xml"] = model_description(model, version, compiled)
+    content["modelDescription.xml"] = model_description(
+        signals, version, compiled, identifier=identifier, token=token, name=design.name, told=sentence
+    )
     if version == "3.0":
-        content["sources/buildDescription.xml"] = build_description(model, compiled)
+        content["sources/buildDescription.xml"] = build_description(identifier, compiled)
     place = _binary_folder(version)
     if place is not None:
         binary = _binary(sources)
@@ -382,15 +352,15 @@ def _contents(
     return signals_of_linear(found, alarms), (source, declared), found.digest
 
 
-def _layout(design: ObserverDesign, model: Model) -> str:
+def _layout(design: ObserverDesign, signals: Signals, token: str) -> str:
     """Return ``layout.h``: sizes, start values, and how one sample is taken."""
-    signals = model.signals
-    names = [output.name for output in signals.outputs]
+    # Of each number, by value reference.
+    starts = [shown.get("start", "0.0") for is_number, _, shown in _variables(signals) if is_number]
     points = [signals.point_index(signal if signals.points else None) for signal in signals.input_signals]
     shown = [signals.point_index(output.signal) for output in signals.outputs]
     sizes = {
         "N_IN": len(signals.inputs),
-        "N_OUT": len(names),
+        "N_OUT": len(signals.outputs),
         "N_POINT": len(signals.points),
         "N_WATCHED": len(signals.alarms.levels),
     }
@@ -403,13 +373,13 @@ def _layout(design: ObserverDesign, model: Model) -> str:
             "",
             f'#include "{_PREFIX}.h"',
             "",
-            f'#define TOKEN "{model.token}"',
+            f'#define TOKEN "{token}"',
             f"#define DT {signals.dt!r}",
             *(f"#define {name} {size}" for name, size in sizes.items()),
             "",
             f"typedef {_PREFIX}_state observer_memory;",
             "",
-            _table("double", "start_values", [repr(value) for value in start_values(signals)]),
+            _table("double", "start_values", starts),
             _table("int", "point_of_in", points),
             _table("int", "point_of_out", shown),
             "",

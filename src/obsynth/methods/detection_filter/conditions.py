@@ -106,7 +106,7 @@ def _no_zero_on_the_axis(plant: DescriptorSystem) -> tuple[Condition, ...]:
         return ()
     e = np.zeros_like(a)
     e[: plant.nx, : plant.nx] = plant.E
-    zeros = ExactPencil.written(e, a).zeros(discrete=False).roots
+    zeros = ExactPencil.written(e, a).zeros(discrete=False)
     found = [complex(root.value) for root in zeros if root.side == "boundary"]
     detail = (
         "none, exactly"

@@ -19,7 +19,8 @@ from functools import cached_property
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.continuous import ContinuousHinfNorm, ContinuousNorms, continuous_hinf_norm
+from obsynth.numerics.continuous import ContinuousNorms, continuous_hinf_norm
+from obsynth.numerics.norms import HinfNorm
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.verification.error_system import ErrorModel
@@ -121,15 +122,15 @@ class PdErrorSystem:
     def _norms(self) -> ContinuousNorms:
         return ContinuousNorms(self.Az)
 
-    def fault_norm(self, driven: tuple[FloatArray, FloatArray]) -> ContinuousHinfNorm:
+    def fault_norm(self, driven: tuple[FloatArray, FloatArray]) -> HinfNorm:
         """Return the H-infinity norm to the fault error from one of ``rate``, ``disturbance``, ``noise``."""
         return self._norms.between(driven[0], self.estimate[self.nx :], driven[1][self.nx :])
 
-    def state_norm(self, driven: tuple[FloatArray, FloatArray]) -> ContinuousHinfNorm:
+    def state_norm(self, driven: tuple[FloatArray, FloatArray]) -> HinfNorm:
         """Return the same to the error of the state estimate."""
         return self._norms.between(driven[0], self.estimate[: self.nx], driven[1][: self.nx])
 
-    def separate_noise_norm(self, process: FloatArray, sensor: FloatArray) -> ContinuousHinfNorm:
+    def separate_noise_norm(self, process: FloatArray, sensor: FloatArray) -> HinfNorm:
         """Return the H-infinity norm from ``[w; w']``, both free, with ``process (nx, nw)`` and ``sensor (ny, nw)``."""
         n = len(self.Az)
         padded = np.vstack([process, np.zeros((n - self.nx, process.shape[1]))])

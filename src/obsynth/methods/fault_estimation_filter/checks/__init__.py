@@ -189,7 +189,7 @@ def _norm_rows(
         norm.upper,
         gamma,
         source="Wang 2015, eq. (49)",
-        detail=f"peak at {norm.angle:.4g} rad/sample; the largest gain is {reported:.6g}",
+        detail=f"peak at {norm.frequency:.4g} rad/sample; the largest gain is {reported:.6g}",
     )
     state = highest_gain_found(errors.Az, errors.disturbance, states[0], -states[2], modes=modes)
     yield information(

@@ -15,7 +15,8 @@ from obsynth.methods.pd_observer.checks.certificate import fitting_claims, proof
 from obsynth.methods.pd_observer.conditions import pd_observer_conditions
 from obsynth.methods.pd_observer.realisation import PdErrorSystem, solved, with_faults_as_states, with_sensor_noise
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.continuous import ContinuousHinfNorm, spectral_abscissa
+from obsynth.numerics.continuous import spectral_abscissa
+from obsynth.numerics.norms import HinfNorm
 from obsynth.numerics.ranks import RANK_TOLERANCE, rounding_rank
 from obsynth.numerics.scaling import balance_by_least_squares, balanced_matrix
 from obsynth.observers.linear.observer import LinearObserver
@@ -265,7 +266,7 @@ def norm_rows(design: ObserverDesign, errors: PdErrorSystem) -> Iterator[Check]:
     yield from _gain_rows(design, errors)
 
 
-def _norm_row(name: str, claim: str, norm: ContinuousHinfNorm, bound: float | None, note: str = "") -> Check:
+def _norm_row(name: str, claim: str, norm: HinfNorm, bound: float | None, note: str = "") -> Check:
     peak = f"peak at {norm.frequency:.4g} rad/s"
     detail = f"{peak}; {note}" if note else peak
     if bound is None:
