@@ -44,8 +44,8 @@ html_title = "obsynth"
 html_theme_options = {"show_toc_level": 2, "navigation_with_keys": False, "secondary_sidebar_items": ["page-toc"]}
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
-# Pages of the first level have nothing below them that a left column could list.
-html_sidebars: dict[str, list[str]] = {"*": []}
+# These pages have nothing beside or below them that a left column could list.
+html_sidebars: dict[str, list[str]] = {"*": [], "gallery/*": []}
 html_show_sourcelink = False
 
 write_sources(HERE)
