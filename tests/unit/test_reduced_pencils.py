@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ import obsynth
 from obsynth.analysis.diagnosis.reduction import finite_values, left_part
 from obsynth.analysis.existence.named_pencils import named_pencil
 from obsynth.analysis.plant_units import PlantUnits
+from obsynth.methods.ui_pi_observer.checks import decoupling
 from obsynth.methods.ui_pi_observer.checks.decoupling import decoupling_norm, decoupling_norms
 from obsynth.spec.loader import load_spec
 
@@ -52,6 +54,23 @@ def test_a_group_of_inputs_leaks_as_much_as_by_itself() -> None:
     assert max(of_disturbances.relative, decoupling_norm(plant, observer).relative) < 1e-9
     assert of_all.relative == pytest.approx(decoupling_norm(every, observer).relative, rel=1e-6)
     assert of_all.relative > 1e-3
+
+
+def test_points_one_by_one_leak_as_much_as_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And a pole of the observer at one of them, the frequency zero, leaves the others alone."""
+    plant = load_spec(DESIGNS / "motor" / "spec.yaml").plant
+    observer = obsynth.functional_filter(plant).linear[1]
+    faulty = plant.replace(Bd=plant.Bf, Dd=plant.Df, disturbance_names=["fault"], Bf=None, Df=None, fault_names=None)
+    singular = replace(observer, Az=np.diag([0.0, *np.diag(observer.Az)[1:]]))
+    together = [decoupling_norm(faulty, one) for one in (observer, singular)]
+    monkeypatch.setattr(decoupling, "ENTRIES_AT_ONCE", 1)
+    one_by_one = [decoupling_norm(faulty, one) for one in (observer, singular)]
+    assert together[0].relative > 1e-3
+    assert np.isinf(together[1].relative)
+    assert together[1].frequency == 0.0
+    # Products of stacks may be added up in another order: some units in the last place.
+    for one, other in zip(together, one_by_one, strict=True):
+        assert one.relative == pytest.approx(other.relative, rel=1e-9)
 
 
 def test_a_witness_is_exact() -> None:

@@ -84,15 +84,20 @@ def equilibrate_pencil(E: FloatArray, A: FloatArray) -> EquilibratedPencil:
 
     One pass is enough: scaling a column up cannot lift an entry above those that already rule their rows.
     """
-    size = np.maximum(np.abs(E), np.abs(A))
-    rows = 1.0 / power_of_two_below(_row_peaks(size))
-    columns = 1.0 / power_of_two_below(_row_peaks((rows[:, None] * size).T))
+    rows, columns = equilibrating_factors(np.maximum(np.abs(E), np.abs(A)))
     return EquilibratedPencil(
         read_only(rows[:, None] * E * columns),
         read_only(rows[:, None] * A * columns),
         read_only(rows),
         read_only(columns),
     )
+
+
+def equilibrating_factors(sizes: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the factors ``(..., m)`` and ``(..., n)`` of `equilibrate_pencil` for absolute values ``(..., m, n)``."""
+    rows = 1.0 / power_of_two_below(np.max(sizes, axis=-1, initial=0.0))
+    columns = 1.0 / power_of_two_below(np.max(rows[..., :, None] * sizes, axis=-2, initial=0.0))
+    return rows, columns
 
 
 def balance_system(

@@ -12,7 +12,7 @@ from obsynth.analysis.existence.rational import PlantNumbers, SystemFacts
 from obsynth.analysis.existence.statements import Evaluator
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import RANK_TOLERANCE, decide_rank
-from obsynth.numerics.scaling import equilibrate_pencil
+from obsynth.numerics.scaling import equilibrating_factors
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.fault_models import Exosystem
 
@@ -77,10 +77,10 @@ def kernel(matrix: NDArray[Any]) -> NDArray[Any]:
 
 
 def equilibrated(matrix: NDArray[Any]) -> tuple[NDArray[Any], FloatArray]:
-    """Return a complex matrix with rows and columns scaled by powers of two, and the factors of the columns."""
-    size = np.abs(matrix)
-    pencil = equilibrate_pencil(np.zeros_like(size), size)
-    return pencil.rows[:, None] * matrix * pencil.columns, pencil.columns
+    """Return complex matrices ``(..., m, n)`` with rows and columns scaled by powers of two, and the factors of the
+    columns ``(..., n)``."""
+    rows, columns = equilibrating_factors(np.abs(matrix))
+    return rows[..., :, None] * matrix * columns[..., None, :], columns
 
 
 def _exact_pencil(

@@ -7,9 +7,11 @@ plant is regular or not.  Through ``y = C x + Dd d`` and the realisation they gi
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from obsynth.analysis.plant_units import PlantUnits
 from obsynth.methods.ui_pi_observer.pencils import equilibrated
@@ -26,6 +28,8 @@ from obsynth.plants.descriptor import DescriptorSystem
 FAR_FROM_SINGULAR = 1e3 * RANK_TOLERANCE
 #: A signal below this share of what a trajectory of unit size could make of it is held not to be moved.
 UNMOVED_SIGNAL = 1e-4
+#: Points are taken together until their pencils have so many entries: 4 MB, of which a handful is held at once.
+ENTRIES_AT_ONCE = 2**18
 
 
 @dataclass(frozen=True)
@@ -65,64 +69,103 @@ def decoupling_norms(
     units = PlantUnits.of(plant).rounded()
     scaled = units.scaled_plant(plant)
     points = boundary_points(frequencies * (1.0 if units.discrete else units.time), scaled.dt)
-    moved = [trajectories_of(scaled, point, [inputs for _, inputs in groups]) for point in points]
+    moved = trajectories_of(scaled, points, [inputs for _, inputs in groups])
     # How many trajectories there are at almost every frequency: where there seem to be more, rounding hides the rest.
-    counts = [min(at[place].shape[1] for at in moved) for place in range(len(groups))]
+    counts = [min(basis.shape[1] for basis in bases) for bases in moved]
     found = [DecouplingNorm(0.0, 0.0, 0.0) for _ in groups]
     shipped = _Shipped.of(observer, units)
-    for frequency, point, bases in zip(frequencies, points, moved, strict=True):
-        passing = shipped.at(scaled, point)
+    for some in _parts(points, max(scaled.nx + scaled.nd, len(shipped.Az))):
+        passing = shipped.at(scaled, points[some])
         for place, (rows, inputs) in enumerate(groups):
             if counts[place] == 0:
                 continue
-            basis = bases[place][:, -counts[place] :]
-            found[place] = found[place].worse(
-                None if passing is None else passing.misses(basis, rows, inputs), float(frequency)
-            )
+            bases = np.stack([basis[:, -counts[place] :] for basis in moved[place][some]])
+            for frequency, missed in zip(frequencies[some], passing.misses(bases, rows, inputs), strict=True):
+                found[place] = found[place].worse(missed, float(frequency))
     return found
 
 
-def trajectories_of(plant: DescriptorSystem, point: complex, groups: Sequence[Sequence[int]]) -> list[ComplexArray]:
-    """Return the trajectories ``(nx + inputs, count)`` at a point for some groups of unknown inputs, of unit norm."""
-    pencil, nx = np.hstack([point * plant.E - plant.A, -plant.Bd]), plant.nx
-    whole, columns, sure = _null_space(pencil)
-    found = []
-    for inputs in groups:
-        own = [*range(nx), *(nx + np.array(inputs, dtype=np.intp))]
-        absent = np.delete(whole, own, axis=0)
-        if len(absent):
-            _, values, right = np.linalg.svd(absent)
-            # Independent as they are, the others can be left out; or the null space is looked for by itself.
-            if sure and len(values) == len(absent) and values[-1] > FAR_FROM_SINGULAR:
-                basis = (whole @ right[len(absent) :].conj().T)[own] * columns[own, None]
-            else:
-                basis, scales, _ = _null_space(pencil[:, own])
-                basis = scales[:, None] * basis
-        else:
-            basis = whole * columns[:, None]
-        found.append(basis / np.linalg.norm(basis, axis=0))
+def _parts(points: ComplexArray, order: int) -> list[slice]:
+    """Return the points in parts whose matrices of an order fit into the room for them."""
+    size = max(1, ENTRIES_AT_ONCE // max(1, order**2))
+    return [slice(start, start + size) for start in range(0, len(points), size)]
+
+
+def trajectories_of(
+    plant: DescriptorSystem, points: ComplexArray, groups: Sequence[Sequence[int]]
+) -> list[list[ComplexArray]]:
+    """Return, for each group of unknown inputs, trajectories ``(nx + inputs, count)`` at each point, of unit norm."""
+    found: list[list[ComplexArray]] = [[] for _ in groups]
+    for some in _parts(points, plant.nx + plant.nd):
+        at = points[some, None, None]
+        pencils = np.concatenate([at * plant.E - plant.A, np.broadcast_to(-plant.Bd, (len(at), *plant.Bd.shape))], 2)
+        whole, columns, sure = _null_spaces(pencils)
+        for bases, inputs in zip(found, groups, strict=True):
+            own = [*range(plant.nx), *(plant.nx + np.array(inputs, dtype=np.intp))]
+            bases += _of_some(pencils, own, whole, columns, sure)
     return found
 
 
-def _null_space(pencil: ComplexArray) -> tuple[ComplexArray, FloatArray, bool]:
-    """Return a basis ``(n, count)`` of the null space, orthonormal, the least singular value last, in columns scaled
-    by powers of two, with these, and whether the equations are independent beyond doubt."""
-    from obsynth.numerics.lapack import zgecon, zgeqrf, zunmqr
+def _of_some(
+    pencils: ComplexArray, own: Sequence[int], whole: list[ComplexArray], columns: FloatArray, sure: NDArray[np.bool_]
+) -> list[ComplexArray]:
+    """Return the part of null spaces that is zero outside some columns: combinations without the others."""
+    others = np.setdiff1d(np.arange(pencils.shape[2]), own)
+    if not len(others):
+        return [_of_unit_norm(basis * factors[:, None]) for basis, factors in zip(whole, columns, strict=True)]
+    found: list[ComplexArray | None] = [None] * len(whole)
+    if sure.any():
+        places = np.flatnonzero(sure)
+        sure_bases = np.stack([whole[place] for place in places])
+        _, values, right = np.linalg.svd(sure_bases[:, others])
+        # Independent as they are, the others can be left out; or the null space is looked for by itself.
+        left_out = (
+            values[:, -1] > FAR_FROM_SINGULAR if 0 < values.shape[1] == len(others) else np.zeros(len(places), bool)
+        )
+        kept = np.conj(np.swapaxes(right[left_out, len(others) :], 1, 2))
+        combined = (sure_bases[left_out] @ kept)[:, own] * columns[places[left_out]][:, own, None]
+        for place, basis in zip(places[left_out], combined, strict=True):
+            found[place] = _of_unit_norm(basis)
+    rest = [place for place, basis in enumerate(found) if basis is None]
+    if rest:
+        bases, scales, _ = _null_spaces(pencils[rest][:, :, own])
+        for place, basis, factors in zip(rest, bases, scales, strict=True):
+            found[place] = _of_unit_norm(factors[:, None] * basis)
+    return [basis for basis in found if basis is not None]
 
-    scaled, columns = equilibrated(pencil)
-    equations, count = scaled.shape
+
+def _of_unit_norm(basis: ComplexArray) -> ComplexArray:
+    return np.asarray(basis / np.linalg.norm(basis, axis=0))
+
+
+def _null_spaces(pencils: ComplexArray) -> tuple[list[ComplexArray], FloatArray, NDArray[np.bool_]]:
+    """Return bases ``(n, count)`` of the null spaces of ``(k, m, n)``, orthonormal, the least singular value last, in
+    columns scaled by powers of two, with these ``(k, n)``, and whether the equations are independent beyond doubt."""
+    from obsynth.numerics.lapack import zgecon, zunmqr
+
+    scaled, columns = equilibrated(pencils)
+    points, equations, count = scaled.shape
+    found, sure = list[ComplexArray](), np.zeros(points, dtype=bool)
     # Of independent equations a tenth of the work gives the same null space; the condition is estimated to a small
     # factor, and only for pencils far from the tolerance.
-    if 0 < equations < count:
-        packed, factors, _, _ = zgeqrf(scaled.conj().T)
+    if 0 < equations <= count:
+        packed, factors = np.linalg.qr(np.conj(np.swapaxes(scaled, 1, 2)), mode="raw")
         # A triangle is its own LU factor; LAPACK's estimate for triangles is not in the oldest SciPy.
-        triangle = np.triu(packed[:equations])
-        if zgecon(triangle, np.linalg.norm(triangle, 1))[0] > FAR_FROM_SINGULAR:
-            last = np.eye(count, dtype=np.complex128)[:, equations:]
-            return zunmqr("L", "N", packed, factors, last, LAPACK_BLOCK * last.shape[1])[0], columns, True
-    _, values, right = np.linalg.svd(scaled)
-    rank = int(np.sum(values > RANK_TOLERANCE * values[0]))
-    return right[rank:].conj().T, columns, False
+        triangles = np.tril(packed[:, :, :equations])
+        sizes = np.max(np.sum(np.abs(triangles), axis=2), axis=1)
+        for place in range(points):
+            sure[place] = zgecon(triangles[place].T, sizes[place])[0] > FAR_FROM_SINGULAR
+    last = np.eye(count, dtype=np.complex128)[:, equations:]
+    for place in range(points):
+        if sure[place] and last.size:
+            room = LAPACK_BLOCK * last.shape[1]
+            found.append(zunmqr("L", "N", packed[place].T, factors[place], last, room)[0])
+        elif sure[place]:
+            found.append(last)
+        else:
+            _, values, right = np.linalg.svd(scaled[place])
+            found.append(right[int(np.sum(values > RANK_TOLERANCE * values[0])) :].conj().T)
+    return found, columns, sure
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,40 +199,59 @@ class _Shipped:
         # The same holds for a residual, y - C xhat with xhat = z + D y.
         return cls(az, by, cz, dy, formed, np.abs(dy) + np.abs(cz[:, :nx]) @ offsets, observer.fault_rows, nx)
 
-    def at(self, plant: DescriptorSystem, point: complex) -> _Passing | None:
-        """Return what passes at a point; ``None`` at a pole."""
-        try:
-            resolvent = np.linalg.inv(point * np.eye(len(self.Az)) - self.Az)
-        except np.linalg.LinAlgError:
-            return None
-        passed = np.abs(self.Cz) @ (np.abs(resolvent) @ self.formed) + self.direct
-        return _Passing(self, plant, self.Cz @ (resolvent @ self.By) + self.Dy, passed)
+    def at(self, plant: DescriptorSystem, points: ComplexArray) -> _Passing:
+        """Return what passes at some points."""
+        resolvents = _inverses(points[:, None, None] * np.eye(len(self.Az)) - self.Az)
+        passed = np.abs(self.Cz) @ (np.abs(resolvents) @ self.formed) + self.direct
+        return _Passing(self, plant, self.Cz @ (resolvents @ self.By) + self.Dy, passed)
+
+
+def _inverses(matrices: ComplexArray) -> ComplexArray:
+    """Return the inverses of ``(k, n, n)``, of a singular one nothing but NaN."""
+    try:
+        return np.asarray(np.linalg.inv(matrices))
+    except np.linalg.LinAlgError:
+        pass
+    found = np.full_like(matrices, np.nan)
+    for place, matrix in enumerate(matrices):
+        with suppress(np.linalg.LinAlgError):
+            found[place] = np.linalg.inv(matrix)
+    return found
 
 
 @dataclass(frozen=True, eq=False)
 class _Passing:
-    """An observer at a point: what it makes of outputs, and of the sizes of their terms."""
+    """An observer at some points: what it makes of outputs, and of the sizes of their terms."""
 
     shipped: _Shipped
     plant: DescriptorSystem
     through: ComplexArray
     passed: FloatArray
 
-    def misses(self, trajectories: ComplexArray, rows: Sequence[int], inputs: Sequence[int]) -> tuple[float, float]:
-        """Return the largest relative error of an estimate in some rows, and that of a fault."""
+    def misses(
+        self, trajectories: ComplexArray, rows: Sequence[int], inputs: Sequence[int]
+    ) -> list[tuple[float, float] | None]:
+        """Return, at each point, the largest relative error of an estimate in some rows, and that of a fault; ``None``
+        at a pole."""
         plant, tracked = self.plant, self.shipped.tracked
         dd, picked = plant.Dd[:, list(inputs)], list(rows)
         states = np.array([row for row in picked if row < tracked], dtype=np.intp)
-        x, d = trajectories[: plant.nx], trajectories[plant.nx :]
-        error = self.through[picked] @ (plant.C @ x + dd @ d)
-        error[: len(states)] -= x[states]
-        passed = self.passed[picked]
+        x, d = trajectories[:, : plant.nx], trajectories[:, plant.nx :]
+        error = self.through[:, picked] @ (plant.C @ x + dd @ d)
+        error[:, : len(states)] -= x[:, states]
+        passed = self.passed[:, picked]
         size = passed @ (np.abs(plant.C) @ np.abs(x) + np.abs(dd) @ np.abs(d))
-        size[: len(states)] += np.abs(x[states])
+        size[:, : len(states)] += np.abs(x[:, states])
         # A signal that a trajectory does not move is rounding: it is judged by what trajectories of its size could do.
         possible = passed @ (np.sum(np.abs(plant.C), axis=1) + np.sum(np.abs(dd), axis=1))
-        possible[: len(states)] += 1.0
-        terms = np.maximum(np.max(size, axis=1), UNMOVED_SIGNAL * possible)
-        relative = float(np.max(np.max(np.abs(error), axis=1) / np.where(terms > 0.0, terms, 1.0), initial=0.0))
-        faults = [place for place, row in enumerate(picked) if row in range(len(self.through))[self.shipped.faults]]
-        return relative, float(np.max(np.linalg.norm(error[faults], axis=1), initial=0.0))
+        possible[:, : len(states)] += 1.0
+        terms = np.maximum(np.max(size, axis=2), UNMOVED_SIGNAL * possible)
+        shares = np.max(np.abs(error), axis=2) / np.where(terms > 0.0, terms, 1.0)
+        faults = [place for place, row in enumerate(picked) if row in range(self.through.shape[1])[self.shipped.faults]]
+        relative = np.max(shares, axis=1, initial=0.0)
+        absolute = np.max(np.linalg.norm(error[:, faults], axis=2), axis=1, initial=0.0)
+        poles = [bool(np.isnan(through).any()) for through in self.through]
+        return [
+            None if pole else (float(share), float(fault))
+            for pole, share, fault in zip(poles, relative, absolute, strict=True)
+        ]
