@@ -25,6 +25,7 @@ class Group(NamedTuple):
 
     title: str
     arguments: tuple[Argument, ...]
+    required: bool = False  # whether one of them must be given
 
 
 class Settings(NamedTuple):
@@ -39,7 +40,8 @@ def add_arguments(parser: Any, arguments: Iterable[Argument | Group | Settings])
         if isinstance(item, Settings):
             continue
         if isinstance(item, Group):
-            group = parser.add_argument_group(item.title) if item.title else parser.add_mutually_exclusive_group()
+            one_of = parser.add_mutually_exclusive_group
+            group = parser.add_argument_group(item.title) if item.title else one_of(required=item.required)
             add_arguments(group, item.arguments)
         else:
             parser.add_argument(*item.names, **item.settings)

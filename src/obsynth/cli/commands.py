@@ -246,6 +246,7 @@ def run_verify(options: argparse.Namespace) -> int:
     from obsynth.results.calibration_files import CALIBRATION_KIND, verify_calibration
     from obsynth.results.certificate_files import RESULTS
 
+    options.gains = options.gains or options.file
     # A pipe would keep us waiting; who reads a gain set says what is wrong with it.
     found = kind_of_file(options.gains) if options.gains.is_file() else ""
     kind = {ALARM_KIND: "alarm", CALIBRATION_KIND: "calibration"}.get(found, found.removeprefix("obsynth "))

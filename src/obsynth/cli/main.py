@@ -177,12 +177,20 @@ VERBS = {
         "commands:run_verify",
         "Verify a saved gain set, or a certificate of any kind with all files that it refers to, again.",
         (
-            option(
-                "gains",
-                "FILE",
-                "a gain set, what calibrate wrote, or the certificate of an alarm, a robustness analysis, a tolerance "
-                "study or a comparison (--gains FILE, as for other commands, is the same)",
-                type=Path,
+            Group(
+                "",
+                (
+                    option(
+                        "file",
+                        "FILE",
+                        "a gain set, what calibrate wrote, or the certificate of an alarm, a robustness analysis, a "
+                        "tolerance study or a comparison",
+                        type=Path,
+                        nargs="?",
+                    ),
+                    option("--gains", "FILE", "the same, as other commands take it", type=Path),
+                ),
+                required=True,
             ),
             option("--data", "FILE", "the log that an alarm, a comparison or a calibration names", type=Path),
             Settings(
@@ -763,11 +771,7 @@ def _run(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> in
 
 def _options(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> argparse.Namespace:
     """Return the arguments of a command line, settings among them."""
-    words = list(sys.argv[1:] if arguments is None else arguments)
-    if words[:1] == ["verify"]:
-        # The other commands take a gain set by this option.
-        words = [word.removeprefix("--gains=") for word in words if word != "--gains"]
-    options, rest = parser.parse_known_args(words)
+    options, rest = parser.parse_known_args(sys.argv[1:] if arguments is None else arguments)
     rest = read_settings(parser.prog, VERBS[options.verb].arguments, options, rest)
     if rest:
         _refuse_words(parser.prog, options.verb, rest)
