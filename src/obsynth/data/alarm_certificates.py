@@ -15,7 +15,7 @@ from obsynth.experiments.alarm_multipliers import (
     checked,
     statement_of,
 )
-from obsynth.experiments.alarm_proof import ALARM_KIND, ALARM_VERSION, Question, statement
+from obsynth.experiments.alarm_proof import ALARM_KIND, ALARM_VERSION, assumptions_of, programme_of, statement
 from obsynth.experiments.assumptions import Log, file_digest
 from obsynth.methods.verifying import verify
 from obsynth.numerics.arguments import is_whole
@@ -71,7 +71,7 @@ def _checked(body: Mapping[str, Any], log_file: Path | None) -> Iterator[Check]:
     log = None if data["log"] is None else Log.from_dict(data["log"])
     yield gain_set_row(design, body["gain_set"]["sha256"])
     yield _log_row(log, log_file, design, u, y)
-    question = Question.of(
+    assumed = assumptions_of(
         design,
         dict(zip(plant.disturbance_names, bounds.tolist(), strict=True)),
         data["noise_bound"] if plant.nw else None,
@@ -79,11 +79,11 @@ def _checked(body: Mapping[str, Any], log_file: Path | None) -> Iterator[Check]:
         data["state_bounds"],
         data["window"],
     )
-    programme, origin = question.programme(design, u, y)
+    programme, origin = programme_of(design, assumed, data["window"], u, y)
     equal, below = np.asarray(data["equal"]), np.asarray(data["below"])
     fits = equal.shape == (len(programme.equal.right),) and below.shape == (len(programme.below.right),)
     margin = float(programme.proved_least(equal, below)) if fits else float("nan")
-    said = statement(design, question, len(y), origin, log, body["gain_set"]["sha256"])
+    said = statement(assumed, data["window"], len(y), origin, log, body["gain_set"]["sha256"])
     rows = len(y) == data["row"] and len(u) == len(y)
     stated = float(data["margin"])
     told = said == data["statement"] and origin == data["origin"]

@@ -116,12 +116,12 @@ def proved_alarm(
         }  # fmt: skip
         refuse_bounds(given)
         return _proved_by_test(design, u, y, log, unverified=unverified)
-    question = Question.of(design, disturbance_bounds, noise_bound, initial_set, state_bounds, window)
+    assumed = assumptions_of(design, disturbance_bounds, noise_bound, initial_set, state_bounds, window)
     row, length = len(y), min(window, len(y))
     if (failing := _failing(design, unverified=unverified)) is not None:
         return AlarmProof(False, row, length, 0.0, failing, "", {})
     try:
-        programme, origin = question.programme(design, u, y)
+        programme, origin = programme_of(design, assumed, window, u, y)
     except PreconditionError as error:
         return AlarmProof(False, row, length, 0.0, f"Cannot be proved: {error}", "", {})
     found = solved(programme)
@@ -132,15 +132,19 @@ def proved_alarm(
     margin = float(programme.proved_least(equal, below))
     if not margin > 0.0:
         text = (
-            f"Cannot be proved: with {question.assumptions(design).phrase()}, some plant may produce the last "
+            f"Cannot be proved: with {assumed.phrase()}, some plant may produce the last "
             f"{length} samples without a fault (the relaxed linear programme has a solution)."
         )
         return AlarmProof(False, row, length, margin, text, origin, {})
     margin *= 1.0 - MARGIN_SHARE
     gain_set = design_as_dict(design)
-    text = statement(design, question, row, origin, log, gain_set["sha256"])
+    text = statement(assumed, window, row, origin, log, gain_set["sha256"])
     certificate = {
-        **question.as_dict(),
+        "bounds": assumed.bounds,
+        "noise_bound": assumed.noise_bound,
+        "window": window,
+        "initial_set": None if initial_set is None else _listed(initial_set),
+        "state_bounds": None if state_bounds is None else _listed(state_bounds),
         "u": u,
         "y": y,
         "row": row,
@@ -190,17 +194,16 @@ def _proved_by_test(
     return AlarmProof(True, row, found.rows, found.margin, text, "", {**plain(certificate), "gain_set": gain_set})
 
 
-def statement(design: ObserverDesign, question: Question, row: int, origin: str, log: Log | None, gain_set: str) -> str:
+def statement(assumed: Assumptions, window: int, row: int, origin: str, log: Log | None, gain_set: str) -> str:
     """Return what a proof says, with everything it rests on."""
-    assumed = question.assumptions(design)
-    uncertain = design.linear[0].uncertainty
+    uncertain = assumed.plant.uncertainty
     linear = (
         "" if assumed.box is None or uncertain is None or not uncertain.not_covered else f"; {uncertain.not_covered}"
     )
     outside = "a model that is not exact" if assumed.box is None else assumed.box.sentence
-    since = "since row 1" if question.initial_set is not None else "in these rows"
+    since = "since row 1" if assumed.initial_set is not None else "in these rows"
     source = "a record" if log is None else f"{log.name} (sha256 {log.sha256[:SHOWN_DIGITS]})"
-    first = row - min(question.window, row) + 1
+    first = row - min(window, row) + 1
     return (
         f"Proved: rows {first} to {row} of {source} cannot occur without a fault {since}, with {assumed.phrase()}: "
         f"there is a fault, or {outside}{linear}. Bounds of the state: {origin}. Assumptions "
@@ -208,88 +211,48 @@ def statement(design: ObserverDesign, question: Question, row: int, origin: str,
     )
 
 
-@dataclass(frozen=True, eq=False)
-class Question:
-    """What is asked of a record: bounds of what is unknown, and the window's length."""
-
-    bounds: FloatArray
-    noise_bound: float
-    initial_set: Mapping[str, Any] | None
-    state_bounds: Mapping[str, Any] | None
-    window: int
-
-    @classmethod
-    def of(
-        cls,
-        design: ObserverDesign,
-        disturbance_bounds: Mapping[str, float] | None,
-        noise_bound: float | None,
-        initial_set: Mapping[str, Any] | None,
-        state_bounds: Mapping[str, Any] | None,
-        window: int,
-    ) -> Question:
-        """Return what is asked of a discrete linear design, checked."""
-        plant, _ = design.linear
-        if not plant.is_discrete:
-            raise SpecError("A window is proved for sampled designs: this one is continuous in time.", path="gains")
-        if not is_whole(window) or window < 2:
-            raise SpecError(f"window is {window!r}: give a whole number of samples, 2 or more.", path="window")
-        bounds = np.full(plant.nd, np.nan)
-        for name, value in (disturbance_bounds or {}).items():
-            bounds[index_of(name, plant.disturbance_names, what="disturbance_bounds")] = value
-        if not np.all(bounds >= 0.0) or not np.isfinite(bounds).all():
-            missing = [name for name, bound in zip(plant.disturbance_names, bounds, strict=True) if not bound >= 0.0]
-            raise SpecError(
-                f"The disturbance {(missing or ['?'])[0]!r} has no bound: give disturbance_bounds "
-                "(--disturbance), finite and 0 or more.",
-                path="disturbance_bounds",
-            )
-        if initial_set is not None and state_bounds is not None:
-            raise SpecError("Bounds of the state follow from initial_set: leave state_bounds out.", path="state_bounds")
-        if plant.nw and noise_bound is None:
-            raise SpecError(
-                "Noise has no bound: give noise_bound (--noise-bound), in standard deviations.", path="noise_bound"
-            )
-        if initial_set is None and state_bounds is None:
-            raise SpecError(
-                "Nothing bounds the state: give initial_set (--initial), or state_bounds.", path="initial_set"
-            )
-        return cls(bounds, float(noise_bound or 0.0) if plant.nw else 0.0, initial_set, state_bounds, window)
-
-    def programme(self, design: ObserverDesign, u: FloatArray, y: FloatArray) -> tuple[Window, str]:
-        """Return the programme of the last samples of a record, and where its bounds of the state come from."""
-        affine, data, origin = window_data(
-            design,
-            u,
-            y,
-            self.window,
-            bounds=self.bounds,
-            noise_bound=self.noise_bound,
-            initial_set=self.initial_set,
-            state_bounds=self.state_bounds,
+def assumptions_of(
+    design: ObserverDesign,
+    disturbance_bounds: Mapping[str, float] | None,
+    noise_bound: float | None,
+    initial_set: Mapping[str, Any] | None,
+    state_bounds: Mapping[str, Any] | None,
+    window: int,
+) -> Assumptions:
+    """Return what is assumed of all that is unknown to a discrete linear design, checked, as is the window's length."""
+    plant, _ = design.linear
+    if not plant.is_discrete:
+        raise SpecError("A window is proved for sampled designs: this one is continuous in time.", path="gains")
+    if not is_whole(window) or window < 2:
+        raise SpecError(f"window is {window!r}: give a whole number of samples, 2 or more.", path="window")
+    bounds = np.full(plant.nd, np.nan)
+    for name, value in (disturbance_bounds or {}).items():
+        bounds[index_of(name, plant.disturbance_names, what="disturbance_bounds")] = value
+    if not np.all(bounds >= 0.0) or not np.isfinite(bounds).all():
+        missing = [name for name, bound in zip(plant.disturbance_names, bounds, strict=True) if not bound >= 0.0]
+        raise SpecError(
+            f"The disturbance {(missing or ['?'])[0]!r} has no bound: give disturbance_bounds "
+            "(--disturbance), finite and 0 or more.",
+            path="disturbance_bounds",
         )
-        bounds = np.concatenate([self.bounds, np.full(affine.plant.nw, self.noise_bound)])
-        return window_programme(affine, bounds, data), origin
-
-    def assumptions(self, design: ObserverDesign) -> Assumptions:
-        """Return what is assumed of all that is unknown."""
-        return Assumptions(
-            design.linear[0],
-            self.bounds,
-            self.noise_bound,
-            self.initial_set,
-            self.state_bounds,
+    if initial_set is not None and state_bounds is not None:
+        raise SpecError("Bounds of the state follow from initial_set: leave state_bounds out.", path="state_bounds")
+    if plant.nw and noise_bound is None:
+        raise SpecError(
+            "Noise has no bound: give noise_bound (--noise-bound), in standard deviations.", path="noise_bound"
         )
+    if initial_set is None and state_bounds is None:
+        raise SpecError("Nothing bounds the state: give initial_set (--initial), or state_bounds.", path="initial_set")
+    return Assumptions(plant, bounds, float(noise_bound or 0.0) if plant.nw else 0.0, initial_set, state_bounds)
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return plain data."""
-        return {
-            "bounds": self.bounds,
-            "noise_bound": self.noise_bound,
-            "window": self.window,
-            "initial_set": None if self.initial_set is None else _listed(self.initial_set),
-            "state_bounds": None if self.state_bounds is None else _listed(self.state_bounds),
-        }
+
+def programme_of(
+    design: ObserverDesign, assumed: Assumptions, window: int, u: FloatArray, y: FloatArray
+) -> tuple[Window, str]:
+    """Return the programme of the last samples of a record, and where its bounds of the state come from."""
+    affine, data, origin = window_data(design, assumed, window, u, y)
+    bounds = np.concatenate([assumed.bounds, np.full(affine.plant.nw, assumed.noise_bound)])
+    return window_programme(affine, bounds, data), origin
 
 
 def _listed(given: Mapping[str, Any]) -> dict[str, Any]:

@@ -16,6 +16,7 @@ import numpy as np
 
 from obsynth.analysis.transformations.uncertain_plant import AffinePlant, affine_plant
 from obsynth.errors import SpecError
+from obsynth.experiments.assumptions import Assumptions
 from obsynth.experiments.monitors.adaptive_monitor import start_of
 from obsynth.methods.tracking import tracking_of
 from obsynth.numerics.arguments import is_finite_number
@@ -104,16 +105,67 @@ class WindowData:
     high: FloatArray
 
 
-class _Variables:
-    """Places of the variables: x (N n), d (N nd), q, products (N m), t."""
+def window_programme(plant: AffinePlant, bounds: FloatArray, data: WindowData) -> Window:
+    """Return the programme of a window; ``bounds (nd + nw,)`` of disturbances and noise."""
+    builder, steps = _Builder(plant, bounds, data), len(data.y)
+    for k in range(steps):
+        builder.dynamics(k)
+        builder.outputs(k)
+        builder.planes(k)
+        builder.states(k)
+    # The bounds of the state are rows that t relaxes; the variables themselves have room for that.
+    upper = np.full(builder.t + 1, LARGEST_RELAXATION)
+    upper[builder.d : builder.q] = np.tile(bounds, steps) / builder.equal.scales[builder.d : builder.q]
+    upper[builder.q : builder.products] = 1.0
+    lower = -upper
+    lower[builder.t] = 0.0
+    return Window(builder.equal, builder.below, lower, upper)
 
-    def __init__(self, steps: int, n: int, nd: int, q: int, m: int, *, varying: bool) -> None:
-        self.n, self.nd, self.p, self.m, self.varying = n, nd, q, m, varying
-        self.d = steps * n
-        self.q = self.d + steps * nd
-        self.products = self.q + q * (steps if varying else 1)
-        self.t = self.products + steps * m
-        self.count = self.t + 1
+
+def _power_of_two(value: float) -> float:
+    return math.ldexp(1.0, math.frexp(value)[1])
+
+
+class _Builder:
+    """Rows of one sample, and the places of the variables: x (N n), d (N nd), q, products (N m), t."""
+
+    def __init__(self, plant: AffinePlant, bounds: FloatArray, data: WindowData) -> None:
+        self.plant, self.data = plant, data
+        self.n, self.nd, self.p = plant.A.shape[0], len(bounds), plant.count
+        self.pairs = [
+            (i, j)
+            for i in range(self.p)
+            for j in range(self.n)
+            if plant.A.parts[i][:, j].any() or plant.E.parts[i][:, j].any() or plant.C.parts[i][:, j].any()
+        ]
+        steps, self.varying = len(data.y), plant.box.variation == "varying"
+        self.d = steps * self.n
+        self.q = self.d + steps * self.nd
+        self.products = self.q + self.p * (steps if self.varying else 1)
+        self.t = self.products + steps * len(self.pairs)
+        self.size = np.maximum(np.abs(data.low), np.abs(data.high))
+        scales = self._scales(bounds)
+        self.equal, self.below = Rows(scales), Rows(scales)
+        self.bd = np.hstack([plant.Bd.center, plant.plant.Bw])
+        self.dd = np.hstack([plant.Dd.center, plant.plant.Dw])
+        moving = np.abs(plant.E.center) + plant.E.spread + plant.E.radius
+        self.algebraic = moving.max(axis=1, initial=0.0) == 0.0
+        # A right side is computed: what rounding may have taken from it, relative to its terms, counts as remainder.
+        self.rounding = gamma(plant.B.shape[1] + MORE_ROUNDINGS)
+        nd = plant.Bd.shape[1]
+        self.loose = (plant.Bd.spread + plant.Bd.radius) @ bounds[:nd]
+        self.seen = (plant.Dd.spread + plant.Dd.radius) @ bounds[:nd]
+
+    def _scales(self, bounds: FloatArray) -> FloatArray:
+        """Return powers of two near the bounds of the variables; those of a state are the same at all samples."""
+        steps, largest = len(self.size), self.size.max(axis=0, initial=0.0)
+        least = float(min(largest[largest > 0.0], default=1.0))
+        own = np.array([_power_of_two(value if value > 0.0 else least) for value in largest])
+        found = np.ones(self.t + 1)
+        found[: self.d] = np.tile(own, steps)
+        found[self.d : self.q] = np.tile([_power_of_two(value if value > 0.0 else 1.0) for value in bounds], steps)
+        found[self.products : self.t] = np.tile(own[[j for _, j in self.pairs]], steps)
+        return found
 
     def state(self, k: int, i: int) -> int:
         return k * self.n + i
@@ -125,95 +177,25 @@ class _Variables:
         return self.q + (k * self.p if self.varying else 0) + i
 
     def product(self, k: int, j: int) -> int:
-        return self.products + k * self.m + j
-
-
-def window_programme(plant: AffinePlant, bounds: FloatArray, data: WindowData) -> Window:
-    """Return the programme of a window; ``bounds (nd + nw,)`` of disturbances and noise."""
-    steps, n, p = len(data.y), plant.A.shape[0], plant.count
-    pairs = [
-        (i, j)
-        for i in range(p)
-        for j in range(n)
-        if plant.A.parts[i][:, j].any() or plant.E.parts[i][:, j].any() or plant.C.parts[i][:, j].any()
-    ]
-    at = _Variables(steps, n, len(bounds), p, len(pairs), varying=plant.box.variation == "varying")
-    size = np.maximum(np.abs(data.low), np.abs(data.high))
-    scales = _scales(at, size, bounds, [j for _, j in pairs])
-    builder = _Builder(plant, at, pairs, data, size, bounds, Rows(scales), Rows(scales))
-    for k in range(steps):
-        builder.dynamics(k)
-        builder.outputs(k)
-        builder.products(k)
-        builder.state(k)
-    # The bounds of the state are rows that t relaxes; the variables themselves have room for that.
-    upper = np.full(at.count, LARGEST_RELAXATION)
-    upper[at.d : at.q] = np.tile(bounds, steps) / scales[at.d : at.q]
-    upper[at.q : at.products] = 1.0
-    lower = -upper
-    lower[at.t] = 0.0
-    return Window(builder.equal, builder.below, lower, upper)
-
-
-def _scales(at: _Variables, size: FloatArray, bounds: FloatArray, states: list[int]) -> FloatArray:
-    """Return powers of two near the bounds of the variables; those of a state are the same at all samples."""
-    steps, largest = len(size), size.max(axis=0, initial=0.0)
-    least = float(min(largest[largest > 0.0], default=1.0))
-    own = np.array([_power_of_two(value if value > 0.0 else least) for value in largest])
-    found = np.ones(at.count)
-    found[: at.d] = np.tile(own, steps)
-    found[at.d : at.q] = np.tile([_power_of_two(value if value > 0.0 else 1.0) for value in bounds], steps)
-    found[at.products : at.t] = np.tile(own[states], steps)
-    return found
-
-
-def _power_of_two(value: float) -> float:
-    return math.ldexp(1.0, math.frexp(value)[1])
-
-
-class _Builder:
-    """Rows of one sample."""
-
-    def __init__(
-        self,
-        plant: AffinePlant,
-        at: _Variables,
-        pairs: list[tuple[int, int]],
-        data: WindowData,
-        size: FloatArray,
-        bounds: FloatArray,
-        equal: Rows,
-        below: Rows,
-    ) -> None:
-        self.plant, self.at, self.pairs, self.data, self.size = plant, at, pairs, data, size
-        self.equal, self.below = equal, below
-        self.bd = np.hstack([plant.Bd.center, plant.plant.Bw])
-        self.dd = np.hstack([plant.Dd.center, plant.plant.Dw])
-        moving = np.abs(plant.E.center) + plant.E.spread + plant.E.radius
-        self.algebraic = moving.max(axis=1, initial=0.0) == 0.0
-        # A right side is computed: what rounding may have taken from it, relative to its terms, counts as remainder.
-        self.rounding = gamma(plant.B.shape[1] + MORE_ROUNDINGS)
-        nd = plant.Bd.shape[1]
-        self.loose = (plant.Bd.spread + plant.Bd.radius) @ bounds[:nd]
-        self.seen = (plant.Dd.spread + plant.Dd.radius) @ bounds[:nd]
+        return self.products + k * len(self.pairs) + j
 
     def dynamics(self, k: int) -> None:
         """Add ``E x(k+1) - A x(k) - Bd d = B u``: exactly, or between bounds of the remainders."""
-        plant, at, data = self.plant, self.at, self.data
+        plant, data = self.plant, self.data
         last = k + 1 == len(data.y)
-        for r in range(at.n):
+        for r in range(self.n):
             if last and not self.algebraic[r]:
                 continue
             entries = dict[int, float]()
             loose = float(self.loose[r] + plant.A.radius[r] @ self.size[k] + plant.B.radius[r] @ np.abs(data.u[k]))
             if not self.algebraic[r]:
-                entries |= {at.state(k + 1, i): plant.E.center[r, i] for i in range(at.n)}
-                entries |= {at.product(k + 1, j): plant.E.parts[i][r, c] for j, (i, c) in enumerate(self.pairs)}
+                entries |= {self.state(k + 1, i): plant.E.center[r, i] for i in range(self.n)}
+                entries |= {self.product(k + 1, j): plant.E.parts[i][r, c] for j, (i, c) in enumerate(self.pairs)}
                 loose += float(plant.E.radius[r] @ self.size[k + 1])
-            entries |= {at.state(k, i): -plant.A.center[r, i] for i in range(at.n)}
-            entries |= {at.product(k, j): -plant.A.parts[i][r, c] for j, (i, c) in enumerate(self.pairs)}
-            entries |= {at.constant(k, i): -float(plant.B.parts[i][r] @ data.u[k]) for i in range(at.p)}
-            entries |= {at.disturbance(k, i): -self.bd[r, i] for i in range(at.nd)}
+            entries |= {self.state(k, i): -plant.A.center[r, i] for i in range(self.n)}
+            entries |= {self.product(k, j): -plant.A.parts[i][r, c] for j, (i, c) in enumerate(self.pairs)}
+            entries |= {self.constant(k, i): -float(plant.B.parts[i][r] @ data.u[k]) for i in range(self.p)}
+            entries |= {self.disturbance(k, i): -self.bd[r, i] for i in range(self.nd)}
             right = float(plant.B.center[r] @ data.u[k])
             loose += self.rounding * float(plant.B.magnitude[r] @ np.abs(data.u[k]))
             if loose == 0.0:
@@ -224,12 +206,12 @@ class _Builder:
 
     def outputs(self, k: int) -> None:
         """Add ``y = C x + D u + Dd d``, relaxed by t."""
-        plant, at, data = self.plant, self.at, self.data
+        plant, data = self.plant, self.data
         for r in range(len(plant.C.center)):
-            entries = {at.state(k, i): plant.C.center[r, i] for i in range(at.n)}
-            entries |= {at.product(k, j): plant.C.parts[i][r, c] for j, (i, c) in enumerate(self.pairs)}
-            entries |= {at.disturbance(k, i): self.dd[r, i] for i in range(at.nd)}
-            entries |= {at.constant(k, i): float(plant.D.parts[i][r] @ data.u[k]) for i in range(at.p)}
+            entries = {self.state(k, i): plant.C.center[r, i] for i in range(self.n)}
+            entries |= {self.product(k, j): plant.C.parts[i][r, c] for j, (i, c) in enumerate(self.pairs)}
+            entries |= {self.disturbance(k, i): self.dd[r, i] for i in range(self.nd)}
+            entries |= {self.constant(k, i): float(plant.D.parts[i][r] @ data.u[k]) for i in range(self.p)}
             right = float(data.y[k, r] - plant.D.center[r] @ data.u[k])
             loose = float(self.seen[r] + plant.C.radius[r] @ self.size[k] + plant.D.radius[r] @ np.abs(data.u[k]))
             loose += self.rounding * float(abs(data.y[k, r]) + plant.D.magnitude[r] @ np.abs(data.u[k]))
@@ -237,20 +219,20 @@ class _Builder:
                 row = {column: sign * value for column, value in entries.items()}
                 self.below.add(row, sign * right + loose, relaxed=True)
 
-    def state(self, k: int) -> None:
+    def states(self, k: int) -> None:
         """Add the bounds of the state, relaxed by t."""
-        for i in range(self.at.n):
-            place = self.at.state(k, i)
+        for i in range(self.n):
+            place = self.state(k, i)
             self.below.add({place: 1.0}, float(self.data.high[k, i]), relaxed=True)
             self.below.add({place: -1.0}, -float(self.data.low[k, i]), relaxed=True)
 
-    def products(self, k: int) -> None:
+    def planes(self, k: int) -> None:
         """Add the four planes of McCormick of each product, relaxed by t."""
-        at, data = self.at, self.data
+        data = self.data
         for j, (i, c) in enumerate(self.pairs):
             low, high = float(data.low[k, c]), float(data.high[k, c])
             for q, s, sign in ((-1.0, low, -1.0), (1.0, high, -1.0), (1.0, low, 1.0), (-1.0, high, 1.0)):
-                row = {at.product(k, j): sign, at.state(k, c): -sign * q, at.constant(k, i): -sign * s}
+                row = {self.product(k, j): sign, self.state(k, c): -sign * q, self.constant(k, i): -sign * s}
                 self.below.add(row, -sign * q * s, relaxed=True)
 
 
@@ -259,29 +241,21 @@ REPLAY, STATED_BOUNDS = "replay from the start", "stated"
 
 
 def window_data(
-    design: ObserverDesign,
-    u: FloatArray,
-    y: FloatArray,
-    length: int,
-    *,
-    bounds: FloatArray,
-    noise_bound: float,
-    initial_set: Mapping[str, Any] | None,
-    state_bounds: Mapping[str, Any] | None,
+    design: ObserverDesign, assumed: Assumptions, length: int, u: FloatArray, y: FloatArray
 ) -> tuple[AffinePlant, WindowData, str]:
     """Return the plant over its box, the last ``length`` samples with bounds of the state, and where these come from.
     Without stated ones they come from the observer run again from the start, and its error."""
     affine = affine_plant(design.linear[0])
     first = max(0, len(y) - length)
-    if initial_set is None:
-        low, high = _stated(affine, state_bounds or {}, len(y) - first)
+    if assumed.initial_set is None:
+        low, high = _stated(affine, assumed.state_bounds or {}, len(y) - first)
         return affine, WindowData(u[first:], y[first:], low, high), STATED_BOUNDS
     _, observer = design.linear
     tracking = tracking_of(design, affine)
     structure = structure_of(
-        design, affine, tracking, bounds=bounds, noise_bound=noise_bound, faults=False, states=True
+        design, affine, tracking, bounds=assumed.bounds, noise_bound=assumed.noise_bound, faults=False, states=True
     )
-    start = start_of(affine, tracking, None, initial_set, np.zeros(observer.order))
+    start = start_of(affine, tracking, None, assumed.initial_set, np.zeros(observer.order))
     bound = adaptive_bound(structure, observer, start, varying=affine.box.variation == "varying")
     estimates = observer.run(y, u if u.shape[1] else None)
     rows = np.hstack([estimates.states, estimates.faults, estimates.residuals])
