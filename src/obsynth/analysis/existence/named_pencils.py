@@ -64,9 +64,13 @@ class NamedPencil:
         return nearest(self.A), nearest(self.E)
 
     @cached_property
-    def _whole(self) -> tuple[_WholeRows, _WholeRows]:
-        """A and E in whole numbers."""
-        return _WholeRows.of(self.A), _WholeRows.of(self.E)
+    def _whole(self) -> list[tuple[Rational, list[int]]]:
+        """A and E in whole numbers, each row over its own denominator."""
+        found = []
+        for matrix in (self.A, self.E):
+            rows = [_whole_numbers(row) for row in matrix.tolist()]
+            found.append((_objects([row for row, _ in rows], matrix.shape), [denominator for _, denominator in rows]))
+        return found
 
     @cached_property
     def _weights(self) -> FloatArray:
@@ -130,7 +134,7 @@ class NamedPencil:
         scale = rational(columns)
         real, imaginary = vector[0] * scale, vector[1] * scale
         # (A - s E) v, s = a + b j.
-        (of_a, of_e) = ([matrix.times(part) for part in (real, imaginary)] for matrix in self._whole)
+        (of_a, of_e) = ([_product(*matrix, part) for part in (real, imaginary)] for matrix in self._whole)
         rest = (
             of_a[0] - point[0] * of_e[0] + point[1] * of_e[1],
             of_a[1] - point[0] * of_e[1] - point[1] * of_e[0],
@@ -173,23 +177,11 @@ class NamedPencil:
         ]
 
 
-@dataclass(frozen=True, eq=False)
-class _WholeRows:
-    """A rational matrix ``(m, n)`` in whole numbers, each row over its own denominator."""
-
-    numerators: Rational
-    denominators: list[int]
-
-    @classmethod
-    def of(cls, matrix: Rational) -> _WholeRows:
-        rows = [_whole_numbers(row) for row in matrix.tolist()]
-        return cls(_objects([row for row, _ in rows], matrix.shape), [denominator for _, denominator in rows])
-
-    def times(self, vector: Rational) -> Rational:
-        """Return the product with a rational vector ``(n,)``."""
-        whole, common = _whole_numbers(vector.tolist())
-        products = zip(self.numerators @ _objects(whole, vector.shape), self.denominators, strict=True)
-        return as_array([[Fraction(value, common * own) for value, own in products]], (len(self.denominators),))
+def _product(numerators: Rational, denominators: list[int], vector: Rational) -> Rational:
+    """Return the product of whole rows over their denominators with a rational vector ``(n,)``."""
+    whole, common = _whole_numbers(vector.tolist())
+    products = zip(numerators @ _objects(whole, vector.shape), denominators, strict=True)
+    return as_array([[Fraction(value, common * own) for value, own in products]], (len(denominators),))
 
 
 def _objects(numbers: Sequence[object], shape: tuple[int, ...]) -> Rational:

@@ -26,18 +26,6 @@ from obsynth.plants.validation import listed
 
 
 @dataclass(frozen=True, eq=False)
-class SparseCoordinates:
-    """Equations and states of a plant, split into dynamic and algebraic ones by what E does."""
-
-    dynamic_rows: Any  # ``(count, nx)``: combinations of equations
-    algebraic_rows: Any  # ``(nx - count, nx)``: those without E
-    dynamic: Any  # ``(nx, count)``: basis of states
-    algebraic: Any  # ``(nx, nx - count)``: basis of ker E
-    names: tuple[str, ...]  # of the dynamic states: their own, where these are whole states of the plant
-    neglected: tuple[str, ...]  # states whose derivative has a coefficient that counts as zero beside the others
-
-
-@dataclass(frozen=True, eq=False)
 class SparseReduction:
     """A plant without its algebraic states: its matrices, and how the others follow from the states that are left."""
 
@@ -60,8 +48,8 @@ class SparseReduction:
 
 def reduced_by_sparsity(plant: DescriptorSystem) -> SparseReduction | None:
     """Solve the algebraic equations of a plant with sparse factors; ``None`` where it does not have index 1."""
-    split = split_by_derivatives(plant)
-    count = split.dynamic.shape[1]
+    (dynamic_rows, algebraic_rows, dynamic, algebraic), names, neglected = split_by_derivatives(plant)
+    count = dynamic.shape[1]
     if count == 0:
         raise PreconditionError(
             "Every state is algebraic: nothing is left after elimination. Solve the equations directly.",
@@ -70,36 +58,45 @@ def reduced_by_sparsity(plant: DescriptorSystem) -> SparseReduction | None:
     a, c = csr(plant.A), csr(plant.C)
     counts = (count, plant.nu, plant.nf, plant.nd, plant.nw)
     signals = np.hstack([dense(matrix) for matrix in (plant.B, plant.Bf, plant.Bd, plant.Bw)])
-    inner = csr(split.algebraic_rows @ a @ split.algebraic)
+    inner = csr(algebraic_rows @ a @ algebraic)
     factor = sparse_factor(inner)
     if factor.singular:
         return None
-    right = _side_by_side(split.algebraic_rows @ a @ split.dynamic, split.algebraic_rows @ csr(signals))
+    right = _side_by_side(algebraic_rows @ a @ dynamic, algebraic_rows @ csr(signals))
     found, backward = factor.solve_with_error(right.toarray())
     found[:, count:] = without_rounding(factor, found[:, count:])
     solution = -found
-    kept = _side_by_side(split.dynamic_rows @ a @ split.dynamic, split.dynamic_rows @ csr(signals)).toarray()
-    mass = sparse_factor(split.dynamic_rows @ csr(plant.E) @ split.dynamic)
-    moved, backward_of_e = mass.solve_with_error(_sum(kept, csr(split.dynamic_rows @ a @ split.algebraic), solution))
-    direct = np.hstack([(c @ split.dynamic).toarray(), *(dense(m) for m in (plant.D, plant.Df, plant.Dd, plant.Dw))])
-    shown = _sum(direct, csr(c @ split.algebraic), solution)
+    kept = _side_by_side(dynamic_rows @ a @ dynamic, dynamic_rows @ csr(signals)).toarray()
+    mass = sparse_factor(dynamic_rows @ csr(plant.E) @ dynamic)
+    moved, backward_of_e = mass.solve_with_error(_sum(kept, csr(dynamic_rows @ a @ algebraic), solution))
+    direct = np.hstack([(c @ dynamic).toarray(), *(dense(m) for m in (plant.D, plant.Df, plant.Dd, plant.Dw))])
+    shown = _sum(direct, csr(c @ algebraic), solution)
     ends = np.cumsum(counts)[:-1]
     matrices = dict(zip(("A", "B", "Bf", "Bd", "Bw"), np.split(moved, ends, axis=1), strict=True))
     matrices |= dict(zip(("C", "D", "Df", "Dd", "Dw"), np.split(shown, ends, axis=1), strict=True))
-    operator = RecoveryOperator(split.dynamic, split.algebraic, inner, right, counts)
+    operator = RecoveryOperator(dynamic, algebraic, inner, right, counts)
     bounds = SolutionBounds(max(factor.condition, mass.condition), max(backward, backward_of_e))
-    return SparseReduction(matrices, split.names, operator, bounds, split.neglected)
+    return SparseReduction(matrices, names, operator, bounds, neglected)
 
 
-def split_by_derivatives(plant: DescriptorSystem) -> SparseCoordinates:
-    """Return dynamic and algebraic equations and states: E is decomposed component by component of its pattern."""
+def split_by_derivatives(
+    plant: DescriptorSystem,
+) -> tuple[tuple[Any, Any, Any, Any], tuple[str, ...], tuple[str, ...]]:
+    """Return combinations of equations with E ``(count, nx)`` and without, bases of the states that E moves
+    ``(nx, count)`` and does not, names of the former, and states whose derivatives count as zero beside the others.
+    E is decomposed component by component of its pattern; names are their own where these are whole states."""
     e, a = csr(plant.E), csr(plant.A)
     parts = _components(e)
     pieces = _split(e, parts, _scales(e, a))
     if len(pieces.dynamic) < coarse_structure(e).structural_rank:
         # Small entries of E may be a matter of units: judged again with those that suit all entries.
         pieces = _split(e, parts, scales_by_all_entries(csr(abs(e) + abs(a))))
-    return pieces.coordinates(plant.state_names)
+    moving = sorted(pieces.dynamic, key=lambda piece: piece[0])
+    names = tuple(
+        plant.state_names[piece[1][0]] if len(piece[1]) == 1 else f"xi {k}" for k, piece in enumerate(moving, 1)
+    )
+    neglected = tuple(plant.state_names[i] for i in sorted(set(pieces.neglected)))
+    return pieces.matrices(), names, neglected
 
 
 def _components(e: Any) -> list[tuple[Any, Any, FloatArray]]:
@@ -138,7 +135,7 @@ def _split(e: Any, parts: list[tuple[Any, Any, FloatArray]], scales: tuple[Float
 
 
 class _Pieces:
-    """Collects the rows and columns of `SparseCoordinates`, one component of E after the other."""
+    """Collects rows and columns of dynamic and algebraic parts, one component of E after the other."""
 
     def __init__(self, count: int) -> None:
         self.count = count
@@ -178,20 +175,10 @@ class _Pieces:
         self.algebraic_rows += [(int(row), np.array([row]), np.ones(1)) for row in rows]
         self.algebraic += [(int(column), np.array([column]), np.ones(1)) for column in columns]
 
-    def coordinates(self, state_names: tuple[str, ...]) -> SparseCoordinates:
-        """Return the whole, in the order of equations and states."""
-        moving = sorted(self.dynamic, key=lambda piece: piece[0])
-        names = tuple(
-            state_names[piece[1][0]] if len(piece[1]) == 1 else f"xi {k}" for k, piece in enumerate(moving, 1)
-        )
-        return SparseCoordinates(
-            self._matrix(self.dynamic_rows),
-            self._matrix(self.algebraic_rows),
-            csr(self._matrix(self.dynamic).T),
-            csr(self._matrix(self.algebraic).T),
-            names,
-            tuple(state_names[i] for i in sorted(set(self.neglected))),
-        )
+    def matrices(self) -> tuple[Any, Any, Any, Any]:
+        """Return the whole, in the order of equations and states: rows, then states as columns."""
+        rows = self._matrix(self.dynamic_rows), self._matrix(self.algebraic_rows)
+        return *rows, csr(self._matrix(self.dynamic).T), csr(self._matrix(self.algebraic).T)
 
     def _matrix(self, pieces: list[tuple[int, Any, FloatArray]]) -> Any:
         from scipy.sparse import csr_array
@@ -224,8 +211,8 @@ def not_index_one(
     """Return the refusal of a plant that does not have index 1 without its idle variables either: which part, and why.
     It goes on where ``said`` refused; its signals are the variables, none where nothing was found wrong."""
     part = active_part(plant, active)
-    split = split_by_derivatives(part)
-    inner = csr(split.algebraic_rows @ csr(part.A) @ split.algebraic)
+    (_, algebraic_rows, _, algebraic), _, _ = split_by_derivatives(part)
+    inner = csr(algebraic_rows @ csr(part.A) @ algebraic)
     factor = sparse_factor(inner)
     null = factor.null_vectors()
     if not factor.exactly_singular and null.smallest > RANK_TOLERANCE:
@@ -233,7 +220,7 @@ def not_index_one(
     generic = [sparse_factor(csr(part.A) - point * csr(part.E)) for point in GENERIC_POINTS[:2]]
     regular = any(not found.singular for found in generic)
     if regular:
-        equations, variables = _leading(split.algebraic_rows, split.algebraic, null, inner)
+        equations, variables = _leading(algebraic_rows, algebraic, null, inner)
     else:
         null = generic[0].null_vectors()
         equations, variables = _named(null.rows), _named(null.columns)

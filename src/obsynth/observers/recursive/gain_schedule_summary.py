@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -51,15 +50,6 @@ class GainScheduleSummary:
     state_deviations: FloatArray
 
 
-class Contraction(NamedTuple):
-    """How the product of L_k A_k goes along a horizon; the fields are those of `GainScheduleSummary`."""
-
-    mean: float
-    growth: float
-    span: str
-    survivors: FloatArray
-
-
 def looked_at(observer: RecursiveObserver) -> int:
     """Return how many steps of an observer's model are looked at."""
     steps = observer.plant.horizon or STEPS_WITHOUT_HORIZON
@@ -75,18 +65,18 @@ def gain_schedule_summary(observer: RecursiveObserver, *, gains: Gains = gain_st
     plain = observer.without_walk
     whole = steps + int(observer.early_constraints)
     product, regressors, last = ErrorProduct(observer.plant.nx, _first_end(observer, whole)), [], None
-    kept: Contraction | None = None
+    kept: tuple[float, str] | None = None
     for found in gains(plain, steps):
         last, kept = found, None
         regressors.append(found.G)
         product.move(found.gain[:, : len(found.step.A)] @ found.step.A)
         if product.done == product.steps < whole:
-            if product.contraction().mean < 1.0 or (kept := product.contraction_of_kept_gains()) is not None:
+            if product.contraction()[0] < 1.0 or (kept := product.contraction_of_kept_gains()) is not None:
                 break
             product.go_on_to(min(whole, FOLLOW_FURTHER * product.steps))
     if last is None:
         raise SpecError("The plant has no steps.", path="horizon")
-    errors, ne = kept if kept is not None else product.contraction(), len(last.step.A)
+    (contraction, span), ne = kept if kept is not None else product.contraction(), len(last.step.A)
     window = observer.adaptation.window if observer.adaptation is not None else 1
     levels = excitation_levels(regressors, window)[window - 1 :]
     deviations, state_deviations = _lengths(last.spread), _lengths(last.factor)
@@ -96,10 +86,10 @@ def gain_schedule_summary(observer: RecursiveObserver, *, gains: Gains = gain_st
         state_deviations, deviations = lengths[: observer.plant.nx], lengths[observer.plant.nx :]
     return GainScheduleSummary(
         steps=len(regressors),
-        contraction=errors.mean,
-        growth=errors.growth,
-        span=errors.span,
-        survivors=errors.survivors,
+        contraction=contraction,
+        growth=product.growth,
+        span=span,
+        survivors=product.survivors,
         excitation=float(levels.min()) if learning and levels.size else float("nan"),
         excitation_k=int(levels.argmin()) + window if learning and levels.size else 0,
         L=last.gain[:, :ne],
@@ -130,7 +120,7 @@ class ErrorProduct:
         self.product, self.logarithm, self.growth = np.eye(nx), 0.0, 1.0
         self.factor = np.eye(nx)
         self.late, self.late_logarithm, self.middle = np.eye(nx), 0.0, 0.0
-        self.ended: Contraction | None = None
+        self.ended: tuple[float, str] | None = None
 
     def go_on_to(self, steps: int) -> None:
         """Go on to a later end, of which less than half is done."""
@@ -147,10 +137,10 @@ class ErrorProduct:
         size = norm_or_bound(self.product)
         self.growth = max(self.growth, size * float(np.exp(min(self.logarithm, 0.0))))
         if not size < 1.0 / GONE:
-            self.ended = Contraction(float("inf"), float("inf"), "from the start", _shares(self.product))
+            self.growth, self.ended = float("inf"), (float("inf"), "from the start")
             return
         if size == 0.0:
-            self.ended = Contraction(0.0, self.growth, "from the start", _shares(self.product))
+            self.ended = 0.0, "from the start"
             return
         if size < GONE:
             self.product, self.logarithm = self.product / size, self.logarithm + float(np.log(size))
@@ -164,14 +154,20 @@ class ErrorProduct:
     def _length(self) -> float:
         return self.logarithm + float(np.log(np.linalg.norm(self.product, 2)))
 
-    def contraction_of_kept_gains(self) -> Contraction | None:
+    @property
+    def survivors(self) -> FloatArray:
+        """Size of the product in each state, relative to its largest ``(nx,)``."""
+        sizes = np.max(np.abs(self.product), axis=1)
+        return np.asarray(sizes / max(float(sizes.max()), np.finfo(np.float64).tiny))
+
+    def contraction_of_kept_gains(self) -> tuple[float, str] | None:
         """Return the contraction of one step with the last gains, were they kept; ``None`` where errors stay then."""
         radius = 1.0 if self.ended is not None else spectral_radius(self.factor)
         span = "of one step with the last gains, were they kept: errors have not shrunk as a whole yet"
-        return Contraction(radius, self.growth, span, _shares(self.product)) if radius < CLEARLY_STABLE else None
+        return (radius, span) if radius < CLEARLY_STABLE else None
 
-    def contraction(self) -> Contraction:
-        """Return what the product says."""
+    def contraction(self) -> tuple[float, str]:
+        """Return the mean factor by which an error shrinks in a step, and what it was taken over."""
         if self.ended is not None:
             return self.ended
         steps = self.steps
@@ -183,8 +179,8 @@ class ErrorProduct:
         slowest = max(last - self.middle, self.late_logarithm + float(np.log(radius)) if radius else -np.inf)
         second = float(np.exp(slowest / (steps - steps // 2)))
         if whole >= 1.0 and second < 1.0 - BOUNDARY_TOLERANCE:
-            return Contraction(second, self.growth, "over the second half", _shares(self.product))
-        return Contraction(whole, self.growth, "from the start", _shares(self.product))
+            return second, "over the second half"
+        return whole, "from the start"
 
 
 def norm_or_bound(matrix: FloatArray) -> float:
@@ -193,8 +189,3 @@ def norm_or_bound(matrix: FloatArray) -> float:
         # What `norm` does of one matrix, without asking thousands of times which axes it has.
         return float(np.linalg.svd(matrix, compute_uv=False).max(initial=0.0))
     return float(np.sqrt(np.linalg.norm(matrix, 1) * np.linalg.norm(matrix, np.inf)))
-
-
-def _shares(product: FloatArray) -> FloatArray:
-    sizes = np.max(np.abs(product), axis=1)
-    return np.asarray(sizes / max(float(sizes.max()), np.finfo(np.float64).tiny))

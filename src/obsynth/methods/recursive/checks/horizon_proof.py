@@ -48,16 +48,14 @@ def horizon_proof(
     """Return what can be proved of the first steps of a shipped observer on the stated plant; `None` for nothing."""
     if stated.plant.nx > MOST_PROVED_STATES or _kind(stated) != _kind(shipped):
         return None  # the rows on what fits say so
-    joint = None
-    found = _followed(stated.without_walk, shipped.without_walk, steps, gains)
+    errors, joint, lengths, bias, last = _followed(stated.without_walk, shipped.without_walk, steps, gains)
     if stated.adaptation is not None and stated.adaptation.form == "random-walk":
-        joint = _followed(stated, shipped, steps, gains)
-    mean, span = _mean_factor(found, found.last.factor)
-    nq = 0 if shipped.adaptation is None else shipped.plant.nq
-    whole = joint.errors if joint is not None else found.joint
-    bias = found.bias if joint is None else max(found.bias, joint.bias)
-    together = float(np.exp(min(logarithm_of_product(whole) / found.steps, 0.0))) if nq and whole else np.nan
-    return HorizonProof(found.steps, bias, mean, span, together, found.last)
+        joint, _, _, other_bias, _ = _followed(stated, shipped, steps, gains)
+        bias = max(bias, other_bias)
+    mean, span = _mean_factor(errors, lengths, last.factor)
+    nq, steps = 0 if shipped.adaptation is None else shipped.plant.nq, sum(lengths)
+    together = float(np.exp(min(logarithm_of_product(joint) / steps, 0.0))) if nq and joint else np.nan
+    return HorizonProof(steps, bias, mean, span, together, last)
 
 
 def _kind(observer: RecursiveObserver) -> tuple[object, ...]:
@@ -67,20 +65,11 @@ def _kind(observer: RecursiveObserver) -> tuple[object, ...]:
     return observer.early_constraints, form, plant.nx, plant.ne, plant.ny, plant.nq
 
 
-@dataclass(frozen=True, eq=False)
-class _Followed:
-    """Products of so many steps each (``lengths``), of the states and of states with parameters."""
-
-    steps: int
-    bias: float
-    errors: list[Ball]
-    joint: list[Ball]
-    lengths: list[int]
-    last: GainStep
-
-
-def _followed(stated: RecursiveObserver, shipped: RecursiveObserver, steps: int, gains: Gains) -> _Followed:
-    """Follow the gains of a shipped observer on the matrices of the stated plant."""
+def _followed(
+    stated: RecursiveObserver, shipped: RecursiveObserver, steps: int, gains: Gains
+) -> tuple[list[Ball], list[Ball], list[int], float, GainStep]:
+    """Follow the gains of a shipped observer on the matrices of the stated plant: products of so many steps each, of
+    the states and of states with parameters, how many, how far the gains are from unbiased, and the last ones."""
     units = natural_units(stated)
     bias = 0.0
     errors: list[Ball] = []
@@ -99,7 +88,7 @@ def _followed(stated: RecursiveObserver, shipped: RecursiveObserver, steps: int,
     if last is None:
         raise SpecError("The plant has no steps.", path="horizon")
     bias = max(bias, _closed(waiting, errors, joint, lengths, units))
-    return _Followed(sum(lengths), bias, errors, joint, lengths, last)
+    return errors, joint, lengths, bias, last
 
 
 def natural_units(observer: RecursiveObserver) -> FloatArray:
@@ -175,10 +164,9 @@ def _transitions(pairs: list[tuple[StepMatrices, GainStep]]) -> tuple[_Stack, _S
     return (middle, radius), (whole, whole_radius)
 
 
-def _mean_factor(found: _Followed, factor: FloatArray) -> tuple[float, str]:
+def _mean_factor(errors: list[Ball], lengths: list[int], factor: FloatArray) -> tuple[float, str]:
     """Return a bound on the mean factor per step, and of what: of the horizon in the units given, or in deviations."""
-    errors, steps = found.errors, found.steps
-    bound = logarithm_of_product(errors)
+    bound, steps = logarithm_of_product(errors), sum(lengths)
     if bound < 0.0:
         return float(np.exp(bound / steps)), "from the start"
     units = _deviations(factor)
@@ -187,7 +175,7 @@ def _mean_factor(found: _Followed, factor: FloatArray) -> tuple[float, str]:
         return float(np.exp(bound / steps)), "from the start, in units of the last deviations"
     half = len(errors) // 2
     late = logarithm_of_product(errors[half:], units)
-    mean = late / sum(found.lengths[half:])
+    mean = late / sum(lengths[half:])
     return float(np.exp(min(mean, 0.0))), "over the second half, in units of the last deviations"
 
 
