@@ -77,11 +77,14 @@ def told(design: obsynth.ObserverDesign) -> LearnedThresholds:
     A = np.array([0.5 * np.eye(m) + 0.1, -0.2 * np.eye(m)])
     model = Autoregression(np.full(m, 0.02), A, 3.0 * np.eye(m) - 0.5)
     signatures = np.vstack([np.eye(m), np.ones(m)])
-    statistics = Statistics(model, signatures, (*columns, f"fault {design.observer.fault_names[-1]}" if nf else "both"))
+    shown = (*columns, f"fault {design.observer.fault_names[-1]}" if nf else "both")
+    estimates = names[:nf] if isinstance(design.observer, DAEObserver) else ()
+    statistics = Statistics(model, signatures, shown, estimates)
     levels = np.linspace(8.0, 20.0, len(statistics.names))
     dt = design.observer.dt or SAMPLE_TIME
     return LearnedThresholds(columns, statistics, levels, 500.0, 1000, 500, dt, np.zeros(nf), np.ones(nf),
-                             gain_set_digest(design), settling=0 if m == 1 else 30, innovation=0.7)  # fmt: skip
+                             gain_set_digest(design), settling=0 if m == 1 else 30, innovation=0.7,
+                             deviations=0.5 + 0.2 * np.arange(len(estimates)))  # fmt: skip
 
 
 def designed(name: str) -> obsynth.ObserverDesign:

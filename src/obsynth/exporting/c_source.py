@@ -215,6 +215,7 @@ def monitor_source(alarms: Alarms, prefix: str) -> str:
         "MEANS": len(shares),
         "SHAPES": len(shapes),
         "MONITOR_FAULTS": len(found.scales),
+        "MONITOR_ESTIMATES": len(found.deviations),
         "MONITOR_SETTLING": found.settling,
         "MONITOR_HOLD": HOLD,
         "MONITOR_WATCHED": sum(name.startswith(("fhat[", "r[")) for name in alarms.columns),
@@ -234,6 +235,7 @@ def monitor_source(alarms: Alarms, prefix: str) -> str:
         "monitor_weights": 1.0 / np.maximum(powers, SMALLEST),
         "monitor_centres": found.centres[None],
         "monitor_scales": found.scales[None],
+        "monitor_deviations": found.deviations[None],
         "monitor_innovation": np.array([[found.innovation]]),
     }
     faults = {f"fhat[{name}]": i for i, name in enumerate(alarms.fault_names)}
@@ -400,7 +402,7 @@ def _step_text(found: Realisation, prefix: str, alarms: Alarms) -> str:
         "COPY_OUT": " ".join(f"copied({to}, {of}, {n});" for to, of, n in shown if n),
         "MONITOR_RESET": "monitor_reset(&s->monitor);" if learned else "",
         "MONITOR_STEP": (
-            f"monitor_take(&s->monitor, shown, s->status == {prefix.upper()}_OK, -1);\n"
+            f"monitor_take(&s->monitor, shown, NULL, s->status == {prefix.upper()}_OK, -1);\n"
             "    shown[SHOWN_COUNT] = s->monitor.statistic;"
             if learned
             else ""

@@ -122,7 +122,7 @@ def _step_text(prefix: str, model: DAEModel, alarms: Alarms) -> str:
         "INPUT": "u" if model.nu else "s->u",
         "MONITOR_RESET": "monitor_reset(&s->monitor);" if alarms.learned is not None else "",
         "MONITOR_STEP": (
-            "monitor_take(&s->monitor, shown, is_deciding, sqrt(estimates->nis));\n"
+            "monitor_take(&s->monitor, shown, estimates->fault_deviations, is_deciding, sqrt(estimates->nis));\n"
             "    shown[NQ + NY + 1] = s->monitor.statistic;"
             if alarms.learned is not None
             else ""

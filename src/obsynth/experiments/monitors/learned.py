@@ -5,17 +5,19 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from obsynth.errors import SpecError
 from obsynth.experiments.monitors.learned_levels import (
     AGES,
     FORGETTING,
     HOLD,
+    ROWS_PER_REMEMBERED,
     SETTLING,
     Statistics,
     conformal_levels,
@@ -37,7 +39,7 @@ from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import digest_of, gain_set_digest, plain, restored
 
 LEARNED_KIND = "obsynth learned thresholds"
-LEARNED_VERSION = 4
+LEARNED_VERSION = 5
 LEARNED = FileKind("learned thresholds of obsynth", rb'\A\s*\{\s*"kind":\s*"obsynth learned thresholds"')
 #: Columns that are watched at most, and the least share of a column's variance that others leave unexplained.
 MOST_WATCHED, LEAST_NEW = 8, 1e-6
@@ -96,6 +98,7 @@ class WrongPairs(NamedTuple):
 
 
 NO_PAIRS = WrongPairs(0, 0.0)
+NOTHING = read_only(np.zeros(0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,6 +133,9 @@ class LearnedThresholds:
         Pairs of wrong samples in a row that count as not measured.
     innovation : float
         Root mean square of the innovations in the observer's own deviations: one where its covariances are right.
+    deviations : FloatArray
+        ``(nf,)``: deviations of the fault estimates there, each in units of the deviation that the observer stated for
+        it in the same row; none where estimates are not watched in these units.
     """
 
     columns: tuple[str, ...]
@@ -147,6 +153,7 @@ class LearnedThresholds:
     settling: int = 0
     pairs: WrongPairs = NO_PAIRS
     innovation: float = 1.0
+    deviations: FloatArray = field(default_factory=lambda: NOTHING)
 
     @property
     def holds(self) -> bool:
@@ -160,7 +167,9 @@ class LearnedThresholds:
         text = (
             f"learned from {self.rows} rows without faults: at most one false alarm per {self.every:.6g} rows "
             f"({_duration(lasting)}) on average, in {len(self.columns)} column(s), whitened by an autoregression of "
-            f"order {model.order}; alarms less than {HOLD} rows apart count as one"
+            f"order {model.order}"
+            + (f", and in {len(self.deviations)} fault estimate(s)" if len(self.deviations) else "")
+            + f"; alarms less than {HOLD} rows apart count as one"
             + (
                 "; the level was found from the second half of these rows"
                 if is_conformal(self.rows, self.pairs.others(self.every))
@@ -209,6 +218,8 @@ class LearnedThresholds:
             "settling": self.settling,
             "pairs": {"number": self.pairs.number, "chance": self.pairs.chance},
             "innovation": self.innovation,
+            "estimates": list(self.statistics.estimates),
+            "deviations": self.deviations,
         }
 
     def save(self, path: str | Path) -> Path:
@@ -272,9 +283,12 @@ def _from_dict(data: Mapping[str, Any]) -> LearnedThresholds:
     offset, a, whitener, signatures, levels = (
         np.asarray(data[name], dtype=np.float64) for name in ("offset", "A", "whitener", "signatures", "levels")
     )
-    statistics = Statistics(Autoregression(offset, a, whitener), signatures, tuple(map(str, data["told"])))
+    told, estimates = (tuple(map(str, data[name])) for name in ("told", "estimates"))
+    statistics = Statistics(Autoregression(offset, a, whitener), signatures, told, estimates)
+    deviations = np.asarray(data["deviations"], dtype=np.float64)
     shapes = (offset.shape, a.shape[1:], whitener.shape, signatures.shape[1:], levels.shape)
-    fits = shapes == ((m,), (m, m), (m, m), (m,), (len(statistics.names),)) and len(statistics.told) == len(signatures)
+    fits = shapes == ((m,), (m, m), (m, m), (m,), (len(statistics.names),)) and len(told) == len(signatures)
+    fits = fits and deviations.shape == (len(estimates),) and bool((deviations > 0.0).all())
     if not (fits and all(np.isfinite(part).all() for part in (offset, a, whitener, signatures)) and (levels > 0).all()):
         raise ValueError("its parts do not fit together")
     for part in (offset, a, whitener, signatures):
@@ -295,6 +309,7 @@ def _from_dict(data: Mapping[str, Any]) -> LearnedThresholds:
         int(data["settling"]),
         WrongPairs(int(data["pairs"]["number"]), float(data["pairs"]["chance"])),
         float(data["innovation"]),
+        read_only(deviations),
     )
 
 
@@ -350,12 +365,16 @@ def thresholds_from_rows(
     seed: int = 0,
     pairs: WrongPairs = NO_PAIRS,
     innovation: float = 1.0,
+    deviations: FloatArray | None = None,
 ) -> LearnedThresholds:
     """Return thresholds from ``rows (n, m)`` of all that may be watched, NaN where nothing is known; ``pairs``: what
-    does not stand in them, but alarms; ``innovation``: how large innovations are in the observer's own deviations.
+    does not stand in them, but alarms; ``innovation``: how large innovations are in the observer's own deviations;
+    ``deviations (n, nf)``: those that it states of its fault estimates, where it does.
 
     Where the fault estimates remember more than the rows can tell, or nearly follow from the residuals (the gains of a
-    filter move them, and what is left is how these change with the inputs), the residuals alone are watched.
+    filter move them, and what is left is how these change with the inputs), the residuals alone are watched.  A fault
+    that the estimates follow leaves nothing in these: where the observer states deviations of the estimates, how many
+    of these each is from its mean is watched beside them.
     """
     names, known = watched_names(design), np.asarray(np.isfinite(rows).all(axis=1))
     others = pairs.others(every)
@@ -367,7 +386,13 @@ def thresholds_from_rows(
             path="normal",
         )
     faults = len(design.observer.fault_names)
-    choices = [part for part in (independent(rows[known], 0), independent(rows[known], faults)) if part]
+    conformal = is_conformal(count, others)
+    own = None
+    if deviations is not None and faults:
+        usual = np.flatnonzero(known)[: count // 2 if conformal else count]
+        own = _own_units(rows[:, :faults], deviations, usual)
+    both, residuals = independent(rows[known], 0), independent(rows[known], faults)
+    choices = [part for part in ((residuals or both,) if own is not None else (both, residuals)) if part]
     if not choices:
         raise SpecError("No monitored signal changes in these rows: there is no noise to learn from.", path="normal")
     fits = [(kept, fitted_autoregression(np.where(known[:, None], rows[:, kept], np.nan))) for kept in choices]
@@ -375,12 +400,19 @@ def thresholds_from_rows(
     kept, model = enough[0] if enough else min(fits, key=lambda fit: rows_needed(fit[1], 1.0))
     x = np.where(known[:, None], rows[:, kept], np.nan)
     told = tuple(names[i] for i in kept)
-    statistics = Statistics(model, *signatures(design, kept, np.sqrt(np.nanvar(x, axis=0))))
-    if is_conformal(count, others):
-        statistics, levels = conformal_levels(x, others, statistics)
-    else:
-        levels = learned_levels(x, others, statistics, seed)
     centres, scales = rows[known, :faults].mean(axis=0), rows[known, :faults].std(axis=0)
+    estimates = None
+    if own is not None:
+        centres, estimates = own.centres, np.where(known[:, None], own.found, np.nan)
+    statistics = Statistics(
+        model,
+        *signatures(design, kept, np.sqrt(np.nanvar(x, axis=0))),
+        estimates=() if own is None else names[:faults],
+    )
+    if conformal:
+        statistics, levels = conformal_levels(x, others, statistics, estimates)
+    else:
+        levels = learned_levels(x, others, statistics, seed, estimates)
     return LearnedThresholds(
         told,
         statistics,
@@ -393,11 +425,37 @@ def thresholds_from_rows(
         read_only(np.where(scales > 0.0, scales, 1.0)),
         gain_set_digest(design),
         levels.extrapolated,
-        tuple(name for i, name in enumerate(names) if i not in kept),
+        tuple(name for i, name in enumerate(names) if i not in kept and name not in statistics.estimates),
         settling_rows(design),
         pairs,
         innovation,
+        NOTHING if own is None else own.deviations,
     )
+
+
+class _OwnUnits(NamedTuple):
+    """Fault estimates in deviations that the observer states."""
+
+    found: FloatArray  # ``(n, nf)``, of mean 0 and deviation 1 in usual rows
+    centres: FloatArray  # ``(nf,)``, in the units of the faults
+    deviations: FloatArray  # ``(nf,)``
+
+
+def _own_units(theta: FloatArray, stated: FloatArray, usual: NDArray[np.int64]) -> _OwnUnits | None:
+    """Return fault estimates ``(n, nf)`` in units of the deviations that the observer states of each, from what they
+    are in the ``usual`` rows; `None` where these remember too much for so few rows."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        weights = 1.0 / stated
+        centres = np.sum(theta[usual] * weights[usual], axis=0) / np.sum(weights[usual], axis=0)
+        away = (theta - centres) * weights
+        deviations = away[usual].std(axis=0)
+    if not (np.isfinite(deviations).all() and (deviations > 0.0).all()):
+        return None
+    found = away / deviations
+    model = fitted_autoregression(found[usual])
+    if len(usual) < ROWS_PER_REMEMBERED * model.longest_gain:
+        return None
+    return _OwnUnits(found, read_only(centres), read_only(deviations))
 
 
 def signatures(design: ObserverDesign, kept: Sequence[int], sizes: FloatArray) -> tuple[FloatArray, tuple[str, ...]]:
@@ -512,13 +570,21 @@ class LearnedRule(Rule):
         if not counts:
             return state, Judged(math.nan, math.nan)
         # Products of numbers that overflow have passed any level.
-        with np.errstate(over="ignore", invalid="ignore"):
+        with np.errstate(all="ignore"):
             ratios = ((self._templates @ state.white.ravel()) ** 2).reshape(-1, len(AGES)).max(axis=1)
             weights = np.array([(2.0 - share) / share for share in FORGETTING])
             smooth = weights * np.sum(state.means**2, axis=1)
-            values = np.concatenate([[np.sum(state.white[-1] ** 2)], smooth, ratios]) / self.learned.levels
+            sizes = self._own_units(sample.said) ** 2
+            values = np.concatenate([[np.sum(state.white[-1] ** 2)], smooth, ratios, sizes]) / self.learned.levels
         values = np.where(np.isnan(values), np.inf, values)
         return state, Judged(float(values.max()), 1.0, self._fault(found, ratios))
+
+    def _own_units(self, said: Any) -> FloatArray:
+        """Return how far the fault estimates that are watched as they are stand from where they were, in deviations."""
+        if not len(self.learned.deviations):
+            return NOTHING
+        stated = np.sqrt(np.maximum(np.diag(said.covariance), 0.0))
+        return np.asarray((said.theta - self.learned.centres) / (stated * self.learned.deviations))
 
     def _fault(self, found: FloatArray, ratios: FloatArray) -> int | None:
         """Return the fault whose step or ramp explains most, or whose estimate is furthest from where it was."""

@@ -161,9 +161,10 @@ static REAL likelihood_ratio(const PREFIX_monitor *m, int shape)
     return largest;
 }
 
-/* Take a row: fault estimates, then residuals; `innovation`: its norm in the observer's own covariance, or
- * less than zero where the gain does not follow what is measured. */
-static void monitor_take(PREFIX_monitor *m, const REAL *shown, int deciding, REAL innovation)
+/* Take a row: fault estimates, then residuals; `deviations`: those that the observer states of the fault estimates, if
+ * it does; `innovation`: its norm in the observer's own covariance, or less than zero where the gain does not follow
+ * what is measured. */
+static void monitor_take(PREFIX_monitor *m, const REAL *shown, const REAL *deviations, int deciding, REAL innovation)
 {
     REAL x[CHANNELS];
     REAL kept[CHANNELS];
@@ -225,6 +226,11 @@ static void monitor_take(PREFIX_monitor *m, const REAL *shown, int deciding, REA
                 which = i;
             }
             ratio /= monitor_levels[0][1 + MEANS + i];
+            statistic = ratio <= statistic ? statistic : ratio;
+        }
+        for (i = 0; i < MONITOR_ESTIMATES; i++) {
+            ratio = (shown[i] - monitor_centres[0][i]) / (deviations[i] * monitor_deviations[0][i]);
+            ratio *= ratio / monitor_levels[0][1 + MEANS + SHAPES + i];
             statistic = ratio <= statistic ? statistic : ratio;
         }
         m->statistic = isnan(statistic) ? (REAL)HUGE_VAL : statistic;
