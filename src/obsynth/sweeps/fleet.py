@@ -8,13 +8,13 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from obsynth.data.run import run_on_data
+from obsynth.data.run import DataRun, run_on_data
 from obsynth.errors import ObsynthError, SpecError
 from obsynth.experiments.assumptions import file_digest
 from obsynth.files.inputs import input_file
@@ -22,7 +22,7 @@ from obsynth.methods.handing_on import require_verified
 from obsynth.methods.verifying import verify
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import load
-from obsynth.sweeps.work import WORK_STATUSES, ResultFolder, ResultTable, all_of, carried_out
+from obsynth.sweeps.work import WORK_STATUSES, ResultFolder, ResultTable, Work, all_of, carried_out
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -141,15 +141,6 @@ class Fleet(ResultTable):
         return figure
 
 
-@dataclass(frozen=True)
-class _Pair:
-    name: str
-    gains: Path
-    log: Path
-    options: Mapping[str, Any]
-    key: str
-
-
 def run_fleet(
     gains: str | Path | Sequence[str | Path],
     data: str | Path | Sequence[str | Path],
@@ -223,18 +214,16 @@ def _files(given: Any, endings: tuple[str, ...], what: str) -> list[Path]:
     return found
 
 
-def _pairs(gains: Sequence[Path], logs: Sequence[Path], options: Mapping[str, Any]) -> list[_Pair]:
+def _pairs(gains: Sequence[Path], logs: Sequence[Path], options: Mapping[str, Any]) -> list[Work]:
     names = {path: path.name.removesuffix(GAINS_ENDING).removesuffix(".json") for path in gains}
     digests = {path: hashlib.sha256(input_file(path).read_bytes()).hexdigest() for path in (*gains, *logs)}
     own = {log: log.stem for log in logs if log.stem in names.values()}
     said = json.dumps(options, sort_keys=True, default=str)
     return [
-        _Pair(
+        Work(
             f"{names[gain]} on {log.stem}",
-            gain,
-            log,
-            options,
             hashlib.sha256(f"{digests[gain]} {digests[log]} {said}".encode()).hexdigest(),
+            partial(_estimates, gain, log, **options),
         )
         for gain in gains
         for log in logs
@@ -250,16 +239,18 @@ def _verified(path: Path, digest: str, *, unverified: bool) -> ObserverDesign:
     return design
 
 
-def _run(pair: _Pair) -> tuple[FleetRun, str]:
+def _estimates(gains: Path, log: Path, *, unverified: bool = False, **options: Any) -> tuple[DataRun, str]:
+    """Return the run of a design on a log, and its estimates as CSV."""
+    stream, design = io.StringIO(), _verified(gains, file_digest(gains), unverified=bool(unverified))
+    return run_on_data(design, log, stream, **options), stream.getvalue()
+
+
+def _run(pair: Work) -> tuple[FleetRun, str]:
     """Return what a run comes to, and its estimates as CSV; errors of the package are results."""
-    stream = io.StringIO()
     try:
-        options = dict(pair.options)
-        design = _verified(pair.gains, file_digest(pair.gains), unverified=bool(options.pop("unverified", False)))
-        found = run_on_data(design, pair.log, stream, **options)
+        found, text = pair.make()
     except ObsynthError as error:
         return FleetRun(pair.name, WORK_STATUSES[error.exit_code], str(error)), ""
-    text = stream.getvalue()
     return FleetRun(pair.name, "run", "", found.rows, dict(found.statuses), dict(found.alarms), _largest(text)), text
 
 

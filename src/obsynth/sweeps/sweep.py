@@ -14,18 +14,16 @@ from typing import TYPE_CHECKING, Any, get_args
 import numpy as np
 
 from obsynth.errors import ObsynthError, SpecError
-from obsynth.methods.designing import design
 from obsynth.methods.registry import Plant
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.progress import RunsProgress, progress_of_runs
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import gain_set_bytes, load, loaded, plain
-from obsynth.spec.loader import spec_of
 from obsynth.sweeps.work import (
     WORK_STATUSES,
     ResultFolder,
     ResultTable,
-    SweepCase,
+    Work,
     all_of,
     carried_out,
     plant_cases,
@@ -232,7 +230,7 @@ def sweep(
         )
 
 
-def _cases(cases: Any, parameters: Mapping[str, Sequence[Any]], method: str | None) -> list[SweepCase]:
+def _cases(cases: Any, parameters: Mapping[str, Sequence[Any]], method: str | None) -> list[Work]:
     from obsynth.version import __version__
 
     if not isinstance(parameters, Mapping):
@@ -254,12 +252,12 @@ def _cases(cases: Any, parameters: Mapping[str, Sequence[Any]], method: str | No
     return spec_cases([Path(path) for path in paths], parameters, __version__)
 
 
-def run_case(case: SweepCase) -> SweepResult:
+def run_case(case: Work) -> SweepResult:
     """Return what a case comes to; errors of the package are results."""
     started = time.process_time()
     result = partial(SweepResult, case.name, case.parameters)
     try:
-        made = _designed(case)
+        made = case.make()
     except ObsynthError as error:
         told = error.as_dict()
         return result(
@@ -283,20 +281,6 @@ def run_case(case: SweepCase) -> SweepResult:
         content=gain_set_bytes(made),
         seconds=time.process_time() - started,
     )
-
-
-def _designed(case: SweepCase) -> ObserverDesign:
-    if case.plant is not None:
-        return design(case.plant, case.method, name=case.name, **dict(case.options))
-    if case.source is None:
-        raise SpecError(f"The case {case.name!r} has neither a spec nor a plant.", path="cases")
-    spec = spec_of(case.document, case.source, plant_changes=case.plant_changes)
-    recovery = None if spec.transformation is None else spec.transformation.recovery
-    found = design(
-        spec.plant, spec.method, name=case.name, recovery=recovery, scenario=spec.scenario, **dict(spec.options)
-    )
-    notes = () if spec.transformation is None else spec.transformation.notes
-    return found.replace(notes=(*notes, *found.notes)) if notes else found
 
 
 def _cell(value: Any) -> Any:

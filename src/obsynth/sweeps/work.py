@@ -10,6 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast
 
@@ -17,13 +18,15 @@ from obsynth.errors import SpecError
 from obsynth.files.inputs import input_file, read_json
 from obsynth.files.outputs import write_atomically
 from obsynth.files.tables import TableWriter
+from obsynth.methods.designing import design
 from obsynth.methods.registry import Plant
 from obsynth.observers.progress import as_they_come
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.validation import index_of
+from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import plain, restored
 from obsynth.spec.documents import read_yaml
-from obsynth.spec.loader import changed_document
+from obsynth.spec.loader import changed_document, spec_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -38,40 +41,47 @@ MOST_CASES = 100_000
 
 
 @dataclass(frozen=True, eq=False)
-class SweepCase:
-    """One design to be made: a spec and changes to the plant in its file, or a plant, method and options in memory."""
+class Work:
+    """A piece of work, which may be done in another process."""
 
     name: str
-    parameters: Mapping[str, Any]  # what was put in place, by name
-    key: str  # digest of all that the design depends on
-    source: Path | None = None
-    document: Mapping[str, Any] = field(default_factory=dict)
-    plant_changes: Mapping[str, Any] = field(default_factory=dict)
-    plant: Plant | None = None
-    method: str = ""
-    options: Mapping[str, Any] = field(default_factory=dict)
+    key: str  # digest of all that the result depends on
+    make: Callable[[], Any]
+    parameters: Mapping[str, Any] = field(default_factory=dict)  # what a sweep puts in place, by name
 
 
-def spec_cases(specs: Sequence[Path], parameters: Mapping[str, Sequence[Any]], version: str) -> list[SweepCase]:
-    """Return a case for each spec and each combination of values."""
-    cases: list[SweepCase] = []
+def spec_cases(specs: Sequence[Path], parameters: Mapping[str, Sequence[Any]], version: str) -> list[Work]:
+    """Return a design to be made for each spec and each combination of values."""
+    cases: list[Work] = []
     stems = [path.stem if [other.stem for other in specs].count(path.stem) == 1 else str(path) for path in specs]
     for path, stem in zip(specs, stems, strict=True):
         document = read_yaml(path)
         for chosen in _combinations(parameters, len(specs)):
             own, of_plant = _sorted_out(document, chosen)
             changed = changed_document(document, own)
-            digest = _digest(version, changed, of_plant, path)
-            cases.append(SweepCase(_named(stem, chosen), chosen, digest, path, changed, of_plant))
+            name, digest = _named(stem, chosen), _digest(version, changed, of_plant, path)
+            cases.append(Work(name, digest, partial(_design_of_spec, name, path, changed, of_plant), chosen))
     return _distinct(cases)
+
+
+def _design_of_spec(
+    name: str, path: Path, document: Mapping[str, Any], plant_changes: Mapping[str, Any]
+) -> ObserverDesign:
+    """Return the design of a spec, and of changes to the plant in the file that it refers to."""
+    spec = spec_of(document, path, plant_changes=plant_changes)
+    recovery = None if spec.transformation is None else spec.transformation.recovery
+    found = design(spec.plant, spec.method, name=name, recovery=recovery, scenario=spec.scenario, **dict(spec.options))
+    notes = () if spec.transformation is None else spec.transformation.notes
+    return found.replace(notes=(*notes, *found.notes)) if notes else found
 
 
 def plant_cases(
     plants: Mapping[str, Plant], method: str, parameters: Mapping[str, Sequence[Any]], version: str
-) -> list[SweepCase]:
-    """Return a case for each plant and each combination of values: of its fields (``plant.C``) or of options."""
-    cases: list[SweepCase] = []
-    for name, plant in plants.items():
+) -> list[Work]:
+    """Return a design to be made for each plant and each combination of values: of its fields (``plant.C``) or of
+    options."""
+    cases: list[Work] = []
+    for stem, plant in plants.items():
         for chosen in _combinations(parameters, len(plants)):
             changes = {key.removeprefix("plant."): value for key, value in chosen.items() if key.startswith("plant.")}
             options = {
@@ -84,8 +94,8 @@ def plant_cases(
             varied = _varied(plant, changes) if changes and isinstance(plant, DescriptorSystem) else plant
             written = varied.dense() if isinstance(varied, DescriptorSystem) else varied
             body = json.dumps(plain([version, method, options, written.as_dict()]), sort_keys=True)
-            digest = hashlib.sha256(body.encode()).hexdigest()
-            cases.append(SweepCase(_named(name, chosen), chosen, digest, plant=varied, method=method, options=options))
+            name, digest = _named(stem, chosen), hashlib.sha256(body.encode()).hexdigest()
+            cases.append(Work(name, digest, partial(design, varied, method, name=name, **options), chosen))
     return _distinct(cases)
 
 
@@ -171,7 +181,7 @@ def _said(value: Any) -> str:
     return text if len(text) <= 40 else f"{text[:36]} ..."
 
 
-def _distinct(cases: list[SweepCase]) -> list[SweepCase]:
+def _distinct(cases: list[Work]) -> list[Work]:
     """Return the cases without repetitions: the same design is made once."""
     return list({case.key: case for case in reversed(cases)}.values())[::-1]
 
@@ -182,7 +192,6 @@ WORK_STATUSES = {0: "designed", 2: "malformed", 3: "impossible", 4: "infeasible"
 DIGEST_DIGITS = 16
 #: Letters of its name there.
 LONGEST_STEM = 60
-_Item = TypeVar("_Item")
 _Outcome = TypeVar("_Outcome")
 _Result = TypeVar("_Result")
 
@@ -229,12 +238,12 @@ def all_of(mappings: Iterable[Mapping[str, Any]]) -> list[str]:
 
 
 def carried_out(
-    items: Sequence[_Item],
-    work: Callable[[_Item], _Outcome],
+    items: Sequence[Work],
+    work: Callable[[Work], _Outcome],
     *,
     executor: Executor | None,
-    known: Callable[[_Item], _Result | None],
-    kept: Callable[[_Item, _Outcome], _Result],
+    known: Callable[[Work], _Result | None],
+    kept: Callable[[Work, _Outcome], _Result],
     told: Callable[[int, int], object] | None,
     at_start: bool = False,
 ) -> tuple[_Result, ...]:
@@ -265,12 +274,12 @@ class ResultFolder(Generic[_Result]):
         except OSError as error:
             raise SpecError(f"{folder} cannot be used as a folder: {error.strerror}.", path=str(folder)) from error
 
-    def _file(self, item: Any, ending: str) -> Path:
+    def _file(self, item: Work, ending: str) -> Path:
         """Return a file of a piece of work: its name in letters that every file may have, and its digest."""
         stem = "".join(letter if letter.isalnum() or letter in "-_." else "-" for letter in item.name)[:LONGEST_STEM]
         return self.folder / f"{stem}-{item.key[:DIGEST_DIGITS]}{ending}"
 
-    def kept(self, item: Any, result: _Result, content: bytes | str | None) -> _Result:
+    def kept(self, item: Work, result: _Result, content: bytes | str | None) -> _Result:
         """Write what was made, then the result; return the result with the file."""
         file = write_atomically(self._file(item, self.ending), content) if content else None
         body = {name: getattr(result, name) for name in self.fields}
@@ -278,7 +287,7 @@ class ResultFolder(Generic[_Result]):
         write_atomically(self._file(item, ".result.json"), json.dumps(plain({**known, **body}), indent=1) + "\n")
         return replace(result, file=file)  # type: ignore[type-var]
 
-    def known(self, item: Any, **own: Any) -> _Result | None:
+    def known(self, item: Work, **own: Any) -> _Result | None:
         """Return a result that is there already, whole and of the same work; `None` where it is to be made again."""
         written, file = self._file(item, ".result.json"), self._file(item, self.ending)
         try:
