@@ -42,15 +42,6 @@ class SmootherGain(NamedTuple):
     unknown: FloatArray
 
 
-class JointStep(NamedTuple):
-    """A step: ``estimate (n, columns)``, square root ``factor (n, any)``, ``diffuse (n, r)``, and the way back."""
-
-    estimate: FloatArray
-    factor: FloatArray
-    diffuse: FloatArray
-    back: SmootherGain
-
-
 def joint_step(
     H: FloatArray,
     known: FloatArray,
@@ -59,8 +50,9 @@ def joint_step(
     unknown: FloatArray,
     *,
     complete: bool = True,
-) -> JointStep:
-    """Solve ``H x = right + [known noise] e + unknown d``, where known and unknown multiply the coordinates before.
+) -> tuple[Gaussian, SmootherGain]:
+    """Solve ``H x = right + [known noise] e + unknown d``, where known and unknown multiply the coordinates before;
+    return x, and the way back.
 
     Where the step is not complete, as samples are missing, the rank of H may be short.
     """
@@ -72,7 +64,9 @@ def joint_step(
     return _by_rank(H, S, known.shape[1], right, unknown) if found is None else found
 
 
-def _regular(H: FloatArray, S: FloatArray, width: int, right: FloatArray, least: float) -> JointStep | None:
+def _regular(
+    H: FloatArray, S: FloatArray, width: int, right: FloatArray, least: float
+) -> tuple[Gaussian, SmootherGain] | None:
     """Solve a step by LAPACK alone, or return ``None`` where a rank has to be decided."""
     from scipy.linalg import solve_triangular
 
@@ -91,10 +85,12 @@ def _regular(H: FloatArray, S: FloatArray, width: int, right: FloatArray, least:
     head = orthogonal[:width]
     back = SmootherGain(head[:, :m] @ white, head[:, m:rows], head[:, rows:], np.zeros((width, 0)))
     columns = right.shape[1]
-    return JointStep(solved[:, :columns], solved[:, columns:], np.zeros((n, 0)), back)
+    return Gaussian(solved[:, :columns], solved[:, columns:], np.zeros((n, 0))), back
 
 
-def _by_rank(H: FloatArray, S: FloatArray, width: int, right: FloatArray, unknown: FloatArray) -> JointStep:
+def _by_rank(
+    H: FloatArray, S: FloatArray, width: int, right: FloatArray, unknown: FloatArray
+) -> tuple[Gaussian, SmootherGain]:
     """Solve a step in which x may be undetermined, noise may be missing, and earlier directions are unknown."""
     from scipy.linalg import qr, solve_triangular
 
@@ -136,7 +132,7 @@ def _by_rank(H: FloatArray, S: FloatArray, width: int, right: FloatArray, unknow
         np.vstack((before @ compact[:, most:], solved[n:, columns:] @ compact[:, most:])),
         np.vstack((np.zeros((width, free.shape[1] - kept)), lost @ right_vectors[kept:].T)),
     )
-    return JointStep(solved[:n, :columns], triangle[:most].T, basis, back)
+    return Gaussian(solved[:n, :columns], triangle[:most].T, basis), back
 
 
 def _whitened(q2: FloatArray, S: FloatArray, right: FloatArray) -> tuple[FloatArray, FloatArray, int]:

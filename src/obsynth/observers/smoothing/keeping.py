@@ -130,17 +130,17 @@ class _ConstantLinks(_DAELinks):
         right[:nx, 1:], right[nx:, 0], right[nx:, 1:] = self.steps.part(after, "Upsilon"), y - expected, -L
         root = covariance_factor(at.R, "R") if count else np.zeros((0, 0))
         known = np.vstack((at.F @ node.factor, np.zeros((count, node.factor.shape[1]))))
-        found = joint_step(
+        found, back = joint_step(
             np.vstack((np.eye(nx), H)), known, stacked_noise(at.noise, root), right, np.zeros((nx + count, 0))
         )
         # Its way back is written about the parameters of this sample.
-        offset = found.back.offset.copy()
+        offset = back.offset.copy()
         offset[:, 0] -= offset[:, 1:] @ theta
         return Node(
             self._origin(after),
             found.factor,
             found.diffuse,
-            found.back._replace(offset=offset),
+            back._replace(offset=offset),
             self._learnt(before, after, at, node.factor),
         )
 
@@ -219,9 +219,9 @@ class _WalkingLinks(_DAELinks):
         root = covariance_factor(at.R, "R") if count else np.zeros((0, 0))
         known = np.vstack((F @ factor, np.zeros((count, factor.shape[1]))))
         rows = np.vstack((np.eye(nx + nq), np.hstack((at.H, at.L))))
-        found = joint_step(rows, known, stacked_noise(noise, root), right, np.zeros((len(rows), 0)))
+        found, back = joint_step(rows, known, stacked_noise(noise, root), right, np.zeros((len(rows), 0)))
         # The observer's own estimate, which keeps to the bounds.
-        return Node(self._posterior(after)[:, None], found.factor, found.diffuse, found.back)
+        return Node(self._posterior(after)[:, None], found.factor, found.diffuse, back)
 
 
 class _RecursiveLinks(Links):
@@ -268,8 +268,8 @@ class _RecursiveLinks(Links):
         kept = ~np.isnan(right[:, 0])
         parts = (step.H, known, step.noise, right, unknown)
         complete = bool(kept.all())
-        found = joint_step(*(parts if complete else tuple(part[kept] for part in parts)), complete=complete)
-        return Node(found.estimate, found.factor, found.diffuse, found.back)
+        found, back = joint_step(*(parts if complete else tuple(part[kept] for part in parts)), complete=complete)
+        return Node(*found, back)
 
     def _lesson(self, before: RecursiveState, after: RecursiveState, row: RawEstimate) -> Lesson | None:
         known = after.parameters
