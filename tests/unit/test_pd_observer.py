@@ -354,10 +354,10 @@ class TestCertificates:
         a = np.array([[0.0, 1.0], [-4.0, -0.4]])
         found = symmetric_certificate(a)
         assert found is not None
-        none = np.zeros((2, 1))
-        for delta, proved in ((0.999 * found.limit, True), (1.001 * found.limit, False)):
-            p1 = found.P1(delta)
-            assert prove_gains(a, none.T, none, none, p1, found.P3, delta=delta, decay=0.0).proved is proved
+        (p3, weight, limit), none = found, np.zeros((2, 1))
+        for delta, proved in ((0.999 * limit, True), (1.001 * limit, False)):
+            p1 = p3 + 0.5 * delta * weight
+            assert prove_gains(a, none.T, none, none, p1, p3, delta=delta, decay=0.0).proved is proved
         assert symmetric_certificate(-a) is None
 
     @pytest.mark.parametrize("delta", [1e-3, 0.1, 1.0, 10.0, 1e3])

@@ -377,7 +377,7 @@ class TestNumerics:
         matrix[:, 5] = 2.0 * matrix[:, 7] if exactly else matrix[:, 7] * (1.0 + 1e-15)
         factor = SparseFactor(sp.csr_array(matrix))
         assert factor.singular
-        assert set(np.argsort(-factor.null_vectors().columns)[:2]) == {5, 7}
+        assert set(np.argsort(-factor.null_vectors()[2])[:2]) == {5, 7}
 
 
 class TestRounding:

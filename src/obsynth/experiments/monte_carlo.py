@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass
+from functools import partial
 from types import MappingProxyType
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import numpy as np
 
@@ -119,38 +120,36 @@ class Evaluation:
 BATCH_SAMPLES = 100_000
 
 
-class _Task(NamedTuple):
-    """What a worker needs; plain data and arrays."""
-
-    bench: Bench
-    watched: Monitor | ParameterMonitor | None
-    warm_ups: tuple[int, int]
-    seeds: tuple[int, ...]
-    fault_names: tuple[str, ...]  # of the plant
-
-
-def _run(task: _Task) -> dict[str, FloatArray]:
-    """Return what counts of a batch of runs, one row per run; NaN for what did not happen."""
-    runs, observer = task.bench.run(task.seeds), task.bench.observer
+def _run(
+    task: tuple[Bench, tuple[int, ...]],
+    *,
+    watched: Monitor | ParameterMonitor | None,
+    warm_ups: tuple[int, int],
+    fault_names: tuple[str, ...],
+) -> dict[str, FloatArray]:
+    """Return what counts of a batch of runs on a bench, by their seeds, one row per run; NaN for what did not happen.
+    ``fault_names`` are those of the plant."""
+    bench, seeds = task
+    runs, observer = bench.run(seeds), bench.observer
     found, nx = dict[str, FloatArray](), len(observer.state_names)
     for name, rows, truth, delays, warm_up in (
-        ("states", slice(0, nx), runs.states, observer.state_delays, task.warm_ups[0]),
+        ("states", slice(0, nx), runs.states, observer.state_delays, warm_ups[0]),
         (
             "faults",
             slice(nx, nx + len(observer.fault_names)),
-            runs.faults[:, :, list(task.bench.estimated)],
+            runs.faults[:, :, list(bench.estimated)],
             observer.fault_delays,
-            task.warm_ups[1],
+            warm_ups[1],
         ),
     ):
         errors = aligned_errors(runs.rows[:, :, rows], truth, delays)[max(warm_up, *delays, 0) :]
         # A record no longer than the delays has no error to speak of.
         found[name] = np.sqrt(np.mean(errors**2, axis=0)) if len(errors) else np.full(errors.shape[1:], np.nan)
-    judged = np.full((3, len(task.seeds)), np.nan)
-    if isinstance(task.watched, Monitor):
-        judged = _judged_residuals(task.watched, task.bench, runs, task.fault_names)
-    elif task.watched is not None:
-        decided = [_judged_parameters(task.watched, task.bench, estimates) for estimates in runs.estimates]
+    judged = np.full((3, len(seeds)), np.nan)
+    if isinstance(watched, Monitor):
+        judged = _judged_residuals(watched, bench, runs, fault_names)
+    elif watched is not None:
+        decided = [_judged_parameters(watched, bench, estimates) for estimates in runs.estimates]
         judged = np.array(decided).T
     return {**found, "false": judged[0], "found": judged[1], "wrong": judged[2]}
 
@@ -214,13 +213,14 @@ def evaluate(
     states, faults = ((end or 0) if isinstance(bench.observer, LinearObserver) else 1 for end in bench.warm_ups())
     names = design.linear[0].fault_names if isinstance(bench.observer, LinearObserver) else ()
     tasks = [
-        _Task(one, monitor, (states, faults), tuple(seeds[i] for i in part[begin : begin + size]), names)
+        (one, tuple(seeds[i] for i in part[begin : begin + size]))
         for one, part in zip(benches, np.array_split(np.arange(runs), len(benches)), strict=True)
         for begin in range(0, len(part), size)
     ]
+    work = partial(_run, watched=monitor, warm_ups=(states, faults), fault_names=names)
     results, finished = [dict[str, FloatArray]() for _ in tasks], 0
     with progress_of_runs(progress) as told:
-        for i, found in as_they_come(_run, tasks, executor):
+        for i, found in as_they_come(work, tasks, executor):
             results[i], finished = found, finished + len(found["false"])
             if told is not None:
                 told(finished, runs)

@@ -7,7 +7,7 @@ holds the finite zeros, so that no generalised eigenvalue has to be recognised a
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,7 +89,7 @@ def finite_zeros(E: FloatArray, A: FloatArray, *, to_the_end: bool = True) -> Fi
         left = without_left_singular_part(right, scales)
         values = _eigenvalues(left.E, left.A)
         return FiniteZeros(values, normal_rank_of(right, left), right.decisions + left.decisions)
-    parts = _SquarePart.of(right.E, right.A)
+    parts = _square_part(right.E, right.A)
     candidates, clear = _clearly_no_zeros(parts, scales)
     if np.all(clear) and not to_the_end:
         # Full rank of the columns everywhere.
@@ -113,18 +113,14 @@ def _confirmed_zeros(found: ComplexArray, points: PencilPoints) -> ComplexArray:
     return _in_pairs(np.array([value for value in upper if value is not None], dtype=np.complex128))
 
 
-class _SquarePart(NamedTuple):
-    """A tall pencil in orthonormal bases of the range of E (``E``, ``A`` square) and beside it (``rest``)."""
+#: Square E and A of a tall pencil in an orthonormal basis of the range of E, and what is beside it.
+_SquarePart: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
 
-    E: FloatArray
-    A: FloatArray
-    rest: FloatArray
 
-    @classmethod
-    def of(cls, E: FloatArray, A: FloatArray) -> _SquarePart:
-        basis, square = np.linalg.qr(E, mode="complete")
-        turned, columns = basis.T @ A, E.shape[1]
-        return cls(square[:columns], turned[:columns], turned[columns:])
+def _square_part(E: FloatArray, A: FloatArray) -> _SquarePart:
+    basis, square = np.linalg.qr(E, mode="complete")
+    turned, columns = basis.T @ A, E.shape[1]
+    return square[:columns], turned[:columns], turned[columns:]
 
 
 def _with_missed_zeros(found: ComplexArray, candidates: ComplexArray, points: PencilPoints) -> ComplexArray:
@@ -209,7 +205,7 @@ def _conjugates(values: ComplexArray) -> NDArray[np.int64]:
 
 def _candidates(parts: _SquarePart) -> tuple[ComplexArray, NDArray[np.bool_]]:
     """Return the eigenvalues of the square part by QZ, none of them clear: its E may be nearly singular."""
-    values = _eigenvalues(parts.E, parts.A)
+    values = _eigenvalues(*parts[:2])
     return values, np.zeros(len(values), dtype=bool)
 
 

@@ -41,15 +41,6 @@ class SolutionBounds:
         return self.condition * self.backward_error
 
 
-@dataclass(frozen=True, eq=False)
-class NullVectors:
-    """What makes a matrix singular: ``rows`` and ``columns`` are the sizes of the null vectors, for naming."""
-
-    smallest: float
-    rows: FloatArray
-    columns: FloatArray
-
-
 class SparseFactor:
     """LU factors of a square sparse matrix, with rows and columns scaled by powers of two by their largest entries.
 
@@ -80,10 +71,11 @@ class SparseFactor:
             self._lu = splu(csc_array(self.matrix + ridge))
             self.exactly_singular = True
 
-    def null_vectors(self) -> NullVectors:
-        """Return an estimate of the smallest singular value of the scaled matrix, relative to its norm, and where."""
+    def null_vectors(self) -> tuple[float, FloatArray, FloatArray]:
+        """Return an estimate of the smallest singular value of the scaled matrix, relative to its norm, and where: the
+        sizes of the null vectors of the rows and columns, for naming."""
         if not self.size:
-            return NullVectors(1.0, np.zeros(0), np.zeros(0))
+            return 1.0, np.zeros(0), np.zeros(0)
         right = np.random.default_rng(1).normal(size=self.size)
         left, smallest = right, np.inf
         norm = _norm_estimate(self.matrix)
@@ -97,12 +89,12 @@ class SparseFactor:
                 break
         right = right / max(float(np.linalg.norm(right)), np.finfo(float).tiny)
         value = 0.0 if self.exactly_singular else smallest / norm
-        return NullVectors(value, np.abs(left), np.abs(right))
+        return value, np.abs(left), np.abs(right)
 
     @property
     def singular(self) -> bool:
         """Whether the matrix is singular to the tolerance of every rank."""
-        return self.exactly_singular or self.null_vectors().smallest <= RANK_TOLERANCE
+        return self.exactly_singular or self.null_vectors()[0] <= RANK_TOLERANCE
 
     @cached_property
     def condition(self) -> float:

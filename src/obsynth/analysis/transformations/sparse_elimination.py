@@ -20,7 +20,7 @@ from obsynth.numerics.pencil_points import GENERIC_POINTS
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, NAMED_SHARE, RANK_TOLERANCE
 from obsynth.numerics.scaling import power_of_two_below
 from obsynth.numerics.sparse import coarse_structure, components_of, csr, dense, selection
-from obsynth.numerics.sparse_factor import NullVectors, SolutionBounds, scales_by_all_entries, sparse_factor
+from obsynth.numerics.sparse_factor import SolutionBounds, scales_by_all_entries, sparse_factor
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.validation import listed
 
@@ -214,16 +214,15 @@ def not_index_one(
     (_, algebraic_rows, _, algebraic), _, _ = split_by_derivatives(part)
     inner = csr(algebraic_rows @ csr(part.A) @ algebraic)
     factor = sparse_factor(inner)
-    null = factor.null_vectors()
-    if not factor.exactly_singular and null.smallest > RANK_TOLERANCE:
+    smallest, left, right = factor.null_vectors()
+    if not factor.exactly_singular and smallest > RANK_TOLERANCE:
         return said or PreconditionError("", condition="index")
     generic = [sparse_factor(csr(part.A) - point * csr(part.E)) for point in GENERIC_POINTS[:2]]
     regular = any(not found.singular for found in generic)
     if regular:
-        equations, variables = _leading(algebraic_rows, algebraic, null, inner)
+        equations, variables = _leading(algebraic_rows, algebraic, left, right, inner)
     else:
-        null = generic[0].null_vectors()
-        equations, variables = _named(null.rows), _named(null.columns)
+        equations, variables = map(_named, generic[0].null_vectors()[1:])
     # As the plant was given: equations and variables that were left out count.
     variables = active.columns[variables]
     equations = own_first(active.rows[equations], variables)
@@ -248,14 +247,14 @@ def not_index_one(
     )
 
 
-def _leading(rows: Any, basis: Any, null: NullVectors, inner: Any) -> tuple[Any, Any]:
+def _leading(rows: Any, basis: Any, left: FloatArray, right: FloatArray, inner: Any) -> tuple[Any, Any]:
     """Return the equations and variables of the null vectors; by the pattern alone, where that is singular already."""
     coarse = coarse_structure(inner)
     if coarse.structural_rank < inner.shape[0]:
         over, under = np.zeros(inner.shape[0]), np.zeros(inner.shape[0])
         over[coarse.over_rows], under[coarse.under_columns] = 1.0, 1.0
         return _named(abs(rows).T @ over), _named(abs(basis) @ under)
-    return _named(abs(rows).T @ null.rows), _named(abs(basis) @ null.columns)
+    return _named(abs(rows).T @ left), _named(abs(basis) @ right)
 
 
 def _named(shares: FloatArray) -> Any:

@@ -7,7 +7,6 @@ which the factors around P3 are unit columns, P3 cancels its off-diagonal block.
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -47,21 +46,12 @@ def explicit_certificate(
     return 0.5 * (p1 + p1.T), (x / units[:, None] / units) @ inverse, delta
 
 
-@dataclass(frozen=True, eq=False)
-class SymmetricCertificate:
-    """A certificate with a symmetric P3 for an observer with L = 0, for every delta below a limit."""
+def symmetric_certificate(Az: FloatArray) -> tuple[FloatArray, FloatArray, float] | None:
+    """Return a certificate of Theorem 2 in closed form for ``Az (n, n)`` and L = 0; ``None`` when errors do not decay.
 
-    P3: FloatArray  # (n, n), positive definite: A' P3 + P3 A = -weight
-    weight: FloatArray  # (n, n), positive definite
-    limit: float  # the delta from which it does not serve; infinite where it always does
-
-    def P1(self, delta: float) -> FloatArray:
-        """Return P1 ``(n, n)`` for a delta below the limit."""
-        return self.P3 + 0.5 * delta * self.weight
-
-
-def symmetric_certificate(Az: FloatArray) -> SymmetricCertificate | None:
-    """Return a certificate of Theorem 2 in closed form for ``Az (n, n)``; ``None`` when errors do not decay."""
+    It is a symmetric P3 and a weight, both positive definite: ``A' P3 + P3 A = -weight``, and ``P3 + (delta / 2)
+    weight`` is P1 for every delta below a limit, infinite where it always serves.
+    """
     from scipy.linalg import eigvalsh
 
     if not spectral_abscissa(Az) < 0.0:
@@ -77,7 +67,7 @@ def symmetric_certificate(Az: FloatArray) -> SymmetricCertificate | None:
     # With P1 = P3 + (delta / 2) weight the lower left block is delta times S, the skew part of P3 A: it holds when
     # weight > (delta / 2) S' P3^-1 S.
     limit = 2.0 / largest if largest > 0.0 else np.inf
-    return SymmetricCertificate(p / units[:, None] / units, weight / units[:, None] / units, limit)
+    return p / units[:, None] / units, weight / units[:, None] / units, limit
 
 
 def coupled_certificate(a: FloatArray, delta: float) -> tuple[FloatArray, FloatArray]:

@@ -78,15 +78,16 @@ def _closed_form(task: PdTask, *, free_delta: bool) -> tuple[PdSolution, float]:
         raise SolverError(
             "A Riccati equation gave gains that are not stable: the result is inconclusive.", record=record
         )
-    delta = min(task.delta, DELTA_SHARE * found.limit) if free_delta else task.delta
-    if delta < found.limit:
-        p1, p3 = found.P1(delta), found.P3
+    p3, weight, limit = found
+    delta = min(task.delta, DELTA_SHARE * limit) if free_delta else task.delta
+    if delta < limit:
+        p1 = p3 + 0.5 * delta * weight
     elif task.theorem == 1:
         p1, p3 = coupled_certificate(moving, delta)
     else:
         raise SolverError(
             "The closed form serves Theorem 2 for smaller delta alone: take engine 'lmi', or leave delta out.",
-            record={**record, "delta_limit": found.limit},
+            record={**record, "delta_limit": limit},
         )
     return PdSolution(gain, np.zeros_like(gain), (0.5 * (p1 + p1.T),), p3, record), delta
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import TypeAlias
 
 import numpy as np
 
@@ -67,12 +67,9 @@ _NAME = "identifiable parameters"
 _TRACES_SOURCE = "our finding: (26) needs it, Moussa Ali, Zhang 2013"
 
 
-class _Kernel(NamedTuple):
-    """Constant parameters, in their own units, that leave no trace, and the states that hide them."""
-
-    parameters: FloatArray  # (nq,)
-    shares: FloatArray  # (nq,), free of units
-    states: tuple[str, ...]  # names
+#: Constant parameters ``(nq,)`` that leave no trace, in their own units, their shares ``(nq,)``, free of units, and the
+#: names of the states that hide them.
+_Kernel: TypeAlias = tuple[FloatArray, FloatArray, tuple[str, ...]]
 
 
 def identifiability_condition(
@@ -80,7 +77,7 @@ def identifiability_condition(
 ) -> Condition:
     """Return the condition that outputs tell the parameters from each other and from the state."""
     still = all(matrix.is_constant for matrix in (plant.E, plant.A, plant.C, plant.Phi, plant.Psi))
-    decision, kernel = _steady(plant) if still else _along(plant, early=early)
+    decision, (parameters, shares, states) = _steady(plant) if still else _along(plant, early=early)
     if still and constant is not None:
         decision = _settled_traces(constant, decision)
     wanted = "rank [A - E, Phi; C, Psi]" if still else "rank of the traces of all parameters"
@@ -89,8 +86,8 @@ def identifiability_condition(
     if decision.full:
         how = "" if still else ", in floating point along the horizon"
         return Condition(_NAME, claim, True, value, bound, _TRACES_SOURCE, f"{decision.describe()}{how}")
-    names = leading_names(kernel.shares, plant.parameter_names)
-    detail = f"{decision.describe()}: {_explained(kernel, names, plant)}"
+    names = leading_names(shares, plant.parameter_names)
+    detail = f"{decision.describe()}: {_explained(parameters, states, names, plant)}"
     found = Condition(_NAME, claim, False, value, bound, _TRACES_SOURCE, detail, signals=names)
     if constant is None or decision.means != "unclear":
         return found
@@ -108,14 +105,16 @@ def _settled_traces(judge: Evaluator, decision: RankDecision) -> RankDecision:
     return settled_rank(decision, numbers.rank_at_root(numbers.matrix("Bf"), numbers.matrix("Df"), fmpz_poly([-1, 1])))
 
 
-def _explained(kernel: _Kernel, names: tuple[str, ...], plant: TimeVaryingDescriptorSystem) -> str:
-    hidden = ", ".join(map(repr, kernel.states))
+def _explained(
+    parameters: FloatArray, states: tuple[str, ...], names: tuple[str, ...], plant: TimeVaryingDescriptorSystem
+) -> str:
+    hidden = ", ".join(map(repr, states))
     with_states = f" together with constant shifts of {hidden}" if hidden else ""
     if len(names) == 1:
         text = f"the parameter {names[0]!r} leaves no trace in the outputs"
         text += f": it cannot be distinguished from constant shifts of {hidden}" if hidden else ""
     else:
-        values = [kernel.parameters[plant.parameter_names.index(name)] for name in names]
+        values = [parameters[plant.parameter_names.index(name)] for name in names]
         size = values[int(np.argmax(np.abs(values)))]
         ratio = " : ".join(f"{value / size:.4g}" for value in values)
         text = (
@@ -181,9 +180,9 @@ def _along(plant: TimeVaryingDescriptorSystem, *, early: bool) -> tuple[RankDeci
 def _kernel_of(parameters: FloatArray, columns: FloatArray, states: tuple[str, ...]) -> _Kernel:
     """Return a kernel whose rows are given in scaled coordinates; the row with most parameters stands for its ratio."""
     if not len(parameters):
-        return _Kernel(np.zeros(len(columns)), np.zeros(len(columns)), states)
+        return np.zeros(len(columns)), np.zeros(len(columns)), states
     strongest = parameters[int(np.argmax(np.linalg.norm(parameters, axis=1)))]
-    return _Kernel(strongest * columns, np.linalg.norm(parameters, axis=0), states)
+    return strongest * columns, np.linalg.norm(parameters, axis=0), states
 
 
 def _largest(plant: TimeVaryingDescriptorSystem, steps: int, late: IntArray) -> StepBlocks:
