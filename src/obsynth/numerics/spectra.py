@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.norms import balanced_realisation, output_covariance
+from obsynth.numerics.scaling import balanced_matrix
 
 #: Wanted poles closer than this, relative to their size, are compared as a group: rounding scatters a multiple
 #: eigenvalue by a root of the unit roundoff, but hardly moves the mean of the group.
@@ -21,6 +22,8 @@ PRINTED_DIGITS, DOUBLE_DIGITS = 9, 17
 #: Powers of ten that are doubles, and whole numbers up to which every one is.
 EXACT_POWERS = np.array([float(10**power) for power in range(23)])
 LARGEST_WHOLE = 2**53
+#: Computed eigenvalues are those of a matrix that is another by this, times its order and the unit roundoff, at most.
+ROUNDING_OF_EIGENVALUES = 10.0
 
 
 def eigenvalues(matrix: FloatArray) -> ComplexArray:
@@ -37,7 +40,12 @@ def spectrum_error(matrix: FloatArray, wanted: Sequence[complex] | ComplexArray,
     goal = np.asarray(wanted, dtype=np.complex128)
     if matrix.shape[0] != goal.size or not np.all(np.isfinite(matrix)):
         return float("inf")
-    groups = _groups(eigenvalues(matrix), goal, dt)
+    return mean_miss(eigenvalues(matrix), goal, dt)
+
+
+def mean_miss(found: Sequence[complex] | ComplexArray, wanted: Sequence[complex] | ComplexArray, dt: float) -> float:
+    """Return `spectrum_error` of a matrix that has these n eigenvalues."""
+    groups = _groups(*(np.asarray(given, dtype=np.complex128) for given in (found, wanted)), dt)
     return max((abs(complex(np.mean(misses))) for misses in groups), default=0.0)
 
 
@@ -61,12 +69,14 @@ def _groups(found: ComplexArray, goal: ComplexArray, dt: float) -> list[ComplexA
     assigned = np.empty_like(goal)
     assigned[columns] = found[rows]
     largest = float(np.max(np.abs(goal))) or 1.0
-    groups, waiting = [], list(range(goal.size))
-    while waiting:
-        first = goal[waiting[0]]
+    groups, waiting = [], np.arange(goal.size)
+    while waiting.size:
+        first = complex(goal[waiting[0]])
         reach = SAME_POLE * (1.0 if dt > 0.0 else abs(first))
-        group = [i for i in waiting if abs(goal[i] - first) <= reach] or [waiting[0]]
-        waiting = [i for i in waiting if i not in group]
+        same = np.abs(goal[waiting] - first) <= reach
+        # Itself, where it is no number.
+        same[0] = True
+        group, waiting = waiting[same], waiting[~same]
         # A pole at zero is compared with the others.
         size = 1.0 if dt > 0.0 else max(abs(first), SAME_POLE * largest)
         groups.append(np.asarray((assigned[group] - goal[group]) / size))
@@ -116,9 +126,29 @@ def _printed(values: FloatArray, digits: int) -> tuple[FloatArray, NDArray[np.bo
 
 def digits_needed(matrix: FloatArray, dt: float) -> int:
     """Return the least number of significant digits with which, and with more than which, a matrix is stable."""
-    bound, all_digits = 1.0 if dt > 0.0 else 0.0, range(DOUBLE_DIGITS - 1, 0, -1)
-    unstable = (digits for digits in all_digits if not abscissa(as_printed(matrix, digits), dt) < bound)
+    bound, doubtful = 1.0 if dt > 0.0 else 0.0, range(_digits_beyond_doubt(matrix, dt) - 1, 0, -1)
+    unstable = (digits for digits in doubtful if not abscissa(as_printed(matrix, digits), dt) < bound)
     return next(unstable, 0) + 1
+
+
+def _digits_beyond_doubt(matrix: FloatArray, dt: float) -> int:
+    """Return a number of digits with which, and with more than which, a matrix is stable by the theorem of Bauer and
+    Fike: rounding moves no eigenvalue by more than its norm times the condition of the eigenvectors."""
+    if not matrix.size or not np.all(np.isfinite(matrix)):
+        return DOUBLE_DIGITS
+    balanced, _ = balanced_matrix(matrix)
+    values, vectors = np.linalg.eig(balanced)
+    with np.errstate(all="ignore"):
+        try:
+            condition = float(np.linalg.norm(vectors) * np.linalg.norm(np.linalg.inv(vectors)))
+        except np.linalg.LinAlgError:
+            return DOUBLE_DIGITS
+        size = condition * float(np.linalg.norm(balanced))
+    margin = float(1.0 - np.max(np.abs(values)) if dt > 0.0 else -np.max(values.real))
+    margin -= size * ROUNDING_OF_EIGENVALUES * len(matrix) * np.finfo(np.float64).eps
+    # Rounding to d digits changes an entry by half a unit of the d-th.
+    digits = (digits for digits in range(1, DOUBLE_DIGITS) if size * 0.5 * 10.0 ** (1 - digits) < margin)
+    return next(digits, DOUBLE_DIGITS)
 
 
 def decay_rates(values: ComplexArray | Sequence[complex], dt: float) -> FloatArray:

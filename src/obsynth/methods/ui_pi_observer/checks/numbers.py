@@ -17,6 +17,7 @@ from obsynth.numerics.spectra import (
     digits_needed,
     eigenvalues,
     farthest_pole,
+    mean_miss,
     spectrum_error,
 )
 from obsynth.observers.linear.observer import LinearObserver
@@ -83,10 +84,11 @@ def _digits_rows(ahat: FloatArray, dt: float, poles: list[complex], claims: Mapp
 
 def _missed(a: FloatArray, claimed: list[complex], dt: float) -> float:
     """Return by how much the claimed poles are missed, groups by their means; more digits tell ill-conditioned ones."""
-    missed = farthest_pole(eigenvalues(a), claimed, dt)
+    values = eigenvalues(a)
+    missed = farthest_pole(values, claimed, dt)
     if missed > SPECTRUM_TOLERANCE and len(claimed) == len(a) and (enclosed := enclosed_eigenvalues(a)) is not None:
         return farthest_pole([middle_of(ball) for ball in enclosed], claimed, dt)
-    return missed if missed > SPECTRUM_TOLERANCE else spectrum_error(a, claimed, dt)
+    return missed if missed > SPECTRUM_TOLERANCE else mean_miss(values, claimed, dt)
 
 
 def noise_rows(design: ObserverDesign) -> Iterator[Check]:
