@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -140,7 +140,7 @@ def invariant_zeros(
 ) -> tuple[Zero, ...]:
     """Return the finite zeros of ``[A - z E, B; C, D]`` with multiplicity, each with its direction."""
     wide_e, wide_a = system_pencil(E, A, B, C, D)
-    return _with_directions(wide_e, wide_a, system_zeros(wide_e, wide_a, nx=E.shape[0]), nx=E.shape[0])
+    return zeros_with_directions(wide_e, wide_a, system_zeros(wide_e, wide_a, nx=E.shape[0]), nx=E.shape[0])
 
 
 def fault_zeros(plant: DescriptorSystem) -> tuple[tuple[Zero, ...], tuple[Zero, ...]]:
@@ -176,7 +176,7 @@ def zeros_of_system(
     """Return what `finite_zeros` says of ``[A - z E, B; C, D]``, the zeros, and those not strictly stable."""
     e, a = system_pencil(E, A, B, C, D)
     found = system_zeros(e, a, nx=E.shape[0])
-    zeros = _with_directions(e, a, found, nx=E.shape[0])
+    zeros = zeros_with_directions(e, a, found, nx=E.shape[0])
     outside = tuple(zero for zero, out in zip(zeros, are_outside(e, a, found, dt), strict=True) if out)
     return found, zeros, outside
 
@@ -207,10 +207,15 @@ def _reaches_boundary(pencil: PencilPoints | EquilibratedPencil, value: complex,
     return True
 
 
-def _with_directions(E: FloatArray, A: FloatArray, found: FiniteZeros, *, nx: int) -> tuple[Zero, ...]:
+def zeros_with_directions(
+    E: FloatArray, A: FloatArray, found: FiniteZeros, *, nx: int, wanted: Callable[[complex], bool] = lambda _: True
+) -> tuple[Zero, ...]:
+    """Return zeros of the system pencil ``A - z E`` with their directions: all, or the wanted ones; of a pair both."""
     values = [complex(value) for value in found.values]
     zeros: list[Zero] = []
     for i, value in enumerate(values):
+        if not wanted(value):
+            continue
         if value.imag < 0.0:
             # Pairs follow each other and are exact.
             state, driving = (_frozen(part.conj()) for part in (zeros[-1].state_direction, zeros[-1].input_direction))

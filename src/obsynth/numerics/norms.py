@@ -62,15 +62,29 @@ def response(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, points:
     """Return ``C (s I - A)^-1 B + D`` at each point s (z in discrete time), ``(len(points), rows, cols)``."""
     if a.shape[0] == 0:
         return np.broadcast_to(d.astype(complex), (len(points), *d.shape)).copy()
-    parts = [c @ states for states in resolved(np.eye(a.shape[0]), a, b, points)]
+    parts = [c @ states for states in resolved(None, a, b, points)]
     return np.asarray(np.concatenate(parts) + d) if parts else np.zeros((0, *d.shape), dtype=complex)
 
 
-def resolved(e: FloatArray, a: FloatArray, b: FloatArray, points: ComplexArray) -> Iterator[ComplexArray]:
+def pencils_at(e: FloatArray | None, a: FloatArray, points: ComplexArray) -> ComplexArray:
+    """Return ``s E - A`` at points, ``(count, n, m)``; E is the identity where it is not given."""
+    found = np.empty((len(points), *a.shape), dtype=np.complex128)
+    if e is not None:
+        found[:] = np.ascontiguousarray(e)
+        found *= points[:, None, None]
+        found -= np.ascontiguousarray(a)
+        return found
+    found[:] = -a
+    diagonal = np.arange(len(a))
+    found[:, diagonal, diagonal] += points[:, None]
+    return found
+
+
+def resolved(e: FloatArray | None, a: FloatArray, b: FloatArray, points: ComplexArray) -> Iterator[ComplexArray]:
     """Yield ``(s E - A)^-1 B`` at the points, as many at once as take little memory, ``(count, n, m)`` each."""
     at_once = max(1, MOST_ENTRIES_AT_ONCE // max(a.size, 1))
     for start in range(0, len(points), at_once):
-        pencils = np.asarray(points)[start : start + at_once, None, None] * e - a
+        pencils = pencils_at(e, a, np.asarray(points)[start : start + at_once])
         yield np.asarray(np.linalg.solve(pencils, np.broadcast_to(b.astype(complex), (len(pencils), *b.shape))))
 
 

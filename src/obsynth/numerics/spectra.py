@@ -44,8 +44,11 @@ def spectrum_error(matrix: FloatArray, wanted: Sequence[complex] | ComplexArray,
 
 
 def mean_miss(found: Sequence[complex] | ComplexArray, wanted: Sequence[complex] | ComplexArray, dt: float) -> float:
-    """Return `spectrum_error` of a matrix that has these n eigenvalues."""
-    groups = _groups(*(np.asarray(given, dtype=np.complex128) for given in (found, wanted)), dt)
+    """Return `spectrum_error` of a matrix that has these eigenvalues."""
+    values, goal = (np.asarray(given, dtype=np.complex128) for given in (found, wanted))
+    if values.size != goal.size:
+        return float("inf")
+    groups = _groups(values, goal, dt)
     return max((abs(complex(np.mean(misses))) for misses in groups), default=0.0)
 
 
@@ -85,11 +88,13 @@ def _groups(found: ComplexArray, goal: ComplexArray, dt: float) -> list[ComplexA
 
 def abscissa(matrix: FloatArray, dt: float) -> float:
     """Return the largest real part (``dt == 0``) or modulus of an eigenvalue; the empty matrix is stable."""
-    if matrix.shape[0] == 0:
+    return abscissa_of(eigenvalues(matrix), dt) if np.all(np.isfinite(matrix)) else np.inf
+
+
+def abscissa_of(values: ComplexArray, dt: float) -> float:
+    """Return the largest real part (``dt == 0``) or modulus of some eigenvalues."""
+    if not values.size:
         return 0.0 if dt > 0.0 else -np.inf
-    if not np.all(np.isfinite(matrix)):
-        return np.inf
-    values = eigenvalues(matrix)
     return float(np.max(np.abs(values))) if dt > 0.0 else float(np.max(values.real))
 
 

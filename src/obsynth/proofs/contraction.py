@@ -98,7 +98,8 @@ def prove_contraction(matrix: FloatArray | Ball, *, discrete: bool, rate: float 
     """Return a proved contraction of ``matrix (n, n)`` (with ``rate``, at that), or ``None`` where none is found."""
     ball = Ball.of(matrix)
     if rate is not None and ball.midpoint.size:
-        return _tried(ball, rate, discrete=discrete) if ball.is_finite else None
+        # Only the rate matters, not how tight the norm is: any factor that proves it will do, the quickest first.
+        return _tried(ball, rate, discrete=discrete, sums_first=False) if ball.is_finite else None
     return next(proved_contractions(ball, discrete=discrete), None)
 
 
@@ -115,7 +116,9 @@ def proved_contractions(matrix: FloatArray | Ball, *, discrete: bool) -> Iterato
     if not (bound < 1.0 if discrete else bound > 0.0):
         return
     for share in TRIED_RATES:
-        found = _tried(ball, bound + share * (1.0 - bound) if discrete else (1.0 - share) * bound, discrete=discrete)
+        tried = bound + share * (1.0 - bound) if discrete else (1.0 - share) * bound
+        # Sums of squares lose no digits to the slowest mode; with many states they take too long.
+        found = _tried(ball, tried, discrete=discrete, sums_first=len(a) <= MOST_STATES_FOR_SUMS)
         if found is not None:
             yield found
 
@@ -136,10 +139,9 @@ def proved_rate(matrix: FloatArray | Ball, known: Contraction | None = None) -> 
     return None if found is None else found.rate
 
 
-def _tried(ball: Ball, rate: float, *, discrete: bool) -> Contraction | None:
-    # Sums of squares lose no digits to the slowest mode; with many states they take too long.
+def _tried(ball: Ball, rate: float, *, discrete: bool, sums_first: bool) -> Contraction | None:
     ways = (_summed_factor, _lyapunov_factor)
-    for way in ways if len(ball.midpoint) <= MOST_STATES_FOR_SUMS else ways[::-1]:
+    for way in ways if sums_first else ways[::-1]:
         factor = way(ball.midpoint, rate, discrete=discrete)
         found = None if factor is None else _proved(ball, factor, rate, discrete=discrete)
         if found is not None:

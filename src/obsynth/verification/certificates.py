@@ -18,6 +18,7 @@ import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.spectra import decay_rates, eigenvalues
+from obsynth.observers.linear.derived import poles_of
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.contraction import prove_contraction
@@ -137,9 +138,10 @@ def proof_row(name: str, claim: str, proof: DefinitenessProof, source: str) -> C
     return Check(name, claim, bound, 0.0, bound, proof.proved, source, "proved", proof.text)
 
 
-def decay_row(a: FloatArray, dt: float, claimed: float) -> Check:
+def decay_row(observer: LinearObserver, claimed: float) -> Check:
     """Return the row on a claimed decay (1/s): proved for all but `RATE_TOLERANCE` of it, whatever poles there are."""
-    slowest = float(np.min(decay_rates(eigenvalues(a), dt), initial=np.inf))
+    a, dt = observer.Az, observer.dt
+    slowest = float(np.min(decay_rates(poles_of(observer), dt), initial=np.inf))
     wanted = claimed - RATE_TOLERANCE * abs(claimed)
     source, passed = "recomputed eigenvalues", bool(slowest >= wanted)
     status: CheckKind = "computed"

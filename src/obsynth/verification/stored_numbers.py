@@ -12,10 +12,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from obsynth.numerics.arrays import SMALLEST, ComplexArray, FloatArray, remembered
-from obsynth.numerics.norms import MOST_ENTRIES_AT_ONCE, resolved
+from obsynth.numerics.norms import MOST_ENTRIES_AT_ONCE, pencils_at, resolved
 from obsynth.numerics.pencils import pencil_structure
 from obsynth.numerics.ranks import BOUNDARY_TOLERANCE
 from obsynth.numerics.spectra import boundary_points
+from obsynth.observers.linear.derived import poles_of
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.proofs.balls import rounded_up
 from obsynth.proofs.contraction import proved_contractions
@@ -174,25 +175,21 @@ def _gain_rows(design: ObserverDesign, model: ErrorModel, gamma: float | None) -
         return
     system = _Composite(model)
     unit = 1.0 if plant.dt > 0.0 else system.fastest
-    few = plant.nx + observer.order <= MANY_JOINT_STATES
-    points = CLAIM_POINTS if few else FEWER_POINTS
-    frequencies = unit * np.geomspace(SLOWEST_CLAIMED, np.pi if plant.dt > 0.0 else 10.0, points)
-    angles = system.boundary_angles(unit)
-    if few:
-        frequencies = np.concatenate([frequencies, _around(angles[angles > SLOWEST_CLAIMED * unit], unit, plant.dt)])
-    gains = system.gains(frequencies)
-    worst = int(np.argmax(gains))
     level = NOTICED if gamma is None else float(gamma) * (1.0 + GAIN_TOLERANCE)
-    beyond = frequencies[gains > level]
-    nearest = np.min(np.abs(beyond[:, None] - angles[None, :]), axis=1, initial=np.inf) / unit
+    if gamma is None and system.is_plant_stable:
+        # How large the gain is matters to nothing then.
+        frequencies = gains = nearest = np.zeros(0)
+    else:
+        frequencies, gains, nearest = system.swept(unit, level)
     verdict, seconds = _when_it_matters(system, level, unit, float(np.max(nearest, initial=0.0)))
     if gamma is not None:
+        worst = int(np.argmax(gains))
         text = (
             f"gain d -> fault error of the plant and the stored observer, from {SLOWEST_CLAIMED:.0e} rad per sample up"
         )
         detail = f"largest of {len(frequencies)} frequencies at {frequencies[worst]:.2g} rad per sample; {verdict}"
         drifting = np.isfinite(seconds) and np.all(nearest <= MOST_DISTANCE)
-        if beyond.size and drifting and model.rounding() <= IDENTITY_ROUNDING:
+        if nearest.size and drifting and model.rounding() <= IDENTITY_ROUNDING:
             # Nobody could store better numbers: no finite gain exists, and what can be said is for how long it holds.
             yield information(
                 "gain with stored numbers",
@@ -241,7 +238,7 @@ class _Composite:
         self.shown = observer.Cz[rows]
         values = pencil_structure(plant.E, plant.A).finite_eigenvalues
         self.poles: ComplexArray = np.asarray(values, dtype=np.complex128)
-        own = np.abs(np.linalg.eigvals(observer.Az)) if observer.order else np.ones(1)
+        own = np.abs(poles_of(observer)) if observer.order else np.ones(1)
         self.fastest = float(max(np.max(own, initial=0.0), np.finfo(np.float64).tiny))
 
     def boundary_angles(self, unit: float) -> FloatArray:
@@ -252,6 +249,32 @@ class _Composite:
         # Scattered multiple poles have angles next to each other.
         kept = [angle for i, angle in enumerate(angles) if not i or angle - angles[i - 1] > APART * unit]
         return np.asarray(kept[:MOST_ANGLES], dtype=np.float64)
+
+    @property
+    def is_plant_stable(self) -> bool:
+        """Whether no pole of the plant is on the boundary of stability, as far as can be told, or outside."""
+        return not self.poles.size or bool(np.all(self.distances < -BOUNDARY_TOLERANCE))
+
+    @property
+    def distances(self) -> FloatArray:
+        """How far the plant's poles are outside the region of stability, relative to the largest in continuous time."""
+        size = max(float(np.max(np.abs(self.poles), initial=0.0)), np.finfo(np.float64).tiny)
+        return np.asarray(np.abs(self.poles) - 1.0 if self.plant.dt > 0.0 else self.poles.real / size)
+
+    def swept(self, unit: float, level: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return frequencies, the gains there, and for those above a level how far the next pole on the boundary is."""
+        discrete = self.plant.dt > 0.0
+        few = self.plant.nx + self.observer.order <= MANY_JOINT_STATES
+        points = CLAIM_POINTS if few else FEWER_POINTS
+        frequencies = unit * np.geomspace(SLOWEST_CLAIMED, np.pi if discrete else 10.0, points)
+        angles = self.boundary_angles(unit)
+        if few:
+            around = _around(angles[angles > SLOWEST_CLAIMED * unit], unit, self.plant.dt)
+            frequencies = np.concatenate([frequencies, around])
+        gains = self.gains(frequencies)
+        beyond = frequencies[gains > level]
+        nearest = np.min(np.abs(beyond[:, None] - angles[None, :]), axis=1, initial=np.inf) / unit
+        return frequencies, gains, np.asarray(nearest)
 
     def gains(self, frequencies: FloatArray) -> FloatArray:
         """Return the largest singular values at frequencies (rad per sample, or rad/s), a few of them at once."""
@@ -273,12 +296,12 @@ class _Composite:
 
     def _gains_at(self, points: ComplexArray) -> FloatArray:
         # From the left, where the rows of fault errors are fewer than the disturbances.
-        left = np.concatenate([*resolved(np.eye(self.observer.order), self.observer.Az.T, self.shown.T, points)])
+        left = np.concatenate([*resolved(None, self.observer.Az.T, self.shown.T, points)])
         left = left.transpose(0, 2, 1)
         ages = np.split(left @ self.K + self.J, self.lags, axis=2)
         seen = sum(part * points[:, None, None] ** -age for age, part in enumerate(ages))
         through = np.linalg.solve(
-            points[:, None, None] * self.plant.E.T - self.plant.A.T, np.asarray(seen).transpose(0, 2, 1)
+            pencils_at(self.plant.E.T, self.plant.A.T, points), np.asarray(seen).transpose(0, 2, 1)
         )
         whole = through.transpose(0, 2, 1) @ self.plant.Bd + left @ self.driven + self.direct
         finite = np.all(np.isfinite(whole), axis=(1, 2))
@@ -292,11 +315,9 @@ def _when_it_matters(system: _Composite, level: float, unit: float, beyond: floa
     """
     dt, poles = system.plant.dt, system.poles
     per_unit = dt if dt > 0.0 else 1.0 / unit
-    size = max(float(np.max(np.abs(poles), initial=0.0)), np.finfo(np.float64).tiny)
-    distance = np.abs(poles) - 1.0 if dt > 0.0 else poles.real / size
-    outside = distance > BOUNDARY_TOLERANCE
+    outside = system.distances > BOUNDARY_TOLERANCE
     seconds = per_unit / beyond if beyond > 0.0 else np.inf
-    if not poles.size or np.all(distance < -BOUNDARY_TOLERANCE):
+    if system.is_plant_stable:
         return "the plant is stable: a finite gain exists", np.inf
     if outside.any():
         rate = float(np.max(np.log(np.abs(poles[outside])) / dt if dt > 0.0 else poles[outside].real))

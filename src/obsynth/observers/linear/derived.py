@@ -13,10 +13,26 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import is_finite_number, require_kind
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import ComplexArray, FloatArray, remembered
 from obsynth.numerics.continuous import first_order_hold
 from obsynth.numerics.spectra import abscissa, eigenvalues, speeds
 from obsynth.observers.linear.observer import LinearObserver
+
+
+@remembered
+def poles_of(observer: LinearObserver) -> ComplexArray:
+    """Return the eigenvalues of a shipped ``Az``."""
+    found = eigenvalues(observer.Az)
+    found.setflags(write=False)
+    return found
+
+
+def is_stable(observer: LinearObserver) -> bool:
+    """Whether computed poles lie strictly inside the region of stability."""
+    if not np.all(np.isfinite(observer.Az)):
+        return False
+    poles = poles_of(observer)
+    return bool(np.all(np.abs(poles) < 1.0) if observer.dt > 0.0 else np.all(poles.real < 0.0))
 
 
 def sample_observer(observer: LinearObserver, dt: float) -> LinearObserver:
@@ -190,7 +206,7 @@ GRID_REACH = 30.0
 
 def frequency_grid(observer: LinearObserver) -> FloatArray:
     """Return frequencies in rad/s around the poles of an observer, zero included; up to pi/dt in discrete time."""
-    found = speeds(eigenvalues(observer.Az), observer.dt) if observer.order else np.ones(1)
+    found = speeds(poles_of(observer), observer.dt) if observer.order else np.ones(1)
     alive = found[np.isfinite(found) & (found > 0.0)]
     low = float(np.min(alive, initial=1.0 if not alive.size else np.inf)) / GRID_REACH
     high = float(np.max(alive, initial=1.0 if not alive.size else 0.0)) * GRID_REACH

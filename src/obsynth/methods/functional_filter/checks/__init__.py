@@ -268,7 +268,7 @@ def _tracking(
 
 
 def _claimed(design: ObserverDesign) -> Iterator[Check]:
-    (plant, observer), claims = design.linear, design.certificate.claims
+    (_, observer), claims = design.linear, design.certificate.claims
     order = claims.get("order", float("nan"))
     yield upper_bound_check(
         "order",
@@ -280,4 +280,4 @@ def _claimed(design: ObserverDesign) -> Iterator[Check]:
         detail=f"{observer.order} states",
     )
     if "decay" in claims:
-        yield decay_row(observer.Az, plant.dt, claims["decay"])
+        yield decay_row(observer, claims["decay"])

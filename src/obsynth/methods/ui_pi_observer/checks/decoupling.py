@@ -17,6 +17,7 @@ from obsynth.analysis.plant_units import PlantUnits
 from obsynth.methods.ui_pi_observer.pencils import equilibrated
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.lapack import LAPACK_BLOCK
+from obsynth.numerics.norms import pencils_at
 from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.numerics.scaling import balancing_factors
 from obsynth.numerics.spectra import boundary_points
@@ -97,8 +98,8 @@ def trajectories_of(
     """Return, for each group of unknown inputs, trajectories ``(nx + inputs, count)`` at each point, of unit norm."""
     found: list[list[ComplexArray]] = [[] for _ in groups]
     for some in _parts(points, plant.nx + plant.nd):
-        at = points[some, None, None]
-        pencils = np.concatenate([at * plant.E - plant.A, np.broadcast_to(-plant.Bd, (len(at), *plant.Bd.shape))], 2)
+        none = np.zeros_like(plant.Bd)
+        pencils = pencils_at(np.hstack([plant.E, none]), np.hstack([plant.A, plant.Bd]), points[some])
         whole, columns, sure = _null_spaces(pencils)
         for bases, inputs in zip(found, groups, strict=True):
             own = [*range(plant.nx), *(plant.nx + np.array(inputs, dtype=np.intp))]
@@ -201,7 +202,7 @@ class _Shipped:
 
     def at(self, plant: DescriptorSystem, points: ComplexArray) -> _Passing:
         """Return what passes at some points."""
-        resolvents = _inverses(points[:, None, None] * np.eye(len(self.Az)) - self.Az)
+        resolvents = _inverses(pencils_at(None, self.Az, points))
         passed = np.abs(self.Cz) @ (np.abs(resolvents) @ self.formed) + self.direct
         return _Passing(self, plant, self.Cz @ (resolvents @ self.By) + self.Dy, passed)
 

@@ -14,15 +14,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.analysis.plant_units import PlantUnits
-from obsynth.analysis.zeros import invariant_zeros, is_outside, leading_names, system_pencil
+from obsynth.analysis.zeros import is_outside, leading_names, system_pencil, system_zeros, zeros_with_directions
 from obsynth.errors import SpecError
 from obsynth.methods.ui_pi_observer.pencils import number
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.norms import balanced_realisation, response
-from obsynth.numerics.pencils import finite_zeros
 from obsynth.numerics.ranks import NEGLIGIBLE_INPUT
-from obsynth.numerics.spectra import abscissa, boundary_points, decay_rates, eigenvalues
-from obsynth.observers.linear.derived import frequency_grid
+from obsynth.numerics.spectra import boundary_points, decay_rates
+from obsynth.observers.linear.derived import frequency_grid, is_stable, poles_of
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.fault_models import balanced_transition
@@ -118,7 +117,7 @@ def tracking_rows(
 ) -> Iterator[Check]:
     """Yield what a user should know about faults outside the model; nothing here fails."""
     source = "recomputed from plant and realisation"
-    if not abscissa(observer.Az, observer.dt) < (1.0 if observer.dt > 0.0 else 0.0):
+    if not is_stable(observer):
         return
     frequencies = frequency_grid(observer)
     gains = _transfer(plant, observer, tracking, boundary_points(frequencies, plant.dt))
@@ -153,12 +152,17 @@ def _limits(plant: DescriptorSystem, observer: LinearObserver, tracking: FloatAr
     scaled = units.scaled_plant(plant)
     inputs, direct = np.hstack([scaled.Bf, scaled.Bd]), np.hstack([scaled.Df, scaled.Dd])
     padded, whole = system_pencil(scaled.E, scaled.A, inputs, scaled.C, direct)
-    if plant.nf == 0 or finite_zeros(padded, whole).normal_rank < whole.shape[1]:
+    if plant.nf == 0:
         return
-    slowest = float(np.min(decay_rates(eigenvalues(observer.Az), plant.dt), initial=np.inf))
-    for zero in invariant_zeros(scaled.E, scaled.A, inputs, scaled.C, direct):
-        if zero.value.imag < 0.0 or not is_outside(zero.value, plant.dt):
-            continue
+    found = system_zeros(padded, whole, nx=scaled.nx)
+    if found.normal_rank < whole.shape[1]:
+        return
+    slowest = float(np.min(decay_rates(poles_of(observer), plant.dt), initial=np.inf))
+
+    def outside(value: complex) -> bool:
+        return value.imag >= 0.0 and is_outside(value, plant.dt)
+
+    for zero in zeros_with_directions(padded, whole, found, nx=scaled.nx, wanted=outside):
         if float(np.linalg.norm(zero.input_direction[: plant.nf])) <= NEGLIGIBLE_INPUT:
             continue
         fault, place = units.faults * zero.input_direction[: plant.nf], units.eigenvalue(zero.value)

@@ -12,14 +12,14 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.spectra import (
     DOUBLE_DIGITS,
     PRINTED_DIGITS,
-    abscissa,
+    abscissa_of,
     as_printed,
     digits_needed,
     eigenvalues,
     farthest_pole,
     mean_miss,
-    spectrum_error,
 )
+from obsynth.observers.linear.derived import poles_of
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.fault_models import Exosystem
@@ -48,13 +48,13 @@ def stability_rows(design: ObserverDesign, poles: FloatArray, factor: FloatArray
     yield upper_bound_check(
         "poles",
         "the eigenvalues of Ahat are the claimed ones, each within this share of its size",
-        _missed(observer.Az, claimed, dt),
+        _missed(observer, claimed),
         SPECTRUM_TOLERANCE,
         source="Share Pasand, procedure 1, step 7",
         detail="slowest " + ", ".join(slowest) if slowest else "none",
     )
     if "decay" in claims:
-        yield decay_row(observer.Az, dt, claims["decay"])
+        yield decay_row(observer, claims["decay"])
     yield from _digits_rows(observer.Az, dt, claimed, claims)
 
 
@@ -63,7 +63,8 @@ def _digits_rows(ahat: FloatArray, dt: float, poles: list[complex], claims: Mapp
     wanted = claims.get("digits", PRINTED_DIGITS)
     digits = int(wanted) if 1 <= wanted <= DOUBLE_DIGITS else 1
     rounded = as_printed(ahat, digits)
-    found, bound = abscissa(rounded, dt), 1.0 if dt > 0.0 else 0.0
+    values, bound = eigenvalues(rounded), 1.0 if dt > 0.0 else 0.0
+    found = abscissa_of(values, dt)
     yield Check(
         "stable with the claimed digits" if "digits" in claims else f"stable with {PRINTED_DIGITS} digits",
         f"Ahat rounded to {digits} significant digits is still stable (strictly below the bound)",
@@ -78,13 +79,13 @@ def _digits_rows(ahat: FloatArray, dt: float, poles: list[complex], claims: Mapp
         "significant digits of Ahat with which every mode stays stable",
         float(digits_needed(ahat, dt)),
         source="recomputed eigenvalues",
-        detail=f"with {digits} digits poles move by {spectrum_error(rounded, poles, dt):.1e} of their size",
+        detail=f"with {digits} digits poles move by {mean_miss(values, poles, dt):.1e} of their size",
     )
 
 
-def _missed(a: FloatArray, claimed: list[complex], dt: float) -> float:
+def _missed(observer: LinearObserver, claimed: list[complex]) -> float:
     """Return by how much the claimed poles are missed, groups by their means; more digits tell ill-conditioned ones."""
-    values = eigenvalues(a)
+    a, dt, values = observer.Az, observer.dt, poles_of(observer)
     missed = farthest_pole(values, claimed, dt)
     if missed > SPECTRUM_TOLERANCE and len(claimed) == len(a) and (enclosed := enclosed_eigenvalues(a)) is not None:
         return farthest_pole([middle_of(ball) for ball in enclosed], claimed, dt)
