@@ -17,7 +17,6 @@ import numpy as np
 from obsynth.analysis.existence.witnesses import (
     EntryChange,
     Rational,
-    Unclear,
     Witness,
     as_array,
     nearest,
@@ -323,19 +322,3 @@ def _owned(name: Cell, height: int, columns: Sequence[int]) -> Rational:
             for place, j in enumerate(columns):
                 found[i, place] = (name, i, j)
     return found
-
-
-def unclear(
-    plant: DescriptorSystem,
-    named: NamedPencil,
-    *,
-    tolerance: float,
-    other: str,
-    decider: str,
-    point: complex | None = None,
-    dt: float | None = None,
-    last: bool = False,
-) -> Unclear:
-    """Return why an answer is unclear: the tolerance is never less than what the witness needs."""
-    witness = named.witness(tolerance, point, dt=dt, last=last)
-    return Unclear(max(tolerance, 0.0 if witness is None else witness.size), witness, other, decider)

@@ -21,7 +21,7 @@ from obsynth.analysis.existence.distance import (
     relative_singular_values,
     zeros_at_rounding_level,
 )
-from obsynth.analysis.existence.named_pencils import named_pencil, unclear
+from obsynth.analysis.existence.named_pencils import NamedPencil, named_pencil
 from obsynth.analysis.existence.numbers import numbers_of
 from obsynth.analysis.existence.rational import PlantNumbers, SystemFacts
 from obsynth.analysis.existence.witnesses import Unclear
@@ -31,6 +31,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.pencils import finite_zeros
 from obsynth.numerics.ranks import NAMED_SHARE, RANK_TOLERANCE, RankDecision, decide_rank, rank_in_any_units
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.fault_models import Exosystem
 from obsynth.proofs.balls import UNIT_ROUNDOFF
 
 
@@ -147,6 +148,7 @@ class Evaluator:
 
     plant: DescriptorSystem
     exactly: bool = True
+    model: Exosystem | None = None  # that the faults follow, which has a say in the units
 
     @cached_property
     def numbers(self) -> PlantNumbers | None:
@@ -155,13 +157,21 @@ class Evaluator:
 
     @cached_property
     def units(self) -> PlantUnits:
-        """Units of the plant's own, as powers of two."""
-        return PlantUnits.of(self.plant).rounded()
+        """Units of the plant's own, as powers of two: what is exact in the data, such as a zero at 0, stays exact."""
+        return PlantUnits.of(self.plant, self.model).rounded()
 
     @cached_property
     def natural(self) -> DescriptorSystem:
         """The plant in these units."""
         return self.units.scaled_plant(self.plant)
+
+    @cached_property
+    def kept_disturbances(self) -> list[int]:
+        """The unknown inputs that are no combinations of those before them; all where the numbers are not known."""
+        numbers, count = self.numbers, self.plant.nd
+        if numbers is None:
+            return list(range(count))
+        return numbers.independent_columns(numbers.blocks([[numbers.matrix("Bd")], [numbers.matrix("Dd")]]), count)
 
     @cached_property
     def terms(self) -> DescriptorSystem | None:
@@ -239,18 +249,32 @@ class Evaluator:
 
     def rank_doubt(self, said: FullRank, decision: RankDecision, point: complex | None = None) -> Unclear:
         """Return why a rank is unclear, with ``A - point E`` for A."""
-        named = named_pencil(self.plant, self.units, said.blocks, kept=said.kept)
+        named = self.named(said)
         if said.last_rows is not None:
             before = sum(self._sizes(said)[0][:-1])
             named = named.with_rows([*range(before), *(before + int(row) for row in said.last_rows)])
-        return unclear(
-            self.plant,
-            named.transposed if said.of_rows else named,
-            tolerance=ROUNDING_LEVEL,
-            point=point,
-            other=f"has rank {decision.expected - 1}",
-            decider=DECIDER,
-        )
+        other = f"has rank {decision.expected - 1}"
+        return self.doubt(named.transposed if said.of_rows else named, other, point=point)
+
+    def named(self, said: FullRank) -> NamedPencil:
+        """Return the blocks as a pencil of which each entry is known by its name."""
+        return named_pencil(self.plant, self.units, said.blocks, kept=said.kept)
+
+    def doubt(
+        self,
+        named: NamedPencil,
+        other: str,
+        *,
+        point: complex | None = None,
+        tolerance: float = ROUNDING_LEVEL,
+        decider: str = DECIDER,
+        moving: bool = False,
+        last: bool = False,
+    ) -> Unclear:
+        """Return why an answer is unclear: a plant within the tolerance, which is never less than that needs, ``other``
+        than this one loses rank. The point may be ``moving``; ``last``: the last column depends on the others."""
+        witness = named.witness(tolerance, point, dt=self.plant.dt if moving else None, last=last)
+        return Unclear(max(tolerance, 0.0 if witness is None else witness.size), witness, other, decider)
 
     def pencil(self, said: NoZeroOutside) -> tuple[FloatArray, FloatArray]:
         """Return the two matrices of a pencil ``A - s E``."""
@@ -339,16 +363,14 @@ class Evaluator:
 
     def _zero_doubt(self, said: NoZeroOutside, found: Distance, what: str) -> Unclear:
         """Return why it is unclear whether a pencil has a zero outside."""
-        at_zero, point = said.at_zero, found.point
+        point = found.point
         where = f"{point.real:.6g}" if point.imag == 0.0 else f"{point:.6g}"
-        return unclear(
-            self.plant,
-            named_pencil(self.plant, self.units, at_zero.blocks, kept=at_zero.kept),
-            tolerance=max(ROUNDING_LEVEL, found.value),
+        return self.doubt(
+            self.named(said.at_zero),
+            f"has a zero at {where}, and no {what}",
             point=point,
-            dt=self.plant.dt,
-            other=f"has a zero at {where}, and no {what}",
-            decider=DECIDER,
+            tolerance=max(ROUNDING_LEVEL, found.value),
+            moving=True,
         )
 
     def _needed_gain(self, said: NoZeroOutside, point: complex) -> str:
@@ -403,5 +425,5 @@ def reconsidered(
     found, exact = decide(judge), judge.plant.exact
     if judge.numbers is None or exact is None or exact.uncleaned is None or not is_refused(told(found)):
         return found
-    other = decide(Evaluator(judge.plant.replace(exact=exact.before_cleaning())))
+    other = decide(replace(judge, plant=judge.plant.replace(exact=exact.before_cleaning())))
     return other if is_doubted(told(other)) else found

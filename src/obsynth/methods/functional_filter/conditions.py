@@ -14,10 +14,9 @@ from obsynth.analysis.diagnosis.exact import question
 from obsynth.analysis.diagnosis.explanations import hidden_motion
 from obsynth.analysis.diagnosis.fault_columns import Question, dc_point
 from obsynth.analysis.existence.distance import ROUNDING_LEVEL
-from obsynth.analysis.existence.named_pencils import NamedPencil, named_pencil, unclear
+from obsynth.analysis.existence.named_pencils import NamedPencil
 from obsynth.analysis.existence.numbers import COMPUTED_STATES
-from obsynth.analysis.existence.statements import DECIDER
-from obsynth.analysis.plant_units import PlantUnits
+from obsynth.analysis.existence.statements import Evaluator, FullRank
 from obsynth.methods.functional_filter.wanted_faults import chosen_faults, residual_sets
 from obsynth.numerics.arrays import remembered
 from obsynth.plants.descriptor import DescriptorSystem
@@ -102,22 +101,15 @@ def _may_show(asked: Question, point: complex | None = None) -> bool:
 def _named(plant: DescriptorSystem, asked: Question) -> NamedPencil:
     """Return what the fault must not be a combination of, and the fault itself in the last column."""
     kept = {name: [*asked.removed, asked.number] for name in ("Bf", "Df")}
-    return named_pencil(plant, PlantUnits.of(plant).rounded(), [["A", "Bd", "Bf"], ["C", "Dd", "Df"]], kept=kept)
+    return Evaluator(plant).named(FullRank([["A", "Bd", "Bf"], ["C", "Dd", "Df"]], kept))
 
 
 def _in_doubt(condition: Condition, plant: DescriptorSystem, asked: Question, point: complex) -> Condition:
     """Return the condition as one that rounding of the data could change."""
     named, name = _named(plant, asked), plant.fault_names[asked.number]
     share = named.last_share(point)
-    doubt = unclear(
-        plant,
-        named,
-        tolerance=max(ROUNDING_LEVEL, share),
-        point=point,
-        last=True,
-        decider=DECIDER,
-        other=f"hides {name} at {'z' if plant.dt > 0.0 else 's'} = {_place(point)}, and no filter estimates it",
-    )
+    other = f"hides {name} at {'z' if plant.dt > 0.0 else 's'} = {_place(point)}, and no filter estimates it"
+    doubt = Evaluator(plant).doubt(named, other, point=point, tolerance=max(ROUNDING_LEVEL, share), last=True)
     detail = f"{share:.1g} of {name} reaches the outputs at {_place(point)}: rounding of the data is as large."
     return replace(condition, detail=detail, mode=point, signals=(name,)).in_doubt(doubt, plant)
 

@@ -24,11 +24,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.analysis.conditions import Condition
-from obsynth.analysis.existence.distance import ROUNDING_LEVEL, least_share, zeros_at_rounding_level
-from obsynth.analysis.existence.named_pencils import named_augmented, unclear
+from obsynth.analysis.existence.distance import least_share, zeros_at_rounding_level
+from obsynth.analysis.existence.named_pencils import NamedPencil, named_augmented
 from obsynth.analysis.existence.rational import SystemFacts
 from obsynth.analysis.existence.statements import (
-    DECIDER,
     SCATTER,
     Evaluator,
     FullRank,
@@ -65,7 +64,6 @@ from obsynth.methods.ui_pi_observer.pencils import (
     in_disturbances,
     independent_disturbances,
     instability,
-    kept_disturbances,
     kernel,
     number,
     numbers,
@@ -78,27 +76,27 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.fault_models import Exosystem
 
 
-def model_conditions(
-    judge: Evaluator, courses: Exosystem, plant: DescriptorSystem, model: Exosystem, units: PlantUnits
-) -> list[Condition]:
+def model_conditions(judge: Evaluator, model: Exosystem) -> list[Condition]:
     """Test (D3) at each unstable eigenvalue of the fault model, upper half plane only."""
-    given, terms = judge.plant, judge.terms
-    sizes = None if terms is None else units.scaled_plant(terms)
-    unstable = [complex(value) for value in model.eigenvalues if value.imag >= 0.0 and is_outside(value, plant.dt)]
+    plant, units, scaled_model = judge.natural, judge.units, judge.units.scaled_model(model)
+    sizes = None if judge.terms is None else units.scaled_plant(judge.terms)
+    eigenvalues = map(complex, scaled_model.eigenvalues)
+    unstable = [value for value in eigenvalues if value.imag >= 0.0 and is_outside(value, plant.dt)]
     found = []
     for value in sorted(unstable, key=lambda value: (value.real, value.imag)):
-        lost = exact_loss(judge, courses, units.eigenvalue(value))
-        pencil = _ModelPencil.of(plant, model, value, sizes)
+        lost = exact_loss(judge, model, units.eigenvalue(value))
+        pencil = _ModelPencil.of(plant, scaled_model, value, sizes)
         decision = pencil.decision(lost)
         if lost is None and not decision.full:
             # Of a plant of many parts its own units drift apart; rounding is as small in those that were given.
-            as_given = _ModelPencil.of(given, courses, units.eigenvalue(value), None).decision(None)
+            as_given = _ModelPencil.of(judge.plant, model, units.eigenvalue(value), None).decision(None)
             decision = max(decision, as_given, key=lambda found: found.rank)
         condition = _model_condition(pencil, decision, plant, value, units)
         if decision.means == "unclear":
             point = units.eigenvalue(value)
             other = f"hides a fault that follows its model at {number(point)}, and no observer estimates it"
-            condition = condition.in_doubt(_model_doubt(judge, courses, units, point, other=other), given)
+            named = _named(judge, model, of_the_model=False)
+            condition = condition.in_doubt(judge.doubt(named, other, point=point), judge.plant)
         found.append(condition)
         if not found[-1].holds:
             break
@@ -182,37 +180,21 @@ def _model_condition(
     )
 
 
-def _model_doubt(
-    judge: Evaluator,
-    model: Exosystem,
-    units: PlantUnits,
-    value: complex,
-    *,
-    other: str,
-    decider: str = DECIDER,
-    of_the_model: bool = False,
-    tolerance: float = ROUNDING_LEVEL,
-    moving: bool = False,
-) -> Unclear:
-    """Return why it is unclear whether plant and fault model hide something at a point, in the plant's own time."""
-    plant, kept = judge.plant, kept_disturbances(judge)
-    named = named_augmented(plant, model, units, kept=kept, of_the_model=of_the_model)
-    return unclear(
-        plant, named, tolerance=tolerance, point=value, dt=plant.dt if moving else None, other=other, decider=decider
-    )
+def _named(judge: Evaluator, model: Exosystem, *, of_the_model: bool) -> NamedPencil:
+    """Return plant and fault model as a pencil of which each entry is known by its name."""
+    return named_augmented(judge.plant, model, judge.units, kept=judge.kept_disturbances, of_the_model=of_the_model)
 
 
-def order_conditions(
-    judge: Evaluator, courses: Exosystem, plant: DescriptorSystem, model: Exosystem, units: PlantUnits
-) -> list[Condition]:
+def order_conditions(judge: Evaluator, model: Exosystem) -> list[Condition]:
     """Test that the fault model is not lost in rounding: at a zero z0 order n shows with about abs(z0)^(n + 1) only."""
+    plant, units = judge.natural, judge.units
     inputs, direct = np.hstack([plant.Bf, plant.Bd]), np.hstack([plant.Df, plant.Dd])
     wide_e, wide_a = system_pencil(plant.E, plant.A, inputs, plant.C, direct)
     zeros = finite_zeros(wide_e, wide_a)
     if zeros.normal_rank < wide_e.shape[1]:
         return []
     points = [complex(value) for value in zeros.values if value.imag >= 0.0 and is_outside(value, plant.dt)]
-    augmented = AugmentedPlant.of(plant, model)
+    augmented = AugmentedPlant.of(plant, units.scaled_model(model))
     worst: tuple[RankDecision, complex] | None = None
     for point in points:
         decision = _rank_at(augmented, independent_disturbances(plant), point)
@@ -236,7 +218,7 @@ def order_conditions(
         mode=None if decision.full else point,
         signals=() if decision.full else plant.fault_names,
     )
-    return [found if decision.full else found.in_doubt(_order_doubt(judge, courses, units, point), judge.plant)]
+    return [found if decision.full else found.in_doubt(_order_doubt(judge, model, point), judge.plant)]
 
 
 def _rank_at(augmented: AugmentedPlant, disturbances: tuple[FloatArray, FloatArray], point: complex) -> RankDecision:
@@ -247,22 +229,20 @@ def _rank_at(augmented: AugmentedPlant, disturbances: tuple[FloatArray, FloatArr
     return decide_rank(equilibrated(matrix)[0], expected=matrix.shape[1], equilibrated=False)
 
 
-def _order_doubt(judge: Evaluator, model: Exosystem, units: PlantUnits, point: complex) -> Unclear:
-    return _model_doubt(
-        judge,
-        model,
-        units,
-        point,
-        of_the_model=True,
+def _order_doubt(judge: Evaluator, model: Exosystem, point: complex) -> Unclear:
+    return judge.doubt(
+        _named(judge, model, of_the_model=True),
+        f"hides a motion of plant and fault model at {number(point)}, and no observer estimates it",
+        point=point,
         tolerance=RANK_TOLERANCE,
-        moving=True,
-        other=f"hides a motion of plant and fault model at {number(point)}, and no observer estimates it",
         decider="A fault model of lower order, or an output nearer to the fault, would decide it.",
+        moving=True,
     )
 
 
-def lost_in_rounding(judge: Evaluator, model: Exosystem, units: PlantUnits, mode: complex, order: int) -> Condition:
+def lost_in_rounding(judge: Evaluator, model: Exosystem, mode: complex) -> Condition:
     """Return the failing condition for a mode that seems fixed and unstable, against all other conditions."""
+    order = judge.plant.nx + model.order
     found = Condition(
         "fault model in double precision",
         "no mode of plant and fault model seems unobservable by rounding alone",
@@ -276,7 +256,7 @@ def lost_in_rounding(judge: Evaluator, model: Exosystem, units: PlantUnits, mode
         mode=mode,
         signals=judge.plant.fault_names,
     )
-    return found.in_doubt(_order_doubt(judge, model, units, mode), judge.plant)
+    return found.in_doubt(_order_doubt(judge, model, mode), judge.plant)
 
 
 def _masking(scaled: NDArray[Any], plant: DescriptorSystem, width: int, shares: FloatArray) -> tuple[str, ...]:
@@ -413,7 +393,7 @@ def _decoupling_condition(judge: Evaluator, before: str, after: str) -> Conditio
     if decision.means != "unclear":
         return found
     # Without direct parts, as almost always, the condition is that [E Bd; C 0] has full rank.
-    kept = kept_disturbances(judge)
+    kept = judge.kept_disturbances
     free = [j for j in kept if not plant.Dd[:, j].any()]
     seen = [j for j in kept if j not in free]
     layout: list[list[str | None]] = [["E", "Bd"], ["C", None]] if not seen else [["E", "Bd", None], ["C", None, "Dd"]]
@@ -493,20 +473,16 @@ def _decided_without_algebraic_states(
     judge: Evaluator, model: Exosystem, found: list[Condition], transformation: Transformation | None
 ) -> Existence:
     """Decide about a plant of which the first conditions were found."""
-    working, nothing = judge.plant, np.zeros(0, dtype=np.complex128)
-    # Powers of two: what is exact in the data, such as a zero at the origin, stays exact.
-    units = PlantUnits.of(working, model).rounded()
-    scaled, courses = units.scaled_plant(working), units.scaled_model(model)
-    found.append(_zero_condition(judge, scaled, units))
+    working, fixed, whole = judge.plant, np.zeros(0, dtype=np.complex128), replace(judge, model=model)
+    found.append(_zero_condition(judge, whole.natural, whole.units))
     if found[-1].holds:
-        found += model_conditions(judge, model, scaled, courses, units)
-    if not all(condition.holds for condition in found):
-        return Existence(tuple(found), working, transformation, nothing)
-    found += order_conditions(judge, model, scaled, courses, units)
-    if not found[-1].holds:
-        return Existence(tuple(found), working, transformation, nothing)
-    fixed, condition = _fixed_modes(judge, model, scaled, courses, units)
-    return Existence((*found, condition), working, transformation, fixed)
+        found += model_conditions(whole, model)
+    if all(condition.holds for condition in found):
+        found += order_conditions(whole, model)
+        if found[-1].holds:
+            fixed, condition = _fixed_modes(whole, model)
+            found.append(condition)
+    return Existence(tuple(found), working, transformation, fixed)
 
 
 def _enough_outputs(judge: Evaluator) -> Condition:
@@ -533,7 +509,7 @@ def _zero_condition(judge: Evaluator, plant: DescriptorSystem, units: PlantUnits
     """Decide (D2) on the numbers of the plant as given, or in floating point on the scaled one."""
     if judge.numbers is None:
         return _zero_condition_in_floating_point(plant, units)
-    kept = kept_disturbances(judge)
+    kept = judge.kept_disturbances
     inputs, direct = plant.Bd[:, kept], plant.Dd[:, kept]
 
     def holding(facts: SystemFacts) -> Condition:
@@ -589,22 +565,21 @@ def _zero_failure(
     return replace(found, mode=value, signals=(*states, *disturbances))
 
 
-def _shown_as_given(plant: DescriptorSystem, courses: Exosystem, units: PlantUnits, drop: complex) -> bool:
+def _shown_as_given(judge: Evaluator, model: Exosystem, drop: complex) -> bool:
     """Whether the units of the plant as given show a mode that is not stable, where its own hide it.
 
     Along a plant of parts that hardly touch its own units drift apart, and rounding hides what they make small."""
+    plant, units = judge.plant, judge.units
     if not is_outside(drop, 1.0 if units.discrete else 0.0):
         return False
-    augmented = AugmentedPlant.of(plant, courses)
+    augmented = AugmentedPlant.of(plant, model)
     return _rank_at(augmented, independent_disturbances(plant), units.eigenvalue(drop)).full
 
 
-def _fixed_modes(
-    judge: Evaluator, courses: Exosystem, plant: DescriptorSystem, model: Exosystem, units: PlantUnits
-) -> tuple[ComplexArray, Condition]:
+def _fixed_modes(judge: Evaluator, model: Exosystem) -> tuple[ComplexArray, Condition]:
     """Return the drops of the augmented pencil, exact where the numbers of the plant as given are known."""
-    augmented, given = AugmentedPlant.of(plant, model), judge.plant
-    exact = exact_drops(judge, courses)
+    plant, units = judge.natural, judge.units
+    augmented, exact = AugmentedPlant.of(plant, units.scaled_model(model)), exact_drops(judge, model)
     if exact is not None:
         inputs, direct = plant.Bd[:, exact[1]], plant.Dd[:, exact[1]]
     else:
@@ -618,11 +593,11 @@ def _fixed_modes(
         verdict = zero_verdict(facts, *pencil, nx=augmented.order, discrete=plant.dt > 0.0)
         if verdict.answer == "unclear" and verdict.distance is not None:
             point = units.eigenvalue(verdict.distance.point)
-            return zeros, lost_in_rounding(judge, courses, units, point, augmented.order)
+            return zeros, lost_in_rounding(judge, model, point)
     else:
         drops = system_zeros(*pencil, nx=augmented.order).values
         if exact is None:
-            drops = np.array([value for value in drops if not _shown_as_given(given, courses, units, complex(value))])
+            drops = np.array([value for value in drops if not _shown_as_given(judge, model, complex(value))])
         zeros = units.eigenvalues(drops)
         # Rounding scatters a multiple mode around its mean.  (D2) and (D3) exclude an unstable one: it is none at all.
         bound = 1.0 if plant.dt > 0.0 else 0.0
@@ -630,7 +605,7 @@ def _fixed_modes(
         unstable = [mean for mean in means if instability(complex(mean), plant.dt) >= bound]
         if unstable:
             point = units.eigenvalue(complex(unstable[0]))
-            return zeros, lost_in_rounding(judge, courses, units, point, augmented.order)
+            return zeros, lost_in_rounding(judge, model, point)
     text = ", ".join(numbers(zeros))
     return zeros, Condition(
         "fixed modes",

@@ -61,14 +61,6 @@ def in_disturbances(
     return np.abs(np.linalg.pinv(whole) @ (basis @ direction)) if whole.size else np.zeros(0)
 
 
-def kept_disturbances(judge: Evaluator) -> list[int]:
-    """Return the unknown inputs that are no combinations of those before them; all where the numbers are not known."""
-    numbers, count = judge.numbers, judge.plant.nd
-    if numbers is None:
-        return list(range(count))
-    return numbers.independent_columns(numbers.blocks([[numbers.matrix("Bd")], [numbers.matrix("Dd")]]), count)
-
-
 def kernel(matrix: NDArray[Any]) -> NDArray[Any]:
     """Return an orthonormal basis of the null space."""
     _, values, right = np.linalg.svd(matrix)
@@ -87,7 +79,7 @@ def _exact_pencil(
     judge: Evaluator, numbers: PlantNumbers, model: Exosystem
 ) -> tuple[PlantNumbers, Any, Any, list[int]]:
     """Return the augmented plant on the numbers as written, Bda and Dd, and the disturbances kept in these."""
-    kept = kept_disturbances(judge)
+    kept = judge.kept_disturbances
     bd, dd = (numbers.columns(name, kept) for name in ("Bd", "Dd"))
     below = numbers.zeros(judge.plant.nx + model.order, 0)
     if kept:
