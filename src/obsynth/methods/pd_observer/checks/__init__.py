@@ -14,17 +14,18 @@ import numpy as np
 from obsynth.methods.pd_observer.checks.certificate import fitting_claims, proof_rows, stacked_gains
 from obsynth.methods.pd_observer.conditions import pd_observer_conditions
 from obsynth.methods.pd_observer.realisation import PdErrorSystem, solved, with_faults_as_states, with_sensor_noise
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.continuous import spectral_abscissa
 from obsynth.numerics.norms import HinfNorm
 from obsynth.numerics.ranks import RANK_TOLERANCE, rounding_rank
-from obsynth.numerics.scaling import balance_by_least_squares, balanced_matrix
+from obsynth.numerics.scaling import balanced_matrix
+from obsynth.numerics.spectra import eigenvalues
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.validation import listed
 from obsynth.results.checks import Check, fitting_check, information, lower_bound_check, upper_bound_check
 from obsynth.results.design import ObserverDesign
-from obsynth.verification.error_system import ErrorModel
+from obsynth.verification.error_system import ErrorModel, natural_scaling
 from obsynth.verification.identities import ALIKE, equality, relative_tolerance, residual, tracking_identities, worst
 from obsynth.verification.plant import condition_rows, plant_information
 
@@ -57,7 +58,8 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
     if not fitting:
         return
     tolerance = relative_tolerance(printed_digits, plant.nx + plant.nf + plant.ny)
-    augmented = with_faults_as_states(with_sensor_noise(plant))
+    noisy = with_sensor_noise(plant)
+    augmented = with_faults_as_states(noisy)
     # The faults are states of the augmented plant, so that their estimates are state estimates of it.
     whole = replace(
         observer, state_names=augmented.state_names, fault_names=(), state_delays=(0,) * augmented.nx, fault_delays=()
@@ -71,7 +73,7 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
     yield from _spectra(design, errors)
     yield _pencil_row(design, augmented)
     yield from proof_rows(design)
-    yield from norm_rows(design, errors)
+    yield from norm_rows(design, errors, noisy)
 
 
 def _fits(plant: DescriptorSystem, observer: LinearObserver) -> bool:
@@ -95,7 +97,7 @@ def _gains_row(design: ObserverDesign, augmented: DescriptorSystem, tolerance: f
     observer, (gain_j, gain_l) = design.linear[1], stacked_gains(design)
     estimate, direct = observer.Cz[: observer.order], observer.Dy[: observer.order]
     # A gain on an output in small units must not hide behind one on an output in large units.
-    units = 1.0 / balance_by_least_squares(augmented.E, augmented.A, outputs=[augmented.C]).outputs
+    units = 1.0 / natural_scaling(augmented).outputs
     # S = I - T C is stored to rounding of T C, so S L is known to rounding of T C L.
     found = [
         residual(estimate @ gain_l, -direct, factors=((estimate, gain_l), (direct, augmented.C, gain_l)), units=units),
@@ -134,13 +136,14 @@ def _spectra(design: ObserverDesign, errors: PdErrorSystem) -> Iterator[Check]:
         source="Filasova et al., Remark 1",
         detail=f"inverse of its condition number; the determinant is {1.0 / np.linalg.det(errors.estimate):.6g}",
     )
-    abscissa = spectral_abscissa(errors.Az)
+    poles = _poles(errors.Az)
+    abscissa = _slowest(poles)
     yield _negative(
         "error system",
         "every eigenvalue of the error system has a negative real part",
         abscissa,
         source="Filasova et al., eq. (33)",
-        detail=f"eigenvalues {spectrum_text(errors.Az)}; computed, their proof is the row 'LMI'",
+        detail=f"eigenvalues {spectrum_text(poles)}; computed, their proof is the row 'LMI'",
     )
     decay = claims["decay"]
     if decay > 0.0:
@@ -153,7 +156,7 @@ def _spectra(design: ObserverDesign, errors: PdErrorSystem) -> Iterator[Check]:
         )
     if "disk_radius" in claims:
         centre, radius = claims["disk_centre"], claims["disk_radius"]
-        distance = float(np.max(np.abs(np.linalg.eigvals(errors.Az) + centre)))
+        distance = float(np.max(np.abs(poles + centre)))
         yield upper_bound_check(
             "disk",
             f"every eigenvalue of the error system lies within {radius:.6g} of {-centre:.6g}",
@@ -172,29 +175,40 @@ def _parts(plant: DescriptorSystem, errors: PdErrorSystem) -> Iterator[Check]:
     """Yield the two spectra that the paper prints besides; neither theorem says anything about the second."""
     nx = plant.nx
     proportional = plant.A - errors.J[:nx] @ plant.C
-    together = solved(np.eye(nx) + errors.L[:nx] @ plant.C, proportional)
+    together = _poles(solved(np.eye(nx) + errors.L[:nx] @ plant.C, proportional))
+    apart = _poles(proportional)
     yield information(
         "state error alone",
         "spectral abscissa of (I + L C)^-1 (A - J C), 1/s",
-        spectral_abscissa(together),
+        _slowest(together),
         source="Filasova et al., eq. (28)",
         detail=f"eigenvalues {spectrum_text(together)}",
     )
     yield information(
         "proportional part alone",
         "spectral abscissa of A - J C, 1/s: neither theorem guarantees that it is negative",
-        spectral_abscissa(proportional),
+        _slowest(apart),
         source="Filasova et al., eq. (27)",
-        detail=f"eigenvalues {spectrum_text(proportional)}",
+        detail=f"eigenvalues {spectrum_text(apart)}",
     )
 
 
-def spectrum_text(matrix: FloatArray) -> str:
-    """Return the eigenvalues of a matrix as text, slowest first, conjugate pairs once."""
-    if not np.all(np.isfinite(matrix)):
+def _poles(matrix: FloatArray) -> ComplexArray:
+    """Return the eigenvalues of a matrix, NaN for one that is not finite."""
+    return eigenvalues(matrix) if np.all(np.isfinite(matrix)) else np.full(len(matrix), np.nan, dtype=np.complex128)
+
+
+def _slowest(values: ComplexArray) -> float:
+    """Return the largest real part; minus infinity for no states."""
+    return float(np.max(values.real, initial=-np.inf))
+
+
+def spectrum_text(values: ComplexArray) -> str:
+    """Return eigenvalues as text, slowest first, conjugate pairs once."""
+    if np.any(np.isnan(values)):
         return "not finite"
-    values = sorted((complex(value) for value in np.linalg.eigvals(matrix)), key=lambda v: (-v.real, v.imag))
-    shown = [f"{v.real:.4g}" if v.imag == 0.0 else f"{v.real:.4g} +- {v.imag:.4g}j" for v in values if v.imag >= 0.0]
+    ordered = sorted((complex(value) for value in values), key=lambda v: (-v.real, v.imag))
+    shown = [f"{v.real:.4g}" if v.imag == 0.0 else f"{v.real:.4g} +- {v.imag:.4g}j" for v in ordered if v.imag >= 0.0]
     return listed(shown, most=LISTED_EIGENVALUES)
 
 
@@ -218,10 +232,9 @@ def _pencil_row(design: ObserverDesign, augmented: DescriptorSystem) -> Check:
 LARGE_GAIN = 1e2
 
 
-def norm_rows(design: ObserverDesign, errors: PdErrorSystem) -> Iterator[Check]:
-    """Yield norms and gains: checks where a bound is claimed, else information."""
+def norm_rows(design: ObserverDesign, errors: PdErrorSystem, noisy: DescriptorSystem) -> Iterator[Check]:
+    """Yield norms and gains: checks where a bound is claimed, else information; ``noisy``: the plant with noise."""
     plant, claims = design.linear[0], design.certificate.claims
-    noisy = with_sensor_noise(plant)
     unit = "" if plant.nw else "unit noise on every output, as the plant states none"
     yield _norm_row(
         "fault rate in the fault estimate",
