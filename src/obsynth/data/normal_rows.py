@@ -29,9 +29,9 @@ from obsynth.experiments.monitors.learned import (
 )
 from obsynth.experiments.monitors.learned_levels import AGES
 from obsynth.experiments.monitors.monitor import Evidence
+from obsynth.experiments.monitors.parameter_scores import Scores, before_any, parameter_walk, sample_score
 from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import FloatArray
-from obsynth.observers.linear.observer import LinearObserver
 from obsynth.results.design import ObserverDesign
 
 #: One false alarm in so many rows, where nothing else is asked for.
@@ -119,7 +119,7 @@ def learn_thresholds(
         seed=seed,
         pairs=pairs,
         innovation=_usual_innovation(said.squares[chosen]),
-        deviations=None if said.deviations is None else said.deviations[chosen],
+        scores=None if said.scores is None else said.scores.chosen(chosen),
     )
 
 
@@ -136,7 +136,7 @@ class _Said(NamedTuple):
     times: FloatArray  # ``(n,)`` seconds
     watched: FloatArray  # ``(n, m)``: NaN where nothing is decided, or rows are missing
     squares: FloatArray  # ``(n,)``: mean squares of innovations in the observer's own deviations, where it has these
-    deviations: FloatArray | None  # ``(n, nf)``: of the fault estimates, where the observer states these
+    scores: Scores | None  # of the faults, where it is known what samples say of these
     refused: list[FloatArray]  # ``(4, ny)`` each: what a gate remembers after each row; empty without a gate
 
 
@@ -145,7 +145,9 @@ def _said(design: ObserverDesign, run: LogRun, log: FloatArray) -> _Said:
     nothing = np.full(len(watched_names(design)), np.nan)
     residuals = [i for i, name in enumerate(run.observer.columns) if name.startswith("r[")]
     numbers, times, rows, refused = list[int](), list[float](), list[FloatArray](), list[FloatArray]()
-    squares, deviations = list[float](), list[FloatArray]()
+    squares, scores, walk = list[float](), list[Scores](), parameter_walk(design.observer)
+    faults = len(design.observer.fault_names)
+    before, silent = before_any(faults), Scores(np.zeros(faults), np.zeros((faults, faults)))
     settling = settling_rows(design)
     gate = run.observer if isinstance(run.observer, SteppingLogObserver) and run.observer.gates else None
     for count, row in enumerate(_rows(run, log, CHUNK_ROWS if gate is None else 1)):
@@ -159,22 +161,23 @@ def _said(design: ObserverDesign, run: LogRun, log: FloatArray) -> _Said:
         # Longer gaps than the statistics look back are all the same.
         missing = min(row.skipped, max(AGES))
         rows += [nothing] * missing + [nothing if said is None else said]
-        square, stated = np.nan, np.full(len(design.observer.fault_names), np.nan)
+        square, score = np.nan, silent
+        if walk is not None and isinstance(row.evidence, Evidence):
+            before, score = sample_score(before, row.evidence, walk, row.skipped + 1)
         if said is not None and isinstance(row.evidence, Evidence) and np.isfinite(said).all():
             own = row.evidence.innovation
             square = float(np.mean(own**2)) if own.size else np.nan
-            stated = np.sqrt(np.maximum(np.diag(row.evidence.covariance), 0.0))
         squares += [np.nan] * missing + [square]
-        deviations += [stated] * (missing + 1)
+        scores += [silent] * missing + [score]
         times += [row.time] * (missing + 1)
         numbers += [count] * (missing + 1)
-    states_deviations = not isinstance(design.observer, LinearObserver)
+    both = [np.array(part) for part in zip(*((one.score, one.information) for one in scores), strict=True)]
     return _Said(
         np.array(numbers),
         np.array(times),
         np.array(rows),
         np.array(squares),
-        np.array(deviations) if states_deviations else None,
+        None if walk is None or not both else Scores(*both),
         refused,
     )
 

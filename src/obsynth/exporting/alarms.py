@@ -10,6 +10,7 @@ from obsynth.errors import SpecError
 from obsynth.experiments.monitors.learned import LearnedThresholds
 from obsynth.exporting.realisation import Realisation
 from obsynth.numerics.arguments import is_finite_number, require_mapping
+from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear.derived import checked_warm_up, transient
 
 #: What the largest statistic of a learned monitor is called, in units of its level.
@@ -21,13 +22,14 @@ _NEVER = 1e9
 @dataclass(frozen=True, eq=False)
 class Alarms:
     """What raises an alarm: ``levels`` by watched output, 0 for none; ``columns``: all outputs that a learned monitor
-    may take, fault estimates first; ``warm_up`` in seconds."""
+    may take, fault estimates first; ``warm_up`` in seconds; ``walk (nf, nf)``: by which faults walk between samples."""
 
     levels: Mapping[str, float]
     columns: tuple[str, ...]
     fault_names: tuple[str, ...]
     warm_up: float
     learned: LearnedThresholds | None = None
+    walk: FloatArray | None = None
 
     @classmethod
     def of(

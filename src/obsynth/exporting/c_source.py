@@ -12,6 +12,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.experiments.monitors.learned_levels import AGES, FORGETTING, HOLD
+from obsynth.experiments.monitors.parameter_scores import LEAST_ADDED
 from obsynth.exporting.alarms import Alarms
 from obsynth.exporting.realisation import Realisation
 from obsynth.numerics.arrays import SMALLEST, FloatArray
@@ -179,7 +180,7 @@ def monitor_struct(alarms: Alarms, prefix: str) -> list[str]:
     if alarms.learned is None:
         return []
     model = alarms.learned.statistics.model
-    m = model.channels
+    m, width = model.channels, max(len(alarms.learned.statistics.estimates), 1)
     return [
         "typedef struct {",
         "    /* Read these after a step: the largest statistic in units of its level (NaN where nothing is",
@@ -190,6 +191,8 @@ def monitor_struct(alarms: Alarms, prefix: str) -> list[str]:
         f"    REAL past[{max(model.order * m, 1)}];",
         f"    REAL white[{max(AGES) * m}];",
         f"    REAL means[{len(FORGETTING) * m}];",
+        f"    REAL before[{(1 + width) * width}];",
+        f"    REAL scores[{max(AGES) * 2 * width}];",
         "    int at, quiet, waiting;",
         "    long taken;",
         f"}} {prefix}_monitor;",
@@ -203,7 +206,7 @@ def monitor_source(alarms: Alarms, prefix: str) -> str:
         return ""
     found, model = alarms.learned, alarms.learned.statistics.model
     shapes, slopes = found.statistics.responses()
-    order, shares = model.order, np.array(FORGETTING)
+    order, shares, faults_watched = model.order, np.array(FORGETTING), len(found.statistics.estimates)
     straight = shapes[:, -1:] + (np.arange(order + 1) - order)[:, None] * slopes[:, None, :]
     rows = np.concatenate([shapes, shapes[:, -1:] + np.arange(1, max(AGES))[:, None] * slopes[:, None, :]], axis=1)
     powers = np.cumsum(np.sum(rows**2, axis=2), axis=1)[:, np.array(AGES) - 1]
@@ -215,7 +218,8 @@ def monitor_source(alarms: Alarms, prefix: str) -> str:
         "MEANS": len(shares),
         "SHAPES": len(shapes),
         "MONITOR_FAULTS": len(found.scales),
-        "MONITOR_ESTIMATES": len(found.deviations),
+        "MONITOR_ESTIMATES": faults_watched,
+        "MONITOR_WIDTH": max(faults_watched, 1),
         "MONITOR_SETTLING": found.settling,
         "MONITOR_HOLD": HOLD,
         "MONITOR_WATCHED": sum(name.startswith(("fhat[", "r[")) for name in alarms.columns),
@@ -235,7 +239,7 @@ def monitor_source(alarms: Alarms, prefix: str) -> str:
         "monitor_weights": 1.0 / np.maximum(powers, SMALLEST),
         "monitor_centres": found.centres[None],
         "monitor_scales": found.scales[None],
-        "monitor_deviations": found.deviations[None],
+        "monitor_walk": np.zeros((0, 0)) if alarms.walk is None else alarms.walk,
         "monitor_innovation": np.array([[found.innovation]]),
     }
     faults = {f"fhat[{name}]": i for i, name in enumerate(alarms.fault_names)}
@@ -243,6 +247,7 @@ def monitor_source(alarms: Alarms, prefix: str) -> str:
     listed = ", ".join(f"{name} = {value}" for name, value in sizes.items())
     lines = [
         f"enum {{ {listed} }};",
+        f"#define MONITOR_LEAST ((REAL){LEAST_ADDED!r})",
         *(line for name, table in tables.items() for line in table_lines(name, filled_table(table))),
         *integer_table("monitor_ages", AGES),
         *integer_table("monitor_places", [alarms.columns.index(name) for name in found.columns]),

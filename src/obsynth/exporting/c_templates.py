@@ -14,6 +14,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.experiments.monitors.learned import LearnedThresholds, watched_names
+from obsynth.experiments.monitors.parameter_scores import parameter_walk
 from obsynth.exporting.alarms import Alarms
 from obsynth.exporting.c_source import (
     alarm_comments,
@@ -85,7 +86,7 @@ def dae_alarms(
     found = Alarms.of(columns, model.parameter_names, thresholds, seconds, learned, more=("nis",))
     if learned is not None:
         # A run numbers innovations of any kind.
-        found = replace(found, columns=watched_names(design))
+        found = replace(found, columns=watched_names(design), walk=parameter_walk(observer))
     return design, found
 
 
@@ -122,7 +123,8 @@ def _step_text(prefix: str, model: DAEModel, alarms: Alarms) -> str:
         "INPUT": "u" if model.nu else "s->u",
         "MONITOR_RESET": "monitor_reset(&s->monitor);" if alarms.learned is not None else "",
         "MONITOR_STEP": (
-            "monitor_take(&s->monitor, shown, estimates->fault_deviations, is_deciding, sqrt(estimates->nis));\n"
+            "monitor_take(&s->monitor, shown, MONITOR_ESTIMATES ? after + AT_SPREAD : NULL, is_deciding,\n"
+            "                 sqrt(estimates->nis));\n"
             "    shown[NQ + NY + 1] = s->monitor.statistic;"
             if alarms.learned is not None
             else ""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,7 +17,6 @@ from obsynth.experiments.monitors.learned_levels import (
     AGES,
     FORGETTING,
     HOLD,
-    ROWS_PER_REMEMBERED,
     SETTLING,
     Statistics,
     conformal_levels,
@@ -26,6 +25,7 @@ from obsynth.experiments.monitors.learned_levels import (
     rows_needed,
 )
 from obsynth.experiments.monitors.monitor import Evidence, Judged, LinearSample, Monitor, Rule, Sample
+from obsynth.experiments.monitors.parameter_scores import Scores, before_any, parameter_walk, sample_score
 from obsynth.files.outputs import FileKind, write_atomically
 from obsynth.methods.registry import error_model
 from obsynth.numerics.arguments import is_finite_number
@@ -39,7 +39,7 @@ from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import digest_of, gain_set_digest, plain, restored
 
 LEARNED_KIND = "obsynth learned thresholds"
-LEARNED_VERSION = 5
+LEARNED_VERSION = 6
 LEARNED = FileKind("learned thresholds of obsynth", rb'\A\s*\{\s*"kind":\s*"obsynth learned thresholds"')
 #: Columns that are watched at most, and the least share of a column's variance that others leave unexplained.
 MOST_WATCHED, LEAST_NEW = 8, 1e-6
@@ -98,7 +98,6 @@ class WrongPairs(NamedTuple):
 
 
 NO_PAIRS = WrongPairs(0, 0.0)
-NOTHING = read_only(np.zeros(0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,9 +132,6 @@ class LearnedThresholds:
         Pairs of wrong samples in a row that count as not measured.
     innovation : float
         Root mean square of the innovations in the observer's own deviations: one where its covariances are right.
-    deviations : FloatArray
-        ``(nf,)``: deviations of the fault estimates there, each in units of the deviation that the observer stated for
-        it in the same row; none where estimates are not watched in these units.
     """
 
     columns: tuple[str, ...]
@@ -153,7 +149,6 @@ class LearnedThresholds:
     settling: int = 0
     pairs: WrongPairs = NO_PAIRS
     innovation: float = 1.0
-    deviations: FloatArray = field(default_factory=lambda: NOTHING)
 
     @property
     def holds(self) -> bool:
@@ -168,7 +163,7 @@ class LearnedThresholds:
             f"learned from {self.rows} rows without faults: at most one false alarm per {self.every:.6g} rows "
             f"({_duration(lasting)}) on average, in {len(self.columns)} column(s), whitened by an autoregression of "
             f"order {model.order}"
-            + (f", and in {len(self.deviations)} fault estimate(s)" if len(self.deviations) else "")
+            + (f", and in changes of {len(self.statistics.estimates)} fault(s)" if self.statistics.estimates else "")
             + f"; alarms less than {HOLD} rows apart count as one"
             + (
                 "; the level was found from the second half of these rows"
@@ -219,7 +214,6 @@ class LearnedThresholds:
             "pairs": {"number": self.pairs.number, "chance": self.pairs.chance},
             "innovation": self.innovation,
             "estimates": list(self.statistics.estimates),
-            "deviations": self.deviations,
         }
 
     def save(self, path: str | Path) -> Path:
@@ -285,10 +279,8 @@ def _from_dict(data: Mapping[str, Any]) -> LearnedThresholds:
     )
     told, estimates = (tuple(map(str, data[name])) for name in ("told", "estimates"))
     statistics = Statistics(Autoregression(offset, a, whitener), signatures, told, estimates)
-    deviations = np.asarray(data["deviations"], dtype=np.float64)
     shapes = (offset.shape, a.shape[1:], whitener.shape, signatures.shape[1:], levels.shape)
     fits = shapes == ((m,), (m, m), (m, m), (m,), (len(statistics.names),)) and len(told) == len(signatures)
-    fits = fits and deviations.shape == (len(estimates),) and bool((deviations > 0.0).all())
     if not (fits and all(np.isfinite(part).all() for part in (offset, a, whitener, signatures)) and (levels > 0).all()):
         raise ValueError("its parts do not fit together")
     for part in (offset, a, whitener, signatures):
@@ -309,7 +301,6 @@ def _from_dict(data: Mapping[str, Any]) -> LearnedThresholds:
         int(data["settling"]),
         WrongPairs(int(data["pairs"]["number"]), float(data["pairs"]["chance"])),
         float(data["innovation"]),
-        read_only(deviations),
     )
 
 
@@ -365,16 +356,16 @@ def thresholds_from_rows(
     seed: int = 0,
     pairs: WrongPairs = NO_PAIRS,
     innovation: float = 1.0,
-    deviations: FloatArray | None = None,
+    scores: Scores | None = None,
 ) -> LearnedThresholds:
     """Return thresholds from ``rows (n, m)`` of all that may be watched, NaN where nothing is known; ``pairs``: what
     does not stand in them, but alarms; ``innovation``: how large innovations are in the observer's own deviations;
-    ``deviations (n, nf)``: those that it states of its fault estimates, where it does.
+    ``scores``: what these rows say of faults, where that is known.
 
     Where the fault estimates remember more than the rows can tell, or nearly follow from the residuals (the gains of a
     filter move them, and what is left is how these change with the inputs), the residuals alone are watched.  A fault
-    that the estimates follow leaves nothing in these: where the observer states deviations of the estimates, how many
-    of these each is from its mean is watched beside them.
+    that the estimates follow leaves nothing in these: where it is known what each sample says of the faults, changes of
+    these are looked for beside them, and the estimates, which say the same later, are not watched.
     """
     names, known = watched_names(design), np.asarray(np.isfinite(rows).all(axis=1))
     others = pairs.others(every)
@@ -387,12 +378,9 @@ def thresholds_from_rows(
         )
     faults = len(design.observer.fault_names)
     conformal = is_conformal(count, others)
-    own = None
-    if deviations is not None and faults:
-        usual = np.flatnonzero(known)[: count // 2 if conformal else count]
-        own = _own_units(rows[:, :faults], deviations, usual)
+    scores = None if scores is None else _usual_scores(scores, known)
     both, residuals = independent(rows[known], 0), independent(rows[known], faults)
-    choices = [part for part in ((residuals or both,) if own is not None else (both, residuals)) if part]
+    choices = [part for part in ((both, residuals) if scores is None else (residuals or both,)) if part]
     if not choices:
         raise SpecError("No monitored signal changes in these rows: there is no noise to learn from.", path="normal")
     fits = [(kept, fitted_autoregression(np.where(known[:, None], rows[:, kept], np.nan))) for kept in choices]
@@ -401,18 +389,17 @@ def thresholds_from_rows(
     x = np.where(known[:, None], rows[:, kept], np.nan)
     told = tuple(names[i] for i in kept)
     centres, scales = rows[known, :faults].mean(axis=0), rows[known, :faults].std(axis=0)
-    estimates = None
-    if own is not None:
-        centres, estimates = own.centres, np.where(known[:, None], own.found, np.nan)
+    if scores is not None:
+        centres = scores.chosen(slice(len(rows) // 2 if conformal else None)).centre()
     statistics = Statistics(
         model,
         *signatures(design, kept, np.sqrt(np.nanvar(x, axis=0))),
-        estimates=() if own is None else names[:faults],
+        estimates=() if scores is None else names[:faults],
     )
     if conformal:
-        statistics, levels = conformal_levels(x, others, statistics, estimates)
+        statistics, levels = conformal_levels(x, others, statistics, scores)
     else:
-        levels = learned_levels(x, others, statistics, seed, estimates)
+        levels = learned_levels(x, others, statistics, seed, scores)
     return LearnedThresholds(
         told,
         statistics,
@@ -429,33 +416,15 @@ def thresholds_from_rows(
         settling_rows(design),
         pairs,
         innovation,
-        NOTHING if own is None else own.deviations,
     )
 
 
-class _OwnUnits(NamedTuple):
-    """Fault estimates in deviations that the observer states."""
-
-    found: FloatArray  # ``(n, nf)``, of mean 0 and deviation 1 in usual rows
-    centres: FloatArray  # ``(nf,)``, in the units of the faults
-    deviations: FloatArray  # ``(nf,)``
-
-
-def _own_units(theta: FloatArray, stated: FloatArray, usual: NDArray[np.int64]) -> _OwnUnits | None:
-    """Return fault estimates ``(n, nf)`` in units of the deviations that the observer states of each, from what they
-    are in the ``usual`` rows; `None` where these remember too much for so few rows."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        weights = 1.0 / stated
-        centres = np.sum(theta[usual] * weights[usual], axis=0) / np.sum(weights[usual], axis=0)
-        away = (theta - centres) * weights
-        deviations = away[usual].std(axis=0)
-    if not (np.isfinite(deviations).all() and (deviations > 0.0).all()):
-        return None
-    found = away / deviations
-    model = fitted_autoregression(found[usual])
-    if len(usual) < ROWS_PER_REMEMBERED * model.longest_gain:
-        return None
-    return _OwnUnits(found, read_only(centres), read_only(deviations))
+def _usual_scores(scores: Scores, known: NDArray[np.bool_]) -> Scores | None:
+    """Return what rows say of faults, and nothing of those that are not known; `None` where they do not determine
+    them."""
+    found = Scores(np.where(known[:, None], scores.score, 0.0), np.where(known[:, None, None], scores.information, 0.0))
+    halves = (found.information[: len(known) // 2].sum(axis=0), found.information.sum(axis=0))
+    return found if all(np.isfinite(h).all() and np.linalg.matrix_rank(h) == len(h) for h in halves) else None
 
 
 def signatures(design: ObserverDesign, kept: Sequence[int], sizes: FloatArray) -> tuple[FloatArray, tuple[str, ...]]:
@@ -502,6 +471,9 @@ def independent(rows: FloatArray, first: int) -> list[int]:
     return kept
 
 
+NOTHING = read_only(np.zeros(0))
+
+
 class LearnedState(NamedTuple):
     """The state of `LearnedRule`."""
 
@@ -511,6 +483,8 @@ class LearnedState(NamedTuple):
     last: float | None = None
     taken: int = 0
     waiting: int = 0  # rows until the effect of the last one in which something was missing has settled
+    before: FloatArray = NOTHING  # ``(1 + nf, nf)``: estimates and covariance of the faults after the last sample
+    scores: FloatArray = NOTHING  # ``(ages, 2 nf)``: what samples said of faults, scores and information, latest last
 
 
 class LearnedRule(Rule):
@@ -531,8 +505,10 @@ class LearnedRule(Rule):
         faults: Sequence[str] = (),
         *,
         by_sensor: bool = False,
+        walk: FloatArray | None = None,
     ) -> None:
         self.learned, self.by_sensor = learned, by_sensor
+        self._walk = walk if learned.statistics.estimates else None
         self._residual = np.array([not name.startswith("fhat[") for name in learned.columns])
         self._faults = {f"fault {name}": i for i, name in enumerate(faults)}
         self._places = np.array([names.index(name) for name in learned.columns])
@@ -544,7 +520,10 @@ class LearnedRule(Rule):
         """Return the state before the first sample."""
         model = self._model
         white, means = np.zeros((max(AGES), model.channels)), np.zeros((len(FORGETTING), model.channels))
-        return LearnedState(np.tile(model.mean, (model.order, 1)), white, means)
+        found = LearnedState(np.tile(model.mean, (model.order, 1)), white, means)
+        if self._walk is None:
+            return found
+        return found._replace(before=before_any(len(self._walk)), scores=np.zeros((max(AGES), 2 * len(self._walk))))
 
     def step(self, state: LearnedState, sample: Sample) -> tuple[LearnedState, Judged]:
         """Return the largest statistic in units of its level, one as threshold, and the fault whose step it is."""
@@ -552,6 +531,7 @@ class LearnedRule(Rule):
         for _ in range(min(max(missing, 0), max(AGES))):
             state = self._added(state, None)
         state = state._replace(last=sample.time, taken=state.taken + 1)
+        state = self._scored(state, sample.said, max(missing, 0))
         found = watched_values(sample.residuals, sample.said)
         whole = found is not None and sample.deciding and bool(np.isfinite(found).all())
         shown = None if found is None or not sample.deciding else self._completed(state, found, whole=whole)
@@ -574,17 +554,28 @@ class LearnedRule(Rule):
             ratios = ((self._templates @ state.white.ravel()) ** 2).reshape(-1, len(AGES)).max(axis=1)
             weights = np.array([(2.0 - share) / share for share in FORGETTING])
             smooth = weights * np.sum(state.means**2, axis=1)
-            sizes = self._own_units(sample.said) ** 2
-            values = np.concatenate([[np.sum(state.white[-1] ** 2)], smooth, ratios, sizes]) / self.learned.levels
+            first = [np.sum(state.white[-1] ** 2)]
+            values = np.concatenate([first, smooth, ratios, self._changes(state)]) / self.learned.levels
         values = np.where(np.isnan(values), np.inf, values)
         return state, Judged(float(values.max()), 1.0, self._fault(found, ratios))
 
-    def _own_units(self, said: Any) -> FloatArray:
-        """Return how far the fault estimates that are watched as they are stand from where they were, in deviations."""
-        if not len(self.learned.deviations):
-            return NOTHING
-        stated = np.sqrt(np.maximum(np.diag(said.covariance), 0.0))
-        return np.asarray((said.theta - self.learned.centres) / (stated * self.learned.deviations))
+    def _scored(self, state: LearnedState, said: Any, missing: int) -> LearnedState:
+        """Return the state with what a sample says of the faults."""
+        if self._walk is None or not isinstance(said, Evidence):
+            return state
+        before, found = sample_score(state.before, said, self._walk, missing + 1)
+        row = np.concatenate([found.away(self.learned.centres), np.diag(found.information)])
+        gone = min(missing, max(AGES))
+        kept = np.vstack([state.scores, np.zeros((gone, len(row))), row])[-max(AGES) :]
+        return state._replace(before=before, scores=kept)
+
+    def _changes(self, state: LearnedState) -> FloatArray:
+        """Return twice the largest log likelihood ratios of changes of each fault."""
+        if self._walk is None:
+            return np.zeros(0)
+        sums = np.cumsum(state.scores[::-1], axis=0)[np.array(AGES) - 1]
+        away, power = np.hsplit(sums, 2)
+        return np.asarray(np.where(power > 0.0, away**2 / power, 0.0).max(axis=0, initial=0.0))
 
     def _fault(self, found: FloatArray, ratios: FloatArray) -> int | None:
         """Return the fault whose step or ramp explains most, or whose estimate is furthest from where it was."""
@@ -660,7 +651,13 @@ def learned_monitor(design: ObserverDesign, learned: LearnedThresholds) -> Monit
     return Monitor(
         "learned",
         learned.statement,
-        LearnedRule(learned, names, observer.fault_names, by_sensor=has_innovations_by_sensor(observer)),
+        LearnedRule(
+            learned,
+            names,
+            observer.fault_names,
+            by_sensor=has_innovations_by_sensor(observer),
+            walk=parameter_walk(observer),
+        ),
         residuals=residuals,
         fault_names=observer.fault_names,
         fault_scales=learned.scales,

@@ -2,10 +2,10 @@
 
 Residuals are whitened by their autoregression (Alwan & Roberts 1988).  Watched are Hotelling's T2, exponentially
 weighted means (MEWMA, Lowry et al.  1992) and likelihood ratios of steps and ramps (Willsky & Jones 1976); and, where
-an observer states deviations, how far its fault estimates are from where they were, in these.  The bootstrap makes
-streams from blocks of the whitened rows (Politis & Romano 1994) whose largest follow a generalised Pareto tail; from
-each it fits everything again, so that the uncertainty of a short log is in the levels, which hold in `SURE_STREAMS` of
-the streams (after Gandy & Kvaloy 2013).
+fault estimates follow from a walk of theirs, likelihood ratios of changes of each (`parameter_scores`).  The bootstrap
+makes streams from blocks of the whitened rows (Politis & Romano 1994) whose largest follow a generalised Pareto tail;
+from each it fits everything again, so that the uncertainty of a short log is in the levels, which hold in
+`SURE_STREAMS` of the streams (after Gandy & Kvaloy 2013).
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from obsynth.experiments.monitors.parameter_scores import ScoreModel, Scores, change_ratios
 from obsynth.numerics.arrays import SMALLEST, FloatArray, read_only
 from obsynth.numerics.autoregression import Autoregression, fitted_autoregression
 
@@ -41,9 +42,6 @@ RARER = (1.4, 2.0, 2.8, 4.0, 5.6, 8.0)
 #: So many times the rows of a rate show it themselves: with 20 alarms in their second half, 1.5 times the rate is
 #: passed in 2 % of logs.
 CONFORMAL = 40
-#: Rows that fault estimates need for each one that they remember.  With AR(.9) to AR(.995) driven in bursts, 2,000 and
-#: 4,000 rows, the mean rate was .43 to .96 of the stated one, above 1.5 times it in at most a sixth of 12 logs each.
-ROWS_PER_REMEMBERED = 20.0
 #: A rate counts as observed when so many alarms of it are in the streams; rarer ones are extrapolated.
 OBSERVED = 10.0
 
@@ -51,7 +49,7 @@ OBSERVED = 10.0
 @dataclass(frozen=True, eq=False)
 class Statistics:
     """What is computed of whitened rows: T2, two MEWMA, and for each signature the largest likelihood ratios of a step
-    and of a ramp; beside these the squares of fault ``estimates`` in deviations from where they were.
+    and of a ramp; beside these those of a change of each fault of ``estimates``, of which `change_ratios` are apart.
 
     ``signatures (s, m)``: directions of a step, and of a ramp, in the signals as they are; ``told``: what they show.
     """
@@ -66,7 +64,7 @@ class Statistics:
         """Of the statistics, in order."""
         means = (f"MEWMA {share:g}" for share in FORGETTING)
         likely = (f"GLR of a {shape} in {name}" for shape in ("step", "ramp") for name in self.told)
-        return ("T2", *means, *likely, *(f"size of {name}" for name in self.estimates))
+        return ("T2", *means, *likely, *(f"GLR of a change of {name}" for name in self.estimates))
 
     def responses(self) -> tuple[FloatArray, FloatArray]:
         """Return what steps, then ramps, of each signature do to e: their first p + 1 rows ``(2 s, p + 1, m)``, and
@@ -259,10 +257,10 @@ def is_conformal(rows: int, every: float) -> bool:
 
 
 def conformal_levels(
-    x: FloatArray, every: float, statistics: Statistics, estimates: FloatArray | None = None
+    x: FloatArray, every: float, statistics: Statistics, scores: Scores | None = None
 ) -> tuple[Statistics, Levels]:
-    """Return statistics fitted to the first half of rows ``(n, m)``, and their levels from the second; ``estimates``:
-    as for `learned_levels`.
+    """Return statistics fitted to the first half of rows ``(n, m)``, and their levels from the second; ``scores``:
+    what these rows say of faults, which are where the first half has them.
 
     Alarms in the second half are as exchangeable with later ones as blocks of rows are: with one fewer than allowed
     there, the mean rate of what comes is at most the stated one (split conformal: Papadopoulos et al. 2002).
@@ -272,8 +270,9 @@ def conformal_levels(
     found = replace(statistics, model=model)
     # A row that is missing adds no evidence.
     runs = found.of_rows(np.nan_to_num(model.whitened(x[None])))
-    if estimates is not None:
-        runs = np.concatenate([runs, np.nan_to_num(estimates.T[:, None]) ** 2])
+    if scores is not None:
+        centre = scores.chosen(slice(half)).centre()
+        runs = np.concatenate([runs, _changes(scores, centre)[:, None]])
     first, second = (np.moveaxis(part, 1, 0) for part in (runs[..., :half], runs[..., half:]))
     own, _ = _union(first, every, half - SETTLING)
     union = (second / own[None, :, None]).max(axis=1)
@@ -282,23 +281,30 @@ def conformal_levels(
     return found, Levels(read_only(own), level_of(union, union[:, SETTLING:].size / allowed), extrapolated=False)
 
 
+def _changes(scores: Scores, centre: FloatArray) -> FloatArray:
+    """Return twice the largest log likelihood ratios of changes of each fault from there, ``(nf, n)``."""
+    return change_ratios(scores.away(centre), np.einsum("kii->ki", scores.information), AGES)
+
+
 def learned_levels(
-    x: FloatArray, every: float, statistics: Statistics, seed: int = 0, estimates: FloatArray | None = None
+    x: FloatArray, every: float, statistics: Statistics, seed: int = 0, scores: Scores | None = None
 ) -> Levels:
-    """Return the levels for one alarm per ``every`` rows from rows ``(n, m)`` without faults; ``estimates (n, nf)``:
-    of mean 0 and deviation 1, whose squares are watched as they are."""
+    """Return the levels for one alarm per ``every`` rows from rows ``(n, m)`` without faults; ``scores``: what these
+    rows say of faults."""
     rng = np.random.default_rng(seed)
     model, n = statistics.model, len(x)
     rows = int(np.clip(ROWS_PER_ALARM * every, LEAST_STREAM_ROWS, MOST_STREAM_ROWS))
-    slow = None if estimates is None else fitted_autoregression(estimates)
-    parts = [model.whitened(x)] if slow is None or estimates is None else [model.whitened(x), slow.whitened(estimates)]
+    beside = None if scores is None else ScoreModel.of(scores)
+    parts = [model.whitened(x)] if beside is None else [model.whitened(x), beside.white]
     known = np.asarray(np.isfinite(np.hstack(parts)).all(axis=1))
-    known[: max(fit.order for fit in (model, slow) if fit is not None)] = False
+    known[: max(model.order, 0 if beside is None else beside.model.order)] = False
     e, *others = [part[known] - part[known].mean(axis=0) for part in parts]
     # What is drawn together happened together.
     places = drawn_places(len(e), STREAMS, BURN_IN_ROWS + n + rows, rng)
     streams = model.simulated(drawn_rows(e, places, rng))
-    beside = None if slow is None else slow.simulated(drawn_rows(others[0], places, rng))
+    of_faults = None
+    if beside is not None:
+        of_faults = Scores(*beside.drawn(drawn_rows(others[0], places, rng), np.flatnonzero(known)[places]))
     known = np.asarray(np.isfinite(x).all(axis=1))
     found = []
     for i, stream in enumerate(streams):
@@ -306,10 +312,10 @@ def learned_levels(
         again = fitted_autoregression(seen, order=model.order)
         judged = Statistics(again, statistics.signatures, statistics.told)
         values = judged.of_rows(again.whitened(stream[None, -rows:]))[:, 0]
-        if beside is not None:
-            seen = np.where(known[:, None], beside[i, BURN_IN_ROWS : BURN_IN_ROWS + n], np.nan)
-            away = (beside[i, -rows:] - np.nanmean(seen, axis=0)) / np.nanstd(seen, axis=0)
-            values = np.concatenate([values, away.T**2])
+        if of_faults is not None:
+            said = of_faults.chosen(i)
+            centre = said.chosen(np.arange(BURN_IN_ROWS, BURN_IN_ROWS + n)[known]).centre()
+            values = np.concatenate([values, _changes(said.chosen(slice(-rows, None)), centre)])
         found.append(values)
     runs = np.array(found)
     total = runs[:, 0, SETTLING:].size

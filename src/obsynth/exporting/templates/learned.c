@@ -16,6 +16,12 @@ static void monitor_reset(PREFIX_monitor *m)
     for (i = 0; i < MEANS * CHANNELS; i++) {
         m->means[i] = 0;
     }
+    for (i = 0; i < (1 + MONITOR_WIDTH) * MONITOR_WIDTH; i++) {
+        m->before[i] = NAN;
+    }
+    for (i = 0; i < OLDEST * 2 * MONITOR_WIDTH; i++) {
+        m->scores[i] = 0;
+    }
     m->at = 0;
     m->taken = 0;
     m->waiting = 0;
@@ -161,10 +167,106 @@ static REAL likelihood_ratio(const PREFIX_monitor *m, int shape)
     return largest;
 }
 
-/* Take a row: fault estimates, then residuals; `deviations`: those that the observer states of the fault estimates, if
- * it does; `innovation`: its norm in the observer's own covariance, or less than zero where the gain does not follow
- * what is measured. */
-static void monitor_take(PREFIX_monitor *m, const REAL *shown, const REAL *deviations, int deciding, REAL innovation)
+/* Put the inverse of a definite matrix in its place; return whether there is one. */
+static int inverted(REAL *a)
+{
+    int is_finite = 1;
+    int i, j, k;
+    for (k = 0; k < MONITOR_ESTIMATES; k++) {
+        REAL pivot = 1 / a[k * MONITOR_WIDTH + k];
+        a[k * MONITOR_WIDTH + k] = 1;
+        for (j = 0; j < MONITOR_ESTIMATES; j++) {
+            a[k * MONITOR_WIDTH + j] *= pivot;
+        }
+        for (i = 0; i < MONITOR_ESTIMATES; i++) {
+            REAL share = a[i * MONITOR_WIDTH + k];
+            if (i == k) {
+                continue;
+            }
+            a[i * MONITOR_WIDTH + k] = 0;
+            for (j = 0; j < MONITOR_ESTIMATES; j++) {
+                a[i * MONITOR_WIDTH + j] -= share * a[k * MONITOR_WIDTH + j];
+            }
+        }
+    }
+    for (i = 0; i < MONITOR_ESTIMATES * MONITOR_ESTIMATES; i++) {
+        is_finite = is_finite && isfinite(a[i]);
+    }
+    return is_finite;
+}
+
+/* What a sample says of the faults: what it added to the information on them, and the score of a change. */
+static void monitor_score(PREFIX_monitor *m, const REAL *theta, const REAL *covariance)
+{
+    REAL own[MONITOR_WIDTH * MONITOR_WIDTH];
+    REAL prior[MONITOR_WIDTH * MONITOR_WIDTH];
+    REAL *row = m->scores + m->at * 2 * MONITOR_WIDTH;
+    int says = 1;
+    int any = 0;
+    int i, j;
+    for (i = 0; i < 2 * MONITOR_WIDTH; i++) {
+        row[i] = 0;
+    }
+    if (covariance == NULL) {
+        return;
+    }
+    for (i = 0; i < MONITOR_ESTIMATES; i++) {
+        says = says && isfinite(theta[i]) && isfinite(m->before[i]);
+        for (j = 0; j < MONITOR_ESTIMATES; j++) {
+            int at = i * MONITOR_WIDTH + j;
+            own[at] = covariance[at];
+            prior[at] = m->before[MONITOR_WIDTH + at] + monitor_walk[i][j];
+        }
+    }
+    says = inverted(own) && inverted(prior) && says;
+    for (i = 0; i < MONITOR_ESTIMATES; i++) {
+        REAL added = own[i * MONITOR_WIDTH + i] - prior[i * MONITOR_WIDTH + i];
+        REAL least = MONITOR_LEAST * own[i * MONITOR_WIDTH + i];
+        /* A covariance that has grown beside its walk has started again. */
+        says = says && added >= -least;
+        any = any || added > least;
+    }
+    for (i = 0; says && any && i < MONITOR_ESTIMATES; i++) {
+        for (j = 0; j < MONITOR_ESTIMATES; j++) {
+            int at = i * MONITOR_WIDTH + j;
+            row[i] += own[at] * (theta[j] - monitor_centres[0][j]);
+            row[i] -= prior[at] * (m->before[j] - monitor_centres[0][j]);
+        }
+        row[MONITOR_WIDTH + i] = own[i * MONITOR_WIDTH + i] - prior[i * MONITOR_WIDTH + i];
+    }
+    for (i = 0; i < MONITOR_ESTIMATES; i++) {
+        m->before[i] = theta[i];
+        for (j = 0; j < MONITOR_ESTIMATES; j++) {
+            m->before[MONITOR_WIDTH + i * MONITOR_WIDTH + j] = covariance[i * MONITOR_WIDTH + j];
+        }
+    }
+}
+
+/* The largest likelihood ratio over all ages of a change of one fault. */
+static REAL change_ratio(const PREFIX_monitor *m, int fault)
+{
+    REAL score = 0;
+    REAL power = 0;
+    REAL largest = 0;
+    int back = 0;
+    int age;
+    for (age = 0; age < AGES; age++) {
+        REAL ratio;
+        for (; back < monitor_ages[age]; back++) {
+            const REAL *row = m->scores + (m->at - back + OLDEST) % OLDEST * 2 * MONITOR_WIDTH;
+            score += row[fault];
+            power += row[MONITOR_WIDTH + fault];
+        }
+        ratio = power > 0 ? score * score / power : 0;
+        largest = ratio <= largest ? largest : ratio;
+    }
+    return largest;
+}
+
+/* Take a row: fault estimates, then residuals; `covariance`: that of the fault estimates, or NULL where the observer has
+ * none; `innovation`: its norm in the observer's own covariance, or less than zero where the gain does not follow what
+ * is measured. */
+static void monitor_take(PREFIX_monitor *m, const REAL *shown, const REAL *covariance, int deciding, REAL innovation)
 {
     REAL x[CHANNELS];
     REAL kept[CHANNELS];
@@ -210,6 +312,7 @@ static void monitor_take(PREFIX_monitor *m, const REAL *shown, const REAL *devia
     m->waiting -= m->waiting > 0;
     is_said = is_whole || (innovation >= 0 && (is_said || known));
     monitor_add(m, is_said ? x : NULL, kept, known ? most : 0);
+    monitor_score(m, shown, covariance);
     m->statistic = NAN;
     m->alarm = 0;
     m->fault = -1;
@@ -229,8 +332,7 @@ static void monitor_take(PREFIX_monitor *m, const REAL *shown, const REAL *devia
             statistic = ratio <= statistic ? statistic : ratio;
         }
         for (i = 0; i < MONITOR_ESTIMATES; i++) {
-            ratio = (shown[i] - monitor_centres[0][i]) / (deviations[i] * monitor_deviations[0][i]);
-            ratio *= ratio / monitor_levels[0][1 + MEANS + SHAPES + i];
+            ratio = change_ratio(m, i) / monitor_levels[0][1 + MEANS + SHAPES + i];
             statistic = ratio <= statistic ? statistic : ratio;
         }
         m->statistic = isnan(statistic) ? (REAL)HUGE_VAL : statistic;

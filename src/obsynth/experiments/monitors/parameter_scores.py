@@ -1,0 +1,148 @@
+"""What each sample says of parameters that walk, from estimates and covariances alone, and whether one has changed.
+
+A filter follows a fault, and its innovations return to zero.  What a sample alone says of the parameters is what its
+update added to their information: ``J = P^-1 - M^-1`` and ``s = P^-1 theta - M^-1 theta_before``, with the covariance P
+after and M before it.  Sums of ``s - J c`` over the latest rows are the score of a change from c; their square in units
+of the information is twice the log likelihood ratio of a jump at this age (Willsky & Jones 1976).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from obsynth.experiments.monitors.monitor import Evidence
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.autoregression import Autoregression
+from obsynth.observers.dae.observer import DAEObserver
+from obsynth.observers.recursive.observer import RecursiveObserver
+
+#: Share of the information before it that a sample adds at least: less is what rounding leaves of the difference.
+LEAST_ADDED = 1e-9
+#: Directions of a sample's information below this share of its largest are none.
+NO_DIRECTION = 1e-9
+
+
+def parameter_walk(observer: Any) -> FloatArray | None:
+    """Return the covariance ``(nf, nf)`` by which parameters walk between samples; `None` where estimates do not follow
+    from such a walk, or samples arrive late."""
+    if not observer.fault_names:
+        return None
+    if isinstance(observer, DAEObserver) and observer.timing.is_plain:
+        walks = observer.form == "augmented-kalman" or (
+            observer.form == "random-walk" and observer.weight == "innovation"
+        )
+        return observer.random_walk if walks else None
+    if isinstance(observer, RecursiveObserver) and observer.timing.is_plain and observer.adaptation is not None:
+        return observer.adaptation.walk if observer.form == "random-walk" else None
+    return None
+
+
+@dataclass(frozen=True, eq=False)
+class Scores:
+    """Scores ``s (..., nf)`` at parameters of zero and information ``J (..., nf, nf)`` of samples; zero where a sample
+    says nothing."""
+
+    score: FloatArray
+    information: FloatArray
+
+    def centre(self) -> FloatArray:
+        """Return the parameters that the samples make most likely ``(nf,)``, if they never change."""
+        return np.asarray(np.linalg.solve(self.information.sum(axis=-3), self.score.sum(axis=-2)[..., None])[..., 0])
+
+    def away(self, centre: FloatArray) -> FloatArray:
+        """Return the scores ``(..., nf)`` of a change from there."""
+        return np.asarray(self.score - (self.information @ centre[..., None])[..., 0])
+
+    def chosen(self, rows: Any) -> Scores:
+        """Return those of some rows."""
+        return Scores(self.score[rows], self.information[rows])
+
+
+def before_any(faults: int) -> FloatArray:
+    """Return what is known of ``faults`` parameters before the first sample, ``(1 + nf, nf)``: nothing."""
+    return np.full((1 + faults, faults), np.nan)
+
+
+def sample_score(before: FloatArray, evidence: Evidence, walk: FloatArray, rows: int) -> tuple[FloatArray, Scores]:
+    """Return what is known after a sample, and what it says; ``before (1 + nf, nf)``: estimate and covariance after the
+    one ``rows`` earlier, since which parameters have walked."""
+    theta, spread = evidence.theta, evidence.covariance
+    after = np.vstack([theta, spread])
+    nothing = Scores(np.zeros_like(theta), np.zeros_like(spread))
+    if not (np.isfinite(before).all() and np.isfinite(after).all()):
+        return after, nothing
+    with np.errstate(all="ignore"):
+        try:
+            own, prior = np.linalg.inv(spread), np.linalg.inv(before[1:] + rows * walk)
+        except np.linalg.LinAlgError:
+            return after, nothing
+        added = own - prior
+        found = Scores(own @ theta - prior @ before[0], 0.5 * (added + added.T))
+        # A covariance that has grown beside its walk has started again: what it was before says nothing of this.
+        if not (np.isfinite(added).all() and (np.diag(added) >= -LEAST_ADDED * np.diag(own)).all()):
+            return after, nothing
+    return after, found if (np.diag(added) > LEAST_ADDED * np.diag(own)).any() else nothing
+
+
+def roots(information: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return symmetric roots ``(n, nf, nf)`` of matrices, and their inverses in the directions where they are not
+    zero."""
+    sizes, vectors = np.linalg.eigh(information)
+    sizes = np.maximum(sizes, 0.0)
+    kept = sizes > NO_DIRECTION * np.maximum(sizes[:, -1:], np.finfo(np.float64).tiny)
+    lengths = np.sqrt(np.where(kept, sizes, 0.0))
+    with np.errstate(divide="ignore"):
+        inverse = np.where(kept, 1.0 / lengths, 0.0)
+    turned = np.swapaxes(vectors, 1, 2)
+    return (vectors * lengths[:, None, :]) @ turned, (vectors * inverse[:, None, :]) @ turned
+
+
+def change_ratios(away: FloatArray, own: FloatArray, ages: tuple[int, ...]) -> FloatArray:
+    """Return twice the largest log likelihood ratio over ages of a change of each parameter alone ``(nf, n)``, from
+    scores ``(n, nf)`` of a change and the information ``own (n, nf)`` on each."""
+    n, nf = away.shape
+    sums, powers = (np.vstack([np.zeros((1, nf)), np.cumsum(part, axis=0)]) for part in (away, own))
+    found = np.zeros((nf, n))
+    for age in ages:
+        if age > n:
+            break
+        power = (powers[age:] - powers[:-age]).T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ratio = np.where(power > 0.0, (sums[age:] - sums[:-age]).T ** 2 / power, 0.0)
+        np.maximum(found[:, age - 1 :], ratio, out=found[:, age - 1 :])
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class ScoreModel:
+    """Normal scores in units of their deviations, as an autoregression has them, to be drawn again.
+
+    ``white (n, nf)`` are its innovations, NaN where a sample says nothing or one before it is missing; ``root`` and
+    ``information (n, nf, nf)`` are those of the samples.
+    """
+
+    model: Autoregression
+    white: FloatArray
+    root: FloatArray
+    information: FloatArray
+
+    @classmethod
+    def of(cls, scores: Scores) -> ScoreModel:
+        """Return that of normal rows ``(n, nf)``."""
+        from obsynth.numerics.autoregression import fitted_autoregression
+
+        root, inverse = roots(scores.information)
+        units = (inverse @ scores.away(scores.centre())[..., None])[..., 0]
+        said = np.asarray(np.einsum("kii->k", scores.information) > 0.0)
+        units = np.where(said[:, None], units, np.nan)
+        model = fitted_autoregression(units)
+        return cls(model, model.whitened(units), root, scores.information)
+
+    def drawn(self, white: FloatArray, places: Any) -> tuple[FloatArray, FloatArray]:
+        """Return streams of scores ``(runs, n, nf)`` and information, from innovations and the places that they are
+        of."""
+        units = self.model.simulated(white)
+        return (self.root[places] @ units[..., None])[..., 0], self.information[places]
