@@ -150,6 +150,13 @@ def test_blank_rows_say_nothing_of_faults_and_change_nothing_after_them() -> Non
     np.testing.assert_allclose(table.statistic[252:].to_numpy(), removed.statistic[250:].to_numpy(), rtol=1e-9)
 
 
+def test_what_determines_no_fault_is_known_in_any_unit() -> None:
+    scores = scored(np.random.default_rng(0), 400, 0.0)
+    assert scores.determine
+    assert not scores.chosen(slice(1)).determine
+    assert not Scores(scores.score, scores.information * [[1.0, 0.0], [0.0, 0.0]]).determine
+
+
 @pytest.mark.parametrize("options", [{"form": "forgetting"}, {"form": "random-walk", "weight": "paper"}])
 def test_estimates_that_no_walk_explains_are_watched_as_before(options: dict[str, str]) -> None:
     observer = replace(pumped().observer, **options)
@@ -173,9 +180,10 @@ def scored(rng: np.random.Generator, rows: int, memory: float) -> Scores:
     """Return what samples say of two faults through one sensor whose noise is coloured, in bursts of information."""
     bursts = np.repeat(rng.choice([0.0, 0.3, 1.5], rows // 40 + 1), 40)[:rows]
     noise = lfilter([np.sqrt(1.0 - memory**2)], [1.0, -memory], rng.standard_normal(rows + 200))[200:]
-    regressor = bursts[:, None] * np.column_stack([np.ones(rows), np.sin(np.arange(rows) / 15.0)])
+    # The second fault is in a unit that is ten million times smaller.
+    regressor = bursts[:, None] * np.column_stack([np.ones(rows), 1e-7 * np.sin(np.arange(rows) / 15.0)])
     information = regressor[:, :, None] * regressor[:, None, :]
-    return Scores(regressor * noise[:, None] + information @ [2.0, -1.0], information)
+    return Scores(regressor * noise[:, None] + information @ [2.0, -1e7], information)
 
 
 def rate(learned_rows: int, every: float, seed: int, memory: float, *, conformal: bool) -> float:

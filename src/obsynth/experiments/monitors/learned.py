@@ -423,8 +423,7 @@ def _usual_scores(scores: Scores, known: NDArray[np.bool_]) -> Scores | None:
     """Return what rows say of faults, and nothing of those that are not known; `None` where they do not determine
     them."""
     found = Scores(np.where(known[:, None], scores.score, 0.0), np.where(known[:, None, None], scores.information, 0.0))
-    halves = (found.information[: len(known) // 2].sum(axis=0), found.information.sum(axis=0))
-    return found if all(np.isfinite(h).all() and np.linalg.matrix_rank(h) == len(h) for h in halves) else None
+    return found if found.chosen(slice(len(known) // 2)).determine and found.determine else None
 
 
 def signatures(design: ObserverDesign, kept: Sequence[int], sizes: FloatArray) -> tuple[FloatArray, tuple[str, ...]]:

@@ -14,15 +14,14 @@ from typing import Any
 import numpy as np
 
 from obsynth.experiments.monitors.monitor import Evidence
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import SMALLEST, FloatArray
 from obsynth.numerics.autoregression import Autoregression
+from obsynth.numerics.ranks import DIRECTION_SHARE
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.recursive.observer import RecursiveObserver
 
 #: Share of the information before it that a sample adds at least: less is what rounding leaves of the difference.
 LEAST_ADDED = 1e-9
-#: Directions of a sample's information below this share of its largest are none.
-NO_DIRECTION = 1e-9
 
 
 def parameter_walk(observer: Any) -> FloatArray | None:
@@ -47,6 +46,15 @@ class Scores:
 
     score: FloatArray
     information: FloatArray
+
+    @property
+    def determine(self) -> bool:
+        """Whether all samples ``(n, nf)`` together determine every parameter, whatever its unit."""
+        whole = self.information.sum(axis=0)
+        units = np.sqrt(np.maximum(np.diag(whole), 0.0))
+        if not (np.isfinite(whole).all() and (units > 0.0).all()):
+            return False
+        return bool(np.linalg.matrix_rank(whole / np.outer(units, units)) == len(units))
 
     def centre(self) -> FloatArray:
         """Return the parameters that the samples make most likely ``(nf,)``, if they never change."""
@@ -88,16 +96,17 @@ def sample_score(before: FloatArray, evidence: Evidence, walk: FloatArray, rows:
 
 
 def roots(information: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return symmetric roots ``(n, nf, nf)`` of matrices, and their inverses in the directions where they are not
-    zero."""
-    sizes, vectors = np.linalg.eigh(information)
+    """Return roots ``(n, nf, nf)`` of matrices, symmetric in the usual units of each parameter, and their inverses in
+    the directions where they are not zero."""
+    units = np.sqrt(np.einsum("kii->ki", information).mean(axis=0))
+    sizes, vectors = np.linalg.eigh(information / np.outer(units, units))
     sizes = np.maximum(sizes, 0.0)
-    kept = sizes > NO_DIRECTION * np.maximum(sizes[:, -1:], np.finfo(np.float64).tiny)
+    kept = sizes > DIRECTION_SHARE * np.maximum(sizes[:, -1:], SMALLEST)
     lengths = np.sqrt(np.where(kept, sizes, 0.0))
     with np.errstate(divide="ignore"):
         inverse = np.where(kept, 1.0 / lengths, 0.0)
     turned = np.swapaxes(vectors, 1, 2)
-    return (vectors * lengths[:, None, :]) @ turned, (vectors * inverse[:, None, :]) @ turned
+    return units[:, None] * ((vectors * lengths[:, None, :]) @ turned), (vectors * inverse[:, None, :]) @ turned / units
 
 
 def change_ratios(away: FloatArray, own: FloatArray, ages: tuple[int, ...]) -> FloatArray:
