@@ -213,7 +213,8 @@ def test_plants_are_drawn_from_the_box() -> None:
 
     class Counting(ThreadPoolExecutor):
         def submit(self, work: Any, /, task: Any) -> Any:
-            shares[id(task.bench)] = shares.get(id(task.bench), 0) + len(task.seeds)
+            bench, seeds = task
+            shares[id(bench)] = shares.get(id(bench), 0) + len(seeds)
             return super().submit(work, task)
 
     with Counting(1) as executor:

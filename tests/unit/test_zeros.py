@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.linalg import block_diag, eigvals
 
-from obsynth.analysis.zeros import are_outside, fault_zeros, hidden_faults, invariant_zeros, is_outside, zeros_of_system
+from obsynth.analysis.zeros import are_outside, fault_zeros, hidden_faults, is_outside, zeros_of_system
 from obsynth.methods.fault_estimation_filter.conditions import fault_filter_conditions
 from obsynth.numerics.pencils import finite_zeros
 from obsynth.plants.descriptor import DescriptorSystem
@@ -81,7 +81,7 @@ def test_planted_zeros_and_their_directions(seed):
     zeros = [*rng.uniform(-2, 2, seed % 3), *(rng.uniform(-1, 1, seed % 2) + 1j * rng.uniform(0.1, 1, seed % 2))]
     E, A, B, C = planted(zeros, rng, degree=1 + seed % 3, channels=1 + seed % 2, algebraic=seed % 4)
     before = [matrix.copy() for matrix in (E, A, B, C)]
-    found = invariant_zeros(E, A, B, C)
+    found = zeros_of_system(E, A, B, C, dt=1.0)[1]
     assert mismatch(with_conjugates(zeros), [zero.value for zero in found]) < 1e-10
     for zero in found:
         x, u = zero.state_direction, zero.input_direction
@@ -99,7 +99,7 @@ def test_zeros_agree_with_slycot(seed):
     rng = np.random.default_rng(seed)
     E, A, B, C = planted([], rng, degree=3, channels=2, algebraic=2)
     D = np.outer(rng.standard_normal(2), rng.standard_normal(2)) if seed % 2 else np.zeros((2, 2))
-    found = invariant_zeros(E, A, B, C, D)
+    found = zeros_of_system(E, A, B, C, D, dt=1.0)[1]
     size = len(A)
     reduced_a, reduced_e, *_ = pytest.importorskip("slycot").ag08bd(size, size, 2, 2, A, E, B, C, D, equil="S")
     expected = eigvals(reduced_a, reduced_e) if reduced_a.size else []
@@ -111,9 +111,9 @@ def test_zeros_do_not_depend_on_coordinates_and_units(seed):
     rng = np.random.default_rng(seed)
     E, A, B, C = planted([0.5, -1.5, 0.2 + 0.7j], rng, algebraic=2)
     rows, columns = 10.0 ** rng.uniform(-4, 4, len(A)), 10.0 ** rng.uniform(-4, 4, len(A))
-    found = invariant_zeros(
-        rows[:, None] * E * columns, rows[:, None] * A * columns, 1e5 * rows[:, None] * B, 1e-3 * C * columns
-    )
+    found = zeros_of_system(
+        rows[:, None] * E * columns, rows[:, None] * A * columns, 1e5 * rows[:, None] * B, 1e-3 * C * columns, dt=1.0
+    )[1]
     assert mismatch([0.5, -1.5, 0.2 + 0.7j, 0.2 - 0.7j], [zero.value for zero in found]) < 1e-9
 
 
@@ -166,15 +166,15 @@ def test_unobservable_mode_and_proper_zero_at_the_same_point():
     B = np.array([[0.0], [1.0], [0.0]])
     A[1:, 1:] = [[0.5, 1.0], [-1.0, 0.3]]  # zero of the second part at 0.3
     A[0, 0] = 0.3
-    zeros = invariant_zeros(np.eye(3), A, B, np.array([[0.0, 1.0, 0.0]]))
+    zeros = zeros_of_system(np.eye(3), A, B, np.array([[0.0, 1.0, 0.0]]), dt=1.0)[1]
     assert [zero.value for zero in zeros] == pytest.approx([0.3, 0.3])
     assert [zero.is_unobservable_mode for zero in zeros] == [True, False]
     np.testing.assert_allclose(zeros[0].state_direction, [1.0, 0.0, 0.0], atol=1e-12)
 
 
 def test_no_zero_and_no_input():
-    assert invariant_zeros(np.eye(1), np.eye(1), np.ones((1, 1)), np.ones((1, 1))) == ()
-    (mode,) = invariant_zeros(np.eye(2), np.diag([0.5, 0.7]), np.zeros((2, 0)), np.array([[1.0, 0.0]]))
+    assert zeros_of_system(np.eye(1), np.eye(1), np.ones((1, 1)), np.ones((1, 1)), dt=1.0)[1] == ()
+    (mode,) = zeros_of_system(np.eye(2), np.diag([0.5, 0.7]), np.zeros((2, 0)), np.array([[1.0, 0.0]]), dt=1.0)[1]
     assert mode.value == pytest.approx(0.7)
     assert mode.is_unobservable_mode
 
@@ -283,7 +283,7 @@ def test_planted_zeros_far_out_of_a_tall_pencil_are_kept(modulus, seed):
     A[0] = [-modulus, 1.0, 0.0, 0.0]  # a mode that no output shows
     A[1:, 1:], B[1:, 0], C[:, 1:] = rng.standard_normal((3, 3)), rng.standard_normal(3), rng.standard_normal((2, 3))
     left, right = nonsingular(4, rng), nonsingular(4, rng)
-    zeros = invariant_zeros(left @ right, left @ A @ right, left @ B, C @ right)
+    zeros = zeros_of_system(left @ right, left @ A @ right, left @ B, C @ right, dt=1.0)[1]
     assert [zero.value for zero in zeros] == [pytest.approx(-modulus, rel=1e-6)]
     assert zeros[0].is_unobservable_mode
 

@@ -135,14 +135,6 @@ def are_outside(E: FloatArray, A: FloatArray, zeros: FiniteZeros, dt: float) -> 
     return tuple(found[value] for value in map(complex, zeros.values))
 
 
-def invariant_zeros(
-    E: FloatArray, A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray | None = None
-) -> tuple[Zero, ...]:
-    """Return the finite zeros of ``[A - z E, B; C, D]`` with multiplicity, each with its direction."""
-    wide_e, wide_a = system_pencil(E, A, B, C, D)
-    return zeros_with_directions(wide_e, wide_a, system_zeros(wide_e, wide_a, nx=E.shape[0]), nx=E.shape[0])
-
-
 def fault_zeros(plant: DescriptorSystem) -> tuple[tuple[Zero, ...], tuple[Zero, ...]]:
     """Return the invariant zeros from the faults of ``plant`` to its outputs, and those not strictly stable."""
     plant = plant.dense()
@@ -171,7 +163,7 @@ def hidden_faults(plant: DescriptorSystem, *, missing: int) -> tuple[str, ...]:
 
 
 def zeros_of_system(
-    E: FloatArray, A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray | None, *, dt: float
+    E: FloatArray, A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray | None = None, *, dt: float
 ) -> tuple[FiniteZeros, tuple[Zero, ...], tuple[Zero, ...]]:
     """Return what `finite_zeros` says of ``[A - z E, B; C, D]``, the zeros, and those not strictly stable."""
     e, a = system_pencil(E, A, B, C, D)

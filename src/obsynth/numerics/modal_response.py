@@ -108,10 +108,6 @@ class ModalResponse:
             u = self.driven.conj().T @ (factors.conj() * (self.shown.conj().T @ y)) + self.direct.T @ y
         return np.asarray(size)
 
-    def peaks(self, points: int) -> FloatArray:
-        """Return the angles in [0, pi] of the highest peaks on a grid of so many points and the poles, refined."""
-        return self.refined(*self.rough_peaks(points)[:2])
-
     def rough_peaks(self, points: int) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return the highest peaks on a grid of so many points and the poles, the highest first: angles in [0, pi],
         how far they may be off, and sizes, at most the eighth root of a sum of eighth powers."""

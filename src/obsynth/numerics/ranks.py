@@ -93,16 +93,15 @@ def product_but_rounding(matrix: FloatArray, other: FloatArray) -> FloatArray:
 class RankDecision:
     """A numerical rank with the evidence: all singular values, largest first, as decided upon (rows, columns scaled).
 
-    ``smallest_kept``, ``largest_dropped``: relative to the largest; ``gap``: their ratio, infinite when only exact
-    zeros were dropped, the distance to the tolerance when the rank is full; ``share``: the last value beside the terms
-    it is a sum of.
+    ``smallest_kept``: relative to the largest; ``gap``: its ratio to the next, infinite when only exact zeros were
+    dropped, the distance to the tolerance when the rank is full; ``share``: the last value beside the terms it is a sum
+    of.
     """
 
     rank: int
     expected: int
     singular_values: FloatArray
     smallest_kept: float
-    largest_dropped: float
     gap: float
     means: Literal["tolerance", "exact", "unclear"] = "tolerance"
     share: float = np.inf
@@ -191,7 +190,7 @@ def rank_from(
         gap = float("inf")
     else:
         gap = (kept if rank else tolerance) / dropped
-    return RankDecision(rank, expected, read_only(np.asarray(values, dtype=np.float64)), kept, dropped, gap)
+    return RankDecision(rank, expected, read_only(np.asarray(values, dtype=np.float64)), kept, gap)
 
 
 def covariance_factor(covariance: FloatArray, name: str) -> FloatArray:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,6 @@ import numpy as np
 from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
 from obsynth.analysis.transformations.sampling import discretise
 from obsynth.analysis.transformations.uncertain_plant import AffinePlant, untouched_states
-from obsynth.analysis.zeros import zeros_of_system
 from obsynth.errors import ObsynthError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import DIRECTION_SHARE
@@ -160,56 +158,25 @@ def _summed_response(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
     return total
 
 
-@dataclass(frozen=True)
-class Told:
-    """Whether a constant acts where a fault does (``shares``), or an observer that it does not disturb exists."""
-
-    shares: bool
-    separable: bool
-    reason: str = ""
-
-
-def told_from_faults(plant: DescriptorSystem) -> dict[str, Told]:
-    """Return the verdict for each constant with a tolerance, from the plant as written; empty without faults."""
+def acting_like_faults(plant: DescriptorSystem) -> tuple[str, ...]:
+    """Return the constants with tolerances that act where a fault does, from the plant as written."""
     uncertain = plant.uncertainty
     if uncertain is None or not plant.nf:
-        return {}
+        return ()
     numbers = as_written(plant, uncertain)
     affine = uncertain.affine(numbers, uncertain.box)
-    dt = 0.0 if is_sampled(uncertain.steps) else plant.dt
-    found = {}
+    faults = np.vstack([numbers["Bf"], numbers["Df"]])
+    found = []
     for i, name in enumerate(uncertain.box.names):
         # What multiplies the same signal stands in one column: derivative of the state, state, u, f, d.
         zero = np.zeros((plant.ny, len(numbers["A"])))
         above = [affine[key].parts[i] for key in ("E", "A", "B", "Bf", "Bd")]
         below = [zero, *(affine[key].parts[i] for key in ("C", "D", "Df", "Dd"))]
-        found[name] = _told(numbers, _range(np.vstack([np.hstack(above), np.hstack(below)])), dt)
-    return found
-
-
-def _told(matrices: Mapping[str, FloatArray], directions: FloatArray, dt: float) -> Told:
-    faults = np.vstack([matrices["Bf"], matrices["Df"]])
-    both = np.hstack([faults / np.linalg.norm(faults, axis=0), directions])
-    if np.linalg.matrix_rank(both, tol=DIRECTION_SHARE) < both.shape[1]:
-        return Told(True, False, "it acts where a fault acts")
-    # Decoupling exists where the pencil from both to the outputs has full normal rank and stable zeros.
-    n = len(matrices["A"])
-    try:
-        zeros, _, outside = zeros_of_system(
-            matrices["E"],
-            matrices["A"],
-            np.hstack([matrices["Bf"], directions[:n]]),
-            matrices["C"],
-            np.hstack([matrices["Df"], directions[n:]]),
-            dt=dt,
-        )
-    except ObsynthError as error:
-        return Told(False, False, str(error))
-    if zeros.normal_rank < n + both.shape[1]:
-        return Told(False, False, "the outputs are too few to tell it from the faults")
-    if outside:
-        return Told(False, False, f"there is a zero at {complex(outside[0].value):.4g}, which is not stable")
-    return Told(False, True)
+        directions = _range(np.vstack([np.hstack(above), np.hstack(below)]))
+        both = np.hstack([faults / np.linalg.norm(faults, axis=0), directions])
+        if np.linalg.matrix_rank(both, tol=DIRECTION_SHARE) < both.shape[1]:
+            found.append(name)
+    return tuple(found)
 
 
 def _range(effects: FloatArray) -> FloatArray:

@@ -26,9 +26,9 @@ from obsynth.plants.uncertainty import Uncertainty, as_written
 from obsynth.proofs.affine import AffineMatrix
 from obsynth.results.design import ObserverDesign
 from obsynth.tolerances.exact_plant import (
+    acting_like_faults,
     is_sampled,
     moving_at,
-    told_from_faults,
     vertex_gains,
 )
 from obsynth.tolerances.result import EXACT_MODEL, Robustness
@@ -171,7 +171,7 @@ def robustness(
         stable.verdict,
         stable.boxes,
         reason,
-        tuple(name for name, found in told_from_faults(plant).items() if found.shares),
+        acting_like_faults(plant),
         untouched,
         uncertain.not_covered,
         design,

@@ -17,14 +17,14 @@ CACHED_SAMPLES = 4000
 
 
 class Thresholds(NamedTuple):
-    """Bounds ``(runs, steps, no)`` of fault estimates, then residuals: ``nominal + start + sum of first + rest``."""
+    """Bounds ``(..., no)`` of fault estimates, then residuals: ``nominal + start + sum of first + rest``; of a sample,
+    or of records ``(runs, steps, no)``."""
 
     total: FloatArray
-    first: FloatArray  # ``(runs, steps, p, no)``: of each constant
+    first: FloatArray  # ``(..., p, no)``: of each constant
     shift: FloatArray  # where the interval's middle is, for a box off centre
     start: FloatArray
     rest: FloatArray
-    channels: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +83,7 @@ def thresholds_of_records(
     ring, found = _recursion(bound, fixed[:, :, :m], known)
     rest = found + largest @ bound.rounding[m:].T + ring @ bound.same[:, m:]
     total = (bound.nominal[m:] + start[:, m:] + first.sum(axis=2) + np.abs(shift) + rest) * THRESHOLD_ROUNDING
-    return Thresholds(total, first, shift, np.broadcast_to(start[:, m:], total.shape), rest, ring[:, :, :m])
+    return Thresholds(total, first, shift, np.broadcast_to(start[:, m:], total.shape), rest)
 
 
 def record_columns(

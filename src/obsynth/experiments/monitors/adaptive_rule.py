@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple, TypeAlias
 
@@ -16,7 +15,7 @@ from obsynth.experiments.monitors.monitor import Judged, LinearSample, Rule, Sam
 from obsynth.experiments.monitors.rules import FITTING_SHARE, NormRule, NormState, norm_of
 from obsynth.numerics.arrays import FloatArray
 from obsynth.verification.adaptive_bound import THRESHOLD_ROUNDING, AdaptiveBound
-from obsynth.verification.adaptive_record import AdaptivePlan
+from obsynth.verification.adaptive_record import AdaptivePlan, Thresholds
 
 
 class AdaptiveState(NamedTuple):
@@ -42,20 +41,9 @@ class AdaptiveState(NamedTuple):
         return cls(psi, ring, eps, largest, past, moved)
 
 
-@dataclass(frozen=True, eq=False)
-class AdaptiveStep:
-    """Bounds of the outputs at one sample: ``total, shift, rest, start (no,)`` and ``first (p, no)``."""
-
-    total: FloatArray
-    first: FloatArray
-    shift: FloatArray
-    start: FloatArray
-    rest: FloatArray
-
-
 def adaptive_step(
     bound: AdaptiveBound, state: AdaptiveState, estimates: FloatArray, inputs: FloatArray, outputs: FloatArray
-) -> tuple[AdaptiveState, AdaptiveStep]:
+) -> tuple[AdaptiveState, Thresholds]:
     """Take one sample: ``estimates (n,)`` as `ErrorStructure.reading` gives them; return the state after it as well."""
     *_, m, no = bound.counts
     v = np.concatenate([estimates, inputs])
@@ -75,7 +63,7 @@ def adaptive_step(
     total = (bound.nominal[m:] + start[m:] + first.sum(axis=0) + np.abs(shift) + rest) * THRESHOLD_ROUNDING
     ring, eps = np.vstack([state.ring[1:], h]), np.vstack([state.eps[1:], older[m + no :]])
     after = state._replace(ring=ring, eps=eps, k=state.k + 1)
-    return after, AdaptiveStep(total, first, shift, start[m:], rest)
+    return after, Thresholds(total, first, shift, start[m:], rest)
 
 
 _First: TypeAlias = tuple[AdaptiveState, FloatArray, FloatArray, FloatArray]
@@ -114,7 +102,7 @@ def _varying(bound: AdaptiveBound, state: AdaptiveState, v: FloatArray) -> _Firs
 FORGETTING_RINGS = 3
 
 
-def norm_beyond_nominal(plan: AdaptivePlan, found: AdaptiveStep) -> float:
+def norm_beyond_nominal(plan: AdaptivePlan, found: Thresholds) -> float:
     """Return what box, start and rounding add to the norm of the residual."""
     rows = plan.residuals
     parts = [found.shift[rows], found.rest[rows], plan.bound.more[rows], *found.first[:, rows]]
@@ -194,7 +182,7 @@ class AdaptiveRule(Rule):
         passed = int(np.argmax(ratios[:nf])) if nf and ratios[:nf].max() > 1.0 else None
         return state, Judged(statistic, threshold, passed, cells)
 
-    def _cells(self, faults: FloatArray, found: AdaptiveStep, error: AdaptiveStep) -> tuple[float, ...]:
+    def _cells(self, faults: FloatArray, found: Thresholds, error: Thresholds) -> tuple[float, ...]:
         nf = len(faults)
         cells = found.total.tolist()
         if self.plan.intervals:
