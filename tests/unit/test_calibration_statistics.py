@@ -129,7 +129,7 @@ def explained(innovations: np.ndarray, inputs: np.ndarray | None = None, **more)
     given = {"constants": {}, "with_constant": lambda name, value: innovations, **more}
     inputs = np.zeros((n, 0)) if inputs is None else inputs[:, None]
     names = ["u"] * inputs.shape[1]
-    return {item.text: item.gain for item in explanations(innovations[:, None], inputs, ["y"], names, dt=0.1, **given)}
+    return dict(explanations(innovations[:, None], inputs, ["y"], names, dt=0.1, **given))
 
 
 def test_an_explanation_pays_for_its_coefficient() -> None:

@@ -8,7 +8,7 @@ different numbers of coefficients compare.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 
@@ -22,12 +22,8 @@ MOST_TOLD, MOST_CONSTANTS = 3, 12
 CONSTANT_CHANGE = 1e-3
 
 
-@dataclass(frozen=True)
-class Explanation:
-    """What may be wrong, and the nats that it gains on this log."""
-
-    text: str
-    gain: float
+#: What may be wrong, and the nats that it gains on this log.
+Explanation: TypeAlias = tuple[str, float]
 
 
 def explanations(
@@ -49,14 +45,14 @@ def explanations(
         moves = np.diff(inputs[:, i])
         for move, word in ((np.append(np.nan, moves), "later"), (np.append(moves, np.nan), "earlier")):
             gain, _ = _together(innovations, move[:, None, None] * np.eye(innovations.shape[1]))
-            found.append(Explanation(f"an input {name} that acts {word} than the design takes it", gain))
+            found.append((f"an input {name} that acts {word} than the design takes it", gain))
     for name, value in list(constants.items())[:MOST_CONSTANTS]:
         step = CONSTANT_CHANGE * (abs(value) or 1.0)
         effect = (with_constant(name, value + step) - innovations) / step
         gain, coefficient = _together(innovations, effect[:, :, None])
         nearer = value - float(coefficient[0]) if len(coefficient) else value
-        found.append(Explanation(f"a constant {name} near {nearer:.3g} instead of {value:.3g}", gain))
-    kept = sorted((item for item in found if item.gain >= LEAST_EXPLANATION), key=lambda item: -item.gain)
+        found.append((f"a constant {name} near {nearer:.3g} instead of {value:.3g}", gain))
+    kept = sorted((item for item in found if item[1] >= LEAST_EXPLANATION), key=lambda item: -item[1])
     return tuple(kept[:MOST_TOLD])
 
 
@@ -65,11 +61,11 @@ def _of_sensors(innovations: FloatArray, names: Sequence[str], dt: float) -> lis
     for j, name in enumerate(names):
         column = innovations[:, j : j + 1]
         gain, _ = _together(column, np.ones((len(column), 1, 1)))
-        found.append(Explanation(f"an offset of the sensor {name}", gain))
+        found.append((f"an offset of the sensor {name}", gain))
         gain, first, _ = _on_its_past(column)
         if first > 0.0:
             lasting = f" over about {-dt / np.log(min(first, 1.0 - 1.0 / len(column))):.2g} s"
-            found.append(Explanation(f"noise of {name} that is correlated{lasting}", gain))
+            found.append((f"noise of {name} that is correlated{lasting}", gain))
     return found
 
 

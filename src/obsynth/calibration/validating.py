@@ -126,18 +126,10 @@ CLEARLY_MORE = 1.25
 TOLD_FACTOR = 1.5
 
 
-@dataclass(frozen=True)
-class NoiseRatios:
-    """Likeliest over designed variance for each that the log contradicts, the nats that the likeliest ones gain, and
-    the walk of the parameters ``(nq, nq)`` that goes with them, at most the one that is stated."""
-
-    ratios: Mapping[str, float]
-    gain: float
-    walk: FloatArray
-
-
-def noise_ratios(observer: DAEObserver, log: Log) -> NoiseRatios:
-    """Return what a log says of the variances of a design, parameters at their start, or as they walk."""
+def noise_ratios(observer: DAEObserver, log: Log) -> tuple[Mapping[str, float], float, FloatArray]:
+    """Return what a log says of the variances of a design, parameters at their start, or as they walk: likeliest over
+    designed variance for each that it contradicts, the nats that the likeliest ones gain, and the walk of the
+    parameters ``(nq, nq)`` that goes with them, at most the one that is stated."""
     model = observer.model
     held = model.replace(parameters=dict(zip(model.parameter_names, observer.initial_parameters, strict=True)))
     designed_Q, designed_R = np.diag(observer.Q), np.diag(observer.R)
@@ -146,7 +138,7 @@ def noise_ratios(observer: DAEObserver, log: Log) -> NoiseRatios:
     walking = np.diag(walk) > 0.0
     if walking.any() and not held.is_data:
         # Equations given as functions take no further states.
-        return NoiseRatios({}, 0.0, walk)
+        return {}, 0.0, walk
     walks = dict(zip(np.array(model.parameter_names)[walking].tolist(), np.diag(walk)[walking].tolist(), strict=True))
     made: Any = with_noise(held, walks=walks)[0] if walks else held
     names = (*noisy, *walks, *model.output_names)
@@ -189,7 +181,7 @@ def noise_ratios(observer: DAEObserver, log: Log) -> NoiseRatios:
         best = greatest_likelihood(objective, [fit], lambda text: None)
     except PreconditionError:
         # Without a likelihood nothing can be told of its variances.
-        return NoiseRatios({}, 0.0, walk)
+        return {}, 0.0, walk
     found = {}
     for i, (name, variance) in enumerate(zip(names, designed, strict=True)):
         ratio = float(np.exp(best.z[i]) / variance)
@@ -200,7 +192,7 @@ def noise_ratios(observer: DAEObserver, log: Log) -> NoiseRatios:
     shares = np.ones(model.nq)
     likeliest = np.exp(best.z[len(noisy) : len(noisy) + len(walks)] - np.log(designed[len(noisy) :][: len(walks)]))
     shares[walking] = np.minimum(likeliest, 1.0)
-    return NoiseRatios(found, objective(np.log(designed))[0] - best.value, shared_walk(walk, shares))
+    return found, objective(np.log(designed))[0] - best.value, shared_walk(walk, shares)
 
 
 #: A mean of innovations, or a parameter's deviation from its start, beyond so many standard deviations is told.
@@ -336,16 +328,17 @@ def _contradicted(
     said = noise_ratios(observer, passed_by_gate) if isinstance(observer, DAEObserver) else None
     # A variance that moves no innovation out of what is expected is no reason to change a design.
     agree = whole.holds and white and all(item.nis.holds for item in sensors.values())
-    ratios: Mapping[str, float] = {} if said is None or agree else said.ratios
+    ratios: Mapping[str, float] = {} if said is None or agree else said[0]
     if white:
         return ratios, None
     others = _explanations(design, log, record)
     if said is None or not ratios or not isinstance(observer, DAEObserver):
         return ratios, others
     # Wrong variances colour the innovations too: with the likeliest ones they are white, and nothing explains more.
-    likeliest = recorded_innovations(design.replace(observer=_with_variances(observer, said)), log)
-    rival = CLEARLY_MORE * others[0].gain if others else 0.0
-    if not _white(_sensors(likeliest, design.plant.output_names)) or rival > said.gain:
+    _, gain, walk = said
+    likeliest = recorded_innovations(design.replace(observer=_with_variances(observer, ratios, walk)), log)
+    rival = CLEARLY_MORE * others[0][1] if others else 0.0
+    if not _white(_sensors(likeliest, design.plant.output_names)) or rival > gain:
         return {}, others
     return ratios, None
 
@@ -421,12 +414,12 @@ def _white(sensors: Mapping[str, SensorValidation]) -> bool:
     return all(sensor.whiteness.probability >= SIGNIFICANT for sensor in sensors.values())
 
 
-def _with_variances(observer: DAEObserver, said: NoiseRatios) -> DAEObserver:
+def _with_variances(observer: DAEObserver, ratios: Mapping[str, float], walk: FloatArray) -> DAEObserver:
     """Return the observer with the likeliest variances on a log, where these are told."""
-    q = [said.ratios.get(name, 1.0) for name in observer.model.equation_names]
-    r = [said.ratios.get(name, 1.0) for name in observer.model.output_names]
+    q = [ratios.get(name, 1.0) for name in observer.model.equation_names]
+    r = [ratios.get(name, 1.0) for name in observer.model.output_names]
     Q, R = np.diag(np.diag(observer.Q) * q), np.diag(np.diag(observer.R) * r)
-    return replace(observer, Q=Q, R=R, random_walk=said.walk)
+    return replace(observer, Q=Q, R=R, random_walk=walk)
 
 
 def _explanations(design: ObserverDesign, log: Log, record: RecordedInnovations) -> tuple[Explanation, ...]:
@@ -455,7 +448,7 @@ def _explanations(design: ObserverDesign, log: Log, record: RecordedInnovations)
 def _explained(told: Sequence[Explanation]) -> str:
     if not told:
         return "No single offset, correlated noise, delay of an input or constant explains that: plot the residuals."
-    listed = "; ".join(f"{item.text} ({item.gain:.3g} nats)" for item in told)
+    listed = "; ".join(f"{text} ({gain:.3g} nats)" for text, gain in told)
     return (
         f"What explains it best, by likelihood: {listed}. The factors of Q and R have no meaning until that is "
         "corrected."
