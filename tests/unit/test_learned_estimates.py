@@ -14,6 +14,8 @@ import pytest
 from scipy.signal import lfilter
 
 import obsynth
+from obsynth.cli.data_run import summary_of_run
+from obsynth.data.alarm_events import NOT_APART, alarm_rows
 from obsynth.experiments.monitors.learned_levels import (
     AGES,
     Statistics,
@@ -22,11 +24,12 @@ from obsynth.experiments.monitors.learned_levels import (
     is_conformal,
     learned_levels,
 )
-from obsynth.experiments.monitors.monitor import Evidence
+from obsynth.experiments.monitors.monitor import NOT_TOLD_APART, Evidence
 from obsynth.experiments.monitors.parameter_scores import (
     Scores,
     before_any,
     change_ratios,
+    most_likely_change,
     parameter_walk,
     sample_score,
 )
@@ -135,6 +138,59 @@ def test_a_covariance_that_starts_again_says_nothing() -> None:
     assert not predicted.information.any()
     np.testing.assert_allclose(measured.information, [[1.0 / 0.55 - 1.0 / 1.1]])
     np.testing.assert_allclose(measured.score, [2.0 / 0.55 - 3.0 / 1.1])
+
+
+def test_a_fault_is_named_where_it_explains_more_than_any_other() -> None:
+    assert most_likely_change(np.array([[5.0, 1.0], [40.0, 20.0]])) == 0
+    assert most_likely_change(np.array([[1.0, 60.0], [40.0, 20.0]])) == 1
+    # Odds below 90, or less than a model that is off by some percent explains.
+    assert most_likely_change(np.array([[30.0, 22.0]])) == NOT_TOLD_APART
+    assert most_likely_change(np.array([[900.0, 880.0]])) == NOT_TOLD_APART
+    assert most_likely_change(np.array([[900.0, 850.0, 100.0]])) == 0
+    assert most_likely_change(np.array([[30.0]])) == 0
+    assert most_likely_change(np.array([[8.0]])) == NOT_TOLD_APART
+
+
+@functools.cache
+def two_losses() -> obsynth.ObserverDesign:
+    """Return a tank whose pump loses flow, or that leaks: alike while the input stays."""
+    model = obsynth.DAEModel(
+        {"tank": "der(h) = 10 * (1 - f) * u - h - 5 * leak"}, {"y": "h"}, states={"h": 0.0}, inputs={"u": 0.0},
+        parameters={"f": 0.0, "leak": 0.0},
+    )  # fmt: skip
+    return obsynth.dae_adaptive_observer(
+        model, dt=DT, Q=[[1e-4]], R=[[0.01]], form="augmented-kalman", random_walk=np.diag([1e-4, 1e-4]),
+        initial_covariance=[[0.01]], initial_parameter_covariance=np.diag([0.01, 0.01]),
+    )  # fmt: skip
+
+
+def test_faults_that_look_alike_are_not_told_apart_until_they_do_not() -> None:
+    def drawn(rows: int, seed: int, begin: int | None = None) -> pd.DataFrame:
+        rng, h, found = np.random.default_rng(seed), 0.0, []
+        for k in range(rows):
+            # It changes all the time, but stays for 60 rows after the fault.
+            held = begin is not None and begin - 40 <= k < begin + 60
+            u = 0.5 if held else 0.5 * (-1.0) ** (k // 8)
+            leak = 0.4 if begin is not None and k >= begin else 0.0
+            h = (h + DT * (10.0 * u - 5.0 * leak)) / (1.0 + DT) + 0.01 * rng.standard_normal()
+            found.append([k * DT, u, h + 0.1 * rng.standard_normal()])
+        return pd.DataFrame(found, columns=["time", "u", "y"])
+
+    found = obsynth.learn_thresholds(two_losses(), drawn(3_000, 0), false_alarms="1 per 1000 rows")
+    monitor = obsynth.online_monitor(two_losses(), "learned", normal=found)
+    run = obsynth.run_on_data(two_losses(), drawn(500, 1, begin=300), monitor=monitor)
+    first = next(event for event in run.events if event.first_row > 300)
+    assert first.first_row <= 330
+    told = run.table.alarm[300:355].unique().tolist()
+    assert set(told) == {"", "learned"}
+    assert run.table.alarm[480] == "learned: leak"
+    assert (first.fault, first.apart, run.isolated) == ("leak", True, "leak")
+    assert 0.25 < first.size < 0.55
+    short = obsynth.run_on_data(two_losses(), drawn(500, 1, begin=300)[:350], monitor=monitor)
+    assert not short.events[-1].apart
+    assert short.isolated == ""
+    assert [row[4] for row in alarm_rows(short.events, str)[0]] == ["fault", NOT_APART]
+    assert "points to" not in summary_of_run(short, monitor)
 
 
 def test_blank_rows_say_nothing_of_faults_and_change_nothing_after_them() -> None:

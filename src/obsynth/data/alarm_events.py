@@ -15,6 +15,8 @@ from obsynth.observers.estimates import BAND_WIDTH
 
 #: What stands for the status of rows that are well, but in which the monitor decides nothing.
 NO_DECISION = "undecided"
+#: What stands for the fault of an alarm whose evidence does not tell the faults apart.
+NOT_APART = "not told apart yet"
 #: Why a row cannot alarm, by its status.
 REASONS = {
     WARM_UP: "the initial-condition response has not settled yet (--warm-up)",
@@ -35,7 +37,7 @@ class AlarmEvent:
     by : str
         The column, or the kind of the monitor, whose threshold is passed.
     fault : str
-        The fault that it points to; empty where there is none.
+        The fault that it points to, at the largest evidence at which one is named; empty where there is none.
     start, end : float, seconds
         Times of the first and the last row above the threshold.
     first_row, last_row : int
@@ -47,6 +49,8 @@ class AlarmEvent:
         by an adaptive threshold; NaN where it is not known.
     evidence : float
         Largest share of the threshold that was reached.
+    apart : bool
+        Whether the evidence tells the faults apart; no fault is named otherwise.
     """
 
     by: str
@@ -60,6 +64,7 @@ class AlarmEvent:
     low: float
     high: float
     evidence: float
+    apart: bool = True
 
     @property
     def clear(self) -> bool:
@@ -77,18 +82,36 @@ class AlarmLog:
     def __init__(self, columns: Sequence[str]) -> None:
         self._places = {name: i for i, name in enumerate(columns)}
         self._open, self._closed = dict[str, AlarmEvent](), list[AlarmEvent]()
+        self._named_by = dict[str, float]()  # the evidence at which the fault of an open event was named
         self.silent = Counter[str]()
 
-    def take(self, by: str, fault: str, evidence: float, time: float, row: int, cells: Sequence[float]) -> None:
-        """Take a row above a threshold; ``cells`` are the numbers of its output."""
+    def take(
+        self,
+        by: str,
+        fault: str,
+        evidence: float,
+        time: float,
+        row: int,
+        cells: Sequence[float],
+        *,
+        apart: bool = True,
+    ) -> None:
+        """Take a row above a threshold; ``cells`` are the numbers of its output; ``apart``: whether a fault would be
+        named if there was one."""
         before = self._open.get(by)
         if before is not None and row - before.last_row > HOLD:
             self._closed.append(self._open.pop(by))
             before = None
+        if before is None:
+            self._named_by[by] = -math.inf
         largest = before is None or evidence > before.evidence or math.isnan(before.evidence)
         known = (math.nan,) * 3 if before is None else (before.size, before.low, before.high)
-        size, low, high = self._size(fault, cells) if largest else known
-        named = fault if largest or before is None else before.fault
+        named = "" if before is None else before.fault
+        tells = before is None or (apart and not evidence <= self._named_by[by])
+        size, low, high = self._size(fault, cells) if tells else known
+        if tells:
+            named = fault
+            self._named_by[by] = evidence if apart else -math.inf
         self._open[by] = AlarmEvent(
             by,
             named,
@@ -101,6 +124,7 @@ class AlarmLog:
             low,
             high,
             evidence if largest or before is None else before.evidence,
+            apart or (before is not None and before.apart),
         )
 
     def _size(self, fault: str, cells: Sequence[float]) -> tuple[float, float, float]:
@@ -142,6 +166,7 @@ def alarm_rows(events: Sequence[AlarmEvent], shown: Callable[[float], str]) -> t
         ends = shown(event.start), shown(event.end)
         evidence = f"{event.evidence:.3g} times"
         fault = event.fault if event.clear or not event.fault else f"{event.fault} (unclear)"
+        fault = fault if event.apart else NOT_APART
         rows.append((event.by, *ends, str(event.rows), fault, number(event.size), interval, evidence))
     kept = [i for i in range(len(rows[0])) if any(row[i] for row in rows[1:])]
     return [tuple(row[i] for i in kept) for row in rows], len(events) - len(rows) + 1

@@ -272,10 +272,11 @@ class LogRun:
             undecided = math.isnan(seen.statistic) and (undecided or not self._levels)
             if seen.alarm:
                 evidence = seen.statistic / seen.threshold if seen.threshold else math.inf
-                self.events.take(self.monitor.kind, seen.fault, evidence, time, number, [*before, *cells])
-                if self.monitor.kind not in self.alarms:
-                    self.alarms[self.monitor.kind], self.isolated = time, seen.fault
-                    self.alarm_rows[self.monitor.kind] = number
+                apart = bool(seen.fault) or not self.monitor.fault_names
+                self.events.take(self.monitor.kind, seen.fault, evidence, time, number, [*before, *cells], apart=apart)
+                self.alarms.setdefault(self.monitor.kind, time)
+                self.isolated = self.isolated or seen.fault
+                self.alarm_rows.setdefault(self.monitor.kind, number)
                 names.append(f"{self.monitor.kind}: {seen.fault}" if seen.fault else self.monitor.kind)
         for name, evidence in above:
             if evidence > 1.0:

@@ -12,7 +12,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.experiments.monitors.learned_levels import AGES, FORGETTING, HOLD
-from obsynth.experiments.monitors.parameter_scores import LEAST_ADDED
+from obsynth.experiments.monitors.parameter_scores import APART, LEAST_ADDED, MODEL_SHARE
 from obsynth.exporting.alarms import Alarms
 from obsynth.exporting.realisation import Realisation
 from obsynth.numerics.arrays import SMALLEST, FloatArray
@@ -184,7 +184,8 @@ def monitor_struct(alarms: Alarms, prefix: str) -> list[str]:
     return [
         "typedef struct {",
         "    /* Read these after a step: the largest statistic in units of its level (NaN where nothing is",
-        "     * decided), whether it passes 1, which fault it points to (-1: none), and an alarm that lasts. */",
+        "     * decided), whether it passes 1, which fault it points to (-1: none, or not told apart yet), and an",
+        "     * alarm that lasts. */",
         "    REAL statistic;",
         "    int alarm, fault, event;",
         "    /* Everything else is the monitor's own. */",
@@ -248,6 +249,8 @@ def monitor_source(alarms: Alarms, prefix: str) -> str:
     lines = [
         f"enum {{ {listed} }};",
         f"#define MONITOR_LEAST ((REAL){LEAST_ADDED!r})",
+        f"#define MONITOR_APART ((REAL){APART!r})",
+        f"#define MONITOR_SHARE ((REAL){MODEL_SHARE!r})",
         *(line for name, table in tables.items() for line in table_lines(name, filled_table(table))),
         *integer_table("monitor_ages", AGES),
         *integer_table("monitor_places", [alarms.columns.index(name) for name in found.columns]),

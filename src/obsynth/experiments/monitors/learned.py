@@ -25,7 +25,13 @@ from obsynth.experiments.monitors.learned_levels import (
     rows_needed,
 )
 from obsynth.experiments.monitors.monitor import Evidence, Judged, LinearSample, Monitor, Rule, Sample
-from obsynth.experiments.monitors.parameter_scores import Scores, before_any, parameter_walk, sample_score
+from obsynth.experiments.monitors.parameter_scores import (
+    Scores,
+    before_any,
+    most_likely_change,
+    parameter_walk,
+    sample_score,
+)
 from obsynth.files.outputs import FileKind, write_atomically
 from obsynth.methods.registry import error_model
 from obsynth.numerics.arguments import is_finite_number
@@ -554,9 +560,11 @@ class LearnedRule(Rule):
             weights = np.array([(2.0 - share) / share for share in FORGETTING])
             smooth = weights * np.sum(state.means**2, axis=1)
             first = [np.sum(state.white[-1] ** 2)]
-            values = np.concatenate([first, smooth, ratios, self._changes(state)]) / self.learned.levels
+            changes = self._changes(state)
+            values = np.concatenate([first, smooth, ratios, changes.max(axis=0)]) / self.learned.levels
         values = np.where(np.isnan(values), np.inf, values)
-        return state, Judged(float(values.max()), 1.0, self._fault(found, ratios))
+        which = self._fault(found, ratios) if self._walk is None else most_likely_change(changes)
+        return state, Judged(float(values.max()), 1.0, which)
 
     def _scored(self, state: LearnedState, said: Any, missing: int) -> LearnedState:
         """Return the state with what a sample says of the faults."""
@@ -569,12 +577,12 @@ class LearnedRule(Rule):
         return state._replace(before=before, scores=kept)
 
     def _changes(self, state: LearnedState) -> FloatArray:
-        """Return twice the largest log likelihood ratios of changes of each fault."""
+        """Return twice the log likelihood ratios of changes of each age and fault, ``(ages, nf)``."""
         if self._walk is None:
-            return np.zeros(0)
+            return np.zeros((1, 0))
         sums = np.cumsum(state.scores[::-1], axis=0)[np.array(AGES) - 1]
         away, power = np.hsplit(sums, 2)
-        return np.asarray(np.where(power > 0.0, away**2 / power, 0.0).max(axis=0, initial=0.0))
+        return np.asarray(np.where(power > 0.0, away**2 / power, 0.0))
 
     def _fault(self, found: FloatArray, ratios: FloatArray) -> int | None:
         """Return the fault whose step or ramp explains most, or whose estimate is furthest from where it was."""

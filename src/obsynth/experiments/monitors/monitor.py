@@ -128,8 +128,13 @@ class Sample(NamedTuple):
     bridged: bool = False  # whether the plant's model stood in for all that was missing since the warm-up
 
 
+#: In place of a fault's number: what is known does not tell the faults apart.
+NOT_TOLD_APART = -1
+
+
 class Judged(NamedTuple):
-    """What a rule says of a row: the fault by its number, if the rule knows it, and cells for columns of its own."""
+    """What a rule says of a row: the fault by its number, `NOT_TOLD_APART`, or `None` where the rule does not look for
+    it; and cells for columns of its own."""
 
     statistic: float
     threshold: float
@@ -317,7 +322,7 @@ class Monitor:
 
     def _named(self, which: int | None) -> str:
         """Return the fault of a number, or the group of faults one of which is there for certain."""
-        if which is None:
+        if which is None or which == NOT_TOLD_APART:
             return ""
         return " or ".join(self.groups[which]) if self.groups else (self.fault_names or ("",))[which]
 

@@ -13,13 +13,16 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.experiments.monitors.monitor import Evidence
+from obsynth.experiments.monitors.monitor import NOT_TOLD_APART, Evidence
 from obsynth.numerics.arrays import SMALLEST, FloatArray
 from obsynth.numerics.autoregression import Autoregression
 from obsynth.numerics.ranks import DIRECTION_SHARE
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.recursive.observer import RecursiveObserver
 
+#: A fault is named where a change of it alone is more likely than one of any other by so much in twice the log
+#: likelihood (odds of 90), and by this share of its own: constants that are off by some percent explain as much.
+APART, MODEL_SHARE = 9.0, 0.05
 #: Share of the information before it that a sample adds at least: less is what rounding leaves of the difference.
 LEAST_ADDED = 1e-9
 
@@ -123,6 +126,15 @@ def change_ratios(away: FloatArray, own: FloatArray, ages: tuple[int, ...]) -> F
             ratio = np.where(power > 0.0, (sums[age:] - sums[:-age]).T ** 2 / power, 0.0)
         np.maximum(found[:, age - 1 :], ratio, out=found[:, age - 1 :])
     return found
+
+
+def most_likely_change(ratios: FloatArray) -> int:
+    """Return the fault of which a change alone explains the most, from twice the log likelihood ratios of changes of
+    each age ``(ages, nf)``, at the most likely age; or that this does not tell the faults apart."""
+    found = ratios[int(np.argmax(ratios.max(axis=1)))]
+    best = int(np.argmax(found))
+    lead = found[best] - np.delete(found, best).max(initial=0.0)
+    return best if lead > max(APART, MODEL_SHARE * found[best]) else NOT_TOLD_APART
 
 
 @dataclass(frozen=True, eq=False)

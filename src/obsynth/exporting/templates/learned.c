@@ -242,25 +242,51 @@ static void monitor_score(PREFIX_monitor *m, const REAL *theta, const REAL *cova
     }
 }
 
-/* The largest likelihood ratio over all ages of a change of one fault. */
-static REAL change_ratio(const PREFIX_monitor *m, int fault)
+/* The largest likelihood ratios over all ages of a change of each fault; return the one of which a change alone is more
+ * likely than of any other at the most likely age, or -1 where they are not told apart. */
+static int monitor_changes(const PREFIX_monitor *m, REAL *largest)
 {
-    REAL score = 0;
-    REAL power = 0;
-    REAL largest = 0;
+    REAL sums[2 * MONITOR_WIDTH];
+    REAL best = -1;
+    REAL second = 0;
     int back = 0;
-    int age;
+    int fault = -1;
+    int age, i;
+    for (i = 0; i < 2 * MONITOR_WIDTH; i++) {
+        sums[i] = 0;
+    }
+    for (i = 0; i < MONITOR_ESTIMATES; i++) {
+        largest[i] = 0;
+    }
     for (age = 0; age < AGES; age++) {
-        REAL ratio;
+        REAL first = -1;
+        REAL next = 0;
+        int which = -1;
         for (; back < monitor_ages[age]; back++) {
             const REAL *row = m->scores + (m->at - back + OLDEST) % OLDEST * 2 * MONITOR_WIDTH;
-            score += row[fault];
-            power += row[MONITOR_WIDTH + fault];
+            for (i = 0; i < 2 * MONITOR_WIDTH; i++) {
+                sums[i] += row[i];
+            }
         }
-        ratio = power > 0 ? score * score / power : 0;
-        largest = ratio <= largest ? largest : ratio;
+        for (i = 0; i < MONITOR_ESTIMATES; i++) {
+            REAL power = sums[MONITOR_WIDTH + i];
+            REAL ratio = power > 0 ? sums[i] * sums[i] / power : 0;
+            largest[i] = ratio <= largest[i] ? largest[i] : ratio;
+            if (ratio > first) {
+                next = which >= 0 ? first : 0;
+                first = ratio;
+                which = i;
+            } else if (ratio > next) {
+                next = ratio;
+            }
+        }
+        if (first > best) {
+            best = first;
+            second = next;
+            fault = which;
+        }
     }
-    return largest;
+    return best - second > MONITOR_APART && best - second > MONITOR_SHARE * best ? fault : -1;
 }
 
 /* Take a row: fault estimates, then residuals; `covariance`: that of the fault estimates, or NULL where the observer has
@@ -270,8 +296,10 @@ static void monitor_take(PREFIX_monitor *m, const REAL *shown, const REAL *covar
 {
     REAL x[CHANNELS];
     REAL kept[CHANNELS];
+    REAL changes[MONITOR_WIDTH];
     REAL ratio, statistic;
     REAL best = -1;
+    int changed = -1;
     int which = 0;
     int is_said = 1;
     int is_whole = deciding;
@@ -331,16 +359,17 @@ static void monitor_take(PREFIX_monitor *m, const REAL *shown, const REAL *covar
             ratio /= monitor_levels[0][1 + MEANS + i];
             statistic = ratio <= statistic ? statistic : ratio;
         }
+        changed = monitor_changes(m, changes);
         for (i = 0; i < MONITOR_ESTIMATES; i++) {
-            ratio = change_ratio(m, i) / monitor_levels[0][1 + MEANS + SHAPES + i];
+            ratio = changes[i] / monitor_levels[0][1 + MEANS + SHAPES + i];
             statistic = ratio <= statistic ? statistic : ratio;
         }
         m->statistic = isnan(statistic) ? (REAL)HUGE_VAL : statistic;
         m->alarm = m->statistic > 1;
     }
     if (m->alarm) {
-        m->fault = monitor_told[which % (SHAPES / 2)];
-        if (m->fault < 0) {
+        m->fault = MONITOR_ESTIMATES > 0 ? changed : monitor_told[which % (SHAPES / 2)];
+        if (m->fault < 0 && MONITOR_ESTIMATES == 0) {
             best = -1;
             for (i = 0; i < MONITOR_FAULTS; i++) {
                 ratio = ABS(shown[i] - monitor_centres[0][i]) / monitor_scales[0][i];
