@@ -12,7 +12,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.experiments.monitors.learned_levels import AGES, FORGETTING, HOLD
-from obsynth.experiments.monitors.parameter_scores import APART, LEAST_ADDED, MODEL_SHARE
+from obsynth.experiments.monitors.parameter_scores import LEAST_ADDED, MODEL_SHARE, TOLD_APART
 from obsynth.exporting.alarms import Alarms
 from obsynth.exporting.realisation import Realisation
 from obsynth.numerics.arrays import SMALLEST, FloatArray
@@ -249,7 +249,7 @@ def monitor_source(alarms: Alarms, prefix: str) -> str:
     lines = [
         f"enum {{ {listed} }};",
         f"#define MONITOR_LEAST ((REAL){LEAST_ADDED!r})",
-        f"#define MONITOR_APART ((REAL){APART!r})",
+        f"#define MONITOR_APART ((REAL){TOLD_APART!r})",
         f"#define MONITOR_SHARE ((REAL){MODEL_SHARE!r})",
         *(line for name, table in tables.items() for line in table_lines(name, filled_table(table))),
         *integer_table("monitor_ages", AGES),
