@@ -35,13 +35,6 @@ LENGTH, MOST_CONTINUOUS_STATES = 0.4, 12
 LEFT_OF_GAINS, MOST_STEPS_OF_GAINS = 0.05, 1_024
 
 
-class PeakSums(NamedTuple):
-    """Upper bounds, a column per input: ``partial (steps, ..., m)`` on terms ``0 .. k``, ``whole (..., m)`` on all."""
-
-    partial: FloatArray
-    whole: FloatArray
-
-
 def peak_sums(
     matrix: Ball,
     rows: FloatArray,
@@ -52,8 +45,10 @@ def peak_sums(
     left: float = LEFT_OF_SUM,
     each: bool = False,
     most: int = MOST_SUMMED_STEPS,
-) -> PeakSums:
+) -> tuple[FloatArray, FloatArray]:
     """Return bounds on the sums over j of ``|c M^j b|`` (Euclidean; ``each``: by row) of columns ``b``, ``c (p, n)``.
+
+    A column per input: on terms ``0 .. k``, ``(steps, ..., m)``, and on all of them, ``(..., m)``.
 
     From ``least`` to ``most`` terms, in blocks of 64, until the rest is bounded by the share ``left``.
     """
@@ -88,7 +83,7 @@ def peak_sums(
     products = rounded_up(products + known, n + count)
     added = rounded_up(added + (products if each else np.sum(products, axis=0)), len(rows) + 6)
     partial = rounded_up(np.cumsum(every, axis=0), count + 2 * len(rows) + 10) + added
-    return PeakSums(rounded_up(partial, 4), rounded_up(partial[-1] + after, 6))
+    return rounded_up(partial, 4), rounded_up(partial[-1] + after, 6)
 
 
 def _block(rows: FloatArray, moving: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -196,5 +191,5 @@ def absolute_gains(a: FloatArray, rows: FloatArray, contraction: Contraction) ->
         held = replace(contraction, rate=rate, discrete=True) if rate < 1.0 else None
     if held is None:
         return loose
-    whole = peak_sums(moving, rows, columns, held, left=LEFT_OF_GAINS, each=True, most=MOST_STEPS_OF_GAINS).whole
+    whole = peak_sums(moving, rows, columns, held, left=LEFT_OF_GAINS, each=True, most=MOST_STEPS_OF_GAINS)[1]
     return np.asarray(np.minimum(loose, whole if gather is None else gathered(gather, whole, n)))

@@ -220,6 +220,6 @@ def _peak_gain(
     both = Ball(
         *(np.hstack([getattr(part, name) for part in (pieces.columns, at_samples)]) for name in _INTERVAL_PARTS)
     )
-    sums = peak_sums(az, rows, both, contraction, most=STEPS_OF_INFORMATION).whole
+    _, sums = peak_sums(az, rows, both, contraction, most=STEPS_OF_INFORMATION)
     between, sampled = gathered(pieces, sums[..., :count], smooth.nd), sums[..., count:]
     return float(np.sum(between + sampled + column_norms(Ball.exact(direct))))

@@ -7,7 +7,7 @@ computed in full.  What counts is a pass before something is wrong, and the firs
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,11 +28,8 @@ FIRST_WINDOW = 8
 REMEMBERED_RINGS = 8
 
 
-class Sides(NamedTuple):
-    """``(steps, runs)``: values that surely pass the threshold, and values that surely do not."""
-
-    above: np.ndarray
-    below: np.ndarray
+#: Values ``(steps, runs)`` that surely pass the threshold, and values that surely do not.
+Sides: TypeAlias = tuple[np.ndarray, np.ndarray]
 
 
 class Records(NamedTuple):
@@ -119,7 +116,7 @@ class Screening:
         most = limit + spread + np.linalg.norm(rest[..., at], axis=2) + np.linalg.norm(bound.more[at])
         above |= norm > most * THRESHOLD_ROUNDING * (1.0 + UNDECIDED_SHARE)
         below &= norm <= (limit - spread) * (1.0 - UNDECIDED_SHARE)
-        return Sides(above, below), states[:, -1] @ bound.structure.Az.T + into[:, -1]
+        return (above, below), states[:, -1] @ bound.structure.Az.T + into[:, -1]
 
     def sensitivities(self, records: Records, k: int) -> FloatArray:
         """Return the sensitivities ``(runs, p, nz)`` at a sample, from the signals before it."""
@@ -224,29 +221,31 @@ def _known(bound: AdaptiveBound, n: int, nu: int) -> FloatArray:
     return found
 
 
-def first_passed(screening: Screening, records: Records, candidates: np.ndarray, begin: int) -> Sides:
+def first_passed(
+    screening: Screening, records: Records, candidates: np.ndarray, begin: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Return samples ``(steps, runs)`` that surely pass, and those to be computed in full: the first one counts."""
     above, left = np.zeros(candidates.shape, dtype=bool), np.zeros(candidates.shape, dtype=bool)
     p, nz, *_ = screening.plan.bound.counts
     early = np.flatnonzero(candidates[:begin].any(axis=0))
     if len(early):
-        found, _ = screening.sides(records.of(early), 0, begin, np.zeros((len(early), p, nz)))
-        above[:begin, early] = found.above & candidates[:begin, early]
+        (passed, below), _ = screening.sides(records.of(early), 0, begin, np.zeros((len(early), p, nz)))
+        above[:begin, early] = passed & candidates[:begin, early]
         open_runs = ~above[:begin, early].any(axis=0)
-        left[:begin, early] = candidates[:begin, early] & ~found.below & open_runs
+        left[:begin, early] = candidates[:begin, early] & ~below & open_runs
     todo = np.flatnonzero(candidates[begin:].any(axis=0))
     if not len(todo):
-        return Sides(above, left)
+        return above, left
     psi, at, size = screening.sensitivities(records.of(todo), begin), begin, FIRST_WINDOW
     while len(todo) and at < len(candidates):
         end = min(at + size, len(candidates))
-        found, psi = screening.sides(records.of(todo), at, end, psi)
-        above[at:end, todo] = found.above & candidates[at:end, todo]
-        left[at:end, todo] = candidates[at:end, todo] & ~found.below & ~found.above
+        (passed, below), psi = screening.sides(records.of(todo), at, end, psi)
+        above[at:end, todo] = passed & candidates[at:end, todo]
+        left[at:end, todo] = candidates[at:end, todo] & ~below & ~passed
         going = ~above[at:end, todo].any(axis=0)
         todo, psi, at, size = todo[going], psi[going], end, 2 * size
     first = np.argmax(above[begin:], axis=0) + begin
     first[~above[begin:].any(axis=0)] = len(candidates)
     # What comes after the first that surely passes does not count.
     left &= np.arange(len(candidates))[:, None] < first
-    return Sides(above, left)
+    return above, left

@@ -21,7 +21,7 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.balls import Ball, rounded_up
 from obsynth.proofs.contraction import Contraction, column_norms, prove_contraction
 from obsynth.proofs.extended_balls import block
-from obsynth.proofs.peak_sums import PeakSums, gathered, interval_pieces, peak_sums
+from obsynth.proofs.peak_sums import gathered, interval_pieces, peak_sums
 from obsynth.proofs.products import exponential
 
 #: Modes of the plant that decay by less than this exponent in a sample are not followed until they have decayed.
@@ -145,10 +145,10 @@ class BetweenSamples:
         if not count:
             return np.zeros(steps), np.zeros(0)
         pieces = interval_pieces(plant.A, plant.Bd, self.into, self.dt)
-        between = self._sums(pieces.columns, steps)
+        partial, whole = self._sums(pieces.columns, steps)
         at = self._at_samples(plant.Dd, steps)
-        table = gathered(pieces, between.partial, count)[: max(steps - 1, 0)] + at[1][: max(steps - 1, 0)]
-        whole = rounded_up((gathered(pieces, between.whole, count) + at[2] + at[0]) * sizes, 6)
+        table = gathered(pieces, partial, count)[: max(steps - 1, 0)] + at[1][: max(steps - 1, 0)]
+        whole = rounded_up((gathered(pieces, whole, count) + at[2] + at[0]) * sizes, 6)
         earlier = np.vstack([np.zeros((1, count)), table])[:steps]
         return np.asarray(rounded_up(np.sum((earlier + at[0]) * sizes, axis=1), count + 6)), np.asarray(whole)
 
@@ -156,19 +156,18 @@ class BetweenSamples:
         """Return the same for what is gathered in each sample, columns ``(n, m)`` of x of at most one each."""
         if not columns.shape[1]:
             return np.zeros(steps), np.zeros(0)
-        found = self._sums(self.into @ Ball.exact(columns), steps)
-        earlier = np.vstack([np.zeros((1, columns.shape[1])), found.partial])[:steps]
-        return np.asarray(np.sum(earlier, axis=1)), np.asarray(found.whole)
+        partial, whole = self._sums(self.into @ Ball.exact(columns), steps)
+        earlier = np.vstack([np.zeros((1, columns.shape[1])), partial])[:steps]
+        return np.asarray(np.sum(earlier, axis=1)), np.asarray(whole)
 
     def _at_samples(self, dd: FloatArray, steps: int) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return what the values at the samples do: at once ``(nd,)``, by later samples, and by all."""
         above = np.zeros((len(self.plant.A), dd.shape[1]))
         now, later = np.vstack([above, self.first @ dd]), Ball.exact(np.vstack([above, self.second @ dd]))
         at_once = column_norms(Ball.exact(self.direct) @ Ball.exact(dd) + Ball.exact(self.c) @ Ball.exact(now))
-        found = self._sums(self.M @ Ball.exact(now) + later, steps)
-        return at_once, found.partial, found.whole
+        return at_once, *self._sums(self.M @ Ball.exact(now) + later, steps)
 
-    def _sums(self, columns: Ball, steps: int) -> PeakSums:
+    def _sums(self, columns: Ball, steps: int) -> tuple[FloatArray, FloatArray]:
         if self.contraction is not None:
             return peak_sums(self.M, self.c, columns, self.contraction, least=steps)
         rows, terms = self.c, []
@@ -178,7 +177,7 @@ class BetweenSamples:
             terms.append(np.linalg.norm(rows @ columns.midpoint, axis=0) + rounding)
             rows = rows @ self.M.midpoint
         partial = np.cumsum(np.array(terms), axis=0)
-        return PeakSums(partial, np.full(partial.shape[1], np.inf))
+        return partial, np.full(partial.shape[1], np.inf)
 
     def input_response(self, observer: LinearObserver) -> InputResponse:
         """Return what known inputs do to what is watched: held between samples, or in straight lines."""
