@@ -164,7 +164,7 @@ def augmented_problem(
             constraints["region"] = atoms.region(UAx, P, region, Y=Y, Cy=Cx, margin=margin)[1]
     else:
         wanted = checked_poles(poles, na, np.zeros(0, dtype=np.complex128), plant.dt, of="ui-pi-observer")
-        K = place(UA, shown, wanted, dt=plant.dt, objective="gain").K
+        K = place(UA, shown, wanted, dt=plant.dt, objective="gain")[0]
         X = np.asarray(np.linalg.inv(lyapunov_factor(UA - K @ shown, plant.dt)))
         variables, goal = {"P": P}, cp.trace(P)
         closed = np.linalg.solve(X, (UA - K @ shown) @ X)

@@ -26,12 +26,9 @@ class PlantSource:
     plant: DescriptorSystem
     sample_time: float | None = None
 
-    def derived(self) -> Transformation:
-        """Return the elimination, and the sampling where there was one, done again; once for all checks."""
-        return self._derived
-
     @cached_property
-    def _derived(self) -> Transformation:
+    def derived(self) -> Transformation:
+        """The elimination, and the sampling where there was one, done again; once for all checks."""
         from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
         from obsynth.analysis.transformations.sampling import discretise
 

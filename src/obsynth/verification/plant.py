@@ -106,7 +106,7 @@ def derivation_rows(design: ObserverDesign, model: ErrorModel) -> Iterator[Check
             )
         return
     try:
-        found = source.derived()
+        found = source.derived
     except ObsynthError as error:
         yield upper_bound_check(
             "plant as written", "it can be eliminated and sampled again", 1.0, 0.0, source=_SOURCE, detail=str(error)

@@ -161,7 +161,7 @@ def stored_twice_rows(design: ObserverDesign) -> Iterator[Check]:
 def _noise_of(source: PlantSource, plant: DescriptorSystem) -> list[str]:
     """Return covariances of the noise that do not follow from the plant as written: factors are not unique."""
     try:
-        made = source.derived().plant
+        made = source.derived.plant
     except ObsynthError:
         return ["plant as written"]
     if not source.plant.nw and plant.nw:

@@ -360,7 +360,7 @@ def _placed_filter(
 ) -> FilterPart:
     fixed = np.zeros(0, dtype=np.complex128)
     wanted = checked_poles(poles, len(model.A), fixed, plant.dt, of="functional-filter")
-    gain = place(model.A, model.C, wanted, dt=plant.dt).K if len(model.A) else np.zeros((0, len(model.C)))
+    gain = place(model.A, model.C, wanted, dt=plant.dt)[0]
     lag = (np.zeros_like(gain),) if plant.dt > 0.0 else ()
     noise = model.M @ model.M.T if plant.nw and rounding_rank(model.M) == len(model.M) else np.eye(len(model.C))
     return filter_part(model, KalmanGain(gain, lag, noise, 0.0), whitening(noise), delay=0, mean=asked.mean)

@@ -34,15 +34,6 @@ OVERLAP = 1e-3
 PLACEMENT_TOLERANCE = 1e-5
 
 
-@dataclass(frozen=True, eq=False)
-class Placement:
-    """Gains that place poles."""
-
-    K: FloatArray  # (n, ny)
-    condition: float  # of the (generalised) eigenvectors
-    error: float  # largest relative miss; of the mean for a multiple pole
-
-
 def jordan_form(poles: Sequence[complex]) -> FloatArray:
     """Return a real cyclic matrix ``(n, n)`` with these eigenvalues: one chain for each group of equal poles."""
     upper = [pole for pole in poles if pole.imag >= 0.0]
@@ -75,11 +66,12 @@ def place(
     dt: float = 0.0,
     objective: str = "conditioning",
     weight: FloatArray | None = None,
-) -> Placement:
-    """Return K ``(n, ny)`` such that ``F - K C`` has these poles; ``f (n, n)``, ``c (ny, n)``, ``weight (m, n)``."""
+) -> tuple[FloatArray, float]:
+    """Return K ``(n, ny)`` such that ``F - K C`` has these poles, and the condition of the (generalised) eigenvectors;
+    ``f (n, n)``, ``c (ny, n)``, ``weight (m, n)``."""
     n, outputs = f.shape[0], c.shape[0]
     if n == 0:
-        return Placement(np.zeros((0, outputs)), 1.0, 0.0)
+        return np.zeros((0, outputs)), 1.0
     target = jordan_form(poles)
     rng = np.random.default_rng(STARTS_SEED)
     size = max(float(np.linalg.norm(f, 2)), SMALLEST)
@@ -115,7 +107,7 @@ def place(
             "close to an unobservable one: ask for slower or fewer distinct poles, lower the order of the fault model, "
             "or use decay= instead."
         )
-    return Placement(k, float(np.linalg.cond(x)), error)
+    return k, float(np.linalg.cond(x))
 
 
 @dataclass(frozen=True, eq=False)

@@ -126,7 +126,7 @@ def _placed(problem: PlacementProblem, wanted: Sequence[complex], objective: str
     plain_outputs = problem.free == 0 and np.array_equal(problem.decoupled.seen, np.eye(plant.ny))
     outputs = units.outputs if plain_outputs else np.ones(len(split.C))
     scaled_poles = [units.rate * pole for pole in wanted]
-    found = place(
+    gain, condition = place(
         split.F,
         split.C / outputs[:, None],
         scaled_poles,
@@ -134,7 +134,7 @@ def _placed(problem: PlacementProblem, wanted: Sequence[complex], objective: str
         objective=objective,
         weight=units.augmented_states[:, None] * split.lift(np.eye(split.order)),
     )
-    return found.K / outputs, wanted, {"condition": found.condition}, ()
+    return gain / outputs, wanted, {"condition": condition}, ()
 
 
 def _chosen(
