@@ -113,7 +113,7 @@ def wang2015(
     require_data(held, solvers=("fault zeros",))
     work = with_sensor_faults_as_states(own)
     A, C, F, D = work.A, work.C, work.Bf, work.Bd
-    n, m, q, nd = work.nx, work.ny, work.nf, work.nd
+    n, m, q = work.nx, work.ny, work.nf
 
     T, N = _restricted_equivalent(own, work, S, T, N)  # (7), (16)-(17)
     TA, TF = T @ A, T @ F
@@ -163,23 +163,10 @@ def wang2015(
             del variables["Vw"]
         Wx = W0 + Vw @ V.T  # every left inverse of Upsilon
         Z, Zd = Wx @ (C @ X), Wx @ (shown_d / unit)
-        whole = lmi.symmetric_blocks(
-            [  # (45) before its last Schur complement
-                [-P],
-                [np.zeros((nd, n)), -gamma_squared / unit**2 * np.eye(nd)],
-                [P @ A1 - Y @ C1, P @ TD - Y @ D1, -P],
-                [Z, Zd, np.zeros((q, n)), -np.eye(q)],
-            ]
-        )
     else:
         Z, Zd = W0 @ C @ X, W0 @ shown_d / unit
-        whole = lmi.symmetric_blocks(
-            [  # (45)
-                [-P + Z.T @ Z],
-                [Zd.T @ Z, -gamma_squared / unit**2 * np.eye(nd) + Zd.T @ Zd],
-                [P @ A1 - Y @ C1, P @ TD - Y @ D1, -P],
-            ]
-        )
+    driven = P @ A1 - Y @ C1, P @ TD - Y @ D1
+    whole = _matrix_45(P, gamma_squared / unit**2, driven, Z, Zd, free=free)
     constraints = {"P": lmi.at_least(P, margin), "(45)": lmi.at_most(whole, -margin)}
 
     def gains(values: Values) -> dict[str, FloatArray]:
@@ -187,21 +174,8 @@ def wang2015(
         weight = W0 + values["Vw"] @ V.T if "Vw" in values else W0
         return {"T": T, "N": N, "L": L0 + R, "W": weight, "Psi": Psi, "Upsilon": Upsilon, "R": R}  # (60)
 
-    data = {
-        "T": T,
-        "N": N,
-        "Psi": Psi,
-        "Upsilon": Upsilon,
-        "W": W0,
-        "A1": A1,
-        "C1": C1,
-        "TD": TD,
-        "L0": L0,
-        "D1": D1,
-        "X": X,
-        "R0": R0,
-        "rest": rest,
-    }
+    data = {"T": T, "N": N, "Psi": Psi, "Upsilon": Upsilon, "W": W0, "A1": A1, "C1": C1, "TD": TD}
+    data |= {"L0": L0, "D1": D1, "X": X, "R0": R0, "rest": rest}
     return Conditions(
         "Wang et al. 2015, Theorem 2, (45)",
         cp.Problem(goal, list(constraints.values())),
@@ -214,6 +188,22 @@ def wang2015(
         partial(_design, plant, convex),
         weight=Wx if free else None,
     )
+
+
+def _matrix_45(P: Any, level: Any, driven: tuple[Any, Any], Z: Any, Zd: Any, *, free: bool) -> Any:
+    """Return the matrix of (45), which is to be negative definite; where the weight is free before its last Schur
+    complement."""
+    n, nd, q = P.shape[0], Zd.shape[1], Z.shape[0]
+    if free:
+        return lmi.symmetric_blocks(
+            [
+                [-P],
+                [np.zeros((nd, n)), -level * np.eye(nd)],
+                [*driven, -P],
+                [Z, Zd, np.zeros((q, n)), -np.eye(q)],
+            ]
+        )
+    return lmi.symmetric_blocks([[-P + Z.T @ Z], [Zd.T @ Z, -level * np.eye(nd) + Zd.T @ Zd], [*driven, -P]])
 
 
 def _restricted_equivalent(

@@ -12,8 +12,9 @@ from obsynth.analysis.transformations.entries_in_constants import at_nominal, bo
 from obsynth.analysis.transformations.equilibrium import Point, consistent_point, equilibrium, nominal_point
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.arguments import is_finite_number, require_kind
+from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.constants import ConstantsBox
-from obsynth.plants.dae.functions import local_equations
+from obsynth.plants.dae.functions import LocalEquations, local_equations
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.uncertain_system import filled_plant
@@ -186,18 +187,7 @@ def linear_model(
             condition="not-differentiable",
             signals=list(model.equation_names),
         )
-    motion = local.E @ point.rates
-    moves = np.abs(motion) > LARGEST_MOTION * np.maximum(
-        np.abs(local.by_state) @ model.state_scales, np.abs(motion).min()
-    )
-    if moves.any() and not drift:
-        moved = {name: value for name, value, moving in zip(model.equation_names, motion, moves, strict=True) if moving}
-        raise PreconditionError(
-            f"The point moves: E x' = ({', '.join(f'{name}: {value:.4g}' for name, value in moved.items())}), so that "
-            f"it is no equilibrium. With drift=True this motion becomes an input {DRIFT!r}, which is 1 in every row.",
-            condition="no-equilibrium",
-            signals=list(moved),
-        )
+    motion = _motion(model, point, local, drift=drift)
     uncertain = () if box is None else box.names
     every = [name for name in model.parameter_names if name not in uncertain]
     chosen = every if faults is None else _names(faults, "faults")
@@ -205,7 +195,7 @@ def linear_model(
     unknown = [index_of(name, model.input_names, what="disturbances") for name in _names(disturbances, "disturbances")]
     known = [i for i in range(model.nu) if i not in unknown]
     inputs, B = [model.input_names[i] for i in known], -local.by_input[:, known]
-    if moves.any():
+    if motion is not None:
         inputs, B = [*inputs, DRIFT], np.column_stack([B, motion])
     # A state must not have the name of an output with another value.
     shown = dict(zip(model.output_names, local.y, strict=True))
@@ -220,7 +210,7 @@ def linear_model(
             strict=True,
         )
     )
-    values |= {DRIFT: 0.0} if moves.any() else {}
+    values |= {} if motion is None else {DRIFT: 0.0}
     signals = {*names, *inputs, *model.output_names, *chosen, *disturbances}
     units = {name: unit for name, unit in model.units.items() if name in signals}
     units |= {
@@ -246,7 +236,26 @@ def linear_model(
     if box is None or not box.names:
         return linear
     columns = {"B": known, "Bd": unknown, "Bf": fault_columns}
-    return _over_box(linear, model, point, box, columns, moving=bool(moves.any()))
+    return _over_box(linear, model, point, box, columns, moving=motion is not None)
+
+
+def _motion(model: DAEModel, point: Point, local: LocalEquations, *, drift: bool) -> FloatArray | None:
+    """Return ``E x'`` of a point that moves, refused unless ``drift`` makes an input of it; ``None`` at rest."""
+    motion = local.E @ point.rates
+    moves = np.abs(motion) > LARGEST_MOTION * np.maximum(
+        np.abs(local.by_state) @ model.state_scales, np.abs(motion).min()
+    )
+    if not moves.any():
+        return None
+    if not drift:
+        moved = {name: value for name, value, moving in zip(model.equation_names, motion, moves, strict=True) if moving}
+        raise PreconditionError(
+            f"The point moves: E x' = ({', '.join(f'{name}: {value:.4g}' for name, value in moved.items())}), so that "
+            f"it is no equilibrium. With drift=True this motion becomes an input {DRIFT!r}, which is 1 in every row.",
+            condition="no-equilibrium",
+            signals=list(moved),
+        )
+    return np.asarray(motion)
 
 
 def _over_box(
