@@ -17,7 +17,9 @@ from obsynth.plants.validation import suggestion
 if TYPE_CHECKING:
     from pydantic import BaseModel
 
-    from obsynth.spec.schema import DAESection, PlantSection, SpecDocument, TimeVaryingSection
+    from obsynth.spec.schema import SpecDocument
+    from obsynth.spec.schema_models import DAESection, TimeVaryingSection
+    from obsynth.spec.schema_plants import PlantSection
 
     Model = TypeVar("Model", bound=BaseModel)
 
@@ -150,12 +152,11 @@ class DocumentProblems:
 def checked_spec(document: Mapping[str, Any], source: Path) -> tuple[SpecDocument, dict[str, Any]]:
     """Check a whole spec, and the options of its method."""
     from obsynth.methods.registry import AUTO, REGISTRY, method_class
-    from obsynth.spec.schema import SpecDocument
     from obsynth.spec.schema_values import options_schema
 
     problems = DocumentProblems(source, what="spec")
     _check_version(document, problems)
-    checked = _validated(SpecDocument, document, problems)
+    checked = _checked_sections(document, problems)
     method = document.get("method", {"id": AUTO})
     raw_options: Any = {}
     identifier = None
@@ -181,6 +182,24 @@ def checked_spec(document: Mapping[str, Any], source: Path) -> tuple[SpecDocumen
     return checked, {name: getattr(options, name) for name in options.model_fields_set}
 
 
+def _checked_sections(document: Mapping[str, Any], problems: DocumentProblems) -> SpecDocument | None:
+    """Return a whole spec but for the options of its method; ``None`` where it has problems, which are noted."""
+    from obsynth.spec.schema import CHECKED_APART, SpecDocument, section_of
+
+    checked = _validated(SpecDocument, document, problems)
+    sections: dict[str, BaseModel | None] = {}
+    for name in CHECKED_APART:
+        value = document.get(name)
+        if value is not None or (name == "plant" and name in document):
+            sections[name] = _validated(section_of(name, value), value, problems, prefix=name)
+    # As if all had been checked at once: in the order of the keys of a spec, unknown ones last.
+    order = list(SpecDocument.model_fields)
+    problems.found.sort(key=lambda problem: (*order, key := problem[0].partition(".")[0]).index(key))
+    if checked is None or None in sections.values():
+        return None
+    return checked.model_copy(update=sections)
+
+
 def _options_of_any(given: dict[str, Any], source: Path) -> dict[str, Any]:
     """Return options as the first method reads them that has them all; `auto` decides between those that do."""
     from obsynth.methods.registry import REGISTRY
@@ -202,12 +221,12 @@ def _options_of_any(given: dict[str, Any], source: Path) -> dict[str, Any]:
 
 def checked_plant(document: Mapping[str, Any], source: Path) -> PlantSection | TimeVaryingSection | DAESection:
     """Check a plant in a file of its own."""
-    from obsynth.spec.schema import PLANT_DOCUMENTS
+    from obsynth.spec.schema import RARE_KINDS, plant_document
 
     problems = DocumentProblems(source, what="plant")
     _check_version(document, problems)
     kind = document.get("kind")
-    known = PLANT_DOCUMENTS.get(kind if isinstance(kind, str) else None, PLANT_DOCUMENTS[None])
+    known = plant_document(kind if kind in RARE_KINDS else None)
     checked: Any = _validated(known, document, problems)
     problems.raise_if_any()
     found: PlantSection | TimeVaryingSection | DAESection = checked
@@ -224,9 +243,7 @@ def _check_version(document: Mapping[str, Any], problems: DocumentProblems) -> N
         problems.raise_if_any()
 
 
-def _validated(
-    model: type[Model], document: Mapping[str, Any], problems: DocumentProblems, *, prefix: str = ""
-) -> Model | None:
+def _validated(model: type[Model], document: Any, problems: DocumentProblems, *, prefix: str = "") -> Model | None:
     from pydantic import ValidationError
 
     try:
@@ -249,7 +266,7 @@ def _explained(item: Any, model: type[BaseModel], prefix: str) -> tuple[str, str
     if kind == "invalid_key" or "[key]" in location:
         text, numbers = f"a key must be a non-empty text, not {described(value)}.", []
     elif kind == "extra_forbidden":
-        known = _known_keys(item["loc"]) if len(names) > 1 else list(model.model_fields)
+        known = _known_keys((prefix, *item["loc"])) if len(names) > 1 else list(model.model_fields)
         text = f"unknown key.{suggestion(key, known)}"
     elif kind == "missing":
         needed = ": give the seconds between samples, or 0 for a plant in continuous time"
@@ -296,17 +313,14 @@ def _wanted(kind: str, context: Mapping[str, Any]) -> str:
 def _known_keys(location: Sequence[str | int]) -> list[str]:
     """Return the keys that the section around the last part of ``location`` may have."""
     from obsynth.spec import schema
+    from obsynth.spec.schema_plants import TransformSection
     from obsynth.spec.schema_values import MatrixFile
 
     sections: dict[str, type[BaseModel]] = {
         "<file>": MatrixFile,
-        "<inline>": schema.PlantSection,
-        "<varying>": schema.TimeVaryingSection,
-        "<dae>": schema.DAESection,
         "<one>": schema.ProfileSection,
         "method": schema.MethodSection,
-        "transform": schema.TransformSection,
-        "scenario": schema.ScenarioSection,
+        "transform": TransformSection,
     }
     if "<pick>" in location:
         return ["outputs" if {"C", "Df", "Dd"} & set(location) else "states", "file"]

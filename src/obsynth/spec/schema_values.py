@@ -30,13 +30,14 @@ from obsynth.methods.registry import method_class
 from obsynth.numerics.arguments import Count, NonNegative, OpenUnitInterval, Positive, WrittenAs, field_types, is_number
 
 # Tags of unions appear in the locations of pydantic's errors; the bracket marks them for removal.
-_ROWS, FILE_TAG, _PICK, LIST_TAG, _STACK_TAG, _NUMBER_TAG = (
+_ROWS, FILE_TAG, _PICK, LIST_TAG, _STACK_TAG, _NUMBER_TAG, ONE_TAG = (
     "<rows>",
     "<file>",
     "<pick>",
     "<list>",
     "<stack>",
     "<number>",
+    "<one>",
 )
 
 
