@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import wraps
 from inspect import Parameter, signature
@@ -44,6 +45,11 @@ def read_only(array: FloatArray) -> FloatArray:
     copy = np.array(array, dtype=np.float64, order="C", copy=True)
     copy.setflags(write=False)
     return copy
+
+
+def all_finite(vector: FloatArray) -> bool:
+    """Whether every entry of a short vector ``(n,)`` is finite; what is not is left in a sum of them."""
+    return math.isfinite(sum(vector.tolist())) or bool(np.isfinite(vector).all())
 
 
 def unmasked(value: Any) -> Any:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from obsynth.analysis.dae_structure import involved
 from obsynth.errors import SolverError
+from obsynth.numerics import lapack
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.numerics.ranks import SINGULAR_CONDITION
 from obsynth.observers.estimates import NO_NUMBERS, STEP_RESIDUAL, Estimates
@@ -116,13 +117,22 @@ class DAERow:
         """Condition number of the equilibrated matrix of (7) at each sample; one at k = 0, where no step was taken."""
         rows = self.several
         if rows is not self:
-            return rows.conditions
+            return np.array([self.condition])
         found, begin = np.full(len(rows.memory), np.inf), int(self.k == 0)
         found[:begin] = 1.0
         values = np.linalg.svd(rows.part("scaled")[begin:], compute_uv=False)
         least = values[:, -1]
         np.divide(values[:, 0], least, out=found[begin:], where=least > 0.0)
         return found
+
+    @property
+    def condition(self) -> float:
+        """The same number of one sample, infinite where LAPACK has none."""
+        if self.k == 0:
+            return 1.0
+        _, values, _, failed = lapack.dgesdd(self.part("scaled"), compute_uv=0)
+        least = float(values[-1])
+        return float(values[0]) / least if not failed and least > 0.0 else np.inf
 
     @property
     def contractions(self) -> FloatArray:
@@ -201,20 +211,20 @@ class SampleEstimates(Estimates):
     def __init__(self, observer: DAESettings, row: DAERow, informations: tuple[FloatArray, ...]) -> None:
         """Keep the row, and the information (``(nq, nq)`` each) on the parameters of the latest samples."""
         vars(self).update(
-            _observer=observer, _rows=row.several, _informations=informations,
+            _observer=observer, _row=row, _informations=informations,
             residual_names=STEP_RESIDUAL, regressors=NO_NUMBERS,
         )  # fmt: skip
 
     def __getattr__(self, name: str) -> Any:
         made: Any
         if name in _KEPT_COLUMNS:
-            made = read_only(_KEPT_COLUMNS[name](self._rows))
+            made = read_only(_KEPT_COLUMNS[name](self._row.several))
         elif name in ("state_names", "fault_names", "state_delays", "fault_delays"):
             made = getattr(self._observer, name)
         elif name == "excitation":
             made = read_only(_excitation(self._observer, np.array(self._informations))[-1:])
         elif name == "projection":
-            made = read_only(self._rows.moved)
+            made = read_only(self._row.moved)
         elif name == "received":
             made = ~np.isnan(self.innovations)
             made.setflags(write=False)

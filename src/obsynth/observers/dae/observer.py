@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SolverError, SpecError
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import FloatArray, all_finite
+from obsynth.numerics.ranks import SINGULAR_CONDITION
 from obsynth.observers.dae.c_code import DAELibrary
 from obsynth.observers.dae.estimates import DAERow, GatheredRows, SampleEstimates, require_regular
 from obsynth.observers.dae.settings import DAESettings
@@ -90,6 +91,11 @@ def advanced(
     return state
 
 
+def _is_plain(values: ArrayLike, count: int) -> bool:
+    """Whether a sample is an array of so many numbers already."""
+    return type(values) is np.ndarray and values.dtype == np.float64 and values.shape == (count,)
+
+
 class DAEObserver(DAESettings):
     """An observer: what `start` and `run` need, and nothing that depends on data.
 
@@ -148,16 +154,16 @@ class DAEObserver(DAESettings):
         return self.steps
 
     def _trust(self, row: DAERow) -> None:
-        require_regular(self, row, row.conditions)
+        if not row.condition <= SINGULAR_CONDITION:
+            require_regular(self, row, row.conditions)
 
     def _sample(self, state: DAEState, y: ArrayLike, u: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        plain = type(y) is np.ndarray and y.dtype == np.float64 and y.shape == (self.model.ny,)
+        outputs = np.asarray(y)
         # What can be wrong with plain numbers is an infinity: it is told below.
-        outputs = (
-            np.asarray(y)
-            if plain and not np.isinf(y).any()
-            else measured_record(np.atleast_2d(np.asarray(y)), self.model.ny)[0]
-        )
+        if not (_is_plain(y, self.model.ny) and (all_finite(outputs) or not np.isinf(outputs).any())):
+            outputs = measured_record(np.atleast_2d(outputs), self.model.ny)[0]
+        if _is_plain(u, self.model.nu) and all_finite(np.asarray(u)):
+            return outputs, np.asarray(u)
         try:
             inputs = np.atleast_1d(np.asarray(u, dtype=np.float64))
         except (TypeError, ValueError):

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from obsynth.errors import SolverError
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import FloatArray, all_finite, read_only
 from obsynth.numerics.ranks import covariance_factor
 from obsynth.observers.dae.estimates import DAERow
 from obsynth.observers.dae.settings import DAESettings, initial_memory
@@ -40,6 +40,7 @@ class Steps:
         self._compiled: dict[str, Compiled] = {}
         self.limit = checked_limit(settings.outliers, settings.outlier_limit)
         self.implicit = ImplicitStep(self.graph.functions, settings.dt, largest_move=settings.largest_move)
+        self._unmoved = read_only(np.zeros(settings.model.nx))
         self.first = DAEState(
             initial_memory(settings, settings.initial_state),
             0,
@@ -108,23 +109,24 @@ class Steps:
     def plain(self, state: DAEState, y: FloatArray, u: FloatArray) -> tuple[DAEState, DAERow]:
         """Take a sample as it is."""
         seen = ~np.isnan(y)
-        received, moved = np.where(seen, y, 0.0), np.zeros(self.settings.model.nx)
+        received, moved = np.where(seen, y, 0.0), self._unmoved
         if state.k == 0:
-            memory, moved = self.projected(state, u)
-            after, said = self._call("first", memory, received, seen)
+            begun, moved = self.projected(state, u)
+            after, said = self._call("first", begun, received, seen)
         else:
             after, said = self._call("whole", state.memory, np.concatenate([u, received, seen]))
             if said[-1, 0] != 1.0:
                 after, said = self._carefully(state, received, seen, u)
-        if not np.isfinite(after).all():
+        memory = after[:, 0]
+        if not all_finite(memory):
             raise SolverError(
                 f"The matrix of (7), dF/dx' / dt + dF/dx, is singular at k = {state.k}, or the model is not defined "
                 "there: the step has no unique solution.",
                 record={"k": state.k},
             )
-        row = DAERow(self.graph, state.k, after[:, 0], said[:, 0], seen, moved)
+        row = DAERow(self.graph, state.k, memory, said[:, 0], seen, moved)
         informations = (*state.informations, row.part("information"))[-self.settings.window :]
-        return state._replace(memory=after[:, 0], k=state.k + 1, u=u, informations=informations), row
+        return DAEState(memory, state.k + 1, u, informations, *state[4:]), row
 
     def stretch(
         self, state: DAEState, y: FloatArray, u: FloatArray, run: Callable[..., tuple[FloatArray, ...]]

@@ -56,7 +56,7 @@ class Compiled:
         if self._buffer.ret():
             # A factorisation inside met a singular matrix; what is in the buffers belongs to another call.
             return tuple(np.full(shape, np.nan) for shape in self._shapes)
-        return tuple([found.copy(order="F") for found in self._found])
+        return tuple([found.copy("F") for found in self._found])
 
 
 class DAEFunctions:
