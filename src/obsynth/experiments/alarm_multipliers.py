@@ -8,7 +8,6 @@ numbers are fractions, so that nothing is rounded: an auditor needs no solver, a
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
@@ -33,16 +32,6 @@ from obsynth.results.certificate_files import SHOWN_DIGITS
 from obsynth.results.design import ObserverDesign
 
 
-@dataclass(frozen=True, eq=False)
-class Multipliers:
-    """What proves that the last rows of a record are not without a fault of a group; ``rows`` of them."""
-
-    test: str
-    values: tuple[Fraction, ...]
-    margin: float
-    rows: int
-
-
 def refuse_bounds(given: Mapping[str, Any]) -> None:
     """Raise `SpecError` where bounds are given: those of the design count."""
     stated = [name for name, value in given.items() if value]
@@ -59,10 +48,14 @@ def rows_of_test(test: GuaranteedTest) -> int:
     return test.linear[1].order + 1 - len(test.certificate.matrices.get("state_tracking", ()))
 
 
-def refuted(design: ObserverDesign, u: FloatArray, y: FloatArray) -> Multipliers | None:
-    """Return the proof with the largest margin of any test of a design, for the end of a record; ``None``: none."""
-    best: Multipliers | None = None
-    for test in GuaranteedTest.of(design).tests:
+def refuted(design: ObserverDesign, u: FloatArray, y: FloatArray) -> tuple[int, int, dict[str, Any]] | None:
+    """Return the proof with the largest margin of any test of a design, for the end of a record; ``None``: none.
+
+    It is the number of the test, the rows that it looks at, and the numbers as plain data: fractions in words that
+    Python's ``Fraction`` reads."""
+    best: tuple[int, int, dict[str, Any]] | None = None
+    largest = 0.0
+    for place, test in enumerate(GuaranteedTest.of(design).tests):
         rows = rows_of_test(test)
         if len(y) < rows:
             continue
@@ -70,8 +63,9 @@ def refuted(design: ObserverDesign, u: FloatArray, y: FloatArray) -> Multipliers
         for guess in programmes.refuting(y[-rows:], u[-rows:]):
             values = exact_multipliers(programmes.window, guess)
             margin = np.nan if values is None else margin_of(programmes.window, values, y[-rows:], u[-rows:])
-            if values is not None and margin > 0.0 and (best is None or margin > best.margin):
-                best = Multipliers(test.fault, tuple(values), margin, rows)
+            if values is not None and margin > largest:
+                largest, told = margin, [str(value) for value in values]
+                best = place, rows, {"test": test.fault, "multipliers": told, "margin": margin}
     return best
 
 
@@ -157,11 +151,6 @@ def _told(name: str, size: float, middle: float, unit: str, word: str) -> str:
     else:
         within = shown(float(f"{size:.6g}") if noise else size, unit)
     return f"noise of {name} within {within}" if noise else f"{name} {word} {within}"
-
-
-def written(found: Multipliers) -> dict[str, Any]:
-    """Return the numbers as plain data: fractions in words that Python's ``Fraction`` reads."""
-    return {"test": found.test, "multipliers": [str(value) for value in found.values], "margin": found.margin}
 
 
 def checked(design: ObserverDesign, body: Mapping[str, Any], u: FloatArray, y: FloatArray) -> Iterator[Any]:

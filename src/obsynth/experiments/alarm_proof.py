@@ -15,7 +15,6 @@ from obsynth.experiments.alarm_multipliers import (
     refuted,
     rows_of_test,
     statement_of,
-    written,
 )
 from obsynth.experiments.alarm_window import Window, window_data, window_programme
 from obsynth.experiments.assumptions import Assumptions, Log
@@ -184,14 +183,14 @@ def _proved_by_test(
     if found is None:
         text = f"Cannot be proved: within the bounds of the design, the last {most} samples may be without a fault."
         return AlarmProof(False, row, most, 0.0, text, "", {})
-    place = [test.fault for test in whole.tests].index(found.test)
+    place, rows, numbers = found
     gain_set = design_as_dict(design)
     text = statement_of(whole.tests[place], whole.groups[place], row, log, gain_set["sha256"])
     certificate = {
-        **written(found), "u": u[-found.rows :], "y": y[-found.rows :], "row": row, "statement": text,
+        **numbers, "u": u[-rows:], "y": y[-rows:], "row": row, "statement": text,
         "log": None if log is None else log.as_dict(),
     }  # fmt: skip
-    return AlarmProof(True, row, found.rows, found.margin, text, "", {**plain(certificate), "gain_set": gain_set})
+    return AlarmProof(True, row, rows, numbers["margin"], text, "", {**plain(certificate), "gain_set": gain_set})
 
 
 def statement(assumed: Assumptions, window: int, row: int, origin: str, log: Log | None, gain_set: str) -> str:
