@@ -24,6 +24,7 @@ from obsynth.calibration.problem import Problem, calibration_problem, require_va
 from obsynth.calibration.reporting import IntegrationError, integration_error, reported
 from obsynth.calibration.result import Calibration
 from obsynth.calibration.simulation_error import FIRST_ROWS, Fit, SimulationError, simulation_fits, with_seen_start
+from obsynth.calibration.wrong_runs import wrong_runs
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.arguments import chosen, is_whole, whole_number
 from obsynth.numerics.arrays import SMALLEST, FloatArray, read_only
@@ -635,12 +636,14 @@ class _Fitting:
         return _Found(problem, fits, fit, timing, error)
 
     def without_outliers(self, found: _Found) -> _Found:
-        """Return the fit again without single samples that stand out: they would make R a multiple of what it is."""
+        """Return the fit again without samples that stand out alone or a few in a row: they would make R a multiple of
+        what it is."""
         for _ in range(OUTLIER_ROUNDS):
             if found.fit is None:
                 break
             problem = found.problem
-            wrong = standing_out(np.where(np.isfinite(problem.y), found.fit.whitened, np.nan))
+            alone = standing_out(np.where(np.isfinite(problem.y), found.fit.whitened, np.nan))
+            wrong = alone | wrong_runs(problem, found.fit)
             off = np.abs(found.fit.innovations).T
             if not wrong.any():
                 break
@@ -657,7 +660,7 @@ class _Fitting:
                 y=read_only(np.where(wrong, np.nan, problem.y)),
                 notes=(*log.notes, *told),
                 outliers=tuple(
-                    np.concatenate([before, off[i, wrong[:, i]]])
+                    np.concatenate([before, off[i, alone[:, i]]])
                     for i, before in enumerate(log.outliers or [np.zeros(0)] * len(names))
                 ),
             )

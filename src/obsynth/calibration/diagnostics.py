@@ -136,6 +136,11 @@ def wrong_samples(y: FloatArray) -> BoolArray:
     return found
 
 
+def usual_size(column: FloatArray) -> float:
+    """Return the deviation of most of a column ``(n,)``, NaN left out."""
+    return max(NORMAL_OF_MEDIAN * float(np.median(np.abs(column[np.isfinite(column)]))), LEAST_USUAL)
+
+
 def standing_out(whitened: FloatArray) -> BoolArray:
     """Return which single whitened innovations ``(n, ny)`` stand out of what most of their sensor are.
 
@@ -147,8 +152,7 @@ def standing_out(whitened: FloatArray) -> BoolArray:
         seen = np.isfinite(column)
         if seen.sum() < LEAST_DIAGNOSED_ROWS:
             continue
-        usual = max(NORMAL_OF_MEDIAN * float(np.median(np.abs(column[seen]))), LEAST_USUAL)
-        far = seen & (np.abs(column) > STANDS_OUT * usual)
+        far = seen & (np.abs(column) > STANDS_OUT * usual_size(column))
         beside = np.concatenate([[False], far[:-1]]) | np.concatenate([far[1:], [False]])
         alone = far & (~beside | _answered(column, far))
         if alone.sum() <= MOST_OUTLIERS * seen.sum():
