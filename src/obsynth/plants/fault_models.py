@@ -28,6 +28,9 @@ SAME_EIGENVALUE = 1e-9
 
 def stated_eigenvalues(phi: FloatArray) -> ComplexArray:
     """Return the distinct eigenvalues of a stacked transition ``(nw, nw)``, block by block where it falls apart."""
+    if not (phi - np.diag(np.diag(phi))).any():
+        # Blocks of one, such as steps: in order, each value once.
+        return np.array(list(dict.fromkeys(np.diag(phi).tolist())), dtype=np.complex128)
     from scipy.sparse.csgraph import connected_components
 
     count, parts = connected_components(phi != 0.0, directed=False) if len(phi) else (0, np.zeros(0))
