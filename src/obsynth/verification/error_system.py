@@ -431,6 +431,7 @@ def _as_ball(part: Ball | ExtendedBall) -> Ball:
     return Ball(np.where(nothing, 0.0, found.midpoint), np.where(nothing, 0.0, found.radius))
 
 
+@remembered
 def contraction_of(observer: LinearObserver) -> Contraction | None:
     """Return a proved contraction of a shipped observer's state, ``None`` where none is found."""
     return prove_contraction(observer.Az, discrete=observer.dt > 0.0)

@@ -16,12 +16,12 @@ from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.validation import listed
 from obsynth.proofs.balls import Ball
-from obsynth.proofs.contraction import column_norms, prove_contraction
+from obsynth.proofs.contraction import column_norms
 from obsynth.proofs.peak_sums import gathered, interval_pieces, peak_sums
 from obsynth.proofs.products import energy
 from obsynth.results.checks import Check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
-from obsynth.verification.error_system import ErrorModel
+from obsynth.verification.error_system import ErrorModel, contraction_of
 
 #: Imaginary parts below this are not shown.
 SHOWN_AS_REAL = 1e-12
@@ -210,7 +210,7 @@ STEPS_OF_INFORMATION = 8_192
 def _peak_gain(
     smooth: DescriptorSystem, dt: float, observer: LinearObserver, t: FloatArray, direct: FloatArray
 ) -> float:
-    contraction = prove_contraction(observer.Az, discrete=True)
+    contraction = contraction_of(observer)
     if contraction is None:
         return np.nan
     rows = observer.Cz[observer.fault_rows]

@@ -327,16 +327,13 @@ def _when_it_matters(system: _Composite, level: float, unit: float, beyond: floa
             "the plant has a pole outside the region of stability: no finite gain exists for stored numbers; where its "
             f"state is not held down, they matter after about {seconds:.3g} s"
         ), seconds
-    last = SLOWEST_CLAIMED
-    for frequency in () if np.isfinite(seconds) else SLOWER:
-        if system.gains(np.array([frequency * unit]))[0] > level:
-            seconds = per_unit / frequency
-            break
-        last = frequency
+    if not np.isfinite(seconds):
+        above = np.flatnonzero(system.gains(np.array(SLOWER) * unit) > level)
+        seconds = per_unit / SLOWER[above[0]] if above.size else np.inf
     if np.isfinite(seconds):
         return (
             f"{_ON_THE_BOUNDARY}; they matter for disturbances that last longer than about "
             f"{seconds:.3g} s ({seconds / 86_400:.3g} days)"
         ), seconds
-    seconds = per_unit / last
+    seconds = per_unit / SLOWER[-1]
     return f"{_ON_THE_BOUNDARY}; they do not matter within {seconds:.3g} s", seconds

@@ -113,7 +113,7 @@ def _of_some(
     """Return the part of null spaces that is zero outside some columns: combinations without the others."""
     others = np.setdiff1d(np.arange(pencils.shape[2]), own)
     if not len(others):
-        return [_of_unit_norm(basis * factors[:, None]) for basis, factors in zip(whole, columns, strict=True)]
+        return _of_unit_norm(whole, columns)
     found: list[ComplexArray | None] = [None] * len(whole)
     if sure.any():
         places = np.flatnonzero(sure)
@@ -124,19 +124,27 @@ def _of_some(
             values[:, -1] > FAR_FROM_SINGULAR if 0 < values.shape[1] == len(others) else np.zeros(len(places), bool)
         )
         kept = np.conj(np.swapaxes(right[left_out, len(others) :], 1, 2))
-        combined = (sure_bases[left_out] @ kept)[:, own] * columns[places[left_out]][:, own, None]
-        for place, basis in zip(places[left_out], combined, strict=True):
-            found[place] = _of_unit_norm(basis)
+        combined = (sure_bases[left_out] @ kept)[:, own]
+        for place, basis in zip(
+            places[left_out], _of_unit_norm([*combined], columns[places[left_out]][:, own]), strict=True
+        ):
+            found[place] = basis
     rest = [place for place, basis in enumerate(found) if basis is None]
     if rest:
         bases, scales, _ = _null_spaces(pencils[rest][:, :, own])
-        for place, basis, factors in zip(rest, bases, scales, strict=True):
-            found[place] = _of_unit_norm(factors[:, None] * basis)
+        for place, basis in zip(rest, _of_unit_norm(bases, scales), strict=True):
+            found[place] = basis
     return [basis for basis in found if basis is not None]
 
 
-def _of_unit_norm(basis: ComplexArray) -> ComplexArray:
-    return np.asarray(basis / np.linalg.norm(basis, axis=0))
+def _of_unit_norm(bases: Sequence[ComplexArray], scales: FloatArray) -> list[ComplexArray]:
+    """Return bases ``(n, count)`` with rows times their scales ``(k, n)``, each column of unit norm."""
+    if len({basis.shape[1] for basis in bases}) > 1:
+        return [_of_unit_norm([basis], own[None])[0] for basis, own in zip(bases, scales, strict=True)]
+    if not len(bases):
+        return []
+    found = np.stack(bases) * scales[:, :, None]
+    return [*(found / np.linalg.norm(found, axis=1, keepdims=True))]
 
 
 def _null_spaces(pencils: ComplexArray) -> tuple[list[ComplexArray], FloatArray, NDArray[np.bool_]]:
