@@ -263,6 +263,28 @@ def test_c_finds_changes_of_faults_as_a_run_does(shipped: SimpleNamespace) -> No
     test_c_says_what_a_run_says(shipped, WALKING)
 
 
+def test_floats_find_changes_of_faults_too(shipped: SimpleNamespace, tmp_path: Path) -> None:
+    design = shipped.designs[WALKING]
+    monitor = obsynth.online_monitor(design, "learned", normal=told(design))
+    sources = obsynth.export(design, tmp_path / "walking.c", monitor=monitor, precision="float", unverified=True)
+    text, width = harness(design, "walking")
+    (tmp_path / "run.c").write_text('#include "walking.h"\n' + text.replace("double", "float"))
+    files = [str(file) for file in (*sources, tmp_path / "run.c") if file.suffix == ".c"]
+    subprocess.run([str(COMPILER), *FLAGS, *files, "-o", str(tmp_path / "run.so"), "-lm"], check=True)
+    log = log_of(design)
+    count = len(design.observer.fault_names) + design.plant.ny + 3
+    given = np.concatenate([np.zeros(count), log.to_numpy()[:, 1:].ravel()]).astype(np.float32)
+    out, pointer = np.zeros((ROWS, width), dtype=np.float32), ctypes.POINTER(ctypes.c_float)
+    code = ctypes.CDLL(str(tmp_path / "run.so"))
+    code.run_walking(given.ctypes.data_as(pointer), out.ctypes.data_as(pointer), ROWS)
+    run = obsynth.run_on_data(design, log, monitor=monitor).table
+    found, wanted = out[:, -2], run.statistic.to_numpy()
+    np.testing.assert_array_equal(np.isnan(found), np.isnan(wanted))
+    assert (wanted > 1.0).sum() >= 50
+    # Single precision has seven digits, of which the difference of two inverses leaves two or more.
+    np.testing.assert_allclose(found[wanted > 1.0], wanted[wanted > 1.0], rtol=0.03)
+
+
 @pytest.mark.one_in(3)
 @pytest.mark.parametrize("name", [*LINEAR, *NONLINEAR])
 def test_c_says_what_a_run_says(shipped: SimpleNamespace, name: str) -> None:

@@ -55,8 +55,8 @@ def learn_thresholds(
 
     Offsets, covariance and colour of the fault estimates and residuals are taken from the rows, whatever the design
     assumes of them: they are whitened by a fitted autoregression and watched by Hotelling's T2, exponentially weighted
-    means and likelihood ratios of steps.  Levels come from a bootstrap of all that is estimated, so that a short log
-    gives higher ones.
+    means and likelihood ratios of steps; where faults are parameters that walk, by likelihood ratios of a change of
+    each fault, too.  Levels come from a bootstrap of all that is estimated, so that a short log gives higher ones.
 
     Parameters
     ----------

@@ -25,6 +25,8 @@ from obsynth.simulation.dae import simulate_dae
 FLOAT_LAST_STEP, FLOAT_RESIDUAL = 3e-4, 1e-5
 #: A projection that moves no state by more than rounding moves none, and bounds that dependent rows miss are kept.
 FLOAT_PROJECTION_NOTICE, FLOAT_DEPENDENT, FLOAT_SLACK = 1e-4, 1e-5, 1e-4
+#: What a sample adds to the information on faults is a difference of inverses of covariances.
+FLOAT_LEAST_ADDED = 1e-5
 #: What is larger has no square in a float.
 FLOAT_OVERFLOW = 1e18
 #: Samples of each record that errors are measured on, their seeds, and the samples without outputs.
@@ -39,6 +41,7 @@ _FLOAT_CONSTANTS = {
     "DEPENDENT": FLOAT_DEPENDENT,
     "SLACK": FLOAT_SLACK,
     "OVERFLOW_LIMIT": FLOAT_OVERFLOW,
+    "MONITOR_LEAST": FLOAT_LEAST_ADDED,
 }
 _HARNESS = """
 #include "HEADER"
