@@ -24,7 +24,7 @@ from obsynth.experiments.monitors.learned_levels import (
     is_conformal,
     learned_levels,
 )
-from obsynth.experiments.monitors.monitor import NOT_TOLD_APART, Evidence
+from obsynth.experiments.monitors.monitor import NOT_DISTINGUISHED, Evidence
 from obsynth.experiments.monitors.parameter_scores import (
     Scores,
     before_any,
@@ -144,11 +144,11 @@ def test_a_fault_is_named_where_it_explains_more_than_any_other() -> None:
     assert most_likely_change(np.array([[5.0, 1.0], [40.0, 20.0]])) == 0
     assert most_likely_change(np.array([[1.0, 60.0], [40.0, 20.0]])) == 1
     # Odds below 90, or less than a model that is off by some percent explains.
-    assert most_likely_change(np.array([[30.0, 22.0]])) == NOT_TOLD_APART
-    assert most_likely_change(np.array([[900.0, 880.0]])) == NOT_TOLD_APART
+    assert most_likely_change(np.array([[30.0, 22.0]])) == NOT_DISTINGUISHED
+    assert most_likely_change(np.array([[900.0, 880.0]])) == NOT_DISTINGUISHED
     assert most_likely_change(np.array([[900.0, 850.0, 100.0]])) == 0
     assert most_likely_change(np.array([[30.0]])) == 0
-    assert most_likely_change(np.array([[8.0]])) == NOT_TOLD_APART
+    assert most_likely_change(np.array([[8.0]])) == NOT_DISTINGUISHED
 
 
 @functools.cache

@@ -16,7 +16,7 @@ from obsynth.observers.estimates import BAND_WIDTH
 #: What stands for the status of rows that are well, but in which the monitor decides nothing.
 NO_DECISION = "undecided"
 #: What stands for the fault of an alarm whose evidence does not tell the faults apart.
-NOT_APART = "not told apart yet"
+NOT_APART = "not distinguished yet"
 #: Why a row cannot alarm, by its status.
 REASONS = {
     WARM_UP: "the initial-condition response has not settled yet (--warm-up)",

@@ -48,7 +48,7 @@ class DataRun:
     alarms : mapping of str to float
         Time in seconds at which each column, or the monitor, first passed its threshold.
     isolated : str
-        The fault that the monitor named first; empty without one, and where the evidence does not tell faults apart.
+        The fault that the monitor named first; empty without one, and where the evidence does not distinguish faults.
     recovered : mapping of str to str
         States of the plant as written that were recovered from the estimates, and what each of these estimates is:
         ``exact``, ``needs the fault estimate`` (it is used) or ``biased by the disturbance``.

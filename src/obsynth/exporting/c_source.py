@@ -12,7 +12,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.experiments.monitors.learned_levels import AGES, FORGETTING, HOLD
-from obsynth.experiments.monitors.parameter_scores import LEAST_ADDED, MODEL_SHARE, TOLD_APART
+from obsynth.experiments.monitors.parameter_scores import DISTINGUISHED, LEAST_ADDED, MODEL_SHARE
 from obsynth.exporting.alarms import Alarms
 from obsynth.exporting.realisation import Realisation
 from obsynth.numerics.arrays import SMALLEST, FloatArray
@@ -184,7 +184,7 @@ def monitor_struct(alarms: Alarms, prefix: str) -> list[str]:
     return [
         "typedef struct {",
         "    /* Read these after a step: the largest statistic in units of its level (NaN where nothing is",
-        "     * decided), whether it passes 1, which fault it points to (-1: none, or not told apart yet), and an",
+        "     * decided), whether it passes 1, which fault it points to (-1: none, or not distinguished yet), and an",
         "     * alarm that lasts. */",
         "    REAL statistic;",
         "    int alarm, fault, event;",
@@ -249,7 +249,7 @@ def monitor_source(alarms: Alarms, prefix: str) -> str:
     lines = [
         f"enum {{ {listed} }};",
         f"#define MONITOR_LEAST ((REAL){LEAST_ADDED!r})",
-        f"#define MONITOR_APART ((REAL){TOLD_APART!r})",
+        f"#define MONITOR_APART ((REAL){DISTINGUISHED!r})",
         f"#define MONITOR_SHARE ((REAL){MODEL_SHARE!r})",
         *(line for name, table in tables.items() for line in table_lines(name, filled_table(table))),
         *integer_table("monitor_ages", AGES),

@@ -129,12 +129,12 @@ class Sample(NamedTuple):
 
 
 #: In place of a fault's number: what is known does not tell the faults apart.
-NOT_TOLD_APART = -1
+NOT_DISTINGUISHED = -1
 
 
 class Judged(NamedTuple):
-    """What a rule says of a row: the fault by its number, `NOT_TOLD_APART`, or `None` where the rule does not look for
-    it; and cells for columns of its own."""
+    """What a rule says of a row: the fault by its number, `NOT_DISTINGUISHED`, or `None` where the rule does not look
+    for it; and cells for columns of its own."""
 
     statistic: float
     threshold: float
@@ -322,7 +322,7 @@ class Monitor:
 
     def _named(self, which: int | None) -> str:
         """Return the fault of a number, or the group of faults one of which is there for certain."""
-        if which is None or which == NOT_TOLD_APART:
+        if which is None or which == NOT_DISTINGUISHED:
             return ""
         return " or ".join(self.groups[which]) if self.groups else (self.fault_names or ("",))[which]
 

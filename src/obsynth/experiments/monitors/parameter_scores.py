@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.experiments.monitors.monitor import NOT_TOLD_APART, Evidence
+from obsynth.experiments.monitors.monitor import NOT_DISTINGUISHED, Evidence
 from obsynth.numerics.arrays import SMALLEST, FloatArray
 from obsynth.numerics.autoregression import Autoregression
 from obsynth.numerics.ranks import DIRECTION_SHARE
@@ -22,7 +22,7 @@ from obsynth.observers.recursive.observer import RecursiveObserver
 
 #: A fault is named where a change of it alone is more likely than one of any other by so much in twice the log
 #: likelihood (odds of 90), and by this share of its own: constants that are off by some percent explain as much.
-TOLD_APART, MODEL_SHARE = 9.0, 0.05
+DISTINGUISHED, MODEL_SHARE = 9.0, 0.05
 #: Share of the information before it that a sample adds at least: less is what rounding leaves of the difference.
 LEAST_ADDED = 1e-9
 
@@ -134,7 +134,7 @@ def most_likely_change(ratios: FloatArray) -> int:
     found = ratios[int(np.argmax(ratios.max(axis=1)))]
     best = int(np.argmax(found))
     lead = found[best] - np.delete(found, best).max(initial=0.0)
-    return best if lead > max(TOLD_APART, MODEL_SHARE * found[best]) else NOT_TOLD_APART
+    return best if lead > max(DISTINGUISHED, MODEL_SHARE * found[best]) else NOT_DISTINGUISHED
 
 
 @dataclass(frozen=True, eq=False)

@@ -243,7 +243,7 @@ static void monitor_score(PREFIX_monitor *m, const REAL *theta, const REAL *cova
 }
 
 /* The largest likelihood ratios over all ages of a change of each fault; return the one of which a change alone is more
- * likely than of any other at the most likely age, or -1 where they are not told apart. */
+ * likely than of any other at the most likely age, or -1 where they are not distinguished. */
 static int monitor_changes(const PREFIX_monitor *m, REAL *largest)
 {
     REAL sums[2 * MONITOR_WIDTH];
