@@ -62,7 +62,7 @@ def test_any_separator(design, frame, wanted, tmp_path, separator):
     same(obsynth.run_on_data(design, tmp_path / "log.csv", thresholds=THRESHOLDS), wanted)
 
 
-@pytest.mark.parametrize("head", ["", "sep=;\n"])
+@pytest.mark.parametrize("head", ["", "sep=;\n", "# logger 7; north\r\n# in kW, degC\n"])
 def test_decimal_commas(design, frame, wanted, tmp_path, head):
     text = head + frame.to_csv(sep=";", index=False, decimal=",")
     (tmp_path / "log.csv").write_text(text)

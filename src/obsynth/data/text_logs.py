@@ -23,6 +23,8 @@ from obsynth.numerics.arrays import FloatArray
 SEPARATORS = (",", ";", "\t", "|")
 #: How programs of Microsoft say what separates the columns, in a line before the header.
 _SEPARATOR_LINE = re.compile(r"\s*sep=(.)\s*", re.IGNORECASE)
+#: What a remark of the logger begins with, before the header.
+REMARK = "#"
 #: Lines that may end with CR alone.
 _OLD_LINES = re.compile(r"[^\r]*\r\n?|[^\r]+")
 
@@ -78,14 +80,7 @@ def text_chunks(path: Path, signals: Signals, stamps: Stamps, rows: int) -> Iter
 
 def stream_rows(stream: TextIO, signals: Signals, stamps: Stamps) -> Iterator[FloatArray]:
     """Yield one row at a time, ``(1, 1 + nu + ny)``, as soon as its line is there."""
-    lines = _text_lines(stream)
-    first = next(lines, "")
-    told = _SEPARATOR_LINE.fullmatch(first)
-    head = next(lines, "") if told else first
-    dialect = Dialect(told.group(1)) if told else _dialect_of(head, signals.columns)
-    # A name in quotes may go on in the next line.
-    table = _cells(itertools.chain([head], lines), dialect)
-    header = tuple(unquoted(name.strip()) for name in next(table, []))
+    header, dialect, table = _opened(stream, signals.columns)
     places = signals.positions(header)
     row, shown = 0, set[int]()  # columns that have shown a number
     for cells in table:
@@ -111,16 +106,26 @@ def header_of(path: Path, wanted: Sequence[str]) -> list[str]:
     """Return the names of the columns of a file, of which some are wanted."""
     try:
         with path.open(encoding="utf-8-sig", newline="") as stream:
-            lines = _text_lines(stream)
-            first = next(lines, "")
-            told = _SEPARATOR_LINE.fullmatch(first)
-            head = next(lines, "") if told else first
-            dialect = Dialect(told.group(1)) if told else _dialect_of(head, wanted)
-            return [unquoted(name.strip()) for name in next(_cells(itertools.chain([head], lines), dialect), [])]
+            return list(_opened(stream, wanted)[0])
     except UnicodeDecodeError as error:
         raise SpecError(f"{path} is no UTF-8 text (byte {error.start}).", path=str(path)) from error
     except OSError as error:
         raise SpecError(f"{path} cannot be read: {error.strerror or error}.", path=str(path)) from error
+
+
+def _opened(stream: TextIO, wanted: Sequence[str]) -> tuple[tuple[str, ...], Dialect, Iterator[list[str]]]:
+    """Return the names of the columns, how the log is written, and the cells of the lines below the header.  What a
+    logger remarks before the header, in lines that begin with ``#`` and name no column that is read, is passed over."""
+    lines = _text_lines(stream)
+    head = next(lines, "")
+    while head.startswith(REMARK) and not any(set(wanted) & set(_names(head, separator)) for separator in SEPARATORS):
+        head = next(lines, "")
+    told = _SEPARATOR_LINE.fullmatch(head)
+    head = next(lines, "") if told else head
+    dialect = Dialect(told.group(1)) if told else _dialect_of(head, wanted)
+    # A name in quotes may go on in the next line.
+    table = _cells(itertools.chain([head], lines), dialect)
+    return tuple(unquoted(name.strip()) for name in next(table, [])), dialect, table
 
 
 def _together(rows: Iterator[FloatArray], count: int) -> Iterator[FloatArray]:
