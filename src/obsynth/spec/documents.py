@@ -166,7 +166,7 @@ def checked_spec(document: Mapping[str, Any], source: Path) -> tuple[SpecDocumen
     if identifier == AUTO and isinstance(raw_options, dict) and checked is not None:
         problems.raise_if_any()
         return checked, _options_of_any(raw_options, source)
-    if isinstance(identifier, str) and identifier not in (*REGISTRY, AUTO):
+    if isinstance(identifier, str) and identifier != AUTO and identifier not in REGISTRY:
         close = suggestion(identifier, list(REGISTRY))
         known = ", ".join(sorted([*REGISTRY, AUTO]))
         problems.add("method.id", f"unknown method {identifier!r}; the known methods are: {known}.{close}")
