@@ -13,7 +13,6 @@ from fractions import Fraction
 import numpy as np
 
 from obsynth.analysis.conditions import Condition
-from obsynth.analysis.diagnosis.explanations import least_additions, listed_sets, state_sensors
 from obsynth.analysis.existence.witnesses import EntryChange, Unclear, Witness
 from obsynth.errors import ObsynthError, PreconditionError
 from obsynth.methods.method import Method
@@ -51,6 +50,8 @@ def require_all_told(conditions: Iterable[Condition]) -> None:
 
 def with_advice(error: PreconditionError, plant: DescriptorSystem, asked: Method) -> PreconditionError:
     """Return the refusal with what would help at its end; as it is where the existence conditions hold."""
+    from obsynth.analysis.diagnosis.explanations import least_additions, listed_sets, state_sensors
+
     holds = _asker(asked)
     if holds(plant):
         return error
