@@ -76,7 +76,7 @@ def simulate_dae(
     measurement_noise = _noise(R, model.ny, "R", rng, len(inputs))
     run = _Run(ImplicitStep(DAEFunctions(model, integration), length), inputs, theta, pushed)
     run.start(_consistent(model, x, inputs, theta, length))
-    take_samples(1, len(inputs), run.together, run.alone)
+    take_samples(len(inputs), run.together, run.alone)
     time = length * np.arange(len(inputs), dtype=np.float64)
     return Trajectory(run.states, run.outputs + measurement_noise, inputs, theta, time=time, residuals=run.residuals)
 

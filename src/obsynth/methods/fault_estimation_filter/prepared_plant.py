@@ -78,7 +78,7 @@ MOST_CONDITION = 256.0
 class PreparedPlant:
     """A plant in the form the theory works on: ``plant`` has sensor faults as states, and is not balanced.
 
-    The rest is in the coordinates of ``scaling``: T, N, TA, C, TF, and disturbance and noise as they enter the error
+    The rest is in the coordinates of ``scaling``: T, N, TA, C, and disturbance and noise as they enter the error
     system (``Bd``, ``Bw``) and the innovation (``Dd``, ``Dw``).
     """
 
@@ -88,7 +88,6 @@ class PreparedPlant:
     N: FloatArray
     TA: FloatArray
     C: FloatArray
-    TF: FloatArray
     Bd: FloatArray
     Dd: FloatArray
     Bw: FloatArray
@@ -147,4 +146,4 @@ def prepare(plant: DescriptorSystem, s: FloatArray | None = None, *, exactly: bo
     found = fault_detectability(ta, c, tf, exact=exact_indexes(plant) if exactly else None)
     bd, dd = error_input(work.Bd, work.Dd)
     bw, dw = error_input(work.Bw, work.Dw)
-    return PreparedPlant(work, scaling, t, n, ta, c, tf, bd, dd, bw, dw, found)
+    return PreparedPlant(work, scaling, t, n, ta, c, bd, dd, bw, dw, found)

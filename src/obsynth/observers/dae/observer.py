@@ -87,7 +87,7 @@ def advanced(
 
     if len(y):
         alone(0)
-    take_samples(1, len(y), together, alone, note)
+    take_samples(len(y), together, alone, note)
     return state
 
 

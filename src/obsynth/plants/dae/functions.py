@@ -126,14 +126,13 @@ STRETCHES = (16, 256)
 
 
 def take_samples(
-    first: int,
     samples: int,
     together: Callable[[int, int], int],
     alone: Callable[[int], object],
     note: Callable[[int], object] = bool,
 ) -> None:
-    """Go through samples in stretches."""
-    k, allowed = first, STRETCHES[-1]
+    """Go through the samples after the first in stretches."""
+    k, allowed = 1, STRETCHES[-1]
     while k < samples:
         length = next((size for size in reversed(STRETCHES) if size <= min(allowed, samples - k)), 0)
         taken = together(k, length) if length else 0
