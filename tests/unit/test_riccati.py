@@ -5,7 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from scipy.linalg import solve_continuous_are, solve_discrete_are
+from scipy.linalg import block_diag, solve_continuous_are, solve_discrete_are
 
 from obsynth.methods.fault_estimation_filter.central_filter import (
     CentralEquation,
@@ -22,7 +22,7 @@ from obsynth.numerics.doubling import (
     continuous_riccati_solution,
     doubled_riccati_solution,
 )
-from obsynth.numerics.norms import hinf_norm, spectral_radius
+from obsynth.numerics.norms import hinf_norm, largest_peak, spectral_radius
 
 
 def random_problem(rng, n=5, m=2, q=1, nd=3, free_weight=False):
@@ -217,6 +217,40 @@ def test_an_equation_of_slow_and_fast_states_is_solved_in_fewer_of_them(spread, 
     )
     assert found is not None
     assert np.max(np.abs(found * np.outer(units, units) - expected) / np.outer(sizes, sizes)) <= 1e-8
+
+
+@pytest.mark.parametrize("rows", [2, 60, 130, 230])
+def test_many_states_with_few_or_many_measurements(rows):
+    # Up to 0.7 n rows the first doublings are done with these; from there on with the matrix they make.
+    rng, n = np.random.default_rng(rows), 240
+    a = 1.02 * rng.normal(size=(n, n)) / np.sqrt(n)
+    h, b = rng.normal(size=(rows, n)) / np.sqrt(n), rng.normal(size=(n, 5))
+    process, cross = b @ b.T + 0.1 * np.eye(n), 0.1 * rng.normal(size=(n, rows)) / np.sqrt(n)
+    weight = np.diag(rng.uniform(1.0, 2.0, rows))
+    found = doubled_riccati_solution(a, h, process, weight, cross)
+    expected = solve_discrete_are(a.T, h.T, process, weight, s=cross)
+    assert np.linalg.norm(found - expected) <= 1e-9 * np.linalg.norm(expected)
+
+
+@pytest.mark.parametrize("inputs", [2, 40])
+def test_many_states_are_compared_and_bounded_from_either_side(inputs):
+    rng, n = np.random.default_rng(inputs), 210
+    a = 0.95 * rng.normal(size=(n, n)) / np.sqrt(n)
+    b, c, d = rng.normal(size=(n, inputs)), rng.normal(size=(3, n)) / n, 0.1 * rng.normal(size=(3, inputs))
+    norm = largest_peak(a, b, c, d)
+    for way in ((a, b, c, d), (a.T, c.T, b.T, d.T)):
+        assert compared_gain(*way, 1.001 * norm) is True
+        assert compared_gain(*way, 0.9 * norm) is not True
+        assert compared_gain(*way, 0.5 * norm) is False
+        slack, level = 1e-3 * np.linalg.norm(way[2], 2) ** 2, 1.1 * norm
+        p = bounded_real_matrix(*way, level, slack=slack)
+        assert p is not None
+        # In coordinates in which P is I the inequality says that the whole matrix is a contraction.
+        root = np.linalg.cholesky(p).T
+        states, inputs_of_one = np.linalg.inv(root), np.eye(way[1].shape[1]) / level
+        moved = block_diag(root, np.eye(len(way[2]))) @ np.block([[way[0], way[1]], [way[2], way[3]]])
+        assert np.linalg.norm(moved @ block_diag(states, inputs_of_one), 2) < 1.0
+        assert bounded_real_matrix(*way, 0.5 * norm, slack=slack) is None
 
 
 def test_what_is_left_of_a_power_is_found_and_a_full_power_is_left_alone():
