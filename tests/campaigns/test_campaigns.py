@@ -17,7 +17,7 @@ PARTS = 4
 @pytest.mark.parametrize("name", frame.campaign_names())
 def test_a_share_of_the_campaign(name, part, share):
     campaign = frame.load_campaign(name)
-    outcomes = frame.run_campaign(campaign, share(list(frame.share_of(campaign))[part::PARTS], 16))
+    outcomes = frame.run_campaign(campaign, share(list(frame.share_of(campaign))[part::PARTS], 32))
     wrong = {seed: outcome for seed, outcome in outcomes.items() if outcome.wrong}
     assert not wrong, wrong
 

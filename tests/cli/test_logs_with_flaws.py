@@ -133,7 +133,7 @@ def kind(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 
 
-@pytest.mark.one_in(3)
+@pytest.mark.one_in(6)
 @pytest.mark.parametrize("flaw", FLAWS)
 @pytest.mark.parametrize("kind", ["recursive", "nonlinear"])
 def test_run_thresholds_validate_and_smoothing_take_each_flaw(

@@ -89,7 +89,7 @@ def test_there_are_enough_plants_and_they_are_what_they_should_be():
 def test_every_plant_is_solved(family, theorem, every, share):
     failures = [
         f"{text}\n    {recipe}"
-        for plant, recipe in share(plants_of(family)[::every], 8)
+        for plant, recipe in share(plants_of(family)[::every], 16)
         if (text := outcome_of(plant, theorem=theorem))
     ]  # fmt: skip
     assert failures == [], "\n".join(failures)
@@ -99,7 +99,7 @@ def test_every_plant_is_solved(family, theorem, every, share):
 def test_theorem_1_does_not_depend_on_delta(delta, share):
     """In units of the plant's own time (its modes are of order one)."""
     failures = [
-        text for plant, _ in share(plants_of("random")[:30], 8) if (text := outcome_of(plant, delta=delta, decay=0.0))
+        text for plant, _ in share(plants_of("random")[:30], 16) if (text := outcome_of(plant, delta=delta, decay=0.0))
     ]
     assert failures == []
 
@@ -107,7 +107,7 @@ def test_theorem_1_does_not_depend_on_delta(delta, share):
 @pytest.mark.parametrize("decay", [0.1, 1.0])
 def test_a_decay_rate_is_reached(decay, share):
     """All of these plants are observable, so any rate is possible."""
-    failures = [text for plant, _ in share(plants_of("random")[:20], 8) if (text := outcome_of(plant, decay=decay))]
+    failures = [text for plant, _ in share(plants_of("random")[:20], 16) if (text := outcome_of(plant, decay=decay))]
     assert failures == []
 
 

@@ -49,7 +49,7 @@ def outcome(plant: obsynth.DescriptorSystem, engine: str, **options: Any) -> tup
 @pytest.mark.parametrize("family", FAMILIES)
 def test_where_there_is_an_observer_every_engine_finds_one(family: str, theorem: int, share: Share) -> None:
     replaced = 0
-    for plant in share(plants_of(family), 2)[:: 1 if theorem == 1 else 4]:
+    for plant in share(plants_of(family), 4)[:: 1 if theorem == 1 else 4]:
         for engine in ENGINES:
             kind, ran = outcome(plant, engine, theorem=theorem)
             # Where the semidefinite solver gives up, the closed form takes its place.

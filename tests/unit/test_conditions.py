@@ -49,6 +49,7 @@ EACH = {
 }
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("solver", SETTINGS)
 @pytest.mark.parametrize("name", EACH)
 def test_two_solvers_end_in_a_verified_design(name, solver):

@@ -93,6 +93,7 @@ def test_outliers_in_c(form, name, tmp_path) -> None:
     assert_same(run_c(design, y, u, tmp_path), expected)
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("form", FORMS)
 def test_everything_at_once_in_c(form, tmp_path) -> None:
     design = tank_observer(form, BOTH)
@@ -122,6 +123,7 @@ WIDE = {"state_bounds": {"h1": [0.0, 5.0], "h2": [0.0, 5.0], "h3": [-1.0, 5.0]}}
 FLOATS = {"plain": {}, "all": {**OPTIONS["gate"], **WIDE, **OPTIONS["late"]}}
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("name", FLOATS)
 def test_floats_keep_near_doubles_and_say_how_near_they_were_measured(name, tmp_path) -> None:
     design = tank_observer("forgetting", FLOATS[name])

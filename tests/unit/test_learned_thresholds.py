@@ -333,6 +333,7 @@ def learned_from(kind: str) -> obsynth.types.LearnedThresholds:
     return obsynth.learn_thresholds(filtered(), wrong_log(kind), false_alarms="1 per 1000 rows")
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.usefixtures("taken_as_verified")
 @pytest.mark.parametrize("kind", ["pair", "pair and a blank"])
 def test_two_wrong_samples_in_a_row_do_not_raise_the_levels(kind: str) -> None:
@@ -347,6 +348,7 @@ def test_two_wrong_samples_in_a_row_do_not_raise_the_levels(kind: str) -> None:
     assert (ratios < 1.2).all()
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.usefixtures("taken_as_verified")
 @pytest.mark.parametrize("kind", ["stays", "many pairs"])
 def test_what_no_chance_explains_is_how_the_plant_is(kind: str) -> None:

@@ -165,6 +165,7 @@ def gated(kind):
     return design, y, u, at, size, gate_counts(design.observer, y, u)[0]
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("name", ONSETS)
 @pytest.mark.parametrize("kind", ["recursive", "nonlinear"])
 def test_a_gate_believes_a_second_sample_as_far_off_as_the_first_and_no_wild_one(kind, name):
@@ -239,6 +240,7 @@ def test_options_are_checked_and_kept(tmp_path):
             filter_design.__wrapped__(**options)
 
 
+@pytest.mark.one_in(4)
 @pytest.mark.parametrize("kind", ["gate", "huber"])
 @pytest.mark.parametrize("early", [False, True])
 @pytest.mark.parametrize("form", ["innovation", "literal", "random-walk"])

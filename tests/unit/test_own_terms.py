@@ -77,6 +77,7 @@ def made(name: str):
     return MADE[name]()
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("name", MADE)
 def test_it_is_a_verified_design_that_can_be_kept(name, tmp_path):
     design = made(name)
