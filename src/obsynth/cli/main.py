@@ -356,6 +356,12 @@ VERBS = {
                         action="append",
                     ),
                     option(
+                        "--lag",
+                        "N",
+                        "smoothed estimates, from the N samples after each row as well: rows are delayed by N samples",
+                        type=int,
+                    ),
+                    option(
                         "--state-every",
                         "N",
                         "rows of a stream after which --state is saved again (default: 100)",
@@ -364,21 +370,7 @@ VERBS = {
                     ),
                 )
             ),
-            Group(
-                "",
-                (
-                    flag(
-                        "--smooth",
-                        "recursive and nonlinear designs: smoothed estimates, from the whole log",
-                    ),
-                    option(
-                        "--lag",
-                        "N",
-                        "smoothed estimates, from the N samples after each row as well: rows are delayed by N samples",
-                        type=int,
-                    ),
-                ),
-            ),
+            flag("--smooth", "recursive and nonlinear designs: smoothed estimates, from the whole log"),
             option("--state", "FILE", "continue from this saved state if it exists, and save the new one", type=Path),
             JSON,
             FORCE,
