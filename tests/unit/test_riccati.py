@@ -233,7 +233,7 @@ def test_many_states_with_few_or_many_measurements(rows):
 
 
 @pytest.mark.parametrize("inputs", [2, 40])
-def test_many_states_are_compared_and_bounded_from_either_side(inputs):
+def test_levels_of_many_states_are_told_from_either_side(inputs):
     rng, n = np.random.default_rng(inputs), 210
     a = 0.95 * rng.normal(size=(n, n)) / np.sqrt(n)
     b, c, d = rng.normal(size=(n, inputs)), rng.normal(size=(3, n)) / n, 0.1 * rng.normal(size=(3, inputs))

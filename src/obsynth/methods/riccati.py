@@ -10,7 +10,7 @@ from itertools import chain, product
 import numpy as np
 
 from obsynth.numerics.arrays import SMALLEST, FloatArray
-from obsynth.numerics.doubling import FEWEST_STATES, REFUTED, doubled_riccati_solution, is_clearly_negative, is_positive
+from obsynth.numerics.doubling import REFUTED, doubled_riccati_solution, is_clearly_negative, is_positive
 from obsynth.numerics.norms import spectral_radius
 from obsynth.numerics.scaling import balancing_factors
 from obsynth.numerics.spectra import abscissa
@@ -24,11 +24,6 @@ REGULARISATIONS = (1e-6, 1e-4, 1e-2, 1.0)
 FAST_ENOUGH = 0.999
 #: Eigenvalues of a normalising matrix are kept above this fraction of the largest.
 CONDITION_LIMIT = 1e-20
-#: Slack of the transposed inequality beside what enters, as a share of the other's beside what is shown: many inputs
-#: leave less room for one more at every state.
-ENTERING_SLACK = 1e-3
-#: Less than this, relative to what enters, is not asked of the transposed inequality: its solution is inverted.
-LEAST_ENTERING = 5e-10
 
 
 def stabilising_gain(a: FloatArray, c: FloatArray, noise_a: FloatArray, noise_c: FloatArray) -> FloatArray | None:
@@ -67,32 +62,14 @@ def bounded_real_matrix(
     """Return P > 0 with the bounded real inequality strict at ``level``, or ``None``; ``a (n, n)``, ``d (p, m)``.
 
     Of ``P = A'PA + C'C + slack*I + (A'PB + C'D)(level^2 I - D'D - B'PB)^-1 (A'PB + C'D)'``, the stabilising solution.
-    Of many states with few outputs that of the transposed system, Y, whose first doublings take few rows: with
-    ``P = level^2 Y^-1`` the two inequalities are the same.
     """
     n = a.shape[0]
     if n == 0:
         return np.zeros((0, 0))
-    if n >= FEWEST_STATES and 0 < len(c) < b.shape[1] and np.any(c):
-        share = ENTERING_SLACK * slack / float(np.linalg.norm(c, 2)) ** 2
-        left = share * float(np.linalg.norm(b, 2)) ** 2
-        enough = share >= LEAST_ENTERING
-        y = _bounded_real_solution(a.T, c.T, b.T, d.T, level, slack=left, by_qz=False) if enough else None
-        if y is not None:
-            p = level**2 * np.linalg.inv(y)
-            return np.asarray(0.5 * (p + p.T))
-    return _bounded_real_solution(a, b, c, d, level, slack=slack)
-
-
-def _bounded_real_solution(
-    a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, level: float, *, slack: float, by_qz: bool = True
-) -> FloatArray | None:
-    """Return the stabilising solution itself, where it is positive."""
-    n = a.shape[0]
     weight = c.T @ c + slack * np.eye(n)
     cross, gap = c.T @ d, d.T @ d - level**2 * np.eye(b.shape[1])
     if b.shape[1]:
-        p = riccati_solution(a.T, b.T, weight, gap, cross, impossible=_Exceeded(b, gap), by_qz=by_qz)
+        p = riccati_solution(a.T, b.T, weight, gap, cross, impossible=_Exceeded(b, gap))
     else:
         p = lyapunov_solution(a, weight)
     if p is None:
@@ -138,7 +115,6 @@ def riccati_solution(
     cross: FloatArray,
     *,
     impossible: Callable[[FloatArray], bool] | None = None,
-    by_qz: bool = True,
 ) -> FloatArray | None:
     """Return the stabilising solution by doubling, or where that breaks down by SciPy; ``None`` without one."""
     ended = False
@@ -151,7 +127,7 @@ def riccati_solution(
     doubled = _by_doubling(a, h, process, weight, cross, possible=possible)
     if ended or doubled is not None:
         return None if ended else doubled
-    return _by_qz(a, h, process, weight, cross) if by_qz else None
+    return _by_qz(a, h, process, weight, cross)
 
 
 def _by_doubling(
