@@ -16,7 +16,7 @@ import numpy as np
 from obsynth.experiments.monitors.monitor import NOT_DISTINGUISHED, Evidence
 from obsynth.numerics.arrays import SMALLEST, FloatArray
 from obsynth.numerics.autoregression import Autoregression
-from obsynth.numerics.ranks import DIRECTION_SHARE
+from obsynth.numerics.ranks import DIRECTION_SHARE, rounding_rank
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.recursive.observer import RecursiveObserver
 
@@ -57,7 +57,7 @@ class Scores:
         units = np.sqrt(np.maximum(np.diag(whole), 0.0))
         if not (np.isfinite(whole).all() and (units > 0.0).all()):
             return False
-        return bool(np.linalg.matrix_rank(whole / np.outer(units, units)) == len(units))
+        return rounding_rank(whole / np.outer(units, units)) == len(units)
 
     def centre(self) -> FloatArray:
         """Return the parameters that the samples make most likely ``(nf,)``, if they never change."""
