@@ -6,7 +6,6 @@
 
 from __future__ import annotations
 
-import gc
 import zlib
 from collections import defaultdict
 from collections.abc import Callable, Sequence
@@ -58,12 +57,6 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     left_out = _left_out(config, items)
     config.hook.pytest_deselected(items=list(left_out))
     items[:] = [item for item in items if item not in left_out]
-
-
-def pytest_collection_finish() -> None:
-    """Thousands of tests that live to the end are not looked through again whenever garbage is collected."""
-    gc.collect()
-    gc.freeze()
 
 
 def _left_out(config: pytest.Config, items: Sequence[pytest.Item]) -> set[pytest.Item]:
