@@ -15,7 +15,7 @@ from scipy.signal import lfilter
 
 import obsynth
 from obsynth.cli.data_run import summary_of_run
-from obsynth.data.alarm_events import NOT_APART, alarm_rows
+from obsynth.data.alarm_events import NOT_DISTINGUISHED_YET, alarm_rows
 from obsynth.experiments.monitors.learned_levels import (
     AGES,
     Statistics,
@@ -184,12 +184,12 @@ def test_faults_that_look_alike_are_not_told_apart_until_they_do_not() -> None:
     told = run.table.alarm[300:355].unique().tolist()
     assert set(told) == {"", "learned"}
     assert run.table.alarm[480] == "learned: leak"
-    assert (first.fault, first.apart, run.isolated) == ("leak", True, "leak")
+    assert (first.fault, first.distinguished, run.isolated) == ("leak", True, "leak")
     assert 0.25 < first.size < 0.55
     short = obsynth.run_on_data(two_losses(), drawn(500, 1, begin=300)[:350], monitor=monitor)
-    assert not short.events[-1].apart
+    assert not short.events[-1].distinguished
     assert short.isolated == ""
-    assert [row[4] for row in alarm_rows(short.events, str)[0]] == ["fault", NOT_APART]
+    assert [row[4] for row in alarm_rows(short.events, str)[0]] == ["fault", NOT_DISTINGUISHED_YET]
     assert "points to" not in summary_of_run(short, monitor)
 
 

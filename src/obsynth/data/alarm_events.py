@@ -15,8 +15,8 @@ from obsynth.observers.estimates import BAND_WIDTH
 
 #: What stands for the status of rows that are well, but in which the monitor decides nothing.
 NO_DECISION = "undecided"
-#: What stands for the fault of an alarm whose evidence does not tell the faults apart.
-NOT_APART = "not distinguished yet"
+#: What stands for the fault of an alarm whose evidence does not distinguish the faults.
+NOT_DISTINGUISHED_YET = "not distinguished yet"
 #: Why a row cannot alarm, by its status.
 REASONS = {
     WARM_UP: "the initial-condition response has not settled yet (--warm-up)",
@@ -49,8 +49,8 @@ class AlarmEvent:
         by an adaptive threshold; NaN where it is not known.
     evidence : float
         Largest share of the threshold that was reached.
-    apart : bool
-        Whether the evidence tells the faults apart; no fault is named otherwise.
+    distinguished : bool
+        Whether the evidence distinguishes the faults; no fault is named otherwise.
     """
 
     by: str
@@ -64,7 +64,7 @@ class AlarmEvent:
     low: float
     high: float
     evidence: float
-    apart: bool = True
+    distinguished: bool = True
 
     @property
     def clear(self) -> bool:
@@ -94,10 +94,10 @@ class AlarmLog:
         row: int,
         cells: Sequence[float],
         *,
-        apart: bool = True,
+        distinguished: bool = True,
     ) -> None:
-        """Take a row above a threshold; ``cells`` are the numbers of its output; ``apart``: whether a fault would be
-        named if there was one."""
+        """Take a row above a threshold; ``cells`` are the numbers of its output; ``distinguished``: whether a
+        fault would be named if there was one."""
         before = self._open.get(by)
         if before is not None and row - before.last_row > HOLD:
             self._closed.append(self._open.pop(by))
@@ -107,11 +107,11 @@ class AlarmLog:
         largest = before is None or evidence > before.evidence or math.isnan(before.evidence)
         known = (math.nan,) * 3 if before is None else (before.size, before.low, before.high)
         named = "" if before is None else before.fault
-        tells = before is None or (apart and not evidence <= self._named_by[by])
+        tells = before is None or (distinguished and not evidence <= self._named_by[by])
         size, low, high = self._size(fault, cells) if tells else known
         if tells:
             named = fault
-            self._named_by[by] = evidence if apart else -math.inf
+            self._named_by[by] = evidence if distinguished else -math.inf
         self._open[by] = AlarmEvent(
             by,
             named,
@@ -124,7 +124,7 @@ class AlarmLog:
             low,
             high,
             evidence if largest or before is None else before.evidence,
-            apart or (before is not None and before.apart),
+            distinguished or (before is not None and before.distinguished),
         )
 
     def _size(self, fault: str, cells: Sequence[float]) -> tuple[float, float, float]:
@@ -166,7 +166,7 @@ def alarm_rows(events: Sequence[AlarmEvent], shown: Callable[[float], str]) -> t
         ends = shown(event.start), shown(event.end)
         evidence = f"{event.evidence:.3g} times"
         fault = event.fault if event.clear or not event.fault else f"{event.fault} (unclear)"
-        fault = fault if event.apart else NOT_APART
+        fault = fault if event.distinguished else NOT_DISTINGUISHED_YET
         rows.append((event.by, *ends, str(event.rows), fault, number(event.size), interval, evidence))
     kept = [i for i in range(len(rows[0])) if any(row[i] for row in rows[1:])]
     return [tuple(row[i] for i in kept) for row in rows], len(events) - len(rows) + 1

@@ -272,8 +272,8 @@ class LogRun:
             undecided = math.isnan(seen.statistic) and (undecided or not self._levels)
             if seen.alarm:
                 evidence = seen.statistic / seen.threshold if seen.threshold else math.inf
-                apart = bool(seen.fault) or not self.monitor.fault_names
-                self.events.take(self.monitor.kind, seen.fault, evidence, time, number, [*before, *cells], apart=apart)
+                kind, known = self.monitor.kind, bool(seen.fault) or not self.monitor.fault_names
+                self.events.take(kind, seen.fault, evidence, time, number, [*before, *cells], distinguished=known)
                 self.alarms.setdefault(self.monitor.kind, time)
                 self.isolated = self.isolated or seen.fault
                 self.alarm_rows.setdefault(self.monitor.kind, number)

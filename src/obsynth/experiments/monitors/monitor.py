@@ -128,7 +128,7 @@ class Sample(NamedTuple):
     bridged: bool = False  # whether the plant's model stood in for all that was missing since the warm-up
 
 
-#: In place of a fault's number: what is known does not tell the faults apart.
+#: In place of a fault's number: what is known does not distinguish the faults.
 NOT_DISTINGUISHED = -1
 
 
