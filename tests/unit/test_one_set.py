@@ -14,12 +14,15 @@ import pytest
 
 import obsynth
 from obsynth import conditions
+from obsynth.conditions.wang import error_norm
 from obsynth.methods.fault_estimation_filter.central_filter import search_least_gain
 from obsynth.methods.fault_estimation_filter.conditions import examine_fault_filter
 from obsynth.methods.fault_estimation_filter.synthesis import _gains, centred, gain_problem
 from obsynth.methods.pd_observer import inequalities
 from obsynth.methods.pd_observer.realisation import with_faults_as_states
 
+#: The solver's points are judged, not its word: near the least gain how many digits it finds hangs on the processor.
+INACCURATE = pytest.mark.filterwarnings("ignore:Solution may be inaccurate:UserWarning")
 DESIGNS = Path(__file__).parents[2] / "designs"
 
 
@@ -72,14 +75,14 @@ def least_gain(name: str) -> float:
     return least(name).gain
 
 
+@INACCURATE
 @pytest.mark.parametrize("name", PLANTS)
 def test_least_gains_agree(name):
-    """Not below: the printed minimum is no less.  Not above: the engine's filter satisfies the printed inequality."""
+    """Not below: no filter of the printed minimum has less.  Not above: the engine has one that satisfies it."""
     plant, gain = filter_plant(name), least_gain(name)
     found = conditions.wang2015(plant, coordinates="balanced", margin=0.0)
     found.problem.solve(solver="CLARABEL")
-    assert found.problem.status == "optimal"
-    assert np.sqrt(found.variables["gamma_squared"].value) >= gain - 1e-6 * max(gain, 1.0)
+    assert error_norm(plant, found.gains()) >= gain - 1e-6 * max(gain, 1.0)
     _, prepared, parts = engine_problem(plant)
     gains = _gains(prepared, parts, least(name).injection)
     level = gain + 1e-6 * max(gain, 1.0)
@@ -103,6 +106,7 @@ def smallest(problem, P, R, level: float) -> float:
     return float(np.linalg.eigvalsh(form * units * units[:, None]).min())
 
 
+@INACCURATE
 @pytest.mark.parametrize("name", PLANTS)
 def test_points_of_the_printed_filter_inequality_are_the_engine_s(name):
     plant, level = filter_plant(name), 1.1 * least_gain(name) + 1e-3

@@ -188,7 +188,7 @@ def _dynamics(design: ObserverDesign) -> str:
         seconds = transient(design.linear[1])
         if not math.isfinite(seconds):
             return f"the initial-condition response does not decay; observer of order {design.observer.order}"
-        settling = f"{100.0 * SETTLED_TO:g} % settling time {number(seconds, digits=2)} s"
+        settling = f"{100.0 * SETTLED_TO:g} % settling time {number(float(f'{seconds:.2g}'))} s"
         return f"{settling}; observer of order {design.observer.order}"
     factor = design.certificate.claims.get("contraction", math.nan)
     return f"errors shrink to {number(100.0 * factor)} % per step on average; observer of order {design.observer.order}"
