@@ -273,7 +273,7 @@ obsynth.plotting.plot_simulation(obsynth.simulate(own, happens))
 plt.show()
 
 # %% [markdown]
-# The estimate comes one sample late and is noisy: a fault of any course costs a difference of measurements.
+# The estimate has a delay of one sample and is noisy: a fault of any course costs a difference of measurements.
 
 # %% [markdown]
 # ## 9. What is impossible, explained

@@ -154,7 +154,7 @@ except obsynth.PreconditionError as error:
 # ## 4. A better residual is not enough
 #
 # The innovation form, our default, learns from the parity innovation instead. It finds $\theta$ at once, and then the
-# excitation ends: both entries of $\Phi_k$ tend to one, and the effect of a *constant* parameter on $y$ dies out. The
+# excitation ends: both entries of $\Phi_k$ tend to one, and the effect of a *constant* parameter on $y$ decays. The
 # guard keeps the estimate where it is, instead of letting it blow up. The band is that of a constant parameter: it
 # widens as far as forgetting goes, and knows nothing of the change, which was never seen.
 

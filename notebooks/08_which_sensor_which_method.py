@@ -10,7 +10,7 @@
 # # Which sensor, which method?
 #
 # A motor drives a load through a flexible shaft. Part of its torque is lost, and nobody knows what the load draws. What
-# must be measured so that the loss can be told from the load, and what estimates it best?
+# must be measured so that the loss is distinguished from the load, and what estimates it best?
 
 # %%
 import numpy as np

@@ -39,7 +39,7 @@ plt.show()
 
 # %% [markdown]
 # Why is there no smaller one? Because of this course: twice the fault with these disturbances, and no fault with their
-# opposites, give the very same samples. No function of them tells the two apart.
+# opposites, give the very same samples. No function of them distinguishes the two.
 
 # %%
 obsynth.plotting.plot_hidden_course(step)

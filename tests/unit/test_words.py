@@ -11,12 +11,10 @@ import pytest
 from obsynth.methods.fault_figures import FaultFigures
 
 ROOT = Path(__file__).parents[2]
-#: What is read: sources and templates, documentation, and the notes of the designs.
+#: What is read: sources and templates, documentation, notebooks, and the notes of the designs.
+PATTERNS = ("src/**/*.py", "src/**/*.pyi", "src/**/*.c", "docs/**/*.md", "docs/**/*.py", "notebooks/*.py")
 FILES = sorted(
-    path
-    for pattern in ("src/**/*.py", "src/**/*.pyi", "src/**/*.c", "docs/**/*.md", "docs/**/*.py", "designs/*/NOTES.md")
-    for path in ROOT.glob(pattern)
-    if "made" not in path.parts
+    path for pattern in (*PATTERNS, "designs/*/NOTES.md") for path in ROOT.glob(pattern) if "made" not in path.parts
 )
 FILES += [ROOT / name for name in ("README.md", "CONTRIBUTING.md")]
 
