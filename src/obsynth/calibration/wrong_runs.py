@@ -25,8 +25,8 @@ def wrong_runs(problem: Problem, fit: InnovationsFit) -> BoolArray:
     whitened = np.where(np.isfinite(problem.y), fit.whitened, np.nan)
     found = np.zeros(problem.y.shape, dtype=bool)
     seen = np.isfinite(problem.y)
-    usual = np.array([usual_size(column) if count >= LEAST_DIAGNOSED_ROWS else np.inf
-                      for column, count in zip(whitened.T, seen.sum(axis=0), strict=True)])  # fmt: skip
+    enough = seen.sum(axis=0) >= LEAST_DIAGNOSED_ROWS
+    usual = np.array([usual_size(column) if many else np.inf for column, many in zip(whitened.T, enough, strict=True)])
     far = seen & (np.abs(whitened) > STANDS_OUT * usual)
     for i in range(far.shape[1]):
         for first, last in _groups(far[:, i]):

@@ -1,7 +1,7 @@
 """Levels of alarms from rows without faults: statistics of whitened rows, and a bootstrap of all that is estimated.
 
 Residuals are whitened by their autoregression (Alwan & Roberts 1988).  Watched are Hotelling's T2, exponentially
-weighted means (MEWMA, Lowry et al.  1992) and likelihood ratios of steps and ramps (Willsky & Jones 1976); and, where
+weighted means (MEWMA, Lowry et al. 1992) and likelihood ratios of steps and ramps (Willsky & Jones 1976); and, where
 fault estimates follow from a walk of theirs, likelihood ratios of changes of each (`parameter_scores`).  The bootstrap
 makes streams from blocks of the whitened rows (Politis & Romano 1994) whose largest follow a generalised Pareto tail;
 from each it fits everything again, so that the uncertainty of a short log is in the levels, which hold in
