@@ -240,6 +240,18 @@ class TestNumbers:
         assert told.err.startswith("Error: g.json") or "NOT verified" in told.out or "fail" in told.out
         assert main(["run", "--gains", "g.json", "--data", "log.csv", "--out", "o.csv", "--quiet"]) in (0, 2)
 
+    @pytest.mark.parametrize("value", [1e308, -1e308, 5e-324])
+    @pytest.mark.parametrize("matrix", ["plant A", "plant C", "plant Bf", "observer Az", "observer By", "observer Dy"])
+    def test_numbers_that_overflow_fail_their_checks_without_a_warning(self, matrix, value, capsys):
+        document = json.loads(Path("g.json").read_text("utf-8"))
+        part, name = matrix.split()
+        document["design"][part][name]["data"][0] = value
+        Path("g.json").write_text(with_digest(document, "design"), "utf-8")
+        assert main(["verify", "g.json"]) in (2, 5, 6)
+        told = capsys.readouterr()
+        assert "Warning" not in told.err
+        assert "FAIL" in told.out or "NOT verified" in told.out or told.err.startswith(("Error", "Inconclusive"))
+
     @pytest.mark.parametrize("value", [10**400, float("nan"), "1", [], True, {"shape": [1], "data": [None]}])
     def test_in_a_saved_state(self, value, capsys):
         assert main([*RUN, "o.csv", "--state", "state.json"]) == 0

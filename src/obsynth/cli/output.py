@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 _TITLES = {
     "PreconditionError": "Existence condition fails",
     "InfeasibleError": "Infeasible",
-    "SolverError": "The solver gave up",
+    "SolverError": "Inconclusive",
     "VerificationError": "Verification failed",
 }
 

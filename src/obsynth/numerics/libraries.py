@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from threadpoolctl import ThreadpoolController
 
 
-#: How scipy says that an overflow has reached LAPACK.
-_NOT_FINITE = "infs or NaNs"
+#: How scipy says, by a ValueError, that an overflow has reached LAPACK, or that LAPACK cannot reorder a Schur form.
+_NUMERICAL_VALUE_ERRORS = ("infs or NaNs", "too far from generalized Schur form")
 
 
 def failure_of(error: Exception) -> SolverError | None:
@@ -34,7 +34,9 @@ def failure_of(error: Exception) -> SolverError | None:
             f"This does not fit into the memory{f' ({told})' if told else ''}. The result is inconclusive."
         )
     is_numerical = isinstance(error, (np.linalg.LinAlgError, ArithmeticError))
-    if not is_numerical and not (isinstance(error, ValueError) and _NOT_FINITE in str(error)):
+    if isinstance(error, ValueError):
+        is_numerical = is_numerical or any(text in str(error) for text in _NUMERICAL_VALUE_ERRORS)
+    if not is_numerical:
         return None
     return SolverError(
         f"LAPACK gave up ({str(error).rstrip('.')}): the numbers are beyond double precision. The result is "

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Iterator, Mapping
 
+import numpy as np
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
@@ -170,7 +171,11 @@ def gains_if_linear(design: ObserverDesign) -> FaultGains | None:
     """Return the gains of a linear design that estimates faults of its plant; a broken one has none."""
     if not isinstance(design.plant, DescriptorSystem) or not design.observer.fault_names:
         return None
-    return None if any(check.name == FITS for check in design.report.failures) else fault_gains(design)
+    if any(check.name == FITS for check in design.report.failures):
+        return None
+    # Numbers of a corrupted design may overflow; the table shows infinity then, beside the checks that fail.
+    with np.errstate(over="ignore", invalid="ignore"):
+        return fault_gains(design)
 
 
 def fault_estimates(design: ObserverDesign, gains: FaultGains | None) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:

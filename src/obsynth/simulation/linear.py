@@ -21,6 +21,7 @@ from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.arguments import real_array, real_vector, whole_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import driven, first_order_hold
+from obsynth.numerics.libraries import failed_computations
 from obsynth.numerics.ranks import decide_rank
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
@@ -195,6 +196,7 @@ def _sampled_noise(
     return sampled.Bw, sampled.Dw, np.zeros((len(recovery.names), sampled.nw))
 
 
+@failed_computations()
 def stabilising_feedback(plant: DescriptorSystem) -> FloatArray:
     """Return the linear-quadratic state feedback with unit weights of a plant with ``E = I``."""
     from scipy.linalg import solve_continuous_are, solve_discrete_are

@@ -172,7 +172,7 @@ def _from_riccati(E: FloatArray, A: FloatArray, C: FloatArray, q: FloatArray, r:
             np.zeros((n, n)), np.eye(n), 0.5 * (known + known.T), 0.5 * (square + square.T), e=np.eye(n), s=cross
         )
         P = np.linalg.inv(inverse)
-    except np.linalg.LinAlgError:
+    except (np.linalg.LinAlgError, ValueError):  # SciPy raises ValueError where it cannot reorder the Schur form
         return None
     return np.asarray(0.5 * (P + P.T), dtype=np.float64)
 
