@@ -15,6 +15,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.experiments.assumptions import Log
+from obsynth.methods.guaranteed_test.checks import while_inside
 from obsynth.methods.guaranteed_test.exact import Programmes
 from obsynth.methods.guaranteed_test.proofs import (
     columns_of_exact,
@@ -23,7 +24,6 @@ from obsynth.methods.guaranteed_test.proofs import (
     exact_right_sides,
     sum_in_ellipsoids,
 )
-from obsynth.methods.guaranteed_test.regions import while_inside
 from obsynth.methods.guaranteed_test.result import GuaranteedTest
 from obsynth.methods.guaranteed_test.windows import Window
 from obsynth.numerics.arrays import FloatArray

@@ -16,10 +16,10 @@ from obsynth.experiments.monitors.adaptive_rule import AdaptiveRule
 from obsynth.experiments.monitors.monitor import Judged, LinearSample, Monitor, Rule, Sample
 from obsynth.experiments.monitors.rules import NormRule
 from obsynth.methods.guaranteed_test.bank import is_bank
+from obsynth.methods.guaranteed_test.checks import while_inside
 from obsynth.methods.guaranteed_test.exact import Programmes
 from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
 from obsynth.methods.guaranteed_test.problem import window_as_designed
-from obsynth.methods.guaranteed_test.regions import while_inside
 from obsynth.methods.guaranteed_test.result import GuaranteedTest
 from obsynth.methods.guaranteed_test.tolerant import noisy_as_bounded, rows_before
 from obsynth.numerics.arrays import FloatArray

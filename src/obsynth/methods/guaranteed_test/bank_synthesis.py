@@ -26,7 +26,7 @@ from obsynth.methods.guaranteed_test.bank import (
 )
 from obsynth.methods.guaranteed_test.conditions import conditions, told
 from obsynth.methods.guaranteed_test.problem import problem_of
-from obsynth.methods.guaranteed_test.synthesis import TRADE_OFF, chosen_samples, synthesise
+from obsynth.methods.guaranteed_test.synthesis import TRADE_OFF, chosen_samples, padded, synthesise
 from obsynth.methods.method import Synthesis
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.descriptor import DescriptorSystem
@@ -140,9 +140,7 @@ def _stacked(given: list[dict[str, FloatArray]]) -> dict[str, FloatArray]:
     for name in BY_TEST:
         if not any(name in matrices for matrices in given):
             continue
-        rows = [np.ravel(matrices.get(name, np.zeros(1))) for matrices in given]
-        width = max(len(row) for row in rows)
-        found[name] = np.array([np.pad(row, (0, width - len(row))) for row in rows])
+        found[name] = padded([np.ravel(matrices.get(name, np.zeros(1))) for matrices in given])
     return found
 
 

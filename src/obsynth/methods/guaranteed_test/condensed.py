@@ -17,9 +17,10 @@ from typing import Any
 import numpy as np
 from flint import arb, arb_mat, ctx
 
-from obsynth.methods.guaranteed_test.windows import Constant, Window
+from obsynth.methods.guaranteed_test.windows import Window
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import decide_rank
+from obsynth.plants.descriptor import DescriptorSystem
 
 #: Bits of the balls: far more than any window that double precision solves loses.
 CONDENSED_BITS = 512
@@ -64,7 +65,7 @@ class Condensed:
     @classmethod
     def of(cls, window: Window) -> Condensed | None:
         """Return it, or ``None`` where the window is small or has not this structure."""
-        if window.rows < FEWEST_ROWS or not isinstance(window.model, Constant):
+        if window.rows < FEWEST_ROWS or not isinstance(window.model.plant, DescriptorSystem):
             return None
         plant, samples = window.plant, window.question.samples
         bounds = window.bounds

@@ -2,64 +2,68 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 
 from obsynth.analysis.conditions import Condition
+from obsynth.errors import SpecError
 from obsynth.methods.guaranteed_test.condensed import Condensed
 from obsynth.methods.guaranteed_test.options import Asked
-from obsynth.methods.guaranteed_test.problem import Problem, missing_bounds, problem_of
+from obsynth.methods.guaranteed_test.problem import Problem, missing_bounds, problem_of, samples_given
 from obsynth.methods.guaranteed_test.proofs import proved_ray, repaired_multipliers
-from obsynth.methods.guaranteed_test.windows import Window
+from obsynth.methods.guaranteed_test.windows import Window, fault_names
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 
 SOURCE = "duality of linear programmes"
 #: Values of a hidden course below this share of its largest are not told.
 TOLD_COURSE = 1e-6
 
 
-def conditions(plant: DescriptorSystem, asked: Asked, *, with_windows: bool = True) -> tuple[Condition, ...]:
+def conditions(
+    plant: DescriptorSystem | TimeVaryingDescriptorSystem, asked: Asked, *, with_windows: bool = True
+) -> tuple[Condition, ...]:
     """Return the conditions in order; ``with_windows``: also whether a window tells the fault, if the others hold."""
-    discrete = Condition(
-        "discrete time",
-        "dt > 0",
-        plant.dt > 0.0,
-        plant.dt,
-        0.0,
-        SOURCE,
-        "" if plant.dt > 0.0 else "the plant is continuous: sample it (transform: sample_time, obsynth.discretise).",
+    first: tuple[Condition, ...] = ()
+    names, none = fault_names(plant), "the plant has no parameter (Phi, Psi)."
+    named = asked.fault is not None or len(names) == 1
+    if isinstance(plant, DescriptorSystem):
+        detail = "the plant is continuous: sample it (transform: sample_time, obsynth.discretise)."
+        sampled = plant.dt > 0.0
+        first = (Condition("discrete time", "dt > 0", sampled, plant.dt, 0.0, SOURCE, "" if sampled else detail),)
+        named, none = named if not asked.isolate else plant.nf > 0, "the plant has no fault (Bf, Df)."
+    advice = f"name one of {', '.join(names)} (fault)." if names else none
+    lacking = list(missing_bounds(plant, asked))
+    first = (
+        *first,
+        Condition(
+            "fault named",
+            "one fault is tested for",
+            named,
+            float(len(names)),
+            1.0,
+            SOURCE,
+            "" if named else advice,
+        ),
+        Condition(
+            "bounds stated",
+            "disturbances and noise have bounds",
+            not lacking,
+            float(len(lacking)),
+            0.0,
+            SOURCE,
+            " ".join(lacking),
+        ),
     )
-    named = plant.nf > 0 if asked.isolate else asked.fault is not None or plant.nf == 1
-    fault = fault_named(named, plant.fault_names, "the plant has no fault (Bf, Df).")
-    stated = bounds_stated(list(missing_bounds(plant, asked)))
-    first = (discrete, fault, stated)
     if not all(condition.holds for condition in first) or not with_windows:
         return first
-    if asked.isolate:
-        return (*first, *(_alone(plant, replace(asked, isolate=False, fault=name)) for name in plant.fault_names))
-    return (*first, told(problem_of(plant, asked), asked)[0])
-
-
-def fault_named(named: bool, names: Sequence[str], none: str) -> Condition:
-    """Return the condition that one fault is tested for; ``none`` says that the plant has none to choose from."""
-    advice = f"name one of {', '.join(names)} (fault)." if names else none
-    detail = "" if named else advice
-    return Condition("fault named", "one fault is tested for", named, float(len(names)), 1.0, SOURCE, detail)
-
-
-def bounds_stated(lacking: Sequence[str]) -> Condition:
-    """Return the condition that everything has a bound, from the sentences on what has none."""
-    claim, count = "disturbances and noise have bounds", float(len(lacking))
-    return Condition("bounds stated", claim, not lacking, count, 0.0, SOURCE, " ".join(lacking))
-
-
-def _alone(plant: DescriptorSystem, asked: Asked) -> Condition:
-    """Return the condition that a fault is told where no other is there: some group of a bank then tells it."""
-    asked = replace(asked, free="none")
-    return told(problem_of(plant, asked), asked)[0]
+    # Of a bank: that a fault is told where no other is there; some group then tells it.
+    alone = [replace(asked, isolate=False, fault=name, free="none") for name in names]
+    each = alone if asked.isolate and isinstance(plant, DescriptorSystem) else [asked]
+    return (*first, *(told(problem_of(plant, own), own)[0] for own in each))
 
 
 def told(problem: Problem, asked: Asked) -> tuple[Condition, int]:
@@ -67,16 +71,39 @@ def told(problem: Problem, asked: Asked) -> tuple[Condition, int]:
     lags = [problem.question.lag]
     if problem.question.course == "any" and asked.lag is None:
         lags = list(range(problem.plant.nx + 2))
+    if isinstance(problem.plant, TimeVaryingDescriptorSystem):
+        lags = [lag for lag in lags if lag < _samples_by_row(problem, asked)] or lags[:1]
     for lag in lags:
-        most = samples_decided_on(problem, asked, lag)
-        least = max(problem.before, lag) + 2
-        # A test on fewer samples is one on more: short windows are decided in no time.
-        doubled = [least * 2**k for k in range(most.bit_length())]
-        for samples in (*(tried for tried in doubled if tried < most), most):
-            window = problem.window(samples, lag=lag)
+        for window in _decisive(problem, asked, lag):
             if has_test(window):
                 return told_condition(window, True, ""), lag
     return told_condition(window, False, _why(problem, asked, window)), lags[-1]
+
+
+def _decisive(problem: Problem, asked: Asked, lag: int) -> Iterator[Window]:
+    """Yield the windows of which one has a test where there is any."""
+    if isinstance(problem.plant, TimeVaryingDescriptorSystem):
+        samples = _samples_by_row(problem, asked)
+        rows = problem.tried(samples)
+        if not rows:
+            raise SpecError(
+                f"The plant's horizon of {problem.horizon} steps has no window of {samples} samples (k = 1 is the "
+                "first): give fewer samples, or extend the model.",
+                path="method.options.samples",
+            )
+        yield from (problem.window(samples, lag=lag, row=row) for row in reversed(rows))
+        return
+    most = samples_decided_on(problem, asked, lag)
+    least = max(problem.question.before, lag) + 2
+    # A test on fewer samples is one on more: short windows are decided in no time.
+    doubled = [least * 2**k for k in range(most.bit_length())]
+    yield from (problem.window(samples, lag=lag) for samples in (*(tried for tried in doubled if tried < most), most))
+
+
+def _samples_by_row(problem: Problem, asked: Asked) -> int:
+    """Return the samples on which it is decided where each row has a window of its own."""
+    given = samples_given(asked)
+    return problem.ladder()[-1] if given == "auto" else int(given)
 
 
 def samples_decided_on(problem: Problem, asked: Asked, lag: int) -> int:
@@ -119,7 +146,7 @@ SEEN = 1e-6
 
 def told_condition(window: Window, holds: bool, detail: str) -> Condition:
     """Return the condition that a window tells the fault, in words."""
-    fault = window.model.fault_names[window.question.fault]
+    fault = fault_names(window.model.plant)[window.question.fault]
     return Condition(
         "fault detectable",
         f"{fault} changes the samples in a way that no free signal does",
@@ -134,16 +161,24 @@ def told_condition(window: Window, holds: bool, detail: str) -> Condition:
 
 def _why(problem: Problem, asked: Asked, window: Window) -> str:
     """Return in words what hides the fault."""
-    fault = problem.plant.fault_names[problem.question.fault]
+    fault, varies = problem.fault, isinstance(problem.plant, TimeVaryingDescriptorSystem)
     found = proved_ray(window)
     samples = window.question.samples
+    if found is None and varies:
+        return (
+            f"no weights of {samples} samples respond to {fault} and to nothing that is free at the rows that were "
+            "tried."
+        )
     if found is None:
         return (
             f"no test on {samples} samples responds to {fault} and to nothing that is free, but a time course that "
             "hides it could not be "
             "proved: this is at the edge of double precision. Bounds of the states (state_bounds) help, even wide ones."
         )
-    text = f"{hidden(window, found)} (proved for {samples} samples: every equation holds exactly)."
+    where = f"the window that ends at k = {samples}" if varies else f"{samples} samples"
+    text = f"{hidden(window, found)} (proved for {where}: every equation holds exactly)."
+    if varies:
+        return text
     lag = window.question.lag
     if problem.question.course == "any" and asked.lag is not None:
         for more in range(lag + 1, problem.plant.nx + 2):
@@ -158,13 +193,14 @@ def _why(problem: Problem, asked: Asked, window: Window) -> str:
 
 def hidden(window: Window, point: FloatArray) -> str:
     """Return which signals together look like nothing."""
-    plant, question = window.model, window.question
-    fault = plant.fault_names[question.fault]
+    plant, question = window.model.plant, window.question
+    names = fault_names(plant)
+    fault = names[question.fault]
     largest = float(np.max(np.abs(point)))
     others = []
     for label, value in zip(window.labels, point, strict=True):
         if label[0] == "f" and label[2] != question.fault and abs(value) > TOLD_COURSE * largest:
-            name = plant.fault_names[label[2]]
+            name = names[label[2]]
             if name not in others:
                 others.append(name)
     states = {

@@ -188,10 +188,6 @@ class GuaranteedTestMethod(Asked, Method):
             from obsynth.methods.guaranteed_test.nonlinear import nonlinear_conditions
 
             return nonlinear_conditions(plant, self)
-        if isinstance(plant, TimeVaryingDescriptorSystem):
-            from obsynth.methods.guaranteed_test.varying_synthesis import varying_conditions
-
-            return varying_conditions(plant, self)
         from obsynth.methods.guaranteed_test.conditions import conditions
 
         return conditions(plant, self)
@@ -211,11 +207,7 @@ class GuaranteedTestMethod(Asked, Method):
         for option in ("region", "sample_time", "given", "model"):
             if getattr(self, option) is not None:
                 raise SpecError(f"{option} is for nonlinear plants: leave it out.", path=f"method.options.{option}")
-        if isinstance(plant, TimeVaryingDescriptorSystem):
-            from obsynth.methods.guaranteed_test.varying_synthesis import synthesise_varying
-
-            return synthesise_varying(plant, self, progress=progress)
-        if self.isolate:
+        if self.isolate and isinstance(plant, DescriptorSystem):
             from obsynth.methods.guaranteed_test.bank_synthesis import synthesise_bank
 
             found = synthesise_bank(plant, self, progress=progress)
@@ -231,11 +223,8 @@ class GuaranteedTestMethod(Asked, Method):
         from obsynth.methods.guaranteed_test.checks import checks
 
         del printed_digits
-        if isinstance(design.plant, TimeVaryingDescriptorSystem):
-            from obsynth.methods.guaranteed_test.varying_checks import varying_checks
-
-            return varying_checks(design, cls.of)
-        return (bank_checks if is_bank(design) else checks)(design, cls.of)
+        bank = is_bank(design) and isinstance(design.plant, DescriptorSystem)
+        return (bank_checks if bank else checks)(design, cls.of)
 
     @classmethod
     def has_error_model(cls, design: ObserverDesign) -> bool:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+import hashlib
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from fractions import Fraction
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -12,12 +14,21 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.methods.guaranteed_test.options import Asked
 from obsynth.methods.guaranteed_test.tolerant import side_by_side
-from obsynth.methods.guaranteed_test.windows import Bounds, Question, Window, window_of
+from obsynth.methods.guaranteed_test.windows import (
+    Bounds,
+    Question,
+    Window,
+    disturbance_names,
+    fault_names,
+    window_of,
+)
 from obsynth.numerics.arguments import is_finite_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import decide_rank
 from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.windows import WindowObserver
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.proofs.exact_pencils import ExactPencil
 
 #: What each course covers, and what not.
@@ -38,74 +49,193 @@ MOST_STATES = 2500
 WITHIN = 0.05
 
 
+#: Rows, evenly spread, whose windows decide on the number of samples and the lag where matrices change with k.
+TRIED_ROWS = 8
+#: What is for plants with constant matrices, and what to do instead.
+REFUSED: Mapping[str, str] = {
+    "isolate": "design one test for each fault, insensitive to the others (free: others)",
+    "exact": "leave it out: the fixed tests, one a row, are proved",
+    "missing": "leave it out (missing: wait)",
+}
+
+
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """A plant with its bounds and what is asked, but for the number of samples and the lag."""
+    """A plant with its bounds and what is asked, but for the number of samples, the lag and the row.
 
-    plant: DescriptorSystem
+    Of a plant that changes with k, ``E_{k+1} x(k+1) = A_k x(k) + B_k u(k) + Phi_k f(k) + mu(k)`` and
+    ``y(k+1) = C_{k+1} x(k+1) + Psi_k f(k) + nu(k)``, each row has a window of its own.
+    """
+
+    plant: DescriptorSystem | TimeVaryingDescriptorSystem
     bounds: Bounds
     question: Question  # of one sample more than its course needs
-    before: int
 
-    def window(self, samples: int, *, lag: int | None = None) -> Window:
-        """Return the stacked equations of so many samples."""
+    def window(self, samples: int, *, lag: int | None = None, row: int = 0) -> Window:
+        """Return the stacked equations of so many samples, of which the last is that of k = ``row``."""
         lag = self.question.lag if lag is None else lag
-        return window_of(self.plant, self.bounds, replace(self.question, samples=samples, lag=lag))
+        start = 1 if self.horizon is None else row - samples + 1
+        return window_of(self.plant, self.bounds, replace(self.question, samples=samples, lag=lag), start)
+
+    @property
+    def horizon(self) -> int | None:
+        """The last k of a plant that changes with k."""
+        return None if isinstance(self.plant, DescriptorSystem) else self.plant.horizon
+
+    @property
+    def fault(self) -> str:
+        """Name of the fault that is looked for."""
+        return fault_names(self.plant)[self.question.fault]
 
     @property
     def shortest(self) -> int:
         """The least number of samples that the course fits in."""
-        return max(self.before, self.question.lag) + 1
+        return max(self.question.before, self.question.lag) + 1
 
     def enough(self, lag: int) -> int:
         """Return samples after which more of them make no test possible that there was none before."""
-        return self.before + 2 * self.plant.nx + 2 + lag
+        return self.question.before + 2 * self.plant.nx + 2 + lag
 
     def ladder(self) -> tuple[int, ...]:
         """Return the numbers of samples to try; of a large plant fewer."""
         most = max(MOST_STATES // max(self.plant.nx, 1), self.shortest)
-        asked = [self.before + rung for rung in LADDER] if self.question.course == "step" else list(LADDER)
+        most = most if self.horizon is None else min(most, self.horizon)
+        asked = [self.question.before + rung for rung in LADDER]
         return tuple(rung for rung in asked if self.shortest <= rung <= most) or (self.shortest,)
 
+    def rows(self, samples: int) -> range:
+        """Return the rows that have a window; without a horizon 0, which stands for all."""
+        return range(1) if self.horizon is None else range(samples, self.horizon + 1)
 
-def question_of(
-    asked: Asked, fault_names: tuple[str, ...], disturbance_names: tuple[str, ...], *, closing: int = 0
-) -> Question:
+    def tried(self, samples: int) -> list[int]:
+        """Return some rows, evenly spread."""
+        rows = self.rows(samples)
+        return sorted({rows[int(k)] for k in np.linspace(0, len(rows) - 1, TRIED_ROWS)}) if len(rows) else []
+
+    @cached_property
+    def _continuing(self) -> np.ndarray:
+        """By k, whether every state that satisfies the equations up to it has a course to the horizon."""
+        plant = self.plant
+        if isinstance(plant, DescriptorSystem):
+            # What follows the window is in its equations (`Question.closing`).
+            return np.ones(1, dtype=bool)
+        last = 2 if plant.horizon is None else plant.horizon
+        found = np.ones(last + 1, dtype=bool)
+        for k in range(last - 1, 0, -1):
+            found[k] = found[k + 1] and _continues(plant.E.at(k), plant.A.at(k), plant.E.at(k + 1))
+        return found
+
+    def continues(self, window: Window, row: int) -> bool:
+        """Whether what satisfies the equations of a window satisfies those after it, with some later states."""
+        found = self._continuing
+        after = 1 if self.horizon is None else row - window.question.samples + 1 + window.equations
+        return bool(found[min(after, len(found) - 1)])
+
+
+def _continues(before: FloatArray, a: FloatArray, after: FloatArray) -> bool:
+    """Whether a state with any ``E_k x`` can also satisfy those equations of the next step that E has no part in."""
+    rank = decide_rank(after).rank
+    if rank == len(after):
+        return True
+    without = np.linalg.svd(after)[0][:, rank:].T
+    return decide_rank(np.vstack([before, without @ a])).rank == decide_rank(before).rank + len(without)
+
+
+def question_of(asked: Asked, plant: DescriptorSystem | TimeVaryingDescriptorSystem) -> Question:
     """Return what is looked for, of one sample more than its course needs."""
-    fault, before = fault_of(fault_names, asked.fault), asked.before if asked.course == "step" else 0
-    rates = np.zeros(0)
+    names, before = fault_names(plant), asked.before if asked.course == "step" else 0
+    fault, rates = fault_of(names, asked.fault), np.zeros(0)
     if asked.disturbance == "rate":
-        rates = by_name(asked.disturbance_rate, disturbance_names, "disturbance_rate", every=True)
+        rates = by_name(asked.disturbance_rate, disturbance_names(plant), "disturbance_rate", every=True)
+    index = None
+    if isinstance(plant, DescriptorSystem) and not decide_rank(plant.E).full:
+        index = ExactPencil.written(plant.E, plant.A).index
     return Question(
         fault,
         asked.course,
         before + 1,
         asked.lag or 0,
         before,
-        free_faults(fault_names, asked.free, fault),
+        free_faults(names, asked.free, fault),
         asked.free_course,
         asked.disturbance,
         rates,
         float(asked.fault_rate or 0.0),
         asked.norm == "ellipsoid",
-        closing,
+        max((index or 0) - 1, 0),
     )
 
 
-def problem_of(plant: DescriptorSystem, asked: Asked) -> Problem:
-    """Return what is asked of a plant; raise `SpecError` for unknown signals, missing bounds and courses that do not
-    fit."""
-    regular = decide_rank(plant.E).full
-    index = 0 if regular else ExactPencil.written(plant.E, plant.A).index
-    closing = 0 if index is None else max(index - 1, 0)
-    question = question_of(asked, plant.fault_names, plant.disturbance_names, closing=closing)
-    return Problem(plant, bounds_of(plant, asked), question, question.before)
+def problem_of(plant: DescriptorSystem | TimeVaryingDescriptorSystem, asked: Asked) -> Problem:
+    """Return what is asked of a plant; raise `SpecError` for what it cannot be asked, unknown signals, missing bounds
+    and courses that do not fit."""
+    if isinstance(plant, TimeVaryingDescriptorSystem):
+        for name, given in (("isolate", asked.isolate), ("exact", asked.exact), ("missing", asked.missing == "solve")):
+            if given:
+                raise SpecError(
+                    f"{name} is for plants whose matrices do not change with k: {REFUSED[name]}.",
+                    path=f"method.options.{name}",
+                )
+        if plant.horizon is None and not plant.is_time_invariant:
+            raise SpecError(
+                "The plant changes with k and has no horizon, but each row has a programme of its own: give a horizon, "
+                "as many steps as the log has.",
+                path="plant.horizon",
+            )
+    question = question_of(asked, plant)
+    return Problem(plant, bounds_of(plant, asked), question)
+
+
+def samples_given(asked: Asked) -> Any:
+    """Return the number of samples, or ``auto``."""
+    return asked.before + asked.after if asked.after is not None else asked.samples
+
+
+def _key_of(window: Window) -> bytes:
+    """Return what windows have in common that have one programme and one test."""
+    digest = hashlib.blake2b(digest_size=32)
+    for part in (window.i, window.j, window.value, window.times, window.bar, np.array([window.rows])):
+        digest.update(np.ascontiguousarray(part).tobytes() + b"|")
+    for _, _, inputs in window.model.equations:
+        digest.update(np.ascontiguousarray(inputs).tobytes())
+    return digest.digest()
+
+
+@dataclass(frozen=True, eq=False)
+class Programmes:
+    """The different windows of all rows, the first row of each, and which window each row has ``(rows,)``."""
+
+    windows: tuple[Window, ...]
+    first: tuple[int, ...]
+    of_row: np.ndarray
+
+    @classmethod
+    def of(cls, problem: Problem, samples: int) -> Programmes:
+        """Return them; those with the same numbers are one."""
+        numbers: dict[bytes, int] = {}
+        windows: list[Window] = []
+        first: list[int] = []
+        of_row = []
+        for row in problem.rows(samples):
+            window = problem.window(samples, row=row)
+            key = _key_of(window) + bytes([problem.continues(window, row)])
+            if key not in numbers:
+                numbers[key] = len(windows)
+                windows.append(window)
+                first.append(row)
+            of_row.append(numbers[key])
+        return cls(tuple(windows), tuple(first), np.array(of_row, dtype=np.int64))
+
+
+def problem_as_designed(plant: DescriptorSystem | TimeVaryingDescriptorSystem, asked: Asked) -> Problem:
+    """Return the problem of options as a design ships them: with the lag."""
+    problem = problem_of(plant, asked)
+    return replace(problem, question=replace(problem.question, lag=asked.lag or 0))
 
 
 def window_as_designed(plant: DescriptorSystem, asked: Asked) -> Window:
     """Return the stacked equations of options as a design ships them: with the number of samples and the lag."""
-    problem = problem_of(plant, asked)
-    return replace(problem, question=replace(problem.question, lag=asked.lag or 0)).window(int(asked.samples))
+    return problem_as_designed(plant, asked).window(int(asked.samples))
 
 
 def fault_of(names: tuple[str, ...], name: str | None) -> int:
@@ -141,11 +271,22 @@ def free_faults(names: tuple[str, ...], given: Any, fault: int) -> tuple[int, ..
     return tuple(sorted({names.index(name) for name in listed}))
 
 
-def missing_bounds(plant: DescriptorSystem, asked: Asked) -> Iterator[str]:
+def missing_bounds(plant: DescriptorSystem | TimeVaryingDescriptorSystem, asked: Asked) -> Iterator[str]:
     """Yield a sentence for each bound that is missing."""
+    known, names = asked.disturbance_bounds, disturbance_names(plant)
+    if isinstance(plant, TimeVaryingDescriptorSystem):
+        if known is None:
+            yield (
+                "disturbance_bounds: the largest absolute value of mu(k) in each equation is missing: of "
+                f"{', '.join(names)}, 0 where an equation holds exactly."
+            )
+        if not isinstance(asked.noise_bound, Mapping):
+            yield (
+                "noise_bound: a plant that changes with k states no deviations; give the bound of each output by name: "
+                f"{', '.join(plant.output_names)}."
+            )
+        return
     acting = np.any(plant.Bd != 0.0, axis=0) | np.any(plant.Dd != 0.0, axis=0)
-    known = asked.disturbance_bounds
-    names = plant.disturbance_names
     if known is None or isinstance(known, Mapping):
         lacking = [name for name, does in zip(names, acting, strict=True) if does and name not in (known or {})]
         if lacking:
@@ -157,30 +298,24 @@ def missing_bounds(plant: DescriptorSystem, asked: Asked) -> Iterator[str]:
         )
 
 
-def require_bounds(missing: Iterable[str]) -> None:
-    """Raise `SpecError` where bounds are missing, as sentences that begin with an option."""
-    lacking = list(missing)
+def bounds_of(plant: DescriptorSystem | TimeVaryingDescriptorSystem, asked: Asked) -> Bounds:
+    """Return the bounds that are given; raise `SpecError` where some are missing."""
+    lacking = list(missing_bounds(plant, asked))
     if lacking:
         first = lacking[0].partition(":")[0]
         raise SpecError("A guaranteed test needs bounds.", path=f"method.options.{first}", problems=lacking)
-
-
-def bounds_of(plant: DescriptorSystem, asked: Asked) -> Bounds:
-    """Return the bounds that are given."""
-    require_bounds(missing_bounds(plant, asked))
-    names, middle = plant.disturbance_names, np.zeros(plant.nw)
-    disturbance, disturbance_middle = between(asked.disturbance_bounds, names, "disturbance_bounds", every=False)
-    if isinstance(asked.noise_bound, Mapping):
-        output = np.eye(plant.ny)
+    every, names = isinstance(plant, TimeVaryingDescriptorSystem), disturbance_names(plant)
+    disturbance, disturbance_middle = between(asked.disturbance_bounds, names, "disturbance_bounds", every=every)
+    if isinstance(asked.noise_bound, Mapping) or not isinstance(plant, DescriptorSystem):
+        state, output = np.zeros((plant.nx, plant.ny)), np.eye(plant.ny)
         noise, middle = between(asked.noise_bound, plant.output_names, "noise_bound", every=True)
-        state, kept = np.zeros((plant.nx, plant.ny)), np.any(plant.Bw != 0.0, axis=0)
-        if kept.any():
+        if isinstance(plant, DescriptorSystem) and plant.Bw.any():
             raise SpecError(
                 "noise_bound is given by output, but noise enters the equations too: give a number of deviations.",
                 path="method.options.noise_bound",
             )
     else:
-        state, output = plant.Bw, plant.Dw
+        state, output, middle = plant.Bw, plant.Dw, np.zeros(plant.nw)
         noise = by_name(asked.noise_bound, plant.noise_names, "noise_bound", every=False)
     always = by_name(asked.state_bounds, plant.state_names, "state_bounds", every=False, missing=np.inf)
     at_first = by_name(asked.initial_bounds, plant.state_names, "initial_bounds", every=False, missing=np.inf)
@@ -281,6 +416,37 @@ def observer_of(window: Window, multipliers: FloatArray, beside: LinearObserver 
         constant=np.array([window.constant(multipliers)]),
     )
     return test if beside is None else side_by_side(test, beside)
+
+
+def observer_of_rows(
+    problem: Problem, programmes: Programmes, told: np.ndarray, multipliers: list[FloatArray]
+) -> WindowObserver:
+    """Return the weights of all rows; ``told``: which programmes have a test."""
+    plant, question = problem.plant, programmes.windows[0].question
+    weights = []
+    for window, values, has_test in zip(programmes.windows, multipliers, told, strict=True):
+        on_y, on_u, _ = window.weights(values)
+        both = np.hstack([on_u, on_y]).ravel()
+        weights.append(both if has_test else np.zeros_like(both))
+    constants = [
+        window.constant(values) if has_test else 0.0
+        for window, values, has_test in zip(programmes.windows, multipliers, told, strict=True)
+    ]
+    estimated = question.course != "step"
+    name = (problem.fault,)
+    return WindowObserver(
+        weights=np.array(weights),
+        programmes=np.where(told[programmes.of_row], programmes.of_row, -1).astype(np.float64),
+        samples=question.samples,
+        horizon=problem.horizon,
+        dt=plant.dt,
+        input_names=plant.input_names,
+        output_names=plant.output_names,
+        fault_names=name if estimated else (),
+        residual_names=() if estimated else name,
+        fault_delays=(question.lag,) if estimated else (),
+        constants=np.array(constants),
+    )
 
 
 def rounding_of(window: Window, multipliers: FloatArray, radius: FloatArray) -> FloatArray:

@@ -14,9 +14,8 @@ from obsynth.extensions import extension
 from obsynth.methods.designing import design
 from obsynth.methods.functions import design_function
 from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
-from obsynth.methods.guaranteed_test.problem import window_as_designed
+from obsynth.methods.guaranteed_test.problem import Programmes, problem_as_designed, window_as_designed
 from obsynth.methods.guaranteed_test.tolerant import rows_before
-from obsynth.methods.guaranteed_test.varying import programmes_as_designed
 from obsynth.methods.guaranteed_test.windows import courses_of
 from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import FloatArray
@@ -294,9 +293,9 @@ class GuaranteedTest(ObserverDesign):
         leasts = shipped["leasts"].ravel()
         if np.isnan(self.least) or self.least == 0.0:
             return {}
-        _, programmes = programmes_as_designed(self._varying_plant, GuaranteedTestMethod.of(self.options))
+        problem = problem_as_designed(self._varying_plant, GuaranteedTestMethod.of(self.options))
         place = int(np.flatnonzero(leasts == self.least)[0])
-        window = programmes.windows[place]
+        window = Programmes.of(problem, self.samples).windows[place]
         return courses_of(window, shipped["witness"][place][: len(window.bar)])
 
     def plot(self, axes: Axes | None = None) -> Axes:

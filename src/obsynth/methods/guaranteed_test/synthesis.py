@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
 
 from obsynth.analysis.conditions import require_all
-from obsynth.errors import ObsynthError, SolverError
-from obsynth.methods.guaranteed_test.beside import observer_beside
+from obsynth.analysis.transformations.uncertain_plant import affine_plant
+from obsynth.errors import ObsynthError, PreconditionError, SolverError
+from obsynth.methods.designing import design
 from obsynth.methods.guaranteed_test.conditions import conditions, told
 from obsynth.methods.guaranteed_test.options import Asked
 from obsynth.methods.guaranteed_test.problem import (
@@ -18,10 +19,13 @@ from obsynth.methods.guaranteed_test.problem import (
     MOST_STATES,
     WITHIN,
     Problem,
+    Programmes,
     delay_in_samples,
     observer_of,
+    observer_of_rows,
     problem_of,
     rounding_of,
+    samples_given,
 )
 from obsynth.methods.guaranteed_test.programs import Optimum, largest_hidden_fault
 from obsynth.methods.guaranteed_test.proofs import (
@@ -31,13 +35,23 @@ from obsynth.methods.guaranteed_test.proofs import (
     repaired_multipliers,
     repaired_point,
 )
-from obsynth.methods.guaranteed_test.tolerant import Beside, mean_over_record, with_tolerances
-from obsynth.methods.guaranteed_test.windows import Window
+from obsynth.methods.guaranteed_test.tolerant import (
+    Beside,
+    mean_over_record,
+    noisy_as_bounded,
+    thresholds_over_record,
+    with_tolerances,
+)
+from obsynth.methods.guaranteed_test.windows import Question, Window, disturbance_names
 from obsynth.methods.method import Synthesis
+from obsynth.methods.tracking import tracking_of
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.results.design import Certificate
+from obsynth.simulation.linear import scenario_runs, scenario_stepper
 from obsynth.simulation.scenario import Scenario
+from obsynth.verification.error_structure import error_structure
 
 #: A threshold below this share of what all bounds could do is tried as an exact zero.
 ZERO_THRESHOLD = 1e-9
@@ -45,70 +59,134 @@ ZERO_THRESHOLD = 1e-9
 TRADE_OFF = "trade_off"
 
 
+#: The method whose observer runs beside a test: faults do not move its state estimate.
+BESIDE = "fault-estimation-filter"
+#: Samples of the scenario over which thresholds are compared, at most.
+MOST_COMPARED_SAMPLES = 500
+
+
 def synthesise(
-    plant: DescriptorSystem, asked: Asked, *, progress: Callable[[str], None], scenario: Scenario | None = None
+    plant: DescriptorSystem | TimeVaryingDescriptorSystem,
+    asked: Asked,
+    *,
+    progress: Callable[[str], None],
+    scenario: Scenario | None = None,
 ) -> Synthesis:
     """Return weights, observer and certificate; with a scenario the threshold over the tolerances of the plant's
     constants is least in the mean over it, without its faults."""
-    if scenario is None:
-        return _synthesised(plant, asked, progress, None)
-    try:
-        beside = observer_beside(asked, scenario, plant, progress)
-    except ObsynthError as error:
-        found = _synthesised(plant, asked, progress, None)
-        return replace(found, notes=(*found.notes, f"There is no threshold over the tolerances: {error}"))
-    return _synthesised(plant, asked, progress, beside)
-
-
-def _synthesised(
-    plant: DescriptorSystem, asked: Asked, progress: Callable[[str], None], beside: Beside | None
-) -> Synthesis:
+    beside, notes = None, []
+    if scenario is not None and isinstance(plant, DescriptorSystem):
+        try:
+            beside = _observer_beside(asked, scenario, plant, progress)
+        except ObsynthError as error:
+            notes.append(f"There is no threshold over the tolerances: {error}")
     problem = problem_of(plant, asked)
     require_all(conditions(plant, asked, with_windows=False))
     condition, lag = told(problem, asked)
     condition.require()
     problem = replace(problem, question=replace(problem.question, lag=lag))
-    given = asked.before + asked.after if asked.after is not None else asked.samples
+    given = samples_given(asked)
     most = problem.ladder()[-1] if given == "auto" else int(given)
     progress(f"solving linear programmes of up to {most} samples, which take {in_time(plant.nx, most)}")
-    samples, table, found = chosen_samples(problem, asked, beside)
-    progress(f"proving the threshold on {samples} samples")
-    window = problem.window(samples)
-    shipped = proved_test(window, found)
-    return _synthesis(problem, asked, window, shipped, table, beside)
+    samples, table, known = chosen_samples(problem, asked, beside)
+    programmes = Programmes.of(problem, samples)
+    several = f", one for each of {len(programmes.windows)} different windows" if len(programmes.windows) > 1 else ""
+    progress(f"proving the threshold on {samples} samples{several}")
+    shipped = []
+    for window, row in zip(programmes.windows, programmes.first, strict=True):
+        optimum = known.get(row) or largest_hidden_fault(window)
+        shipped.append(proved_test(window, optimum) if np.isfinite(optimum.size) else None)
+    if not any(shipped[programme] for programme in programmes.of_row):
+        raise SolverError(
+            f"HiGHS finds no test on {samples} samples at any row, but there is one: inconclusive. Other units may "
+            "help."
+        )
+    found = _synthesis(problem, asked, programmes, shipped, table, beside)
+    return replace(found, notes=(*found.notes, *notes))
 
 
-def chosen_samples(problem: Problem, asked: Asked, beside: Beside | None) -> tuple[int, FloatArray, Optimum]:
-    """Return the number of samples, the table of those tried with their thresholds ``(tried, 2)``, and the optimum.
+def _observer_beside(
+    asked: Asked, scenario: Scenario, plant: DescriptorSystem, progress: Callable[[str], None]
+) -> Beside:
+    """Return the observer of the state, and what it says of a scenario without its faults."""
+    if asked.state_bounds or asked.initial_bounds:
+        raise PreconditionError(
+            "Bounds of states and tolerances do not go together: leave state_bounds and initial_bounds out.",
+            condition="tolerances",
+        )
+    if asked.exact:
+        raise PreconditionError(
+            "exact is for an exact model: leave it out for a threshold over the tolerances.", condition="tolerances"
+        )
+    if list(problem_of(plant, asked).bounds.middles):
+        raise PreconditionError(
+            "Bounds [low, high] and tolerances do not go together: the effect of the constants on the middle is not "
+            "known. Give the larger end.",
+            condition="tolerances",
+        )
+    progress("designing the observer of the state beside the test")
+    own = design(plant, BESIDE)
+    affine = affine_plant(plant)
+    tracking = tracking_of(own, affine)
+    observer = own.linear[1]
+    quiet = scenario.replace(faults={}, sensors={}, horizon=min(scenario.horizon, MOST_COMPARED_SAMPLES * plant.dt))
+    nu = plant.nu
+    start = np.array([quiet.initial_state.get(name, 0.0) for name in plant.state_names])
+    _, outputs, inputs, _, _ = scenario_runs(
+        *scenario_stepper(own.linear[0], quiet, start), (nu, nu + plant.nf), [quiet.seed]
+    )
+    record = np.hstack([inputs[:, 0], outputs[:, 0]])
+    problem = problem_of(plant, asked)
+    noisy = noisy_as_bounded(problem.window(problem.shortest + 1))
+    bounded = replace(affine, plant=noisy)
+    structure = error_structure(observer, bounded, tracking, problem.bounds.disturbance, 1.0, states=True)
+    found, states = thresholds_over_record(structure, observer, record, varying=affine.box.variation == "varying")
+    n = plant.nx
+    return Beside(observer, tracking.T, tracking.T0[:n], affine, record, states[:, :n], found.total[0])
+
+
+def chosen_samples(
+    problem: Problem, asked: Asked, beside: Beside | None
+) -> tuple[int, FloatArray, Mapping[int, Optimum]]:
+    """Return the number of samples, the table of those tried with their thresholds ``(tried, 2)``, and the optima by
+    row; where each row has a window of its own some rows are tried, and the worst one counts.
 
     With tolerances the table has a third column, the mean threshold over the record, which decides, and the
     multipliers are those that make it least.
     """
-    given = asked.before + asked.after if asked.after is not None else asked.samples
+    given = samples_given(asked)
     tried = problem.ladder() if given == "auto" else (int(given),)
     if beside is not None:
         tried = tuple(rung for rung in tried if rung <= beside.longest()) or tried[:1]
-    found: list[Optimum] = []
+    # Rows that have a window of every length.
+    rows = problem.tried(tried[-1])
+    found: list[list[Optimum]] = []
     for rung in reversed(tried):
         # More samples never raise a threshold: where there is no test, there is none on fewer.
-        hopeless = bool(found) and not np.isfinite(found[0].size)
-        found.insert(0, Optimum(np.inf) if hopeless else largest_hidden_fault(problem.window(rung)))
-    table = np.array([[rung, optimum.size] for rung, optimum in zip(tried, found, strict=True)])
-    if not np.isfinite(table[-1, 1]):
-        raise SolverError(
-            f"HiGHS finds no test on {tried[-1]} samples, but there is one: inconclusive. Other units may help."
-        )
+        hopeless = bool(found) and problem.horizon is None and not np.isfinite(found[0][0].size)
+        windows = (problem.window(rung, row=row) for row in rows)
+        found.insert(0, [Optimum(np.inf) if hopeless else largest_hidden_fault(window) for window in windows])
+    table = np.array(
+        [[rung, max(optimum.size for optimum in optima)] for rung, optima in zip(tried, found, strict=True)]
+    )
+    if not np.isfinite(table[:, 1]).any():
+        if problem.horizon is None:
+            raise SolverError(
+                f"HiGHS finds no test on {tried[-1]} samples, but there is one: inconclusive. Other units may help."
+            )
+        # No length tells the fault at all of these rows: the longest tells it at most of them.
+        return tried[-1], table, dict(zip(rows, found[-1], strict=True))
     if beside is not None:
         wider = [
             largest_hidden_fault(with_tolerances(problem.window(rung), beside)) if np.isfinite(own.size) else own
-            for rung, own in zip(tried, found, strict=True)
+            for rung, (own,) in zip(tried, found, strict=True)
         ]
         table = np.column_stack([table, [optimum.size for optimum in wider]])
-        found = [replace(own, multipliers=other.multipliers) for own, other in zip(found, wider, strict=True)]
+        found = [[replace(own, multipliers=more.multipliers)] for (own,), more in zip(found, wider, strict=True)]
     # With tolerances more samples may be worse.
     good = table[:, -1] <= (1.0 + WITHIN) * np.min(table[:, -1])
     place = int(np.flatnonzero(good)[0])
-    return int(table[place, 0]), table, found[place]
+    return tried[place], table, dict(zip(rows, found[place], strict=True))
 
 
 #: A programme of so many equations took so many seconds, and others about this power of their ratio as many.
@@ -159,57 +237,98 @@ def proved_test(window: Window, found: Optimum) -> Shipped:
 
 
 def _synthesis(
-    problem: Problem, asked: Asked, window: Window, shipped: Shipped, table: FloatArray, beside: Beside | None
+    problem: Problem,
+    asked: Asked,
+    programmes: Programmes,
+    shipped: list[Shipped | None],
+    table: FloatArray,
+    beside: Beside | None,
 ) -> Synthesis:
-    on_y, on_u, delay = window.weights(shipped.test.values)
-    observer = observer_of(window, shipped.test.values, None if beside is None else beside.observer)
-    question, plant = window.question, problem.plant
-    matrices = {
-        "multipliers": shipped.test.values,
-        "multiplier_radius": shipped.test.radius,
-        "rounding": rounding_of(window, shipped.test.values, shipped.test.radius),
-        TRADE_OFF: table,
-    }
+    first, question = programmes.windows[0], programmes.windows[0].question
+    multipliers = [
+        np.zeros(window.rows) if one is None else one.test.values
+        for window, one in zip(programmes.windows, shipped, strict=True)
+    ]
+    matrices = _by_programme(problem, programmes, shipped)
+    of_row, thresholds, leasts = (matrices[name].ravel() for name in ("programmes", "thresholds", "leasts"))
+    used = sorted(set(of_row[of_row >= 0].astype(np.int64).tolist()))
+    on_y, on_u, delay = first.weights(multipliers[0])
     claims = {
-        "threshold": shipped.threshold,
-        "surely_found": 2.0 * shipped.threshold,
-        "delay": delay_in_samples(window, delay) * plant.dt,
+        "threshold": float(thresholds[used].max()),
+        "surely_found": 2.0 * float(thresholds[used].max()),
+        "delay": delay_in_samples(first, delay) * problem.plant.dt,
     }
-    if shipped.witness is not None:
-        matrices |= {"witness": shipped.witness.values, "witness_radius": shipped.witness.radius}
-    if np.isfinite(shipped.least):
-        claims["least"] = shipped.least
-    if beside is not None:
-        matrices |= {"state_tracking": beside.T, "state_rows": beside.T0, "record": beside.record}
-        mean = mean_over_record(window, observer, shipped.test.values, beside.T, beside.T0, beside.record)
-        claims["mean_threshold"] = mean
+    if np.isfinite(leasts[used]).any():
+        claims["least"] = float(np.nanmax(leasts[used]))
     options: dict[str, Any] = {option.name: getattr(asked, option.name) for option in fields(Asked)} | {
         "samples": question.samples,
         "lag": question.lag if question.course in ("any", "ramp", "rate") else None,
-        "fault": plant.fault_names[question.fault],
+        "fault": problem.fault,
     }
-    return Synthesis(
-        options,
-        {"h": on_y, "g": on_u},
-        observer,
-        Certificate(matrices, claims),
-        notes=tuple(_notes(problem, asked, window, shipped, table, claims.get("mean_threshold"))),
-    )
+    if not isinstance(problem.plant, DescriptorSystem):
+        has_test = np.array([one is not None for one in shipped])
+        weighing = observer_of_rows(problem, programmes, has_test, multipliers)
+        by_row = tuple(_notes_of_rows(problem, claims, matrices, question))
+        certificate = Certificate(matrices | {TRADE_OFF: table}, claims)
+        return Synthesis(options, {"weights": weighing.weights}, weighing, certificate, notes=by_row)
+    observer = observer_of(first, multipliers[0], None if beside is None else beside.observer)
+    alone = {name: matrices[name][0] for name in ("multipliers", "multiplier_radius", "rounding")}
+    if matrices["witness"].any():
+        alone |= {name: matrices[name][0] for name in ("witness", "witness_radius")}
+    if beside is not None:
+        alone |= {"state_tracking": beside.T, "state_rows": beside.T0, "record": beside.record}
+        mean = mean_over_record(first, observer, multipliers[0], beside.T, beside.T0, beside.record)
+        claims["mean_threshold"] = mean
+    notes = tuple(_notes(problem, asked, first, claims, table))
+    certificate = Certificate(alone | {TRADE_OFF: table}, claims)
+    return Synthesis(options, {"h": on_y, "g": on_u}, observer, certificate, notes=notes)
 
 
-def _notes(
-    problem: Problem, asked: Asked, window: Window, shipped: Shipped, table: FloatArray, mean: float | None
-) -> list[str]:
-    question = window.question
+def _by_programme(problem: Problem, programmes: Programmes, shipped: list[Shipped | None]) -> dict[str, FloatArray]:
+    """Return what is proved of each different window, a row for each, and which of them each row of a record has."""
+    windows, empty = programmes.windows, Repaired(np.zeros(1), np.zeros(1))
+    tests = [empty if one is None else one.test for one in shipped]
+    continued = [
+        one if one is not None and problem.continues(window, row) else None
+        for window, one, row in zip(windows, shipped, programmes.first, strict=True)
+    ]
+    witnesses = [empty if one is None or one.witness is None else one.witness for one in continued]
+    has_test = np.array([one is not None for one in shipped])
+    _, _, nu, ny = windows[0].model.sizes
+    rounding = [
+        np.zeros(nu + ny) if one is None else rounding_of(window, one.test.values, one.test.radius)
+        for window, one in zip(windows, shipped, strict=True)
+    ]
+    rows = max(window.rows for window in windows)
+    return {
+        "multipliers": padded([test.values for test in tests], rows),
+        "multiplier_radius": padded([test.radius for test in tests], rows),
+        "rounding": np.array(rounding),
+        "witness": padded([witness.values for witness in witnesses]),
+        "witness_radius": padded([witness.radius for witness in witnesses]),
+        "thresholds": np.array([[np.inf if one is None else one.threshold] for one in shipped]),
+        "leasts": np.array([[np.nan if one is None else one.least] for one in continued]),
+        "programmes": np.where(has_test[programmes.of_row], programmes.of_row, -1).astype(np.float64)[:, None],
+    }
+
+
+def padded(rows: Sequence[FloatArray], width: int = 1) -> FloatArray:
+    """Return rows of different lengths as a matrix, with zeros at their ends."""
+    width = max(width, *(len(row) for row in rows))
+    return np.array([np.pad(row, (0, width - len(row))) for row in rows])
+
+
+def _notes(problem: Problem, asked: Asked, window: Window, claims: Mapping[str, float], table: FloatArray) -> list[str]:
+    question, threshold, least = window.question, claims["threshold"], claims.get("least")
     words = []
-    if shipped.threshold == 0.0:
+    if threshold == 0.0:
         words.append(
             "No disturbance and no noise has an effect on the residual: compare it with the effect of rounding."
         )
-    elif np.isfinite(shipped.least):
+    elif least is not None:
         words.append(
-            f"The threshold is {shipped.threshold:.9g}, and no function of {question.samples} samples has one below "
-            f"{shipped.least:.9g}: they differ by {shipped.threshold - shipped.least:.1e}. A fault of twice "
+            f"The threshold is {threshold:.9g}, and no function of {question.samples} samples has one below "
+            f"{least:.9g}: they differ by {threshold - least:.1e}. A fault of twice "
             "that is certain to raise an alarm."
         )
         if not window.twice_is_hidden:
@@ -223,9 +342,8 @@ def _notes(
         words.append("That there is no smaller threshold could not be proved on these numbers: least is not claimed.")
     words.append(f"The course {question.course} is {COURSES[question.course]}.")
     if question.course == "any" and asked.lag is None:
-        words.append(
-            f"The least lag with which {problem.plant.fault_names[question.fault]} can be estimated is {question.lag}."
-        )
+        words.append(f"The least lag with which {problem.fault} can be estimated is {question.lag}.")
+    mean = claims.get("mean_threshold")
     if mean is not None:
         words.append(
             f"Over the tolerances of the constants the threshold follows the signals ({mean:.4g} in the mean over the "
@@ -234,7 +352,7 @@ def _notes(
             "is that of the nominal plant: over the tolerances a fault of twice the threshold of its row may be "
             "needed, and more where they move what the fault does."
         )
-    elif problem.plant.uncertainty is not None:
+    elif isinstance(problem.plant, DescriptorSystem) and problem.plant.uncertainty is not None:
         words.append(
             "The threshold is that of the nominal plant: tolerances of its constants are not in it (give a scenario)."
         )
@@ -247,3 +365,31 @@ def _notes(
                 f"twice as many take {in_time(problem.plant.nx, 2 * int(table[-1, 0]))}. Give samples for more."
             )
     return words
+
+
+def _notes_of_rows(
+    problem: Problem, claims: Mapping[str, float], matrices: Mapping[str, FloatArray], question: Question
+) -> Iterator[str]:
+    thresholds, of_row = matrices["thresholds"], matrices["programmes"].astype(np.int64)
+    without = int(np.sum(of_row < 0))
+    used = thresholds[sorted(set(of_row[of_row >= 0].tolist()))]
+    forever = problem.horizon is None
+    rows = "every row from" if forever else f"the {len(of_row)} rows from"
+    yield (
+        f"{len(thresholds)} linear programme(s) serve {rows} k = {question.samples} on, each proved: thresholds from "
+        f"{used.min():.6g} to {used.max():.6g}, of which the largest is claimed."
+    )
+    if without:
+        yield (
+            f"{without} rows have no verdict: no weights of {question.samples} samples respond to the fault and to "
+            "nothing that is free."
+        )
+    if "least" not in claims:
+        yield "That there is no smaller threshold is not claimed: equations after the window may reduce it."
+    elif np.isnan(matrices["leasts"]).any():
+        yield "At some rows it is not claimed that there is no smaller threshold."
+    yield f"The course {question.course} is {COURSES[question.course]}."
+    yield (
+        f"A fault of k acts on the way to sample k + 1; {', '.join(disturbance_names(problem.plant))} stand for mu(k) "
+        "in the equations."
+    )

@@ -9,11 +9,11 @@ size of the fault.  Every entry is kept as a double times a whole number, so tha
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import decide_rank
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.proofs.balls import UNIT_ROUNDOFF
 
 if TYPE_CHECKING:
@@ -81,82 +82,83 @@ class Question:
     closing: int = 0
 
 
-class Model(Protocol):
-    """The matrices of a plant over a window, by the sample of the window, 0 first."""
+@dataclass(frozen=True, eq=False)
+class Model:
+    """The matrices of a plant over a window, by its samples, 0 first.
 
-    D: FloatArray
-    state_names: tuple[str, ...]
-    disturbance_names: tuple[str, ...]
-    fault_names: tuple[str, ...]
+    Of each equation what multiplies the states after and before it, and known inputs; of each sample what multiplies
+    the state in its outputs, and of faults, disturbances and noise (``f``, ``d``, ``w``) the number of the equation
+    that they enter, what they do there and what they do to the outputs.
+    """
+
+    plant: DescriptorSystem | TimeVaryingDescriptorSystem
+    equations: tuple[tuple[FloatArray, FloatArray, FloatArray], ...]
+    seen: tuple[FloatArray, ...]
+    columns: Mapping[str, Sequence[tuple[int, FloatArray, FloatArray]]]
     #: Whether E leads from each state to the next.
     regular: bool
-    #: Samples by which the faults of an equation are later than it.
-    later: int
 
     @property
     def sizes(self) -> tuple[int, int, int, int]:
         """Numbers of states, equations of a sample, known inputs and outputs."""
-        ...
+        plant = self.plant
+        return plant.nx, plant.nx if isinstance(plant, DescriptorSystem) else plant.ne, plant.nu, plant.ny
 
-    def equations(self, question: Question) -> int:
-        """Return for how many k there are equations."""
-        ...
-
-    def at(self, k: int) -> tuple[FloatArray, FloatArray]:
-        """Return what multiplies the states after and before equation k."""
-        ...
-
-    def seen(self, k: int) -> FloatArray:
-        """Return what multiplies the state in the outputs of sample k."""
-        ...
-
-    def acting(self, kind: str, which: np.ndarray, k: int) -> tuple[int, FloatArray, FloatArray]:
-        """Return what columns of faults, disturbances or noise (``f``, ``d``, ``w``) of sample k do: the number of the
-        equation that they enter, what they do there, and what they do to the outputs."""
-        ...
-
-    def inputs(self, k: int) -> FloatArray:
-        """Return what known inputs do in equation k."""
-        ...
+    @property
+    def D(self) -> FloatArray:
+        """What known inputs do to the outputs of their own sample."""
+        plant = self.plant
+        return plant.D if isinstance(plant, DescriptorSystem) else np.zeros((plant.ny, plant.nu))
 
 
-class Constant:
-    """The same matrices at each sample."""
+def fault_names(plant: DescriptorSystem | TimeVaryingDescriptorSystem) -> tuple[str, ...]:
+    """Return the names of the faults of a plant: of one that changes with k its parameters."""
+    return plant.fault_names if isinstance(plant, DescriptorSystem) else plant.parameter_names
 
-    later = 0
 
-    def __init__(self, plant: DescriptorSystem, bounds: Bounds) -> None:
-        self.plant, self.D = plant, plant.D
-        self.state_names, self.fault_names = plant.state_names, plant.fault_names
-        self.disturbance_names = plant.disturbance_names
-        self.sizes = (plant.nx, plant.nx, plant.nu, plant.ny)
-        self.regular = decide_rank(plant.E).full
-        self._matrices = {
-            "f": (plant.Bf, plant.Df),
-            "d": (plant.Bd, plant.Dd),
-            "w": (bounds.noise_state, bounds.noise_output),
-        }
+def disturbance_names(plant: DescriptorSystem | TimeVaryingDescriptorSystem) -> tuple[str, ...]:
+    """Return the names of the disturbances; of a plant that changes with k one in each equation: ``mu1``, ..."""
+    return (
+        plant.disturbance_names if isinstance(plant, DescriptorSystem) else tuple(f"mu{i + 1}" for i in range(plant.ne))
+    )
 
-    def equations(self, question: Question) -> int:
-        """Return for how many k there are equations."""
-        return question.samples - 1 if self.regular else question.samples + question.closing
 
-    def at(self, k: int) -> tuple[FloatArray, FloatArray]:
-        """Return what multiplies the states after and before equation k."""
-        return self.plant.E, self.plant.A
+def _constant_model(plant: DescriptorSystem, bounds: Bounds, question: Question) -> Model:
+    """Return the same matrices at each sample."""
+    regular = decide_rank(plant.E).full
+    count = question.samples - 1 if regular else question.samples + question.closing
+    kinds = {
+        "f": (plant.Bf, plant.Df),
+        "d": (plant.Bd, plant.Dd),
+        "w": (bounds.noise_state, bounds.noise_output),
+    }
+    span = range(max(count, question.samples))
+    columns = {kind: [(k, *both) for k in span] for kind, both in kinds.items()}
+    return Model(plant, ((plant.E, plant.A, plant.B),) * count, (plant.C,) * question.samples, columns, regular)
 
-    def seen(self, k: int) -> FloatArray:
-        """Return what multiplies the state in the outputs of sample k."""
-        return self.plant.C
 
-    def acting(self, kind: str, which: np.ndarray, k: int) -> tuple[int, FloatArray, FloatArray]:
-        """Return what columns of a kind do at sample k."""
-        state, output = self._matrices[kind]
-        return k, state[:, which], output[:, which]
+def _varying_model(plant: TimeVaryingDescriptorSystem, samples: int, start: int) -> Model:
+    """Return the matrices of the samples from k = ``start`` on, 1 or more.
 
-    def inputs(self, k: int) -> FloatArray:
-        """Return what known inputs do in equation k."""
-        return self.plant.B
+    A fault of k acts on the way to sample k + 1, and shows in its outputs; of a window it is that of this sample.
+    """
+    last, ne, ny = start + samples, plant.ne, plant.ny
+    # An equation whose state is determined by nothing else says something where E loses rows only.
+    more = (plant.horizon is None or last <= plant.horizon) and not has_full_rows(plant.E.at(last))
+    ks = range(start, last - 1 + int(more))
+    columns = {
+        "f": [(k, plant.Phi.at(start + k), plant.Psi.at(start + k)) for k in range(-1, max(len(ks), samples - 1))],
+        "d": [(k, np.eye(ne), np.zeros((ny, ne))) for k in range(max(len(ks), samples))],
+        "w": [(-1, np.zeros((ne, ny)), np.eye(ny))] * max(len(ks), samples),
+    }
+    equations = tuple((plant.E.at(k + 1), plant.A.at(k), plant.B.at(k)) for k in ks)
+    regular = all(has_full_rows(after) for after, _, _ in equations)
+    return Model(plant, equations, tuple(plant.C.at(start + k) for k in range(samples)), columns, regular)
+
+
+def has_full_rows(matrix: FloatArray) -> bool:
+    """Whether rows are independent: a state then satisfies them whatever stands on the right."""
+    return matrix.shape[0] <= matrix.shape[1] and decide_rank(matrix).rank == len(matrix)
 
 
 class Builder:
@@ -191,7 +193,6 @@ class Window:
     bounds: Bounds
     question: Question
     rows: int
-    equations: int  # number of k for which there are equations
     labels: tuple[tuple[Any, ...], ...]
     bar: FloatArray
     group: np.ndarray
@@ -217,9 +218,14 @@ class Window:
     @property
     def plant(self) -> DescriptorSystem:
         """The plant of a window whose matrices do not change."""
-        if not isinstance(self.model, Constant):
+        if not isinstance(self.model.plant, DescriptorSystem):
             raise SpecError("This question is for plants whose matrices do not change with k.", path="plant")
         return self.model.plant
+
+    @property
+    def equations(self) -> int:
+        """For how many k there are equations."""
+        return len(self.model.equations)
 
     @property
     def outputs_at(self) -> int:
@@ -278,13 +284,13 @@ class Window:
         for kind, i, middle in middles:
             exact = Fraction(middle)
             for k in range(max(self.equations, self.question.samples)):
-                equation, state, output = self.model.acting(kind, np.array([i]), k)
+                equation, state, output = self.model.columns[kind][k]
                 if 0 <= equation < self.equations:
-                    for row in np.flatnonzero(state[:, 0]).tolist():
-                        found[equation * ne + row] -= exact * Fraction(float(state[row, 0]))
+                    for row in np.flatnonzero(state[:, i]).tolist():
+                        found[equation * ne + row] -= exact * Fraction(float(state[row, i]))
                 if k < self.question.samples:
-                    for row in np.flatnonzero(output[:, 0]).tolist():
-                        found[self.outputs_at + k * ny + row] += exact * Fraction(float(output[row, 0]))
+                    for row in np.flatnonzero(output[:, i]).tolist():
+                        found[self.outputs_at + k * ny + row] += exact * Fraction(float(output[row, i]))
         return tuple(found)
 
     @cached_property
@@ -312,7 +318,7 @@ class Window:
         on_y[: question.samples] = per_sample.reshape(-1, ny)
         equations = multipliers[: self.outputs_at].reshape(self.equations, ne)
         for k, part in enumerate(equations):
-            on_u[k] += part @ model.inputs(k)
+            on_u[k] += part @ model.equations[k][2]
         on_u -= on_y @ model.D
         # The equations after the last sample that are used have known inputs, and a state that they lead to.
         later = np.flatnonzero(equations[question.samples :].any(axis=1))
@@ -338,8 +344,8 @@ class Window:
         model, at, samples = self.model, self.outputs_at, self.question.samples
         _, ne, nu, ny = model.sizes
         outputs = sizes[at : at + samples * ny].reshape(samples, ny).sum(axis=0)
-        equations = enumerate(sizes[:at].reshape(self.equations, ne))
-        on_inputs = sum((np.abs(model.inputs(k)).T @ part for k, part in equations), start=np.zeros(nu))
+        parts = zip(model.equations, sizes[:at].reshape(self.equations, ne), strict=True)
+        on_inputs = sum((np.abs(inputs).T @ part for (_, _, inputs), part in parts), start=np.zeros(nu))
         return np.concatenate([on_inputs + np.abs(model.D).T @ outputs, outputs])
 
     def followed(self, multipliers: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -365,13 +371,13 @@ class Window:
 
 def courses_of(window: Window, point: FloatArray) -> dict[str, FloatArray]:
     """Return states, disturbances and faults of a point ``(columns,)`` over the samples of a window, by name."""
-    model, question = window.model, window.question
+    plant, question = window.model.plant, window.question
     length = max(window.equations + 1, question.samples)
-    names = {"x": model.state_names, "d": model.disturbance_names, "f": model.fault_names}
+    names = {"x": plant.state_names, "d": disturbance_names(plant), "f": fault_names(plant)}
     found: dict[str, FloatArray] = {}
     own = np.zeros(length)
     own[question.before :] = point[0]
-    found[model.fault_names[question.fault]] = own
+    found[names["f"][question.fault]] = own
     for label, value in zip(window.labels, point, strict=True):
         if label[0] in names:
             course = found.setdefault(names[label[0]][label[2]], np.zeros(length))
@@ -391,38 +397,38 @@ def courses_of(window: Window, point: FloatArray) -> dict[str, FloatArray]:
     return found
 
 
-def window_of(plant: DescriptorSystem, bounds: Bounds, question: Question) -> Window:
-    """Return the stacked equations of a question about a plant whose matrices do not change."""
-    return stacked(Constant(plant, bounds), bounds, question)
-
-
-def stacked(model: Model, bounds: Bounds, question: Question) -> Window:
-    """Return the stacked equations of a question about a model of a window."""
+def window_of(
+    plant: DescriptorSystem | TimeVaryingDescriptorSystem, bounds: Bounds, question: Question, start: int = 1
+) -> Window:
+    """Return the stacked equations of a question; ``start``: k of the first sample, where matrices change with it."""
+    if isinstance(plant, DescriptorSystem):
+        model = _constant_model(plant, bounds, question)
+    else:
+        model = _varying_model(plant, question.samples, start)
     builder, samples = Builder(), question.samples
-    equations = model.equations(question)
+    equations = len(model.equations)
     nx, ne, _, ny = model.sizes
     rows = equations * ne + samples * ny
     builder.columns([("theta",)], [np.inf])
 
     def acting(kind: str, which: np.ndarray, k: int, column: int, times: int = 1) -> None:
         """Enter columns that act at sample k, in both kinds of rows."""
-        equation, state, output = model.acting(kind, which, k)
+        equation, state, output = model.columns[kind][k]
         if 0 <= equation < equations:
-            builder.put(equation * ne, -state, column, times)
+            builder.put(equation * ne, -state[:, which], column, times)
         if k < samples:
-            builder.put(equations * ne + k * ny, output, column, times)
+            builder.put(equations * ne + k * ny, output[:, which], column, times)
 
     first = builder.columns(
         [("x", k, i) for k in range(equations + 1) for i in range(nx)],
         np.concatenate([np.minimum(bounds.state, bounds.first), *[bounds.state] * equations]),
     )
-    for k in range(equations):
-        after, before = model.at(k)
+    for k, (after, before, _) in enumerate(model.equations):
         builder.put(k * ne, after, first + (k + 1) * nx)
         builder.put(k * ne, -before, first + k * nx)
     for k in range(samples):
-        builder.put(equations * ne + k * ny, model.seen(k), first + k * nx)
-    span = range(max(equations + model.later, samples))
+        builder.put(equations * ne + k * ny, model.seen[k], first + k * nx)
+    span = range(len(model.columns["f"]))
     moving = np.flatnonzero(bounds.noise > 0.0)
     for k in range(max(equations, samples)):
         if moving.size:
@@ -442,7 +448,6 @@ def stacked(model: Model, bounds: Bounds, question: Question) -> Window:
         bounds,
         question,
         rows,
-        equations,
         tuple(builder.labels),
         np.array(builder.bar),
         np.array(builder.group),
