@@ -15,8 +15,7 @@ import numpy as np
 from benchmarks.campaigns.frame import Outcome
 
 from obsynth import DescriptorSystem
-from obsynth.analysis.diagnosis.exact import ExactQuestion, ReducedQuestion
-from obsynth.analysis.diagnosis.fault_columns import Question
+from obsynth.analysis.diagnosis.fault_columns import ExactQuestion, Question, Removal
 
 CASES = 500
 LIMIT = 60.0
@@ -30,11 +29,11 @@ def case(seed: int) -> Outcome:
     verdicts, wrong = [], []
     for fault in range(plant.nf):
         for removed in ((), tuple(j for j in range(plant.nf) if j != fault)):
-            exact = ReducedQuestion(plant, removed, fault)
-            pencil = ExactQuestion(plant, removed, fault)
+            exact = ExactQuestion(Removal(plant, removed), fault)
+            pencil = ExactQuestion(Removal(plant, removed), fault, reduced=False)
             if exact.polynomial not in (pencil.polynomial, -pencil.polynomial):
                 wrong.append(f"{removed}, {fault}: polynomials differ")
-            rounded = Question(other, removed, fault)
+            rounded = Question(Removal(other, removed), fault)
             facts, found = _facts(exact, exact.order), _facts(rounded, rounded.order)
             if facts != found:
                 wrong.append(f"{removed}, {fault}: {facts} exactly, {found} in other units")

@@ -10,8 +10,8 @@ from networks import random_network
 
 import obsynth
 from obsynth.analysis.diagnosis.decoupled import decoupled, unknowns_pencil
-from obsynth.analysis.diagnosis.exact import Questions, question
-from obsynth.analysis.diagnosis.explanations import hidden_motion
+from obsynth.analysis.diagnosis.explanations import hidden_motion, hiding_amplitudes
+from obsynth.analysis.diagnosis.fault_columns import Questions, question
 from obsynth.analysis.diagnosis.reduction import PencilUnits
 from obsynth.numerics.ranks import TRACE_TOLERANCE
 
@@ -290,7 +290,7 @@ def test_no_motion_is_told_that_hides_nothing() -> None:
     hidden = obsynth.DescriptorSystem(None, **given, Bd=[[1.0]], disturbance_names=["d"])
     for point in (1.0 + 0.0j, 2.0 + 0.0j):
         assert hidden_motion(shown, 0, point, []) is None
-        assert hidden_motion(hidden, 0, point, []).values == {"d": pytest.approx(-1.0)}
+        assert hiding_amplitudes(hidden, 0, point, []) == {"d": pytest.approx(-1.0)}
 
 
 def question_of(plant: obsynth.DescriptorSystem, *, exactly: bool):

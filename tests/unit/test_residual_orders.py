@@ -7,7 +7,7 @@ import pytest
 from flint import fmpq_mat
 
 import obsynth
-from obsynth.analysis.diagnosis.exact import question
+from obsynth.analysis.diagnosis.fault_columns import question
 from obsynth.analysis.diagnosis.residual_orders import exact_residual_order
 
 

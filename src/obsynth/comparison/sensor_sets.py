@@ -12,8 +12,8 @@ import numpy as np
 from annotated_types import Ge
 
 from obsynth.analysis.diagnosis.decoupled import fault_numbers
-from obsynth.analysis.diagnosis.exact import Questions
 from obsynth.analysis.diagnosis.explanations import Sensor, state_sensors
+from obsynth.analysis.diagnosis.fault_columns import Questions
 from obsynth.analysis.diagnosis.sensor_search import GOALS, SensorSearch, Task, reached
 from obsynth.analysis.transformations.recovery import Transformation, linear_plant
 from obsynth.comparison.threshold_sensors import ThresholdQuestion

@@ -10,8 +10,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from obsynth.analysis.diagnosis.exact import question
-from obsynth.analysis.diagnosis.fault_columns import dc_point
+from obsynth.analysis.diagnosis.fault_columns import dc_point, question
 from obsynth.analysis.transformations.recovery import StateRecovery
 from obsynth.errors import ObsynthError, PreconditionError
 from obsynth.methods.fault_figures import SETTLING_SAMPLES, FaultFigures, fault_figures, on_the_clock

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.analysis.diagnosis.exact import Questions, decided_exactly
 from obsynth.analysis.diagnosis.explanations import (
     MOST_STATES_FOR_SENSOR_PAIRS,
     MOST_STATES_FOR_SENSORS,
@@ -20,7 +19,14 @@ from obsynth.analysis.diagnosis.explanations import (
     listed_sets,
     state_sensors,
 )
-from obsynth.analysis.diagnosis.fault_columns import Question, dc_point, others
+from obsynth.analysis.diagnosis.fault_columns import (
+    Question,
+    Questions,
+    Removal,
+    dc_point,
+    decided_exactly,
+    others,
+)
 from obsynth.analysis.diagnosis.sensor_search import SensorResponses
 from obsynth.analysis.diagnosis.verdicts import (
     MOST_FAULTS_OF_WHOLE_BANK,
@@ -254,7 +260,7 @@ def _suggestion(candidates: _Candidates, name: str, shown: Question, *, step: bo
 
     def free(changed: DescriptorSystem) -> Question:
         added = changed.output_names[plant.ny :]
-        return answered.setdefault(added, Question(changed, rest, fault))
+        return answered.setdefault(added, Question(Removal(changed, rest), fault))
 
     full = candidates.additions(fault, rest, lambda changed: free(changed).estimable)
     constant = () if step else candidates.additions(fault, rest, lambda changed: free(changed).shows_at_rest)
@@ -264,7 +270,7 @@ def _suggestion(candidates: _Candidates, name: str, shown: Question, *, step: bo
     elif constant:
         texts.append(f"{name}: Add one of: {listed_sets(constant)} (then a step of it can be estimated).")
     if not shown.visible:
-        showing = candidates.additions(fault, (), lambda changed: Question(changed, (), fault).visible)
+        showing = candidates.additions(fault, (), lambda changed: Question(Removal(changed, ()), fault).visible)
         more = [names for names in showing if names not in (*full, *constant)]
         if more:
             texts.append(f"{name}: {listed_sets(more)} would make it detectable, but not estimable.")

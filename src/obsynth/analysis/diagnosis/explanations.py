@@ -108,48 +108,44 @@ EXACTNESS = 1e-8
 MOST_NAMED_SIGNALS = 6
 
 
-@dataclass(frozen=True, eq=False)
-class HiddenMotion:
-    """Amplitudes of states, unknown inputs and other faults that, with a fault of 1, leave every output at zero."""
-
-    fault: str
-    point: complex  # all go like ``exp(point t)``, or ``point^k``
-    values: dict[str, complex]
-    causes: int  # how many of the values, the first ones, are inputs
-    dt: float
-
-    def __str__(self) -> str:
-        named = list(self.values.items())
-        inputs = [self._signal(name, value) for name, value in named[: self.causes]]
-        moving = [f"{name} = {_amplitude(value)}" for name, value in named[self.causes :][:MOST_NAMED_SIGNALS]]
-        more = len(named) - self.causes - len(moving)
-        rest = [*moving, *([f"{more} more states"] if more else [])]
-        others = [*inputs, *([f"states {', '.join(rest)}"] if rest else [])]
-        together = f"together with {' and '.join(others)}" if others else "from some initial state"
-        return f"{self._signal(self.fault, 1.0)} is output-nulling {together}"
-
-    def _signal(self, name: str, value: complex) -> str:
-        point, size = self.point, _amplitude(value)
-        if point == dc_point(self.dt):
-            return f"a step of {size} in {name}"
-        if self.dt > 0.0:
-            return f"{name} = {size} * ({_amplitude(point)})^k"
-        if point.real == 0.0:
-            return f"a sinusoid of {size} at {abs(point.imag):.4g} rad/s in {name}"
-        return f"{name} = {size} * exp({_amplitude(point)} t)"
+def hidden_motion(plant: DescriptorSystem, fault: int, point: complex, removed: Sequence[int]) -> str | None:
+    """Return in words the amplitudes of states, unknown inputs and other faults with which a fault of 1 leaves every
+    output at zero, least in balanced units; all go like ``exp(point t)``, or ``point^k``.  ``None`` where none do."""
+    values = hiding_amplitudes(plant, fault, point, removed)
+    if values is None:
+        return None
+    own = plant.fault_names[fault]
+    names = (*plant.disturbance_names, *(plant.fault_names[j] for j in removed))
+    inputs = [_signal(plant.dt, point, name, value) for name, value in values.items() if name in names]
+    states = [f"{name} = {_amplitude(value)}" for name, value in values.items() if name not in names]
+    more = len(states) - MOST_NAMED_SIGNALS
+    rest = [*states[:MOST_NAMED_SIGNALS], *([f"{more} more states"] if more > 0 else [])]
+    others = [*inputs, *([f"states {', '.join(rest)}"] if rest else [])]
+    together = f"together with {' and '.join(others)}" if others else "from some initial state"
+    return f"{_signal(plant.dt, point, own, 1.0)} is output-nulling {together}"
 
 
-def hidden_motion(plant: DescriptorSystem, fault: int, point: complex, removed: Sequence[int]) -> HiddenMotion | None:
-    """Return the motion that hides a fault at a point, least in balanced units; ``None`` where there is none."""
+def hiding_amplitudes(
+    plant: DescriptorSystem, fault: int, point: complex, removed: Sequence[int]
+) -> dict[str, complex] | None:
+    """Return these amplitudes by name, those of inputs first."""
     e, a = unknowns_pencil(plant, removed)
-    matrix = a - point * e
-    right = -np.concatenate([plant.Bf[:, fault], plant.Df[:, fault]])
-    found = _solved(matrix, right)
+    found = _solved(a - point * e, -np.concatenate([plant.Bf[:, fault], plant.Df[:, fault]]))
     if found is None:
         return None
     names = (*plant.disturbance_names, *(plant.fault_names[j] for j in removed))
-    inputs, states = _named(names, found[plant.nx :]), _named(plant.state_names, found[: plant.nx])
-    return HiddenMotion(plant.fault_names[fault], complex(point), {**inputs, **states}, len(inputs), plant.dt)
+    return {**_named(names, found[plant.nx :]), **_named(plant.state_names, found[: plant.nx])}
+
+
+def _signal(dt: float, point: complex, name: str, value: complex) -> str:
+    size = _amplitude(value)
+    if point == dc_point(dt):
+        return f"a step of {size} in {name}"
+    if dt > 0.0:
+        return f"{name} = {size} * ({_amplitude(point)})^k"
+    if point.real == 0.0:
+        return f"a sinusoid of {size} at {abs(point.imag):.4g} rad/s in {name}"
+    return f"{name} = {size} * exp({_amplitude(point)} t)"
 
 
 def _solved(matrix: ComplexArray, right: ComplexArray) -> ComplexArray | None:

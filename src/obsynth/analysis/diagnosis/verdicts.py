@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.analysis.diagnosis.exact import Questions
+from obsynth.analysis.diagnosis.fault_columns import Questions
 from obsynth.files.tables import html_table, text_table
 from obsynth.numerics.arrays import ComplexArray
 

@@ -10,9 +10,8 @@ import numpy as np
 
 from obsynth.analysis.conditions import Condition
 from obsynth.analysis.diagnosis.diagnosing import model_points
-from obsynth.analysis.diagnosis.exact import question
 from obsynth.analysis.diagnosis.explanations import hidden_motion
-from obsynth.analysis.diagnosis.fault_columns import Question, dc_point
+from obsynth.analysis.diagnosis.fault_columns import Question, dc_point, question
 from obsynth.analysis.existence.distance import ROUNDING_LEVEL
 from obsynth.analysis.existence.named_pencils import NamedPencil
 from obsynth.analysis.existence.numbers import COMPUTED_STATES
