@@ -182,7 +182,13 @@ class TestBadInput:
             with pytest.raises(SpecError, match=part):
                 observer.run(*bad)
         with pytest.raises(SpecError, match="u must be 1 finite"):
+            observer.start().step(y[0], [1.0, 2.0])
+        with pytest.raises(SpecError, match="'u1' is nan at k = 0: inputs must be known at the first sample"):
             observer.start().step(y[0], [np.nan])
+        running = observer.start()
+        running.step(y[0], u[0])
+        with pytest.raises(SpecError, match="'u1' is inf at k = 1"):
+            running.step(y[1], [np.inf])
         with pytest.raises(SpecError, match="y has shape"):
             observer.start().step([1.0], u[0])
 

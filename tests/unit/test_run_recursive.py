@@ -114,11 +114,8 @@ def test_missing_outputs_are_the_filters_own_business(name):
 @pytest.mark.parametrize("name", LINEAR)
 def test_rows_that_are_not_there_are_samples_without_outputs(name):
     table = log_of(name)
-    u = table["valve"].to_numpy(copy=True)
-    u[20:26] = u[19]
-    table["valve"] = u
     holed = table.copy()
-    holed.iloc[20:26, 2:] = np.nan
+    holed.iloc[20:26, 1:] = np.nan
     wanted = run_on_data(designed(name), holed, warm_up=0.0).table
     found = run_on_data(designed(name), table.drop(index=range(20, 26)).reset_index(drop=True), warm_up=0.0).table
     kept = [k for k in range(60) if not 20 <= k < 26]
@@ -128,7 +125,7 @@ def test_rows_that_are_not_there_are_samples_without_outputs(name):
     assert list(again["status"][18:26]) == ["ok", "ok", *["recovering"] * 5, "ok"]
 
 
-def test_a_missing_input_is_held_and_said():
+def test_a_missing_input_is_held_within_its_changes_and_said():
     table = log_of("filter")
     table.loc[30, "valve"] = np.nan
     found = run_on_data(designed("filter"), table, warm_up=3 * DT).table
@@ -136,7 +133,12 @@ def test_a_missing_input_is_held_and_said():
     filled = table.copy()
     filled.loc[30, "valve"] = table.loc[29, "valve"]
     same = run_on_data(designed("filter"), filled, warm_up=0.0).table
-    np.testing.assert_array_equal(columns(found, "xhat["), columns(same, "xhat["))
+    # The input of a row acts in the step after it.
+    np.testing.assert_array_equal(columns(found, "xhat[")[:31], columns(same, "xhat[")[:31])
+    wider = columns(found, "sd xhat[") / columns(same, "sd xhat[")
+    assert (wider[:31] == 1.0).all()
+    assert wider[31].max() > 1.5
+    assert (wider[31:] >= 1.0 - 1e-12).all()
     table = log_of("nonlinear")
     table.loc[0, "inflow"] = np.nan
     # A nonlinear model has no zero to begin with: it begins in the row in which all inputs are known.

@@ -326,12 +326,27 @@ def shifted_design() -> ObserverDesign:
     return adaptive_observer(plant(operating_point={"x1": 100.0, "y1": 100.0}), outliers="none", **FILTER)
 
 
+def uncertain_inputs(u: np.ndarray) -> np.ndarray:
+    """Return Q(k) with what the inputs of rows 14 and 15 may be off by when these are missing."""
+    before = u[:14, 0]
+    change, width = np.abs(np.diff(before)).max(), np.ptp(before)
+    off = np.cumsum([min(change, width), min(2 * change, width)])
+    variances = np.diff(off**2, prepend=0.0)
+    moved = abs(u[16, 0] - u[13, 0])
+    if moved > min(3 * change, width):
+        variances[1] += (2 * moved) ** 2 - off[1] ** 2
+    found = np.tile(Q, (2 * SAMPLES, 1, 1))
+    found[14:16] += variances[:, None, None] * (B @ B.T)
+    return found
+
+
 def test_logs_with_gaps_are_smoothed_like_arrays(tmp_path) -> None:
     y, u = record()
     design, frame = shifted_design(), log(y, u)
+    told = adaptive_observer(shifted_design().plant, outliers="none", **{**FILTER, "Q": uncertain_inputs(u)})
     y[14:16], u[14:16] = np.nan, u[13]
     kept = np.setdiff1d(np.arange(SAMPLES), [14, 15])
-    whole, late = smooth(design, y, u), smooth(design, y, u, lag=3)
+    whole, late = smooth(told, y, u), smooth(told, y, u, lag=3)
     on_log = smooth(design, frame, outliers="none")
     np.testing.assert_allclose(on_log.states - [100.0, 0.0, 0.0], whole.states[kept], atol=1e-11)
     table = run_on_data(design, frame, smooth=True, outliers="none").table

@@ -216,8 +216,9 @@ def run_on_data(
 
     Recursive and nonlinear designs take missing outputs themselves, with what they cost in the columns ``sd ...``
     (standard deviations): a row without some outputs is ``partial``, one without all of them, or without an input, is a
-    ``gap``.  The first row is k = 0, of which recursive designs do not use the outputs.  Missing inputs are held;
-    the rows after that are ``recovering``.  ``r`` is the innovation at the parameters estimated one sample before
+    ``gap``.  The first row is k = 0, of which recursive designs do not use the outputs.  Missing inputs are held,
+    within the largest changes that they have made before, by which deviations grow; the rows after that are
+    ``recovering`` until the warm-up is over.  ``r`` is the innovation at the parameters estimated one sample before
     (whitened, for recursive designs).
     """
     require_kind(design, ObserverDesign, "design", "an ObserverDesign, such as obsynth.load(path)")

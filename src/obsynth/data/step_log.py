@@ -72,9 +72,15 @@ class SteppingLogObserver(LogObserver):
         counts = self.state.refused[1]
         return {name: int(count) for name, count in zip(self.output_names, counts, strict=True) if count}
 
+    def _begun(self, u: FloatArray) -> FloatArray:
+        """Return inputs ``(nu,)`` with those of the row before where they are missing: an observer begins with known
+        ones."""
+        return np.where(np.isnan(u), 0.0 if self.u is None else self.u, u)
+
     def _taken(self, y: FloatArray, u: FloatArray) -> StepRow | None:
         """Take one sample, or none of it: `None` where numbers are no finite ones any more."""
         before = self.state
+        u = u if self.state.k else self._begun(u)
         found: StepRow
         try:
             with np.errstate(all="ignore"):
@@ -101,15 +107,14 @@ class SteppingLogObserver(LogObserver):
         if self.u is None and not self.is_recursive and not known[:nu].all():
             # A nonlinear model has no zero to begin with: it begins when all inputs are known.
             return Row(GAP, np.full(len(self.columns), np.nan), missing)
-        held = np.zeros(nu) if self.u is None else self.u
-        u, y = np.where(known[:nu], values[:nu], held), np.where(known[nu:], values[nu:], np.nan)
+        u, y = (np.where(known, values, np.nan)[part] for part in (slice(nu), slice(nu, None)))
         if missing > LONGEST_BRIDGE and self.may_restart:
             self.state, fresh = self.observer.init(), True
         else:
-            fresh = self._bridged(missing, held) or fresh
+            fresh = self._bridged(missing) or fresh
         total = self.state.refused[1]
         found, spoiled, restarted = self._found(y, u, may_restart=self.may_restart and not fresh)
-        self.u, fresh = u, fresh or restarted
+        self.u, fresh = self._begun(u), fresh or restarted
         if fresh:
             self.settled_at, self.phase = time + self.warm_up, WARM_UP
         elif nu and (missing or not known[:nu].all()):
@@ -130,11 +135,11 @@ class SteppingLogObserver(LogObserver):
         """Return which outputs of the last sample were left out as outliers: of which more are than before it."""
         return np.asarray(self.state.refused[1] > total) & (self.observer.outliers == "gate")
 
-    def _bridged(self, missing: int, held: FloatArray) -> bool:
-        """Take samples without outputs; return whether the observer had to start again."""
-        for _ in range(missing):
+    def _bridged(self, missing: int) -> bool:
+        """Take samples of which nothing is known; return whether the observer had to start again."""
+        for _ in range(0 if self.u is None else missing):
             try:
-                self._required(held)
+                self._required(np.full(len(self.input_names), np.nan))
             except ObsynthError:
                 if not self.may_restart:
                     raise

@@ -85,17 +85,20 @@ def robust_advance(
     u: FloatArray,
     *,
     predicted_outputs: Callable[[State, FloatArray], tuple[FloatArray, FloatArray]] | None = None,
+    held: FloatArray | None = None,
 ) -> tuple[State, Row]:
     """Take a step; where its innovation is too long, ask each sensor and take the step again without the outliers:
     those further off than so many deviations, and than ``sizes (ny,)`` where these are known.
     ``predicted(state, received, u)``: mean and deviation of each output ``(ny,)`` from the samples that are received;
-    ``predicted_outputs(state, u)``: of outputs that determine the state; these may be `BLIND` times further off."""
+    ``predicted_outputs(state, u)``: of outputs that determine the state; these may be `BLIND` times further off.
+    ``held (nu,)``, where inputs are missing: as they last were. What these exclude may be wrong, or the inputs have
+    moved: it counts once the next sample goes on with it."""
     failed, mean, reach, far = False, y, y, np.zeros(len(y), dtype=bool)
     least = np.zeros(len(y)) if sizes is None else sizes
     try:
         with np.errstate(all="ignore"):
             after, row = plain(state, y, u)
-            passes = float(row.nis) <= limit**2
+            passes = float(row.nis) <= limit**2 and held is None
             if passes and predicted_outputs is not None:
                 mean, deviation = predicted_outputs(state, u)
                 reach = np.maximum(limit * deviation, least)
@@ -105,7 +108,7 @@ def robust_advance(
     except (SolverError, np.linalg.LinAlgError, ValueError):
         failed = True
     if not far.any():
-        mean, reach, far = _judged(limit, least, predicted, state, y, u)
+        mean, reach, far = _judged(limit, least, predicted, state, y, u if held is None else held)
     off, gone = np.where(far, y - mean, 0.0), far
     if kind == "gate":
         # A wrong sample stands alone; of a sensor, or a plant, that has moved the next is on the same side, as far off.

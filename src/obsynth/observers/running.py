@@ -185,7 +185,8 @@ class RunningObserver(Generic[State, Row]):
         y : array_like
             Outputs ``(ny,)``.  Recursive and nonlinear observers take NaN for a missing one.
         u : array_like, optional
-            Known inputs ``(nu,)``.
+            Known inputs ``(nu,)``.  Recursive and nonlinear observers take NaN for one that is missing after the first
+            sample: it counts as it last was, and deviations grow by what its past changes let it be off by.
 
         Raises
         ------

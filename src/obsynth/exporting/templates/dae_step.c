@@ -61,6 +61,7 @@ static int status_of(PREFIX_state *s, const double *seen, const int *refused, in
 int PREFIX_step(PREFIX_state *s, ARGUMENTSconst double y[NY], PREFIX_estimates *estimates)
 {
     double used[LENGTH(NU)];
+    double held[LENGTH(NU)];
     double seen[NY];
     double none[NY];
     double received[NY];
@@ -71,10 +72,11 @@ int PREFIX_step(PREFIX_state *s, ARGUMENTSconst double y[NY], PREFIX_estimates *
     int inputs_known = 1;
     int is_first = !s->is_started;
     int is_deciding, i, failed;
-    used[0] = 0.0;
+    used[0] = held[0] = 0.0;
     for (i = 0; i < NU; i++) {
         int is_known = isfinite(INPUT[i]) != 0;
-        used[i] = is_known ? INPUT[i] : s->u[i];
+        held[i] = is_known ? INPUT[i] : s->u[i];
+        used[i] = is_known ? INPUT[i] : NAN;
         inputs_known = inputs_known && is_known;
     }
     if (is_first && !inputs_known) {
@@ -93,10 +95,10 @@ int PREFIX_step(PREFIX_state *s, ARGUMENTSconst double y[NY], PREFIX_estimates *
             struct PREFIX_observer before = s->running;
             begin(&s->running);
             is_first = 1;
-            failed = advance(&s->running, used, seen, received, said);
+            failed = advance(&s->running, held, seen, received, said);
             if (failed) {
                 copy(seen, none, NY);
-                failed = advance(&s->running, used, seen, received, said);
+                failed = advance(&s->running, held, seen, received, said);
             }
             if (failed) {
                 s->running = before;
@@ -114,7 +116,7 @@ int PREFIX_step(PREFIX_state *s, ARGUMENTSconst double y[NY], PREFIX_estimates *
     s->is_started = 1;
     s->time = (double)s->k * UPPER_DT;
     s->k++;
-    copy(s->u, used, LENGTH(NU));
+    copy(s->u, held, LENGTH(NU));
     s->status = status_of(s, seen, refused, inputs_known, is_first);
     is_deciding = s->status == UPPER_OK || s->status == UPPER_PARTIAL;
     after = latest_of(&s->running)->memory;

@@ -47,6 +47,8 @@ def observer_code(steps: Steps) -> str:
     graph = steps.graph
     short = step_graph(DAEFunctions(steps.settings.model), PROJECTION_SHARE * steps.settings.dt, np.inf)
     functions = {"project": short.newton, "newton": graph.step.newton, "first": graph.first, "sample": graph.sample}
+    if steps.settings.model.nu:
+        functions["unknown"] = graph.unknown
     if steps.settings.outliers != "none":
         functions["forecast"] = graph.forecast
     return "\n".join(
@@ -73,6 +75,8 @@ def observer_struct(steps: Steps, name: str) -> Iterator[str]:
     yield "       far off the latest in a row was that was left out, and that was believed */"
     yield from ("    long k;", f"    int in_a_row[{model.ny}];", f"    int refused[{model.ny}];", "    int resets;")
     yield from (f"    double left_out[{model.ny}];", f"    double believed[{model.ny}];")
+    yield "    /* of each input: lowest, highest, largest change, samples missing in a row, what these may be off by */"
+    yield f"    double inputs[{5 * max(model.nu, 1)}];"
     yield from ("    int watched;", f"    double surprises[{2 * RESET_WINDOW}];", "};")
     if not timing.is_plain:
         rows = timing.longest + 1

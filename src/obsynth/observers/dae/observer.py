@@ -22,7 +22,8 @@ from obsynth.observers.dae.steps import DAEState, Steps
 from obsynth.observers.estimates import Estimates
 from obsynth.observers.progress import shown_progress
 from obsynth.observers.records import measured_record
-from obsynth.plants.dae.checks import checked_inputs, require_known
+from obsynth.observers.unknown_inputs import require_inputs
+from obsynth.plants.dae.checks import checked_inputs
 from obsynth.plants.dae.functions import Compiled, take_samples
 
 #: Samples in one call of the C: a tenth of a second or less, so that progress shows and memory stays small.
@@ -170,7 +171,7 @@ class DAEObserver(DAESettings):
             inputs = np.zeros((0, 0))
         if inputs.shape != (self.model.nu,):
             raise SpecError(f"u must be {self.model.nu} finite number(s) at k = {state.k}.", path="u")
-        require_known(self.model, inputs[None], state.k)
+        require_inputs(inputs, self.model.input_names, state.k)
         return outputs, inputs
 
     def _estimates(self, state: DAEState, row: DAERow) -> Estimates:

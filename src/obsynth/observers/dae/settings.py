@@ -201,6 +201,7 @@ MATRIX_SETTINGS = frozenset(
         "F",
         "G",
         "noise",
+        "missing",
         "kept",
         "scaled",
         "expected",
@@ -236,8 +237,9 @@ def row_layout(observer: DAESettings) -> Layout:
     n = nx * len(BUTCHER[observer.integration])
     # score less information times the true parameters (which stay as they are): to first order mean zero and covariance
     # ``information``; expected: covariance of the innovation, the identity for what is not seen; noise: derivative by
-    # what is added to the equations; kept: F (I - K H) with K and H of the sample before; scaled: the equilibrated
-    # matrix of (7); trusted: one where the step of the compiled graph was solved
+    # what is added to the equations; missing: covariance by inputs that nobody measured; kept: F (I - K H) with K and H
+    # of the sample before; scaled: the equilibrated matrix of (7); trusted: one where the step of the compiled graph
+    # was solved
     return Layout(
         {
             "innovation": (ny, 1),
@@ -249,6 +251,7 @@ def row_layout(observer: DAESettings) -> Layout:
             "F": (nx, nx),
             "G": (nx, nq),
             "noise": (nx, nx),
+            "missing": (nx, nx),
             "kept": (nx, nx),
             "scaled": (n, n),
             "residual": (1, 1),

@@ -14,7 +14,7 @@ import numpy as np
 from obsynth.numerics.newton import definite_solved
 from obsynth.observers.dae.settings import Layout, memory_layout, row_layout
 from obsynth.plants.dae.functions import DAEFunctions
-from obsynth.plants.dae.step import StepGraph, step_graph
+from obsynth.plants.dae.step import StepGraph, input_effect, step_graph
 
 if TYPE_CHECKING:
     from obsynth.observers.dae.settings import DAESettings
@@ -31,7 +31,9 @@ class ObserverGraph:
     functions: DAEFunctions  # the model with its method of integration
     step: StepGraph  # its implicit step
     first: Any  # from memory, outputs and one for each that is seen, at k = 0, to memory and row
-    sample: Any  # from memory, stages of the solved step, input, outputs and what is seen to memory and row
+    # from memory, stages of the solved step, input, outputs, what is seen, and what `unknown` says, to memory and row
+    sample: Any
+    unknown: Any  # from memory, stages, input and variances of what is missing of it to a covariance of the state
     whole: Any  # the implicit step and `sample`: from memory and ``[u; y; seen]`` to memory and row
     forecast: Any  # from memory and row of a sample that nothing was seen of to mean and deviation of each output
     _stretches: dict[int, Any] = field(default_factory=dict, repr=False)
@@ -53,6 +55,7 @@ def observer_graph(observer: DAESettings) -> ObserverGraph:
     nx, nu, ny = observer.model.nx, observer.model.nu, observer.model.ny
     packed, X = ca.MX.sym("memory", memory.size), ca.MX.sym("stages", nx * functions.stages)
     u, y, seen = ca.MX.sym("u", nu), ca.MX.sym("y", ny), ca.MX.sym("seen", ny)
+    missing = ca.MX.sym("missing", nx, nx)
     nothing = {name: ca.MX(*shape) for name, shape in row.shapes.items()}
     begun = {**nothing, **memory.symbols(packed)}
     first = ca.Function(
@@ -60,21 +63,34 @@ def observer_graph(observer: DAESettings) -> ObserverGraph:
     )
     before = memory.symbols(packed)
     local = step.sensitivities(X, before["posterior"], u, before["theta"])
-    predicted = _predicted(observer, before, X[-nx:], local)
+    predicted = _predicted(observer, before, X[-nx:], local, missing)
     found = {**nothing, **_Update(observer, functions, y, seen).later(predicted)}
-    sample = ca.Function("sample", [packed, X, u, y, seen], _outcome(found, memory, row))
+    sample = ca.Function("sample", [packed, X, u, y, seen, missing], _outcome(found, memory, row))
+    unknown = _unknown(observer, functions, memory) if nu else None
     if step.small:
         first, sample = first.expand(), sample.expand()
     arriving = ca.MX.sym("arriving", nu + 2 * ny)
     u, y, seen = arriving[:nu], arriving[nu : nu + ny], arriving[nu + ny :]
     before = memory.symbols(packed)
     stages, residual, trusted = step.step(before["posterior"], u, before["theta"])
-    after, said = sample(packed, stages, u, y, seen)
+    after, said = sample(packed, stages, u, y, seen, ca.DM.zeros(nx, nx))
     # The residual and the verdict are the last two entries of a row.
     said = ca.vertcat(said[: row.size - 2], residual, trusted)
     whole = ca.Function("whole", [packed, arriving], [after, said])
     forecast = _forecast(observer, functions, memory, row)
-    return ObserverGraph(memory, row, functions, step, first, sample, whole, forecast)
+    return ObserverGraph(memory, row, functions, step, first, sample, unknown, whole, forecast)
+
+
+def _unknown(observer: DAESettings, functions: DAEFunctions, memory: Layout) -> Any:
+    """Return the function to what missing inputs add to the covariance of the state in a step ``(nx, nx)``."""
+    import casadi as ca
+
+    effect = input_effect(functions, observer.dt)
+    packed, variances = ca.MX.sym("memory", memory.size), ca.MX.sym("variances", observer.model.nu)
+    X, u = effect.mx_in(0), effect.mx_in(2)
+    before = memory.symbols(packed)
+    moved = effect(X, before["posterior"], u, before["theta"])
+    return ca.Function("unknown", [packed, X, u, variances], [moved @ ca.diag(variances) @ moved.T])
 
 
 def _forecast(observer: DAESettings, functions: DAEFunctions, memory: Layout, row: Layout) -> Any:
@@ -95,15 +111,16 @@ def _outcome(found: Arrays, memory: Layout, row: Layout) -> list[Any]:
     return [memory.column(found), row.column(found)]
 
 
-def _predicted(observer: DAESettings, before: Arrays, x: Any, local: tuple[Any, ...]) -> Arrays:
-    """Steps 1 to 5: the prediction and its covariance, with K, H and L of k - 1."""
+def _predicted(observer: DAESettings, before: Arrays, x: Any, local: tuple[Any, ...], missing: Any) -> Arrays:
+    """Steps 1 to 5: the prediction and its covariance, with K, H and L of k - 1, and what missing inputs add."""
     import casadi as ca
 
     F, G, noise, scaled = local
     P, K, H, L, spread = (before[name] for name in ("P", "K", "H", "L", "spread"))
-    added = noise @ ca.DM(observer.Q) @ noise.T
+    added = noise @ ca.DM(observer.Q) @ noise.T + missing
     kept = ca.DM.eye(observer.model.nx) - K @ H
-    after = {**before, "x": x, "F": F, "G": G, "noise": noise, "kept": F @ kept, "scaled": scaled}
+    after = {**before, "x": x, "F": F, "G": G, "noise": noise, "missing": missing, "kept": F @ kept,
+             "scaled": scaled}  # fmt: skip
     carried = F @ (kept @ before["Upsilon"] - K @ L)
     if observer.form != "forgetting":
         # The parameters of a sample act in the step that leads there: they have walked already.

@@ -15,6 +15,7 @@ from obsynth.observers.dae.estimates import DAERow
 from obsynth.observers.dae.settings import DAESettings, initial_memory
 from obsynth.observers.dae.step_graph import ObserverGraph, observer_graph
 from obsynth.observers.outliers import checked_limit, has_jumped, no_refusals, projected, robust_advance, with_surprise
+from obsynth.observers.unknown_inputs import TakenInputs, held_inputs, no_inputs, over_samples, taken_inputs
 from obsynth.plants.dae.functions import Compiled
 from obsynth.plants.dae.step import ImplicitStep, onto_constraint
 
@@ -30,6 +31,7 @@ class DAEState(NamedTuple):
     # ``(any, 2)``: normalised squares of the latest innovations, and their degrees of freedom, for resets
     surprises: FloatArray
     resets: int  # how many there were
+    inputs: FloatArray  # ``(5, nu)``: what `no_inputs` says
 
 
 class Steps:
@@ -49,6 +51,7 @@ class Steps:
             no_refusals(settings.model.ny),
             np.zeros((0, 2)),
             0,
+            no_inputs(settings.model.nu),
         )
 
     def part(self, state: DAEState, name: str) -> FloatArray:
@@ -56,14 +59,16 @@ class Steps:
         return self.graph.memory.part(state.memory, name)
 
     def advance(self, state: DAEState, y: FloatArray, u: FloatArray) -> tuple[DAEState, DAERow]:
-        """Return the state after a sample and what is said at it; NaN in ``y (ny,)`` is what is missing."""
+        """Return the state after a sample and what is said at it; NaN in ``y (ny,)`` or ``u (nu,)`` is missing."""
         take = self.watched if self.settings.reset else self.plain
         if self.settings.outliers == "none":
             after, row = take(state, y, u)
         else:
+            held = held_inputs(state.u, u) if state.k else None
             after, row = robust_advance(
-                self.settings.outliers, self.limit, self.settings.outlier_sizes, take, self.predicted, state, y, u
-            )
+                self.settings.outliers, self.limit, self.settings.outlier_sizes, take, self.predicted, state, y, u,
+                held=held,
+            )  # fmt: skip
         return (after, row) if self.settings.state_bounds is None else self.within_bounds(after, row)
 
     def within_bounds(self, state: DAEState, row: DAERow) -> tuple[DAEState, DAERow]:
@@ -110,13 +115,16 @@ class Steps:
         """Take a sample as it is."""
         seen = ~np.isnan(y)
         received, moved = np.where(seen, y, 0.0), self._unmoved
+        known = taken_inputs(state.inputs, state.u, u, is_first=state.k == 0)
         if state.k == 0:
             begun, moved = self.projected(state, u)
             after, said = self._call("first", begun, received, seen)
+        elif known.variances is not None:
+            after, said = self._carefully(state, received, seen, known)
         else:
             after, said = self._call("whole", state.memory, np.concatenate([u, received, seen]))
             if said[-1, 0] != 1.0:
-                after, said = self._carefully(state, received, seen, u)
+                after, said = self._carefully(state, received, seen, known)
         memory = after[:, 0]
         if not all_finite(memory):
             raise SolverError(
@@ -126,7 +134,7 @@ class Steps:
             )
         row = DAERow(self.graph, state.k, memory, said[:, 0], seen, moved)
         informations = (*state.informations, row.part("information"))[-self.settings.window :]
-        return DAEState(memory, state.k + 1, u, informations, *state[4:]), row
+        return DAEState(memory, state.k + 1, known.u, informations, *state[4:7], known.history), row
 
     def stretch(
         self, state: DAEState, y: FloatArray, u: FloatArray, run: Callable[..., tuple[FloatArray, ...]]
@@ -142,7 +150,11 @@ class Steps:
             latest = tuple(rows.part("information")[-self.settings.window :])
             informations = (*state.informations, *latest)[-self.settings.window :]
             state = state._replace(
-                memory=after[taken - 1].copy(), k=state.k + taken, u=u[taken - 1], informations=informations
+                memory=after[taken - 1].copy(),
+                k=state.k + taken,
+                u=u[taken - 1],
+                informations=informations,
+                inputs=over_samples(state.inputs, state.u, u[:taken]),
             )
         return state, rows
 
@@ -154,11 +166,20 @@ class Steps:
             return state.memory, np.zeros_like(start)
         return initial_memory(self.settings, found), found - start
 
-    def _carefully(self, state: DAEState, y: FloatArray, seen: FloatArray, u: FloatArray) -> tuple[FloatArray, ...]:
-        """Take a step that needs damping or a homotopy: solved outside the graph, and all else in it."""
+    def _carefully(
+        self, state: DAEState, y: FloatArray, seen: FloatArray, known: TakenInputs
+    ) -> tuple[FloatArray, ...]:
+        """Take a step that needs damping or a homotopy, or whose inputs are not all known: solved outside the graph,
+        and all else in it."""
         posterior, theta = self.part(state, "posterior"), self.part(state, "theta")
-        solution = self.implicit.solve_carefully(posterior, u, theta, before=state.u, k=state.k)
-        after, said = self._call("sample", state.memory, solution.stages, u, y, seen)
+        missing = np.zeros(self.settings.model.nx**2)
+        if known.variances is None:
+            solution = self.implicit.solve_carefully(posterior, known.u, theta, before=state.u, k=state.k)
+        else:
+            solution = self.implicit.solve(posterior, known.u, theta, before=state.u, k=state.k)
+            (found,) = self._call("unknown", state.memory, solution.stages, known.u, known.variances)
+            missing = found.ravel(order="F")
+        after, said = self._call("sample", state.memory, solution.stages, known.u, y, seen, missing)
         said[-2:, 0] = solution.residual, 1.0
         return after, said
 

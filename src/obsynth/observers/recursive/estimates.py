@@ -89,6 +89,8 @@ class RecursiveState(NamedTuple):
     surprises: FloatArray
     resets: int  # how many there were
     refused: FloatArray  # ``(4, ny)``: what `no_refusals` says
+    inputs: FloatArray  # ``(5, nu)``: what `no_inputs` says
+    missing: FloatArray | None  # ``(nu,)``: variances of `u`, where inputs are missing
 
 
 def recursive_estimates(

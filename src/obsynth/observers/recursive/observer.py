@@ -23,6 +23,7 @@ from obsynth.observers.recursive.compiled_run import kernel_is_chosen, run_compi
 from obsynth.observers.recursive.estimates import RawEstimate, RecursiveState, recursive_estimates
 from obsynth.observers.recursive.recursion import Recursion
 from obsynth.observers.recursive.settings import Adaptation, RecursiveSettings
+from obsynth.observers.unknown_inputs import require_inputs
 from obsynth.plants.sequences import MatrixSequence
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 
@@ -84,7 +85,11 @@ class RecursiveObserver(RecursiveSettings):
 
     def _sample(self, state: RecursiveState, y: ArrayLike, u: ArrayLike) -> tuple[FloatArray, FloatArray]:
         outputs = measured_record(np.atleast_2d(real_array(y, "y")), self.plant.ny)[0]
-        return outputs, real_vector(u, self.plant.nu, "u")
+        inputs = np.atleast_1d(real_array(u, "u"))
+        if inputs.shape != (self.plant.nu,):
+            raise SpecError(f"u must be {self.plant.nu} finite number(s) at k = {state.k}.", path="u")
+        require_inputs(inputs, self.plant.input_names, state.k)
+        return outputs, inputs
 
     def _estimates(self, state: RecursiveState, row: RawEstimate) -> Estimates:
         return recursive_estimates(self, [row], window=state.regressors)

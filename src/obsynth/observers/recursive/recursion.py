@@ -30,7 +30,9 @@ from obsynth.observers.recursive.step_model import (
     StepModel,
     right_side,
     spreads,
+    with_missing_inputs,
 )
+from obsynth.observers.unknown_inputs import TakenInputs, held_inputs, no_inputs, taken_inputs
 
 
 def walk_of(settings: RecursiveSettings) -> FloatArray | None:
@@ -109,6 +111,8 @@ class Recursion:
             np.zeros((0, 2)),
             0,
             no_refusals(settings.plant.ny),
+            no_inputs(settings.plant.nu),
+            None,
         )
         if adaptation is None:
             return
@@ -125,7 +129,7 @@ class Recursion:
         self.regular = parameters.triangle if adaptation.guard == "regularise" else None
 
     def advance(self, state: RecursiveState, y: FloatArray, u: FloatArray) -> tuple[RecursiveState, RawEstimate]:
-        """Return the state after a sample and what is known at it; NaN in ``y (ny,)`` is what is missing."""
+        """Return the state after a sample and what is known at it; NaN in ``y (ny,)`` or ``u (nu,)`` is missing."""
         if self.settings.outliers == "none":
             return self.plain(state, y, u)
         predicted_outputs = self.predicted_outputs if state.k and self._constraints is not None else None
@@ -139,6 +143,7 @@ class Recursion:
             y,
             u,
             predicted_outputs=predicted_outputs,
+            held=held_inputs(state.u, u) if state.k else None,
         )
 
     def predicted_outputs(self, state: RecursiveState, u: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -150,7 +155,7 @@ class Recursion:
             return nothing, np.full(plant.ny, np.inf)
         try:
             after, _ = self.plain(state, nothing, u)
-            corrected, v, G = self._stepped(after, self._constraints.correction(k), np.zeros(0), u)
+            corrected, v, G = self._stepped(after, self._constraints.correction(k), np.zeros(0), after.u)
         except PreconditionError:
             # Equations without noise contradict each other within rounding: they judge nothing.
             return nothing, np.full(plant.ny, np.inf)
@@ -192,8 +197,10 @@ class Recursion:
     def plain(self, state: RecursiveState, y: FloatArray, u: FloatArray) -> tuple[RecursiveState, RawEstimate]:
         """Take a sample as it is."""
         theta = state.parameters.theta
+        known = taken_inputs(state.inputs, state.u, u, is_first=state.k == 0)
+        u = known.u
         if state.k > 0:
-            after, v, G = self._stepped(state, self.model.at(state.k - 1), y, u)
+            after, v, G = self._stepped(state, self.step_of(state, known), y, u)
         elif (first := self.model.first()) is not None:
             after, v, G = self._stepped(state, first, np.zeros(0), u)
         else:
@@ -202,9 +209,16 @@ class Recursion:
         row = self._estimate(after, v, G, gap, y)
         k, regressors = state.k + 1, (*state.regressors, G)[-self.window :]
         # By place: `_replace` of two or three fields takes as long as a product.
-        _, x, factor, Upsilon, diffuse, parameters, _, _, surprises, resets, refused = after
-        taken = RecursiveState(k, x, factor, Upsilon, diffuse, parameters, u, regressors, surprises, resets, refused)
+        _, x, factor, Upsilon, diffuse, parameters, _, _, surprises, resets, refused, _, _ = after
+        taken = RecursiveState(k, x, factor, Upsilon, diffuse, parameters, u, regressors, surprises, resets, refused,
+                               known.history, known.missing)  # fmt: skip
         return taken, row
+
+    def step_of(self, state: RecursiveState, known: TakenInputs) -> StepMatrices:
+        """Return the step that ends at a sample after the first, with the noise that missing inputs are."""
+        step = self.model.at(state.k - 1)
+        parts = [part for part in (state.missing, known.returned) if part is not None]
+        return step if not parts and known.missing is None else with_missing_inputs(step, sum(parts), known.missing)
 
     def _stepped(
         self, state: RecursiveState, step: StepMatrices, y: FloatArray, u: FloatArray
@@ -252,6 +266,8 @@ class Recursion:
             surprises,
             resets,
             state.refused,
+            state.inputs,
+            state.missing,
         )
         return after, v, G
 

@@ -275,6 +275,16 @@ def with_walking_parameters(step: StepMatrices, walk: FloatArray, *, early: bool
     )
 
 
+def with_missing_inputs(step: StepMatrices, before: FloatArray | float, now: FloatArray | None) -> StepMatrices:
+    """Return one step whose inputs have variances ``before (nu,)``, and those of its own sample ``now (nu,)``."""
+    ne, nu = step.B.shape
+    acting = np.zeros((len(step.H), 2 * nu))
+    acting[:ne, :nu] = step.B * np.sqrt(before)
+    if now is not None and len(step.Dn):
+        acting[len(step.H) - len(step.Dn) :, nu:] = step.Dn * np.sqrt(now)
+    return step._replace(noise=np.hstack((step.noise, acting[:, acting.any(axis=0)])))
+
+
 @dataclass(frozen=True, eq=False)
 class PreparedStep:
     """One step with its factorisation."""

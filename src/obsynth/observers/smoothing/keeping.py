@@ -29,6 +29,7 @@ from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.recursive.recursion import Recursion
 from obsynth.observers.recursive.step_model import StepMatrices, right_side, stacked_noise
 from obsynth.observers.smoothing.chain import Lesson, Links, Node, Smoothed, deviations_in, smoothed_from
+from obsynth.observers.unknown_inputs import taken_inputs
 from obsynth.plants.dae.checks import checked_inputs
 
 
@@ -79,12 +80,19 @@ class _DAELinks(Links):
             theta,
             row.part("F"),
             row.part("G"),
-            row.part("noise") @ self.Q,
+            self._noise(row),
             row.innovation[seen],
             H[seen],
             L[seen],
             R,
         )
+
+    def _noise(self, row: DAERow) -> FloatArray:
+        """Return a root of the covariance that a step adds; missing inputs widen it."""
+        noise, missing = row.part("noise") @ self.Q, row.part("missing")
+        if not missing.any():
+            return np.asarray(noise)
+        return np.hstack((noise, covariance_factor(0.5 * (missing + missing.T), "covariance")))
 
     def through(self, state: DAEState) -> FloatArray:
         """Return the derivative of the state after the measurement by the parameters."""
@@ -257,8 +265,9 @@ class _RecursiveLinks(Links):
 
     def next(self, node: Node, before: RecursiveState, after: RecursiveState, row: RawEstimate, u: FloatArray) -> Node:
         """Return the node of the next sample."""
-        step = self.recursion.model.at(before.k - 1)
-        return self._linked(node, step, before.u, row.y, u)._replace(lesson=self._lesson(before, after, row))
+        known = taken_inputs(before.inputs, before.u, u, is_first=False)
+        step = self.recursion.step_of(before, known)
+        return self._linked(node, step, before.u, row.y, known.u)._replace(lesson=self._lesson(before, after, row))
 
     def _linked(self, node: Node, step: StepMatrices, before: FloatArray, y: FloatArray, u: FloatArray) -> Node:
         """Take a step from inputs ``before`` to the sample ``y`` with inputs ``u``."""

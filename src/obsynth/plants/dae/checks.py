@@ -206,21 +206,16 @@ def checked_inputs(model: DAEFields, u: Any, samples: int | None = None) -> Floa
         what = "no numbers" if raw.dtype.kind in "OUSbc" else f"of shape {raw.shape}"
         raise SpecError(f"u is {what}, but (samples, {model.nu}) numbers are needed.", path="u")
     array = raw.astype(np.float64)
-    require_known(model, array)
+    if not np.isfinite(array).all():
+        k, i = np.argwhere(~np.isfinite(array))[0]
+        raise SpecError(
+            f"The input {model.input_names[i]!r} is {array[k, i]} at k = {k}: inputs must be known. Fill the gap, or "
+            "make the signal a state with a sensor.",
+            path="u",
+        )
     if samples is not None and len(array) != samples:
         raise SpecError(f"u has {len(array)} samples and y has {samples}: give the same number.", path="u")
     return array
-
-
-def require_known(model: DAEFields, u: FloatArray, first: int = 0) -> None:
-    """Raise `SpecError` naming signal and k where an input ``(samples, nu)`` that begins at ``first`` is not finite."""
-    if not np.isfinite(u).all():
-        k, i = np.argwhere(~np.isfinite(u))[0]
-        raise SpecError(
-            f"The input {model.input_names[i]!r} is {u[k, i]} at k = {first + k}: inputs must be known. Fill the gap, "
-            "or make the signal a state with a sensor.",
-            path="u",
-        )
 
 
 def finite_vector(value: Any, names: Sequence[str], default: FloatArray, what: str) -> FloatArray:

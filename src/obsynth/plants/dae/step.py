@@ -77,6 +77,23 @@ def _graph(functions: DAEFunctions, dt: float, largest_move: float) -> StepGraph
     return StepGraph(newton, local, _whole(newton, sizes, stages, largest_move), n <= SMALL)
 
 
+def input_effect(functions: DAEFunctions, dt: float) -> Any:
+    """Return the function from stages, state before, input and parameters to the derivative of a solved step by the
+    input ``(nx, nu)``."""
+    import casadi as ca
+
+    model, stages = functions.model, functions.stages
+    n = model.nx * stages
+    sizes = np.tile(model.state_scales, stages)
+    point = [ca.MX.sym(name, size) for name, size in (("X", n), ("x", model.nx), ("u", model.nu), ("theta", model.nq))]
+    value, J = functions.residual_function(*point, dt)
+    scaled, rows = equilibrated(J, sizes)
+    right = -ca.densify(ca.jacobian(value, point[2]))
+    moved = ca.repmat(ca.DM(sizes), 1, model.nu) * solved(scaled, ca.repmat(rows, 1, model.nu) * right)
+    found = ca.Function("input_effect", point, [moved[n - model.nx :, :]])
+    return found.expand() if n <= SMALL else found
+
+
 def _whole(newton: Any, sizes: FloatArray, stages: int, largest_move: float) -> Any:
     """Return the step: blocks of iterations, the later ones taken only where the earlier have not ended."""
     import casadi as ca

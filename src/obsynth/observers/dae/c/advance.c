@@ -197,16 +197,51 @@ static int put_on_constraint(double *memory, const double *u)
     return 1;
 }
 
-/* Take one sample as it is, from what is remembered: 0, or 2 if the step has no solution. */
-static int attempt(const double *given, const struct observer *state, const double *u, const double *y, double *after,
-                   double *said)
+/* Take what is missing of the inputs (not a number) as it last was: `used`, and variances of what they may be off by.
+   An input moves by no more from one sample to the next than it did before, and not out of its range; what one has been
+   off by adds up, and one that is known again may have moved further than was thought of. */
+static void take_inputs(const struct observer *state, const double *u, double *used, double *variances, double *history)
+{
+    int i;
+    for (i = 0; i < NU; i++) {
+        double *lowest = history + 5 * i;
+        double held = state->u[i];
+        double moved, reach, total;
+        copy(lowest, state->inputs + 5 * i, 5);
+        variances[i] = 0.0;
+        used[i] = isnan(u[i]) ? held : u[i];
+        if (state->k == 0) {
+            lowest[0] = lowest[1] = used[i];
+            continue;
+        }
+        moved = fabs(used[i] - held);
+        reach = fmin((lowest[3] + 1.0) * lowest[2], lowest[1] - lowest[0]);
+        total = lowest[4] + reach;
+        if (isnan(u[i])) {
+            variances[i] = total * total - lowest[4] * lowest[4];
+        } else if (lowest[3] > 0.0 && moved > reach) {
+            variances[i] = fmax(lowest[3] * moved * (lowest[3] * moved) - lowest[4] * lowest[4], 0.0);
+        }
+        lowest[0] = fmin(lowest[0], used[i]);
+        lowest[1] = fmax(lowest[1], used[i]);
+        lowest[2] = fmax(lowest[2], moved / (lowest[3] + 1.0));
+        lowest[3] = isnan(u[i]) ? lowest[3] + 1.0 : 0.0;
+        lowest[4] = isnan(u[i]) ? total : 0.0;
+    }
+}
+
+/* Take one sample as it is, from what is remembered: 0, or 2 if the step has no solution; inputs may be off by
+   `variances`. */
+static int attempt(const double *given, const struct observer *state, const double *u, const double *variances,
+                   const double *y, double *after, double *said)
 {
     double memory[MEMORY];
     double X[NX * STAGES];
     double received[NY];
     double seen[NY];
+    double missing[NX * NX];
     double residual = 0.0;
-    const double *inputs[5];
+    const double *inputs[6];
     double *outputs[2];
     int failed, i;
     for (i = 0; i < NY; i++) {
@@ -223,9 +258,28 @@ static int attempt(const double *given, const struct observer *state, const doub
         }
         inputs[1] = X;
         inputs[2] = u;
+        for (i = 0; i < NX * NX; i++) {
+            missing[i] = 0.0;
+        }
+#if NU
+        for (i = 0; i < NU; i++) {
+            if (variances[i] > 0.0) {
+                double *found[1];
+                found[0] = missing;
+                inputs[3] = variances;
+                if (call(unknown, inputs, 4, found, 1) != 0) {
+                    return 2;
+                }
+                break;
+            }
+        }
+#else
+        (void)variances;
+#endif
         inputs[3] = received;
         inputs[4] = seen;
-        failed = call(sample, inputs, 5, outputs, 2);
+        inputs[5] = missing;
+        failed = call(sample, inputs, 6, outputs, 2);
     } else {
         if (!put_on_constraint(memory, u)) {
             return 2;

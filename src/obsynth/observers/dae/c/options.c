@@ -2,13 +2,14 @@
 /* Outliers, resets and bounds on states, around a plain step. */
 
 /* Take a sample; where innovations have become too large, again with parameters known no better than at first. */
-static int watched(const struct observer *state, const double *u, const double *y, struct observer *after, double *said)
+static int watched(const struct observer *state, const double *u, const double *variances, const double *y,
+                   struct observer *after, double *said)
 {
 #if RESETS
     int i, degrees = 0;
 #endif
     *after = *state;
-    if (attempt(state->memory, state, u, y, after->memory, said) != 0) {
+    if (attempt(state->memory, state, u, variances, y, after->memory, said) != 0) {
         return 2;
     }
 #if RESETS
@@ -38,7 +39,7 @@ static int watched(const struct observer *state, const double *u, const double *
 #else
             copy(respread + AT_S, START + AT_S, NQ * NQ);
 #endif
-            if (attempt(respread, state, u, y, after->memory, said) != 0) {
+            if (attempt(respread, state, u, variances, y, after->memory, said) != 0) {
                 return 2;
             }
             after->watched = 0;
@@ -51,7 +52,8 @@ static int watched(const struct observer *state, const double *u, const double *
 
 #if OUTLIERS
 /* Mean and deviation of each output, from what is remembered alone. */
-static int forecasted(const struct observer *state, const double *u, double *mean, double *deviation)
+static int forecasted(const struct observer *state, const double *u, const double *variances, double *mean,
+                      double *deviation)
 {
     double nothing[NY];
     double after[MEMORY];
@@ -62,7 +64,7 @@ static int forecasted(const struct observer *state, const double *u, double *mea
     for (i = 0; i < NY; i++) {
         nothing[i] = NAN;
     }
-    if (attempt(state->memory, state, u, nothing, after, said) != 0) {
+    if (attempt(state->memory, state, u, variances, nothing, after, said) != 0) {
         return 2;
     }
     inputs[0] = after;
@@ -97,9 +99,10 @@ static void remember(const struct observer *state, struct observer *after, int i
 }
 
 /* Take a step; where its innovation is too long, ask each sensor and take the step again without the outliers. */
-static int robust(const struct observer *state, const double *u, const double *y, double *received, struct observer *after,
-                  double *said)
+static int robust(const struct observer *state, const double *u, const double *variances, int is_missing,
+                  const double *y, double *received, struct observer *after, double *said)
 {
+    double none[LENGTH(NU)];
     double mean[NY];
     double deviation[NY];
     double off[NY];
@@ -108,8 +111,8 @@ static int robust(const struct observer *state, const double *u, const double *y
     int failed, any = 0;
     int i;
     copy(received, y, NY);
-    failed = watched(state, u, y, after, said);
-    if (!failed && said[AT_NIS] <= OUTLIER_LIMIT * OUTLIER_LIMIT) {
+    failed = watched(state, u, variances, y, after, said);
+    if (!failed && !is_missing && said[AT_NIS] <= OUTLIER_LIMIT * OUTLIER_LIMIT) {
         for (i = 0; i < NY; i++) {
             if (!isnan(y[i])) {
                 remember(state, after, i, 0, 0, 0.0);
@@ -117,7 +120,12 @@ static int robust(const struct observer *state, const double *u, const double *y
         }
         return 0;
     }
-    if (forecasted(state, u, mean, deviation) != 0) {
+    /* Where inputs are missing, samples are judged by the inputs as they last were: what these exclude may be wrong, or
+       the inputs have moved. It counts once the next sample goes on with it. */
+    for (i = 0; i < LENGTH(NU); i++) {
+        none[i] = 0.0;
+    }
+    if (forecasted(state, u, is_missing ? none : variances, mean, deviation) != 0) {
         return 2;
     }
     for (i = 0; i < NY; i++) {
@@ -135,13 +143,13 @@ static int robust(const struct observer *state, const double *u, const double *y
         any = any || gone[i];
     }
     if (failed || any) {
-        if (watched(state, u, received, after, said) != 0) {
+        if (watched(state, u, variances, received, after, said) != 0) {
             /* A sample that nothing predicts, and with which there is no step. */
             for (i = 0; i < NY; i++) {
                 gone[i] = !isnan(y[i]);
                 received[i] = NAN;
             }
-            if (watched(state, u, received, after, said) != 0) {
+            if (watched(state, u, variances, received, after, said) != 0) {
                 return 2;
             }
         }
@@ -332,6 +340,9 @@ static void reset(struct observer *state)
     for (i = 0; i < NU; i++) {
         state->u[i] = 0.0;
     }
+    for (i = 0; i < 5 * NU; i++) {
+        state->inputs[i] = 0.0;
+    }
     for (i = 0; i < NY; i++) {
         state->in_a_row[i] = 0;
         state->left_out[i] = 0.0;
@@ -347,26 +358,38 @@ static void reset(struct observer *state)
 static int taken(const struct observer *state, const double *u, const double *y, double *received, struct observer *after,
                  double *said)
 {
+    double used[LENGTH(NU)];
+    double variances[LENGTH(NU)];
+    double history[5 * LENGTH(NU)];
 #if OUTLIERS
-    if (robust(state, u, y, received, after, said) != 0) {
+    int is_missing = 0;
+    int i;
+    for (i = 0; i < NU; i++) {
+        is_missing = is_missing || isnan(u[i]);
+    }
+#endif
+    take_inputs(state, u, used, variances, history);
+#if OUTLIERS
+    if (robust(state, used, variances, is_missing, y, received, after, said) != 0) {
         return 2;
     }
 #else
     copy(received, y, NY);
-    if (watched(state, u, y, after, said) != 0) {
+    if (watched(state, used, variances, y, after, said) != 0) {
         return 2;
     }
 #endif
 #if BOUNDS
     project_onto_bounds(after, said);
 #endif
-    copy(after->u, u, NU);
+    copy(after->u, used, NU);
+    copy(after->inputs, history, 5 * NU);
     after->k = state->k + 1;
     return 0;
 }
 
-/* Whether a sample can be taken: inputs are finite, and outputs finite or missing. */
-static int is_sample(const double *u, const double *y)
+/* Whether sample k can be taken: inputs and outputs are finite or missing, but for inputs of the first one. */
+static int is_sample(long k, const double *u, const double *y)
 {
     int i;
     for (i = 0; i < NY; i++) {
@@ -374,7 +397,12 @@ static int is_sample(const double *u, const double *y)
             return 0;
         }
     }
-    return all_finite(u, NU);
+    for (i = 0; i < NU; i++) {
+        if (isinf(u[i]) || (k == 0 && isnan(u[i]))) {
+            return 0;
+        }
+    }
+    return 1;
 }
 
 #if WAITS
@@ -398,7 +426,7 @@ static int advance(struct waiting *state, const double *u, const double *y, doub
     int earliest = kept;
     int dropped = kept + 1 > LATEST ? kept + 1 - LATEST : 0;
     int i, t;
-    if (!is_sample(u, y)) {
+    if (!is_sample(state->latest.k, u, y)) {
         return 1;
     }
     after.before[kept] = state->latest;
@@ -442,11 +470,11 @@ static const struct observer *latest_of(const struct observer *state)
     return state;
 }
 
-/* Take one sample: 0; 1 if an input is not finite or an output infinite; 2 if the step has no solution. */
+/* Take one sample: 0; 1 if a number is infinite, or an input of the first sample missing; 2 if the step has no solution. */
 static int advance(struct observer *state, const double *u, const double *y, double *received, double *said)
 {
     struct observer after;
-    if (!is_sample(u, y)) {
+    if (!is_sample(state->k, u, y)) {
         return 1;
     }
     if (taken(state, u, y, received, &after, said) != 0) {
