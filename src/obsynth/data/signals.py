@@ -20,20 +20,33 @@ from obsynth.numerics.arrays import FloatArray, read_only
 MISSING_TEXTS = frozenset({"", "nan", "na", "n/a", "null", "none"})
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _EXPECTED_TIMES = "seconds, such as 12.5, or a date and a time, such as 2026-05-01T08:30:00.5+02:00"
-#: Dates with points, which have the day first wherever they are written; slashes have no such rule.
-_POINTED = re.compile(r"(\d{1,2})\.(\d{1,2})\.(\d{4})(?:[ T]+(\d{1,2}:\d{2}\S*))?")
+#: Dates with points, which have the day first wherever they are written, and with slashes, which have no such rule but
+#: where the year is first.
+_POINTED = re.compile(r"(\d{1,2})\.(\d{1,2})\.(\d{4})(.*)")
+_SLASHED = re.compile(r"(\d{1,4})/(\d{1,2})/(\d{1,4})(.*)")
+#: A time of day, with AM or PM where the hours are counted to twelve.
+_CLOCK = re.compile(r"[ T]+(\d{1,2})(:\d{2}\S*?)(?:\s*([AaPp])\.?[Mm]\.?)?")
+_HALF_DAY = 12
+#: The part of a date that is larger is its day.
+_MONTHS = 12
+#: Seconds since 1970 reach this in the year 5138: larger numbers count parts of a second.
+_LARGEST_SECONDS = 1e11
+#: How many of them are in a second: milliseconds, microseconds, nanoseconds.
+_PARTS = (1e3, 1e6, 1e9)
 _MICROSECOND = timedelta(microseconds=1)
 #: Seconds in a nanosecond, a microsecond and a day; microseconds in a second.
 _NANO, _MICRO, _DAY_SECONDS, _MICROSECONDS = 1e-9, 1e-6, 86400.0, 1e6
 
 
-def _as_iso(cell: str) -> str:
-    """Return a date as ISO 8601 writes it; one with points, such as 5.3.2026 08:30:00,5, has the day first."""
-    found = _POINTED.fullmatch(cell)
+def _clock(text: str) -> str:
+    """Return a time of day, with what stands before it, as ISO 8601 writes it; other texts as they are."""
+    found = _CLOCK.fullmatch(text)
     if found is None:
-        return cell
-    day, month, year, time = found.groups()
-    return f"{year}-{month:0>2}-{day:0>2}" + (f"T{time:0>{len(time) + (time[1] == ':')}}" if time else "")
+        return text
+    hour, rest, half = int(found.group(1)), found.group(2), (found.group(3) or "").lower()
+    if half and not 1 <= hour <= _HALF_DAY:
+        return text
+    return f"T{hour % _HALF_DAY + _HALF_DAY * (half == 'p') if half else hour:02}{rest}"
 
 
 class Stamps:
@@ -42,6 +55,8 @@ class Stamps:
     def __init__(self) -> None:
         self.is_dated: bool | None = None
         self.zone: tzinfo | None = None  # of the first stamp, `None` where it names none (taken as UTC)
+        self.day_first: bool | None = None  # of dates with slashes, by the first one
+        self.per_second: float | None = None  # how many of the numbers of the log are a second, by the first one
         #: Rows and texts of cells that hold a word instead of a number, by column: they count as missing.
         self.words: dict[str, list[tuple[int, str]]] = {}
         #: Inputs ``(delay, nu)`` of the latest rows, where inputs act later than they are written.
@@ -67,10 +82,10 @@ class Stamps:
                 seconds = None
             if seconds is not None:
                 self.is_dated = False
-                return seconds
+                return float(self.seconds(np.array([seconds]))[0])
         if self.is_dated is not False:
             try:
-                found = datetime.fromisoformat(_as_iso(cell))
+                found = datetime.fromisoformat(self._as_iso(cell, row, column))
             except ValueError:
                 found = None
             if found is not None:
@@ -78,6 +93,40 @@ class Stamps:
         raise SpecError(
             f"Row {row}, column {column!r}: {text!r} is no time stamp: {self._expected()}.", path=f"row {row}"
         )
+
+    def seconds(self, numbers: FloatArray) -> FloatArray:
+        """Return seconds from stamps that are numbers ``(rows,)``: those too large for seconds since 1970 count parts
+        of one."""
+        known = np.abs(numbers[np.isfinite(numbers)])
+        if self.per_second is None and known.size:
+            first = float(known[0])
+            self.per_second = 1.0
+            if _LARGEST_SECONDS <= first < _LARGEST_SECONDS * _PARTS[-1]:
+                self.per_second = next(parts for parts in _PARTS if first < _LARGEST_SECONDS * parts)
+        return numbers if self.per_second in (None, 1.0) else np.asarray(numbers / self.per_second)
+
+    def _as_iso(self, cell: str, row: int, column: str) -> str:
+        """Return a date as ISO 8601 writes it: one with points, such as 5.3.2026 08:30:00,5, has the day first; of one
+        with slashes the first of the log must say what its parts are."""
+        pointed, slashed = _POINTED.fullmatch(cell), _SLASHED.fullmatch(cell)
+        if pointed is not None:
+            day, month, year, time = pointed.groups()
+        elif slashed is not None and len(slashed.group(1)) > 2:
+            year, month, day, time = slashed.groups()
+        elif slashed is not None:
+            one, two, year, time = slashed.groups()
+            if self.day_first is None and max(int(one), int(two)) > _MONTHS:
+                self.day_first = int(one) > _MONTHS
+            if self.day_first is None and one != two:
+                raise SpecError(
+                    f"Row {row}, column {column!r}: {cell!r} may have the day first or the month: write dates with "
+                    f"the year first, such as {year}-12-31.",
+                    path=f"row {row}",
+                )
+            day, month = (one, two) if self.day_first else (two, one)
+        else:
+            return cell[:10] + _clock(cell[10:])
+        return f"{year}-{month:0>2}-{day:0>2}{_clock(time)}"
 
     def read_column(self, column: Any) -> FloatArray | None:
         """Return the seconds of a column of a data frame that holds dates; `None` where it holds none."""

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, TextIO, TypeAlias
 import numpy as np
 
 from obsynth.data.signals import TIME_HEADER, Signals, Stamps
-from obsynth.data.text_logs import Dialect, stream_rows, text_chunks
+from obsynth.data.text_logs import Dialect, no_text, stream_rows, text_chunks
 from obsynth.errors import SpecError
 from obsynth.files.inputs import input_file
 from obsynth.numerics.arguments import require_kind
@@ -143,7 +143,7 @@ def _readable(path: Path) -> Iterator[None]:
     except SpecError:
         raise
     except UnicodeDecodeError as error:
-        raise SpecError(f"{path} is no UTF-8 text (byte {error.start}).", path=str(path)) from error
+        raise no_text(path, error) from error
     except OSError as error:
         raise SpecError(f"{path} cannot be read: {error.strerror or error}.", path=str(path)) from error
     except (ValueError, KeyError, IndexError, AttributeError, Warning) as error:
@@ -266,7 +266,7 @@ def _times(column: pd.Series, done: int, stamps: Stamps) -> FloatArray:
         return found
     if pd.api.types.is_numeric_dtype(column):
         stamps.is_dated = False
-        return _numbers(column, done)
+        return stamps.seconds(_numbers(column, done))
     texts = ["" if pd.isna(cell) else str(cell) for cell in column]
     return np.array([stamps.read(text, done + i + 1, str(column.name)) for i, text in enumerate(texts)])
 

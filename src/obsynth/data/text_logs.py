@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import csv
 import itertools
 import math
@@ -64,9 +65,21 @@ class Dialect:
             ) from None
 
 
+def encoding_of(path: Path) -> str:
+    """Return the encoding of a text: UTF-8 but where its first bytes say UTF-16, as Windows writes it."""
+    with path.open("rb") as stream:
+        return "utf-16" if stream.read(2) in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE) else "utf-8-sig"
+
+
+def no_text(path: Path, error: UnicodeDecodeError) -> SpecError:
+    """Return what is told of a file whose bytes are no text."""
+    name = "UTF-16" if error.encoding.startswith("utf-16") else "UTF-8"
+    return SpecError(f"{path} is no {name} text (byte {error.start}).", path=str(path))
+
+
 def text_chunks(path: Path, signals: Signals, stamps: Stamps, rows: int) -> Iterator[FloatArray]:
     """Yield ``(rows, 1 + nu + ny)`` of a file."""
-    with path.open(encoding="utf-8-sig", newline="") as stream:
+    with path.open(encoding=encoding_of(path), newline="") as stream:
         if not stream.readline():
             raise SpecError(f"{path} cannot be read: it is empty.", path=str(path))
         stream.seek(0)
@@ -105,10 +118,10 @@ def stream_rows(stream: TextIO, signals: Signals, stamps: Stamps) -> Iterator[Fl
 def header_of(path: Path, wanted: Sequence[str]) -> list[str]:
     """Return the names of the columns of a file, of which some are wanted."""
     try:
-        with path.open(encoding="utf-8-sig", newline="") as stream:
+        with path.open(encoding=encoding_of(path), newline="") as stream:
             return list(_opened(stream, wanted)[0])
     except UnicodeDecodeError as error:
-        raise SpecError(f"{path} is no UTF-8 text (byte {error.start}).", path=str(path)) from error
+        raise no_text(path, error) from error
     except OSError as error:
         raise SpecError(f"{path} cannot be read: {error.strerror or error}.", path=str(path)) from error
 
@@ -168,7 +181,7 @@ def _text_lines(stream: TextIO) -> Iterator[str]:
             block = stream.readline()
         except UnicodeDecodeError as error:
             name = getattr(stream, "name", "The data")
-            raise SpecError(f"{name} is no UTF-8 text after line {count}.", path="data") from error
+            raise SpecError(f"{name} is no text of its encoding after line {count}.", path="data") from error
         if not block:
             return
         for line in _OLD_LINES.findall(block):
