@@ -156,6 +156,17 @@ def test_a_constant_is_told_where_it_should_be() -> None:
     assert any(text.startswith("a constant k near 2 instead of 1") for text in found)
 
 
+def test_a_constant_is_told_by_a_run_with_it_and_not_by_what_its_slope_foretells() -> None:
+    """The slope at 1 asks for 2; with 2 the innovations are nearly what they were, so that nothing is explained."""
+    rng = np.random.default_rng(1)
+    x, noise = rng.standard_normal(80), 0.01 * rng.standard_normal(80)
+    inputs = {"constants": {"k": 1.0}, "with_constant": lambda _, k: (x * max(2.0 - k, 0.999) + noise)[:, None]}
+    assert not any("constant k" in text for text in explained(x + noise, **inputs))
+    # Nor where the plant has no solution there.
+    nowhere = lambda _, k: (x * (2.0 - k) + noise if k < 1.5 else np.full(80, np.nan))[:, None]  # noqa: E731
+    assert not any("constant k" in text for text in explained(x + noise, constants={"k": 1.0}, with_constant=nowhere))
+
+
 def test_a_regressor_counts_beside_others() -> None:
     rng = np.random.default_rng(2)
     x, y = rng.standard_normal(50), rng.standard_normal(50)

@@ -10,6 +10,7 @@ import pytest
 import obsynth
 from obsynth.cli.main import main
 from obsynth.errors import SpecError
+from obsynth.plants.validation import index_of
 from obsynth.report.page import value_text
 
 PLANT = {
@@ -93,3 +94,10 @@ def test_every_wrong_name_and_shape_of_a_plant_is_told_at_once():
     assert any("'x11'" in text and "Did you mean 'x1'" in text for text in told)
     assert any("'x22'" in text and "Did you mean 'x2'" in text for text in told)
     assert len(told) == 6
+
+
+def test_a_name_that_is_like_no_other_is_told_what_there_is() -> None:
+    with pytest.raises(SpecError, match=r"Q has no signal named 'Tc'\. There are: coil, zone\."):
+        index_of("Tc", ["coil", "zone"], what="Q")
+    with pytest.raises(SpecError, match=r"Q has no signal named 'cool'\. Did you mean 'coil'\?"):
+        index_of("cool", ["coil", "zone"], what="Q")

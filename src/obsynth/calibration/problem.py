@@ -123,7 +123,7 @@ def calibration_problem(
     low, high = _bounds(unknown, values)
     equations = tuple(plant.equation_names if noisy is None else noisy)
     for name in equations:
-        index_of(name, plant.equation_names, what="noisy")
+        index_of(name, plant.equation_names, what="noisy (the equations that Q names)")
     means, weights = _priors(priors, names, values)
     known_Q = _variances(Q, equations, "Q")
     known_R = _variances(R, log.output_names, "R")

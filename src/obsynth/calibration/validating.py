@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -28,7 +28,7 @@ from obsynth.calibration.reporting import IntegrationError, integration_error
 from obsynth.calibration.simulation_error import Fit
 from obsynth.calibration.step_graphs import sample_graphs
 from obsynth.calibration.walks import likeliest_shares, shared_walk, stated_walk, told_shares, with_walk
-from obsynth.errors import PreconditionError, SpecError
+from obsynth.errors import PreconditionError, SolverError, SpecError
 from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.observers.dae.observer import DAEObserver
@@ -210,6 +210,7 @@ def validate(
     rows: str | slice | Sequence[int] | None = None,
     columns: Mapping[str, str] | None = None,
     scales: Mapping[str, float] | None = None,
+    progress: Callable[[str], object] | None = None,
 ) -> Validation:
     """Test whether a log without faults agrees with a design.
 
@@ -225,6 +226,8 @@ def validate(
         Column of a signal, or of ``time``, where the names differ.
     scales : mapping of str to float, optional
         What a column is multiplied by; those of the plant by default.
+    progress : callable, optional
+        Called with a text at each stage.
 
     Returns
     -------
@@ -239,16 +242,18 @@ def validate(
     SolverError
         A step of a nonlinear plant has no solution along the log.
     """
+    note = progress or (lambda text: None)
     found = _usable_log(design, log, rows=rows, columns=columns, scales=scales)
+    note(f"innovations of {found.samples} rows")
     estimates = recorded_innovations(design, found).estimates
-    design, told = _as_far_as_it_walks(design, found)
+    design, told = _as_far_as_it_walks(design, found, note)
     far_off, near = _far(estimates, design, found.samples)
     record = replace(recorded_innovations(design, found), estimates=estimates)
     sensors = _sensors(record, design.plant.output_names)
     whole, white = consistency(record.squares, record.degrees), _white(sensors)
     place = change_of_mean(record.standardised if white else whitened(record.standardised))
     change = None if place is None else found.rows[0] + place
-    ratios, others = _contradicted(design, found, record, sensors, whole)
+    ratios, others = _contradicted(design, found, record, sensors, whole, note)
     sentences = _sentences(sensors, ratios, change, far_off, coloured=others is not None)
     if others is not None:
         sentences.append(_explained(others))
@@ -319,19 +324,22 @@ def _contradicted(
     record: RecordedInnovations,
     sensors: Mapping[str, SensorValidation],
     whole: Consistency,
+    note: Callable[[str], object],
 ) -> tuple[Mapping[str, float], tuple[Explanation, ...] | None]:
     """Return the variances that a log contradicts, and what explains innovations that these leave coloured; ``None``
     where they are white, as the design states its variances or with the likeliest ones."""
     white, observer = _white(sensors), design.observer
     # What a gate leaves out is no sample of the stated noise.
     passed_by_gate = replace(log, y=read_only(np.where(np.isfinite(record.innovations), log.y, np.nan)))
+    if isinstance(observer, DAEObserver):
+        note("variances that the log makes likeliest")
     said = noise_ratios(observer, passed_by_gate) if isinstance(observer, DAEObserver) else None
     # A variance that moves no innovation out of what is expected is no reason to change a design.
     agree = whole.holds and white and all(item.nis.holds for item in sensors.values())
     ratios: Mapping[str, float] = {} if said is None or agree else said[0]
     if white:
         return ratios, None
-    others = _explanations(design, log, record)
+    others = _explanations(design, log, record, note)
     if said is None or not ratios or not isinstance(observer, DAEObserver):
         return ratios, others
     # Wrong variances colour the innovations too: with the likeliest ones they are white, and nothing explains more.
@@ -343,7 +351,9 @@ def _contradicted(
     return ratios, None
 
 
-def _as_far_as_it_walks(design: ObserverDesign, log: Log) -> tuple[ObserverDesign, list[str]]:
+def _as_far_as_it_walks(
+    design: ObserverDesign, log: Log, note: Callable[[str], object]
+) -> tuple[ObserverDesign, list[str]]:
     """Return the design with as much of the walk of its parameters as the log shows, and what is said of that."""
     observer = design.observer
     walk = stated_walk(observer)
@@ -353,6 +363,7 @@ def _as_far_as_it_walks(design: ObserverDesign, log: Log) -> tuple[ObserverDesig
     def with_another(tried: FloatArray) -> ObserverDesign:
         return design.replace(observer=with_walk(observer, tried))
 
+    note("how far parameters walk in this log")
     shares = likeliest_shares(walk, lambda tried: recorded_innovations(with_another(tried), log).loss)
     return with_another(shared_walk(walk, shares)), told_shares(design.observer.fault_names, walk, shares)
 
@@ -422,16 +433,22 @@ def _with_variances(observer: DAEObserver, ratios: Mapping[str, float], walk: Fl
     return replace(observer, Q=Q, R=R, random_walk=walk)
 
 
-def _explanations(design: ObserverDesign, log: Log, record: RecordedInnovations) -> tuple[Explanation, ...]:
+def _explanations(
+    design: ObserverDesign, log: Log, record: RecordedInnovations, note: Callable[[str], object]
+) -> tuple[Explanation, ...]:
     """Return what explains innovations that are not white, other than the variances."""
     observer, constants = design.observer, dict[str, float]()
     if isinstance(observer, DAEObserver):
         constants = {name: float(value) for name, value in observer.model.constants.items()}
 
     def with_constant(name: str, value: float) -> FloatArray:
+        note(f"innovations with another value of {name}")
         nonlinear: Any = observer  # no other observer has constants
         model = nonlinear.model.replace(constants={**nonlinear.model.constants, name: value})
-        found = recorded_innovations(design.replace(observer=replace(nonlinear, model=model)), log)
+        try:
+            found = recorded_innovations(design.replace(observer=replace(nonlinear, model=model)), log)
+        except SolverError:
+            return np.full(record.innovations.shape, np.nan)
         return np.asarray(found.innovations / record.deviations)
 
     return explanations(

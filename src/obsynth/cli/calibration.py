@@ -185,6 +185,8 @@ def run_validate(options: argparse.Namespace) -> int:
     protect(options.data)
     with progress(quiet=options.quiet) as report_stage:
         report_stage(f"running {options.gains} over {options.data}")
-        found = validate(with_input_delay(design, options), options.data, **_log_arguments(options))
+        found = validate(
+            with_input_delay(design, options), options.data, progress=report_stage, **_log_arguments(options)
+        )
     answer(options, {"gains": options.gains, "data": options.data, **found.to_dict()}, str(found))
     return 0 if found.passed else VerificationError.exit_code

@@ -44,10 +44,11 @@ def checked_names(names: Sequence[str] | None, count: int, *, prefix: str, what:
 
 
 def index_of(name: str, names: Sequence[str], *, what: str) -> int:
-    """Return the position of ``name``; the error suggests the closest names."""
+    """Return the position of ``name``; the error suggests the closest names, or lists what there is."""
     if name in names:
         return list(names).index(name)
-    raise SpecError(f"{what} has no signal named {name!r}.{suggestion(name, names)}", path=what)
+    near = suggestion(name, names) or (f" There are: {listed(names)}." if names else " There are none.")
+    raise SpecError(f"{what} has no signal named {name!r}.{near}", path=what)
 
 
 def listed(texts: Sequence[str], *, most: int = 6) -> str:
