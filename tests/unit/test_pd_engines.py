@@ -12,10 +12,10 @@ import scipy.linalg
 import obsynth
 from obsynth.methods.pd_observer import synthesis
 from obsynth.methods.pd_observer.checks.certificate import prove_gains
-from obsynth.methods.pd_observer.closed_form import closed_form
 from obsynth.methods.pd_observer.inequalities import PdTask
 from obsynth.methods.pd_observer.method import MOST_STATES_FOR_LMI, PdObserver
 from obsynth.methods.pd_observer.realisation import with_faults_as_states
+from obsynth.methods.pd_observer.synthesis import closed_form
 from obsynth.spec import load_spec
 
 PLANT = load_spec(Path(__file__).parents[2] / "designs" / "filasova" / "spec.yaml").plant

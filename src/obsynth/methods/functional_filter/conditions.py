@@ -16,7 +16,8 @@ from obsynth.analysis.existence.distance import ROUNDING_LEVEL
 from obsynth.analysis.existence.named_pencils import NamedPencil
 from obsynth.analysis.existence.numbers import COMPUTED_STATES
 from obsynth.analysis.existence.statements import Evaluator, FullRank
-from obsynth.methods.functional_filter.wanted_faults import chosen_faults, residual_sets
+from obsynth.errors import SpecError
+from obsynth.methods.method import OPTIONS_PATH
 from obsynth.numerics.arrays import remembered
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.fault_models import Exosystem, exosystem
@@ -160,3 +161,36 @@ def _hidden(plant: DescriptorSystem, asked: Question, point: complex) -> str:
 
 def _place(point: complex) -> str:
     return f"{point.real:.4g}{f'{point.imag:+.4g}j' if point.imag else ''}"
+
+
+def chosen_faults(faults: Any, plant: DescriptorSystem) -> list[int]:
+    """Return the columns of the faults to estimate."""
+    names = plant.fault_names if faults is None else faults
+    listed = [names] if isinstance(names, str) else list(names)
+    unknown = [name for name in listed if name not in plant.fault_names]
+    if unknown or len(set(listed)) < len(listed):
+        what = f"{', '.join(map(repr, unknown))}: no such fault" if unknown else "a fault is named twice"
+        there = ", ".join(plant.fault_names) or "none"
+        raise SpecError(f"{what}; there are: {there}.", path=f"{OPTIONS_PATH}.faults")
+    return sorted(plant.fault_names.index(name) for name in listed)
+
+
+def residual_sets(residuals: Any, plant: DescriptorSystem) -> list[list[int]] | None:
+    """Return the sets of faults that residuals are to see; ``None`` where estimates are asked for."""
+    if residuals is None:
+        return None
+    everything = list(range(plant.nf))
+    if residuals == "detect":
+        return [everything]
+    if residuals == "isolate":
+        return [[i] for i in everything]
+    given = [residuals] if isinstance(residuals, str) else list(residuals)
+    sets = [[entry] if isinstance(entry, str) else list(entry) for entry in given]
+    unknown = sorted({str(name) for entry in sets for name in entry if name not in plant.fault_names})
+    if unknown or not all(sets):
+        raise SpecError(
+            f"residuals is {residuals!r}: give detect, isolate, or lists of faults to see; there are: "
+            f"{', '.join(plant.fault_names) or 'none'}.",
+            path=f"{OPTIONS_PATH}.residuals",
+        )
+    return [sorted(plant.fault_names.index(name) for name in entry) for entry in sets]

@@ -20,6 +20,7 @@ import numpy as np
 from scipy.linalg import block_diag, schur
 
 from obsynth.errors import SpecError
+from obsynth.methods.functional_filter.conditions import chosen_faults, residual_sets
 from obsynth.methods.functional_filter.kalman_gain import (
     FilterModel,
     KalmanGain,
@@ -32,7 +33,6 @@ from obsynth.methods.functional_filter.kalman_gain import (
 from obsynth.methods.functional_filter.method import FunctionalFilter
 from obsynth.methods.functional_filter.rates import default_rates, settling_time
 from obsynth.methods.functional_filter.tracking import estimate_deviations, tracking_map
-from obsynth.methods.functional_filter.wanted_faults import chosen_faults, residual_sets
 from obsynth.methods.method import Synthesis
 from obsynth.methods.placement.eigenstructure import checked_poles, place
 from obsynth.methods.refusals import require_all_told
@@ -53,17 +53,12 @@ FAR_FROM_NORMAL = 1e3
 
 
 @dataclass(frozen=True, eq=False)
-class Dynamics:
-    """``z+ = A z + B v`` with v = [u; y], and T ``(nz, nx)``."""
-
-    A: FloatArray
-    B: FloatArray
-    T: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
 class Rows:
-    """``C z + D v``, and T0 ``(rows, nx)``; C may have fewer columns than there are states: the first ones."""
+    """``C z + D v`` with v = [u; y], and what these rows are of the plant's equations, T0 ``(rows, nx)``.
+
+    C may have fewer columns than there are states: the first ones.  The dynamics of a filter are rows as well, those of
+    the next state: C is A, D is B, and T0 is T.
+    """
 
     C: FloatArray
     D: FloatArray
@@ -91,7 +86,7 @@ class Rows:
 class FilterPart:
     """A filter for some faults: its dynamics, rows that estimate them, and residuals; ``delay`` in samples."""
 
-    dynamics: Dynamics
+    dynamics: Rows
     estimates: Rows
     residuals: Rows
     faults: tuple[int, ...]
@@ -104,11 +99,11 @@ def filter_part(model: FilterModel, gain: KalmanGain, shown: FloatArray, *, dela
     gain = replace(gain, K=_told(gain.K, sizes), lag=tuple(_told(part, sizes) for part in gain.lag))
     shown = _told(shown, sizes)
     parts = (model.A, -model.C), (model.B, model.L), (model.T, model.T0)
-    dynamics = Dynamics(*(_sum_but_rounding(own, gain.K, fed_back) for own, fed_back in parts))
+    dynamics = Rows(*(_sum_but_rounding(own, gain.K, fed_back) for own, fed_back in parts))
     innovation = Rows(-model.C, model.L, model.T0)
     count, nx = len(model.estimate), model.T.shape[1]
     row = Rows(model.estimate, np.zeros((count, model.L.shape[1])), np.zeros((count, nx)))
-    coordinates = _plain_coordinates(dynamics.A)
+    coordinates = _plain_coordinates(dynamics.C)
     if coordinates is not None:
         dynamics = _rounded_once(model, gain, coordinates)
         innovation, row = (Rows(r.C @ coordinates, r.D, r.T0) for r in (innovation, row))
@@ -153,7 +148,7 @@ def _plain_coordinates(a: FloatArray) -> FloatArray | None:
     return np.asarray(turn * balanced_matrix(triangular)[1])
 
 
-def _rounded_once(model: FilterModel, gain: KalmanGain, coordinates: FloatArray) -> Dynamics:
+def _rounded_once(model: FilterModel, gain: KalmanGain, coordinates: FloatArray) -> Rows:
     """Return the dynamics in other coordinates; with digits to spare, for the small rows of entries that cancel."""
     import flint
 
@@ -162,16 +157,16 @@ def _rounded_once(model: FilterModel, gain: KalmanGain, coordinates: FloatArray)
         back = there.inv()
         parts = ((model.A, -model.C), (model.B, model.L), (model.T, model.T0))
         a, b, t = (back * (arb_matrix(own) + k * arb_matrix(fed_back)) for own, fed_back in parts)
-        return Dynamics(*(as_ball(part).midpoint for part in (a * there, b, t)))
+        return Rows(*(as_ball(part).midpoint for part in (a * there, b, t)))
 
 
-def _registered(dynamics: Dynamics, row: Rows) -> tuple[Dynamics, Rows]:
+def _registered(dynamics: Rows, row: Rows) -> tuple[Rows, Rows]:
     """Return the dynamics with states that hold the last value of ``row``, and the rows that read them."""
-    order, count = len(dynamics.A), len(row.C)
-    more = Dynamics(
-        np.block([[dynamics.A, np.zeros((order, count))], [row.of_order(order), np.zeros((count, count))]]),
-        np.vstack([dynamics.B, row.D]),
-        np.vstack([dynamics.T, row.T0]),
+    order, count = len(dynamics.C), len(row.C)
+    more = Rows(
+        np.block([[dynamics.C, np.zeros((order, count))], [row.of_order(order), np.zeros((count, count))]]),
+        np.vstack([dynamics.D, row.D]),
+        np.vstack([dynamics.T0, row.T0]),
     )
     read = np.hstack([np.zeros((count, order)), np.eye(count)])
     return more, Rows(read, np.zeros_like(row.D), np.zeros_like(row.T0))
@@ -182,11 +177,11 @@ def assembled(
 ) -> tuple[LinearObserver, FloatArray, FloatArray]:
     """Return the observer of several filters side by side, with T ``(nz, nx)`` and T0 ``(rows, nx)``."""
     nu, nx = plant.nu, plant.nx
-    a = block_diag(*(part.dynamics.A for part in parts)) if parts else np.zeros((0, 0))
-    b = _stacked([part.dynamics.B for part in parts], nu + plant.ny)
+    a = block_diag(*(part.dynamics.C for part in parts)) if parts else np.zeros((0, 0))
+    b = _stacked([part.dynamics.D for part in parts], nu + plant.ny)
     faults = [(fault, part.delay) for part in parts for fault in part.faults if len(part.estimates.C)]
     rows = sorted(range(len(faults)), key=lambda i: faults[i][0])
-    orders = [len(part.dynamics.A) for part in parts]
+    orders = [len(part.dynamics.C) for part in parts]
     estimate = _side_by_side([part.estimates for part in parts], orders, nu + plant.ny, nx)
     residual = _side_by_side([part.residuals for part in parts], orders, nu + plant.ny, nx)
     cz, d, t0 = (
@@ -209,7 +204,7 @@ def assembled(
         state_delays=(),
         fault_delays=tuple(faults[i][1] for i in rows),
     )
-    return observer, _stacked([part.dynamics.T for part in parts], nx), t0
+    return observer, _stacked([part.dynamics.T0 for part in parts], nx), t0
 
 
 def _side_by_side(found: Sequence[Rows], orders: Sequence[int], inputs: int, nx: int) -> Rows:

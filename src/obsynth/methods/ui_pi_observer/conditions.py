@@ -85,13 +85,12 @@ def model_conditions(judge: Evaluator, model: Exosystem) -> list[Condition]:
     found = []
     for value in sorted(unstable, key=lambda value: (value.real, value.imag)):
         lost = exact_loss(judge, model, units.eigenvalue(value))
-        pencil = _ModelPencil.of(plant, scaled_model, value, sizes)
-        decision = pencil.decision(lost)
+        decision = _model_rank(plant, scaled_model, value, lost, sizes)
         if lost is None and not decision.full:
             # Of a plant of many parts its own units drift apart; rounding is as small in those that were given.
-            as_given = _ModelPencil.of(judge.plant, model, units.eigenvalue(value), None).decision(None)
+            as_given = _model_rank(judge.plant, model, units.eigenvalue(value), None)
             decision = max(decision, as_given, key=lambda found: found.rank)
-        condition = _model_condition(pencil, decision, plant, value, units)
+        condition = _model_condition(scaled_model, decision, plant, value, units)
         if decision.means == "unclear":
             point = units.eigenvalue(value)
             other = f"hides a fault that follows its model at {number(point)}, and no observer estimates it"
@@ -103,33 +102,30 @@ def model_conditions(judge: Evaluator, model: Exosystem) -> list[Condition]:
     return found
 
 
-@dataclass(frozen=True, eq=False)
-class _ModelPencil:
-    """The matrix of (D3) at one eigenvalue, scaled, with what its columns stand for."""
+def _model_matrix(plant: DescriptorSystem, courses: NDArray[Any], value: complex) -> NDArray[Any]:
+    """Return the matrix of (D3) at an eigenvalue; ``courses``: of the faults along its eigenvectors ``(nf, any)``."""
+    inputs, direct = independent_disturbances(plant)
+    return np.block(
+        [
+            [value * plant.E - plant.A, -plant.Bf @ courses, -inputs],
+            [plant.C.astype(complex), plant.Df @ courses, direct],
+        ]
+    )
 
-    scaled: NDArray[Any]
-    columns: FloatArray
-    courses: NDArray[Any]
-    inputs: FloatArray
-    direct: FloatArray
-    share: float = np.inf
 
-    @classmethod
-    def of(
-        cls, plant: DescriptorSystem, model: Exosystem, value: complex, sizes: DescriptorSystem | None
-    ) -> _ModelPencil:
-        """Return the matrix; ``sizes`` of the terms that the entries of the plant are sums of."""
-        inputs, direct = independent_disturbances(plant)
-        courses = model.Cw @ kernel(model.Phi - value * np.eye(model.order))
-        matrix = np.block(
-            [
-                [value * plant.E - plant.A, -plant.Bf @ courses, -inputs],
-                [plant.C.astype(complex), plant.Df @ courses, direct],
-            ]
-        )
-        if sizes is None:
-            return cls(*equilibrated(matrix), courses, inputs, direct)
+def _courses(model: Exosystem, value: complex) -> NDArray[Any]:
+    return np.asarray(model.Cw @ kernel(model.Phi - value * np.eye(model.order)))
+
+
+def _model_rank(
+    plant: DescriptorSystem, model: Exosystem, value: complex, lost: int | None, sizes: DescriptorSystem | None = None
+) -> RankDecision:
+    """Decide (D3); ``sizes`` of the terms that the entries of the plant are sums of."""
+    courses, share = _courses(model, value), np.inf
+    matrix = _model_matrix(plant, courses, value)
+    if sizes is not None:
         # Disturbances that are combinations of others are judged as those: their own terms are not known.
+        inputs, direct = independent_disturbances(plant)
         own = inputs.shape == plant.Bd.shape
         whole = np.block(
             [
@@ -137,27 +133,26 @@ class _ModelPencil:
                 [sizes.C, sizes.Df @ np.abs(courses), sizes.Dd if own else np.abs(direct)],
             ]
         )
-        return cls(*equilibrated(matrix), courses, inputs, direct, least_share(matrix, whole))
-
-    def decision(self, lost: int | None) -> RankDecision:
-        width = self.scaled.shape[1]
-        found = decide_rank(self.scaled, expected=width, equilibrated=False)
-        return settled_rank(found, None if lost is None else width - lost, self.share)
+        share = least_share(matrix, whole)
+    width = matrix.shape[1]
+    found = decide_rank(equilibrated(matrix)[0], expected=width, equilibrated=False)
+    return settled_rank(found, None if lost is None else width - lost, share)
 
 
 def _model_condition(
-    pencil: _ModelPencil, decision: RankDecision, plant: DescriptorSystem, value: complex, units: PlantUnits
+    model: Exosystem, decision: RankDecision, plant: DescriptorSystem, value: complex, units: PlantUnits
 ) -> Condition:
-    scaled, columns, courses = pencil.scaled, pencil.columns, pencil.courses
-    inputs, direct, width = pencil.inputs, pencil.direct, courses.shape[1]
     own = units.eigenvalue(value)
     where = f"{'s' if plant.dt == 0.0 else 'z'} = {number(own)}"
     signals: tuple[str, ...] = ()
     detail = decision.describe()
     if not decision.full:
+        courses = _courses(model, value)
+        width = courses.shape[1]
+        scaled, columns = equilibrated(_model_matrix(plant, courses, value))
         direction = columns * np.linalg.svd(scaled)[2][-1].conj()
         faults = leading_names(np.abs(courses @ direction[plant.nx : plant.nx + width]), plant.fault_names)
-        shares = in_disturbances(plant, inputs, direct, direction[plant.nx + width :])
+        shares = in_disturbances(plant, *independent_disturbances(plant), direction[plant.nx + width :])
         disturbances = _masking(scaled, plant, width, shares)
         signals = (*faults, *disturbances)
         masked = f" is masked by the unknown input {', '.join(map(repr, disturbances))}" if disturbances else ""

@@ -23,7 +23,6 @@ from obsynth.verification.error_system import ErrorModel
 
 if TYPE_CHECKING:
     from obsynth.methods.placement.region import Region
-    from obsynth.methods.ui_pi_observer.placement_problem import NoiseWeights
 
 #: What to make of the freedom that poles leave.
 OBJECTIVES = ("conditioning", "gain")
@@ -181,12 +180,10 @@ class UiPiObserver(Method):
             )
         return Region.of({key: value for key, value in self.region.items() if value is not None}, dt)
 
-    def checked_noise(self, output_names: Sequence[str]) -> NoiseWeights:
-        """Return the noise weights asked for."""
-        from obsynth.methods.ui_pi_observer.placement_problem import NoiseWeights
-
+    def checked_noise(self, output_names: Sequence[str]) -> dict[str, Any]:
+        """Return the noise weights asked for, by name."""
         if self.noise is None:
-            return NoiseWeights()
+            return {}
         if not isinstance(self.noise, Mapping):
             message = f"noise is {self.noise!r}: give measurement, process, fault by name."
             raise SpecError(message, path=f"{OPTIONS_PATH}.noise")
@@ -213,7 +210,7 @@ class UiPiObserver(Method):
             problems.append("measurement must be positive standard deviations: one number, a list, or by output.")
         if problems:
             raise SpecError("Option noise of ui-pi-observer:", path=f"{OPTIONS_PATH}.noise", problems=problems)
-        return NoiseWeights(**given)
+        return given
 
     def slowest_asked(self, dt: float) -> float | None:
         """Return the least rate of decay that was asked for, in 1/s."""

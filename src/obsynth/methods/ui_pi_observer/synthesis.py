@@ -28,7 +28,6 @@ from obsynth.methods.ui_pi_observer.conditions import Existence, existence
 from obsynth.methods.ui_pi_observer.method import UiPiObserver
 from obsynth.methods.ui_pi_observer.pencils import number, numbers
 from obsynth.methods.ui_pi_observer.placement_problem import (
-    NoiseWeights,
     PlacementProblem,
     kalman_problem,
     placement_problem,
@@ -138,7 +137,7 @@ def _placed(problem: PlacementProblem, wanted: Sequence[complex], objective: str
 
 
 def _chosen(
-    asked: UiPiObserver, problem: PlacementProblem, region: Region | None, weights: NoiseWeights, dt: float
+    asked: UiPiObserver, problem: PlacementProblem, region: Region | None, weights: Mapping[str, Any], dt: float
 ) -> Choice:
     """Return a gain of the observable part, its poles where they were asked for, what is claimed of it, and records."""
     split, time = problem.split, problem.units.time

@@ -6,9 +6,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from obsynth.methods.functional_filter.conditions import conditions
+from obsynth.methods.functional_filter.conditions import conditions, residual_sets
 from obsynth.methods.functional_filter.tracking import estimate_deviations, wanted_faults
-from obsynth.methods.functional_filter.wanted_faults import residual_sets
 from obsynth.methods.ui_pi_observer.augmented_plant import shipped_model
 from obsynth.methods.ui_pi_observer.checks.decoupling import decoupling_norms
 from obsynth.numerics.arrays import FloatArray

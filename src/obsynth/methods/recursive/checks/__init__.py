@@ -1,42 +1,60 @@
 """Checks of a recursive observer: fit, a batch solution, proofs, excitation, and consistency by Monte Carlo.
 
 Source of the claims: Moussa Ali, Zhang 2013, (6), (13), (26) and Lemma 3.1; the residual directions are our finding.
+
+A batch solution is one least-squares problem over the first steps as a whole.  Of the listed gains it is proved, where
+plant and noise stay the same, that kept for ever they would make errors of mean zero which decay, and the covariance
+that they reach is enclosed: the filter's own, whose gains move on, ends at or below it.
 """
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Collection, Iterator, Mapping
+from dataclasses import replace
 
 import numpy as np
 
 from obsynth.analysis.time_varying import HorizonRanks, horizon_ranks
 from obsynth.errors import ObsynthError
-from obsynth.methods.recursive.checks.batch import BATCH_STEPS, batch_residuals, batch_steps
 from obsynth.methods.recursive.checks.horizon_proof import (
     HorizonProof,
     bias_row,
     covariance_row,
+    definite_by_its_noise,
     horizon_proof,
+    largest_bias,
+    natural_units,
+    noise_is_definite,
     parameter_row,
 )
-from obsynth.methods.recursive.checks.steady_state import steady_rows
 from obsynth.methods.recursive.conditions import SOURCE, recursive_conditions
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.least_squares_step import LeastSquaresStep, least_squares_step, rank_revealing_step
+from obsynth.numerics.norms import spectral_radius
+from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.observers.dae.observer import DAEObserver
-from obsynth.observers.recursive.gain_schedule import gains_once
+from obsynth.observers.recursive.gain_schedule import GainStep, gains_once
 from obsynth.observers.recursive.gain_schedule_summary import (
+    CLEARLY_STABLE,
     STEPS_TO_CONTRACT,
     GainScheduleSummary,
     gain_schedule_summary,
     looked_at,
 )
 from obsynth.observers.recursive.observer import RecursiveObserver, observer_from_options
+from obsynth.observers.recursive.step_model import EarlyConstraintSteps, StepMatrices
 from obsynth.observers.running import plain_recursion
 from obsynth.plants.sequences import MatrixSequence
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.plants.validation import listed
+from obsynth.proofs.balls import Ball, rounded_up
+from obsynth.proofs.contraction import Contraction, column_norms, prove_contraction, proved_rate
+from obsynth.proofs.definiteness import prove_positive_definite
 from obsynth.results.checks import Check, fitting_check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
-from obsynth.verification.consistency import consistency
+from obsynth.verification.consistency import consistency, data_deviations, state_terms
+from obsynth.verification.identities import EQUALITY_TOLERANCE
 from obsynth.verification.plant import condition_rows
 
 #: Claims may differ from what is recomputed by this much: they are the same numbers from another run.
@@ -308,3 +326,257 @@ def _different_matrix(
             if not np.array_equal(first.at(k), second.at(k)):
                 return f"{name}({k})"
     return ""
+
+
+#: Steps in the batch: enough for every matrix to matter, few enough for one dense problem.
+BATCH_STEPS = 6
+#: Of many states fewer: as many as keep the problem to this many rows, but two at least.
+MOST_BATCH_ROWS = 1500
+#: Seed of the record that both are given; the estimators are linear, so any record will do.
+RECORD_SEED = 2013
+
+
+def batch_steps(stated: RecursiveObserver) -> int:
+    """Return how many steps the size of a plant allows in one batch."""
+    rows = len(stated.recursion.model.at(0).H)
+    return min(BATCH_STEPS, looked_at(stated), max(2, (MOST_BATCH_ROWS - stated.plant.nx) // rows))
+
+
+def batch_residuals(stated: RecursiveObserver, shipped: RecursiveObserver) -> dict[str, float]:
+    """Return how far the shipped recursion is from the batch solution of the stated problem."""
+    steps = batch_steps(stated)
+    y, u = _record(stated, steps + 1)
+    running, reference = shipped.init(), stated.init()
+    for k in range(steps + 1):
+        before = reference.x, reference.factor, reference.Upsilon
+        running, _ = shipped.advance(running, y[k], u[k])
+        reference, _ = stated.advance(reference, y[k], u[k])
+    exact = _solved(stated, y, u)
+    made_of = _terms(stated.recursion.model.at(steps - 1), before, (y[-1], u[-2], u[-1]))
+    covariance = exact.factor @ exact.factor.T
+    size = made_of[:, 0] + np.abs(exact.estimate[:, 0]) + np.finfo(np.float64).tiny
+    found = running.factor @ running.factor.T
+    gaps = {
+        "state": np.abs(running.x - exact.estimate[:, 0]) / size,
+        "covariance": np.abs(found - covariance) / np.maximum(np.outer(size, size), np.finfo(np.float64).tiny),
+    }
+    if running.Upsilon.shape[1]:
+        regressor = exact.estimate[:, 1:]
+        sizes = np.linalg.norm(regressor, axis=0) + np.linalg.norm(made_of[:, 1:], axis=0) + np.finfo(np.float64).tiny
+        gaps["regressor"] = np.abs(running.Upsilon - regressor) / sizes
+    return {name: float(np.max(gap)) for name, gap in gaps.items()}
+
+
+def _terms(
+    step: StepMatrices, before: tuple[FloatArray, FloatArray, FloatArray], data: tuple[FloatArray, ...]
+) -> FloatArray:
+    """Return the terms of deviation and regressor ``(nx, 1 + nq)``: what tends to zero rounds as they do."""
+    (x, factor, upsilon), (y, u, after) = before, data
+    driven = np.abs(step.A) @ np.abs(x) + np.abs(step.B) @ np.abs(u)
+    values = np.concatenate([driven, np.abs(y), np.abs(step.Dn) @ np.abs(after)]) + data_deviations(step, factor)
+    nq = upsilon.shape[1]
+    regressors = np.vstack([np.abs(step.A) @ np.abs(upsilon) + np.abs(step.Phi[:, :nq]), np.abs(step.Psi[:, :nq])])
+    return state_terms(step, np.hstack([values[:, None], regressors]))
+
+
+def _record(observer: RecursiveObserver, samples: int) -> tuple[FloatArray, FloatArray]:
+    """Return a random record, changed as little as is needed where equations without noise would contradict it."""
+    from scipy.linalg import qr
+
+    plant, rng = observer.plant, np.random.default_rng(RECORD_SEED)
+    y, u = rng.standard_normal((samples, plant.ny)), rng.standard_normal((samples, plant.nu))
+    H, S, data = _problem(observer, y, u)
+    # Directions without noise, by two factorisations that cost a tenth of the singular values.
+    triangle = qr(np.hstack([H, S[:, S.any(axis=0)]]).T, mode="r")[0]
+    basis, kept, _ = qr(triangle[: len(H)].T, pivoting=True)
+    sizes = np.abs(np.diagonal(kept))
+    perfect = basis[:, int(np.sum(sizes > RANK_TOLERANCE * sizes[0])) :]
+    if not perfect.shape[1]:
+        return y, u
+    # The data are affine in the record: a column of the map is the difference that one sample makes.
+    zero = np.zeros(y.size + u.size)
+    none = _data(observer, *_split(zero, y, u))[:, 0]
+    unit = np.eye(zero.size)
+    effect = np.array([perfect.T @ (_data(observer, *_split(one, y, u))[:, 0] - none) for one in unit]).T
+    flat = np.concatenate([y.ravel(), u.ravel()])
+    return _split(flat - np.linalg.pinv(effect, rcond=RANK_TOLERANCE) @ (perfect.T @ data[:, 0]), y, u)
+
+
+def _split(flat: FloatArray, y: FloatArray, u: FloatArray) -> tuple[FloatArray, FloatArray]:
+    return flat[: y.size].reshape(y.shape), flat[y.size :].reshape(u.shape)
+
+
+def _solved(observer: RecursiveObserver, y: FloatArray, u: FloatArray) -> LeastSquaresStep:
+    """Return the last state of the solution over all states at once; further columns belong to the parameters."""
+    H, S, data = _problem(observer, y, u)
+    n = H.shape[1] // len(y)
+    found = least_squares_step(H, S, data) or rank_revealing_step(H, S, data, np.zeros((len(H), 0)))
+    return LeastSquaresStep(found.estimate[-n:], found.factor[-n:], found.innovation, found.diffuse[-n:])
+
+
+def _data(observer: RecursiveObserver, y: FloatArray, u: FloatArray) -> FloatArray:
+    """Return the data of `_problem`; further columns belong to the parameters."""
+    start, model = observer.init(), observer.recursion.model
+    n, nq = len(start.x), start.Upsilon.shape[1]
+    parts = [np.hstack([start.x[:, None], np.zeros((n, nq))])]
+    for k in range(len(y) - 1):
+        step = model.at(k)
+        values = np.concatenate([step.B @ u[k], y[k + 1], step.Dn @ u[k + 1]])
+        parts.append(np.hstack([values[:, None], np.vstack([step.Phi, -step.Psi])[:, :nq]]))
+    if isinstance(model, EarlyConstraintSteps):
+        first = model.first()
+        parts.append(np.hstack([(first.Dn @ u[0])[:, None], -first.Psi[:, :nq]]))
+    return np.vstack(parts)
+
+
+def _problem(observer: RecursiveObserver, y: FloatArray, u: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return H, S and data of ``data = H x + S e`` for all states at once."""
+    start, model, steps = observer.init(), observer.recursion.model, len(y) - 1
+    n, listed = len(start.x), [model.at(k) for k in range(steps)]
+    H = np.zeros((n + sum(len(step.H) for step in listed), n * (steps + 1)))
+    roots = [start.factor, *(step.noise for step in listed)]
+    H[:n, :n] = np.eye(n)
+    top = n
+    for k, step in enumerate(listed):
+        H[top : top + len(step.H), (k + 1) * n : (k + 2) * n] = step.H
+        H[top : top + len(step.A), k * n : (k + 1) * n] = -step.A
+        top += len(step.H)
+    if isinstance(model, EarlyConstraintSteps):
+        first, late = model.first(), len(model.rows)
+        H = np.vstack([H, np.hstack([first.H[n:], np.zeros((late, n * steps))])])
+        roots.append(first.noise[n:])
+    S = np.zeros((len(H), max(sum(root.shape[1] for root in roots), len(H))))
+    top = left = 0
+    for root in roots:
+        S[top : top + len(root), left : left + root.shape[1]] = root
+        top, left = top + len(root), left + root.shape[1]
+    return H, S, _data(observer, y, u)
+
+
+#: An enclosure of variances that is wider than this share of the filter's says nothing about definiteness.
+WIDEST = 0.1
+#: So many deviations are listed in a row.
+LISTED_DEVIATIONS = 6
+#: Both ends are told where the upper one is so many times the lower one.
+BOTH_ENDS = 1.001
+
+
+def steady_rows(
+    stated: RecursiveObserver, gains: Mapping[str, FloatArray], recomputed: GainStep, condition: float
+) -> Iterator[Check]:
+    """Yield the rows on the listed gains, were they kept for ever; of a plant and noise that stay the same."""
+    plant = stated.plant
+    if not (plant.is_time_invariant and stated.Q.is_constant and stated.R.is_constant) or stated.early_constraints:
+        return
+    E, A, C, ne = plant.E.at(1), plant.A.at(0), plant.C.at(1), plant.ne
+    L, K = gains.get("L", recomputed.gain[:, :ne]), gains.get("K", recomputed.gain[:, ne:])
+    if L.shape != (plant.nx, ne) or K.shape != (plant.nx, plant.ny):
+        return  # the row on the listed gains says so
+    step = StepMatrices(np.vstack([E, C]), A, *recomputed.step[2:])
+    listed = recomputed._replace(gain=np.hstack([L, K]))
+    yield upper_bound_check(
+        "steady state: unbiased",
+        "L E + K C = I for the listed gains",
+        largest_bias([(step, listed)], natural_units(stated)[: plant.nx]),
+        EQUALITY_TOLERANCE * condition,
+        source=f"{SOURCE}, (10)-(11)",
+        kind="proved",
+        detail="in units of its terms, outward rounded",
+    )
+    transition = Ball.exact(L) @ Ball.exact(A)
+    contraction = prove_contraction(transition, discrete=True)
+    claim = "errors decay with the listed gains, were they kept: modulus per step in a norm"
+    source = f"{SOURCE}, (13); Lyapunov inequality of L A"
+    if contraction is None:
+        radius = spectral_radius(transition.midpoint)
+        if spectral_radius(recomputed.gain[:, :ne] @ A) >= CLEARLY_STABLE:
+            yield information(
+                "steady state: contraction",
+                claim,
+                radius,
+                source=source,
+                detail="the gains of the last step make no steady filter (yet)",
+            )
+            return
+        yield upper_bound_check(
+            "steady state: contraction",
+            claim,
+            radius,
+            np.nextafter(1.0, 0.0),
+            source=source,
+            detail="eigenvalues computed: no inequality was proved",
+        )
+        return
+    rate = proved_rate(transition, contraction)
+    yield upper_bound_check(
+        "steady state: contraction",
+        claim,
+        np.nan if rate is None else rate,
+        np.nextafter(1.0, 0.0),
+        source=source,
+        kind="proved",
+        detail="outward rounded",
+    )
+    variances = np.einsum("ij,ij->i", recomputed.factor, recomputed.factor)[: plant.nx]
+    yield _steady_covariance(stated, transition, (L, K), contraction, variances)
+
+
+def _steady_covariance(
+    stated: RecursiveObserver,
+    transition: Ball,
+    gains: tuple[FloatArray, FloatArray],
+    contraction: Contraction,
+    variances: FloatArray,
+) -> Check:
+    """Return the row on the covariance that errors reach with kept gains; ``variances (nx,)`` after the last step.
+
+    Of X, with ``D = F X F' + L Q L' + K R K' - X``, the true one is ``X + sum F^j D F'^j``; the sum is at most
+    ``|Q D Q'| / (1 - rate^2)`` in the norm of the contraction.
+    """
+    from scipy.linalg import solve_discrete_lyapunov
+
+    claim = "covariance of the errors that the listed gains lead to, enclosed: positive definite"
+    L, K = (Ball.exact(part) for part in gains)
+    noise = L @ Ball.exact(stated.Q.at(0)) @ L.T + K @ Ball.exact(stated.R.at(0)) @ K.T
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the enclosure says what an ill-conditioned equation costs
+        found = np.asarray(solve_discrete_lyapunov(transition.midpoint, noise.midpoint))
+    X = Ball.exact((found + found.T) / 2.0)
+    norm = Ball.exact(contraction.Q)
+    gap = norm @ (transition @ X @ transition.T + noise - X) @ norm.T
+    # One minus the rate squared, in a form that does not cancel: three roundings, which the radius below covers.
+    share = (1.0 - contraction.rate) * (1.0 + contraction.rate)
+    # Every row of the inverse is seen on its own.
+    seen = rounded_up(column_norms(Ball.exact(contraction.inverse).T) / (1.0 - contraction.defect), 4)
+    radius = rounded_up(np.outer(seen, seen) * gap.frobenius_norm / share, 8)
+    enclosed = Ball(X.midpoint, radius)
+    middle, spread = np.diag(X.midpoint), np.diag(radius)
+    low, high = np.sqrt(np.maximum(middle - spread, 0.0)), np.sqrt(rounded_up(np.abs(middle) + spread, 4))
+    proof = prove_positive_definite(enclosed)
+    certain = bool(np.all(spread <= WIDEST * variances))
+    deviations = [
+        f"{name} {low[i]:.4g} to {high[i]:.4g}" if high[i] > low[i] * BOTH_ENDS else f"{name} {high[i]:.4g}"
+        for i, name in enumerate(stated.plant.state_names)
+    ]
+    detail = (
+        f"standard deviations {listed(deviations, most=LISTED_DEVIATIONS)}; the filter itself, whose gains move on, "
+        "ends at these or below"
+    )
+    source = "P = L A P A' L' + L Q L' + K R K', outward rounded"
+    if proof.proved:
+        return Check(
+            "steady state: covariance", claim, proof.lower_bound, 0.0, proof.lower_bound, True, source, "proved", detail
+        )
+    if certain and noise_is_definite(stated):
+        plant = stated.plant
+        H = np.vstack([plant.E.at(1), plant.C.at(1)])
+        row = definite_by_its_noise("steady state: covariance", claim, np.hstack(gains), H, natural_units(stated))
+        return replace(row, detail=f"{detail}; {row.detail}")
+    return information(
+        "steady state: covariance",
+        "largest standard deviation that the listed gains lead to, enclosed",
+        float(np.max(high, initial=0.0)),
+        source=source,
+        status="proved",
+        detail=detail,
+    )

@@ -74,14 +74,13 @@ def decoupling_norms(
     # How many trajectories there are at almost every frequency: where there seem to be more, rounding hides the rest.
     counts = [min(basis.shape[1] for basis in bases) for bases in moved]
     found = [DecouplingNorm(0.0, 0.0, 0.0) for _ in groups]
-    shipped = _Shipped.of(observer, units)
-    for some in _parts(points, max(scaled.nx + scaled.nd, len(shipped.Az))):
-        passing = shipped.at(scaled, points[some])
+    for some in _parts(points, max(scaled.nx + scaled.nd, observer.order)):
+        passing = _Passing.of(observer, units, points[some])
         for place, (rows, inputs) in enumerate(groups):
             if counts[place] == 0:
                 continue
             bases = np.stack([basis[:, -counts[place] :] for basis in moved[place][some]])
-            for frequency, missed in zip(frequencies[some], passing.misses(bases, rows, inputs), strict=True):
+            for frequency, missed in zip(frequencies[some], passing.misses(scaled, bases, rows, inputs), strict=True):
                 found[place] = found[place].worse(missed, float(frequency))
     return found
 
@@ -178,20 +177,18 @@ def _null_spaces(pencils: ComplexArray) -> tuple[list[ComplexArray], FloatArray,
 
 
 @dataclass(frozen=True, eq=False)
-class _Shipped:
-    """An observer of the first ``tracked`` states that reads scaled outputs in scaled time, its own states balanced."""
+class _Passing:
+    """An observer of the first ``tracked`` states at some points: what it makes of scaled outputs, and of the sizes of
+    their terms."""
 
-    Az: FloatArray
-    By: FloatArray
-    Cz: FloatArray
-    Dy: FloatArray
-    formed: FloatArray
-    direct: FloatArray
+    through: ComplexArray
+    passed: FloatArray
     faults: slice
     tracked: int
 
     @classmethod
-    def of(cls, observer: LinearObserver, units: PlantUnits) -> _Shipped:
+    def of(cls, observer: LinearObserver, units: PlantUnits, points: ComplexArray) -> _Passing:
+        """Return it at points in scaled time, with the observer's own states balanced."""
         order, outputs, nx = observer.order, observer.By.shape[1], len(observer.state_names)
         rows = np.ones(len(observer.Cz))
         rows[:nx] = 1.0 / units.states[:nx]
@@ -206,13 +203,37 @@ class _Shipped:
         offsets = (units.states[:nx] / states[:nx])[:, None] * np.abs(dy[:nx])
         formed = np.abs(by) + np.abs(az[:, :nx]) @ offsets
         # The same holds for a residual, y - C xhat with xhat = z + D y.
-        return cls(az, by, cz, dy, formed, np.abs(dy) + np.abs(cz[:, :nx]) @ offsets, observer.fault_rows, nx)
+        direct = np.abs(dy) + np.abs(cz[:, :nx]) @ offsets
+        resolvents = _inverses(pencils_at(None, az, points))
+        passed = np.abs(cz) @ (np.abs(resolvents) @ formed) + direct
+        return cls(cz @ (resolvents @ by) + dy, passed, observer.fault_rows, nx)
 
-    def at(self, plant: DescriptorSystem, points: ComplexArray) -> _Passing:
-        """Return what passes at some points."""
-        resolvents = _inverses(pencils_at(None, self.Az, points))
-        passed = np.abs(self.Cz) @ (np.abs(resolvents) @ self.formed) + self.direct
-        return _Passing(self, plant, self.Cz @ (resolvents @ self.By) + self.Dy, passed)
+    def misses(
+        self, plant: DescriptorSystem, trajectories: ComplexArray, rows: Sequence[int], inputs: Sequence[int]
+    ) -> list[tuple[float, float] | None]:
+        """Return, at each point, the largest relative error of an estimate in some rows, and that of a fault; ``None``
+        at a pole."""
+        tracked, dd, picked = self.tracked, plant.Dd[:, list(inputs)], list(rows)
+        states = np.array([row for row in picked if row < tracked], dtype=np.intp)
+        x, d = trajectories[:, : plant.nx], trajectories[:, plant.nx :]
+        error = self.through[:, picked] @ (plant.C @ x + dd @ d)
+        error[:, : len(states)] -= x[:, states]
+        passed = self.passed[:, picked]
+        size = passed @ (np.abs(plant.C) @ np.abs(x) + np.abs(dd) @ np.abs(d))
+        size[:, : len(states)] += np.abs(x[:, states])
+        # A signal that a trajectory does not move is rounding: it is judged by what trajectories of its size could do.
+        possible = passed @ (np.sum(np.abs(plant.C), axis=1) + np.sum(np.abs(dd), axis=1))
+        possible[:, : len(states)] += 1.0
+        terms = np.maximum(np.max(size, axis=2), UNMOVED_SIGNAL * possible)
+        shares = np.max(np.abs(error), axis=2) / np.where(terms > 0.0, terms, 1.0)
+        faults = [place for place, row in enumerate(picked) if row in range(self.through.shape[1])[self.faults]]
+        relative = np.max(shares, axis=1, initial=0.0)
+        absolute = np.max(np.linalg.norm(error[:, faults], axis=2), axis=1, initial=0.0)
+        poles = [bool(np.isnan(through).any()) for through in self.through]
+        return [
+            None if pole else (float(share), float(fault))
+            for pole, share, fault in zip(poles, relative, absolute, strict=True)
+        ]
 
 
 def _inverses(matrices: ComplexArray) -> ComplexArray:
@@ -226,41 +247,3 @@ def _inverses(matrices: ComplexArray) -> ComplexArray:
         with suppress(np.linalg.LinAlgError):
             found[place] = np.linalg.inv(matrix)
     return found
-
-
-@dataclass(frozen=True, eq=False)
-class _Passing:
-    """An observer at some points: what it makes of outputs, and of the sizes of their terms."""
-
-    shipped: _Shipped
-    plant: DescriptorSystem
-    through: ComplexArray
-    passed: FloatArray
-
-    def misses(
-        self, trajectories: ComplexArray, rows: Sequence[int], inputs: Sequence[int]
-    ) -> list[tuple[float, float] | None]:
-        """Return, at each point, the largest relative error of an estimate in some rows, and that of a fault; ``None``
-        at a pole."""
-        plant, tracked = self.plant, self.shipped.tracked
-        dd, picked = plant.Dd[:, list(inputs)], list(rows)
-        states = np.array([row for row in picked if row < tracked], dtype=np.intp)
-        x, d = trajectories[:, : plant.nx], trajectories[:, plant.nx :]
-        error = self.through[:, picked] @ (plant.C @ x + dd @ d)
-        error[:, : len(states)] -= x[:, states]
-        passed = self.passed[:, picked]
-        size = passed @ (np.abs(plant.C) @ np.abs(x) + np.abs(dd) @ np.abs(d))
-        size[:, : len(states)] += np.abs(x[:, states])
-        # A signal that a trajectory does not move is rounding: it is judged by what trajectories of its size could do.
-        possible = passed @ (np.sum(np.abs(plant.C), axis=1) + np.sum(np.abs(dd), axis=1))
-        possible[:, : len(states)] += 1.0
-        terms = np.maximum(np.max(size, axis=2), UNMOVED_SIGNAL * possible)
-        shares = np.max(np.abs(error), axis=2) / np.where(terms > 0.0, terms, 1.0)
-        faults = [place for place, row in enumerate(picked) if row in range(self.through.shape[1])[self.shipped.faults]]
-        relative = np.max(shares, axis=1, initial=0.0)
-        absolute = np.max(np.linalg.norm(error[:, faults], axis=2), axis=1, initial=0.0)
-        poles = [bool(np.isnan(through).any()) for through in self.through]
-        return [
-            None if pole else (float(share), float(fault))
-            for pole, share, fault in zip(poles, relative, absolute, strict=True)
-        ]
