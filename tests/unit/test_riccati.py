@@ -3,12 +3,14 @@
 from dataclasses import replace
 from functools import cache
 
+import mpmath
 import numpy as np
 import pytest
 from scipy.linalg import block_diag, solve_continuous_are, solve_discrete_are
 
 from obsynth.methods.fault_estimation_filter.central_filter import (
     CentralEquation,
+    Whitened,
     central_filter_at,
     central_injection,
     search_central_filter,
@@ -136,17 +138,36 @@ def test_exact_measurements_need_fewer_states(free_weight, m, nd):
         problem = replace(problem, D=np.zeros((m, nd)), Zd=np.zeros((1, nd)))
         equation, level = CentralEquation.of(problem, noise=noise), 1e3 * problem.disturbance_size
         assert equation.a.shape == (6 - m, 6 - m)
-        y = equation.solution(level)
-        assert y is not None
+        hidden = equation.solution(level)
+        assert hidden is not None
+        process = problem.B @ problem.B.T + (noise * np.linalg.norm(problem.B, 2)) ** 2 * np.eye(6)
+        y = hidden + process
         h = np.vstack([problem.C, problem.Z])
         total = h @ y @ h.T - np.diag([0.0] * m + [level**2])
         through = problem.A @ y @ h.T
-        process = problem.B @ problem.B.T + (noise * np.linalg.norm(problem.B, 2)) ** 2 * np.eye(6)
         right = problem.A @ y @ problem.A.T - through @ np.linalg.solve(total, through.T) + process
         assert np.linalg.norm(y - right) <= 1e-9 * np.linalg.norm(problem.A @ y @ problem.A.T)
         found, margin = equation.filter_and_margin(level)
         assert problem.achieved_gain(found) < level
         assert 0.0 < margin < 1.0
+
+
+@pytest.mark.parametrize("noise", [1e-6, 1e-8, 1e-10])
+def test_what_measurements_leave_of_a_disturbance_that_they_show_is_told_to_its_digits(noise):
+    """The disturbance is in three measurements but for the noise: what is left of it is the square of that."""
+    rng = np.random.default_rng(11)
+    b, d, zd = rng.normal(size=(4, 2)), rng.normal(size=(3, 2)), rng.normal(size=(1, 2))
+    white = Whitened.of(d, noise, b, zd)
+    with mpmath.workdps(60):
+        B, D = mpmath.matrix(b.tolist()), mpmath.matrix(d.tolist())
+        left = B * B.T - B * D.T * (D * D.T + mpmath.mpf(noise) ** 2 * mpmath.eye(3)) ** -1 * D * B.T
+        exact = np.array((left / mpmath.mpf(noise) ** 2).tolist(), dtype=float)
+    # U is orthonormal to 1e-15, and what is looked for of the size of the noise.
+    found = white.state_left @ white.state_left.T / noise**2
+    np.testing.assert_allclose(found, exact, rtol=0.0, atol=1e-14 / noise * np.abs(exact).max())
+    both = np.hstack([d, noise * np.eye(3)])
+    np.testing.assert_allclose(white.factor @ white.factor.T, both @ both.T, atol=1e-14)
+    np.testing.assert_allclose(white.known @ white.factor.T, b @ d.T, atol=1e-14)
 
 
 def test_the_margin_vanishes_at_the_least_level():

@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -35,6 +35,40 @@ from obsynth.numerics.norms import spectral_radius
 from obsynth.numerics.pencil_points import GENERIC_POINTS
 
 
+class Whitened(NamedTuple):
+    """Measurements ``D d + s v`` with unit noise v, in units ``L`` in which they are white, and what they leave.
+
+    A disturbance that they show but for a little noise would cancel to rounding in ``B B' - B D' (D D' + s^2 I)^-1 D
+    B'``: with ``[D, s I] = L U'``, orthonormal U, that is the square of ``[B, 0] (I - U U')``.
+    """
+
+    factor: FloatArray
+    known: FloatArray
+    direct: FloatArray
+    state_left: FloatArray
+    output_left: FloatArray
+
+    @classmethod
+    def of(cls, d: FloatArray, noise: float, b: FloatArray, zd: FloatArray) -> Whitened:
+        """Return L ``(m, m)``, ``[B, 0] U``, ``[Zd, 0] U`` and what is left of both; ``noise`` is s."""
+        m, nd = d.shape
+        u, triangle = np.linalg.qr(np.vstack([d.T, noise * np.eye(m)]))
+        known, direct = b @ u[:nd], zd @ u[:nd]
+        state_left, output_left = -known @ u.T, -direct @ u.T
+        state_left[:, :nd] += b
+        output_left[:, :nd] += zd
+        return cls(triangle.T, known, direct, state_left, output_left)
+
+    def blocks(self, own: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return process, weight and cross of the equation of what is left; ``own``: noise of each state, squared."""
+        m, q = len(self.factor), len(self.direct)
+        process = self.state_left @ self.state_left.T
+        process.reshape(-1)[:: len(process) + 1] += own
+        weight = np.eye(m + q)
+        weight[m:, m:] = self.output_left @ self.output_left.T
+        return process, weight, np.hstack([np.zeros_like(self.known), self.state_left @ self.output_left.T])
+
+
 @dataclass(frozen=True, eq=False)
 class CentralEquation:
     """The equation of a problem with measurements for every level, in as few states as it takes; no limit on V.
@@ -42,7 +76,7 @@ class CentralEquation:
     Where the disturbance is in no measurement, only the error on null C is left: with an orthonormal basis N of it, M
     one of its complement and ``F = A N`` (``lift``), ``Y = F K F' + B B'``, ``K = S - S N'Z' (Z N S N'Z' - g^2 I)^-1 Z
     N S``, where S solves the equation with ``N'F``, ``[M'F; ZN]``, ``N'BB'N``, ``diag(M'BB'M, -g^2 I)`` and ``[N'BB'M,
-    0]``.
+    0]``.  Each is solved for what the measurements leave of the noise (`Whitened`); their units are ``factor``.
     """
 
     problem: GainProblem
@@ -51,45 +85,58 @@ class CentralEquation:
     process: FloatArray
     weight: FloatArray
     cross: FloatArray
-    full_process: FloatArray
+    outputs: FloatArray
     full_weight: FloatArray
     full_cross: FloatArray
+    factor: FloatArray
     lift: FloatArray | None
-    outputs: FloatArray
-    last: FloatArray
 
     @classmethod
     def of(cls, problem: GainProblem, *, noise: float) -> CentralEquation:
         """Return the equation with artificial noise, relative to the disturbance."""
-        n, m, q = problem.order, problem.measured, problem.Z.shape[0]
         size = float(np.linalg.norm(problem.B, 2)) if problem.B.size else 0.0
-        h, k = np.vstack([problem.C, problem.Z]), np.vstack([problem.D, problem.Zd])
-        last = np.diag([0.0] * m + [1.0] * q)
-        process = problem.B @ problem.B.T + (noise * size) ** 2 * np.eye(n)
-        if np.any(k) or not 0 < m < n or size == 0.0:
-            seen = max(float(np.linalg.norm(part, 2)) if part.size else 0.0 for part in (problem.D, problem.C * size))
-            weight = k @ k.T + np.diag([(noise * seen) ** 2] * m + [0.0] * q)
-            cross = problem.B @ k.T
-            return cls(problem, problem.A, h, process, weight, cross, process, weight, cross, None, h, last)
-        basis = np.linalg.qr(problem.C.T, mode="complete")[0]
-        hidden, known = basis[:, m:], basis[:, :m]
-        lift = problem.A @ hidden
-        moved = process @ basis
-        weight = np.zeros((m + q, m + q))
-        weight[:m, :m] = known.T @ moved[:, :m]
+        if np.any(problem.D) or np.any(problem.Zd) or not 0 < problem.measured < problem.order or size == 0.0:
+            return cls._of_all_states(problem, noise, size)
+        return cls._of_hidden_states(problem, noise * size)
+
+    @classmethod
+    def _of_all_states(cls, problem: GainProblem, noise: float, size: float) -> CentralEquation:
+        seen = max(float(np.linalg.norm(part, 2)) if part.size else 0.0 for part in (problem.D, problem.C * size))
+        white = Whitened.of(problem.D, noise * (seen or 1.0), problem.B, problem.Zd)
+        shown = np.linalg.solve(white.factor, problem.C)
         return cls(
             problem,
-            hidden.T @ lift,
-            np.vstack([known.T @ lift, problem.Z @ hidden]),
-            hidden.T @ moved[:, m:],
-            weight,
-            np.hstack([hidden.T @ moved[:, :m], np.zeros((n - m, q))]),
-            process,
-            np.zeros((m + q, m + q)),
-            np.zeros((n, m + q)),
+            problem.A - white.known @ shown,
+            np.vstack([shown, problem.Z - white.direct @ shown]),
+            *white.blocks((noise * size) ** 2),
+            np.vstack([shown, problem.Z]),
+            _bordered(white.direct, problem.Zd @ problem.Zd.T),
+            np.hstack([white.known, problem.B @ problem.Zd.T]),
+            white.factor,
+            None,
+        )
+
+    @classmethod
+    def _of_hidden_states(cls, problem: GainProblem, noise: float) -> CentralEquation:
+        m, a, b, z = problem.measured, problem.A, problem.B, problem.Z
+        basis, triangle = np.linalg.qr(problem.C.T, mode="complete")
+        known, hidden = basis[:, :m], basis[:, m:]
+        lift = a @ hidden
+        white = Whitened.of(known.T @ b, noise, hidden.T @ b, problem.Zd)
+        shown = np.linalg.solve(white.factor, known.T @ lift)
+        # What the measurements of a sample say of the noise before it, and all that this does.
+        told = known @ white.factor + hidden @ white.known
+        done = b @ (z @ b).T + noise**2 * z.T
+        return cls(
+            problem,
+            hidden.T @ lift - white.known @ shown,
+            np.vstack([shown, z @ hidden]),
+            *white.blocks(noise**2),
+            np.vstack([np.linalg.solve(white.factor, known.T), z]),
+            _bordered(z @ told, z @ done),
+            np.hstack([a @ told, a @ done]),
+            triangle[:m].T @ white.factor,
             lift,
-            h,
-            last,
         )
 
     def filter_at(self, level: float) -> Injection | None:
@@ -113,8 +160,8 @@ class CentralEquation:
         return found, float(np.linalg.eigvalsh(left)[0]) / level**2
 
     def solution(self, level: float) -> FloatArray | None:
-        """Return Y ``(n, n)`` at ``level``, or ``None``; its signs are not looked at."""
-        lowered = self.weight - level**2 * self.last
+        """Return Y ``(n, n)`` at ``level``, or ``None``, of hidden states ``F K F'``; its signs are not looked at."""
+        lowered = self._lowered(self.weight, level)
         s = doubled_riccati_solution(
             self.a,
             self.h,
@@ -127,10 +174,15 @@ class CentralEquation:
         return None if s is None else self._in_all_states(s, level)
 
     def _sums(self, y: FloatArray, level: float) -> tuple[FloatArray, FloatArray]:
-        """Return ``k k' - diag(0, g^2 I) + h Y h'`` and ``A Y h' + B k'`` in all states."""
+        """Return ``k k' - diag(0, g^2 I) + h Y h'`` and ``A Y h' + B k'`` in all states; white measurements."""
         seen = y @ self.outputs.T
-        total = self.full_weight + self.outputs @ seen - level**2 * self.last
+        total = self._lowered(self.full_weight + self.outputs @ seen, level)
         return total, self.problem.A @ seen + self.full_cross
+
+    def _lowered(self, weight: FloatArray, level: float) -> FloatArray:
+        lowered = weight.copy()
+        lowered.reshape(-1)[self.problem.measured * (len(weight) + 1) :: len(weight) + 1] -= level**2
+        return lowered
 
     def _in_all_states(self, s: FloatArray, level: float) -> FloatArray:
         if self.lift is None:
@@ -138,7 +190,7 @@ class CentralEquation:
         shown = self.h[self.problem.measured :]
         through = s @ shown.T
         k = s - through @ np.linalg.solve(shown @ through - level**2 * np.eye(len(shown)), through.T)
-        return np.asarray(self.lift @ k @ self.lift.T + self.full_process)
+        return np.asarray(self.lift @ k @ self.lift.T)
 
     def _is_possible(self, y: FloatArray, level: float) -> bool:
         """Whether what xi shows over finitely many steps is still below the level, with the current measurement."""
@@ -147,8 +199,9 @@ class CentralEquation:
             total = self.weight + self.h @ y @ self.h.T
             left = total[m:, :m] @ np.linalg.solve(total[:m, :m], total[:m, m:]) - total[m:, m:]
         else:
-            shown = self.h[m:]
-            left = -self.weight[m:, m:] - shown.dot(y).dot(shown.T)
+            # Without a free weight xi knows nothing of the current measurement.
+            h, weight = (self.outputs, self.full_weight) if self.lift is None else (self.h, self.weight)
+            left = -weight[m:, m:] - h[m:].dot(y).dot(h[m:].T)
         left.reshape(-1)[:: len(left) + 1] += level**2
         return is_positive(0.5 * (left + left.T))
 
@@ -160,6 +213,7 @@ class CentralEquation:
             solved = np.linalg.solve(total[:m, :m], np.vstack([through[:, :m], total[m:, :m]]).T).T
             left = solved[n:] @ total[:m, m:] - total[m:, m:]
             left = 0.5 * (left + left.T)
+            solved = np.linalg.solve(self.factor.T, solved.T).T
             found = Injection(np.asarray(solved[:n]), np.asarray(-solved[n:]))
             return (found if is_positive(total[:m, :m]) and is_positive(left) else None), left
         left = -0.5 * (total[m:, m:] + total[m:, m:].T)
@@ -167,8 +221,13 @@ class CentralEquation:
         reduced = total[:m, :m] - total[:m, m:] @ change
         if not (is_positive(left) and is_positive(0.5 * (reduced + reduced.T))):
             return None, left
-        gain = np.linalg.solve(reduced.T, (through[:, :m] - through[:, m:] @ change).T).T
-        return Injection(np.asarray(gain), np.zeros((q, m))), left
+        gain = np.linalg.solve(self.factor.T, np.linalg.solve(reduced.T, (through[:, :m] - through[:, m:] @ change).T))
+        return Injection(np.asarray(gain.T), np.zeros((q, m))), left
+
+
+def _bordered(border: FloatArray, corner: FloatArray) -> FloatArray:
+    """Return ``[I, border'; border, corner]``."""
+    return np.block([[np.eye(border.shape[1]), border.T], [border, corner]])
 
 
 def central_injection(problem: GainProblem, level: float, *, noise: float) -> Injection | None:
@@ -188,6 +247,8 @@ SMALL_MARGIN = 1e-5
 CAUTION = 10.0
 #: Levels that may fail in a narrow bracket where rounding is to be expected.
 MOST_FAILURES = 3
+#: A margin is at most one, up to rounding, or the solution is not the one looked for.
+MOST_MARGIN = 1.0 + 1e-6
 #: A filter whose true gain is above its level by this relative amount shows that the equation was not solved.
 NORM_EXCESS = 2e-3
 #: Steps away from a level that the true gain exceeds, each longer than the one before, and halvings (of their
@@ -210,7 +271,8 @@ class GammaIteration:
     """The way down from ``high`` to the least level; low and high are the bracket, tolerance its relative width.
 
     ``settled``: the margin tells that nothing is below; ``expects_rounding``: the first filter is judged and a few
-    failures in a narrow bracket end it; ``judged``: a level counts only when the true gain of its filter is within it.
+    failures in a narrow bracket end it; ``judged``: a level counts only when the true gain of its filter is within it;
+    ``seen``: the filters whose true gain was asked for.
     """
 
     equation: CentralEquation
@@ -221,6 +283,7 @@ class GammaIteration:
     settled: bool = False
     expects_rounding: bool = False
     judged: bool = False
+    seen: list[tuple[Injection, float]] = field(default_factory=list)
 
     def run(self, first: float) -> None:
         """Go down from ``first``; where that is not reached and close to ``high``, nothing below is looked for."""
@@ -245,6 +308,8 @@ class GammaIteration:
 
     def _is_credible(self, level: float, margin: float, found: Injection) -> bool:
         """Whether the margin has shrunk with the level, without which the solution is not the one looked for."""
+        if margin > MOST_MARGIN:
+            return False
         if self.reached and margin * level**2 >= self.reached[-1].margin * self.reached[-1].level ** 2:
             return False
         believed = not self.judged and (not self.expects_rounding or bool(self.reached))
@@ -308,8 +373,13 @@ class GammaIteration:
         gain = None if found is None else self._gain_within(found, level)
         return None if found is None or gain is None else (found, gain)
 
+    def least_seen(self) -> tuple[Injection, float] | None:
+        """Return the filter of the least true gain of those that were judged, if there is one."""
+        return min((item for item in self.seen if math.isfinite(item[1])), key=lambda item: item[1], default=None)
+
     def _gain_within(self, found: Injection, level: float) -> float | None:
         gain = self.equation.problem.achieved_gain(found)
+        self.seen.append((found, gain))
         return gain if gain <= level * (1.0 + self.tolerance) else None
 
 
@@ -324,7 +394,7 @@ def _vanishing(points: list[tuple[float, float]]) -> float:
 
 #: Artificial noise relative to the disturbance, in turn: the first is bisected, and each of the others only where it
 #: reaches a level below.
-NOISES = (1e-6, 1e-8, 1e-7, 1e-5, 1e-4, 1e-2)
+NOISES = (1e-6, 1e-8, 1e-10, 1e-7, 1e-5, 1e-4, 1e-2)
 #: Relative width of the bracket at which the search ends, for few and for many states.
 FEW_STATES = 80
 LEVEL_TOLERANCE = 1e-7
@@ -406,6 +476,8 @@ def search_central_filter(
         if found is None and descent.reached and descent.reached[0].level < gain * (1.0 - NEXT_TO):
             descent = descent.judged_again(gain)
             found = descent.best()
+        # The level that is reached last may be made up by rounding, or noise may raise it.
+        found = min(filter(None, [found, descent.least_seen()]), key=lambda item: item[1], default=None)
         if found is None:
             continue
         injection, reached = found
