@@ -227,7 +227,10 @@ class CentralEquation:
 
 def _bordered(border: FloatArray, corner: FloatArray) -> FloatArray:
     """Return ``[I, border'; border, corner]``."""
-    return np.block([[np.eye(border.shape[1]), border.T], [border, corner]])
+    m = border.shape[1]
+    found = np.eye(m + len(border))
+    found[m:, :m], found[:m, m:], found[m:, m:] = border, border.T, corner
+    return found
 
 
 def central_injection(problem: GainProblem, level: float, *, noise: float) -> Injection | None:
@@ -459,13 +462,13 @@ def search_central_filter(
     """
     tolerance = LEVEL_TOLERANCE if problem.order <= FEW_STATES else COARSE_LEVEL_TOLERANCE
     best, gain = start, problem.achieved_gain(start) if gain is None else gain
-    low, most_noise = least_level(problem), np.inf
+    low, least_noise, most_noise = least_level(problem), 0.0, np.inf
     if low <= DECOUPLED_GAIN * gain and (decoupled := _decoupling_filter(problem, gain)) is not None:
         return decoupled
     for noise in NOISES if problem.order <= FEW_STATES else COARSE_NOISES:
         if gain <= low * (1.0 + 2.0 * tolerance):
             break
-        if noise > most_noise:
+        if not least_noise <= noise <= most_noise:
             continue
         close = start_is_good or best is not start
         equation = CentralEquation.of(problem, noise=noise)
@@ -478,6 +481,8 @@ def search_central_filter(
             found = descent.best()
         # The level that is reached last may be made up by rounding, or noise may raise it.
         found = min(filter(None, [found, descent.least_seen()]), key=lambda item: item[1], default=None)
+        if noise < most_noise < np.inf and (found is None or found[1] >= gain):
+            least_noise = noise  # nor is less of it worth a try
         if found is None:
             continue
         injection, reached = found
