@@ -154,6 +154,19 @@ def test_scaling_by_powers_of_two():
         assert np.all(miss[finite] <= 0)
 
 
+def test_scaling_by_powers_whose_products_are_no_doubles_is_the_same():
+    rng = np.random.default_rng(8)
+    ball, exponents = random_ball(rng, (4, 4), (-40, 40)), np.array([500, -500, 3, 0])
+    larger = np.array([501, -501, 3, 0])
+    for given in (exponents, larger):
+        total = given[:, None] + given
+        scaled = ball.congruent(given)
+        with np.errstate(over="ignore"):
+            middle, radius = np.ldexp(ball.midpoint, total), np.ldexp(ball.radius, total) + UNDERFLOW
+        assert np.array_equal(scaled.midpoint, middle)
+        assert np.array_equal(scaled.radius, radius)
+
+
 def test_blocks_and_transposes():
     rng = np.random.default_rng(7)
     a, b, c, d = (random_ball(rng, shape, (-5, 5)) for shape in ((2, 2), (2, 3), (1, 2), (1, 3)))

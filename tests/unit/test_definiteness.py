@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from obsynth.proofs import definiteness
-from obsynth.proofs.balls import Ball
+from obsynth.proofs.balls import PANEL_ROWS, Ball
 from obsynth.proofs.definiteness import prove_positive_definite
 
 
@@ -258,3 +258,32 @@ def test_extreme_sizes_neither_warn_nor_raise(monkeypatch):
     assert prove_positive_definite(factor @ factor.T).means == "ball arithmetic"
     monkeypatch.setattr(definiteness, "LARGEST_ORDER", 0)
     assert not prove_positive_definite(factor @ factor.T).proved
+
+
+def test_a_ball_of_several_blocks_is_made_symmetric_entry_by_entry():
+    rng = np.random.default_rng(9)
+    n = 2 * PANEL_ROWS + 5
+    ball = Ball(rng.standard_normal((n, n)), rng.random((n, n)))
+    found = definiteness._symmetric(ball)
+    for part in (found.midpoint, found.radius):
+        assert np.array_equal(part, part.T)
+    # Every symmetric member of the ball is within: those are members of its transpose, too.
+    lower = np.maximum(ball.midpoint - ball.radius, ball.midpoint.T - ball.radius.T)
+    upper = np.minimum(ball.midpoint + ball.radius, ball.midpoint.T + ball.radius.T)
+    some = lower <= upper
+    assert np.all((found.midpoint - found.radius <= lower)[some])
+    assert np.all((found.midpoint + found.radius >= upper)[some])
+    assert np.array_equal(found.midpoint, 0.5 * (ball.midpoint + ball.midpoint.T))
+
+
+def test_a_shift_is_taken_from_the_diagonal_alone():
+    rng = np.random.default_rng(10)
+    matrix = rng.standard_normal((6, 6))
+    matrix = matrix @ matrix.T + 2.0 * np.eye(6)
+    kept = matrix.copy()
+    factor = definiteness._shifted_factor(matrix, 1.5)
+    assert np.array_equal(matrix, kept)
+    assert np.array_equal(factor, np.tril(factor))
+    assert np.allclose(factor @ factor.T, matrix - 1.5 * np.eye(6), rtol=0.0, atol=1e-14 * np.max(matrix))
+    assert definiteness._shifted_factor(matrix, 1e3) is None
+    assert definiteness._shifted_factor(np.full((2, 2), np.nan), 0.0) is None

@@ -15,6 +15,7 @@ import obsynth
 from obsynth.numerics.scaling import LogBalance
 from obsynth.proofs import contraction
 from obsynth.proofs.contraction import prove_contraction, proved_contractions
+from obsynth.verification import certificates
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
@@ -86,3 +87,56 @@ def test_what_the_entries_leave_open_is_no_rounding() -> None:
 def test_a_gain_set_that_one_processor_made_another_verifies(capfd: pytest.CaptureFixture[str]) -> None:
     assert kernels.compare_designs(("Haswell", "Nehalem"), ["sharepasand/spec"]) == 0
     assert "1 plants, 2 gain sets, 2 verifications: 0 differences" in capfd.readouterr().out
+
+
+@pytest.mark.parametrize("spread", [0.0, 30.0])
+def test_many_states_are_contracted_by_products_alone(spread: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(5)
+    n = contraction.STATES_FOR_DOUBLED_SUMS
+    a = 0.85 * rng.normal(size=(n, n)) / np.sqrt(n)
+    units = np.exp2(rng.uniform(-spread, spread, n))
+    monkeypatch.setattr("scipy.linalg.solve_discrete_lyapunov", lambda *_: pytest.fail("by Schur vectors"))
+    found = contraction.prove_contraction(a * units / units[:, None], discrete=True)
+    assert found is not None
+    assert np.max(np.abs(np.linalg.eigvals(a))) < found.rate < 1.0
+
+
+def test_the_root_of_a_sum_of_powers_is_triangular_and_none_where_powers_grow() -> None:
+    found = contraction._root_of_sum(0.5 * np.eye(5))
+    assert found is not None
+    assert np.allclose(found, np.eye(5) / np.sqrt(0.75), rtol=1e-14, atol=0.0)
+    with np.errstate(over="ignore", invalid="ignore"):
+        assert contraction._root_of_sum(2.0 * np.eye(5)) is None
+    rng = np.random.default_rng(6)
+    a = 0.2 * rng.normal(size=(7, 7))
+    root = contraction._root_of_sum(a)
+    assert root is not None
+    assert np.array_equal(root, np.triu(root))
+    p = root.T @ root
+    assert np.allclose(p - a.T @ p @ a, np.eye(7), rtol=0.0, atol=1e-13)
+
+
+def test_an_inequality_is_proved_once_for_the_same_numbers_and_again_for_others(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    design = obsynth.fault_estimation_filter(PLANTS["sampled"])
+    plain, tried = certificates.prove_positive_definite, []
+    monkeypatch.setattr(certificates, "prove_positive_definite", lambda given: tried.append(given) or plain(given))
+
+    def lmi(changed: obsynth.ObserverDesign) -> tuple[int, bool]:
+        tried.clear()
+        row = obsynth.verify(changed)["LMI"]
+        return len(tried), row.passed
+
+    assert lmi(design) == (0, True)
+    # Equal numbers in another observer, and the same observer beside another factor or another gain.
+    assert lmi(design.replace(observer=replace(design.observer, Az=design.observer.Az.copy()))) == (1, True)
+    old = design.certificate
+    factor = old.matrices["P_factor"]
+    for changed in (2.0 * factor, factor + np.triu(np.full(factor.shape, 0.1 * np.max(np.abs(factor))))):
+        known = obsynth.Certificate({**old.matrices, "P_factor": changed}, old.claims)
+        assert lmi(design.replace(certificate=known))[0] == 1
+    gain = obsynth.Certificate(old.matrices, {**old.claims, "gamma": 0.5 * old.claims["gamma"]})
+    assert lmi(design.replace(certificate=gain)) == (1, False)
+    # What was not proved is not remembered.
+    assert lmi(design.replace(certificate=gain)) == (1, False)

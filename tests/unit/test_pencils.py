@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 from scipy.linalg import block_diag, eigvals
 
+from obsynth import DescriptorSystem
+from obsynth.analysis.zeros import regularity_of, structure_of
 from obsynth.numerics import pencils
 from obsynth.numerics.pencils import finite_zeros, pencil_structure
 
@@ -297,3 +299,16 @@ def test_zeros_beside_a_badly_conditioned_derivative_are_found_among_clear_candi
     assert np.allclose(sorted(found, key=lambda z: (z.real, z.imag)), [-8.0, -1.5 - 2.0j, -1.5 + 2.0j], atol=1e-5)
     # Found by the staircase or not, few points are looked at: of a pair one.
     assert len(counted) <= 10
+
+
+def test_the_structure_of_a_plant_is_that_of_its_pencil_and_found_once(monkeypatch):
+    rng = np.random.default_rng(12)
+    e = np.diag([1.0, 1.0, 0.0, 0.0])
+    plant = DescriptorSystem(e, rng.standard_normal((4, 4)), None, np.eye(4), dt=0.1)
+    found, direct = structure_of(plant), pencil_structure(plant.E, plant.A)
+    for name in ("regular", "normal_rank", "index", "infinite_block_sizes"):
+        assert getattr(found, name) == getattr(direct, name)
+    assert np.array_equal(found.finite_eigenvalues, direct.finite_eigenvalues)
+    monkeypatch.setattr("obsynth.analysis.zeros.reduced", lambda *_: pytest.fail("again"))
+    assert structure_of(plant) is found
+    assert regularity_of(plant) == (True, 4)

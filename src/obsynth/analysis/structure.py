@@ -11,10 +11,10 @@ import numpy as np
 
 from obsynth.analysis.existence.statements import Evaluator
 from obsynth.analysis.transformations.recovery import Transformation, linear_plant
-from obsynth.analysis.zeros import are_outside
+from obsynth.analysis.zeros import are_outside, structure_of
 from obsynth.numerics.arrays import ComplexArray
 from obsynth.numerics.libraries import on_one_thread_if_small
-from obsynth.numerics.pencils import FiniteZeros, pencil_structure
+from obsynth.numerics.pencils import FiniteZeros
 from obsynth.numerics.ranks import RankDecision, decide_rank
 from obsynth.numerics.scaling import equilibrate_pencil
 from obsynth.plants.descriptor import DescriptorSystem
@@ -74,7 +74,7 @@ def analyse_structure(plant: DescriptorSystem | Transformation) -> Structure:
     """
     plant = linear_plant(plant).dense()
     E, A, C = plant.E, plant.A, plant.C
-    pencil = pencil_structure(E, A)
+    pencil = structure_of(plant)
     poles = FiniteZeros(pencil.finite_eigenvalues, pencil.normal_rank, pencil.decisions)
     outside = are_outside(E, A, poles, plant.dt)
     unstable = tuple(complex(value) for value, out in zip(poles.values, outside, strict=True) if out)
@@ -165,7 +165,7 @@ def _rest(plant: DescriptorSystem, missing: Sequence[str]) -> str:
 def _other_time(plant: DescriptorSystem) -> tuple[str, ...]:
     """Ask about eigenvalues that are those of a plant in the other kind of time."""
     plain = plant.dense()
-    values = np.asarray(pencil_structure(plain.E, plain.A).finite_eigenvalues)
+    values = np.asarray(structure_of(plain).finite_eigenvalues)
     values = values[np.isfinite(values)]
     far, close = int(np.sum(np.abs(values) > _FAR_EIGENVALUE)), (np.abs(values) < 1.0) & (values.real > 0.0)
     if plant.is_discrete and far and np.sum(values.real < 0.0) >= values.size / 2.0:

@@ -9,16 +9,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.numerics.arrays import ComplexArray, FloatArray, read_only
+from obsynth.numerics.arrays import ComplexArray, FloatArray, read_only, remembered
 from obsynth.numerics.pencil_points import (
     FEW_COLUMNS,
     GENERIC_POINTS,
     MOST_DIRECTIONS,
     ZERO_STEPS,
+    Deflation,
     PencilPoints,
     smallest_singular,
 )
-from obsynth.numerics.pencils import FiniteZeros, finite_zeros
+from obsynth.numerics.pencils import (
+    FiniteZeros,
+    PencilStructure,
+    finite_zeros,
+    reduced,
+    regularity_of_reduced,
+    structure_of_reduced,
+)
 from obsynth.numerics.ranks import (
     BOUNDARY_NEIGHBOURHOOD,
     BOUNDARY_RANK_TOLERANCE,
@@ -30,6 +38,22 @@ from obsynth.numerics.ranks import (
 )
 from obsynth.numerics.scaling import EquilibratedPencil, equilibrate_pencil, power_of_two_below
 from obsynth.plants.descriptor import DescriptorSystem
+
+
+@remembered
+def _reduced(plant: DescriptorSystem) -> tuple[Deflation, Deflation]:
+    return reduced(plant.E, plant.A)
+
+
+def regularity_of(plant: DescriptorSystem) -> tuple[bool, int]:
+    """Return whether a plant's pencil ``A - z E`` is regular, and its normal rank, without eigenvalues."""
+    return regularity_of_reduced(plant.E.shape, _reduced(plant))
+
+
+@remembered
+def structure_of(plant: DescriptorSystem) -> PencilStructure:
+    """Return the structure of a plant's pencil ``A - z E``, which methods and verification ask for again and again."""
+    return structure_of_reduced(plant.E.shape, _reduced(plant))
 
 
 def system_zeros(E: FloatArray, A: FloatArray, *, nx: int) -> FiniteZeros:

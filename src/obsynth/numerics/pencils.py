@@ -61,9 +61,19 @@ class FiniteZeros:
 
 def pencil_structure(E: FloatArray, A: FloatArray) -> PencilStructure:
     """Return the structure of ``A - z E (m, n)`` of any size, including zero (Algorithms 3.1 and 4.1)."""
-    right, left = reduce_pencil(equilibrate_pencil(E, A))
-    rows, columns = E.shape
-    regular = _is_regular(E, right)
+    return structure_of_reduced(E.shape, reduced(E, A))
+
+
+def reduced(E: FloatArray, A: FloatArray) -> tuple[Deflation, Deflation]:
+    """Return what the two passes leave of ``A - z E (m, n)``: all that structure and regularity follow from."""
+    return reduce_pencil(equilibrate_pencil(E, A))
+
+
+def structure_of_reduced(shape: tuple[int, ...], passes: tuple[Deflation, Deflation]) -> PencilStructure:
+    """Return the structure of a pencil ``(m, n)`` from its two passes."""
+    right, left = passes
+    rows, columns = shape
+    regular = _is_regular(shape, right)
     next_nullities = (*right.nullities[1:], 0)
     counts = [rank - following for rank, following in zip(right.ranks, next_nullities, strict=False)]
     sizes = tuple(size for size in range(len(counts), 0, -1) for _ in range(counts[size - 1]))
@@ -209,15 +219,14 @@ def _candidates(parts: _SquarePart) -> tuple[ComplexArray, NDArray[np.bool_]]:
     return values, np.zeros(len(values), dtype=bool)
 
 
-def regularity(E: FloatArray, A: FloatArray) -> tuple[bool, int]:
-    """Return whether ``A - z E (m, n)`` is regular, and its normal rank, without eigenvalues."""
-    right, left = reduce_pencil(equilibrate_pencil(E, A))
-    return _is_regular(E, right), normal_rank_of(right, left)
+def regularity_of_reduced(shape: tuple[int, ...], passes: tuple[Deflation, Deflation]) -> tuple[bool, int]:
+    """Return whether a pencil ``(m, n)`` is regular, and its normal rank, from its two passes; without eigenvalues."""
+    return _is_regular(shape, passes[0]), normal_rank_of(*passes)
 
 
-def _is_regular(E: FloatArray, right: Deflation) -> bool:
+def _is_regular(shape: tuple[int, ...], right: Deflation) -> bool:
     # Without right singular blocks a square pencil has no left ones either.
-    return E.shape[0] == E.shape[1] and right.nullities == right.ranks
+    return shape[0] == shape[1] and right.nullities == right.ranks
 
 
 def _eigenvalues(E: FloatArray, A: FloatArray) -> ComplexArray:

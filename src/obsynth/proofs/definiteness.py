@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 
 from obsynth.numerics import lapack
 from obsynth.numerics.arrays import FloatArray
-from obsynth.proofs.balls import UNDERFLOW, UNIT_ROUNDOFF, Ball, gamma, rounded_up
+from obsynth.proofs.balls import PANEL_ROWS, UNDERFLOW, UNIT_ROUNDOFF, Ball, gamma, rounded_up
 from obsynth.proofs.extended_balls import LARGEST_ORDER, Enclosed, Formula, prove_by_ball_arithmetic
 
 #: The first shift that is tried, relative to the error bound: as little as leaves a bound above zero.
@@ -90,7 +90,10 @@ def prove_positive_definite(matrix: Formula | Ball | FloatArray) -> Definiteness
         place = int(np.argmin(diagonal))
         return unproved(f"diagonal entry {place + 1} is {diagonal[place]:.3g}: not positive definite")
     exponents = -np.round(np.log2(diagonal) / 2.0).astype(np.int64)
-    scaled = _symmetric(ball.congruent(exponents))
+    # Large matrices are let go as soon as nothing follows from them any more.
+    ball = ball.congruent(exponents)
+    scaled = _symmetric(ball)
+    del ball
     if not scaled.is_finite:
         return unproved("an entry beside the diagonal is larger than the diagonal allows: not positive definite")
     first = _by_cholesky(scaled)
@@ -112,11 +115,20 @@ def _as_formula(matrix: Formula | Ball | FloatArray) -> Formula:
 
 def _symmetric(ball: Ball) -> Ball:
     """Return a ball with symmetric midpoint and all symmetric members of ``ball``: they lie in its transpose too."""
+    middle, radius = np.empty(ball.shape), np.empty(ball.shape)
+    starts = range(0, len(middle), PANEL_ROWS)
     with np.errstate(over="ignore", invalid="ignore"):
-        middle = 0.5 * (ball.midpoint + ball.midpoint.T)
-        # The difference of the midpoints more than covers the rounding of their average.
-        radius = np.maximum(ball.radius, ball.radius.T) + np.abs(ball.midpoint - ball.midpoint.T)
-        return Ball(middle, rounded_up(radius, 4))
+        for rows, columns in (
+            (slice(i, i + PANEL_ROWS), slice(j, j + PANEL_ROWS)) for i in starts for j in starts[i // PANEL_ROWS :]
+        ):
+            one, other = ball.midpoint[rows, columns], ball.midpoint[columns, rows].T
+            middle[rows, columns] = 0.5 * (one + other)
+            middle[columns, rows] = middle[rows, columns].T
+            # The difference of the midpoints more than covers the rounding of their average.
+            size = np.maximum(ball.radius[rows, columns], ball.radius[columns, rows].T) + np.abs(one - other)
+            radius[rows, columns] = rounded_up(size, 4)
+            radius[columns, rows] = radius[rows, columns].T
+    return Ball(middle, radius)
 
 
 def _by_cholesky(ball: Ball, means: Means = "Cholesky") -> DefinitenessProof:
@@ -124,7 +136,7 @@ def _by_cholesky(ball: Ball, means: Means = "Cholesky") -> DefinitenessProof:
     forming = float(rounded_up(np.max(np.sum(ball.radius, axis=1)), size + 2))
     error = forming + _factorisation_bound(ball.midpoint)
     shift = LEAST_SHIFT * error
-    factor = _cholesky_factor(ball.midpoint - shift * np.eye(size))
+    factor = _shifted_factor(ball.midpoint, shift)
     if factor is None:
         estimate = float(np.linalg.eigvalsh(ball.midpoint)[0])
         reason = (
@@ -136,7 +148,7 @@ def _by_cholesky(ball: Ball, means: Means = "Cholesky") -> DefinitenessProof:
     left = _smallest_eigenvalue(factor)
     for share in EIGENVALUE_SHARES:
         larger = shift + share * left
-        if larger > shift and _cholesky_factor(ball.midpoint - larger * np.eye(size)) is not None:
+        if larger > shift and _shifted_factor(ball.midpoint, larger) is not None:
             return DefinitenessProof(True, larger - error, error, means)
     return DefinitenessProof(True, shift - error, error, means)
 
@@ -209,8 +221,13 @@ def _factorisation_bound(symmetric: FloatArray) -> float:
 
 
 def _cholesky_factor(matrix: FloatArray) -> FloatArray | None:
-    try:
-        factor = np.asarray(np.linalg.cholesky(matrix))
-    except np.linalg.LinAlgError:
-        return None
-    return factor if np.isfinite(factor).all() else None
+    return _shifted_factor(matrix, 0.0)
+
+
+def _shifted_factor(matrix: FloatArray, shift: float) -> FloatArray | None:
+    """Return the lower triangular factor of a symmetric matrix less ``shift`` times the identity, or ``None``."""
+    # Transposed, it is the same matrix in the order that LAPACK reads, and its copy the only one.
+    lowered = np.array(matrix, order="C", dtype=np.float64).T
+    np.einsum("ii->i", lowered)[:] -= shift
+    factor, failed = lapack.dpotrf(lowered, lower=1, clean=1, overwrite_a=1)
+    return np.asarray(factor) if not failed and np.isfinite(factor).all() else None

@@ -12,11 +12,12 @@ congruence S (here close to the inverse of Q).  Q is stored: P, rounded, loses d
 
 from __future__ import annotations
 
+from hashlib import blake2b
 from typing import Any
 
 import numpy as np
 
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import FloatArray, remembered
 from obsynth.numerics.spectra import decay_rates, eigenvalues
 from obsynth.observers.linear.derived import poles_of
 from obsynth.observers.linear.observer import LinearObserver
@@ -36,7 +37,37 @@ def prove_bounded_real(
     *,
     lag: int,
 ) -> DefinitenessProof:
-    """Try to prove the bounded real inequality for the shipped observer; ``factor (core, core)``."""
+    """Try to prove the bounded real inequality for the shipped observer; ``factor (core, core)``.
+
+    What was proved of the same numbers, to the last bit, is not proved again while the observer lives.
+    """
+    known = _proofs_of(observer)
+    numbers = _digest(plant.Bd, plant.Dd, tracking, factor, np.array([gain, lag]))
+    if numbers in known:
+        return known[numbers]
+    found = _try_bounded_real(plant, observer, tracking, factor, gain, lag)
+    if found.proved:
+        known[numbers] = found
+    return found
+
+
+@remembered
+def _proofs_of(_observer: LinearObserver) -> dict[bytes, DefinitenessProof]:
+    return {}
+
+
+def _digest(*parts: FloatArray) -> bytes:
+    """Return what tells numbers ``(m, n)`` from all others."""
+    found = blake2b()
+    for part in parts:
+        found.update(repr((part.shape, part.dtype.str)).encode())
+        found.update(np.ascontiguousarray(part).data)
+    return found.digest()
+
+
+def _try_bounded_real(
+    plant: DescriptorSystem, observer: LinearObserver, tracking: FloatArray, factor: FloatArray, gain: float, lag: int
+) -> DefinitenessProof:
     core = factor.shape[0]
     outside = (observer.Az[:core, core:], observer.Cz[observer.fault_rows, core:])
     # What follows the core must be a chain of delays: strictly lower triangular, hence stable.

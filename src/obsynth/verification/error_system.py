@@ -27,6 +27,7 @@ import numpy as np
 
 from obsynth.numerics.arrays import FloatArray, Made, remembered
 from obsynth.numerics.scaling import Scaling, balance_by_least_squares
+from obsynth.observers.linear.derived import poles_of
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.balls import Ball, rounded_up
@@ -434,4 +435,5 @@ def _as_ball(part: Ball | ExtendedBall) -> Ball:
 @remembered
 def contraction_of(observer: LinearObserver) -> Contraction | None:
     """Return a proved contraction of a shipped observer's state, ``None`` where none is found."""
-    return prove_contraction(observer.Az, discrete=observer.dt > 0.0)
+    poles = poles_of(observer) if np.all(np.isfinite(observer.Az)) else None
+    return prove_contraction(observer.Az, discrete=observer.dt > 0.0, poles=poles)

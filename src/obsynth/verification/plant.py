@@ -7,11 +7,11 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 
 from obsynth.analysis.conditions import Condition
-from obsynth.analysis.zeros import are_outside
+from obsynth.analysis.zeros import are_outside, structure_of
 from obsynth.errors import ObsynthError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.norms import hinf_norm
-from obsynth.numerics.pencils import FiniteZeros, PencilStructure, pencil_structure
+from obsynth.numerics.pencils import FiniteZeros
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.validation import listed
@@ -29,9 +29,9 @@ SHOWN_AS_REAL = 1e-12
 MOST_EIGENVALUES = 6
 
 
-def plant_information(plant: DescriptorSystem, structure: PencilStructure | None = None) -> Iterator[Check]:
+def plant_information(plant: DescriptorSystem) -> Iterator[Check]:
     """Yield rows on regularity, index, eigenvalues and stability of the plant; they inform and never fail."""
-    structure = pencil_structure(plant.E, plant.A) if structure is None else structure
+    structure = structure_of(plant)
     blocks = structure.infinite_block_sizes
     rows = [("regular", "det(A - zE) is not identically zero", float(structure.regular), "")]
     if structure.regular:

@@ -8,15 +8,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
+from obsynth.analysis.zeros import structure_of
 from obsynth.numerics.arrays import SMALLEST, ComplexArray, FloatArray, remembered
+from obsynth.numerics.modal_solves import STATES_FOR_MODES, ModalSolves
 from obsynth.numerics.norms import MOST_ENTRIES_AT_ONCE, pencils_at, resolved
-from obsynth.numerics.pencils import pencil_structure
 from obsynth.numerics.ranks import BOUNDARY_TOLERANCE
 from obsynth.numerics.spectra import boundary_points
-from obsynth.observers.linear.derived import poles_of
+from obsynth.observers.linear.derived import modes_of, poles_of
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.proofs.balls import rounded_up
 from obsynth.proofs.contraction import proved_contractions
@@ -36,6 +38,8 @@ MOST_ROOM = 1.0
 SLOWEST_CLAIMED, CLAIM_POINTS = 1e-7, 120
 #: With more states, of plant and observer together, fewer are looked at.
 MANY_JOINT_STATES, FEWER_POINTS = 300, 40
+#: A point is outside of all poles where its modulus is so many times the largest.
+OUTSIDE = 1.5
 #: Frequencies beyond that at which the time is looked for after which stored numbers matter, rad per sample.
 SLOWER = tuple(10.0**-k for k in range(8, 17))
 #: Multiple poles scatter; those this close to the boundary may be on it, and this far apart they are different ones.
@@ -90,7 +94,7 @@ class StoredErrors:
     def least(self, observer: LinearObserver) -> StoredErrors:
         """Return the least bounds by all contractions that are found: any of them is a proof."""
         bounds = self.bounds
-        for contraction in proved_contractions(observer.Az, discrete=observer.dt > 0.0):
+        for contraction in proved_contractions(observer.Az, discrete=observer.dt > 0.0, poles=poles_of(observer)):
             others = self.channel.errors_per_unit(observer, contraction)
             bounds = tuple(np.fmin(one, other) for one, other in zip(bounds, others, strict=True))
         return replace(self, bounds=bounds)
@@ -236,7 +240,7 @@ class _Composite:
         self.driven = -model.disturbance
         self.direct = observer.Dy[rows] @ plant.Dd
         self.shown = observer.Cz[rows]
-        values = pencil_structure(plant.E, plant.A).finite_eigenvalues
+        values = structure_of(plant).finite_eigenvalues
         self.poles: ComplexArray = np.asarray(values, dtype=np.complex128)
         own = np.abs(poles_of(observer)) if observer.order else np.ones(1)
         self.fastest = float(max(np.max(own, initial=0.0), np.finfo(np.float64).tiny))
@@ -296,16 +300,42 @@ class _Composite:
 
     def _gains_at(self, points: ComplexArray) -> FloatArray:
         # From the left, where the rows of fault errors are fewer than the disturbances.
-        left = np.concatenate([*resolved(None, self.observer.Az.T, self.shown.T, points)])
-        left = left.transpose(0, 2, 1)
+        left = self._through_observer(points)
         ages = np.split(left @ self.K + self.J, self.lags, axis=2)
-        seen = sum(part * points[:, None, None] ** -age for age, part in enumerate(ages))
-        through = np.linalg.solve(
-            pencils_at(self.plant.E.T, self.plant.A.T, points), np.asarray(seen).transpose(0, 2, 1)
-        )
-        whole = through.transpose(0, 2, 1) @ self.plant.Bd + left @ self.driven + self.direct
+        seen = np.asarray(sum(part * points[:, None, None] ** -age for age, part in enumerate(ages)))
+        whole = self._through_plant(points, seen) @ self.plant.Bd + left @ self.driven + self.direct
         finite = np.all(np.isfinite(whole), axis=(1, 2))
         return np.where(finite, np.linalg.norm(np.where(finite[:, None, None], whole, 0.0), 2, axis=(1, 2)), 0.0)
+
+    def _through_observer(self, points: ComplexArray) -> ComplexArray:
+        if self._observer_solves is not None:
+            return self._observer_solves.rows(points, self.shown)
+        found = np.concatenate([*resolved(None, self.observer.Az.T, self.shown.T, points)])
+        return np.asarray(found.transpose(0, 2, 1))
+
+    def _through_plant(self, points: ComplexArray, rows: ComplexArray) -> ComplexArray:
+        if self._plant_solves is not None:
+            return self._plant_solves.rows(points, rows)
+        found = np.linalg.solve(pencils_at(self.plant.E.T, self.plant.A.T, points), rows.transpose(0, 2, 1))
+        return np.asarray(found.transpose(0, 2, 1))
+
+    @cached_property
+    def _observer_solves(self) -> ModalSolves | None:
+        observer = self.observer
+        if observer.order < STATES_FOR_MODES:
+            return None
+        return ModalSolves.of(None, observer.Az, at=self._apart(poles_of(observer)), modes=modes_of(observer))
+
+    @cached_property
+    def _plant_solves(self) -> ModalSolves | None:
+        if self.plant.nx < STATES_FOR_MODES:
+            return None
+        return ModalSolves.of(self.plant.E, self.plant.A, at=self._apart(self.poles))
+
+    @staticmethod
+    def _apart(poles: ComplexArray) -> float:
+        """Return a point outside of all poles."""
+        return OUTSIDE * max(float(np.max(np.abs(poles), initial=0.0)), SMALLEST)
 
 
 def _when_it_matters(system: _Composite, level: float, unit: float, beyond: float) -> tuple[str, float]:

@@ -36,10 +36,10 @@ from obsynth.analysis.diagnosis.verdicts import (
     residual_bank,
 )
 from obsynth.analysis.transformations.recovery import Transformation, linear_plant
+from obsynth.analysis.zeros import structure_of
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import is_finite_number, truth
 from obsynth.numerics.libraries import failed_computations, on_one_thread_if_small
-from obsynth.numerics.pencils import pencil_structure
 from obsynth.numerics.ranks import REST_TOLERANCE
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.fault_models import Exosystem, exosystem, stated_eigenvalues
@@ -295,7 +295,7 @@ def _isolability(
 
 def _warnings(plant: DescriptorSystem, asked: Sequence[Question]) -> tuple[str, ...]:
     texts = []
-    if not pencil_structure(plant.E, plant.A).regular:
+    if not structure_of(plant).regular:
         texts.append(
             "sE - A is not regular: the equations leave states open or bind the inputs. The verdicts are about all "
             "trajectories that satisfy them."

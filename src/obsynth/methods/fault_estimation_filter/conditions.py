@@ -23,7 +23,7 @@ from obsynth.analysis.existence.rational import SystemFacts, WrittenNumbers
 from obsynth.analysis.existence.statements import DECIDER, Evaluator, FullRank, NoZeroOutside, reconsidered
 from obsynth.analysis.existence.witnesses import EntryChange, Unclear, Witness, rational_matrices
 from obsynth.analysis.plant_units import PlantUnits
-from obsynth.analysis.zeros import MOST_NAMES, Zero, hidden_faults, leading_names, zero_at
+from obsynth.analysis.zeros import MOST_NAMES, Zero, hidden_faults, leading_names, regularity_of, zero_at
 from obsynth.errors import PreconditionError
 from obsynth.methods.fault_estimation_filter.detectability_indexes import (
     REFUSE_CONDITION,
@@ -34,7 +34,6 @@ from obsynth.methods.fault_estimation_filter.detectability_indexes import (
 )
 from obsynth.methods.fault_estimation_filter.prepared_plant import PreparedPlant, prepare, with_sensor_faults_as_states
 from obsynth.numerics.arrays import FloatArray, remembered
-from obsynth.numerics.pencils import regularity
 from obsynth.plants.descriptor import DescriptorSystem
 
 if TYPE_CHECKING:
@@ -207,7 +206,7 @@ def _form_conditions(judge: Evaluator) -> list[Condition]:
         normal_rank = numbers.regular_rank
         regular = normal_rank == plant.nx
     else:
-        regular, normal_rank = regularity(plant.E, plant.A)
+        regular, normal_rank = regularity_of(plant)
     return [
         Condition(
             "discrete time",

@@ -26,8 +26,8 @@ from obsynth.methods.fault_estimation_filter.prepared_plant import prepare, with
 from obsynth.methods.method import WARN_AMPLIFICATION, Synthesis
 from obsynth.numerics.arguments import is_whole
 from obsynth.numerics.arrays import FloatArray, as_matrix
-from obsynth.numerics.norms import spectral_radius
 from obsynth.numerics.ranks import decide_rank
+from obsynth.observers.linear.derived import poles_of
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import Certificate
@@ -123,7 +123,7 @@ def notes(
                 f"The estimate of {name!r} amplifies errors of the newest measurement by up to {amplification:.3g}: "
                 "the outputs respond little to the fault within its delay."
             )
-    radius = spectral_radius(observer.Az)
+    radius = float(np.max(np.abs(poles_of(observer)), initial=0.0))
     if radius >= 1.0:
         found.append(
             f"The filter's initial-condition response does not decay: its spectral radius is {radius:.6g}, not below 1."

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from obsynth.analysis.zeros import structure_of
 from obsynth.errors import ObsynthError, SolverError
 from obsynth.methods.functional_filter.kalman_gain import FilterModel, KalmanGain, filter_model, kalman_gain
 from obsynth.methods.riccati import riccati_solution
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.pencils import pencil_structure
 from obsynth.numerics.ranks import decide_rank
 from obsynth.numerics.spectra import speeds
 from obsynth.plants.descriptor import DescriptorSystem
@@ -40,7 +40,7 @@ DECADES, RATE_BISECTIONS = 8, 9
 
 def settling_time(plant: DescriptorSystem) -> float:
     """Return the time in seconds after which a step of a fault should be seen."""
-    values = pencil_structure(plant.E, plant.A).finite_eigenvalues
+    values = structure_of(plant).finite_eigenvalues
     found = speeds(values, plant.dt)
     alive = np.sort(found[np.isfinite(found) & (found > STANDING * np.max(found, initial=0.0))])
     # The median, for which numpy would load its masked arrays.

@@ -16,9 +16,8 @@ from obsynth.analysis.existence.rational import SystemFacts, WrittenNumbers
 from obsynth.analysis.existence.statements import Evaluator, FullRank, NoZeroOutside, reconsidered
 from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
 from obsynth.analysis.transformations.recovery import Transformation
-from obsynth.analysis.zeros import MOST_NAMES, equilibrated_at, leading_names
+from obsynth.analysis.zeros import MOST_NAMES, equilibrated_at, leading_names, structure_of
 from obsynth.numerics.arrays import FloatArray, remembered
-from obsynth.numerics.pencils import pencil_structure
 from obsynth.numerics.ranks import equilibrate
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.exact_arithmetic import holds_computed
@@ -100,7 +99,7 @@ def _form(judge: Evaluator) -> tuple[int, int, int]:
     """Return normal rank, index (0 for a plant that is not regular) and the number of dynamic states."""
     plant, numbers = judge.plant, judge.numbers
     if not isinstance(numbers, WrittenNumbers) or holds_computed(plant.E):
-        pencil = pencil_structure(plant.E, plant.A)
+        pencil = structure_of(plant)
         return pencil.normal_rank, pencil.index or 0, len(pencil.finite_eigenvalues)
     index = numbers.index
     dynamic = numbers.rank(numbers.matrix("E"))

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.analysis.plant_units import PlantUnits
-from obsynth.analysis.zeros import is_outside
+from obsynth.analysis.zeros import is_outside, structure_of
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.methods.placement.kalman import KalmanProblem
 from obsynth.methods.ui_pi_observer.augmented_plant import (
@@ -29,7 +29,7 @@ from obsynth.methods.ui_pi_observer.augmented_plant import (
     paper_decoupling,
 )
 from obsynth.numerics.arrays import ComplexArray, FloatArray, as_matrix
-from obsynth.numerics.pencils import finite_zeros, pencil_structure
+from obsynth.numerics.pencils import finite_zeros
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, HIDDEN_MODE_TOLERANCE, RANK_TOLERANCE
 from obsynth.numerics.scaling import LogBalance
 from obsynth.numerics.spectra import DEAD_BEAT, eigenvalues, speeds
@@ -156,7 +156,7 @@ def _given_decoupling(plant: DescriptorSystem, units: PlantUnits, given: Mapping
 
 def _own_rate(plant: DescriptorSystem, f: FloatArray) -> float:
     """Return the median speed of the plant's modes; of the pair's where it has none; or its size."""
-    structure = pencil_structure(plant.E, plant.A)
+    structure = structure_of(plant)
     size = float(np.linalg.norm(f, 2)) if f.size else 0.0
     for values in (structure.finite_eigenvalues, eigenvalues(f)):
         found = speeds(values, plant.dt)

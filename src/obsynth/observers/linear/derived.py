@@ -15,13 +15,28 @@ from obsynth.errors import SpecError
 from obsynth.numerics.arguments import is_finite_number, require_kind
 from obsynth.numerics.arrays import ComplexArray, FloatArray, remembered
 from obsynth.numerics.continuous import first_order_hold
+from obsynth.numerics.modal_response import Modes
 from obsynth.numerics.spectra import abscissa, eigenvalues, speeds
 from obsynth.observers.linear.observer import LinearObserver
+
+#: From so many states on eigenvectors are worth to be found with the eigenvalues: more than one check wants them.
+STATES_FOR_ALL_MODES = 200
+
+
+@remembered
+def modes_of(observer: LinearObserver) -> Modes:
+    """Return the modes of a shipped ``Az``."""
+    found = Modes.of(observer.Az)
+    for part in found:
+        part.setflags(write=False)
+    return found
 
 
 @remembered
 def poles_of(observer: LinearObserver) -> ComplexArray:
     """Return the eigenvalues of a shipped ``Az``."""
+    if observer.order >= STATES_FOR_ALL_MODES:
+        return modes_of(observer).values
     found = eigenvalues(observer.Az)
     found.setflags(write=False)
     return found

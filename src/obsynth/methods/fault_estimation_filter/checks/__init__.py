@@ -28,8 +28,8 @@ from obsynth.methods.fault_estimation_filter.prepared_plant import with_sensor_f
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.modal_response import Modes
 from obsynth.numerics.norms import highest_gain_found, hinf_norm
-from obsynth.numerics.pencils import pencil_structure
 from obsynth.numerics.scaling import Scaling, balance_by_least_squares
+from obsynth.observers.linear.derived import modes_of
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.covariances import certain_noise_covariance
@@ -62,8 +62,7 @@ _FILTER_IDENTITIES = {
 def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
     """Yield every check of ``design``; see `obsynth.verify`."""
     (plant, observer), claims = design.linear, design.certificate.claims
-    structure = pencil_structure(plant.E, plant.A)
-    yield from plant_information(plant, structure)
+    yield from plant_information(plant)
     yield from condition_rows(fault_filter_conditions(plant))
     yield from claim_rows(plant, claims)
     yield from recovery_rows(plant, design.recovery)
@@ -81,7 +80,7 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
         name, claim, source = _FILTER_IDENTITIES[key]
         yield equality(name, claim, identity.residual(allowances.get(key)), source)
     yield from fault_rows(plant, observer, tracking, errors, scaling, allowances)
-    modes = Modes.of(observer.Az)
+    modes = modes_of(observer)
     radius = modes.radius
     yield upper_bound_check(
         "spectral radius",
