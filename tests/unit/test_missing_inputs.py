@@ -8,8 +8,10 @@ from functools import cache
 import numpy as np
 import pandas as pd
 import pytest
+from test_flaws_of_logs import designed, log
 
 import obsynth
+from obsynth.data.log_run import LogRun
 
 pytestmark = pytest.mark.usefixtures("taken_as_verified")
 DT, RATE, GAIN = 0.1, 2.0, 3.0
@@ -139,3 +141,41 @@ def test_the_inputs_of_delayed_samples_may_be_missing() -> None:
         wanted = running.step(known, u[k])
     np.testing.assert_allclose(found.states, wanted.states, rtol=1e-12)
     np.testing.assert_allclose(found.state_deviations, wanted.state_deviations, rtol=1e-12)
+
+
+@pytest.mark.parametrize("rows", [2, 6, 15])
+@pytest.mark.parametrize("method", ["ui-pi-observer", "fault-estimation-filter"])
+def test_levels_of_linear_designs_decide_after_inputs_that_were_missing(method: str, rows: int) -> None:
+    design = designed(method)
+    clean, data = log(rows=200), log(rows=200)
+    data.loc[100 : 99 + rows, "u"] = np.nan
+    wanted = obsynth.run_on_data(design, clean).table
+    found = LogRun(design).estimates(data["time"].tolist(), data.iloc[:, 1:].to_numpy())
+    assert wanted is not None
+    columns = [name for name in wanted.columns if name.startswith(("fhat[", "r["))]
+    places = [list(LogRun(design).observer.columns).index(name) for name in columns]
+    after = [k for k, row in enumerate(found) if row.status == "recovering"]
+    assert after[0] == 100 + rows
+    excess = np.array([found[k].excess for k in after])[:, places]
+    away = np.abs([found[k].values[places] for k in after] - wanted[columns].to_numpy()[after])
+    # 1e-12: rounding of rows that the gap does not reach.  A residual that changes its sign may be left more by inputs
+    # that were not off by the same all through the gap: 6 numbers of 300.
+    assert (away <= excess + 1e-12)[:, columns.index("fhat[f]")].all()
+    assert (away <= 2.5 * excess + 1e-12).all()
+    # A fault that the excess is small beside is found in these rows: before, no level decided in them.
+    broken = log(rows=200, fault=20.0 * excess.max())
+    broken["u"] = data["u"]
+    run = obsynth.run_on_data(design, broken, thresholds={"fhat[f]": 1e-3})
+    assert run.table is not None
+    assert run.table["alarm"][after[0]] == "fhat[f]"
+    assert "recovering" not in run.silent
+
+
+def test_outputs_that_were_measured_all_through_a_gap_of_an_input_start_nothing_again() -> None:
+    """The model stood in for no output: that it lost the plant meanwhile moved nothing."""
+    design, data = designed("ui-pi-observer"), log(rows=300)
+    data.loc[100:140, "u"] = np.nan
+    data[["a", "b"]] += np.where(np.arange(300) > 120, 50.0, 0.0)[:, None]
+    run = obsynth.run_on_data(design, data)
+    assert run.table is not None
+    assert "warm-up" not in set(run.table["status"][100:])

@@ -17,6 +17,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import first_order_hold
 from obsynth.observers.linear.derived import noise_variances, transient
 from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.unknown_inputs import no_inputs, over_samples, taken_inputs
 from obsynth.observers.windows import WindowObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
@@ -30,6 +31,7 @@ SAMPLED_GAP = "gap is for continuous-time designs: for a sampled one missing row
 #: What goes from row to row.
 SAVED = (
     *("z", "v", "row", "model", "fault", "inputs", "measured", "seen"),
+    *("moves", "reach"),
     *("clear_at", "begun", "changes", "counted", "left", "held", "excess", "carried", "known_from", "bridged"),
 )
 _Part = TypeVar("_Part")
@@ -163,6 +165,8 @@ class LinearLogObserver(LogObserver):
         self.noise = noise_variances(self.observer, self.plant.Dw)[self.shown] if noisy else np.zeros_like(self.changes)
         # What a unit error of each input that was held, and of each output that the model told, has left in z.
         self.left, self.held = np.zeros(self.b.shape), np.zeros(self.nu)
+        # How inputs have moved, and how far those that are missing may have moved since they were known.
+        self.moves, self.reach = no_inputs(self.nu), np.zeros(self.nu)
         # What the errors of the last gap have left in z, and what those of the gaps before it had in the columns.
         self.excess, self.carried = np.zeros(self.b.shape), np.zeros(len(self.columns))
         self.transient = transient(self.observer)
@@ -194,9 +198,12 @@ class LinearLogObserver(LogObserver):
             if missing:
                 self._bridge_interval(seconds, missing, u)
                 seconds = 0.0 if self.observer.dt == 0.0 else seconds
-            if good and self.model is not None and self._lost(seconds, values):
-                self._restart()
-            if good and self.z is None:
+            if good and self.model is not None:
+                self._propagate(seconds, u)
+                if self._lost(values):
+                    self._restart()
+            first = self.z is None
+            if good and first:
                 self.z, self.settled_at, self.phase = np.zeros(self.observer.order), time + self.warm_up, WARM_UP
                 self.known_from = time + max(self.warm_up, self.transient)
                 if self.begun:
@@ -208,9 +215,10 @@ class LinearLogObserver(LogObserver):
                 recovered = self.warm_up if self.model is None else self._recovering(seconds, values, longest)
                 if self.model is None:
                     self._advance_excess(seconds)
+                self.moves = taken_inputs(self.moves, self.v[: self.nu], u, is_first=first).history
                 found = self._measured(seconds, values)
                 if self.model is not None:
-                    self.model, self.left = None, np.zeros_like(self.left)
+                    self.model, self.left, self.reach = None, np.zeros_like(self.left), np.zeros(self.nu)
                     # The initial-condition response settles in as many measured rows as without a gap: what the gap
                     # adds is no larger than what is left of the start then, and goes with it.
                     self.settled_at += since * missing / (missing + 1)
@@ -292,6 +300,7 @@ class LinearLogObserver(LogObserver):
         if self.phase == RECOVERING:
             counts |= self.counted + np.cumsum(~counts) <= LEAST_SHOWN
         self._count(np.diff(np.vstack([self.row, rows[:count]]), axis=0)[counts])
+        self.moves = over_samples(self.moves, self.v[: self.nu], values[:count, : self.nu])
         self.z, self.v, self.row, self.measured = np.array(after[last]), values[last], rows[last], values[last]
         self.fault = self._faults_in(rows[last])
         self.seen = self._states(states[last], values[last], rows[last], self.fault)
@@ -345,8 +354,8 @@ class LinearLogObserver(LogObserver):
         """
         gap_model, nu = _running(self.gap_model), self.nu
         missed = np.abs(v[nu:] - gap_model.outputs(_running(self.model), v[:nu], self.fault))
-        # An input that was held was off by no more than it has changed since.
-        missed = np.concatenate([np.abs(v[:nu] - self.held), missed])
+        # An input that was held was off by no more than it has changed since, or may have by how it moved before.
+        missed = np.concatenate([np.maximum(np.abs(v[:nu] - self.held), self.reach), missed])
         usual, step = self._usual(), self.observer.dt or longest
         if not (np.isfinite(self.left).all() and step > 0.0):
             self.carried = np.full_like(self.carried, np.inf)
@@ -354,7 +363,7 @@ class LinearLogObserver(LogObserver):
         a, left = self.observer.Az, self.left
         if self.observer.dt == 0.0:
             transition, constant, _ = self._hold(seconds or step)
-            told = np.repeat([False, True], [nu, len(self.output_names)])
+            told = left.any(axis=0) & np.repeat([False, True], [nu, len(self.output_names)])
             a, left = self._hold(step)[0], transition @ left + constant * told
         self.excess = left * missed
         if usual is None:
@@ -367,10 +376,12 @@ class LinearLogObserver(LogObserver):
                 break
         return min(waited, self.warm_up)
 
-    def _lost(self, seconds: float, v: FloatArray) -> bool:
-        """Whether the model, after a gap, misses the outputs by more than their whole size before and after it."""
-        self._propagate(seconds, v[: self.nu])
+    def _lost(self, v: FloatArray) -> bool:
+        """Whether the model, after a gap in which it stood in for outputs, misses them by more than their whole size
+        before and after it."""
         gap_model = _running(self.gap_model)
+        if not self.left[:, self.nu :].any():
+            return False
         # The outputs and the model may both be huge; a miss that is not finite is lost as well.
         return not gap_model.miss(v, self.model, self.fault) <= gap_model.miss(self.measured) + gap_model.miss(v)
 
@@ -423,9 +434,7 @@ class LinearLogObserver(LogObserver):
         told = ~np.isfinite(values)
         self.bridged &= not told[: self.nu].any()
         v = np.where(told, np.concatenate([u, self.gap_model.outputs(self.model, u, self.fault)]), values)
-        if (told[: self.nu] & self.left[:, : self.nu].any(axis=0)).any():
-            # What an input has done in more than one row is not known.
-            self.left = np.full_like(self.left, np.nan)
+        self._unknown_inputs(np.where(told, np.nan, values)[: self.nu])
         if self.observer.dt == 0.0:
             self._flow(seconds, v)
             transition, constant, _ = self._hold(seconds)
@@ -440,6 +449,15 @@ class LinearLogObserver(LogObserver):
             self._restart()
             return self._held()
         return row
+
+    def _unknown_inputs(self, u: FloatArray) -> None:
+        """Follow how far inputs may have moved that are missing (NaN in ``u (nu,)``)."""
+        before, known = self.v[: self.nu], taken_inputs(self.moves, self.v[: self.nu], u, is_first=False)
+        lowest, highest, change, count, _ = known.history
+        returned = np.where((count == 0.0) & (self.moves[3] > 0.0), np.abs(known.u - before), 0.0)
+        # In one sample an input is off by what it has changed since; in several it may have come and gone.
+        moved = np.where(count > 1.0, np.minimum(count * change, highest - lowest), returned)
+        self.moves, self.reach = known.history, np.maximum(self.reach, moved)
 
     def _propagate(self, seconds: float, u: FloatArray) -> None:
         before, model = self.v[: self.nu], _running(self.model)

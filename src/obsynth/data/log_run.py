@@ -327,7 +327,7 @@ class LogRun:
 
 
 RUN_STATE_KIND = "obsynth run state"
-RUN_STATE_VERSION = 10
+RUN_STATE_VERSION = 11
 STATE = FileKind("a saved state of obsynth", rb'\A\s*\{\s*"kind":\s*"obsynth run state"')
 #: Parts that are seconds, or nothing before the first row.
 _TIME_PARTS = frozenset({"last", "longest"})

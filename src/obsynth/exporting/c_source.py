@@ -275,6 +275,8 @@ def _state_struct(found: Realisation, prefix: str, alarms: Alarms) -> list[str]:
         "model": gap.states,
         "left": nz * (nu + ny),
         "held": nu,
+        "moves": 4 * nu,
+        "reach": nu,
         "changes": shown,
         "excess": nz * (nu + ny),
         "carried": shown,
@@ -296,7 +298,7 @@ def _state_struct(found: Realisation, prefix: str, alarms: Alarms) -> list[str]:
         *(f"    REAL {name}[{max(size, 1)}];" for name, size in sizes.items()),
         "    double time, from, waiting;",
         "    long k, counted;",
-        "    int kept, is_started, is_gap, inputs_known, phase;",
+        "    int kept, is_started, is_gap, phase;",
         f"}} {prefix}_state;",
     ]
 

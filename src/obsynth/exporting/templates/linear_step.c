@@ -84,7 +84,19 @@ static REAL missed(const REAL *v, const REAL *x, const REAL *fault)
     return sum;
 }
 
-/* Whether the model, after a gap, misses the outputs by more than their whole size before and after it. */
+static int any_left(const REAL *left, int n)
+{
+    int i;
+    for (i = 0; i < n; i++) {
+        if (left[i] != 0) {
+            return 1;
+        }
+    }
+    return 0;
+}
+
+/* Whether the model, after a gap in which it stood in for outputs, misses them by more than their whole size before and
+ * after it; it is brought to this sample. */
 static int is_lost(PREFIX_state *s, const REAL *v)
 {
     static const REAL rest[LENGTH(MODEL_STATES)];
@@ -93,9 +105,40 @@ static int is_lost(PREFIX_state *s, const REAL *v)
     REAL now = missed(v, rest, none);
     REAL more;
     model_after(s->model, s->v, v, s->fault);
+    if (!any_left(s->left + U_COUNT * Z_COUNT, Y_COUNT * Z_COUNT)) {
+        return 0;
+    }
     /* a <= b + c, of squares, without roots. */
     more = missed(v, s->model, s->fault) - before - now;
     return !(more <= 0 || more * more <= 4 * before * now);
+}
+
+/* Follow how inputs move: lowest and highest value, largest change from sample to sample, samples missing in a row; and
+ * how far those that are missing may have moved since they were known. Missing ones stand in `u` as they last were. */
+static void follow(PREFIX_state *s, const REAL *u, const int *unsure, int is_first)
+{
+    int i;
+    for (i = 0; i < U_COUNT; i++) {
+        REAL *moves = s->moves + 4 * i;
+        REAL moved = ABS(u[i] - s->v[i]);
+        if (is_first) {
+            moves[0] = moves[1] = u[i];
+            moves[2] = moves[3] = 0;
+            continue;
+        }
+        moves[0] = u[i] < moves[0] ? u[i] : moves[0];
+        moves[1] = u[i] > moves[1] ? u[i] : moves[1];
+        if (moved / (moves[3] + 1) > moves[2]) {
+            moves[2] = moved / (moves[3] + 1);
+        }
+        moved = moves[3] > 0 && !unsure[i] ? moved : 0;
+        moves[3] = unsure[i] ? moves[3] + 1 : 0;
+        /* In one sample an input is off by what it has changed since; in several it may have come and gone. */
+        if (moves[3] > 1) {
+            moved = moves[3] * moves[2] < moves[1] - moves[0] ? moves[3] * moves[2] : moves[1] - moves[0];
+        }
+        s->reach[i] = s->reach[i] > moved ? s->reach[i] : moved;
+    }
 }
 
 /* Seconds after a gap in which nothing may be decided: until what the model missed by has become usual. */
@@ -109,19 +152,22 @@ static double recovering(PREFIX_state *s, const REAL *v)
 #if STRAIGHT
     REAL one[LENGTH(V_COUNT)] = {0};
 #endif
-    if (!s->inputs_known || !all_finite(s->left, Z_COUNT * V_COUNT)) {
+    if (!all_finite(s->left, Z_COUNT * V_COUNT)) {
         filled(s->carried, (REAL)INFINITY, SHOWN_COUNT);
         return s->warm_up;
     }
     model_outputs(s->model, v, s->fault, miss + U_COUNT);
-    /* An input that was held was off by no more than it has changed since. */
+    /* An input that was held was off by no more than it has changed since, or may have by how it moved before. */
     for (i = 0; i < V_COUNT; i++) {
         miss[i] = ABS(v[i] - (i < U_COUNT ? s->held[i] : miss[i]));
+        if (i < U_COUNT && s->reach[i] > miss[i]) {
+            miss[i] = s->reach[i];
+        }
     }
 #if STRAIGHT
     filled(one, 0, V_COUNT);
     for (j = 0; j < V_COUNT; j++) {
-        one[j] = j >= U_COUNT;
+        one[j] = j >= U_COUNT && any_left(s->left + j * Z_COUNT, Z_COUNT);
         next_of(s->left + j * Z_COUNT, one, zero, moved);
         copied(s->left + j * Z_COUNT, moved, Z_COUNT);
         one[j] = 0;
@@ -253,19 +299,6 @@ static void flowed(PREFIX_state *s, const REAL *v)
 }
 #endif
 
-#if MODEL
-static int any_left(const REAL *left)
-{
-    int i;
-    for (i = 0; i < Z_COUNT; i++) {
-        if (left[i] != 0) {
-            return 1;
-        }
-    }
-    return 0;
-}
-#endif
-
 /* What is said where nothing is known: faults as they were. */
 static int held(PREFIX_state *s, REAL *states, REAL *shown)
 {
@@ -317,6 +350,7 @@ static int unmeasured(PREFIX_state *s, const REAL *u, const int *unsure, REAL *s
 #if STRAIGHT
     flowed(s, v);
 #endif
+    follow(s, v, unsure, 0);
     for (i = 0; i < V_COUNT; i++) {
         REAL one[LENGTH(V_COUNT)] = {0};
         REAL moved[LENGTH(Z_COUNT)] = {0};
@@ -325,10 +359,6 @@ static int unmeasured(PREFIX_state *s, const REAL *u, const int *unsure, REAL *s
 #endif
         filled(one, 0, V_COUNT);
         one[i] = unsure[i];
-        if (i < U_COUNT && unsure[i] && any_left(s->left + i * Z_COUNT)) {
-            /* What an input has done in more than one row is not known. */
-            s->inputs_known = 0;
-        }
 #if STRAIGHT
         next_of(s->left + i * Z_COUNT, one, zero, moved);
 #else
@@ -367,12 +397,16 @@ static int measured(PREFIX_state *s, const REAL *v, REAL *states, REAL *shown)
     int was_measured = s->is_started && !was_gap;
     int i;
 #if MODEL
+    static const int none[LENGTH(V_COUNT)];
     if (was_gap && is_lost(s, v)) {
         restart(s);
         was_gap = 0;
     }
 #endif
     if (!s->is_started) {
+#if MODEL
+        follow(s, v, none, 1);
+#endif
         copied(s->z, start[0], Z_COUNT);
         s->is_started = 1;
         s->from = s->time;
@@ -388,6 +422,7 @@ static int measured(PREFIX_state *s, const REAL *v, REAL *states, REAL *shown)
             later(s);
         }
 #endif
+        follow(s, v, none, 0);
 #endif
 #if STRAIGHT
         flowed(s, v);
@@ -428,7 +463,7 @@ static int measured(PREFIX_state *s, const REAL *v, REAL *states, REAL *shown)
             s->phase = UPPER_RECOVERING;
         }
         filled(s->left, 0, Z_COUNT * V_COUNT);
-        s->inputs_known = 1;
+        filled(s->reach, 0, U_COUNT);
     }
     if (!all_finite(s->z, Z_COUNT) || !all_finite(states, STATE_COUNT) || !all_finite(shown, SHOWN_COUNT)) {
         restart(s);
@@ -462,8 +497,9 @@ void PREFIX_reset(PREFIX_state *s)
     filled(s->changes, 0, SHOWN_COUNT);
     filled(s->left, 0, Z_COUNT * V_COUNT);
     filled(s->held, 0, U_COUNT);
+    filled(s->moves, 0, 4 * U_COUNT);
+    filled(s->reach, 0, U_COUNT);
     s->counted = 0;
-    s->inputs_known = 1;
     s->time = s->from = s->waiting = 0;
     s->warm_up = WARM_UP_SECONDS;
     copied(s->level, levels[0], UPPER_WATCHED);
