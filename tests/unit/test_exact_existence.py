@@ -111,11 +111,11 @@ def test_sampled_plants_are_decided_as_sampled(sample_time):
 def test_a_triple_integrator_has_no_zero_before_it_is_sampled_and_an_unstable_one_after():
     plant = DescriptorSystem(None, np.eye(3, k=1), C=[[1, 0, 0]], Bf=[[0], [0], [1]])
     numbers = numbers_of(discretise(plant, 0.1).plant)
-    facts = numbers.system(numbers.matrix("Bf"), numbers.matrix("Df"))
+    facts = numbers.system(numbers.matrices["Bf"], numbers.matrices["Df"])
     assert not facts.exact
     assert facts.outside[0] == pytest.approx(-2 - np.sqrt(3))
     own = numbers_of(plant)
-    assert own.system(own.matrix("Bf"), own.matrix("Df")).zeros == ()
+    assert own.system(own.matrices["Bf"], own.matrices["Df"]).zeros == ()
 
 
 @pytest.mark.parametrize(("zero", "stable"), [(1 - 1e-9, True), (1.0, False), (1 + 1e-9, False), (-1.0, False)])

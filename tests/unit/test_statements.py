@@ -11,7 +11,7 @@ import pytest
 import obsynth
 from obsynth import DescriptorSystem, discretise
 from obsynth.analysis.conditions import Condition
-from obsynth.analysis.existence.rational import SystemFacts
+from obsynth.analysis.existence.numbers import SystemFacts
 from obsynth.analysis.existence.statements import Evaluator, FullRank, NoZeroOutside
 from obsynth.analysis.existence.witnesses import Unclear
 

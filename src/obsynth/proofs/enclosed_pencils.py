@@ -35,9 +35,9 @@ def enclosed(matrix: fmpq_mat) -> Rows:
     return [[arb(entry) for entry in row] for row in matrix.tolist()]
 
 
-def exponential(matrix: fmpq_mat) -> Rows:
+def exponential(matrix: fmpq_mat) -> Any:
     """Return an enclosure of the exponential of a square rational matrix."""
-    return [list(row) for row in arb_mat(enclosed(matrix)).exp().tolist()]
+    return arb_mat(matrix).exp()
 
 
 def holds_zero(value: Any) -> bool:

@@ -24,11 +24,11 @@ from obsynth.numerics.arrays import FloatArray
 
 
 def blocks(parts: list[list[fmpq_mat]]) -> fmpq_mat:
-    """Return the block matrix with these rows of blocks."""
+    """Return the block matrix with these rows of blocks, rational or enclosures."""
     height = sum(row[0].nrows() for row in parts)
     width = sum(part.ncols() for part in parts[0])
     lines = (line for row in parts for line in zip(*(part.tolist() for part in row), strict=True))
-    return fmpq_mat(height, width, [value for line in lines for piece in line for value in piece])
+    return type(parts[0][0])(height, width, [value for line in lines for piece in line for value in piece])
 
 
 def zeros_matrix(rows: int, columns: int) -> fmpq_mat:
@@ -44,13 +44,13 @@ def identity(order: int) -> fmpq_mat:
 def picked_columns(matrix: fmpq_mat, columns: Sequence[int]) -> fmpq_mat:
     """Return some columns."""
     rows = int(matrix.nrows())
-    return fmpq_mat(rows, len(columns), [matrix[i, j] for i in range(rows) for j in columns])
+    return type(matrix)(rows, len(columns), [matrix[i, j] for i in range(rows) for j in columns])
 
 
 def picked_rows(matrix: fmpq_mat, rows: Sequence[int]) -> fmpq_mat:
     """Return some rows."""
     columns = int(matrix.ncols())
-    return fmpq_mat(len(rows), columns, [matrix[i, j] for i in rows for j in range(columns)])
+    return type(matrix)(len(rows), columns, [matrix[i, j] for i in rows for j in range(columns)])
 
 
 def row_basis(matrix: fmpq_mat) -> fmpq_mat:

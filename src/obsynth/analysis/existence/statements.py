@@ -22,8 +22,7 @@ from obsynth.analysis.existence.distance import (
     zeros_at_rounding_level,
 )
 from obsynth.analysis.existence.named_pencils import NamedPencil, named_pencil
-from obsynth.analysis.existence.numbers import numbers_of
-from obsynth.analysis.existence.rational import PlantNumbers, SystemFacts
+from obsynth.analysis.existence.numbers import PlantNumbers, SystemFacts, numbers_of
 from obsynth.analysis.existence.witnesses import Unclear
 from obsynth.analysis.plant_units import PlantUnits, sized_plant
 from obsynth.analysis.zeros import are_outside, is_outside, system_zeros
@@ -33,6 +32,7 @@ from obsynth.numerics.ranks import NAMED_SHARE, RANK_TOLERANCE, RankDecision, de
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.fault_models import Exosystem
 from obsynth.proofs.balls import UNIT_ROUNDOFF
+from obsynth.proofs.exact_arithmetic import blocks, picked_rows
 
 
 def settled_rank(decision: RankDecision, exact_rank: int | None, share: float = np.inf) -> RankDecision:
@@ -171,7 +171,7 @@ class Evaluator:
         numbers, count = self.numbers, self.plant.nd
         if numbers is None:
             return list(range(count))
-        return numbers.independent_columns(numbers.blocks([[numbers.matrix("Bd")], [numbers.matrix("Dd")]]), count)
+        return numbers.independent_columns(blocks([[numbers.matrices["Bd"]], [numbers.matrices["Dd"]]]), count)
 
     @cached_property
     def terms(self) -> DescriptorSystem | None:
@@ -219,8 +219,8 @@ class Evaluator:
             for row, height in zip(said.blocks, heights, strict=True)
         ]
         if said.last_rows is not None:
-            rows[-1] = [numbers.rows(part, said.last_rows) for part in rows[-1]]
-        return numbers.rank(numbers.blocks(rows))
+            rows[-1] = [picked_rows(part, said.last_rows) for part in rows[-1]]
+        return numbers.rank(blocks(rows))
 
     def rank_itself(self, said: FullRank) -> int:
         """Return the rank that blocks have."""

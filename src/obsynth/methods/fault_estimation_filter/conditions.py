@@ -18,8 +18,7 @@ import numpy as np
 from obsynth.analysis.conditions import Condition, up_to_failure
 from obsynth.analysis.existence.distance import ROUNDING_LEVEL
 from obsynth.analysis.existence.named_pencils import WITNESS_DIGITS
-from obsynth.analysis.existence.numbers import numbers_of
-from obsynth.analysis.existence.rational import SystemFacts, WrittenNumbers
+from obsynth.analysis.existence.numbers import SystemFacts, numbers_of
 from obsynth.analysis.existence.statements import DECIDER, Evaluator, FullRank, NoZeroOutside, reconsidered
 from obsynth.analysis.existence.witnesses import EntryChange, Unclear, Witness, rational_matrices
 from obsynth.analysis.plant_units import PlantUnits
@@ -80,10 +79,10 @@ def _exact(plant: DescriptorSystem) -> tuple[fmpq_mat, fmpq_mat, fmpq_mat, fmpq_
     """Return ``T A``, C, ``T Bf`` and T of the plant as written, with its sensor faults as states."""
     plant = Witness((), 0.0).plant(plant)
     numbers = numbers_with_fault_states(plant, numbers_of(plant))
-    t = nonsingular_t(numbers) if isinstance(numbers, WrittenNumbers) else None
-    if t is None or not isinstance(numbers, WrittenNumbers):
+    t = nonsingular_t(numbers) if numbers is not None and numbers.exact else None
+    if t is None or numbers is None:
         return None
-    return t * numbers.matrix("A"), numbers.matrix("C"), t * numbers.matrix("Bf"), t
+    return t * numbers.matrices["A"], numbers.matrices["C"], t * numbers.matrices["Bf"], t
 
 
 def _moved(a: fmpq_mat, faults: fmpq_mat, fault: int, index: int | None) -> fmpq_mat:

@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import random
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
+from flint import fmpq_mat
 
 from obsynth.analysis.conditions import Condition
-from obsynth.analysis.existence.numbers import numbers_of
-from obsynth.analysis.existence.rational import PlantNumbers
+from obsynth.analysis.existence.numbers import PlantNumbers, numbers_of
 from obsynth.analysis.existence.statements import settled_rank
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import (
@@ -24,10 +24,7 @@ from obsynth.numerics.ranks import (
     decide_rank,
 )
 from obsynth.plants.descriptor import DescriptorSystem
-
-if TYPE_CHECKING:
-    from flint import fmpq_mat
-
+from obsynth.proofs.exact_arithmetic import blocks, identity, left_null_basis, picked_columns, zeros_matrix
 
 #: Random choices of T after which none is taken to be nonsingular.
 MOST_CHOICES = 20
@@ -42,8 +39,6 @@ ExactIndexes: TypeAlias = tuple[tuple[int | None, ...], int]
 
 def numbers_with_fault_states(plant: DescriptorSystem, numbers: PlantNumbers | None) -> PlantNumbers | None:
     """Return the numbers of a plant with its sensor faults appended as algebraic states."""
-    from obsynth.proofs.exact_arithmetic import blocks, identity, picked_columns, zeros_matrix
-
     chosen = [int(j) for j in np.flatnonzero(np.any(plant.Df != 0.0, axis=0))]
     if numbers is None or not chosen:
         return numbers
@@ -54,11 +49,11 @@ def numbers_with_fault_states(plant: DescriptorSystem, numbers: PlantNumbers | N
     kept = identity(nf) - shown * rows
     own = numbers.as_own
     changed: dict[str, Any] = {
-        "E": numbers.blocks([[numbers.matrix("E"), own(across)], [own(down), own(square)]]),
-        "A": numbers.blocks([[numbers.matrix("A"), own(across)], [own(down), own(-identity(count))]]),
-        "Bf": numbers.blocks([[numbers.matrix("Bf")], [own(rows)]]),
-        "C": numbers.blocks([[numbers.matrix("C"), numbers.product(numbers.matrix("Df"), own(shown))]]),
-        "Df": numbers.product(numbers.matrix("Df"), own(kept)),
+        "E": blocks([[numbers.matrices["E"], own(across)], [own(down), own(square)]]),
+        "A": blocks([[numbers.matrices["A"], own(across)], [own(down), own(-identity(count))]]),
+        "Bf": blocks([[numbers.matrices["Bf"]], [own(rows)]]),
+        "C": blocks([[numbers.matrices["C"], numbers.product(numbers.matrices["Df"], own(shown))]]),
+        "Df": numbers.product(numbers.matrices["Df"], own(kept)),
     }
     e, c, df = (numbers.rational[name] for name in ("E", "C", "Df"))
     rational = {"E": blocks([[e, across], [down, square]]), "C": blocks([[c, df * shown]]), "Df": df * kept}
@@ -82,29 +77,25 @@ def _decided_indexes(plant: DescriptorSystem, known: PlantNumbers) -> ExactIndex
     if t is None:
         return None
     left: Any = numbers.as_own(t)
-    ta, c = numbers.product(left, numbers.matrix("A")), numbers.matrix("C")
+    ta, c = numbers.product(left, numbers.matrices["A"]), numbers.matrices["C"]
     order, indexes, columns = int(t.ncols()), list[int | None](), list[Any]()
     for fault in range(plant.nf):
-        vector = numbers.product(left, numbers.picked(numbers.matrix("Bf"), [fault]))
+        vector = numbers.product(left, numbers.columns("Bf", [fault]))
         for step in range(1, order + 1):
             shown = numbers.product(c, vector)
-            if not numbers.is_zero(shown):
+            if numbers.rank(shown):
                 indexes.append(step)
                 columns.append(shown)
                 break
             vector = numbers.product(ta, vector)
         else:
             indexes.append(None)
-    rank = numbers.rank(numbers.blocks([columns])) if None not in indexes and columns else 0
+    rank = numbers.rank(blocks([columns])) if None not in indexes and columns else 0
     return tuple(indexes), rank
 
 
 def nonsingular_t(numbers: PlantNumbers) -> fmpq_mat | None:
     """Return a rational nonsingular T with ``T E + N C = I``."""
-    from flint import fmpq_mat
-
-    from obsynth.proofs.exact_arithmetic import blocks, left_null_basis, picked_columns
-
     e, c = numbers.rational["E"], numbers.rational["C"]
     stacked, order = blocks([[e], [c]]), int(e.ncols())
     if stacked.rank() < order:

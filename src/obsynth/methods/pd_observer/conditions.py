@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from obsynth.analysis.conditions import Condition, up_to_failure
-from obsynth.analysis.existence.rational import SystemFacts, WrittenNumbers
+from obsynth.analysis.existence.numbers import SystemFacts
 from obsynth.analysis.existence.statements import Evaluator, FullRank, NoZeroOutside, reconsidered
 from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
 from obsynth.analysis.transformations.recovery import Transformation
@@ -21,6 +21,7 @@ from obsynth.numerics.arrays import FloatArray, remembered
 from obsynth.numerics.ranks import equilibrate
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.exact_arithmetic import holds_computed
+from obsynth.proofs.exact_pencils import ExactPencil
 
 _SOURCE = "Filasova et al., eqs. (1), (2)"
 
@@ -98,11 +99,11 @@ def _form_conditions(judge: Evaluator) -> Iterator[Condition]:
 def _form(judge: Evaluator) -> tuple[int, int, int]:
     """Return normal rank, index (0 for a plant that is not regular) and the number of dynamic states."""
     plant, numbers = judge.plant, judge.numbers
-    if not isinstance(numbers, WrittenNumbers) or holds_computed(plant.E):
+    if numbers is None or not numbers.exact or holds_computed(plant.E):
         pencil = structure_of(plant)
         return pencil.normal_rank, pencil.index or 0, len(pencil.finite_eigenvalues)
-    index = numbers.index
-    dynamic = numbers.rank(numbers.matrix("E"))
+    index = ExactPencil(numbers.matrices["E"], numbers.matrices["A"]).index
+    dynamic = numbers.rank(numbers.matrices["E"])
     return plant.nx if index is not None else numbers.regular_rank, index or 0, dynamic
 
 

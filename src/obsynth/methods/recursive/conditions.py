@@ -17,7 +17,7 @@ from typing import TypeAlias
 import numpy as np
 
 from obsynth.analysis.conditions import Condition, rank_condition
-from obsynth.analysis.existence.rational import SystemFacts
+from obsynth.analysis.existence.numbers import SystemFacts
 from obsynth.analysis.existence.statements import Evaluator, FullRank, NoZeroOutside, settled_rank
 from obsynth.analysis.time_varying import (
     STEPS_WITHOUT_HORIZON,
@@ -102,7 +102,9 @@ def _settled_traces(judge: Evaluator, decision: RankDecision) -> RankDecision:
     numbers = judge.numbers
     if numbers is None:
         return decision
-    return settled_rank(decision, numbers.rank_at_root(numbers.matrix("Bf"), numbers.matrix("Df"), fmpz_poly([-1, 1])))
+    return settled_rank(
+        decision, numbers.rank_at_root(numbers.matrices["Bf"], numbers.matrices["Df"], fmpz_poly([-1, 1]))
+    )
 
 
 def _explained(

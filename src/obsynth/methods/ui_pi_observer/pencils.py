@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.analysis.existence.rational import PlantNumbers, SystemFacts
+from obsynth.analysis.existence.numbers import PlantNumbers, SystemFacts
 from obsynth.analysis.existence.statements import Evaluator
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import RANK_TOLERANCE, decide_rank
 from obsynth.numerics.scaling import equilibrating_factors
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.fault_models import Exosystem
+from obsynth.proofs.exact_arithmetic import blocks, identity, primitive, written_matrix, zeros_matrix
 
 if TYPE_CHECKING:
     from flint import fmpz_poly
@@ -83,7 +84,7 @@ def _exact_pencil(
     bd, dd = (numbers.columns(name, kept) for name in ("Bd", "Dd"))
     below = numbers.zeros(judge.plant.nx + model.order, 0)
     if kept:
-        below = numbers.blocks([[bd], [numbers.zeros(model.order, len(kept))]])
+        below = blocks([[bd], [numbers.zeros(model.order, len(kept))]])
     return _augmented(numbers, judge.plant, model), below, dd, kept
 
 
@@ -114,21 +115,19 @@ def exact_loss(judge: Evaluator, model: Exosystem, value: complex) -> int | None
 
 
 def _augmented(numbers: PlantNumbers, plant: DescriptorSystem, model: Exosystem) -> PlantNumbers:
-    from obsynth.proofs.exact_arithmetic import blocks, identity, written_matrix, zeros_matrix
-
     count, nx = model.order, plant.nx
     own = numbers.as_own
     across, down = zeros_matrix(nx, count), zeros_matrix(count, nx)
     course = own(written_matrix(model.Cw))
     changed = {
-        "E": numbers.blocks([[numbers.matrix("E"), own(across)], [own(down), own(identity(count))]]),
-        "A": numbers.blocks(
+        "E": blocks([[numbers.matrices["E"], own(across)], [own(down), own(identity(count))]]),
+        "A": blocks(
             [
-                [numbers.matrix("A"), numbers.product(numbers.matrix("Bf"), course)],
+                [numbers.matrices["A"], numbers.product(numbers.matrices["Bf"], course)],
                 [own(down), own(written_matrix(model.Phi))],
             ]
         ),
-        "C": numbers.blocks([[numbers.matrix("C"), numbers.product(numbers.matrix("Df"), course)]]),
+        "C": blocks([[numbers.matrices["C"], numbers.product(numbers.matrices["Df"], course)]]),
     }
     rational = {"E": blocks([[numbers.rational["E"], across], [down, identity(count)]])}
     return numbers.with_matrices(changed, rational=rational)
@@ -136,8 +135,6 @@ def _augmented(numbers: PlantNumbers, plant: DescriptorSystem, model: Exosystem)
 
 def _factor_of(model: Exosystem, value: complex) -> fmpz_poly | None:
     """Return the irreducible polynomial of Phi as written of which the value is a root."""
-    from obsynth.proofs.exact_arithmetic import primitive, written_matrix
-
     polynomial = primitive(written_matrix(model.Phi).charpoly())
     factors = [factor for factor, _ in polynomial.factor()[1]]
 
