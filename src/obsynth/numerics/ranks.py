@@ -7,7 +7,7 @@ how clear it was.  Other constants stand with their algorithm.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -83,10 +83,15 @@ def rounding_rank(matrix: FloatArray) -> int:
     return int(np.linalg.matrix_rank(matrix))
 
 
-def product_but_rounding(matrix: FloatArray, other: FloatArray) -> FloatArray:
-    """Return a product; where its terms cancel down to their rounding, there is nothing."""
-    found = matrix @ other
-    return np.where(np.abs(found) > CANCELLATION_TOLERANCE * (np.abs(matrix) @ np.abs(other)), found, 0.0)
+def but_rounding(found: FloatArray, size_of_terms: FloatArray) -> FloatArray:
+    """Return sums without those that cancel down to the rounding of their terms."""
+    return np.where(np.abs(found) > CANCELLATION_TOLERANCE * size_of_terms, found, 0.0)
+
+
+def product_but_rounding(matrix: Any, other: FloatArray, more: FloatArray | None = None) -> FloatArray:
+    """Return ``more + matrix other``; where its terms cancel down to their rounding, there is nothing."""
+    found, terms = matrix @ other, abs(matrix) @ np.abs(other)
+    return but_rounding(found, terms) if more is None else but_rounding(more + found, np.abs(more) + terms)
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,11 +30,6 @@ def bits_for(states: int) -> int:
     return BASE_BITS + BITS_PER_STATE * states
 
 
-def enclosed(matrix: fmpq_mat) -> Rows:
-    """Return the rows of a rational matrix as enclosures of the current precision."""
-    return [[arb(entry) for entry in row] for row in matrix.tolist()]
-
-
 def exponential(matrix: fmpq_mat) -> Any:
     """Return an enclosure of the exponential of a square rational matrix."""
     return arb_mat(matrix).exp()
@@ -127,7 +122,7 @@ class EnclosedPencil:
         """Return the coefficients of the determinant of the pencil with its rows compressed at random."""
         rows, columns = self.shape
         rng = random.Random(POINTS_SEED + seed)
-        e, a = arb_mat(enclosed(self.E)), arb_mat(self.A)
+        e, a = arb_mat(self.E), arb_mat(self.A)
         if rows > columns:
             left = arb_mat(columns, rows, [rng.randint(-4096, 4096) for _ in range(columns * rows)])
             e, a = left * e, left * a

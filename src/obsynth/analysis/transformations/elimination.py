@@ -20,7 +20,7 @@ from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.libraries import one_thread_if_small
 from obsynth.numerics.pencils import pencil_structure
-from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, rounding_rank
+from obsynth.numerics.ranks import but_rounding, product_but_rounding, rounding_rank
 from obsynth.numerics.scaling import equilibrate_pencil, power_of_two_below
 from obsynth.numerics.sparse import is_sparse
 from obsynth.plants.descriptor import DescriptorSystem
@@ -197,13 +197,15 @@ def _eliminated_densely(plant: DescriptorSystem, count: int) -> Transformation:
     coupling = rows @ plant.A @ algebraic
     # algebraic coordinates = solution @ [state; u; f; d; w]
     solution = _solved(-coupling[count:], right_sides[count:])
-    reduced = _solved(rows[:count] @ plant.E @ dynamic, _sum(right_sides[:count], coupling[:count], solution))
+    reduced = _solved(
+        rows[:count] @ plant.E @ dynamic, product_but_rounding(coupling[:count], solution, right_sides[:count])
+    )
     direct = np.hstack([plant.C @ dynamic, plant.D, plant.Df, plant.Dd, plant.Dw])
     A, B, Bf, Bd, Bw = columns_of(reduced, sizes)
-    C, D, Df, Dd, Dw = columns_of(_sum(direct, plant.C @ algebraic, solution), sizes)
+    C, D, Df, Dd, Dw = columns_of(product_but_rounding(plant.C @ algebraic, solution, direct), sizes)
     padded = np.hstack([dynamic, np.zeros((plant.nx, signals.shape[1]))])
     from_state, from_input, from_fault, from_disturbance, from_noise = columns_of(
-        _sum(padded, algebraic, solution), sizes
+        product_but_rounding(algebraic, solution, padded), sizes
     )
     new = with_states(plant, names, E=None, A=A, B=B, Bf=Bf, Bd=Bd, Bw=Bw, C=C, D=D, Df=Df, Dd=Dd, Dw=Dw)
     recovery = StateRecovery(
@@ -272,16 +274,7 @@ def _solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
     scaled = scale * matrix
     solution: FloatArray = np.asarray(np.linalg.solve(scaled, scale * right), dtype=np.float64)
     inverse = np.abs(np.linalg.inv(scaled))
-    return _cleaned(solution, inverse @ (np.abs(scaled) @ np.abs(solution)))
-
-
-def _sum(direct: FloatArray, factor: FloatArray, solution: FloatArray) -> FloatArray:
-    """Return ``direct + factor solution`` with entries that are only rounding set to zero."""
-    return _cleaned(direct + factor @ solution, np.abs(direct) + np.abs(factor) @ np.abs(solution))
-
-
-def _cleaned(result: FloatArray, size_of_terms: FloatArray) -> FloatArray:
-    return np.where(np.abs(result) > CANCELLATION_TOLERANCE * size_of_terms, result, 0.0)
+    return but_rounding(solution, inverse @ (np.abs(scaled) @ np.abs(solution)))
 
 
 def columns_of(matrix: FloatArray, sizes: Sequence[int]) -> list[FloatArray]:

@@ -8,18 +8,32 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import flint
 import numpy as np
+from flint import fmpq, fmpq_mat
 
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import zero_order_hold
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.exact_numbers import DECISIVE, ExactNumbers
-
-if TYPE_CHECKING:
-    from flint import fmpq_mat
+from obsynth.proofs.exact_arithmetic import (
+    blocks,
+    fractions_of,
+    holds_computed,
+    identity,
+    nearest_doubles,
+    null_basis,
+    picked_columns,
+    picked_rows,
+    pivot_columns,
+    written_fraction,
+    written_matrix,
+    written_rows,
+    zeros_matrix,
+)
 
 #: Plants of more states are eliminated in floating point.
 MOST_STATES_EXACTLY = 64
@@ -43,8 +57,6 @@ class ExactElimination:
 
     def numbers(self, sizes: Mapping[str, FloatArray], *, own: bool) -> ExactNumbers:
         """Return those of the reduced plant, with the sizes of the terms in its coordinates; ``own``: these ones."""
-        from obsynth.proofs.exact_arithmetic import fractions_of, identity
-
         found: dict[str, fmpq_mat] = {"E": identity(len(self.pivots)), **self.matrices}
         kept = {name: sizes[name] for name in DECISIVE if name in sizes}
         known = all(np.all(np.isfinite(part)) for part in kept.values())
@@ -62,8 +74,6 @@ class ExactElimination:
 
 def exact_elimination(plant: DescriptorSystem) -> ExactElimination | None:
     """Return the elimination; ``None`` for too many states, or where no state can be eliminated so."""
-    from obsynth.proofs.exact_arithmetic import holds_computed
-
     if plant.nx > MOST_STATES_EXACTLY or plant.exact is not None:
         return None
     computed = any(holds_computed(getattr(plant, name)) for name in ("E", "A", "C", *_EXACT_INPUTS, *_EXACT_DIRECT))
@@ -79,17 +89,6 @@ def exact_elimination(plant: DescriptorSystem) -> ExactElimination | None:
 def _eliminated(plant: DescriptorSystem, *, clean: bool, sized: bool = True) -> ExactElimination | None:
     """Return the elimination; with ``clean`` what rounding of computed data may have left is zero.
     Without ``sized`` the sizes of terms are left out."""
-    from obsynth.proofs.exact_arithmetic import (
-        blocks,
-        identity,
-        null_basis,
-        picked_columns,
-        picked_rows,
-        pivot_columns,
-        written_matrix,
-        zeros_matrix,
-    )
-
     e, a, c = (written_matrix(matrix) for matrix in (plant.E, plant.A, plant.C))
     pivots, rows = pivot_columns(e), pivot_columns(e.transpose())
     if not pivots:
@@ -153,17 +152,6 @@ def rounded_once(
     found: ExactElimination, plant: DescriptorSystem, dynamic: FloatArray | None
 ) -> tuple[dict[str, FloatArray], dict[str, FloatArray], dict[str, FloatArray]]:
     """Return matrices, recovery and sizes of terms as doubles; states ``dynamic (nx, count)`` instead of the pivots."""
-    import flint
-
-    from obsynth.proofs.enclosed_pencils import enclosed
-    from obsynth.proofs.exact_arithmetic import (
-        nearest_doubles,
-        picked_columns,
-        picked_rows,
-        pivot_columns,
-        written_matrix,
-    )
-
     if dynamic is None:
         return (
             {name: nearest_doubles(matrix) for name, matrix in found.matrices.items()},
@@ -174,13 +162,13 @@ def rounded_once(
     rows = pivot_columns((picked_columns(e, found.pivots)).transpose())
     with flint.ctx.workprec(COORDINATE_BITS):
         # E dynamic z = E (unit vectors) z_rational
-        change = flint.arb_mat(enclosed(picked_rows(e * written_matrix(dynamic), rows))).solve(
-            flint.arb_mat(enclosed(picked_rows(picked_columns(e, found.pivots), rows)))
+        change = flint.arb_mat(picked_rows(e * written_matrix(dynamic), rows)).solve(
+            flint.arb_mat(picked_rows(picked_columns(e, found.pivots), rows))
         )
         back = change.inv()
 
         def moved(name: str, matrix: fmpq_mat, *, recovery: bool) -> FloatArray:
-            work = flint.arb_mat(enclosed(matrix)) if matrix.nrows() and matrix.ncols() else None
+            work = flint.arb_mat(matrix) if matrix.nrows() and matrix.ncols() else None
             if work is None:
                 return np.zeros((int(matrix.nrows()), int(matrix.ncols())))
             if name in ("A", "C"):
@@ -214,8 +202,6 @@ def _sum(direct: fmpq_mat, factor: fmpq_mat, solution: fmpq_mat, *, clean: bool)
 
 
 def _cleaned(result: fmpq_mat, size_of_terms: FloatArray) -> fmpq_mat:
-    from flint import fmpq, fmpq_mat
-
     rows, columns = size_of_terms.shape
     kept = _sizes(result) > CANCELLATION_TOLERANCE * size_of_terms
     entries = [result[i, j] if kept[i, j] else fmpq(0) for i in range(rows) for j in range(columns)]
@@ -223,8 +209,6 @@ def _cleaned(result: fmpq_mat, size_of_terms: FloatArray) -> fmpq_mat:
 
 
 def _sizes(matrix: fmpq_mat) -> FloatArray:
-    from obsynth.proofs.exact_arithmetic import nearest_doubles
-
     return np.abs(nearest_doubles(matrix))
 
 
@@ -234,16 +218,12 @@ def _doubles(matrix: Any) -> FloatArray:
 
 
 def _split(matrix: fmpq_mat, widths: list[int]) -> list[fmpq_mat]:
-    from obsynth.proofs.exact_arithmetic import picked_columns
-
     ends = np.cumsum(widths).tolist()
     return [picked_columns(matrix, range(end - width, end)) for end, width in zip(ends, widths, strict=True)]
 
 
 def sampled_exact_numbers(smooth: DescriptorSystem, sample_time: float) -> ExactNumbers:
     """Return the exact numbers behind a plant that is sampled from one with ``E = I``."""
-    from obsynth.proofs.exact_arithmetic import holds_computed, written_fraction, written_rows
-
     step, known = written_fraction(sample_time), smooth.exact
     if known is None:
         computed = any(holds_computed(getattr(smooth, name)) for name in DECISIVE)

@@ -17,7 +17,7 @@ from obsynth.analysis.transformations.recovery_operator import RecoveryOperator,
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.pencil_points import GENERIC_POINTS
-from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, NAMED_SHARE, RANK_TOLERANCE
+from obsynth.numerics.ranks import NAMED_SHARE, RANK_TOLERANCE, product_but_rounding
 from obsynth.numerics.scaling import power_of_two_below
 from obsynth.numerics.sparse import coarse_structure, components_of, csr, dense, selection
 from obsynth.numerics.sparse_factor import SolutionBounds, scales_by_all_entries, sparse_factor
@@ -68,9 +68,11 @@ def reduced_by_sparsity(plant: DescriptorSystem) -> SparseReduction | None:
     solution = -found
     kept = _side_by_side(dynamic_rows @ a @ dynamic, dynamic_rows @ csr(signals)).toarray()
     mass = sparse_factor(dynamic_rows @ csr(plant.E) @ dynamic)
-    moved, backward_of_e = mass.solve_with_error(_sum(kept, csr(dynamic_rows @ a @ algebraic), solution))
+    moved, backward_of_e = mass.solve_with_error(
+        product_but_rounding(csr(dynamic_rows @ a @ algebraic), solution, kept)
+    )
     direct = np.hstack([(c @ dynamic).toarray(), *(dense(m) for m in (plant.D, plant.Df, plant.Dd, plant.Dw))])
-    shown = _sum(direct, csr(c @ algebraic), solution)
+    shown = product_but_rounding(csr(c @ algebraic), solution, direct)
     ends = np.cumsum(counts)[:-1]
     matrices = dict(zip(("A", "B", "Bf", "Bd", "Bw"), np.split(moved, ends, axis=1), strict=True))
     matrices |= dict(zip(("C", "D", "Df", "Dd", "Dw"), np.split(shown, ends, axis=1), strict=True))
@@ -267,10 +269,3 @@ def _side_by_side(*blocks: Any) -> Any:
     from scipy.sparse import hstack
 
     return csr(hstack([csr(block) for block in blocks]))
-
-
-def _sum(direct: FloatArray, factor: Any, solution: FloatArray) -> FloatArray:
-    """Return ``direct + factor solution`` with entries that are only rounding set to zero."""
-    result = direct + factor @ solution
-    size_of_terms = np.abs(direct) + abs(factor) @ np.abs(solution)
-    return np.where(np.abs(result) > CANCELLATION_TOLERANCE * size_of_terms, result, 0.0)

@@ -11,9 +11,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from fractions import Fraction
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
+from flint import fmpq, fmpq_mat
 
 from obsynth.analysis.conditions import Condition, up_to_failure
 from obsynth.analysis.existence.distance import ROUNDING_LEVEL
@@ -34,9 +34,7 @@ from obsynth.methods.fault_estimation_filter.detectability_indexes import (
 from obsynth.methods.fault_estimation_filter.prepared_plant import PreparedPlant, prepare, with_sensor_faults_as_states
 from obsynth.numerics.arrays import FloatArray, remembered
 from obsynth.plants.descriptor import DescriptorSystem
-
-if TYPE_CHECKING:
-    from flint import fmpq_mat
+from obsynth.proofs.exact_arithmetic import blocks, picked_columns, pivot_columns, zeros_matrix
 
 
 def index_doubt(judge: Evaluator, detectability: FaultDetectability) -> Unclear | None:
@@ -68,8 +66,6 @@ def _is_in_doubt(judge: Evaluator, detectability: FaultDetectability) -> bool:
     found = _exact(judge.plant)
     if found is None:
         return False
-    from obsynth.proofs.exact_arithmetic import blocks
-
     a, c, faults, _ = found
     columns = [c * _moved(a, faults, fault, index) for fault, index in enumerate(detectability.indexes)]
     return int(blocks([columns]).rank()) == rank.expected
@@ -87,8 +83,6 @@ def _exact(plant: DescriptorSystem) -> tuple[fmpq_mat, fmpq_mat, fmpq_mat, fmpq_
 
 def _moved(a: fmpq_mat, faults: fmpq_mat, fault: int, index: int | None) -> fmpq_mat:
     """Return the vector of a fault that becomes visible."""
-    from obsynth.proofs.exact_arithmetic import picked_columns
-
     vector = picked_columns(faults, [fault])
     for _ in range(int(index or 1) - 1):
         vector = a * vector
@@ -131,8 +125,6 @@ def _changed(
 
 def _solution(maps: list[fmpq_mat], rest: fmpq_mat, order: list[int]) -> list[tuple[int, Fraction]] | None:
     """Return delta with ``maps[-1] delta = rest``, and zero for all maps before it, on few equations in this order."""
-    from obsynth.proofs.exact_arithmetic import blocks, picked_columns, pivot_columns, zeros_matrix
-
     whole = blocks([[part] for part in maps])
     picked = picked_columns(whole, order)
     right = blocks([[zeros_matrix(int(whole.nrows()) - int(rest.nrows()), 1)], [rest]])
@@ -145,8 +137,6 @@ def _solution(maps: list[fmpq_mat], rest: fmpq_mat, order: list[int]) -> list[tu
 
 
 def _scalar(value: Fraction) -> fmpq_mat:
-    from flint import fmpq, fmpq_mat
-
     return fmpq_mat(1, 1, [fmpq(value.numerator, value.denominator)])
 
 

@@ -16,10 +16,13 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
+import flint
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.proofs.exact_arithmetic import blocks, null_basis, picked_rows, row_basis, stored_matrix, zeros_matrix
+from obsynth.proofs.extended_balls import arb_matrix, undecided_pivot
 from obsynth.results.checks import Check, information
 
 #: Filters of more states are not examined: exact null spaces of that many doubles take seconds.
@@ -63,15 +66,6 @@ class InvisiblePairs:
     @classmethod
     @lru_cache(maxsize=2)
     def _of(cls, *numbers: tuple[tuple[int, ...], bytes]) -> InvisiblePairs:
-        from obsynth.proofs.exact_arithmetic import (
-            blocks,
-            null_basis,
-            picked_rows,
-            row_basis,
-            stored_matrix,
-            zeros_matrix,
-        )
-
         t, n, feedback, w, upsilon, plain, c, bd, dd = (
             stored_matrix(np.frombuffer(data).reshape(shape)) for shape, data in numbers
         )
@@ -98,11 +92,6 @@ class InvisiblePairs:
 
     def bound(self, matrices: Mapping[str, FloatArray], *, free_weight: bool) -> float:
         """Return the lower bound that a certificate proves, rounded down; zero where it proves nothing."""
-        import flint
-
-        from obsynth.proofs.exact_arithmetic import stored_matrix
-        from obsynth.proofs.extended_balls import arb_matrix
-
         k, s, nd = int(self.top.ncols()), int(self.S.ncols()), int(self.Zd.ncols())
         empty = {LEAST_GAIN_PAIRS: np.zeros((k, 1)), LAST: np.zeros((nd, s)), ALONE: np.zeros((nd, 1))}
         f, last, alone = (np.asarray(matrices.get(name, part)) for name, part in empty.items())
@@ -166,21 +155,15 @@ def least_gain_row(
 
 
 def _definite(matrix: Any) -> bool:
-    from obsynth.proofs.extended_balls import undecided_pivot
-
     size = int(matrix.nrows())
     return undecided_pivot([[matrix[i, j] for j in range(size)] for i in range(size)]) is None
 
 
 def _square(matrix: Any) -> Any:
-    import flint
-
     return sum((value * value for value in matrix.entries()), flint.arb(0))
 
 
 def _balls(matrix: Any) -> Any:
-    import flint
-
     return flint.arb_mat(int(matrix.nrows()), int(matrix.ncols()), [flint.arb(value) for value in matrix.entries()])
 
 

@@ -16,6 +16,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import flint
 import numpy as np
 from scipy.linalg import block_diag, schur
 
@@ -99,7 +100,7 @@ def filter_part(model: FilterModel, gain: KalmanGain, shown: FloatArray, *, dela
     gain = replace(gain, K=_told(gain.K, sizes), lag=tuple(_told(part, sizes) for part in gain.lag))
     shown = _told(shown, sizes)
     parts = (model.A, -model.C), (model.B, model.L), (model.T, model.T0)
-    dynamics = Rows(*(_sum_but_rounding(own, gain.K, fed_back) for own, fed_back in parts))
+    dynamics = Rows(*(product_but_rounding(gain.K, fed_back, own) for own, fed_back in parts))
     innovation = Rows(-model.C, model.L, model.T0)
     count, nx = len(model.estimate), model.T.shape[1]
     row = Rows(model.estimate, np.zeros((count, model.L.shape[1])), np.zeros((count, nx)))
@@ -130,13 +131,6 @@ def _told(gain: FloatArray, sizes: FloatArray) -> FloatArray:
     return np.where(share > CANCELLATION_TOLERANCE * np.max(share, axis=1, initial=0.0, keepdims=True), gain, 0.0)
 
 
-def _sum_but_rounding(own: FloatArray, gain: FloatArray, fed_back: FloatArray) -> FloatArray:
-    """Return ``own + gain @ fed_back``; where the terms cancel down to their rounding, there is nothing."""
-    found = own + gain @ fed_back
-    terms = np.abs(own) + np.abs(gain) @ np.abs(fed_back)
-    return np.where(np.abs(found) > CANCELLATION_TOLERANCE * terms, found, 0.0)
-
-
 def _plain_coordinates(a: FloatArray) -> FloatArray | None:
     """Return coordinates in which A has entries as small as its eigenvalues (balanced real Schur); ``None``: it has."""
     if not len(a) or not np.all(np.isfinite(a)):
@@ -150,8 +144,6 @@ def _plain_coordinates(a: FloatArray) -> FloatArray | None:
 
 def _rounded_once(model: FilterModel, gain: KalmanGain, coordinates: FloatArray) -> Rows:
     """Return the dynamics in other coordinates; with digits to spare, for the small rows of entries that cancel."""
-    import flint
-
     with flint.ctx.workprec(EXPONENTIAL_BITS):
         k, there = arb_matrix(gain.K), arb_matrix(coordinates)
         back = there.inv()

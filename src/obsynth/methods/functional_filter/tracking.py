@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+import flint
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
@@ -33,8 +34,6 @@ def tracking_map(
 
 def _with_digits_to_spare(a: FloatArray, phi: FloatArray, entering: FloatArray) -> FloatArray | None:
     """Return Pi to its last digit, however near a slow pole is to the fault model; ``None`` where it has one."""
-    import flint
-
     order, count = entering.shape
     whole, right = np.kron(a, np.eye(count)), np.kron(np.eye(order), phi.T)
     with flint.ctx.workprec(EXPONENTIAL_BITS):

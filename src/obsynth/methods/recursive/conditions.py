@@ -15,6 +15,7 @@ from dataclasses import replace
 from typing import TypeAlias
 
 import numpy as np
+from flint import fmpz_poly
 
 from obsynth.analysis.conditions import Condition, rank_condition
 from obsynth.analysis.existence.numbers import SystemFacts
@@ -97,8 +98,6 @@ def identifiability_condition(
 
 def _settled_traces(judge: Evaluator, decision: RankDecision) -> RankDecision:
     """Decide the rank of ``[A - E, Phi; C, Psi]``."""
-    from flint import fmpz_poly
-
     numbers = judge.numbers
     if numbers is None:
         return decision

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from flint import fmpz_poly
 from numpy.typing import NDArray
 
 from obsynth.analysis.existence.numbers import PlantNumbers, SystemFacts
@@ -16,9 +17,6 @@ from obsynth.numerics.scaling import equilibrating_factors
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.fault_models import Exosystem
 from obsynth.proofs.exact_arithmetic import blocks, identity, primitive, written_matrix, zeros_matrix
-
-if TYPE_CHECKING:
-    from flint import fmpz_poly
 
 #: An imaginary part below this share of an eigenvalue is not shown: it would not change its printed digits.
 UNSEEN = 5e-7

@@ -30,7 +30,7 @@ from obsynth.methods.ui_pi_observer.augmented_plant import (
 )
 from obsynth.numerics.arrays import ComplexArray, FloatArray, as_matrix
 from obsynth.numerics.pencils import finite_zeros
-from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, HIDDEN_MODE_TOLERANCE, RANK_TOLERANCE
+from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, HIDDEN_MODE_TOLERANCE, RANK_TOLERANCE, product_but_rounding
 from obsynth.numerics.scaling import LogBalance
 from obsynth.numerics.spectra import DEAD_BEAT, eigenvalues, speeds
 from obsynth.plants.descriptor import DescriptorSystem
@@ -94,8 +94,8 @@ def placement_problem(
     u, d = with_faults(decoupled.U, decoupled.Dhat, scaled, model)
     augmented = AugmentedPlant.of(scaled, model)
     injection = np.vstack([decoupled.injection, np.zeros((model.order, plant.ny))])
-    injected = _product(injection, augmented.C, augmented.A)
-    f, c = _product(u, injected), _product(decoupled.seen, augmented.C)
+    injected = product_but_rounding(-injection, augmented.C, augmented.A)
+    f, c = product_but_rounding(u, injected), product_but_rounding(decoupled.seen, augmented.C)
     fixed_modes = units.rate * fixed_modes
     free = 0
     if joint:
@@ -107,14 +107,6 @@ def placement_problem(
         fixed_modes = finite_zeros(np.vstack([np.eye(n), np.zeros((len(c), n))]), np.vstack([f, c])).values
     split = observable_split(f, c, fixed_modes, dt=scaled.dt)
     return PlacementProblem(scaled, model, units, decoupled, u, d, f, c, free, split, _own_rate(scaled, split.F))
-
-
-def _product(left: FloatArray, right: FloatArray, minuend: FloatArray | None = None) -> FloatArray:
-    """Return ``left @ right``, or ``minuend - left @ right``, without entries that are only rounding."""
-    found, size = left @ right, np.abs(left) @ np.abs(right)
-    if minuend is not None:
-        found, size = minuend - found, np.abs(minuend) + size
-    return np.where(np.abs(found) > CANCELLATION_TOLERANCE * size, found, 0.0)
 
 
 def with_faults(
