@@ -177,7 +177,7 @@ def sampled_numbers(exact: Mapping[str, fmpq_mat], sample_time: Any, *, computed
     with flint.ctx.workprec(bits):
         rows = picked_rows(exponential(whole * step), range(states))
         held = {"A": (0, states), "Bf": (states, states + faults), "Bd": (states + faults, states + width)}
-        matrices = {name: picked_columns(rows, range(*ends)) for name, ends in held.items()}
+        matrices: dict[str, Any] = {name: picked_columns(rows, range(*ends)) for name, ends in held.items()}
         matrices |= {name: arb_mat(matrix) for name, matrix in left.items()}
     return PlantNumbers(matrices, left, discrete=True, computed=computed, bits=bits)
 
