@@ -20,8 +20,7 @@ from typing import Any
 import numpy as np
 
 import obsynth
-from obsynth.experiments.monitors.adaptive_monitor import adaptive_plan
-from obsynth.experiments.monitors.adaptive_rule import AdaptiveState, adaptive_step
+from obsynth.experiments.monitors.adaptive import AdaptiveState, adaptive_plan, adaptive_step
 from obsynth.spec import load_spec
 from obsynth.verification.adaptive_record import thresholds_of_records
 

@@ -15,8 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from obsynth.calibration.innovations_fit import guarded_maximum
-from obsynth.calibration.intervals import Profile, quantile
+from obsynth.calibration.innovations_fit import Profile, guarded_maximum, quantile
 from obsynth.calibration.logs import Log
 from obsynth.calibration.maximum import Objective
 from obsynth.calibration.plants import NonlinearPlant

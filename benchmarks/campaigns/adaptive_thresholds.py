@@ -23,9 +23,9 @@ from benchmarks.campaigns.frame import Outcome
 from scipy.linalg import expm
 
 import obsynth
-from obsynth.data.alarm_certificates import verify_alarm
+from obsynth.data.alarm_proof import verify_alarm
 from obsynth.experiments.alarm_proof import proved_alarm
-from obsynth.experiments.monitors.adaptive_monitor import adaptive_plan
+from obsynth.experiments.monitors.adaptive import adaptive_plan
 from obsynth.spec import load_spec
 from obsynth.verification.adaptive_record import record_columns
 

@@ -26,7 +26,7 @@ from scipy.linalg import expm
 import obsynth
 from obsynth.errors import ObsynthError, PreconditionError, SpecError
 from obsynth.experiments.alarm_proof import proved_alarm
-from obsynth.experiments.monitors.adaptive_monitor import adaptive_plan
+from obsynth.experiments.monitors.adaptive import adaptive_plan
 from obsynth.verification.adaptive_record import record_columns
 
 CASES = 400

@@ -16,8 +16,8 @@ from obsynth.comparison.certificates import verify_certificate as verify_certifi
 from obsynth.comparison.comparing import compare as compare
 from obsynth.comparison.result import Comparison as Comparison
 from obsynth.comparison.sensor_sets import sensor_sets as sensor_sets
-from obsynth.data.alarm_certificates import verify_alarm as verify_alarm
 from obsynth.data.alarm_proof import prove_alarm as prove_alarm
+from obsynth.data.alarm_proof import verify_alarm as verify_alarm
 from obsynth.data.normal_rows import learn_thresholds as learn_thresholds
 from obsynth.data.online_monitor import online_monitor as online_monitor
 from obsynth.data.run import run_on_data as run_on_data
@@ -34,11 +34,11 @@ from obsynth.experiments.monte_carlo import evaluate as evaluate
 from obsynth.experiments.simulation import simulate as simulate
 from obsynth.experiments.tolerance_study import tolerance_study as tolerance_study
 from obsynth.exporting.files import export as export
-from obsynth.importing.andes import from_andes as from_andes
-from obsynth.importing.casadi_models import from_casadi as from_casadi
 from obsynth.importing.fmu import from_fmu as from_fmu
 from obsynth.importing.model_files import from_matlab as from_matlab
 from obsynth.importing.model_files import from_modelica as from_modelica
+from obsynth.importing.python_objects import from_andes as from_andes
+from obsynth.importing.python_objects import from_casadi as from_casadi
 from obsynth.importing.python_objects import from_control as from_control
 from obsynth.importing.python_objects import from_pandas as from_pandas
 from obsynth.importing.python_objects import from_scipy as from_scipy
@@ -66,8 +66,8 @@ from obsynth.observers.decisions import ParameterMonitor as ParameterMonitor
 from obsynth.observers.decisions import decide as decide
 from obsynth.observers.linear.derived import sample_observer as sample_observer
 from obsynth.observers.linear.observer import LinearObserver as LinearObserver
+from obsynth.observers.recursive.observer import Adaptation as Adaptation
 from obsynth.observers.recursive.observer import RecursiveObserver as RecursiveObserver
-from obsynth.observers.recursive.settings import Adaptation as Adaptation
 from obsynth.plants.dae.model import DAEModel as DAEModel
 from obsynth.plants.descriptor import DescriptorSystem as DescriptorSystem
 from obsynth.plants.fault_models import FaultModel as FaultModel

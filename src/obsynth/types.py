@@ -24,7 +24,7 @@ _TYPE_NAMES = {
     "methods.fault_figures": "FaultFigures",
     "methods.detection_filter.public": "DetectionFilter",
     "methods.recursive.steady_filter": "SteadyState",
-    "observers.alarms": "Alarm Decision",
+    "observers.decisions": "Alarm Decision",
     "observers.estimates": "Estimates",
     "observers.running": "RunningObserver",
     "observers.windows": "WindowObserver",
@@ -34,7 +34,7 @@ _TYPE_NAMES = {
     "simulation.signals": "Trajectory",
     "sweeps.fleet": "Fleet FleetRun",
     "sweeps.sweep": "Sweep SweepResult",
-    "tolerances.result": "Robustness",
+    "tolerances.robustness": "Robustness",
 }
 _TYPE_HOMES = {name: f"obsynth.{module}" for module, names in _TYPE_NAMES.items() for name in names.split()}
 

@@ -24,8 +24,8 @@ from obsynth.experiments.tolerance_study import ToleranceStudy as ToleranceStudy
 from obsynth.methods.detection_filter.public import DetectionFilter as DetectionFilter
 from obsynth.methods.fault_figures import FaultFigures as FaultFigures
 from obsynth.methods.recursive.steady_filter import SteadyState as SteadyState
-from obsynth.observers.alarms import Alarm as Alarm
-from obsynth.observers.alarms import Decision as Decision
+from obsynth.observers.decisions import Alarm as Alarm
+from obsynth.observers.decisions import Decision as Decision
 from obsynth.observers.estimates import Estimates as Estimates
 from obsynth.observers.running import RunningObserver as RunningObserver
 from obsynth.observers.windows import WindowObserver as WindowObserver
@@ -38,4 +38,4 @@ from obsynth.sweeps.fleet import Fleet as Fleet
 from obsynth.sweeps.fleet import FleetRun as FleetRun
 from obsynth.sweeps.sweep import Sweep as Sweep
 from obsynth.sweeps.sweep import SweepResult as SweepResult
-from obsynth.tolerances.result import Robustness as Robustness
+from obsynth.tolerances.robustness import Robustness as Robustness

@@ -15,8 +15,7 @@ from uncertain_plants import DRIVE, drive, wang
 import obsynth
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.experiments.benches import make_bench
-from obsynth.experiments.monitors.adaptive_monitor import adaptive_plan
-from obsynth.experiments.monitors.adaptive_rule import AdaptiveState, adaptive_step
+from obsynth.experiments.monitors.adaptive import AdaptiveState, adaptive_plan, adaptive_step
 from obsynth.observers.running import state_as_data, state_from_data
 from obsynth.tolerances.exact_plant import drawn_points, plant_at
 from obsynth.verification.adaptive_record import record_columns, thresholds_of_records

@@ -10,7 +10,7 @@ import pytest
 
 import obsynth
 from obsynth.analysis.transformations.uncertain_plant import affine_plant
-from obsynth.experiments.alarm_window import Rows, Window, WindowData, window_programme
+from obsynth.experiments.alarm_proof import Programme, Rows, WindowData, window_programme
 
 STEPS = 5
 BOUNDS = np.array([0.3, 0.2, 0.1])  # the disturbance, process noise, sensor noise
@@ -63,7 +63,7 @@ def happened(variation: str, seed: int) -> tuple[Any, WindowData, np.ndarray]:
     return family, data, np.concatenate([x.ravel(), d.ravel(), at.ravel(), products.ravel(), [0.0]])
 
 
-def scaled(programme: Window, truth: np.ndarray) -> np.ndarray:
+def scaled(programme: Programme, truth: np.ndarray) -> np.ndarray:
     """The truth in the units of the programme."""
     return truth / programme.below.scales
 
@@ -133,7 +133,7 @@ def test_a_multiplier_of_the_wrong_sign_proves_nothing() -> None:
     scales = np.ones(2)
     equal, below = Rows(scales), Rows(scales)
     below.add({0: 1.0}, 10.0)
-    programme = Window(equal, below, np.array([-1.0, 0.0]), np.array([1.0, 1e3]))
+    programme = Programme(equal, below, np.array([-1.0, 0.0]), np.array([1.0, 1e3]))
     assert programme.proved_least(np.zeros(0), np.array([5.0])) <= 0
     assert programme.proved_least(np.zeros(0), np.array([-5.0])) <= 0
 

@@ -13,13 +13,14 @@ from obsynth.calibration import noise_proposals
 from obsynth.calibration.diagnostics import (
     change_of_mean,
     consistency,
+    explanations,
     mean_off,
+    regression_gain,
     standing_out,
     whiteness,
     wrong_samples,
 )
-from obsynth.calibration.explanations import explanations, regression_gain
-from obsynth.calibration.intervals import covariance_of, information, profile_box, quantile
+from obsynth.calibration.innovations_fit import covariance_of, information, profile_box, quantile
 from obsynth.calibration.maximum import Maximum
 from obsynth.calibration.noise_states import NoiseStates, PlantWithNoise
 from obsynth.results.calibration_files import box_row, calibration_text, read_calibration, verify_calibration

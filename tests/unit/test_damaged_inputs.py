@@ -10,7 +10,7 @@ import pytest
 
 import obsynth
 from obsynth.cli.main import main
-from obsynth.data.text_logs import Dialect
+from obsynth.data.sources import Dialect
 from obsynth.spec.documents import read_yaml
 
 FMU = """<?xml version="1.0"?><fmiModelDescription fmiVersion="2.0" modelName="m" guid="{x}"><ModelExchange

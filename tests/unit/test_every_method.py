@@ -20,7 +20,7 @@ from test_export import start_of, through_c
 
 import obsynth
 from obsynth.errors import SpecError
-from obsynth.exporting.c_window import is_window
+from obsynth.exporting.files import is_window
 from obsynth.methods.registry import REGISTRY, method_class
 from obsynth.numerics.arguments import field_types
 from obsynth.observers.dae.observer import DAEObserver

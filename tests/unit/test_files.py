@@ -18,7 +18,7 @@ from obsynth.files.outputs import (
     write_together,
 )
 from obsynth.files.signals import HeldSignals, ending_signals
-from obsynth.files.tables import TableWriter, harmless, unquoted
+from obsynth.files.tables import harmless, table_writer, unquoted
 
 KIND = FileKind("a note", rb"\Anote:", ending=".note.txt")
 
@@ -269,7 +269,7 @@ class TestTables:
 
     def test_no_cell_is_a_formula(self):
         stream = io.StringIO()
-        TableWriter(stream, ["time", *self.NAMES]).write([(1.0, float("nan"), "=alarm", -2.0, 0.1, 1e-300, 1, 2)])
+        table_writer(stream, ["time", *self.NAMES])([(1.0, float("nan"), "=alarm", -2.0, 0.1, 1e-300, 1, 2)])
         header, row = stream.getvalue().replace("'\t", "'").splitlines()
         assert all(cell.strip('"')[0] not in "=+-@\t \uff1d" for cell in header.split(","))
         assert row == "1.0,,'=alarm,-2.0,0.1,1e-300,1,2"

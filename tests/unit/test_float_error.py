@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from obsynth.exporting.float_error import UNIT, float_bounds
+from obsynth.exporting.files import UNIT, float_bounds
 from obsynth.methods.guaranteed_test.problem import rounded_outward
 from obsynth.methods.guaranteed_test.proofs import down, exact_right_sides
 

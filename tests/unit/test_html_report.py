@@ -86,17 +86,17 @@ def recursive() -> obsynth.ObserverDesign:
 @pytest.fixture(scope="module", autouse=True)
 def _drawn_once():
     """Pictures and tolerances of a design are made once: most tests are about what stands around them."""
-    from obsynth.report import designs, page, pictures
+    from obsynth.report import designs, page
 
-    patch, drawn, told = pytest.MonkeyPatch(), {}, {}
+    patch, drawn, told, pictures_of = pytest.MonkeyPatch(), {}, {}, page.pictures_of
 
     def pictures_once(design, *, scenario=None):
         if scenario is not None:
-            return pictures.pictures_of(design, scenario=scenario)
+            return pictures_of(design, scenario=scenario)
         # The plant changes alone where its tolerances go.
         key = design.observer, design.name
         if key not in drawn:
-            drawn[key] = list(pictures.pictures_of(design))
+            drawn[key] = list(pictures_of(design))
         return drawn[key]
 
     def facts_once(design):

@@ -17,7 +17,7 @@ import obsynth
 from obsynth.errors import SpecError
 from obsynth.experiments.benches import make_bench
 from obsynth.experiments.monitors.residual_model import residual_model
-from obsynth.experiments.monitors.whitening import innovation_whitener, whitener_of, window_covariance
+from obsynth.experiments.monitors.thresholds import innovation_whitener, whitener_of, window_covariance
 from obsynth.experiments.monte_carlo import mean, share
 from obsynth.simulation.linear import make_stepper
 from obsynth.spec import load_spec

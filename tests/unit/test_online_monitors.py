@@ -239,7 +239,7 @@ def test_the_sampled_residual_is_what_the_observer_says(machine):
     )  # fmt: skip
     run, model = obsynth.simulate(still, scenario), residual_model(still, scenario)
     noise = np.random.default_rng(4).standard_normal((151, 2))
-    error = model.start + model.start_noise @ noise[0]
+    error = model.start + model.continuous.start_noise @ noise[0]
     for k in range(151):
         np.testing.assert_allclose(run.estimates.residuals[k], model.C @ error + model.Dw @ noise[k], atol=1e-11)
         error = model.A @ error + model.Bw @ noise[k]
@@ -285,7 +285,7 @@ def test_cumulative_sums_of_a_residual_that_a_window_does_not_whiten(machine):
 
 def test_the_correlation_that_is_left_is_that_of_all_lags(machine):
     from obsynth.experiments.monitors.residual_model import residual_model
-    from obsynth.experiments.monitors.whitening import correlation_left, innovation_whitener, window_covariance
+    from obsynth.experiments.monitors.thresholds import correlation_left, innovation_whitener, window_covariance
 
     model = residual_model(machine, obsynth.Scenario(horizon=4, sample_time=0.2, noise=1))
     window, lags, count = 3, 150, len(model.C)

@@ -16,7 +16,7 @@ import obsynth
 from obsynth.cli.main import main
 from obsynth.results.certificate_files import differences
 from obsynth.results.gain_sets import digest_of
-from obsynth.tolerances.result import robustness_statement
+from obsynth.tolerances.robustness import robustness_statement
 
 
 @pytest.fixture(scope="module")

@@ -26,7 +26,7 @@ from obsynth import (
 )
 from obsynth.cli.main import main
 from obsynth.observers.recursive.observer import observer_from_options
-from obsynth.observers.smoothing.keeping import smoothed_record
+from obsynth.observers.smoothing import smoothed_record
 
 pytestmark = pytest.mark.usefixtures("taken_as_verified")
 

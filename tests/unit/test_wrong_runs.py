@@ -9,8 +9,8 @@ import pandas as pd
 import pytest
 
 import obsynth
-from obsynth.calibration import wrong_runs as module
-from obsynth.calibration.wrong_runs import wrong_runs
+from obsynth.calibration import calibrating as module
+from obsynth.calibration.calibrating import wrong_runs
 
 ROWS = 300
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from obsynth import TimeVaryingDescriptorSystem
-from obsynth.observers.recursive.observer import RecursiveObserver
-from obsynth.observers.recursive.settings import Adaptation
+from obsynth.observers.recursive.observer import Adaptation, RecursiveObserver
 from obsynth.plants.sequences import MatrixSequence
 
 

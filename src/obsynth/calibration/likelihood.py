@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from obsynth.calibration.problem import Problem
 from obsynth.calibration.step_graphs import SampleGraphs, compiled
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.dae.functions import Compiled
@@ -23,21 +24,13 @@ IMPOSSIBLE = 1e12
 
 
 class Likelihood:
-    """Negative log likelihood of a record as a function of ``v = [t, log q, log r]``. ``u (n, nu)``, ``y (n, ny)`` with
-    NaN for what is missing, ``noisy`` numbers of equations, ``x0 (nx,)``, ``P0 (nx, nx)``."""
+    """Negative log likelihood of a problem's record, or of other outputs ``y (n, ny)`` with NaN for what is missing, as
+    a function of ``v = [t, log q, log r]``."""
 
-    def __init__(
-        self,
-        graphs: SampleGraphs,
-        u: FloatArray,
-        y: FloatArray,
-        *,
-        noisy: Sequence[int],
-        x0: FloatArray,
-        P0: FloatArray,
-    ) -> None:
-        self.graphs, self.samples, self.size = graphs, len(y), graphs.nt + len(noisy) + graphs.ny
-        self._both = Compiled(_whole(graphs, u, y, noisy, x0, P0))
+    def __init__(self, problem: Problem, y: FloatArray | None = None) -> None:
+        graphs, noisy = problem.graphs, problem.noisy_equations
+        self.ny, self.size = graphs.ny, graphs.nt + len(noisy) + graphs.ny
+        self._both = Compiled(_whole(graphs, problem.u, problem.y if y is None else y, noisy, problem.x0, problem.P0))
 
     def __call__(self, v: FloatArray) -> tuple[float, FloatArray]:
         """Return the value and its gradient ``(nt + len(noisy) + ny,)``."""
@@ -48,7 +41,7 @@ class Likelihood:
 
     def innovations(self, v: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return whitened innovations, innovations and their variances, each ``(n, ny)``; zero where y is missing."""
-        rows, ny = self._both(v)[2], self.graphs.ny
+        rows, ny = self._both(v)[2], self.ny
         return rows[1 : 1 + ny].T, rows[1 + ny : 1 + 2 * ny].T, rows[1 + 2 * ny : 1 + 3 * ny].T
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.data.log_estimator import MOST_STALE
-from obsynth.data.log_tables import log_table, parsed_rows
+from obsynth.data.sources import log_table, parsed_rows
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.arrays import FloatArray, read_only
 
@@ -67,6 +67,7 @@ class Log:
     notes: tuple[str, ...] = ()  # what was noticed and repaired
     #: How far samples that stand out, and count as not measured, were from their prediction: ``(any,)`` of each output.
     outliers: tuple[FloatArray, ...] = ()
+    input_delay: int = 0  # rows by which the inputs are later than the data have them
 
     @property
     def samples(self) -> int:
@@ -102,7 +103,7 @@ class Log:
             u[:rows] = self.u[0]
         elif rows < 0:
             u[rows:] = self.u[-1]
-        return replace(self, u=read_only(u))
+        return replace(self, u=read_only(u), input_delay=self.input_delay + rows)
 
     def without(self, wrong: NDArray[np.bool_]) -> Log:
         """Return the log without single outputs ``(n, ny)`` that are no measurements, with a note for each sensor."""

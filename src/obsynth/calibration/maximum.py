@@ -59,7 +59,7 @@ class Objective:
     def __init__(self, problem: Problem, fit: Fit) -> None:
         p, g = problem, problem.graphs
         self.problem = p
-        self.likelihood = Likelihood(g, p.u, p.y, noisy=p.noisy_equations, x0=p.x0, P0=p.P0)
+        self.likelihood = Likelihood(p)
         self.nt, nq = g.nt, len(p.noisy)
         first_q = _process_noise(problem, fit)
         first_r = np.log(np.maximum(fit.deviations**2, 2.0 * p.floors))

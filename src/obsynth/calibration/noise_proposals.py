@@ -11,8 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from obsynth.calibration.diagnostics import SIGNIFICANT, whiteness
-from obsynth.calibration.explanations import LEAST_EXPLANATION, regression_gain
+from obsynth.calibration.diagnostics import LEAST_EXPLANATION, SIGNIFICANT, regression_gain, whiteness
 from obsynth.calibration.innovations_fit import InnovationsFit
 from obsynth.calibration.likelihood import IMPOSSIBLE, Likelihood
 from obsynth.calibration.maximum import Objective
@@ -82,7 +81,7 @@ def _asking(problem: Problem, fit: InnovationsFit) -> set[tuple[str, str]]:
         for name, column in zip(names, whitened.T, strict=True)
         if whiteness(column).probability < SIGNIFICANT
     }
-    v = np.concatenate([fit.t, np.log(np.concatenate([fit.Q, fit.R]))])
+    v = fit.v
     before = _innovations(problem, v, problem.y)
     moves = [
         (_innovations(problem, v + step, problem.y) - before) / SMALL_MOVE
@@ -99,10 +98,7 @@ def _asking(problem: Problem, fit: InnovationsFit) -> set[tuple[str, str]]:
 
 def _innovations(problem: Problem, v: FloatArray, y: FloatArray) -> FloatArray:
     """Return whitened innovations ``(n, ny)`` of other measurements, NaN where nothing was measured."""
-    found = Likelihood(
-        problem.graphs, problem.u, y, noisy=problem.noisy_equations, x0=problem.x0, P0=problem.P0
-    ).innovations(v)[0]
-    return np.where(np.isfinite(y), found, np.nan)
+    return np.where(np.isfinite(y), Likelihood(problem, y).innovations(v)[0], np.nan)
 
 
 def _candidates(

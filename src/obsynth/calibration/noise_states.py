@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.calibration.logs import Log
-from obsynth.calibration.plants import CalibrationPlant
+from obsynth.calibration.plants import SIZED_SAMPLES, CalibrationPlant
 from obsynth.numerics.arrays import SMALLEST, FloatArray
 from obsynth.plants.dae.functions import BUTCHER
 from obsynth.plants.noise_model import UNKNOWN_NUMBER, noise_state, offset_state, seconds
@@ -17,8 +17,6 @@ from obsynth.plants.validation import index_of
 
 #: Where the search for a correlation begins, and its bounds: in samples, the last as a share of the log.
 FIRST_CORRELATION, LEAST_CORRELATION, LONGEST_SHARE = 10.0, 0.3, 1.0
-#: A load, or an initial state, is sized by what it does to the outputs in this many samples.
-SIZED_SAMPLES = 50
 #: An offset may be this many times what a sensor changes from row to row, or as large as it moves.
 LARGEST_SENSOR_OFFSET = 10.0
 

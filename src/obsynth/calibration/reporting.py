@@ -6,7 +6,7 @@ How a model is to be integrated on a log: what a step of backward Euler errs, ag
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,8 +21,7 @@ from obsynth.calibration.diagnostics import (
     mean_off,
     whiteness,
 )
-from obsynth.calibration.innovations_fit import InnovationsFit, Timing
-from obsynth.calibration.intervals import Side, covariance_of, quantile
+from obsynth.calibration.innovations_fit import InnovationsFit, Side, covariance_of, quantile
 from obsynth.calibration.logs import EVEN, TOLD_ROWS, Log
 from obsynth.calibration.noise_states import PlantWithNoise, correlation_name
 from obsynth.calibration.problem import Problem
@@ -98,7 +97,7 @@ def reported(
     fit: InnovationsFit | None,
     *,
     level: float,
-    timing: Timing,
+    losses: Mapping[int, float],
     error: IntegrationError | None,
     digest: str,
 ) -> Calibration:
@@ -128,7 +127,7 @@ def reported(
         *_fitted(problem, box, found, at_end, correlation, limited, Q, R),
         *_misfits(problem, start, whitened, R),
         *_checked(nis, colours, row, fit is None),
-        *_told(problem, R, timing, error),
+        *_told(problem, R, losses, error),
     ]
     return Calibration(
         box.nominal,
@@ -142,8 +141,8 @@ def reported(
         nis,
         colours,
         row,
-        timing.delay,
-        dict(timing.losses),
+        problem.log.input_delay,
+        dict(losses),
         dict(zip(problem.output_names, problem.quanta.tolist(), strict=True)),
         at_end,
         problem.integration,
@@ -346,21 +345,23 @@ def _checked(nis: Consistency, colours: dict[str, Whiteness], row: int | None, s
     return found
 
 
-def _told(problem: Problem, R: dict[str, float], timing: Timing, error: IntegrationError | None) -> list[str]:
-    found = []
+def _told(
+    problem: Problem, R: dict[str, float], losses: Mapping[int, float], error: IntegrationError | None
+) -> list[str]:
+    found, delay = list[str](), problem.log.input_delay
     for name, step in zip(problem.output_names, problem.quanta, strict=True):
         if step > 0.0 and R[name] < AT_QUANTISATION * step**2 / EVEN:
             found.append(
                 f"The noise of {name} is at its quantisation ({step:.3g} / sqrt 12): its R is at least that of the "
                 "quantisation."
             )
-    if timing.delay and timing.losses:
-        rows = "1 row" if timing.delay == 1 else f"{timing.delay} rows"
-        gained = timing.losses[0] - timing.losses[timing.delay]
+    if delay and losses:
+        rows = "1 row" if delay == 1 else f"{delay} rows"
+        gained = losses[0] - losses[delay]
         found.append(f"The inputs are taken {rows} later than the log writes them: better by {gained:.1f} nats.")
-    lost = timing.losses.get(timing.delay, 0.0)
+    lost = losses.get(delay, 0.0)
     if lost > NOTED_NATS:
-        least = min(timing.losses, key=lambda delay: timing.losses[delay])
+        least = min(losses, key=lambda rows: losses[rows])
         found.append(f"The inputs taken {least:+d} row(s) would be better by {lost:.1f} nats: see input_delay.")
     if error is not None:
         what = "Radau is taken" if problem.integration == "radau" else "it is taken"

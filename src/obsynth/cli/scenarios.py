@@ -146,7 +146,7 @@ def run_evaluate(options: argparse.Namespace) -> int:
                 confidence=options.confidence,
                 plants=options.plants,
             )
-    from obsynth.comparison.least_thresholds import design_beside_least, in_words
+    from obsynth.comparison.comparing import design_beside_least, in_words
     from obsynth.report.scenarios import described, evaluation_report, final_threshold
 
     least = design_beside_least(design, scenario)

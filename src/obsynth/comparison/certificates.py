@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from obsynth.comparison.comparing import compared_again
-from obsynth.data.alarm_certificates import gain_set_row, verify_alarm
+from obsynth.data.alarm_proof import gain_set_row, verify_alarm
 from obsynth.errors import ObsynthError, SpecError
 from obsynth.experiments.alarm_proof import ALARM_KIND
 from obsynth.experiments.assumptions import Log, file_digest
@@ -31,8 +31,7 @@ from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import loaded
 from obsynth.results.verification_report import VerificationReport
 from obsynth.simulation.scenario import scenario_from
-from obsynth.tolerances.result import robustness_statement
-from obsynth.tolerances.robustness import robustness
+from obsynth.tolerances.robustness import robustness, robustness_statement
 
 #: A file may ask for no more runs than this: whoever wrote it does not wait for them.
 MOST_RUNS = 100_000

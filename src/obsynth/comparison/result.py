@@ -12,8 +12,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.files.outputs import FileKind, write_atomically
-from obsynth.files.pages import standing_page
-from obsynth.files.tables import html_table, text_table
+from obsynth.files.tables import html_table, standing_page, text_table
 from obsynth.methods.fault_figures import FaultFigures
 from obsynth.numerics.arrays import FloatArray
 from obsynth.results.certificate_files import COMPARISON, SHOWN_DIGITS, result_text

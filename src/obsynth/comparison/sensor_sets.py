@@ -1,28 +1,95 @@
-"""Which sensors to add, ranked by cost and then by how well the fault can be estimated after design."""
+"""Which sensors to add, ranked by cost and then by how well the fault can be estimated after design.
+
+Which sensors, sample time and number of samples let a fault of a given size be found: by least thresholds.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from html import escape
+from itertools import combinations
+from math import comb
 from typing import Annotated, Any
 
 import numpy as np
 from annotated_types import Ge
 
 from obsynth.analysis.diagnosis.decoupled import fault_numbers
-from obsynth.analysis.diagnosis.explanations import Sensor, state_sensors
+from obsynth.analysis.diagnosis.explanations import Sensor, state_sensors, with_sensors
 from obsynth.analysis.diagnosis.fault_columns import Questions
 from obsynth.analysis.diagnosis.sensor_search import GOALS, SensorSearch, Task, reached
 from obsynth.analysis.transformations.recovery import Transformation, linear_plant
-from obsynth.comparison.threshold_sensors import ThresholdQuestion
+from obsynth.analysis.transformations.sampling import discretise
 from obsynth.errors import ObsynthError, PreconditionError, SpecError
 from obsynth.files.tables import html_table, text_table
 from obsynth.methods.functions import functional_filter
+from obsynth.methods.guaranteed_test.result import GuaranteedTest, guaranteed_test
 from obsynth.numerics.arguments import Count, checked_value, is_finite_number, real_vector
 from obsynth.numerics.libraries import on_one_thread_if_small
 from obsynth.plants.descriptor import DescriptorSystem
+
+#: Sets are tried in the order of their cost; more than these are too many.
+MOST_TRIED_SETS = 4096
+
+
+@dataclass(frozen=True, eq=False)
+class ThresholdQuestion:
+    """What must be found: a fault whose least threshold is at most ``below``; ``test``: options of the test."""
+
+    plant: DescriptorSystem
+    fault: str
+    below: float
+    sensors: tuple[Sensor, ...]
+    costs: Sequence[float]
+    sample_times: tuple[float, ...]
+    test: Mapping[str, Any]
+
+    def best(self, chosen: Sequence[int]) -> GuaranteedTest | None:
+        """Return the test with the fewest seconds that goes below with some sensors; ``None`` where none does."""
+        found = [test for test in self._tests(chosen) if test.threshold <= self.below]
+        return min(found, key=lambda test: (test.delay, test.threshold)) if found else None
+
+    def least(self, chosen: Sequence[int]) -> float:
+        """Return the least threshold with some sensors."""
+        return min((test.threshold for test in self._tests(chosen)), default=float("inf"))
+
+    def _tests(self, chosen: Sequence[int]) -> Iterator[GuaranteedTest]:
+        equipped = with_sensors(self.plant, [self.sensors[i] for i in chosen])
+        for seconds in self.sample_times or (None,):
+            plant = equipped if seconds is None else discretise(equipped, seconds).plant
+            try:
+                test = guaranteed_test(plant, self.fault, **self.test)
+            except PreconditionError:
+                continue
+            enough = test.trade_off[test.trade_off[:, 1] <= self.below]
+            if len(enough) and int(enough[0, 0]) != test.samples:
+                # The fewest samples that go below, not those within 5 % of the last.
+                test = guaranteed_test(plant, self.fault, **{**self.test, "samples": int(enough[0, 0])})
+            yield test
+
+    def minimal_sets(self, largest: int | None, most: int) -> list[tuple[tuple[int, ...], GuaranteedTest]]:
+        """Return the inclusion-minimal sets, cheapest first: more sensors never raise a least threshold."""
+        count = len(self.sensors)
+        sizes = range(min(count, count if largest is None else largest) + 1)
+        if sum(comb(count, size) for size in sizes) > MOST_TRIED_SETS:
+            raise SpecError(
+                f"{count} candidates have more than {MOST_TRIED_SETS} sets: give fewer candidates, or largest.",
+                path="candidates",
+            )
+        sets = [chosen for size in sizes for chosen in combinations(range(count), size)]
+        found: list[tuple[tuple[int, ...], GuaranteedTest]] = []
+        for chosen in sorted(sets, key=lambda each: (sum(self.costs[i] for i in each), len(each))):
+            if any(set(smaller) <= set(chosen) for smaller, _ in found):
+                continue
+            test = self.best(chosen)
+            if test is not None:
+                found.append((chosen, test))
+            if len(found) == most:
+                break
+        return found
+
 
 #: So many sets are returned at most by default, and so many of them designed for.
 MOST_LISTED_SETS = 24

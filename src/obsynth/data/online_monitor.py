@@ -11,24 +11,36 @@ import numpy as np
 from obsynth.data.normal_rows import learn_thresholds
 from obsynth.errors import SpecError
 from obsynth.experiments.assumptions import Assumptions
-from obsynth.experiments.monitors.adaptive_monitor import (
+from obsynth.experiments.monitors.adaptive import (
     NO_TOLERANCE,
+    AdaptiveRule,
     adaptive_plan,
     adaptive_statement,
     noisy_design,
     tolerances_of,
 )
-from obsynth.experiments.monitors.adaptive_rule import AdaptiveRule
-from obsynth.experiments.monitors.gap_growth import GapGrowth, gap_growth
 from obsynth.experiments.monitors.guaranteed import data_monitor, is_guaranteed
 from obsynth.experiments.monitors.learned import LearnedThresholds, learned_monitor, load_thresholds
 from obsynth.experiments.monitors.monitor import MONITOR_KINDS, Monitor, Rule, statement_of
 from obsynth.experiments.monitors.options import LINEAR_OPTIONS, PARAMETER_OPTIONS, checked_options
 from obsynth.experiments.monitors.residual_model import ResidualModel, residual_model, watches_estimates
 from obsynth.experiments.monitors.residual_monitor import bounds_of
-from obsynth.experiments.monitors.rules import ANY_LENGTH, NormRule, WhitenedRule, parameter_monitor
-from obsynth.experiments.monitors.thresholds import samples_of, scaled_inputs, unlimited_bound, unlimited_paper
-from obsynth.experiments.monitors.whitening import steady_mean, whitened
+from obsynth.experiments.monitors.rules import (
+    ANY_LENGTH,
+    GapGrowth,
+    NormRule,
+    WhitenedRule,
+    gap_growth,
+    parameter_monitor,
+)
+from obsynth.experiments.monitors.thresholds import (
+    samples_of,
+    scaled_inputs,
+    steady_mean,
+    unlimited_bound,
+    unlimited_paper,
+    whitened,
+)
 from obsynth.methods.handing_on import require_verified
 from obsynth.numerics.arguments import is_finite_number, require_kind, require_mapping
 from obsynth.numerics.arrays import FloatArray
@@ -259,7 +271,7 @@ def _norm_rule(
     else:
         names = design.linear[0].disturbance_names
         table, limit = unlimited_bound(kind, model, scaled_inputs(model, bounds, noise_bound, names), start, window)
-        if model.flow is not None:
+        if model.continuous is not None:
             inputs = scaled_inputs(model, bounds, noise_bound, names, any_stamps=True)
             irregular = unlimited_bound(kind, model, inputs, start, window)
     driven = None
@@ -280,13 +292,13 @@ def _norm_rule(
 def _more_words(kind: str, model: ResidualModel, limit: float, dt: float) -> str:
     """Return what else the sentence of a bound must say."""
     words = ""
-    if kind != "paper" and model.sensor_noise is not None and model.Bw[:, model.sensor_noise[0].shape[1] :].any():
+    if kind == "paper" or model.continuous is None:
+        return words
+    if model.Bw[:, model.continuous.sensors.sum() :].any():
         # The noise of the plant itself is what is gathered between samples: the closer they are, the less, but in all
         # the more of it that is of one sign.
         words += _NOT_CLOSER.format(dt=shown(dt))
-    if kind != "paper" and model.continuous is not None:
-        words += _REGULAR.format(dt=shown(dt)) + model.continuous.between.lasting_words(limit)
-    return words
+    return words + _REGULAR.format(dt=shown(dt)) + model.continuous.between.lasting_words(limit)
 
 
 def _adaptive(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import chain, islice
@@ -271,13 +272,14 @@ def run_on_data(
     if not hasattr(data, "readline"):
         # What cannot be read leaves no header behind; of a stream the header comes before the first row.
         rows = chain(list(islice(rows, 1)), rows)
-    with sink_for(out, run.header, stamps) as sink:
+    gathered = FrameSink(run.header, stamps)
+    with nullcontext(gathered) if out is None else sink_for(out, run.header, stamps) as sink:
         _run_rows(run, rows, sink, kept, save, progress or bool, state_every)
         if state is None and not hasattr(data, "readline"):
             _require_a_window(design, run.rows)
     if state is not None:
         save_state(Path(state), run, digest)
-    table = sink.frame() if isinstance(sink, FrameSink) else None
+    table = gathered.frame() if out is None else None
     shown = {} if run.recovered is None else dict(run.recovered.flags)
     return DataRun(
         run.rows,
@@ -346,9 +348,9 @@ def _run_rows(
         for chunk in rows:
             if kept is not None:
                 kept.append(chunk)
-            sink.write(run.take(chunk))
+            sink(run.take(chunk))
             progress(run.rows)
-        sink.write(run.finish())
+        sink(run.finish())
         return
     with ending_signals(), held.installed():
         try:
@@ -358,7 +360,7 @@ def _run_rows(
                         is_whole = False
                         found = run.take(row[None])
                         is_whole = True
-                        sink.write(found)
+                        sink(found)
                         if run.rows % state_every == 0:
                             save()
                 progress(run.rows)
@@ -369,4 +371,4 @@ def _run_rows(
         finally:
             if is_whole and run.rows:
                 save()
-                sink.write(run.finish())
+                sink(run.finish())

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, TextIO
+from typing import TYPE_CHECKING, Any, TextIO, TypeAlias
 
 import numpy as np
 
 from obsynth.data.signals import TIME_HEADER, Signals, Stamps
 from obsynth.data.sources import check_suffix
 from obsynth.files.outputs import FileKind, replacement_of
-from obsynth.files.tables import TableWriter
+from obsynth.files.tables import table_writer
 from obsynth.numerics.arrays import FloatArray
 
 if TYPE_CHECKING:
@@ -39,31 +39,26 @@ def dated(rows: Sequence[Sequence[Any]], places: Sequence[int], shown: Callable[
     return found
 
 
-class Sink(Protocol):
-    """Takes rows of cells."""
-
-    def write(self, rows: Sequence[Sequence[Any]]) -> None:
-        """Take rows: texts, and numbers of which NaN is an empty cell."""
-        ...
+#: Takes rows of cells: texts, and numbers of which NaN is an empty cell.
+Sink: TypeAlias = Callable[[Sequence[Sequence[Any]]], None]
 
 
-class TextSink:
-    """CSV to a text stream, flushed after each call; dates are written back as such."""
+def text_sink(stream: TextIO, header: Sequence[str], stamps: Stamps) -> Sink:
+    """Return what writes CSV to a text stream, flushed after each call; floats so that they are read back bit for bit,
+    and dates as such."""
+    write_rows, times = table_writer(stream, header), time_columns(header)
+    # Who reads a stream may wait for the header before a row is sent.
+    stream.flush()
 
-    def __init__(self, stream: TextIO, header: Sequence[str], stamps: Stamps) -> None:
-        self._stream, self._writer, self._stamps = stream, TableWriter(stream, header), stamps
-        self._times = time_columns(header)
-        # Who reads a stream may wait for the header before a row is sent.
+    def write(rows: Sequence[Sequence[Any]]) -> None:
+        write_rows(dated(rows, times, stamps.date) if stamps.is_dated else rows)
         stream.flush()
 
-    def write(self, rows: Sequence[Sequence[Any]]) -> None:
-        """Write rows; floats so that they are read back bit for bit."""
-        self._writer.write(dated(rows, self._times, self._stamps.date) if self._stamps.is_dated else rows)
-        self._stream.flush()
+    return write
 
 
 class FrameSink:
-    """Rows to a data frame, in which dates stay dates; numbers are kept as arrays, not as objects."""
+    """A sink whose rows come to a data frame, in which dates stay dates; numbers are kept as arrays, not as objects."""
 
     def __init__(self, header: Sequence[str], stamps: Stamps) -> None:
         self._header, self._stamps = list(header), stamps
@@ -71,7 +66,7 @@ class FrameSink:
         self._numbers: list[list[FloatArray]] = [[] for _ in header]
         self._others: list[list[Any]] = [[] for _ in header]
 
-    def write(self, rows: Sequence[Sequence[Any]]) -> None:
+    def __call__(self, rows: Sequence[Sequence[Any]]) -> None:
         """Keep rows."""
         for place, cells in enumerate(zip(*rows, strict=True)):
             if self._header[place] in TEXT_COLUMNS:
@@ -97,53 +92,41 @@ class FrameSink:
         return frame
 
 
-class ParquetSink:
-    """Rows to a Parquet file, one row group for each call."""
+@contextmanager
+def parquet_sink(path: str, header: Sequence[str]) -> Iterator[Sink]:
+    """Give what writes a Parquet file, one row group for each call."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
 
-    def __init__(self, path: str, header: Sequence[str]) -> None:
-        import pyarrow as pa
-        import pyarrow.parquet as pq
+    schema = pa.schema([(name, pa.string() if name in TEXT_COLUMNS else pa.float64()) for name in header])
+    with pq.ParquetWriter(path, schema) as writer:
 
-        self._schema = pa.schema([(name, pa.string() if name in TEXT_COLUMNS else pa.float64()) for name in header])
-        self._writer = pq.ParquetWriter(path, self._schema)
+        def write(rows: Sequence[Sequence[Any]]) -> None:
+            if rows:
+                columns = zip(zip(*rows, strict=True), schema, strict=True)
+                arrays = [pa.array(list(cells), field.type) for cells, field in columns]
+                writer.write_table(pa.Table.from_arrays(arrays, schema=schema))
 
-    def write(self, rows: Sequence[Sequence[Any]]) -> None:
-        """Write one row group."""
-        import pyarrow as pa
-
-        if not rows:
-            return
-        columns = [
-            pa.array(list(cells), field.type)
-            for cells, field in zip(zip(*rows, strict=True), self._schema, strict=True)
-        ]
-        self._writer.write_table(pa.Table.from_arrays(columns, schema=self._schema))
-
-    def close(self) -> None:
-        """Finish the file."""
-        self._writer.close()
+        yield write
 
 
 @contextmanager
-def sink_for(out: str | Path | TextIO | None, header: Sequence[str], stamps: Stamps) -> Iterator[Sink]:
-    """Give a sink for a data frame, a stream, or a file that replaces ``out`` when all went well, and not at all else.
+def sink_for(out: str | Path | TextIO, header: Sequence[str], stamps: Stamps) -> Iterator[Sink]:
+    """Give a sink for a stream, or for a file that replaces ``out`` when all went well, and not at all else.
     In a Parquet file times are seconds, since 1970 where the log has dates."""
-    if out is None:
-        yield FrameSink(header, stamps)
-        return
     if not isinstance(out, str | Path):
-        yield TextSink(out, header, stamps)
+        yield text_sink(out, header, stamps)
         return
     path = Path(out)
     check_suffix(path)
     with replacement_of(path) as (handle, temporary):
         if path.suffix.lower() == ".parquet":
             os.close(handle)
-            with closing(ParquetSink(temporary, header)) as sink:
+            with parquet_sink(temporary, header) as sink:
                 yield sink
         else:
             with os.fdopen(handle, "w", encoding="utf-8", newline="") as stream:
-                yield TextSink(stream, header, stamps)
+                yield text_sink(stream, header, stamps)
 
 
 def measured_frame(kept: list[FloatArray] | None, signals: Signals, stamps: Stamps) -> pd.DataFrame | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,22 +20,17 @@ from obsynth.numerics.arrays import read_only
 from obsynth.observers.estimates import Estimates
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.running import changed
-from obsynth.observers.smoothing.chain import Smoothed, deviations_in
-from obsynth.observers.smoothing.keeping import (
+from obsynth.observers.smoothing import (
     Chain,
-    KeepingObserver,
+    Smoothed,
     checked_lag,
+    deviations_in,
+    links_of,
     parameters_of,
     smoothed_estimates,
     smoothed_record,
 )
 from obsynth.results.design import ObserverDesign
-
-
-class _Waiting(NamedTuple):
-    row: Row
-    chain: Chain
-    k: int
 
 
 class LaterRows:
@@ -49,40 +44,39 @@ class LaterRows:
                 path="smooth",
             )
         self.logged, self.lag = observer, checked_lag(lag)
-        self.keeping = KeepingObserver(observer.observer)
-        observer.observer = self.keeping  # type: ignore[assignment]
-        self.waiting: list[_Waiting] = []
+        self.chain = observer.chain = Chain(links_of(observer.observer))
+        #: With the sample of the chain that each is.
+        self.waiting = list[tuple[Row, int]]()
 
     def take(self, row: Row) -> Iterator[tuple[Row, Any, Smoothed]]:
         """Take a row after its step; yield those that are smoothed now, with what the observer said of them."""
-        chain = self.keeping.chain
-        if self.waiting and self.waiting[0].chain is not chain:
+        if self.logged.chain is not None and self.logged.chain is not self.chain:
             # The observer has started again: what comes says nothing of what was.
             yield from self.flush()
-        self.waiting.append(_Waiting(row, chain, chain.last))
+            self.chain = self.logged.chain
+        chain = self.chain
+        self.waiting.append((row, chain.last))
         if self.lag is None:
             return
-        while self.waiting[0].k + self.lag <= chain.last:
-            ready = self.waiting.pop(0)
-            found = chain.smoothed(self.keeping.links, ready.k, ready.k + self.lag)[0]
-            yield self._shown(ready, found)
+        while (k := self.waiting[0][1]) + self.lag <= chain.last:
+            yield self._shown(*self.waiting.pop(0), chain.smoothed(k, k + self.lag)[0])
         # A late value changes what is known since its own time.
-        chain.drop_before(min(self.waiting[0].k, chain.last - self.keeping.observer.timing.longest))
+        chain.drop_before(min(k, chain.last - self.logged.observer.timing.longest))
 
     def flush(self) -> Iterator[tuple[Row, Any, Smoothed]]:
         """Yield the rows that wait, smoothed by as many samples as there are."""
         waiting, self.waiting = self.waiting, []
         if not waiting:
             return
-        chain = waiting[0].chain
-        found = chain.smoothed(self.keeping.links, waiting[0].k, waiting[-1].k)
-        for ready in waiting:
-            yield self._shown(ready, found[ready.k - waiting[0].k])
+        first = waiting[0][1]
+        found = self.chain.smoothed(first, waiting[-1][1])
+        for row, k in waiting:
+            yield self._shown(row, k, found[k - first])
 
-    def _shown(self, ready: _Waiting, found: Smoothed) -> tuple[Row, Any, Smoothed]:
-        nx, row = len(self.logged.state_names), ready.row
+    def _shown(self, row: Row, k: int, found: Smoothed) -> tuple[Row, Any, Smoothed]:
+        nx = len(self.logged.state_names)
         if row.status in STALE:
-            return row, ready.chain.row(ready.k), found
+            return row, self.chain.row(k), found
         theta, spread = parameters_of(found, nx)
         own = (
             found.x[:nx],
@@ -92,7 +86,7 @@ class LaterRows:
         )
         estimated = np.concatenate(own)
         values = np.concatenate((estimated, row.values[len(estimated) :]))
-        return row._replace(values=values), ready.chain.row(ready.k), found
+        return row._replace(values=values), self.chain.row(k), found
 
 
 def smooth(
@@ -201,7 +195,7 @@ def _smoothed_log(run: LogRun, data: Any, lag: int | None) -> Estimates:
     for time, deviations in samples(data, run.signals):
         found.extend(later.take(run.estimates([time], deviations[None])[0]))
     found.extend(later.flush())
-    known = smoothed_estimates(later.keeping.observer, [row for _, row, _ in found], [sample for _, _, sample in found])
+    known = smoothed_estimates(later.logged.observer, [row for _, row, _ in found], [sample for _, _, sample in found])
     point = run.signals.estimates_point(run.observer)
     nx, nq = len(run.observer.state_names), len(run.observer.fault_names)
     return replace(

@@ -13,9 +13,9 @@ from obsynth.experiments.monitors.monitor import Evidence
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.dae.estimates import DAERow
 from obsynth.observers.dae.observer import DAEObserver
-from obsynth.observers.recursive.estimates import RawEstimate
-from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.observers.recursive.observer import RawEstimate, RecursiveObserver
 from obsynth.observers.running import changed
+from obsynth.observers.smoothing import Chain
 from obsynth.results.design import ObserverDesign
 
 #: What an observer with deviations knows at one sample.
@@ -58,8 +58,16 @@ class SteppingLogObserver(LogObserver):
                 f"Values of {late} are delayed: no row holds their innovations, and monitors use them through the "
                 "estimates alone.",
             )
+        #: Of a smoother: the samples since the observer last started.
+        self.chain: Chain | None = None
         self.state: Any = self.observer.init()
         self.u: FloatArray | None = None
+
+    def _begin(self) -> None:
+        """Start the observer again."""
+        self.state = self.observer.init()
+        if self.chain is not None:
+            self.chain = Chain(self.chain.links)
 
     @property
     def gates(self) -> bool:
@@ -84,7 +92,8 @@ class SteppingLogObserver(LogObserver):
         found: StepRow
         try:
             with np.errstate(all="ignore"):
-                self.state, found = self.observer.accept(self.state, y, u)
+                kept = None if self.chain is None else self.chain.add
+                self.state, found = self.observer.accept(self.state, y, u, kept)
         except (np.linalg.LinAlgError, ValueError):
             return None
         if found.is_finite:
@@ -109,7 +118,8 @@ class SteppingLogObserver(LogObserver):
             return Row(GAP, np.full(len(self.columns), np.nan), missing)
         u, y = (np.where(known, values, np.nan)[part] for part in (slice(nu), slice(nu, None)))
         if missing > LONGEST_BRIDGE and self.may_restart:
-            self.state, fresh = self.observer.init(), True
+            self._begin()
+            fresh = True
         else:
             fresh = self._bridged(missing) or fresh
         total = self.state.refused[1]
@@ -143,7 +153,7 @@ class SteppingLogObserver(LogObserver):
             except ObsynthError:
                 if not self.may_restart:
                     raise
-                self.state = self.observer.init()
+                self._begin()
                 return True
         return False
 
@@ -158,7 +168,7 @@ class SteppingLogObserver(LogObserver):
             # An outlier may have led where the model cannot go on.
             if not may_restart:
                 raise
-        self.state = self.observer.init()
+        self._begin()
         found = self._safe(y, u)
         return (self._required(u), True, True) if found is None else (found, False, True)
 

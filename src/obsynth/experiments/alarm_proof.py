@@ -1,34 +1,447 @@
-"""From a record to a proof that it is not fault-free: the programme solved, its dual checked in exact arithmetic."""
+"""From a record to a proof that it is not fault-free: the programme solved, its dual checked in exact arithmetic.
+
+The linear programme of a window: states, disturbances and constants that explain its data without a fault.
+
+A product of a constant and a state is a variable between McCormick's planes.  ``t >= 0``, a share of the bounds,
+relaxes every inequality: least above zero, nothing explains the data.  Powers of two scale variables and rows.
+
+The alarm of a guaranteed test, proved by one number for each equation of its window.
+
+Each equation of the window is multiplied by its number, and all are added up.  States and free faults then cancel, to
+the last digit; what is left says that a sum of disturbances and noise is a number which bounds do not allow.  The
+numbers are fractions, so that nothing is rounded: an auditor needs no solver, and no trust in one.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from obsynth.analysis.transformations.uncertain_plant import AffinePlant, affine_plant
 from obsynth.errors import PreconditionError, SpecError, VerificationError
-from obsynth.experiments.alarm_multipliers import (
-    refuse_bounds,
-    refuted,
-    rows_of_test,
-    statement_of,
-)
-from obsynth.experiments.alarm_window import Window, window_data, window_programme
 from obsynth.experiments.assumptions import Assumptions, Log
+from obsynth.experiments.monitors.adaptive import start_of
 from obsynth.experiments.monitors.options import WINDOW
 from obsynth.files.outputs import FileKind, write_atomically
+from obsynth.methods.guaranteed_test.checks import while_inside
+from obsynth.methods.guaranteed_test.exact import Programmes
 from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
+from obsynth.methods.guaranteed_test.proofs import (
+    columns_of_exact,
+    down,
+    exact_multipliers,
+    exact_right_sides,
+    sum_in_ellipsoids,
+)
 from obsynth.methods.guaranteed_test.result import GuaranteedTest
+from obsynth.methods.guaranteed_test.windows import Window
+from obsynth.methods.tracking import tracking_of
 from obsynth.methods.verifying import verify
-from obsynth.numerics.arguments import is_whole
+from obsynth.numerics.arguments import is_finite_number, is_whole
 from obsynth.numerics.arrays import FloatArray
+from obsynth.plants.constants import MOST_LISTED, shown
 from obsynth.plants.validation import index_of
+from obsynth.proofs.balls import gamma
 from obsynth.results.certificate_files import SHOWN_DIGITS, sealed
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import design_as_dict, plain
+from obsynth.tolerances.robustness import structure_of
+from obsynth.verification.adaptive_bound import adaptive_bound
+from obsynth.verification.adaptive_record import thresholds_of_records
+
+#: Roundings of a computed right side beside those of its products and sums.
+MORE_ROUNDINGS = 8
+#: The largest value of t that is of interest, in bounds of the variables.
+LARGEST_RELAXATION = 1e3
+#: Bounds of the state are widened by this share: more than rounding can take from them.
+WINDOW_OUTWARD = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """Sparse rows ``sum value * variable (= or <=) right`` of variables in ``scales``, powers of two; the last is t."""
+
+    scales: FloatArray
+    columns: list[list[int]] = field(default_factory=list)
+    values: list[list[float]] = field(default_factory=list)
+    right: list[float] = field(default_factory=list)
+
+    def add(self, entries: Mapping[int, float], right: float, *, relaxed: bool = False) -> None:
+        """Append a row for variables in their own units; t relaxes it by its largest entry."""
+        kept = {column: float(value * self.scales[column]) for column, value in entries.items() if value != 0.0}
+        unit = _power_of_two(max((abs(value) for value in kept.values()), default=1.0))
+        columns, values = list(kept), [value / unit for value in kept.values()]
+        if relaxed:
+            columns.append(len(self.scales) - 1)
+            values.append(-1.0)
+        self.columns.append(columns)
+        self.values.append(values)
+        self.right.append(float(right) / unit)
+
+
+@dataclass(frozen=True, eq=False)
+class Programme:
+    """The programme: equations, inequalities, bounds of all variables; the last variable is t."""
+
+    equal: Rows
+    below: Rows
+    lower: FloatArray
+    upper: FloatArray
+
+    def matrices(self) -> tuple[object, object]:
+        """Return both sets of rows as sparse matrices."""
+        from scipy.sparse import csr_array
+
+        found = []
+        for rows in (self.equal, self.below):
+            starts = np.cumsum([0, *(len(item) for item in rows.columns)])
+            columns = np.array([j for item in rows.columns for j in item], dtype=np.int64)
+            values = np.array([value for item in rows.values for value in item])
+            found.append(csr_array((values, columns, starts), shape=(len(rows.right), len(self.lower))))
+        return found[0], found[1]
+
+    def proved_least(self, equal: FloatArray, below: FloatArray) -> Fraction:
+        """Return a lower bound of the least t from any multipliers (of inequalities: 0 or less), in exact arithmetic.
+        Neumaier, Shcherbina, "Safe bounds in linear and mixed-integer linear programming", Math. Prog. 99, 2004."""
+        reduced: dict[int, Fraction] = {len(self.lower) - 1: Fraction(1)}
+        total = Fraction(0)
+        for rows, multipliers in ((self.equal, equal), (self.below, np.minimum(below, 0.0))):
+            for i in np.flatnonzero(multipliers):
+                weight = Fraction(float(multipliers[i]))
+                total += weight * Fraction(rows.right[i])
+                for j, entry in zip(rows.columns[i], rows.values[i], strict=True):
+                    reduced[j] = reduced.get(j, Fraction(0)) - weight * Fraction(entry)
+        for j, value in list(reduced.items()):
+            end = self.lower[j] if value > 0 else self.upper[j]
+            total += value * Fraction(float(end))
+        return total
+
+
+@dataclass(frozen=True, eq=False)
+class WindowData:
+    """What is known of a window of N samples: ``u (N, nu)``, ``y (N, ny)``, the state between ``low, high (N, n)``."""
+
+    u: FloatArray
+    y: FloatArray
+    low: FloatArray
+    high: FloatArray
+
+
+def window_programme(plant: AffinePlant, bounds: FloatArray, data: WindowData) -> Programme:
+    """Return the programme of a window; ``bounds (nd + nw,)`` of disturbances and noise."""
+    builder, steps = _Builder(plant, bounds, data), len(data.y)
+    for k in range(steps):
+        builder.dynamics(k)
+        builder.outputs(k)
+        builder.planes(k)
+        builder.states(k)
+    # The bounds of the state are rows that t relaxes; the variables themselves have room for that.
+    upper = np.full(builder.t + 1, LARGEST_RELAXATION)
+    upper[builder.d : builder.q] = np.tile(bounds, steps) / builder.equal.scales[builder.d : builder.q]
+    upper[builder.q : builder.products] = 1.0
+    lower = -upper
+    lower[builder.t] = 0.0
+    return Programme(builder.equal, builder.below, lower, upper)
+
+
+def _power_of_two(value: float) -> float:
+    return math.ldexp(1.0, math.frexp(value)[1])
+
+
+class _Builder:
+    """Rows of one sample, and the places of the variables: x (N n), d (N nd), q, products (N m), t."""
+
+    def __init__(self, plant: AffinePlant, bounds: FloatArray, data: WindowData) -> None:
+        self.plant, self.data = plant, data
+        self.n, self.nd, self.p = plant.A.shape[0], len(bounds), plant.count
+        self.pairs = [
+            (i, j)
+            for i in range(self.p)
+            for j in range(self.n)
+            if plant.A.parts[i][:, j].any() or plant.E.parts[i][:, j].any() or plant.C.parts[i][:, j].any()
+        ]
+        steps, self.varying = len(data.y), plant.box.variation == "varying"
+        self.d = steps * self.n
+        self.q = self.d + steps * self.nd
+        self.products = self.q + self.p * (steps if self.varying else 1)
+        self.t = self.products + steps * len(self.pairs)
+        self.size = np.maximum(np.abs(data.low), np.abs(data.high))
+        scales = self._scales(bounds)
+        self.equal, self.below = Rows(scales), Rows(scales)
+        self.bd = np.hstack([plant.Bd.center, plant.plant.Bw])
+        self.dd = np.hstack([plant.Dd.center, plant.plant.Dw])
+        moving = np.abs(plant.E.center) + plant.E.spread + plant.E.radius
+        self.algebraic = moving.max(axis=1, initial=0.0) == 0.0
+        # A right side is computed: what rounding may have taken from it, relative to its terms, counts as remainder.
+        self.rounding = gamma(plant.B.shape[1] + MORE_ROUNDINGS)
+        nd = plant.Bd.shape[1]
+        self.loose = (plant.Bd.spread + plant.Bd.radius) @ bounds[:nd]
+        self.seen = (plant.Dd.spread + plant.Dd.radius) @ bounds[:nd]
+
+    def _scales(self, bounds: FloatArray) -> FloatArray:
+        """Return powers of two near the bounds of the variables; those of a state are the same at all samples."""
+        steps, largest = len(self.size), self.size.max(axis=0, initial=0.0)
+        least = float(min(largest[largest > 0.0], default=1.0))
+        own = np.array([_power_of_two(value if value > 0.0 else least) for value in largest])
+        found = np.ones(self.t + 1)
+        found[: self.d] = np.tile(own, steps)
+        found[self.d : self.q] = np.tile([_power_of_two(value if value > 0.0 else 1.0) for value in bounds], steps)
+        found[self.products : self.t] = np.tile(own[[j for _, j in self.pairs]], steps)
+        return found
+
+    def state(self, k: int, i: int) -> int:
+        return k * self.n + i
+
+    def disturbance(self, k: int, i: int) -> int:
+        return self.d + k * self.nd + i
+
+    def constant(self, k: int, i: int) -> int:
+        return self.q + (k * self.p if self.varying else 0) + i
+
+    def product(self, k: int, j: int) -> int:
+        return self.products + k * len(self.pairs) + j
+
+    def dynamics(self, k: int) -> None:
+        """Add ``E x(k+1) - A x(k) - Bd d = B u``: exactly, or between bounds of the remainders."""
+        plant, data = self.plant, self.data
+        last = k + 1 == len(data.y)
+        for r in range(self.n):
+            if last and not self.algebraic[r]:
+                continue
+            entries = dict[int, float]()
+            loose = float(self.loose[r] + plant.A.radius[r] @ self.size[k] + plant.B.radius[r] @ np.abs(data.u[k]))
+            if not self.algebraic[r]:
+                entries |= {self.state(k + 1, i): plant.E.center[r, i] for i in range(self.n)}
+                entries |= {self.product(k + 1, j): plant.E.parts[i][r, c] for j, (i, c) in enumerate(self.pairs)}
+                loose += float(plant.E.radius[r] @ self.size[k + 1])
+            entries |= {self.state(k, i): -plant.A.center[r, i] for i in range(self.n)}
+            entries |= {self.product(k, j): -plant.A.parts[i][r, c] for j, (i, c) in enumerate(self.pairs)}
+            entries |= {self.constant(k, i): -float(plant.B.parts[i][r] @ data.u[k]) for i in range(self.p)}
+            entries |= {self.disturbance(k, i): -self.bd[r, i] for i in range(self.nd)}
+            right = float(plant.B.center[r] @ data.u[k])
+            loose += self.rounding * float(plant.B.magnitude[r] @ np.abs(data.u[k]))
+            if loose == 0.0:
+                self.equal.add(entries, right)
+            else:
+                self.below.add(entries, right + loose)
+                self.below.add({column: -value for column, value in entries.items()}, loose - right)
+
+    def outputs(self, k: int) -> None:
+        """Add ``y = C x + D u + Dd d``, relaxed by t."""
+        plant, data = self.plant, self.data
+        for r in range(len(plant.C.center)):
+            entries = {self.state(k, i): plant.C.center[r, i] for i in range(self.n)}
+            entries |= {self.product(k, j): plant.C.parts[i][r, c] for j, (i, c) in enumerate(self.pairs)}
+            entries |= {self.disturbance(k, i): self.dd[r, i] for i in range(self.nd)}
+            entries |= {self.constant(k, i): float(plant.D.parts[i][r] @ data.u[k]) for i in range(self.p)}
+            right = float(data.y[k, r] - plant.D.center[r] @ data.u[k])
+            loose = float(self.seen[r] + plant.C.radius[r] @ self.size[k] + plant.D.radius[r] @ np.abs(data.u[k]))
+            loose += self.rounding * float(abs(data.y[k, r]) + plant.D.magnitude[r] @ np.abs(data.u[k]))
+            for sign in (1.0, -1.0):
+                row = {column: sign * value for column, value in entries.items()}
+                self.below.add(row, sign * right + loose, relaxed=True)
+
+    def states(self, k: int) -> None:
+        """Add the bounds of the state, relaxed by t."""
+        for i in range(self.n):
+            place = self.state(k, i)
+            self.below.add({place: 1.0}, float(self.data.high[k, i]), relaxed=True)
+            self.below.add({place: -1.0}, -float(self.data.low[k, i]), relaxed=True)
+
+    def planes(self, k: int) -> None:
+        """Add the four planes of McCormick of each product, relaxed by t."""
+        data = self.data
+        for j, (i, c) in enumerate(self.pairs):
+            low, high = float(data.low[k, c]), float(data.high[k, c])
+            for q, s, sign in ((-1.0, low, -1.0), (1.0, high, -1.0), (1.0, low, 1.0), (-1.0, high, 1.0)):
+                row = {self.product(k, j): sign, self.state(k, c): -sign * q, self.constant(k, i): -sign * s}
+                self.below.add(row, -sign * q * s, relaxed=True)
+
+
+#: Where the bounds of the state come from.
+REPLAY, STATED_BOUNDS = "replay from the start", "stated"
+
+
+def window_data(
+    design: ObserverDesign, assumed: Assumptions, length: int, u: FloatArray, y: FloatArray
+) -> tuple[AffinePlant, WindowData, str]:
+    """Return the plant over its box, the last ``length`` samples with bounds of the state, and where these come from.
+    Without stated ones they come from the observer run again from the start, and its error."""
+    affine = affine_plant(design.linear[0])
+    first = max(0, len(y) - length)
+    if assumed.initial_set is None:
+        low, high = _stated(affine, assumed.state_bounds or {}, len(y) - first)
+        return affine, WindowData(u[first:], y[first:], low, high), STATED_BOUNDS
+    _, observer = design.linear
+    tracking = tracking_of(design, affine)
+    structure = structure_of(
+        design, affine, tracking, bounds=assumed.bounds, noise_bound=assumed.noise_bound, faults=False, states=True
+    )
+    start = start_of(affine, tracking, None, assumed.initial_set, np.zeros(observer.order))
+    bound = adaptive_bound(structure, observer, start, varying=affine.box.variation == "varying")
+    estimates = observer.run(y, u if u.shape[1] else None)
+    rows = np.hstack([estimates.states, estimates.faults, estimates.residuals])
+    read = rows @ structure.reading.T
+    found = thresholds_of_records(bound, read[None], u[None], y[None])
+    middle = read - found.shift[0]
+    width = (found.total - np.abs(found.shift))[0] + WINDOW_OUTWARD * (np.abs(read) + found.total[0])
+    low, high = (middle - width)[first:], (middle + width)[first:]
+    return affine, WindowData(u[first:], y[first:], low, high), REPLAY
+
+
+def _stated(affine: AffinePlant, given: Mapping[str, Any], steps: int) -> tuple[FloatArray, FloatArray]:
+    names = affine.plant.state_names
+    missing = [name for name in names if name not in given]
+    if missing:
+        raise SpecError(
+            f"Nothing bounds the state {missing[0]!r}: give initial_set (--initial), or its bound.", path="initial_set"
+        )
+    for name in names:
+        if not (is_finite_number(given[name]) and given[name] >= 0.0):
+            raise SpecError(f"The bound of {name!r} is {given[name]!r}: give a number, 0 or more.", path="state_bounds")
+    sizes = np.array([float(given[name]) for name in names])
+    back = np.abs(2.0 * np.eye(len(names)) - affine.coordinates) @ sizes
+    high = np.tile(back, (steps, 1))
+    return -high, high
+
+
+def refuse_bounds(given: Mapping[str, Any]) -> None:
+    """Raise `SpecError` where bounds are given: those of the design count."""
+    stated = [name for name, value in given.items() if value]
+    if stated:
+        raise SpecError(
+            f"{', '.join(stated)} cannot be given for a guaranteed test: what is proved rests on the bounds of its "
+            "design. Design it again with others.",
+            path=stated[0],
+        )
+
+
+def rows_of_test(test: GuaranteedTest) -> int:
+    """Return the rows that a test looks at."""
+    return test.linear[1].order + 1 - len(test.certificate.matrices.get("state_tracking", ()))
+
+
+def refuted(design: ObserverDesign, u: FloatArray, y: FloatArray) -> tuple[int, int, dict[str, Any]] | None:
+    """Return the proof with the largest margin of any test of a design, for the end of a record; ``None``: none.
+
+    It is the number of the test, the rows that it looks at, and the numbers as plain data: fractions in words that
+    Python's ``Fraction`` reads."""
+    best: tuple[int, int, dict[str, Any]] | None = None
+    largest = 0.0
+    for place, test in enumerate(GuaranteedTest.of(design).tests):
+        rows = rows_of_test(test)
+        if len(y) < rows:
+            continue
+        programmes = Programmes.of(test)
+        for guess in programmes.refuting(y[-rows:], u[-rows:]):
+            values = exact_multipliers(programmes.window, guess)
+            margin = np.nan if values is None else margin_of(programmes.window, values, y[-rows:], u[-rows:])
+            if values is not None and margin > largest:
+                largest, told = margin, [str(value) for value in values]
+                best = place, rows, {"test": test.fault, "multipliers": told, "margin": margin}
+    return best
+
+
+def margin_of(window: Window, values: list[Fraction], y: FloatArray, u: FloatArray) -> float:
+    """Return by which share all bounds would have to be exceeded, at least; NaN where a free column is seen.
+
+    All sums are exact, and the share is rounded down.
+    """
+    seen = columns_of_exact(window, values)
+    if any(seen[j] for j in np.flatnonzero(window.free).tolist()):
+        return np.nan
+    right = exact_right_sides(window, y, u)
+    total = abs(sum((value * side for value, side in zip(values, right, strict=True)), start=Fraction(0)))
+    bounded = np.flatnonzero(window.bounded).tolist()
+    parts = [Fraction(float(window.bar[j])) * abs(seen[j]) for j in bounded]
+    allowed = sum(parts, start=Fraction(0))
+    if window.question.ellipsoid:
+        allowed = Fraction(sum_in_ellipsoids(window, parts))
+    if allowed == 0:
+        # No disturbance and no noise at all: the rounding of the samples themselves would be a proof.
+        return 0.0
+    return down(total / allowed - 1)
+
+
+def statement_of(test: GuaranteedTest, group: tuple[str, ...], row: int, log: Log | None, gain_set: str) -> str:
+    """Return what a proof says, with everything it rests on."""
+    window = Programmes.of(test).window
+    plant, question = window.plant, window.question
+    source = "a record" if log is None else f"{log.name} (sha256 {log.sha256[:SHOWN_DIGITS]})"
+    others = [plant.fault_names[k] for k in question.free]
+    besides = f", whatever {' and '.join(others)} does" if others else ""
+    one = " or ".join(group)
+    return (
+        f"Proved: rows {row - rows_of_test(test) + 1} to {row} of {source} cannot occur without "
+        f"{one}{besides}{while_inside(test)}, with {_assumed(window)}: {one} is present, or the model is not exact. "
+        f"Gain set {gain_set[:SHOWN_DIGITS]}."
+    )
+
+
+def _assumed(window: Window) -> str:
+    """Return the bounds that a proof rests on, in words."""
+    plant, bounds = window.plant, window.bounds
+    noise = np.abs(bounds.noise_output) @ bounds.noise
+    d_middle = bounds.disturbance_middle
+    v_middle = None if bounds.noise_middle is None else bounds.noise_output @ bounds.noise_middle
+    parts = [
+        _listed(plant.disturbance_names, bounds.disturbance, plant.units, "within", "disturbances", d_middle),
+        _listed(plant.output_names, noise, plant.units, "noise of", "sensors", v_middle),
+        "process noise within its bounds" if bounds.noise_state.any() else "",
+        _listed(plant.state_names, bounds.state, plant.units, "within", "states"),
+        _listed(plant.state_names, bounds.first, plant.units, "at first within", "states"),
+        "" if window.question.disturbance == "jump" else f"disturbances that are {window.question.disturbance}",
+    ]
+    told = [part for part in parts if part]
+    return ", ".join(told) if told else "any disturbances and noise"
+
+
+def _listed(
+    names: tuple[str, ...],
+    sizes: FloatArray,
+    units: Mapping[str, str],
+    word: str,
+    kind: str,
+    middles: FloatArray | None = None,
+) -> str:
+    about = np.zeros(len(sizes)) if middles is None else middles
+    known = [
+        (name, size, middle)
+        for name, size, middle in zip(names, sizes.tolist(), about.tolist(), strict=True)
+        if np.isfinite(size) and (size > 0.0 or middle)
+    ]
+    if len(known) > MOST_LISTED:
+        return f"{len(known)} {kind} {word} their bounds"
+    return ", ".join(_told(name, size, middle, units.get(name, ""), word) for name, size, middle in known)
+
+
+def _told(name: str, size: float, middle: float, unit: str, word: str) -> str:
+    noise = word == "noise of"
+    if middle:
+        # Ends are told as they were given, which half width and middle are to some digits.
+        low, high = (float(f"{end:.12g}") for end in (middle - size, middle + size))
+        within = f"{shown(low)} to {shown(high, unit)}"
+    else:
+        within = shown(float(f"{size:.6g}") if noise else size, unit)
+    return f"noise of {name} within {within}" if noise else f"{name} {word} {within}"
+
+
+def checked(design: ObserverDesign, body: Mapping[str, Any], u: FloatArray, y: FloatArray) -> Iterator[Any]:
+    """Yield the test of a certificate, the group of faults, and the margin that is proved again."""
+    whole = GuaranteedTest.of(design)
+    place = [test.fault for test in whole.tests].index(body["test"])
+    test = whole.tests[place]
+    window = Programmes.of(test).window
+    values = [Fraction(text) for text in body["multipliers"]]
+    fits = len(values) == window.rows and len(y) == len(u) == rows_of_test(test)
+    yield test, whole.groups[place], margin_of(window, values, y, u) if fits else np.nan
+
 
 ALARM_VERSION = 2
 ALARM_KIND = "obsynth alarm certificate"
@@ -142,8 +555,8 @@ def proved_alarm(
         "bounds": assumed.bounds,
         "noise_bound": assumed.noise_bound,
         "window": window,
-        "initial_set": None if initial_set is None else _listed(initial_set),
-        "state_bounds": None if state_bounds is None else _listed(state_bounds),
+        "initial_set": None if initial_set is None else _as_lists(initial_set),
+        "state_bounds": None if state_bounds is None else _as_lists(state_bounds),
         "u": u,
         "y": y,
         "row": row,
@@ -247,18 +660,18 @@ def assumptions_of(
 
 def programme_of(
     design: ObserverDesign, assumed: Assumptions, window: int, u: FloatArray, y: FloatArray
-) -> tuple[Window, str]:
+) -> tuple[Programme, str]:
     """Return the programme of the last samples of a record, and where its bounds of the state come from."""
     affine, data, origin = window_data(design, assumed, window, u, y)
     bounds = np.concatenate([assumed.bounds, np.full(affine.plant.nw, assumed.noise_bound)])
     return window_programme(affine, bounds, data), origin
 
 
-def _listed(given: Mapping[str, Any]) -> dict[str, Any]:
+def _as_lists(given: Mapping[str, Any]) -> dict[str, Any]:
     return {name: list(value) if isinstance(value, (list, tuple)) else value for name, value in given.items()}
 
 
-def solved(programme: Window) -> tuple[FloatArray, FloatArray] | None:
+def solved(programme: Programme) -> tuple[FloatArray, FloatArray] | None:
     """Return multipliers of equations and inequalities (0 or less) by HiGHS; `None` where it gives none."""
     from scipy.optimize import linprog
 

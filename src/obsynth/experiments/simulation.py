@@ -14,7 +14,7 @@ from obsynth.analysis.transformations.recovery import Transformation, plant_and_
 from obsynth.errors import SpecError
 from obsynth.experiments.benches import CONSISTENCY_TOLERANCE, bench_of
 from obsynth.files.outputs import FileKind, write_atomically
-from obsynth.files.tables import TableWriter
+from obsynth.files.tables import table_writer
 from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.observers.estimates import BAND_WIDTH, Estimates
@@ -161,7 +161,7 @@ class Simulation:
             Of the file.
         """
         table, text = self.columns(), io.StringIO()
-        TableWriter(text, table).write(zip(*(column.tolist() for column in table.values()), strict=True))
+        table_writer(text, table)(zip(*(column.tolist() for column in table.values()), strict=True))
         return write_atomically(path, text.getvalue())
 
 

@@ -1,8 +1,12 @@
-"""What every export holds: one discrete- or continuous-time realisation, its names, and the digest of the gain set."""
+"""What every export holds: one discrete- or continuous-time realisation, its names, and the digest of the gain set.
+
+Alarms of an exported observer: levels of its outputs, and a monitor that was learned from rows without faults.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from types import MappingProxyType
@@ -12,12 +16,13 @@ import numpy as np
 
 from obsynth.data.linear_log import GAP_LEFT_SHARE, LEAST_SHOWN, LinearLogObserver
 from obsynth.errors import SpecError
+from obsynth.experiments.monitors.learned import LearnedThresholds
 from obsynth.methods.handing_on import unverified_mark
-from obsynth.numerics.arguments import require_kind
+from obsynth.numerics.arguments import is_finite_number, require_kind, require_mapping
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import first_order_hold
 from obsynth.observers.dae.observer import DAEObserver
-from obsynth.observers.linear.derived import sample_observer
+from obsynth.observers.linear.derived import checked_warm_up, sample_observer, transient
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.recursive.gain_schedule import steady_observer
 from obsynth.observers.recursive.observer import RecursiveObserver
@@ -232,3 +237,71 @@ def _constant_plant(plant: Any) -> DescriptorSystem | None:
     except SpecError:
         # More or fewer equations than states.
         return None
+
+
+#: What the largest statistic of a learned monitor is called, in units of its level.
+STATISTIC = "statistic"
+#: Seconds, about thirty years.
+_NEVER = 1e9
+
+
+@dataclass(frozen=True, eq=False)
+class Alarms:
+    """What raises an alarm: ``levels`` by watched output, 0 for none; ``columns``: all outputs that a learned monitor
+    may take, fault estimates first; ``warm_up`` in seconds; ``walk (nf, nf)``: by which faults walk between samples."""
+
+    levels: Mapping[str, float]
+    columns: tuple[str, ...]
+    fault_names: tuple[str, ...]
+    warm_up: float
+    learned: LearnedThresholds | None = None
+    walk: FloatArray | None = None
+
+    @classmethod
+    def of(
+        cls,
+        columns: Sequence[str],
+        fault_names: Sequence[str],
+        thresholds: Mapping[str, float] | None,
+        warm_up: float,
+        learned: LearnedThresholds | None,
+        more: Sequence[str] = (),
+    ) -> Alarms:
+        """Return alarms; ``more``: what may be watched besides the columns.  Raise `SpecError` for another name."""
+        require_mapping(thresholds, "thresholds")
+        watched = [*columns, *more]
+        for name, level in (thresholds or {}).items():
+            if name not in watched:
+                raise SpecError(
+                    f"There is no output {name!r} to monitor: there are {', '.join(watched)}.", path="thresholds"
+                )
+            if not is_finite_number(level) or level <= 0.0:
+                raise SpecError(f"The threshold of {name!r} is {level!r}: give a positive number.", path="thresholds")
+        levels = {name: float((thresholds or {}).get(name, 0.0)) for name in watched}
+        if learned is not None:
+            levels[STATISTIC] = 1.0
+        return cls(levels, tuple(columns), tuple(fault_names), warm_up, learned)
+
+    @property
+    def places(self) -> tuple[int, ...]:
+        """Where each watched output stands, in order."""
+        return tuple(range(len(self.levels)))
+
+
+def finite_warm_up(seconds: float) -> float:
+    """Return a number that a file may hold: an observer that never settles raises no alarm."""
+    return seconds if math.isfinite(seconds) else _NEVER
+
+
+def linear_alarms(
+    found: Realisation,
+    thresholds: Mapping[str, float] | None,
+    warm_up: float | None,
+    learned: LearnedThresholds | None,
+) -> Alarms:
+    """Return the alarms of a linear observer."""
+    observer = found.observer
+    columns = (*observer.row_names[observer.fault_rows], *observer.row_names[observer.residual_rows])
+    # That of the design itself, as runs have it: sampling changes no mode.
+    seconds = finite_warm_up(checked_warm_up(warm_up, transient(found.running)))
+    return Alarms.of(columns, observer.fault_names, thresholds, seconds, learned)

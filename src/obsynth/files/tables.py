@@ -1,11 +1,38 @@
-"""Tables as comma-separated text that is harmless in spreadsheets, as aligned text, and as HTML."""
+"""Tables as comma-separated text that is harmless in spreadsheets, as aligned text, and as HTML.
+
+Pages of HTML that stand alone, in one style.
+"""
 
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from html import escape
-from typing import Any, Protocol
+from importlib.resources import files
+from typing import Any, TextIO
+
+
+def standing_page(title: str, body: Iterable[str], *, generator: str = "obsynth") -> str:
+    """Return a page that stands alone, in the style of the reports; title and lines of the body are HTML."""
+    style = files("obsynth.files").joinpath("page.css").read_text(encoding="utf-8")
+    parts = [
+        "<!DOCTYPE html>",
+        '<html lang="en">',
+        "<head>",
+        '<meta charset="utf-8">',
+        f'<meta name="generator" content="{generator}">',
+        '<meta name="viewport" content="width=device-width, initial-scale=1">',
+        f"<title>{title}</title>",
+        f"<style>{style}</style>",
+        "</head>",
+        "<body>",
+        f"<h1>{title}</h1>",
+        *body,
+        "</body>",
+        "</html>",
+    ]
+    return "\n".join(parts) + "\n"
+
 
 #: A text that begins so is taken for a formula by spreadsheets; the last four are the full-width forms.
 _FORMULA = ("=", "+", "-", "@", "＝", "＋", "－", "＠")
@@ -13,20 +40,12 @@ _FORMULA = ("=", "+", "-", "@", "＝", "＋", "－", "＠")
 _MARK = "'"
 
 
-class _Writable(Protocol):
-    def write(self, text: str, /) -> Any: ...
-
-
-class TableWriter:
-    """Rows to a text stream; floats so that they are read back bit for bit, NaN as an empty cell, texts harmless."""
-
-    def __init__(self, stream: _Writable, header: Iterable[str]) -> None:
-        self._writer = csv.writer(stream, lineterminator="\n")
-        self._writer.writerow([harmless(name) for name in header])
-
-    def write(self, rows: Iterable[Sequence[Any]]) -> None:
-        """Write rows of numbers and texts."""
-        self._writer.writerows([[_cell(value) for value in row] for row in rows])
+def table_writer(stream: TextIO, header: Iterable[str]) -> Callable[[Iterable[Sequence[Any]]], None]:
+    """Write the header of a table, and return what writes its rows of numbers and texts: floats so that they are read
+    back bit for bit, NaN as an empty cell, texts harmless."""
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow([harmless(name) for name in header])
+    return lambda rows: writer.writerows([[_cell(value) for value in row] for row in rows])
 
 
 def harmless(text: str) -> str:

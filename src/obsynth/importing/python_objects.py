@@ -1,20 +1,28 @@
-"""Plants from objects of other libraries: systems of python-control and scipy, matrices of sympy, frames of pandas."""
+"""Plants from objects of other libraries: systems of python-control and scipy, matrices of sympy, frames of pandas.
+
+Plants from CasADi: a Function or a dictionary of expressions, as its integrators take them.
+
+Power networks of the simulator ANDES: a case, or the pencil that was written from one.
+"""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
-from typing import Any
+from pathlib import Path
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
 from obsynth.importing.roles import plant_of
-from obsynth.numerics.arguments import is_finite_number, require_mapping
+from obsynth.numerics.arguments import is_finite_number, require_mapping, shown
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.libraries import imported
+from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import ALL_MATRICES, SIGNAL_NAMES, DescriptorSystem
-from obsynth.plants.validation import suggestion
+from obsynth.plants.validation import checked_names, suggestion
 
 
 def from_control(
@@ -240,3 +248,257 @@ def _evaluated(matrix: Any, numbers: Mapping[Any, Any], name: str) -> FloatArray
                 )
             dense[i, j] = int(entry.p) / int(entry.q) if entry.is_Rational else float(entry)
     return dense
+
+
+#: What goes in and what comes out, by the names that CasADi's integrators have; y is ours.
+INTEGRATOR_INPUTS, OUTPUTS = ("x", "z", "u", "p"), ("ode", "alg", "y")
+
+
+def from_casadi(
+    system: Any,
+    *,
+    states: Mapping[str, float],
+    inputs: Mapping[str, float] | None = None,
+    parameters: Mapping[str, float] | None = None,
+    output_names: Any = None,
+    units: Mapping[str, str] | None = None,
+) -> DAEModel:
+    """Return the nonlinear plant of a CasADi Function, or of a dictionary of expressions.
+
+    Parameters
+    ----------
+    system : casadi.Function or dict
+        ``x' = ode(x, z, u, p)``, ``0 = alg(x, z, u, p)``, ``y = y(x, z, p)``: a Function with inputs and outputs of
+        these names, or a dictionary of SX or MX with these keys, as ``casadi.integrator`` takes it.  ``z``, ``u``,
+        ``p`` and ``alg`` may be missing.
+    states : mapping of str to float
+        Name -> nominal value, of x first and then of z.
+    inputs : mapping of str to float, optional
+        Name -> nominal value, of u.
+    parameters : mapping of str to float, optional
+        Name -> nominal value, of p.
+    output_names : list of str, optional
+        Names of y; ``y1, ...`` by default.
+    units : mapping of str to str, optional
+        As for `DAEModel`.
+
+    Returns
+    -------
+    DAEModel
+        Linearise it by `obsynth.linearise` for a method that needs a linear plant.
+
+    Raises
+    ------
+    SpecError
+        CasADi is not installed, a name is unknown, sizes do not fit, ``ode`` or ``y`` is missing, or y depends on u.
+
+    References
+    ----------
+    .. [Andersson2019] J. Andersson et al., CasADi: a software framework for nonlinear optimization and optimal control,
+       Math. Prog. Comp. 11 (1), 2019.
+    """
+    casadi = imported("casadi", extra="nonlinear", what="A plant of CasADi")
+    for given, name in ((states, "states"), (inputs, "inputs"), (parameters, "parameters")):
+        require_mapping(given, name)
+    function = _function(casadi, system)
+    taken = {name: function.size1_in(name) if name in function.name_in() else 0 for name in INTEGRATOR_INPUTS}
+    made = {name: function.size1_out(name) if name in function.name_out() else 0 for name in OUTPUTS}
+    nx, nz = taken["x"], taken["z"]
+    for what, count, wanted in (
+        ("states", len(states), nx + nz), ("inputs", len(inputs or {}), taken["u"]),
+        ("parameters", len(parameters or {}), taken["p"]),
+    ):  # fmt: skip
+        if count != wanted:
+            raise SpecError(f"{what} names {count} value(s), but the system has {wanted}.", path=what)
+    if made["ode"] != nx or made["alg"] != nz or not made["y"]:
+        raise SpecError(
+            f"The system has {nx} state(s) x and {nz} state(s) z, but {made['ode']} equation(s) ode, {made['alg']} alg "
+            f"and {made['y']} output(s) y: one ode for each x, one alg for each z, and at least one y are needed.",
+            path="system",
+        )
+    if "u" in function.name_in() and function.jac_sparsity(
+        function.index_out("y"), function.index_in("u")
+    ).nnz():  # fmt: skip
+        raise SpecError("y depends on u: outputs are of states and parameters alone.", path="system")
+
+    def values(x: Any, u: Any, theta: Any) -> dict[str, Any]:
+        given = {"x": x[:nx], "z": x[nx:], "u": u, "p": theta}
+        return dict(function(**{name: casadi.vertcat(*given[name]) for name in function.name_in()}))
+
+    def equations(rates: Any, x: Any, u: Any, theta: Any) -> list[Any]:
+        found = values(x, u, theta)
+        moving = [rates[i] - found["ode"][i] for i in range(nx)]
+        return moving + [found["alg"][i] for i in range(nz)]
+
+    def outputs(x: Any, theta: Any) -> list[Any]:
+        found = values(x, [0.0] * taken["u"], theta)["y"]
+        return [found[i] for i in range(made["y"])]
+
+    output_names = [f"y{i + 1}" for i in range(made["y"])] if output_names is None else output_names
+    return DAEModel(
+        equations, outputs, states=states, inputs=inputs, parameters=parameters, units=units, output_names=output_names
+    )  # fmt: skip
+
+
+def _function(casadi: Any, system: Any) -> Any:
+    """Return a Function with our names; raise `SpecError` for what is none."""
+    if isinstance(system, Mapping):
+        unknown = [key for key in system if key not in (*INTEGRATOR_INPUTS, *OUTPUTS)]
+        if unknown:
+            raise SpecError(
+                f"system has the unknown key {unknown[0]!r}; there are: {', '.join((*INTEGRATOR_INPUTS, *OUTPUTS))}.",
+                path="system",
+            )
+        names = [name for name in INTEGRATOR_INPUTS if name in system]
+        results = [name for name in OUTPUTS if name in system]
+        try:
+            made = casadi.Function("plant", [system[n] for n in names], [system[n] for n in results], names, results)
+        except (RuntimeError, NotImplementedError, TypeError) as error:
+            raise SpecError(f"CasADi makes no function of this system: {error}", path="system") from error
+        return made
+    if not isinstance(system, casadi.Function):
+        raise SpecError(f"system is {shown(system)}: give a casadi.Function, or a dictionary.", path="system")
+    unknown = [name for name in (*system.name_in(), *system.name_out()) if name not in (*INTEGRATOR_INPUTS, *OUTPUTS)]
+    if unknown:
+        raise SpecError(
+            f"The Function has an input or output {unknown[0]!r}: name them {', '.join(INTEGRATOR_INPUTS)} and "
+            f"{', '.join(OUTPUTS)}.", path="system",
+        )  # fmt: skip
+    return system
+
+
+#: Names of variables, or the variables of each device: ``{"GENCLS 1": ["omega"], "Bus 1": ["a", "v"]}``.
+Picked: TypeAlias = "Sequence[str] | Mapping[str, Sequence[str]]"
+
+_PENCIL = ("E.mtx", "A.mtx", "names.json")
+
+
+def from_andes(
+    case: Any, *, outputs: Picked, faults: Picked = (), disturbances: Picked = (), **plant: Any
+) -> DescriptorSystem:
+    """Return the plant of a power network, linearised at its power flow solution.
+
+    Parameters
+    ----------
+    case : path or andes.System
+        A case file that ANDES reads (``.json``, ``.xlsx``, ``.raw``, ...); a folder with ``E.mtx``, ``A.mtx`` and
+        ``names.json``, such as ``designs/smib``; or a system of ANDES, whose power flow is solved where it is not yet.
+    outputs : list of str, or mapping
+        Measured variables by name, ``["omega GENCLS 1", "v Bus 1"]``, or by device,
+        ``{"GENCLS 1": ["omega"], "Bus 1": ["v"]}``.
+    faults, disturbances : list of str, or mapping
+        Variables in whose equations a fault, or an unknown input, is added: ``{"GENCLS 1": ["tm"]}`` is a change of
+        mechanical torque, ``{"Bus 3": ["a"]}`` active power drawn at a bus.
+    **plant
+        Any other argument of `DescriptorSystem`, such as ``sensor_noise`` or ``fault_names``.
+
+    Returns
+    -------
+    DescriptorSystem
+        Continuous, ``T x' = f(x, y)``, ``0 = g(x, y)`` as one pencil ``(nx + ny, nx + ny)``: differential variables
+        first.  From a case, the power flow solution is the operating point.
+
+    Raises
+    ------
+    SpecError
+        ANDES is not installed (it is licensed under the GPL and no dependency of ours), it cannot read or solve the
+        case, or a name is unknown.
+    """
+    point: dict[str, float] = {}
+    if isinstance(case, (str, Path)) and Path(case).is_dir():
+        e, a, names = _written_pencil(Path(case))
+    else:
+        e, a, names, point = _solved_case(case)
+    given = {
+        kind: _names(picked, names, kind)
+        for kind, picked in (("outputs", outputs), ("faults", faults), ("disturbances", disturbances))
+    }
+    stated = {**point, **(plant.pop("operating_point", None) or {})}
+    arguments: dict[str, Any] = {
+        "dt": 0.0,
+        "state_names": checked_names(names, len(names), prefix="x", what="state_names"),
+        "Bf": given["faults"] or None,
+        "Bd": given["disturbances"] or None,
+        "C": given["outputs"],
+    }
+    # A fault and a disturbance are changes: the value of the variable they are named after is not theirs.
+    for kind, role, word in (("faults", "fault_names", "change of"), ("disturbances", "disturbance_names", "load on")):
+        if given[kind]:
+            arguments[role] = [f"{word} {name}" for name in given[kind]]
+    return DescriptorSystem(e, a, **{**arguments, "operating_point": stated, **plant})
+
+
+def _written_pencil(folder: Path) -> tuple[FloatArray, FloatArray, list[str]]:
+    from scipy.io import mmread
+
+    missing = [name for name in _PENCIL if not (folder / name).is_file()]
+    if missing:
+        raise SpecError(f"{folder} has no {missing[0]}: a pencil of ANDES is {', '.join(_PENCIL)}.", path=str(folder))
+    try:
+        e, a = (np.asarray(_dense(mmread(folder / name)), dtype=np.float64) for name in _PENCIL[:2])
+        names = json.loads((folder / _PENCIL[2]).read_text(encoding="utf-8"))
+        listed = [*names["differential"], *names["algebraic"]]
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise SpecError(f"{folder} holds no pencil of ANDES: {error}", path=str(folder)) from error
+    return e, a, listed
+
+
+def _solved_case(case: Any) -> tuple[FloatArray, FloatArray, list[str], dict[str, float]]:
+    """Return E, A, the names of the variables and their values at the power flow solution."""
+    andes = imported("andes", extra="andes")
+    system = case
+    if isinstance(case, (str, Path)):
+        if not Path(case).is_file():
+            raise SpecError(f"{case} does not exist.", path=str(case))
+        system = andes.load(str(case), no_output=True, default_config=True, setup=True)
+    if not hasattr(system, "PFlow") or not hasattr(system, "dae"):
+        raise SpecError(f"ANDES cannot read {case}.", path="case")
+    if not system.PFlow.converged and not system.PFlow.run():
+        raise SpecError("The power flow of the case has no solution that ANDES finds.", path="case")
+    if not system.TDS.initialized:
+        system.TDS.init()
+    dae = system.dae
+    n, m = dae.n, dae.m
+    blocks = ((dae.fx, dae.fy), (dae.gx, dae.gy))
+    a = np.block([[_dense(block) for block in row] for row in blocks])
+    e = np.zeros((n + m, n + m))
+    e[np.arange(n), np.arange(n)] = np.asarray(dae.Tf, dtype=np.float64)
+    names = [str(name) for name in (*dae.x_name, *dae.y_name)]
+    values = np.concatenate([np.asarray(dae.x), np.asarray(dae.y)])
+    return e, a, names, dict(zip(names, map(float, values), strict=True))
+
+
+def _dense(matrix: Any) -> FloatArray:
+    """Return a full array of a sparse matrix of scipy or of kvxopt."""
+    if hasattr(matrix, "toarray"):
+        return np.asarray(matrix.toarray(), dtype=np.float64)
+    if hasattr(matrix, "V"):
+        rows, columns, values = (np.array(part).ravel() for part in (matrix.I, matrix.J, matrix.V))
+        dense = np.zeros(matrix.size)
+        np.add.at(dense, (rows.astype(np.int64), columns.astype(np.int64)), values)
+        return dense
+    return np.asarray(matrix, dtype=np.float64)
+
+
+#: Devices that a message lists.
+_LISTED_DEVICES = 12
+
+
+def _names(picked: Picked, known: Sequence[str], what: str) -> list[str]:
+    """Return names of variables; devices are spelled as ANDES does, ``omega GENCLS 1``."""
+    if isinstance(picked, str):
+        raise SpecError(f"{what} is {picked!r}: give a list of names.", path=what)
+    if not isinstance(picked, Mapping):
+        return list(picked)
+    listed = []
+    for device, variables in picked.items():
+        own = [name.removesuffix(f" {device}") for name in known if name.endswith(f" {device}")]
+        if not own:
+            devices = list(dict.fromkeys(name.partition(" ")[2] for name in known))
+            shown = ", ".join(devices[:_LISTED_DEVICES]) + (", ..." if len(devices) > _LISTED_DEVICES else "")
+            raise SpecError(f"{what}: the network has no device {device!r}; it has {shown}.", path=what)
+        for variable in variables:
+            if variable not in own:
+                raise SpecError(f"{what}: {device} has no variable {variable!r}; it has {', '.join(own)}.", path=what)
+            listed.append(f"{variable} {device}")
+    return listed

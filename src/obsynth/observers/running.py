@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
-from functools import cached_property
-from typing import Any, Generic, Self, TypeVar
+from functools import cached_property, partial
+from typing import Any, Generic, Self, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,8 +18,10 @@ from obsynth.observers.sensor_timing import SensorTiming, checked_sensors
 
 State = TypeVar("State")
 Row = TypeVar("Row")
-Kept = TypeVar("Kept", bound=tuple[Any, ...])
+SavedState = TypeVar("SavedState", bound=tuple[Any, ...])
 Robust = TypeVar("Robust", bound=Any)
+#: Takes the states before and after a sample, what is known at it, and its inputs.
+Kept: TypeAlias = Callable[[Any, Any, Any, FloatArray], None]
 #: Marks an array whose columns are contiguous: sums are rounded in another order there.
 BY_COLUMNS = "by columns"
 
@@ -144,16 +146,18 @@ class StepObserver(Observer[Any, Any]):
         after, row = self.timing.advance(self._steps.advance, state, y, u)
         return after, self.shown(row)
 
-    def accept(self, state: Any, y: FloatArray, u: FloatArray) -> tuple[Any, Any]:
-        """Return the same as `advance`, where the step is one that can be trusted (``y (ny,)``, ``u (nu,)``)."""
-        after, row = self.timing.advance(self.in_order, state, y, u)
+    def accept(self, state: Any, y: FloatArray, u: FloatArray, kept: Kept | None = None) -> tuple[Any, Any]:
+        """Return the same as `advance`, where the step is one that can be trusted (``y (ny,)``, ``u (nu,)``); ``kept``
+        is called with what each sample, whose values are all of its own time, led from and to: see `Kept`."""
+        after, row = self.timing.advance(partial(self._in_order, kept), state, y, u)
         return after, self.shown(row)
 
-    def in_order(self, state: Any, y: FloatArray, u: FloatArray) -> tuple[Any, Any]:
-        """Take a sample whose values are all of its own time, as `accept` takes it (``y (ny,)``, ``u (nu,)``)."""
+    def _in_order(self, kept: Kept | None, state: Any, y: FloatArray, u: FloatArray) -> tuple[Any, Any]:
         self._allow(state)
         after, row = self._steps.advance(state, y, u)
         self._trust(row)
+        if kept is not None:
+            kept(state, after, row, u)
         return after, row
 
     def step(self, state: Any, y: ArrayLike, u: ArrayLike = ()) -> tuple[Any, Estimates]:
@@ -253,10 +257,10 @@ def state_as_data(state: tuple[Any, ...]) -> dict[str, Any]:
     return {name: _as_data(value) for name, value in state._asdict().items()}  # type: ignore[attr-defined]
 
 
-def state_from_data(like: Kept, data: dict[str, Any]) -> Kept:
+def state_from_data(like: SavedState, data: dict[str, Any]) -> SavedState:
     """Return the state of the same kind as ``like`` that `state_as_data` described."""
     if hasattr(like, "from_data"):
-        restored: Kept = like.from_data(data, state_from_data)
+        restored: SavedState = like.from_data(data, state_from_data)
         return restored
     values = {name: _from_data(own, data[name]) for name, own in like._asdict().items()}  # type: ignore[attr-defined]
     return type(like)(**values)

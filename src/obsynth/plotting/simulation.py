@@ -10,7 +10,7 @@ import numpy as np
 from obsynth.experiments.monitors.monitor import Detection
 from obsynth.experiments.simulation import Simulation
 from obsynth.numerics.arrays import FloatArray
-from obsynth.observers.alarms import Decision
+from obsynth.observers.decisions import Decision
 from obsynth.plotting.estimates import plot_faults, plot_parameters
 from obsynth.plotting.panels import RESIDUAL_STYLE, THRESHOLD_STYLES, finish, legend_above, mark, new_panels
 

@@ -30,8 +30,7 @@ from obsynth.results.layout import facts_table, headed_table, name_list, number,
 
 def tolerance_facts(design: ObserverDesign) -> list[tuple[str, str]]:
     """Return what holds for every plant within its tolerances, as label and text; none for other designs."""
-    from obsynth.tolerances.result import EXACT_MODEL
-    from obsynth.tolerances.robustness import robustness
+    from obsynth.tolerances.robustness import EXACT_MODEL, robustness
 
     if not isinstance(design.plant, DescriptorSystem) or not isinstance(design.observer, LinearObserver):
         return []

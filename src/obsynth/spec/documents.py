@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from pydantic import BaseModel
 
     from obsynth.spec.schema import SpecDocument
-    from obsynth.spec.schema_models import DAESection, TimeVaryingSection
-    from obsynth.spec.schema_plants import PlantSection
+    from obsynth.spec.schema_rare import DAESection, TimeVaryingSection
+    from obsynth.spec.schema_values import PlantSection
 
     Model = TypeVar("Model", bound=BaseModel)
 
@@ -313,8 +313,7 @@ def _wanted(kind: str, context: Mapping[str, Any]) -> str:
 def _known_keys(location: Sequence[str | int]) -> list[str]:
     """Return the keys that the section around the last part of ``location`` may have."""
     from obsynth.spec import schema
-    from obsynth.spec.schema_plants import TransformSection
-    from obsynth.spec.schema_values import MatrixFile
+    from obsynth.spec.schema_values import MatrixFile, TransformSection
 
     sections: dict[str, type[BaseModel]] = {
         "<file>": MatrixFile,

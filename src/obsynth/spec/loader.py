@@ -43,8 +43,8 @@ from obsynth.spec.documents import DocumentProblems, checked_plant, checked_spec
 if TYPE_CHECKING:
     from obsynth.analysis.transformations.recovery import Transformation
     from obsynth.spec.schema import ProfileSection, ScenarioSection
-    from obsynth.spec.schema_models import DAESection, TimeVaryingSection
-    from obsynth.spec.schema_plants import EntrySection, PlantReference, PlantSection, TransformSection
+    from obsynth.spec.schema_rare import DAESection, TimeVaryingSection
+    from obsynth.spec.schema_values import EntrySection, PlantReference, PlantSection, TransformSection
 
 
 #: Larger matrices are refused; of sparse ones, the entries that are stored count.

@@ -11,8 +11,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Discriminator, Field, Tag, create_model
 
 from obsynth.numerics.arguments import Positive
-from obsynth.spec.schema_plants import PlantReference, PlantSection
-from obsynth.spec.schema_values import LIST_TAG, ONE_TAG, Section, Text
+from obsynth.spec.schema_values import LIST_TAG, ONE_TAG, PlantReference, PlantSection, Section, Text
 
 SPEC_VERSION = 1
 
@@ -23,11 +22,11 @@ RARE_KINDS = ("time-varying", "dae")
 def plant_section(kind: object) -> type[Section]:
     """Return the section of a plant of this kind; the kinds that are rare are made when they are asked for."""
     if kind == "time-varying":
-        from obsynth.spec.schema_models import TimeVaryingSection
+        from obsynth.spec.schema_rare import TimeVaryingSection
 
         return TimeVaryingSection
     if kind == "dae":
-        from obsynth.spec.schema_models import DAESection
+        from obsynth.spec.schema_rare import DAESection
 
         return DAESection
     return PlantSection
@@ -122,6 +121,6 @@ def section_of(name: str, value: Any) -> type[Section]:
         return PlantReference if "file" in given and kind not in RARE_KINDS else plant_section(kind)
     if name == "scenario":
         return ScenarioSection
-    from obsynth.spec.schema_logs import CalibrateSection, InputsSection
+    from obsynth.spec.schema_rare import CalibrateSection, InputsSection
 
     return InputsSection if name == "inputs" else CalibrateSection

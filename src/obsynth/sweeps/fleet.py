@@ -22,7 +22,7 @@ from obsynth.methods.handing_on import require_verified
 from obsynth.methods.verifying import verify
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import load
-from obsynth.sweeps.work import WORK_STATUSES, ResultFolder, ResultTable, Work, all_of, carried_out
+from obsynth.sweeps.sweep import WORK_STATUSES, ResultFolder, ResultTable, Work, all_of, carried_out
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

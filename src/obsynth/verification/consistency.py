@@ -14,7 +14,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import KNOWN_SHARE
 from obsynth.observers.recursive.gain_schedule import GainStep, gain_steps
 from obsynth.observers.recursive.observer import RecursiveObserver
-from obsynth.observers.recursive.step_model import EarlyConstraintSteps, StepMatrices
+from obsynth.observers.recursive.step_model import StepMatrices
 from obsynth.results.checks import Check, upper_bound_check
 
 #: Trials and steps: a wrong variance of 10 % is 20 standard deviations away.
@@ -35,14 +35,14 @@ def consistency(stated: RecursiveObserver, shipped: RecursiveObserver, steps: in
     x = rng.standard_normal((CONSISTENCY_TRIALS, truth.factor.shape[1])) @ truth.factor.T
     theta = rng.standard_normal((CONSISTENCY_TRIALS, nq)) @ truth.parameters.spread.T
     model = stated.recursion.model
-    early = isinstance(model, EarlyConstraintSteps)
+    first = model.first()
     nis, pairs = [], []
     scores: dict[int, tuple[FloatArray, FloatArray]] = {}
     before = np.zeros((CONSISTENCY_TRIALS, 0))
     count, factor = min(steps, CONSISTENCY_STEPS), truth.factor
     for position, gains in enumerate(gain_steps(shipped, count)):
-        k = position - 1 if early else position
-        true = model.first() if isinstance(model, EarlyConstraintSteps) and position == 0 else model.at(k)
+        k = position if first is None else position - 1
+        true = model.at(k) if first is None or position else first
         noise = rng.standard_normal((CONSISTENCY_TRIALS, true.noise.shape[1])) @ true.noise.T
         known = np.zeros_like(noise)
         known[:, : len(true.A)] = x @ gains.step.A.T

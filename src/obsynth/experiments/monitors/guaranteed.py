@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from obsynth.errors import SpecError
 from obsynth.experiments.assumptions import Assumptions
 from obsynth.experiments.benches import make_bench
-from obsynth.experiments.monitors.adaptive_monitor import adaptive_plan, adaptive_statement, over_box
-from obsynth.experiments.monitors.adaptive_rule import AdaptiveRule
+from obsynth.experiments.monitors.adaptive import AdaptiveRule, adaptive_plan, adaptive_statement, over_box
 from obsynth.experiments.monitors.monitor import Judged, LinearSample, Monitor, Rule, Sample
 from obsynth.experiments.monitors.rules import NormRule
 from obsynth.methods.guaranteed_test.bank import is_bank

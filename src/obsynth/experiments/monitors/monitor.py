@@ -56,7 +56,7 @@ def statement_of(
     if kind in ("pointwise", "window"):
         # Of a sampled plant disturbances may move between samples where the continuous one behind it is known.
         held = HELD if model.sampled is None else BOUNDS_AND_HELD_INPUTS
-        ending = held if model.flow is None else BOUNDS_BETWEEN_SAMPLES + ASSUMED
+        ending = held if model.continuous is None else BOUNDS_BETWEEN_SAMPLES + ASSUMED
     known = {name: shown(value) for name, value in numbers.items()}
     kept = "" if assumed is None else assumed.bounds_phrase
     words = (STATEMENTS[kind] + "{kept}" + ending).format(kept=f", with {kept}" if kept else "", **known)

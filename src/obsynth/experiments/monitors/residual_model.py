@@ -42,49 +42,6 @@ def schur_form(matrix: FloatArray) -> tuple[NDArray[Any], NDArray[Any]]:
 
 
 @dataclass(frozen=True, eq=False)
-class SampledErrors:
-    """The recursion of the module's text; w is noise of unit covariance: sensors first, then ``gathered`` others."""
-
-    A: FloatArray
-    Bd: FloatArray
-    Bw: FloatArray
-    sensor_outputs: FloatArray  # ``Dy_h Dw``, to states, faults and residuals at once
-    start: FloatArray  # ``(n, sensors)``: noise at the start
-    gathered: int
-
-    def direct(self, rows: slice) -> FloatArray:
-        """Return the direct effect of all noise on some rows of output."""
-        shown = self.sensor_outputs[rows]
-        return np.hstack([shown, np.zeros((len(shown), self.gathered))])
-
-
-def sampled_errors(errors: ErrorModel, dt: float) -> SampledErrors:
-    """Return the error of a continuous observer from sample to sample."""
-    plant, observer = errors.plant, errors.observer
-    process, sensors = plant.Bw.any(axis=0), plant.Dw.any(axis=0)
-    if (process & sensors).any():
-        raise SpecError(
-            "One noise acts on the plant and on a sensor, which has no model between samples: state two.",
-            path="noise",
-        )
-    held = sample_observer(observer, dt)
-    transition, gathered_d, _ = first_order_hold(observer.Az, errors.disturbance, dt)
-    driven = errors.noise[:, process]
-    whole = DescriptorSystem(None, observer.Az, C=np.eye(observer.order), Bw=driven)
-    gathered = discretise(whole, dt).plant.Bw
-    measurement_noise = plant.Dw[:, sensors]
-    ramp = first_order_hold(observer.Az, observer.By, dt)[2]
-    return SampledErrors(
-        transition,
-        gathered_d,
-        np.hstack([-held.By @ measurement_noise, gathered]),
-        held.Dy @ measurement_noise,
-        ramp @ measurement_noise,
-        gathered.shape[1],
-    )
-
-
-@dataclass(frozen=True, eq=False)
 class ResidualModel:
     """``e+ = A e + Bd d + Bw w``, ``r = C e + Dd d + Dw w`` at the samples, without faults, w of unit covariance."""
 
@@ -103,12 +60,9 @@ class ResidualModel:
     means: FloatArray  # ``(nd,)``: of what is random in them, as deviations
     deviations: FloatArray
     steady: tuple[bool, ...]  # nothing but what is random, all the time
-    flow: tuple[FloatArray, FloatArray] | None = None  # A and Bd in continuous time
-    start_noise: FloatArray | None = None  # noise of the first sample to e
-    sensor_noise: tuple[FloatArray, FloatArray] | None = None  # noise drawn as straight lines, to e' and r
+    errors: ErrorModel  # with the noise of the scenario
     continuous: ContinuousDesign | None = None
-    sampled: BetweenSamples | None = None
-    errors: ErrorModel | None = None  # of a plant on samples, with the noise of the scenario
+    sampled: BetweenSamples | None = None  # of a plant on samples, where the continuous one behind it is known
 
     @property
     def initial_error(self) -> float:
@@ -148,30 +102,76 @@ class ResidualModel:
 
 @dataclass(frozen=True, eq=False)
 class ContinuousDesign:
-    """What a bound at the samples of a continuous design is made of; ``endless``: the record may have any length."""
+    """The errors of a continuous design from sample to sample, by the recursion of the module's text, w sensors first;
+    and what a bound at the samples is made of; ``rows`` are watched; ``endless``: the record may have any length."""
 
-    plant: DescriptorSystem
-    observer: LinearObserver
-    tracking: FloatArray
+    errors: ErrorModel
     dt: float
+    rows: slice
     endless: bool
 
-    rows: slice
+    @property
+    def plant(self) -> DescriptorSystem:
+        """The plant, with the noise of the scenario."""
+        return self.errors.plant
+
+    @property
+    def observer(self) -> LinearObserver:
+        """The observer, in continuous time."""
+        return self.errors.observer
 
     @cached_property
     def between(self) -> BetweenSamples:
         """The design on samples; raises `SpecError` where what is watched has no bound."""
         return BetweenSamples.of(
-            self.plant, self.observer, self.tracking, self.dt, rows=self.rows, endless=self.endless
+            self.plant, self.observer, self.errors.own, self.dt, rows=self.rows, endless=self.endless
         )
 
     def gathered_noise(self, smooth: DescriptorSystem) -> FloatArray:
         """Return a factor ``(n, m)`` of what process noise adds to the states of the plant in a sample."""
         process = smooth.Bw[:, smooth.Bw.any(axis=0)]
-        if not process.shape[1]:
-            return np.zeros((smooth.nx, 0))
-        whole = DescriptorSystem(None, smooth.A, C=np.eye(smooth.nx), Bw=process)
-        return np.asarray(discretise(whole, self.dt).plant.Bw)
+        return _gathered(smooth.A, process, self.dt) if process.shape[1] else np.zeros((smooth.nx, 0))
+
+    @cached_property
+    def recursion(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Matrices of e, d and w in ``e+``."""
+        process = self.plant.Bw.any(axis=0)
+        if (process & self.sensors).any():
+            raise SpecError(
+                "One noise acts on the plant and on a sensor, which has no model between samples: state two.",
+                path="noise",
+            )
+        transition, held, _ = first_order_hold(self.observer.Az, self.errors.disturbance, self.dt)
+        measured = -sample_observer(self.observer, self.dt).By @ self.plant.Dw[:, self.sensors]
+        gathered = _gathered(self.observer.Az, self.errors.noise[:, process], self.dt)
+        return transition, held, np.hstack([measured, gathered])
+
+    @property
+    def sensors(self) -> NDArray[np.bool_]:
+        """Which noise acts on sensors ``(nw,)``."""
+        return np.asarray(self.plant.Dw.any(axis=0))
+
+    def direct(self, rows: slice) -> FloatArray:
+        """Return the direct effect of w on some rows of output at a sample."""
+        shown = sample_observer(self.observer, self.dt).Dy[rows] @ self.plant.Dw[:, self.sensors]
+        return np.hstack([shown, np.zeros((len(shown), self.recursion[2].shape[1] - shown.shape[1]))])
+
+    @property
+    def start_noise(self) -> FloatArray:
+        """From the noise of the first sample to e ``(n, sensors)``."""
+        ramp = first_order_hold(self.observer.Az, self.observer.By, self.dt)[2]
+        return np.asarray(ramp @ self.plant.Dw[:, self.sensors])
+
+    @property
+    def sensor_noise(self) -> tuple[FloatArray, FloatArray]:
+        """From noise drawn as straight lines between samples, to e' and to what is watched."""
+        return self.errors.noise[:, self.sensors], self.errors.output(self.rows)[3][:, self.sensors]
+
+
+def _gathered(A: FloatArray, noise: FloatArray, dt: float) -> FloatArray:
+    """Return a factor of what noise ``(n, m)`` adds to states in a sample."""
+    whole = DescriptorSystem(None, A, C=np.eye(len(A)), Bw=noise)
+    return np.asarray(discretise(whole, dt).plant.Bw)
 
 
 def watches_estimates(design: ObserverDesign) -> bool:
@@ -204,22 +204,11 @@ def residual_model(
     rows = observer.fault_rows if estimates else observer.residual_rows
     faults, _, faults_d, faults_w = errors.fault_output
     bounds, means, deviations, steady = _disturbances(scenario, plant.disturbance_names, drive.steps, drive.dt)
-    a, driven, noise, flow, start_noise, measurement_noise = (
-        errors.Az,
-        errors.disturbance,
-        errors.noise,
-        None,
-        None,
-        None,
-    )
-    continuous = None
+    a, driven, noise, continuous = errors.Az, errors.disturbance, errors.noise, None
     if not plant.is_discrete:
-        held, flow = sampled_errors(errors, drive.dt), (errors.Az, errors.disturbance)
-        a, driven, noise, start_noise = held.A, held.Bd, held.Bw, held.start
-        sensors = noisy.Dw.any(axis=0)
-        measurement_noise = errors.noise[:, sensors], direct_w[:, sensors]
-        continuous = ContinuousDesign(noisy, observer, errors.own, drive.dt, endless, rows)
-        direct_w, faults_w = held.direct(rows), held.direct(observer.fault_rows)
+        continuous = ContinuousDesign(errors, drive.dt, rows, endless)
+        a, driven, noise = continuous.recursion
+        direct_w, faults_w = continuous.direct(rows), continuous.direct(observer.fault_rows)
     between = None
     if plant.is_discrete and plant.nd and design.source is not None and design.source.sample_time is not None:
         between = BetweenSamples.of_sampled(design.source.plant, plant, observer, errors.own, rows=rows)
@@ -239,12 +228,9 @@ def residual_model(
         means,
         deviations,
         steady,
-        flow,
-        start_noise,
-        measurement_noise,
+        errors,
         continuous,
         between,
-        errors if plant.is_discrete else None,
     )
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.experiments.assumptions import Assumptions
 from obsynth.experiments.benches import Bench, make_bench
-from obsynth.experiments.monitors.adaptive_monitor import (
+from obsynth.experiments.monitors.adaptive import (
     NO_TOLERANCE,
     noisy_design,
     over_box,
@@ -26,9 +26,11 @@ from obsynth.experiments.monitors.thresholds import (
     paper_threshold,
     pointwise_threshold,
     scaled_inputs,
+    settled,
+    steady_mean,
+    whitened,
     window_threshold,
 )
-from obsynth.experiments.monitors.whitening import settled, steady_mean, whitened
 from obsynth.methods.handing_on import require_verified
 from obsynth.numerics.arguments import is_finite_number, require_kind, require_mapping
 from obsynth.numerics.arrays import FloatArray
@@ -148,7 +150,7 @@ def monitor(
         threshold = _norm_threshold(
             kind, model, bounds, start, design.linear[0].disturbance_names, gamma, noise_bound, window
         )
-        if model.flow is not None:
+        if model.continuous is not None:
             threshold = threshold + _straight_lines(design, scenario, model, kind, window, rows)
         rule = NormRule(threshold, np.inf, window=window if kind == "window" else 1, dt=bench.signals.dt)
     noisy = noisy_design(design, scenario)

@@ -11,7 +11,7 @@ from obsynth.methods.descriptor_kalman.method import DescriptorKalman
 from obsynth.methods.method import ClaimMeaning, PlantKind, Purpose
 from obsynth.methods.recursive import RECURSIVE_CLAIMS
 from obsynth.numerics.arguments import Count, ForgettingFactor, Probability, WrittenAs
-from obsynth.observers.recursive.settings import Form, Guard
+from obsynth.observers.recursive.observer import Form, Guard
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 

@@ -5,10 +5,9 @@ Early constraints: an equation of step k + 1 without x(k + 2) is an output of x(
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -95,7 +94,7 @@ def spreads(
 
 
 @dataclass
-class StepModel(ABC):
+class StepModel:
     """The matrices of every step, with the parameters among the states where these walk at random.
 
     Then ``[x(k+1); theta(k)]`` is the state at k + 1: theta(k) acted in the step to k + 1, and its increment is noise
@@ -107,21 +106,67 @@ class StepModel(ABC):
     plant: TimeVaryingDescriptorSystem
     Q: MatrixSequence  # Q, R: ``(ne, ne)`` and ``(ny, ny)`` for each k
     R: MatrixSequence
+    #: Algebraic equations, of independent noise, that are used as outputs one step earlier, see
+    #: `obsynth.analysis.time_varying.algebraic_rows`; none leaves the plant as it is.
+    late: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.intp), kw_only=True)
     #: ``(nq, nq)``: square root of the covariance of one step of the walk.
     walk: FloatArray | None = field(default=None, kw_only=True)
-    #: Whether algebraic equations are used one step earlier.
-    early: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
+        plant = self.plant
+        self.early = bool(self.late.size)
+        self.others = np.setdiff1d(np.arange(plant.ne), self.late)
         self._constant: StepMatrices | None = None
+        self._correction: StepMatrices | None = None
+        self._H: FloatArray | None = None
         self._noise: FloatArray | None = None
         self._last: tuple[StepMatrices, StepMatrices] | None = None
+        self._H_is_constant = plant.E.is_constant and plant.C.is_constant and (plant.A.is_constant or not self.early)
         self._noise_is_constant = self.Q.is_constant and self.R.is_constant
-        self._is_constant = self._noise_is_constant and self.plant.is_time_invariant
+        self._is_constant = self._noise_is_constant and plant.is_time_invariant
 
-    @abstractmethod
+    def _other(self, matrix: FloatArray) -> FloatArray:
+        """Return the rows of a matrix of the equations that are not used early."""
+        return matrix[self.others] if self.early else matrix
+
+    def _factors(self, k: int) -> tuple[FloatArray, FloatArray]:
+        """Return square roots of the covariances of the other equations' noise, and of that of those used early."""
+        covariance, name = self.Q.at(k), f"Q({k})"
+        if not self.early:
+            return covariance_factor(covariance, name), np.zeros((0, 0))
+        if np.any(covariance[np.ix_(self.others, self.late)]):
+            raise SpecError(
+                f"Q({k}) couples the noise of algebraic equations with that of the others: early_constraints needs "
+                "them independent.",
+                path="method.options.early_constraints",
+            )
+        return (
+            covariance_factor(covariance[np.ix_(self.others, self.others)], name),
+            covariance_factor(covariance[np.ix_(self.late, self.late)], name),
+        )
+
     def without_walk(self, k: int) -> StepMatrices:
         """Return the matrices of the step from k to k + 1, as if the parameters did not walk."""
+        if self._constant is not None:
+            return self._constant
+        plant, late = self.plant, self.late
+        noise, H, Psi, Dn = self._noise, self._H, plant.Psi.at(k), np.zeros((0, plant.nu))
+        if noise is None:
+            outputs = covariance_factor(self.R.at(k), f"R({k})")
+            if self.early:
+                outputs = stacked_noise(outputs, self._factors(k + 1)[1])
+            noise = stacked_noise(self._factors(k)[0], outputs)
+            self._noise = noise if self._noise_is_constant else None
+        if H is None:
+            seen = [plant.A.at(k + 1)[late]] if self.early else []
+            H = np.asfortranarray(np.vstack([self._other(plant.E.at(k + 1)), plant.C.at(k + 1), *seen]))
+            self._H = H if self._H_is_constant else None
+        if self.early:
+            Psi, Dn = np.vstack([Psi, plant.Phi.at(k + 1)[late]]), -plant.B.at(k + 1)[late]
+        A, B, Phi = (self._other(matrix.at(k)) for matrix in (plant.A, plant.B, plant.Phi))
+        found = StepMatrices(H, A, B, Phi, Psi, Dn, noise)
+        self._constant = found if self._is_constant else None
+        return found
 
     def at(self, k: int) -> StepMatrices:
         """Return the matrices of the step from k to k + 1; the same object for the same step."""
@@ -133,96 +178,10 @@ class StepModel(ABC):
         return last[1]
 
     def first(self) -> StepMatrices | None:
-        """Return the correction of x(0) by the algebraic equations of step 0, where these are used early."""
-        return None
-
-
-@dataclass
-class PlantSteps(StepModel):
-    """The steps of a plant as it is."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self._H: FloatArray | None = None
-        self._Dn = np.zeros((0, self.plant.nu))
-        self._H_is_constant = self.plant.E.is_constant and self.plant.C.is_constant
-
-    def without_walk(self, k: int) -> StepMatrices:
-        """Return the matrices of the step from k to k + 1, as if the parameters did not walk."""
-        if self._constant is not None:
-            return self._constant
-        plant = self.plant
-        noise, H = self._noise, self._H
-        if noise is None:
-            noise = stacked_noise(
-                covariance_factor(self.Q.at(k), f"Q({k})"), covariance_factor(self.R.at(k), f"R({k})")
-            )
-            self._noise = noise if self._noise_is_constant else None
-        if H is None:
-            H = np.asfortranarray(np.vstack([plant.E.at(k + 1), plant.C.at(k + 1)]))
-            self._H = H if self._H_is_constant else None
-        found = StepMatrices(H, plant.A.at(k), plant.B.at(k), plant.Phi.at(k), plant.Psi.at(k), self._Dn, noise)
-        self._constant = found if self._is_constant else None
-        return found
-
-
-@dataclass
-class EarlyConstraintSteps(StepModel):
-    """The steps of a plant with its algebraic equations, of independent noise, used as outputs one step earlier."""
-
-    rows: IntArray  # the algebraic equations, see `obsynth.analysis.time_varying.algebraic_rows`
-    early = True
-
-    def __post_init__(self) -> None:
-        if not self.rows.size:
-            raise SpecError(
-                "early_constraints needs equations in which x(k+1) does not appear (rows of E that are zero for every "
-                "k): this plant has none. Bring E into that form, or leave the option out.",
-                path="method.options.early_constraints",
-            )
-        super().__post_init__()
-        self.others = np.setdiff1d(np.arange(self.plant.ne), self.rows)
-        self._correction: StepMatrices | None = None
-
-    def _factors(self, k: int) -> tuple[FloatArray, FloatArray]:
-        covariance = self.Q.at(k)
-        if np.any(covariance[np.ix_(self.others, self.rows)]):
-            raise SpecError(
-                f"Q({k}) couples the noise of algebraic equations with that of the others: early_constraints needs "
-                "them independent.",
-                path="method.options.early_constraints",
-            )
-        name = f"Q({k})"
-        return (
-            covariance_factor(covariance[np.ix_(self.others, self.others)], name),
-            covariance_factor(covariance[np.ix_(self.rows, self.rows)], name),
-        )
-
-    def without_walk(self, k: int) -> StepMatrices:
-        """Return the matrices of the step from k to k + 1, as if the parameters did not walk."""
-        if self._constant is not None:
-            return self._constant
-        plant, late, others = self.plant, self.rows, self.others
-        noise = self._noise
-        if noise is None:
-            outputs = stacked_noise(covariance_factor(self.R.at(k), f"R({k})"), self._factors(k + 1)[1])
-            noise = stacked_noise(self._factors(k)[0], outputs)
-            self._noise = noise if self._noise_is_constant else None
-        H = np.vstack([plant.E.at(k + 1)[others], plant.C.at(k + 1), plant.A.at(k + 1)[late]])
-        found = StepMatrices(
-            np.asfortranarray(H),
-            plant.A.at(k)[others],
-            plant.B.at(k)[others],
-            plant.Phi.at(k)[others],
-            np.vstack([plant.Psi.at(k), plant.Phi.at(k + 1)[late]]),
-            -plant.B.at(k + 1)[late],
-            noise,
-        )
-        self._constant = found if self._is_constant else None
-        return found
-
-    def first(self) -> StepMatrices:
-        """Return the correction of x(0), and of parameters that walk, by the algebraic equations of step 0."""
+        """Return the correction of x(0), and of parameters that walk, by the algebraic equations of step 0, where these
+        are used early."""
+        if not self.early:
+            return None
         step = self._correction_without_walk(0)
         return step if self.walk is None else with_walking_parameters(step, np.zeros_like(self.walk), early=True)
 
@@ -235,17 +194,15 @@ class EarlyConstraintSteps(StepModel):
         """Return the correction as if the parameters did not walk: what is known is the 'equation'."""
         if self._correction is not None:
             return self._correction
-        plant, late = self.plant, self.rows
-        H = np.vstack([np.eye(plant.nx), plant.A.at(k)[late]])
-        noise = stacked_noise(np.zeros((plant.nx, 0)), self._factors(k)[1])
+        plant, late = self.plant, self.late
         found = StepMatrices(
-            H,
+            np.vstack([np.eye(plant.nx), plant.A.at(k)[late]]),
             np.eye(plant.nx),
             np.zeros((plant.nx, plant.nu)),
             np.zeros((plant.nx, plant.nq)),
             plant.Phi.at(k)[late],
             -plant.B.at(k)[late],
-            noise,
+            stacked_noise(np.zeros((plant.nx, 0)), self._factors(k)[1]),
         )
         self._correction = found if self._is_constant else None
         return found

@@ -43,7 +43,7 @@ from obsynth.observers.recursive.gain_schedule_summary import (
     looked_at,
 )
 from obsynth.observers.recursive.observer import RecursiveObserver, observer_from_options
-from obsynth.observers.recursive.step_model import EarlyConstraintSteps, StepMatrices
+from obsynth.observers.recursive.step_model import StepMatrices
 from obsynth.observers.running import plain_recursion
 from obsynth.plants.sequences import MatrixSequence
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
@@ -423,8 +423,7 @@ def _data(observer: RecursiveObserver, y: FloatArray, u: FloatArray) -> FloatArr
         step = model.at(k)
         values = np.concatenate([step.B @ u[k], y[k + 1], step.Dn @ u[k + 1]])
         parts.append(np.hstack([values[:, None], np.vstack([step.Phi, -step.Psi])[:, :nq]]))
-    if isinstance(model, EarlyConstraintSteps):
-        first = model.first()
+    if (first := model.first()) is not None:
         parts.append(np.hstack([(first.Dn @ u[0])[:, None], -first.Psi[:, :nq]]))
     return np.vstack(parts)
 
@@ -441,9 +440,8 @@ def _problem(observer: RecursiveObserver, y: FloatArray, u: FloatArray) -> tuple
         H[top : top + len(step.H), (k + 1) * n : (k + 2) * n] = step.H
         H[top : top + len(step.A), k * n : (k + 1) * n] = -step.A
         top += len(step.H)
-    if isinstance(model, EarlyConstraintSteps):
-        first, late = model.first(), len(model.rows)
-        H = np.vstack([H, np.hstack([first.H[n:], np.zeros((late, n * steps))])])
+    if (first := model.first()) is not None:
+        H = np.vstack([H, np.hstack([first.H[n:], np.zeros((len(model.late), n * steps))])])
         roots.append(first.noise[n:])
     S = np.zeros((len(H), max(sum(root.shape[1] for root in roots), len(H))))
     top = left = 0

@@ -19,7 +19,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.scaling import balance_by_least_squares
 from obsynth.observers.recursive.gain_schedule import Gains, GainStep, gain_steps
 from obsynth.observers.recursive.observer import RecursiveObserver
-from obsynth.observers.recursive.step_model import EarlyConstraintSteps, StepMatrices
+from obsynth.observers.recursive.step_model import StepMatrices
 from obsynth.proofs.balls import Ball, rounded_up
 from obsynth.proofs.definiteness import prove_positive_definite
 from obsynth.proofs.products import AT_ONCE, logarithm_of_product, product_of_stack, stacked_product
@@ -103,8 +103,8 @@ def _true_steps(stated: RecursiveObserver, shipped: RecursiveObserver, steps: in
     if stated.plant is shipped.plant:
         return repeat(None)
     model = stated.recursion.model
-    first = [model.first()] if isinstance(model, EarlyConstraintSteps) else []
-    return chain(first, (model.at(k) for k in range(steps)))
+    first = model.first()
+    return chain([] if first is None else [first], (model.at(k) for k in range(steps)))
 
 
 def _sizes(step: StepMatrices, found: GainStep) -> tuple[tuple[int, ...], ...]:

@@ -1,1 +1,0 @@
-"""Smoothers: estimates of each sample from those after it as well."""
