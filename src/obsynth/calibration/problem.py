@@ -128,26 +128,7 @@ def calibration_problem(
     known_Q = _variances(Q, equations, "Q")
     known_R = _variances(R, log.output_names, "R")
     quanta = np.array([quantum(column) for column in log.y.T])
-    held = np.array([repeats(column) for column in log.y.T])
-    largest = np.nanmax(np.abs(log.y), axis=0)
-    floors = np.maximum(
-        np.where(held, quanta**2 / EVEN, 0.0), (LEAST_NOISE * np.where(largest > 0.0, largest, 1.0)) ** 2
-    )
-    variances = int(np.isnan(known_Q).sum() + np.isnan(known_R).sum())
-    if not names and not variances:
-        raise SpecError(
-            "unknown is empty, and Q and R are known: there is nothing to estimate. Name constants with their "
-            "bounds, or leave variances out.",
-            path="unknown",
-        )
-    needed, seen = VALUES_PER_UNKNOWN * (len(names) + variances), int(np.isfinite(log.y).sum())
-    if seen < needed:
-        raise bad_log(
-            "too-short",
-            f"The log is too short: {seen} measured values for {len(names)} constants and "
-            f"{variances} variances; at least {needed} are needed. Take more rows, fewer unknowns, or state "
-            "Q and R.",
-        )
+    _require_enough(log, len(names), int(np.isnan(known_Q).sum() + np.isnan(known_R).sum()))
     x0 = named_vector(initial_state, plant.state_names, plant.nominal_state, "initial_state")
     graphs = sample_graphs(plant, names, log.dt, integration=integration, substeps=substeps, samples=log.samples)
     return Problem(
@@ -166,11 +147,36 @@ def calibration_problem(
         x0,
         _covariance(plant, initial_covariance),
         quanta,
-        floors,
+        _floors(log.y, quanta),
         graphs,
         integration,
         substeps,
     )
+
+
+def _floors(y: FloatArray, quanta: FloatArray) -> FloatArray:
+    """Return the least variance of each sensor ``(ny,)``: of its quantisation, where values repeat, or of rounding."""
+    held = np.array([repeats(column) for column in y.T])
+    largest = np.nanmax(np.abs(y), axis=0)
+    return np.maximum(np.where(held, quanta**2 / EVEN, 0.0), (LEAST_NOISE * np.where(largest > 0.0, largest, 1.0)) ** 2)
+
+
+def _require_enough(log: Log, constants: int, variances: int) -> None:
+    """Refuse a question without unknowns, or with more of them than the log can determine."""
+    if not constants and not variances:
+        raise SpecError(
+            "unknown is empty, and Q and R are known: there is nothing to estimate. Name constants with their "
+            "bounds, or leave variances out.",
+            path="unknown",
+        )
+    needed, seen = VALUES_PER_UNKNOWN * (constants + variances), int(np.isfinite(log.y).sum())
+    if seen < needed:
+        raise bad_log(
+            "too-short",
+            f"The log is too short: {seen} measured values for {constants} constants and "
+            f"{variances} variances; at least {needed} are needed. Take more rows, fewer unknowns, or state "
+            "Q and R.",
+        )
 
 
 def _started(unknown: Mapping[str, Sequence[float]], plant: CalibrationPlant) -> dict[str, float]:

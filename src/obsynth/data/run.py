@@ -222,27 +222,9 @@ def run_on_data(
     ``recovering`` until the warm-up is over.  ``r`` is the innovation at the parameters estimated one sample before
     (whitened, for recursive designs).
     """
-    require_kind(design, ObserverDesign, "design", "an ObserverDesign, such as obsynth.load(path)")
-    for name, value in (("columns", columns), ("scales", scales), ("thresholds", thresholds)):
-        require_mapping(value, name)
-    if monitor is not None:
-        require_kind(monitor, Monitor, "monitor", "what obsynth.online_monitor returns")
-    if state is not None:
-        require_kind(state, (str, Path), "state", "the name of a file")
-    if out is not None and not hasattr(out, "write"):
-        require_kind(out, (str, Path), "out", "the name of a file, or a text stream")
-    for name, count in (("chunk_rows", chunk_rows), ("state_every", state_every)):
-        if not is_whole(count) or count < 1:
-            raise SpecError(f"{name} is {count!r}: give a whole number, 1 or more.", path=name)
-    require_distinct(
-        {
-            "state": state,
-            "data": data if isinstance(data, str | Path) else None,
-            "out": out if isinstance(out, str | Path) else None,
-        }
-    )
-    if state is not None:
-        check_output(state)
+    mappings = {"columns": columns, "scales": scales, "thresholds": thresholds}
+    counts = {"chunk_rows": chunk_rows, "state_every": state_every}
+    _require_arguments(design, mappings, counts, monitor=monitor, state=state, out=out, data=data)
     if time_column is not None:
         require_kind(time_column, str, "time_column", "the name of a column")
         columns = {**(columns or {}), TIME_HEADER: time_column}
@@ -299,6 +281,40 @@ def run_on_data(
         dict(run.events.silent),
         "" if monitor is None else monitor.statement,
     )
+
+
+def _require_arguments(
+    design: object,
+    mappings: Mapping[str, Any],
+    counts: Mapping[str, int],
+    *,
+    monitor: object,
+    state: Any,
+    out: Any,
+    data: object,
+) -> None:
+    """Refuse arguments of `run_on_data` of the wrong kind, and files that are one."""
+    require_kind(design, ObserverDesign, "design", "an ObserverDesign, such as obsynth.load(path)")
+    for name, value in mappings.items():
+        require_mapping(value, name)
+    if monitor is not None:
+        require_kind(monitor, Monitor, "monitor", "what obsynth.online_monitor returns")
+    if state is not None:
+        require_kind(state, (str, Path), "state", "the name of a file")
+    if out is not None and not hasattr(out, "write"):
+        require_kind(out, (str, Path), "out", "the name of a file, or a text stream")
+    for name, count in counts.items():
+        if not is_whole(count) or count < 1:
+            raise SpecError(f"{name} is {count!r}: give a whole number, 1 or more.", path=name)
+    require_distinct(
+        {
+            "state": state,
+            "data": data if isinstance(data, str | Path) else None,
+            "out": out if isinstance(out, str | Path) else None,
+        }
+    )
+    if state is not None:
+        check_output(state)
 
 
 def _require_a_window(design: ObserverDesign, rows: int) -> None:

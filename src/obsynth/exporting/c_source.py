@@ -305,7 +305,6 @@ def _state_struct(found: Realisation, prefix: str, alarms: Alarms) -> list[str]:
 def source_text(found: Realisation, prefix: str, header: str, alarms: Alarms) -> str:
     """Return the source."""
     observer, gap = found.observer, found.gap
-    nu, ny = len(observer.input_names), len(observer.output_names)
     groups = {"states": observer.state_rows, "faults": observer.fault_rows, "residuals": observer.residual_rows}
     said: dict[str, dict[str, FloatArray]] = {
         target: {"z": found.running.Cz[rows], "u": found.running.Du[rows], "y": found.running.Dy[rows]}
@@ -321,22 +320,6 @@ def source_text(found: Realisation, prefix: str, header: str, alarms: Alarms) ->
         if matrix.size
         for line in _tables(f"{target}_{signal}", matrix)
     ]
-    shown = len(observer.fault_names) + len(observer.residual_names)
-    sizes = {
-        "Z_COUNT": observer.order,
-        "U_COUNT": nu,
-        "Y_COUNT": ny,
-        "V_COUNT": nu + ny,
-        "STATE_COUNT": len(observer.state_names),
-        "FAULT_COUNT": len(observer.fault_names),
-        "SHOWN_COUNT": shown,
-        "WATCHED_COUNT": shown + 1,
-        "MODEL_STATES": gap.states,
-        "SEEN_COUNT": gap.seen,
-        "PLANT_FAULTS": gap.faults,
-        "KEPT_INPUTS": gap.kept_inputs,
-        "LEAST_SHOWN": gap.least_shown,
-    }
     before, after = found.operating_point
     constants = {
         "start": found.start.reshape(1, -1),
@@ -366,7 +349,7 @@ def source_text(found: Realisation, prefix: str, header: str, alarms: Alarms) ->
                 f"#define WARM_UP_SECONDS {alarms.warm_up!r}",
                 f"#define LEFT_SHARE ((REAL){gap.left_share!r})",
                 "enum {",
-                *(f"    {name} = {value}," for name, value in sizes.items()),
+                *(f"    {name} = {value}," for name, value in _sizes(found).items()),
                 "};",
                 "",
                 *([comment(ADVICE), ""] if large else []),
@@ -383,6 +366,28 @@ def source_text(found: Realisation, prefix: str, header: str, alarms: Alarms) ->
         )
         + "\n"
     )
+
+
+def _sizes(found: Realisation) -> dict[str, int]:
+    """Return the sizes that the C text has as names."""
+    observer, gap = found.observer, found.gap
+    nu, ny = len(observer.input_names), len(observer.output_names)
+    shown = len(observer.fault_names) + len(observer.residual_names)
+    return {
+        "Z_COUNT": observer.order,
+        "U_COUNT": nu,
+        "Y_COUNT": ny,
+        "V_COUNT": nu + ny,
+        "STATE_COUNT": len(observer.state_names),
+        "FAULT_COUNT": len(observer.fault_names),
+        "SHOWN_COUNT": shown,
+        "WATCHED_COUNT": shown + 1,
+        "MODEL_STATES": gap.states,
+        "SEEN_COUNT": gap.seen,
+        "PLANT_FAULTS": gap.faults,
+        "KEPT_INPUTS": gap.kept_inputs,
+        "LEAST_SHOWN": gap.least_shown,
+    }
 
 
 def _products(

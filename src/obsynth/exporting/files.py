@@ -420,15 +420,20 @@ def export(
                 "out.",
                 path="monitor",
             )
-        prefix, header = c_identifier(target.stem), target.with_suffix(".h")
-        source, declared = (in_precision(text, numbers) for text in window_c_texts(found, prefix, header.name))
-        return write_together({target: source, header: with_c_linkage(declared, prefix)})
+        return _write_window(found, target, numbers)
     if found.observer.dt == 0.0:
         raise SpecError(
             "The observer is continuous in time: give the sample time, in seconds, for C.", path="sample_time"
         )
     bound = None if monitor is None or learned is not None else _bound_of(monitor, found)
     return _write_c(found, target, linear_alarms(found, thresholds, warm_up, learned), bound)
+
+
+def _write_window(found: Realisation, target: Path, numbers: str) -> tuple[Path, ...]:
+    """Write a guaranteed test as C."""
+    prefix, header = c_identifier(target.stem), target.with_suffix(".h")
+    source, declared = (in_precision(text, numbers) for text in window_c_texts(found, prefix, header.name))
+    return write_together({target: source, header: with_c_linkage(declared, prefix)})
 
 
 def _require_fitting_options(

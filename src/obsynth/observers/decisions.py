@@ -232,6 +232,42 @@ def decide(
     )
     require_kind(estimates, Estimates, "estimates", "the Estimates of a whole run, such as observer.run(y, u)")
     chosen(statistic, "statistic", STATISTICS)
+    theta, size = _asked(observer, statistic, nominal, false_alarms, change)
+    nq, false_alarms = len(theta), float(false_alarms)
+    if (estimates.state_names, estimates.parameter_names) != (observer.state_names, observer.fault_names):
+        raise SpecError(
+            "The estimates are of other states or parameters than this observer's: give the run of this very observer.",
+            path="estimates",
+        )
+    if not len(estimates.states):
+        return Decision(statistic, read_only(np.zeros(0)), read_only(np.zeros(0)), None)
+    if statistic == "chi-square":
+        return _chi_square(observer, estimates, theta, false_alarms)
+    if isinstance(observer, DAEObserver):
+        if statistic == "nis":
+            return _nis(estimates, np.array(estimates.nis), false_alarms)
+        along = estimates.scores - estimates.informations @ theta
+        return _cusum(estimates, along, np.einsum("kqq->kq", estimates.informations), size, false_alarms)
+    gaps = estimates.innovations
+    if nq and observer.form != "random-walk":
+        gaps = gaps - estimates.regressors @ theta
+    if statistic == "nis":
+        return _nis(estimates, np.nansum(gaps**2, axis=1), false_alarms)
+    if statistic == "cusum":
+        regressors = np.nan_to_num(estimates.regressors)
+        along = np.einsum("kmq,km->kq", regressors, np.nan_to_num(gaps))
+        return _cusum(estimates, along, np.einsum("kmq,kmq->kq", regressors, regressors), size, false_alarms)
+    return likelihood_ratio(observer, estimates, gaps, false_alarms)
+
+
+def _asked(
+    observer: RecursiveObserver | DAEObserver,
+    statistic: str,
+    nominal: ArrayLike | None,
+    false_alarms: float,
+    change: ArrayLike,
+) -> tuple[FloatArray, FloatArray]:
+    """Return nominal parameters and the change looked for, ``(nq,)``; refuse what the observer cannot answer."""
     start, form = observer.initial_parameters, observer.form
     if not len(start) and statistic != "nis":
         raise SpecError(
@@ -239,9 +275,9 @@ def decide(
             "'nis' tests whether the model still fits the data.",
             path="observer",
         )
-    false_alarms = real_number(false_alarms, "false_alarms", "a probability between 0 and 1")
-    if not 0.0 < false_alarms < 1.0:
-        raise SpecError(f"false_alarms is {false_alarms}: give a probability between 0 and 1.", path="false_alarms")
+    probability = real_number(false_alarms, "false_alarms", "a probability between 0 and 1")
+    if not 0.0 < probability < 1.0:
+        raise SpecError(f"false_alarms is {probability}: give a probability between 0 and 1.", path="false_alarms")
     if form in WALKING_FORMS and statistic in ("cusum", "glr"):
         raise SpecError(
             f"{statistic} needs regressors, which form {form!r} does not have: use a form with a forgetting factor.",
@@ -258,30 +294,7 @@ def decide(
     size = np.broadcast_to(size, (nq,)) if size.ndim == 0 else size
     if size.shape != (nq,) or not ((size > 0.0) & (size < np.inf)).all():
         raise SpecError(f"change must be one positive number, or {nq}.", path="change")
-    if (estimates.state_names, estimates.parameter_names) != (observer.state_names, observer.fault_names):
-        raise SpecError(
-            "The estimates are of other states or parameters than this observer's: give the run of this very observer.",
-            path="estimates",
-        )
-    if not len(estimates.states):
-        return Decision(statistic, read_only(np.zeros(0)), read_only(np.zeros(0)), None)
-    if statistic == "chi-square":
-        return _chi_square(observer, estimates, theta, false_alarms)
-    if isinstance(observer, DAEObserver):
-        if statistic == "nis":
-            return _nis(estimates, np.array(estimates.nis), false_alarms)
-        along = estimates.scores - estimates.informations @ theta
-        return _cusum(estimates, along, np.einsum("kqq->kq", estimates.informations), size, false_alarms)
-    gaps = estimates.innovations
-    if nq and form != "random-walk":
-        gaps = gaps - estimates.regressors @ theta
-    if statistic == "nis":
-        return _nis(estimates, np.nansum(gaps**2, axis=1), false_alarms)
-    if statistic == "cusum":
-        regressors = np.nan_to_num(estimates.regressors)
-        along = np.einsum("kmq,km->kq", regressors, np.nan_to_num(gaps))
-        return _cusum(estimates, along, np.einsum("kmq,kmq->kq", regressors, regressors), size, false_alarms)
-    return likelihood_ratio(observer, estimates, gaps, false_alarms)
+    return theta, size
 
 
 @dataclass(frozen=True)
