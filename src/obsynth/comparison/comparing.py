@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -134,15 +134,14 @@ EXACT_ENTRIES = (0.0, 1.0, -1.0)
 
 
 @dataclass(frozen=True, eq=False)
-class DrawnRuns:
-    """Outputs ``(runs, steps, ny)`` of drawn plants with the scenario's faults and without any, and known inputs."""
+class Record:
+    """What observers are run on, ``(.., steps, ..)``: many runs of drawn plants, or a log."""
 
-    faulty: FloatArray
-    faulty_u: FloatArray
-    healthy: FloatArray
-    healthy_u: FloatArray
-    faults: FloatArray
-    dt: float
+    times: FloatArray  # ``(steps,)``, seconds
+    u: FloatArray
+    y: FloatArray
+    truth: FloatArray  # ``(steps, nf)``: the faults, zero where they are not known
+    known: bool = True  # whether any of them is
 
 
 def drawn_runs(
@@ -154,35 +153,35 @@ def drawn_runs(
     tolerance: float,
     seed: int,
     feedback: FloatArray,
-) -> DrawnRuns:
-    """Return the runs; plants are drawn before they are sampled, and disturbances by a factor between -1 and 1."""
-    from obsynth.methods.fault_figures import on_the_clock
-
+) -> tuple[Record, Record]:
+    """Return runs ``(runs, steps, ..)`` with the scenario's faults, and without any; plants are drawn before they are
+    sampled, and disturbances by a factor between -1 and 1."""
     drive = resolve(sampled, scenario)
     nu, nf = sampled.nu, sampled.nf
     rng = np.random.default_rng(seed)
     seeds = [int(value) for value in rng.integers(0, 2**31, size=runs)]
     random, noise, sensors = drive.drawn(seeds, sampled.nw)
     scales = rng.uniform(-1.0, 1.0, size=(runs, sampled.nd))
-    found: dict[str, list[tuple[FloatArray, FloatArray]]] = {"faulty": [], "healthy": []}
+    faults = drive.left[:, nu : nu + nf]
+    found: list[tuple[list[FloatArray], list[FloatArray]]] = [([], []), ([], [])]
     off = tolerance > 0.0 or source.uncertainty is not None
     for run in range(runs):
         plant = on_the_clock(_drawn(source, tolerance, rng), sampled.dt) if off else sampled
         signals = drive.left + random[:, run]
         d = signals[:, nu + nf :] * scales[run]
         shaken = noise[:, run] if noise.shape[2] == plant.nw else np.zeros((drive.steps, plant.nw))
-        for name, f in (("faulty", signals[:, nu : nu + nf]), ("healthy", np.zeros((drive.steps, nf)))):
-            outputs, known = _outputs(plant, signals[:, :nu], d, f, shaken, feedback)
-            found[name].append((outputs + sensors[:, run], known))
-    (faulty, faulty_u), (healthy, healthy_u) = (
-        [np.array(part) for part in zip(*found[name], strict=True)] for name in ("faulty", "healthy")
-    )
-    return DrawnRuns(faulty, faulty_u, healthy, healthy_u, drive.left[:, nu : nu + nf], drive.dt)
+        for (inputs, outputs), f in zip(found, (signals[:, nu : nu + nf], np.zeros((drive.steps, nf))), strict=True):
+            measured, known = _outputs(plant, signals[:, :nu], d, f, shaken, feedback)
+            inputs.append(known)
+            outputs.append(measured + sensors[:, run])
+    times = _clock(drive.steps, drive.dt)
+    (u, y), (healthy_u, healthy_y) = ((np.array(inputs), np.array(outputs)) for inputs, outputs in found)
+    return Record(times, u, y, faults), Record(times, healthy_u, healthy_y, np.zeros_like(faults))
 
 
-def estimates(observer: LinearObserver, u: FloatArray, outputs: FloatArray) -> FloatArray:
-    """Return fault estimates ``(runs, steps, faults)`` of an observer at rest; u and outputs ``(runs, steps, ...)``."""
-    rows, y, known = observer.fault_rows, outputs.swapaxes(0, 1), u.swapaxes(0, 1)
+def estimates(observer: LinearObserver, runs: Record) -> FloatArray:
+    """Return fault estimates ``(runs, steps, faults)`` of an observer at rest."""
+    rows, y, known = observer.fault_rows, runs.y.swapaxes(0, 1), runs.u.swapaxes(0, 1)
     z = driven(observer.Az, np.zeros(observer.order), y @ observer.By.T + known @ observer.Bu.T)
     with np.errstate(over="ignore", invalid="ignore"):
         found = z @ observer.Cz[rows].T + y @ observer.Dy[rows].T + known @ observer.Du[rows].T + observer.added[rows]
@@ -409,13 +408,13 @@ def side_by_side(
         report_stage(f"designing by {method}")
         found.append(candidate(method, plant, sampled, steps, maker, (options or {}).get(method, {})))
     report_stage("running the scenario")
-    drawn = drawn_runs(
+    faulty, healthy = drawn_runs(
         plant, sampled, happening, runs=runs, tolerance=tolerance, seed=COMPARISON_SEED, feedback=kept.feedback
     )
     log = None if data is None else _log(data, sampled, columns, scales, input_delay)
     limit = within if within is not None else settling_time(plant)
     bounds = largest_disturbances(happening, sampled.disturbance_names, kept.steps, dt)
-    compared = [_compared(entry, sampled, drawn, log, kept, limit, false_alarms, bounds) for entry in found]
+    compared = [_compared(entry, sampled, faulty, healthy, log, kept, limit, false_alarms, bounds) for entry in found]
     compared.sort(key=lambda entry: (bool(entry.refused), not entry.fast_enough, entry.rms))
     setting = (
         f"{runs} runs of {happening.horizon:g} s, sampled every {dt:g} s, disturbances and noise drawn"
@@ -424,8 +423,7 @@ def side_by_side(
         + (", a state feedback stabilises the plant" if kept.feedback.any() else "")
         + f"; 90 % of a step to be reached within {limit:.3g} s"
     )
-    times = _clock(len(drawn.faults), dt) if log is None else log.times
-    truth = drawn.faults if log is None else log.truth
+    shown = faulty if log is None else log
     best = next((entry for entry in compared if not entry.refused), None)
     from_file = isinstance(data, (str, Path))
     return Comparison(
@@ -433,8 +431,8 @@ def side_by_side(
         "" if best is None else best.method,
         _reason(best, compared, sampled),
         dt,
-        read_only(times),
-        read_only(truth),
+        read_only(shown.times),
+        read_only(shown.truth),
         plant.fault_names,
         setting,
         asked if data is None or from_file else {},
@@ -525,23 +523,14 @@ def _scenario(plant: DescriptorSystem, given: Scenario | None, dt: float, distur
     )
 
 
-class _Record(NamedTuple):
-    """A log on the clock: known inputs, outputs, faults where it has them."""
-
-    times: FloatArray
-    u: FloatArray
-    y: FloatArray
-    truth: FloatArray
-    known: bool
-
-
 def _log(
     data: Any,
     plant: DescriptorSystem,
     columns: Mapping[str, str] | None,
     scales: Mapping[str, float] | None,
     input_delay: int = 0,
-) -> _Record:
+) -> Record:
+    """Return a log on the clock."""
     import pandas as pd
 
     if not isinstance(data, (str, Path)):
@@ -571,7 +560,7 @@ def _log(
     u, y = signals(plant.input_names), signals(plant.output_names)
     u = u[np.clip(np.arange(count) - input_delay, 0, count - 1)]
     stamps = table.get((columns or {}).get(TIME_HEADER, TIME_HEADER))
-    return _Record(_clock(count, plant.dt) if stamps is None else stamps, u, y, truth, bool(there))
+    return Record(_clock(count, plant.dt) if stamps is None else stamps, u, y, truth, bool(there))
 
 
 def _clock(samples: int, dt: float) -> FloatArray:
@@ -581,8 +570,9 @@ def _clock(samples: int, dt: float) -> FloatArray:
 def _compared(
     entry: Candidate,
     plant: DescriptorSystem,
-    drawn: DrawnRuns,
-    log: _Record | None,
+    faulty: Record,
+    healthy: Record,
+    log: Record | None,
     kept: Held,
     limit: float,
     false_alarms: float,
@@ -595,15 +585,14 @@ def _compared(
     impulses, responses = step_responses(plant, observer, kept.steps, kept.feedback)
     names = [figures.fault for figures in entry.figures]
     beside = thresholds_beside_least(plant, impulses, names, bounds)
-    found = estimates(observer, drawn.faulty_u, drawn.faulty)
-    quiet = estimates(observer, drawn.healthy_u, drawn.healthy)
+    found, quiet = estimates(observer, faulty), estimates(observer, healthy)
     replayed = None if log is None or entry.design is None else faults_on_rows(entry.design, log.times, log.u, log.y)
     rows = []
     for row, figures in enumerate(entry.figures):
         column = plant.fault_names.index(figures.fault)
-        fault = drawn.faults[:, column]
+        fault = faulty.truth[:, column]
         response = responses[:, row, column]
-        level, delay, smallest = alarms(found[:, :, row], quiet[:, :, row], fault, response, false_alarms, drawn.dt)
+        level, delay, smallest = alarms(found[:, :, row], quiet[:, :, row], fault, response, false_alarms, plant.dt)
         error = found[:, :, row] - fault
         if replayed is not None and log is not None and log.known:
             error = replayed[:, row] - log.truth[:, column]
