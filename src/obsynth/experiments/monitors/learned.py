@@ -191,6 +191,8 @@ class LearnedThresholds:
         )
         if rows_needed(model, 1.0) > self.rows:
             other = "the residuals are correlated for so long, or are so many, that these rows determine no rate"
+        elif self.needed > rows_needed(model, self.every):
+            other = "what so few rows say of a fault is correlated for so long that they determine no rate"
         return (
             f"{text}. The rate is uncertain: it needs {self.needed} rows without faults "
             f"({_duration(self.needed * self.dt)}); {other}"
@@ -412,7 +414,7 @@ def thresholds_from_rows(
         read_only(levels.own * levels.factor),
         every,
         count,
-        rows_needed(statistics.model, every),
+        rows_needed(statistics.model, every, scores),
         dt,
         read_only(centres),
         read_only(np.where(scales > 0.0, scales, 1.0)),

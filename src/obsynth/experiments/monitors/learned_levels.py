@@ -42,6 +42,8 @@ RARER = (1.4, 2.0, 2.8, 4.0, 5.6, 8.0)
 #: So many times the rows of a rate show it themselves: with 20 alarms in their second half, 1.5 times the rate is
 #: passed in 2 % of logs.
 CONFORMAL = 40
+#: Rows that are needed, of each that one row is remembered for.
+MEMORIES = 100.0
 #: A rate counts as observed when so many alarms of it are in the streams; rarer ones are extrapolated.
 OBSERVED = 10.0
 
@@ -346,8 +348,15 @@ def _union(runs: FloatArray, every: float, total: int) -> tuple[FloatArray, Floa
     return own, union
 
 
-def rows_needed(model: Autoregression, every: float) -> int:
+def rows_needed(model: Autoregression, every: float, scores: Scores | None = None) -> int:
     """Return how many rows without faults a rate of one alarm per ``every`` rows needs: as many as between alarms, a
-    hundred times what the residuals remember, and enough for every coefficient."""
+    hundred times what the residuals remember, and enough for every coefficient; of what they say of faults (``scores``)
+    a hundred times what that remembers, in rows that say as much as most of it comes from."""
     m = model.channels
-    return int(np.ceil(max(every, 100.0 * model.longest_gain, 50.0 * m * (1 + m * model.order))))
+    needed = [every, MEMORIES * model.longest_gain, 50.0 * m * (1 + m * model.order)]
+    if scores is not None:
+        own = np.einsum("kii->ki", scores.information)
+        # Of n rows of which one alone tells of a fault, one counts.
+        share = float((own.sum(axis=0) ** 2 / (own**2).sum(axis=0)).min()) / len(own)
+        needed.append(MEMORIES * ScoreModel.of(scores).model.longest_gain / share)
+    return int(np.ceil(max(needed)))
