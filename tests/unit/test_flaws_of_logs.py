@@ -620,16 +620,20 @@ def test_a_comparison_replays_a_log_with_flaws(flaw: str) -> None:
 
 
 def test_rows_after_a_missing_sample_count_by_no_more_than_the_observer_says() -> None:
-    from obsynth.experiments.monitors.monitor import Evidence, Sample
+    from obsynth.experiments.monitors.monitor import Sample
+    from obsynth.numerics.square_root_estimation import ParameterState
+    from obsynth.observers.recursive.observer import RawEstimate
 
     design, rng, data = recursive(), np.random.default_rng(8), log(fault=0.5, rows=300)
     data[["a", "b"]] += 0.01 * rng.standard_normal((300, 2))
     rule = obsynth.online_monitor(design, "learned", normal=obsynth.learn_thresholds(design, data)).rule
-    state, whole, nothing = rule.init(), np.zeros((1, 1)), np.zeros(1)
+    state, none, nothing = rule.init(), np.zeros((0, 0)), np.zeros(0)
     for k in range(200):
         lost, far = k == 150, 50.0 if k in (151, 199) else 0.0
         residuals = np.array([far, np.nan if lost else 0.0])
-        said = Evidence(np.zeros(1), whole, np.array([0.3, 0.4]), np.zeros((2, 1)), nothing, whole)
+        known = ParameterState(np.zeros(1), np.zeros((1, 1)), np.zeros((1, 1)))
+        innovation = np.array([0.3, 0.4])
+        said = RawEstimate(k, nothing, none, none, known, innovation, np.zeros((2, 1)), innovation, residuals)
         state, judged = rule.step(state, Sample(k * DT, residuals, np.zeros(1), said))
         if k == 150:
             assert math.isnan(judged.statistic)

@@ -6,6 +6,7 @@ import functools
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -25,7 +26,7 @@ from obsynth.experiments.monitors.learned_levels import (
     learned_levels,
     rows_needed,
 )
-from obsynth.experiments.monitors.monitor import NOT_DISTINGUISHED, Evidence
+from obsynth.experiments.monitors.monitor import NOT_DISTINGUISHED
 from obsynth.experiments.monitors.parameter_scores import (
     Scores,
     before_any,
@@ -103,7 +104,7 @@ def test_the_statistic_is_that_of_a_change_of_its_definition() -> None:
             continue
         gain = prior * u[k] / (u[k] ** 2 * prior + variance)
         theta, spread = theta + gain[0] * (y[k] - u[k] * theta), (1.0 - gain * u[k]) * prior
-        evidence = Evidence(theta, spread, np.zeros(1), np.zeros((1, 0)), np.zeros(1), np.zeros((1, 1)))
+        evidence = SimpleNamespace(theta=theta, parameter_covariance=spread)
         before, said = sample_score(before, evidence, walk, 3 if k == 102 else 1)
         found.append(said)
     said = Scores(*(np.array([getattr(one, name) for one in found]) for name in ("score", "information")))
@@ -124,9 +125,8 @@ def test_the_statistic_is_that_of_a_change_of_its_definition() -> None:
 
 
 def test_a_covariance_that_starts_again_says_nothing() -> None:
-    def evidence(theta: float, variance: float) -> Evidence:
-        spread = np.array([[variance]])
-        return Evidence(np.array([theta]), spread, np.zeros(1), np.zeros((1, 0)), np.zeros(1), np.zeros((1, 1)))
+    def evidence(theta: float, variance: float) -> SimpleNamespace:
+        return SimpleNamespace(theta=np.array([theta]), parameter_covariance=np.array([[variance]]))
 
     walk = np.array([[0.1]])
     before, first = sample_score(before_any(1), evidence(3.0, 1.0), walk, 1)

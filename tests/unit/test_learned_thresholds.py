@@ -34,8 +34,10 @@ from obsynth.experiments.monitors.learned_levels import (
     level_of,
     rows_needed,
 )
-from obsynth.experiments.monitors.monitor import Evidence, LinearSample, Sample
+from obsynth.experiments.monitors.monitor import LinearSample, Sample
 from obsynth.numerics.autoregression import Autoregression, fitted_autoregression
+from obsynth.numerics.square_root_estimation import ParameterState
+from obsynth.observers.recursive.observer import RawEstimate
 
 DT = 0.1
 
@@ -392,7 +394,8 @@ def test_a_row_without_one_sensor_decides_by_the_others(by_sensor: bool) -> None
     state, found = rule.init(), []
     for k, row in enumerate([[0.0, 0.0], [0.0, 0.0], [0.0, 0.0], [7.0, np.nan], [9.0, 0.0]]):
         innovation = np.array([2.0])
-        evidence = Evidence(np.array([0.4 * (k == 3)]), np.eye(1), innovation, none, none, none)
+        known = ParameterState(np.array([0.4 * (k == 3)]), np.eye(1), np.eye(1))
+        evidence = RawEstimate(k, none, none, none, known, innovation, none, innovation, np.array(row))
         state, judged = rule.step(state, Sample(k * DT, np.array(row), np.zeros(1), evidence))
         found.append(judged.statistic)
     if by_sensor:

@@ -232,7 +232,7 @@ def _said(design: ObserverDesign, run: LogRun, log: FloatArray) -> _Said:
         if walk is not None and isinstance(row.evidence, Evidence):
             before, score = sample_score(before, row.evidence, walk, row.skipped + 1)
         if said is not None and isinstance(row.evidence, Evidence) and np.isfinite(said).all():
-            own = row.evidence.innovation
+            own = row.evidence.whitened
             square = float(np.mean(own**2)) if own.size else np.nan
         squares += [np.nan] * missing + [square]
         scores += [silent] * missing + [score]

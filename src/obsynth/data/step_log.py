@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, TypeAlias
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -11,15 +11,11 @@ from obsynth.errors import ObsynthError, SolverError, SpecError
 from obsynth.experiments.monitors.learned import innovation_names
 from obsynth.experiments.monitors.monitor import Evidence
 from obsynth.numerics.arrays import FloatArray
-from obsynth.observers.dae.estimates import DAERow
 from obsynth.observers.dae.observer import DAEObserver
-from obsynth.observers.recursive.observer import RawEstimate, RecursiveObserver
+from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.running import changed
 from obsynth.observers.smoothing import Chain
 from obsynth.results.design import ObserverDesign
-
-#: What an observer with deviations knows at one sample.
-StepRow: TypeAlias = RawEstimate | DAERow
 
 
 class SteppingLogObserver(LogObserver):
@@ -85,11 +81,11 @@ class SteppingLogObserver(LogObserver):
         ones."""
         return np.where(np.isnan(u), 0.0 if self.u is None else self.u, u)
 
-    def _taken(self, y: FloatArray, u: FloatArray) -> StepRow | None:
+    def _taken(self, y: FloatArray, u: FloatArray) -> Evidence | None:
         """Take one sample, or none of it: `None` where numbers are no finite ones any more."""
         before = self.state
         u = u if self.state.k else self._begun(u)
-        found: StepRow
+        found: Evidence
         try:
             with np.errstate(all="ignore"):
                 kept = None if self.chain is None else self.chain.add
@@ -101,7 +97,7 @@ class SteppingLogObserver(LogObserver):
         self.state = before
         return None
 
-    def _values(self, found: StepRow) -> FloatArray:
+    def _values(self, found: Evidence) -> FloatArray:
         """Return a row: estimates, standard deviations, innovation at the parameters of one sample before."""
         residual = np.full(self.directions, np.nan)
         # The correction of the start by early constraints has no more directions, but may have fewer.
@@ -136,10 +132,7 @@ class SteppingLogObserver(LogObserver):
         if fresh and self.is_recursive:
             received = np.ones_like(received)
         status = self._status(time, known[:nu], received, spoiled=spoiled)
-        evidence = Evidence(
-            found.theta, found.parameter_covariance, found.whitened, found.regressor, found.score, found.information
-        )
-        return Row(status, self._values(found), missing, evidence)
+        return Row(status, self._values(found), missing, found)
 
     def _refused(self, total: FloatArray) -> np.ndarray:
         """Return which outputs of the last sample were left out as outliers: of which more are than before it."""
@@ -157,7 +150,7 @@ class SteppingLogObserver(LogObserver):
                 return True
         return False
 
-    def _found(self, y: FloatArray, u: FloatArray, *, may_restart: bool) -> tuple[StepRow, bool, bool]:
+    def _found(self, y: FloatArray, u: FloatArray, *, may_restart: bool) -> tuple[Evidence, bool, bool]:
         """Take one sample; return also whether its outputs were left out, and whether the observer started again."""
         found = self._safe(y, u)
         if found is not None:
@@ -180,14 +173,14 @@ class SteppingLogObserver(LogObserver):
         self.phase = OK
         return OK if outputs.all() else PARTIAL
 
-    def _safe(self, y: FloatArray, u: FloatArray) -> StepRow | None:
+    def _safe(self, y: FloatArray, u: FloatArray) -> Evidence | None:
         """Take one sample, or none of it where there is no solution either."""
         try:
             return self._taken(y, u)
         except SolverError:
             return None
 
-    def _required(self, u: FloatArray) -> StepRow:
+    def _required(self, u: FloatArray) -> Evidence:
         """Take one sample without outputs."""
         found = self._taken(np.full(len(self.output_names), np.nan), u)
         if found is None:

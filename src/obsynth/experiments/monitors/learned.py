@@ -545,7 +545,7 @@ class LearnedRule(Rule):
         counts = shown is not None and state.taken > self.learned.settling
         most, varying = math.inf if counts else 0.0, isinstance(sample.said, Evidence)
         if counts and state.waiting and isinstance(sample.said, Evidence):
-            most = float(np.linalg.norm(sample.said.innovation)) / self.learned.innovation
+            most = float(np.linalg.norm(sample.said.whitened)) / self.learned.innovation
         if not whole and varying:
             state = state._replace(waiting=self._model.order + 1)
         state = state._replace(waiting=max(state.waiting - 1, 0))

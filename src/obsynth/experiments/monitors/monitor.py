@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.observers.dae.estimates import DAERow
 from obsynth.observers.estimates import Estimates
+from obsynth.observers.recursive.observer import RawEstimate
 from obsynth.observers.running import state_as_data, state_from_data
 from obsynth.plants.constants import shown
 
@@ -91,15 +93,8 @@ class Detection:
     fault: str
 
 
-class Evidence(NamedTuple):
-    """What a recursive observer learnt from a sample."""
-
-    theta: FloatArray  # ``(nq,)``
-    covariance: FloatArray
-    innovation: FloatArray  # ``(m,)``; less regressor times true parameters: white, N(0, I)
-    regressor: FloatArray
-    score: FloatArray  # ``(nq,)``
-    information: FloatArray  # ``(nq, nq)``
+#: What a recursive or nonlinear observer learnt from a sample: a row of it.
+Evidence: TypeAlias = RawEstimate | DAERow
 
 
 class LinearSample(NamedTuple):

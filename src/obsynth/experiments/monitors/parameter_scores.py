@@ -80,7 +80,7 @@ def before_any(faults: int) -> FloatArray:
 def sample_score(before: FloatArray, evidence: Evidence, walk: FloatArray, rows: int) -> tuple[FloatArray, Scores]:
     """Return what is known after a sample, and what it says; ``before (1 + nf, nf)``: estimate and covariance after the
     one ``rows`` earlier, since which parameters have walked."""
-    theta, spread = evidence.theta, evidence.covariance
+    theta, spread = evidence.theta, evidence.parameter_covariance
     after = np.vstack([theta, spread])
     nothing = Scores(np.zeros_like(theta), np.zeros_like(spread))
     if not (np.isfinite(before).all() and np.isfinite(after).all()):

@@ -469,10 +469,10 @@ class ParameterRule(Rule):
 
         if self._kind == "chi-square":
             away = found.theta - self._nominal
-            weights = np.linalg.pinv(found.covariance, hermitian=True)
+            weights = np.linalg.pinv(found.parameter_covariance, hermitian=True)
             value, limit = float(away @ weights @ away), float(chdtri(len(away), share))
             return looked, Judged(value, limit, alone(weights @ away, np.diag(weights)))
-        gap = found.innovation
+        gap = found.whitened
         if found.regressor.size:
             gap = gap - found.regressor @ self._nominal
         squares, degrees = (*state.squares, float(gap @ gap))[-NIS_WINDOW:], (*state.degrees, len(gap))[-NIS_WINDOW:]
