@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from obsynth.calibration import noise_proposals
+from obsynth.calibration import calibrating
 from obsynth.calibration.diagnostics import (
     change_of_mean,
     consistency,
@@ -191,13 +191,13 @@ def test_correlations_are_sought_between_a_third_of_a_sample_and_the_length_of_t
 def test_a_state_for_coloured_noise_pays_for_two_numbers(monkeypatch, nats: float, taken: bool) -> None:
     """Log(400) = 5.99 for both numbers together, and three nats that no explanation is below."""
     known = SimpleNamespace(best=lambda problem: (100.0 - nats, known))
-    monkeypatch.setattr(noise_proposals, "_asking", lambda problem, fit: {("coloured", "y")})
-    monkeypatch.setattr(noise_proposals, "_like", lambda problem, new: new)
-    monkeypatch.setattr(noise_proposals, "_Known", SimpleNamespace(of=lambda problem, fit: known))
+    monkeypatch.setattr(calibrating, "_asking", lambda problem, fit: {("coloured", "y")})
+    monkeypatch.setattr(calibrating, "_like", lambda problem, new: new)
+    monkeypatch.setattr(calibrating, "_Known", SimpleNamespace(of=lambda problem, fit: known))
     problem = SimpleNamespace(
         output_names=("y",), plant=SimpleNamespace(unknown_inputs=()), log=SimpleNamespace(samples=400)
     )
-    found, told = noise_proposals.proposed_states(
+    found, told = calibrating.proposed_states(
         problem, SimpleNamespace(value=100.0), NoiseStates(), ("coloured",), lambda states: problem, lambda text: None
     )
     assert bool(found) == taken == bool(told)

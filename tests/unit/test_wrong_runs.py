@@ -27,7 +27,7 @@ def hidden(y: np.ndarray, monkeypatch: pytest.MonkeyPatch, memory: float = 0.0) 
         return found
 
     monkeypatch.setattr(module, "_whitened", whitened)
-    fit = SimpleNamespace(whitened=whitened(None, None, y), t=np.zeros(0), Q=np.ones(1), R=np.ones(2))
+    fit = SimpleNamespace(whitened=whitened(None, None, y), v=np.zeros(3))
     return [tuple(place) for place in np.argwhere(wrong_runs(SimpleNamespace(y=y), fit)).tolist()]
 
 

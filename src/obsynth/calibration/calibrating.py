@@ -5,11 +5,16 @@ Several wrong samples of one sensor in a row: far from their prediction, and gon
 What happened in the plant is seen by other sensors, or goes on.  Once wrong samples are hidden, the next one is where
 it was predicted; then they count as not measured, as single ones do.  Left in a log, three of them made coloured noise
 look white, or of twice its size.
+
+Which states for coloured noise, offsets and loads the innovations of a log ask for, chosen by likelihood.
+
+One state at a time is added, that which gains most: its nats less half a logarithm of the number of samples for each
+number that it adds (Schwarz 1978).  An offset is integrated out, which counts it already.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -18,18 +23,22 @@ from numpy.typing import ArrayLike
 
 from obsynth.calibration.diagnostics import (
     LEAST_DIAGNOSED_ROWS,
+    LEAST_EXPLANATION,
     MOST_OUTLIERS,
+    SIGNIFICANT,
     STANDS_OUT,
     BoolArray,
+    regression_gain,
     standing_out,
     usual_size,
+    whiteness,
     wrong_samples,
 )
 from obsynth.calibration.innovations_fit import InnovationsFit, chosen_timing, innovations_fit
-from obsynth.calibration.likelihood import Likelihood
+from obsynth.calibration.likelihood import IMPOSSIBLE, Likelihood
 from obsynth.calibration.logs import TOLD_ROWS, Log, LogData, read_log
-from obsynth.calibration.noise_proposals import proposed_states
-from obsynth.calibration.noise_states import NoiseStates, PlantWithNoise, asked_states, with_states
+from obsynth.calibration.maximum import Objective
+from obsynth.calibration.noise_states import NoiseStates, PlantWithNoise, asked_states, correlation_name, with_states
 from obsynth.calibration.plants import CalibrationPlant, LinearPlant, NonlinearPlant
 from obsynth.calibration.problem import Problem, calibration_problem, require_variation
 from obsynth.calibration.reporting import IntegrationError, integration_error, reported
@@ -40,7 +49,168 @@ from obsynth.numerics.arguments import chosen, is_whole, whole_number
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.noise_model import noise_state, process_variance
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+
+#: Autocorrelations between which a search for coloured noise begins, and the share of R that it begins with.
+FIRST_KEPT, COLOURED_SHARE = (0.3, 0.98), 0.7
+#: Numbers that a state adds: the variance and correlation of coloured noise, the variance of a walk.
+ADDED_NUMBERS = {"coloured": 2, "offset": 0, "walk": 1}
+#: Nats above which a state is taken.  An offset that is not taken spoils constants, and one too many only widens boxes.
+LEAST_NATS = {"coloured": LEAST_EXPLANATION, "offset": 1.0, "walk": LEAST_EXPLANATION}
+#: Nats that an offset explains beside constants, variances as they are, before it is tried; and by how much constants
+#: are moved to see what they explain, in widths of their bounds.
+ASKING, SMALL_MOVE = 2.0, 1e-4
+
+
+def proposed_states(
+    problem: Problem,
+    fit: InnovationsFit,
+    asked: NoiseStates,
+    kinds: Sequence[str],
+    problem_with: Callable[[NoiseStates], Problem],
+    note: Callable[[str], object],
+) -> tuple[NoiseStates, list[str]]:
+    """Return the states asked for with those that the innovations ask for, and a sentence for each of these."""
+    states, told = asked, list[str]()
+    asking = _asking(problem, fit)
+    value, known = fit.value, _Known.of(problem, fit)
+    while True:
+        found = []
+        for kind, name, tried in _candidates(states, kinds, problem.output_names, problem.plant.unknown_inputs):
+            if (kind, name) not in asking:
+                continue
+            note(f"{kind} of {name}")
+            reached, place = known.best(_like(problem, problem_with(tried)))
+            gain = value - reached - 0.5 * ADDED_NUMBERS[kind] * np.log(problem.log.samples)
+            found.append((gain - LEAST_NATS[kind], kind, name, tried, reached, place))
+        if not found:
+            break
+        gain, kind, name, tried, reached, place = max(found, key=lambda item: item[0])
+        if not gain > 0.0:
+            break
+        told.append(_STATE_SENTENCES[kind].format(name=name, gain=gain + LEAST_NATS[kind]))
+        states, value, known = tried, reached, place
+    return states, told
+
+
+_STATE_SENTENCES = {
+    "coloured": "The noise of {name} is coloured: a state stands for it (better by {gain:.3g} nats).",
+    "offset": "The sensor {name} has an offset: a state stands for it (better by {gain:.3g} nats).",
+    "walk": "The unknown input {name} is taken as a random walk (better by {gain:.3g} nats).",
+}
+
+
+def _asking(problem: Problem, fit: InnovationsFit) -> set[tuple[str, str]]:
+    """Return kinds and names that innovations ask for: sensors whose innovations are not white, offsets that explain
+    more of them than constants can, unknown inputs."""
+    found = {("walk", name) for name in problem.plant.unknown_inputs}
+    names, ny = problem.output_names, len(problem.output_names)
+    whitened = np.where(np.isfinite(problem.y), fit.whitened, np.nan)
+    found |= {
+        ("coloured", name)
+        for name, column in zip(names, whitened.T, strict=True)
+        if whiteness(column).probability < SIGNIFICANT
+    }
+    v = fit.v
+    before = _whitened(problem, v, problem.y)
+    moves = [
+        (_whitened(problem, v + step, problem.y) - before) / SMALL_MOVE
+        for step in SMALL_MOVE * np.hstack([np.diag(problem.widths), np.zeros((len(fit.t), len(v) - len(fit.t)))])
+    ]
+    deviations = np.sqrt(np.nanmean(np.where(np.isfinite(problem.y), fit.innovations, np.nan) ** 2, axis=0))
+    for j, name in enumerate(names):
+        offset = deviations[j] * (np.arange(ny) == j)
+        effect = _whitened(problem, v, problem.y - offset) - before
+        if regression_gain(before.ravel(), [move.ravel() for move in moves], effect.ravel()) > ASKING:
+            found.add(("offset", name))
+    return found
+
+
+def _whitened(problem: Problem, v: FloatArray, y: FloatArray) -> FloatArray:
+    """Return whitened innovations ``(n, ny)`` of other measurements, NaN where nothing was measured."""
+    return np.where(np.isfinite(y), Likelihood(problem, y).innovations(v)[0], np.nan)
+
+
+def _candidates(
+    states: NoiseStates, kinds: Sequence[str], outputs: Sequence[str], unknown_inputs: Sequence[str]
+) -> Iterator[tuple[str, str, NoiseStates]]:
+    for name in outputs:
+        if "coloured" in kinds and name not in states.correlations:
+            yield "coloured", name, replace(states, correlations={**states.correlations, name: None})
+        if "offset" in kinds and name not in states.offsets:
+            yield "offset", name, replace(states, offsets=(*states.offsets, name))
+    for name in unknown_inputs:
+        if "walk" in kinds and name not in states.loads:
+            yield "walk", name, replace(states, loads=(*states.loads, name))
+
+
+def _like(problem: Problem, new: Problem) -> Problem:
+    """Return a problem with the steps, the inputs and the start of another one, as far as it goes."""
+    if (new.integration, new.substeps) != (problem.integration, problem.substeps):
+        new = new.integrated(problem.integration, problem.substeps)
+    own = len(problem.plant.state_names)
+    places = [new.plant.state_names.index(name) for name in problem.plant.state_names]
+    P0 = new.P0.copy()
+    P0[np.ix_(places, places)] = problem.P0[:own, :own]
+    return new.with_start(P0)
+
+
+class _Known:
+    """What a fit found, by name, from which a search with one more state begins."""
+
+    def __init__(self, t: dict[str, float], variances: dict[str, float], kept: dict[str, float], R: FloatArray) -> None:
+        self.t, self.variances, self.kept, self.R = t, variances, kept, R
+
+    @classmethod
+    def of(cls, problem: Problem, fit: InnovationsFit) -> _Known:
+        """Return what a fit found; ``kept``: how much of an innovation of each sensor its next one keeps."""
+        whitened = np.where(np.isfinite(problem.y), fit.whitened, np.nan)
+        kept = {name: whiteness(column).first for name, column in zip(problem.output_names, whitened.T, strict=True)}
+        both = (*problem.noisy, *problem.output_names)
+        variances = dict(zip(both, (*fit.Q.tolist(), *fit.R.tolist()), strict=True))
+        spread = np.nanmean(np.where(np.isfinite(problem.y), fit.innovations, np.nan) ** 2, axis=0)
+        return cls(dict(zip(problem.unknown, fit.t.tolist(), strict=True)), variances, kept, spread)
+
+    def best(self, problem: Problem) -> tuple[float, _Known]:
+        """Return the least negative log likelihood with another model, and what it found."""
+        plant = problem.plant
+        nominal = {name: float(value) for name, value in zip(problem.unknown, problem.nominal, strict=True)}
+        best, value = None, np.inf
+        for longer in (1.0, 5.0):
+            t, variances = nominal | self.t, dict(self.variances)
+            for j, name in enumerate(problem.output_names):
+                if correlation_name(name) in self.t or noise_state(name) not in problem.noisy:
+                    continue
+                time = -longer * problem.log.dt / float(np.log(np.clip(self.kept[name], *FIRST_KEPT)))
+                if correlation_name(name) in problem.unknown:
+                    t[correlation_name(name)] = float(np.log(time))
+                variances[noise_state(name)] = process_variance(
+                    COLOURED_SHARE * self.R[j], time, problem.log.dt, problem.integration
+                )
+                variances[name] = (1.0 - COLOURED_SHARE) * variances[name]
+            start = np.clip([t[name] for name in problem.unknown], problem.low, problem.high)
+            fit = Fit(start, problem.x0, np.sqrt(self.R), 0.0, np.zeros((0, 0)))
+            objective = Objective(problem, fit)
+            full = objective.full(objective.start(start))
+            for i, name in enumerate((*problem.noisy, *problem.output_names)):
+                if variances.get(name, 0.0) > 0.0:
+                    full[objective.nt + i] = np.log(variances[name])
+            full[: objective.nt] /= problem.widths
+            reached, z = objective.descent(full[objective.free])
+            if reached < value and reached < IMPOSSIBLE:
+                value, best = reached, (objective, z)
+            if not isinstance(plant, PlantWithNoise) or not plant.bounds:
+                break
+        if best is None:
+            return np.inf, self
+        objective, z = best
+        Q, R = objective.noise(z)
+        found = dict(zip((*problem.noisy, *problem.output_names), (*Q.tolist(), *R.tolist()), strict=True))
+        return value, _Known(
+            dict(zip(problem.unknown, objective.constants(z).tolist(), strict=True)), found, self.kept, self.R
+        )
+
 
 #: Wrong samples in a row at most, and how many after them must be where they are predicted.
 LONGEST_RUN, RETURNED = 5, 3
@@ -84,13 +254,9 @@ def _end(problem: Problem, fit: InnovationsFit, usual: float, output: int, first
         y = problem.y.copy()
         y[first : end + 1, output] = np.nan
         after = np.flatnonzero(np.isfinite(y[end + 1 :, output]))[:RETURNED] + end + 1
-        if len(after) == RETURNED and (np.abs(_whitened(problem, fit, y)[after, output]) <= STANDS_OUT * usual).all():
+        if len(after) == RETURNED and (np.abs(_whitened(problem, fit.v, y)[after, output]) <= STANDS_OUT * usual).all():
             return end
     return None
-
-
-def _whitened(problem: Problem, fit: InnovationsFit, y: FloatArray) -> FloatArray:
-    return Likelihood(problem, y).innovations(fit.v)[0]
 
 
 def plant_as_written(given: Any) -> Any:

@@ -379,7 +379,7 @@ VERBS = {
         _RUN_DETAILS,
     ),
     "thresholds": Verb(
-        "learned:run_thresholds",
+        "data_commands:run_thresholds",
         "Find thresholds of a design from a log without faults, for a rate of false alarms.",
         (
             GAINS,
