@@ -33,6 +33,20 @@ def test_an_estimate_for_many_states_and_signals_is_below_and_close():
     assert 0.9 * true[0] <= response.gains(angle)[0] <= true[0] * (1.0 + 1e-9)
 
 
+@pytest.mark.parametrize(
+    "units", [(1.0, 1.0, 1.0), (1e25, 1e20, 1e45), (1e-30, 1e-25, 1e-55), (1.0, 0.0, 1e-90), (1.0, 1e-60, 3.0)]
+)
+def test_where_a_peak_may_be_is_told_in_any_units(units):
+    rng = np.random.default_rng(3)
+    a, b, c, d = random_system(rng, 70, 4, 5, damping=1e-2)
+    b, c, d = (part * unit for part, unit in zip((b, c, d), units, strict=True))
+    response, angles = ModalResponse.of(Modes.of(a), b, c, d), np.linspace(0.0, np.pi, 40)
+    rough = response.gains(angles, roughly=True)
+    true = np.linalg.svd(frequency_response(a, b, c, d, angles), compute_uv=False)[:, 0]
+    assert np.all(rough <= true * (1.0 + 1e-4))
+    assert np.all(rough >= 0.5 * true)
+
+
 @pytest.mark.parametrize("damping", [0.5, 1e-1, 1e-2, 1e-4, 1e-6])
 def test_the_highest_peak_is_found_where_a_fine_grid_has_it(damping, share):
     for seed in share(range(5)):

@@ -7,11 +7,13 @@ import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 import obsynth
+from obsynth.numerics import scaling
 from obsynth.numerics.scaling import LogBalance
 from obsynth.proofs import contraction
 from obsynth.proofs.contraction import prove_contraction, proved_contractions
@@ -140,3 +142,25 @@ def test_an_inequality_is_proved_once_for_the_same_numbers_and_again_for_others(
     assert lmi(design.replace(certificate=gain)) == (1, False)
     # What was not proved is not remembered.
     assert lmi(design.replace(certificate=gain)) == (1, False)
+
+
+def test_many_exponents_are_the_same_by_cholesky_and_by_pivots(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(11)
+    n = scaling.MANY_UNKNOWNS // 2 + 10
+    a = rng.standard_normal((n, n)) * np.exp2(rng.uniform(-20, 20, n)) * np.exp2(rng.uniform(-20, 20, n))[:, None]
+    a[rng.random((n, n)) < 0.9] = 0.0
+    plain, failed = scaling.lapack.dpotrf, []
+
+    def watched(*given: Any, **named: Any) -> Any:
+        found = plain(*given, **named)
+        failed.append(found[1])
+        return found
+
+    monkeypatch.setattr(scaling.lapack, "dpotrf", watched)
+    found = scaling.balance_by_least_squares(np.eye(n), a)
+    assert failed == [0]
+    monkeypatch.setattr(scaling, "MANY_UNKNOWNS", 10**9)
+    again = scaling.balance_by_least_squares(np.eye(n), a)
+    assert failed == [0]
+    assert np.array_equal(found.equations, again.equations)
+    assert np.array_equal(found.states, again.states)

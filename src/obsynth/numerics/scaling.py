@@ -183,6 +183,8 @@ SETTLED_SHARE = 1e-2
 PASSES = 3
 #: Up to so many unknowns lists of numbers are added up faster than arrays in pairs.
 FEW_UNKNOWNS = 80
+#: From so many on a positive definite matrix is factored as one, in a third of the time.
+MANY_UNKNOWNS = 500
 
 
 @dataclass(eq=False)
@@ -269,15 +271,20 @@ class LogBalance:
         for unknown, exponent in self._wishes:
             normal[unknown, unknown] += WISH_WEIGHT
             right[unknown] += WISH_WEIGHT * exponent
-        solved = _factored(normal)
+        solved = _factored(normal, definite=ridge >= SMALL_RIDGE)
         return solved, solved(right)
 
 
-def _factored(matrix: FloatArray) -> Callable[[FloatArray], FloatArray]:
-    """Return what solves equations with a matrix ``(n, n)``, which is factored once."""
+def _factored(matrix: FloatArray, *, definite: bool) -> Callable[[FloatArray], FloatArray]:
+    """Return what solves equations with a matrix ``(n, n)``, which is factored once; ``definite``: beyond rounding."""
     if not matrix.size:
         return lambda right: right
-    factors, pivots, failed = lapack.dgetrf(np.asarray_chkfinite(matrix))
+    matrix = np.asarray_chkfinite(matrix)
+    if definite and len(matrix) >= MANY_UNKNOWNS:
+        factor, failed = lapack.dpotrf(matrix.T, lower=1, clean=0)
+        if not failed:
+            return lambda right: np.asarray(lapack.dpotrs(factor, right, lower=1)[0], dtype=np.float64)
+    factors, pivots, failed = lapack.dgetrf(matrix)
     if failed:
         raise np.linalg.LinAlgError("Singular matrix")
     return lambda right: np.asarray(lapack.dgetrs(factors, pivots, right)[0], dtype=np.float64)

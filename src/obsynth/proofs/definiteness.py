@@ -85,7 +85,7 @@ def prove_positive_definite(matrix: Formula | Ball | FloatArray) -> Definiteness
         return DefinitenessProof(True, float("inf"), 0.0, "Cholesky")
     if not ball.is_finite:
         return unproved("an entry is not finite")
-    diagonal = np.diag(ball.midpoint)
+    diagonal = np.diag(ball.midpoint).copy()  # no view, which would keep all of it
     if np.any(diagonal <= 0.0):
         place = int(np.argmin(diagonal))
         return unproved(f"diagonal entry {place + 1} is {diagonal[place]:.3g}: not positive definite")

@@ -637,6 +637,7 @@ def search_least_gain(problem: GainProblem) -> LeastGain:
     best = first.start
     gain = starting = first.start_gain
     records: list[dict[str, Any]] = []
+    modes = None
     if problem.measured == 0 or gain == 0.0:
         return LeastGain(gain, first, best, starting, (gain, gain))
     for number in range(MOST_PASSES):
@@ -654,9 +655,14 @@ def search_least_gain(problem: GainProblem) -> LeastGain:
         records.append({"what": "least gain", "solver": "central filter", "status": "optimal", "gain": level})
         if level * normalised.gain < gain:
             best, gain = normalised.restore(found), level * normalised.gain
+            # Found once, in one of the two coordinates, among many states.
+            modes = normalised.restored_modes(work.modes(found)) if problem.order > MOST_STATES_FOR_LEVELS else None
         if gain >= GOOD_COORDINATES * before or gain <= NEGLIGIBLE_GAIN * starting:
             break
-    gain = replace(problem, judged_exactly=True).achieved_gain(best)
+    exact = replace(problem, judged_exactly=True)
+    if modes is not None:
+        exact.knows(best, modes)
+    gain = exact.achieved_gain(best)
     return LeastGain(gain, first, best, starting, (gain, gain), records)
 
 

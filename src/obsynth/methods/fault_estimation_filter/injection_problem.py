@@ -26,6 +26,8 @@ from obsynth.numerics.norms import (
 NORMALISING_SLACK = 1e-6
 #: The normalising Riccati solution is taken at this multiple of the starting filter's norm.
 NORMALISING_LEVEL = 1.3
+#: From so many states on most filters that are asked how fast they are are too slow: eigenvectors are then for nothing.
+STATES_FOR_RADIUS_ALONE = 200
 #: A share that norms are certain to, and no one misses.
 NORM_ROUNDING = 1e-12
 
@@ -140,10 +142,18 @@ class GainProblem:
             self._modes[solution] = Modes.of(self.A - solution.R @ self.C)
         return self._modes[solution]
 
+    def knows(self, solution: Injection, modes: Modes) -> None:
+        """Note the modes of the closed loop, found in other coordinates."""
+        self._modes.clear()
+        self._modes[solution] = modes
+
     def radius(self, solution: Injection) -> float:
-        """Return the spectral radius of the closed loop; asked for once, as it takes all modes."""
+        """Return the spectral radius of the closed loop; asked for once, as it takes all eigenvalues."""
         if solution not in self._radii:
-            self._radii[solution] = self.modes(solution).radius
+            alone = self.order >= STATES_FOR_RADIUS_ALONE and solution not in self._modes
+            self._radii[solution] = (
+                spectral_radius(self.A - solution.R @ self.C) if alone else self.modes(solution).radius
+            )
         return self._radii[solution]
 
     def reaches(self, solution: Injection, level: float) -> bool:
@@ -196,6 +206,10 @@ class NormalisedProblem:
     def restore(self, solution: Injection) -> Injection:
         """Return gains for the original coordinates."""
         return Injection(self.states @ solution.R @ self.measurements, solution.V @ self.measurements)
+
+    def restored_modes(self, modes: Modes) -> Modes:
+        """Return the modes of a closed loop in the original coordinates."""
+        return Modes(modes.values, np.asarray(self.states @ modes.vectors))
 
     def contracted(self, solution: Injection) -> Injection:
         """Return gains of the original coordinates in the normalised ones."""

@@ -116,15 +116,26 @@ def _units(work: DescriptorSystem) -> Iterator[Scaling]:
 
 def _equivalent(work: DescriptorSystem) -> tuple[Scaling, FloatArray, FloatArray]:
     """Return units in which ``[E; C]`` and T are well conditioned, or as well as can be had, with T and N in them."""
-    tried = []
+    tried, least = list[tuple[float, tuple[Scaling, FloatArray, FloatArray]]](), np.inf
     for scaling in _units(work):
+        if any(_are_same(scaling, known[0]) for _, known in tried):
+            continue
         e, c = scaling.scale_dynamics(work.E), scaling.scale_output(work.C)
+        condition = float(np.linalg.cond(np.vstack([e, c])))
+        if condition >= least:
+            continue  # whatever T is
         t, n = restricted_equivalent(e, c)
-        condition = max(float(np.linalg.cond(np.vstack([e, c]))), float(np.linalg.cond(t)))
+        condition = max(condition, float(np.linalg.cond(t)))
         tried.append((condition, (scaling, t, n)))
+        least = min(least, condition)
         if condition <= MOST_CONDITION:
             break
     return min(tried, key=lambda entry: entry[0])[1]
+
+
+def _are_same(one: Scaling, other: Scaling) -> bool:
+    pairs = (one.equations, other.equations), (one.states, other.states), (one.outputs, other.outputs)
+    return all(np.array_equal(*pair) for pair in pairs)
 
 
 def prepare(plant: DescriptorSystem, s: FloatArray | None = None, *, exactly: bool = True) -> PreparedPlant:
