@@ -19,14 +19,18 @@ STUB = Path(obsynth.methods.__file__).parent / "functions.pyi"
 HEAD = """\
 # Written by tests/unit/test_method_types.py from the classes of the methods.
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 from obsynth.analysis.transformations.recovery import Transformation
 from obsynth.methods.method import Method
 from obsynth.methods.registry import Plant
 from obsynth.results.design import ObserverDesign
 
-def design_function(method: type[Method]) -> Callable[..., ObserverDesign]: ...
+Made = TypeVar("Made", bound=ObserverDesign)
+
+def design_function(
+    method: type[Method], result: type[Made] = ..., *, positional: tuple[str, ...] = ...
+) -> Callable[..., Made]: ...
 """
 
 

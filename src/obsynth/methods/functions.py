@@ -5,30 +5,52 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import fields
 from inspect import Parameter, Signature, getdoc
-from typing import Any
+from typing import Any, TypeVar
 
+from obsynth.analysis.transformations.recovery import Transformation
+from obsynth.errors import SpecError
 from obsynth.methods.designing import design
 from obsynth.methods.method import Method
 from obsynth.methods.registry import method_class
 from obsynth.results.design import ObserverDesign
 
+Made = TypeVar("Made", bound=ObserverDesign)
 
-def design_function(method: type[Method]) -> Callable[..., ObserverDesign]:
+
+def design_function(
+    method: type[Method], result: type[Made] = ObserverDesign, *, positional: tuple[str, ...] = ()
+) -> Callable[..., Made]:
     """Return the function that designs by a method: the plant, and its options by name.
 
-    Signature and docstring are those of the class; some methods take a scenario besides.
+    Signature and docstring are those of the class; some methods take a scenario besides.  ``result``: the class of what
+    it returns; ``positional``: options that may be given without their names.
     """
 
-    def designed(plant: Any, **options: Any) -> ObserverDesign:
-        return design(plant, method.id, **options)
+    named, either = Parameter.KEYWORD_ONLY, Parameter.POSITIONAL_OR_KEYWORD
+    first = [Parameter(name, either, default=None) for name in ("plant", *positional)]
 
-    keyword = Parameter.KEYWORD_ONLY
-    options = [Parameter(o.name, keyword, default=o.default, annotation=o.type) for o in fields(method)]
+    def designed(plant: Any, *given: Any, **options: Any) -> Made:
+        own = plant.plant if isinstance(plant, Transformation) else plant
+        if method.over_scenario and options.get("scenario") and getattr(own, "uncertainty", None) is None:
+            raise SpecError(
+                "scenario is for plants whose constants have tolerances: it weighs what they do. State some "
+                "(obsynth.uncertain_system), or leave it out.",
+                path="scenario",
+            )
+        found = design(**Signature(first).bind(plant, *given).arguments, method=method.id, **options)
+        if isinstance(found, result):
+            return found
+        return result(**{part.name: getattr(found, part.name) for part in fields(found)})
+
+    options = [
+        Parameter(o.name, either if o.name in positional else named, default=o.default, annotation=o.type)
+        for o in fields(method)
+    ]
     if method.over_scenario:
-        options.append(Parameter("scenario", keyword, default=None, annotation="Scenario | None"))
-    options.append(Parameter("name", keyword, default="design", annotation="str"))
-    given = Parameter("plant", Parameter.POSITIONAL_OR_KEYWORD)
-    designed.__signature__ = Signature([given, *options], return_annotation="ObserverDesign")  # type: ignore[attr-defined]
+        options.append(Parameter("scenario", named, default=None, annotation="Scenario | None"))
+    options.append(Parameter("name", named, default="design", annotation="str"))
+    signature = Signature([Parameter("plant", either), *options], return_annotation=result.__name__)
+    designed.__signature__ = signature  # type: ignore[attr-defined]
     designed.__name__ = designed.__qualname__ = method.id.replace("-", "_")
     designed.__doc__ = getdoc(method)
     return designed

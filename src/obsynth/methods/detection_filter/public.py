@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-from inspect import signature
-from typing import Any
+from dataclasses import dataclass
 
-from obsynth.methods.designing import design
 from obsynth.methods.detection_filter.checks import TOGETHER
 from obsynth.methods.detection_filter.method import DetectionFilterMethod
 from obsynth.methods.functions import design_function
@@ -64,12 +61,4 @@ class DetectionFilter(ObserverDesign):
 DetectionFilter.__doc__ = (DetectionFilter.__doc__ or "") + (ObserverDesign.__doc__ or "").partition("\n")[2]
 
 
-def detection_filter(plant: Any, **options: Any) -> DetectionFilter:
-    """Design a detection filter; the docstring is that of the method."""
-    found = design(plant, DetectionFilterMethod.id, **options)
-    return DetectionFilter(**{field.name: getattr(found, field.name) for field in fields(found)})
-
-
-_like = design_function(DetectionFilterMethod)
-detection_filter.__doc__ = _like.__doc__
-detection_filter.__signature__ = signature(_like).replace(return_annotation="DetectionFilter")  # type: ignore[attr-defined]
+detection_filter = design_function(DetectionFilterMethod, DetectionFilter)

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from inspect import Parameter, getdoc, signature
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from obsynth.analysis.transformations.recovery import Transformation
 from obsynth.errors import SpecError
 from obsynth.extensions import extension
-from obsynth.methods.designing import design
 from obsynth.methods.functions import design_function
 from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
 from obsynth.methods.guaranteed_test.problem import Programmes, problem_as_designed, window_as_designed
@@ -315,27 +312,4 @@ class GuaranteedTest(ObserverDesign):
         return found
 
 
-def guaranteed_test(plant: Any, fault: str | None = None, **options: Any) -> GuaranteedTest:
-    """Design a guaranteed test; the docstring is that of the method."""
-    own = plant.plant if isinstance(plant, Transformation) else plant
-    if options.get("scenario") is not None and getattr(own, "uncertainty", None) is None:
-        raise SpecError(
-            "scenario is for plants whose constants have tolerances: it weighs what they do. State some "
-            "(obsynth.uncertain_system), or leave it out.",
-            path="scenario",
-        )
-    return GuaranteedTest.of(design(plant, GuaranteedTestMethod.id, fault=fault, **options))
-
-
-def _like_the_method() -> None:
-    given = signature(design_function(GuaranteedTestMethod))
-    order = [
-        part.replace(kind=Parameter.POSITIONAL_OR_KEYWORD) if part.name == "fault" else part
-        for part in given.parameters.values()
-    ]
-    changed = given.replace(parameters=order, return_annotation="GuaranteedTest")
-    guaranteed_test.__signature__ = changed  # type: ignore[attr-defined]
-    guaranteed_test.__doc__ = getdoc(GuaranteedTestMethod)
-
-
-_like_the_method()
+guaranteed_test = design_function(GuaranteedTestMethod, GuaranteedTest, positional=("fault",))
