@@ -153,9 +153,14 @@ class Method(ABC):
         raise SpecError(f"Gains of {cls.id} are not read: design it instead.", path="method")
 
     @classmethod
-    @abstractmethod
     def checks(cls, design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
-        """Yield a row for each claim, from the plant and the shipped realisation alone."""
+        """Yield a row for each claim, from the plant and the shipped realisation alone.
+
+        By default what the function ``checks(design, printed_digits)`` of the module ``checks`` beside the class does.
+        """
+        package = cls.__module__.rpartition(".")[0]
+        found: Iterator[Check] = import_module(f"{package}.checks").checks(design, printed_digits)
+        return found
 
     @classmethod
     def has_error_model(cls, design: ObserverDesign) -> bool:

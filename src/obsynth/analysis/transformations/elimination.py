@@ -98,16 +98,12 @@ def eliminated_by_sparsity(plant: DescriptorSystem) -> Transformation:
     found = reduced_by_sparsity(part)
     if found is None:
         raise not_index_one(plant, active)
-    new = with_states(part, found.names, E=None, **found.matrices)
-    recovery = StateRecovery.from_operator(part.state_names, found.operator, np.eye(plant.nw), state_point(part))
-    return Transformation(
-        plant,
-        new,
-        _description(part, len(found.names), active.dropped),
-        recovery,
-        active.dropped,
-        tuple(filter(None, (active.note(), found.note()))),
-        found.bounds,
+    return replace(
+        found,
+        source=plant,
+        description=_description(part, found.plant.nx, active.dropped),
+        dropped=active.dropped,
+        notes=tuple(filter(None, (active.note(), *found.notes))),
     )
 
 

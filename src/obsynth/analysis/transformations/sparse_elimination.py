@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,6 +12,7 @@ from obsynth.analysis.transformations.idle_variables import (
     equation_name,
     own_first,
 )
+from obsynth.analysis.transformations.recovery import StateRecovery, Transformation, state_point, with_states
 from obsynth.analysis.transformations.recovery_operator import RecoveryOperator, without_rounding
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import FloatArray
@@ -25,29 +25,11 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.validation import listed
 
 
-@dataclass(frozen=True, eq=False)
-class SparseReduction:
-    """A plant without its algebraic states: its matrices, and how the others follow from the states that are left."""
+def reduced_by_sparsity(plant: DescriptorSystem) -> Transformation | None:
+    """Solve the algebraic equations of a plant with sparse factors; ``None`` where it does not have index 1.
 
-    matrices: dict[str, FloatArray]  # ``A, B, Bf, Bd, Bw, C, D, Df, Dd, Dw``
-    names: tuple[str, ...]  # of the states
-    operator: RecoveryOperator
-    bounds: SolutionBounds  # how well the algebraic equations were solved
-    neglected: tuple[str, ...]  # states whose derivative was taken as zero
-
-    def note(self) -> str:
-        """Return one sentence about derivatives that were taken as zero; empty where there are none."""
-        if not self.neglected:
-            return ""
-        states = listed([repr(name) for name in self.neglected])
-        return (
-            f"Taken as algebraic, since the coefficients of their derivatives in E are less than {RANK_TOLERANCE:g} of "
-            f"the largest in suitable units: {states}. Give E zeros there, or larger entries."
-        )
-
-
-def reduced_by_sparsity(plant: DescriptorSystem) -> SparseReduction | None:
-    """Solve the algebraic equations of a plant with sparse factors; ``None`` where it does not have index 1."""
+    A note names states whose derivatives were taken as zero.
+    """
     (dynamic_rows, algebraic_rows, dynamic, algebraic), names, neglected = split_by_derivatives(plant)
     count = dynamic.shape[1]
     if count == 0:
@@ -77,8 +59,15 @@ def reduced_by_sparsity(plant: DescriptorSystem) -> SparseReduction | None:
     matrices = dict(zip(("A", "B", "Bf", "Bd", "Bw"), np.split(moved, ends, axis=1), strict=True))
     matrices |= dict(zip(("C", "D", "Df", "Dd", "Dw"), np.split(shown, ends, axis=1), strict=True))
     operator = RecoveryOperator(dynamic, algebraic, inner, right, counts)
+    recovery = StateRecovery.from_operator(plant.state_names, operator, np.eye(plant.nw), state_point(plant))
     bounds = SolutionBounds(max(factor.condition, mass.condition), max(backward, backward_of_e))
-    return SparseReduction(matrices, names, operator, bounds, neglected)
+    notes = (
+        f"Taken as algebraic, since the coefficients of their derivatives in E are less than {RANK_TOLERANCE:g} of the "
+        f"largest in suitable units: {listed([repr(name) for name in neglected])}. Give E zeros there, or larger "
+        "entries.",
+    )
+    reduced = with_states(plant, names, E=None, **matrices)
+    return Transformation(plant, reduced, "", recovery, notes=notes if neglected else (), bounds=bounds)
 
 
 def split_by_derivatives(

@@ -12,8 +12,6 @@ from obsynth.numerics.arguments import Count, ForgettingFactor, Positive, Probab
 from obsynth.observers.dae.settings import Guard, Weight
 from obsynth.observers.outliers import Outliers
 from obsynth.plants.dae.model import DAEModel
-from obsynth.results.checks import Check
-from obsynth.results.design import ObserverDesign
 
 FormChoice: TypeAlias = Literal["forgetting", "random-walk", "augmented-kalman", "auto"]
 IntegrationChoice: TypeAlias = Literal["backward-euler", "radau", "auto"]
@@ -160,10 +158,3 @@ class DaeAdaptiveObserver(Method):
         from obsynth.methods.dae_adaptive_observer.conditions import dae_conditions
 
         return tuple(dae_conditions(plant, 1.0 if self.dt is None else self.dt))
-
-    @classmethod
-    def checks(cls, design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
-        """Yield a row for each claim, from the plant and the shipped realisation alone."""
-        from obsynth.methods.dae_adaptive_observer.checks import checks
-
-        return checks(design, printed_digits)

@@ -12,7 +12,6 @@ from obsynth.analysis.conditions import Condition
 from obsynth.methods.method import ClaimMeaning, Method, PlantKind
 from obsynth.numerics.arguments import WrittenAs, is_finite_number
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.results.checks import Check
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.claims import STATED_BY_SEARCH
 from obsynth.verification.error_system import ErrorModel
@@ -98,13 +97,6 @@ class DetectionFilterMethod(Method):
         from obsynth.methods.detection_filter.conditions import conditions
 
         return conditions(plant)
-
-    @classmethod
-    def checks(cls, design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
-        """Yield a row for each claim, from the plant and the shipped realisation alone."""
-        from obsynth.methods.detection_filter.checks import checks
-
-        return checks(design, printed_digits)
 
     @classmethod
     def error_model(cls, design: ObserverDesign) -> ErrorModel:

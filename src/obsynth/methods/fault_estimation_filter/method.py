@@ -22,7 +22,6 @@ from obsynth.methods.own_terms import (
 )
 from obsynth.numerics.arguments import FewSamples, OpenUnitInterval, Positive, WrittenAs, shown
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.results.checks import Check
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.error_system import ErrorModel
 
@@ -199,13 +198,6 @@ class FaultEstimationFilter(Method):
                 "gamma is needed: the plant has disturbances, and a gain set claims a bound on them.", path="gamma"
             )
         return synthesis_from_gains(plant, T=T, N=N, L=L, W=W, gamma=gamma, indexes=indexes)
-
-    @classmethod
-    def checks(cls, design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
-        """Yield a row for each claim, from the plant and the shipped realisation alone."""
-        from obsynth.methods.fault_estimation_filter.checks import checks
-
-        return checks(design, printed_digits)
 
     @classmethod
     def error_model(cls, design: ObserverDesign) -> ErrorModel | None:

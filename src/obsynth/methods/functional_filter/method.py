@@ -15,7 +15,6 @@ from obsynth.methods.method import OPTIONS_PATH, ClaimMeaning, Method, PlantKind
 from obsynth.numerics.arguments import FewSamples, NonNegative, WrittenAs, is_finite_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.results.checks import Check
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.error_system import ErrorModel
 
@@ -159,13 +158,6 @@ class FunctionalFilter(Method):
         if self.faults is None or isinstance(self.faults, str):
             return self
         return replace(self, faults=[name for name in self.faults if name in plant.fault_names])
-
-    @classmethod
-    def checks(cls, design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
-        """Yield a row for each claim, from the plant and the shipped realisation alone."""
-        from obsynth.methods.functional_filter.checks import checks
-
-        return checks(design, printed_digits)
 
     @classmethod
     def error_model(cls, design: ObserverDesign) -> ErrorModel:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from flint import arb, arb_mat, ctx, fmpq, fmpq_mat
@@ -37,56 +37,52 @@ RADIUS_ROOM = 8.0
 _MANTISSA = 53
 
 
-@dataclass(frozen=True, eq=False)
-class Whole:
-    """Doubles as whole numbers times one power of two: exact."""
+#: Doubles as whole numbers of Python times one power of two, of which this is the exponent: exact.
+Whole: TypeAlias = tuple[np.ndarray, int]
 
-    values: np.ndarray  # of Python's whole numbers
-    exponent: int
 
-    @classmethod
-    def of(cls, doubles: FloatArray) -> Whole:
-        """Return doubles exactly."""
-        parts, exponents = np.frexp(doubles)
-        least = int(np.min(exponents, initial=0, where=doubles != 0.0)) - _MANTISSA
-        whole = np.ldexp(parts, _MANTISSA).astype(np.int64).tolist()
-        shifts = np.where(doubles != 0.0, exponents - _MANTISSA - least, 0).tolist()
-        found = np.empty(len(whole), dtype=object)
-        found[:] = [value << shift for value, shift in zip(whole, shifts, strict=True)]
-        return cls(found, least)
+def _whole(doubles: FloatArray) -> Whole:
+    """Return doubles exactly."""
+    parts, exponents = np.frexp(doubles)
+    least = int(np.min(exponents, initial=0, where=doubles != 0.0)) - _MANTISSA
+    whole = np.ldexp(parts, _MANTISSA).astype(np.int64).tolist()
+    shifts = np.where(doubles != 0.0, exponents - _MANTISSA - least, 0).tolist()
+    found = np.empty(len(whole), dtype=object)
+    found[:] = [value << shift for value, shift in zip(whole, shifts, strict=True)]
+    return found, least
 
 
 def _entries(window: Window) -> Whole:
     """Return the entries of the matrix exactly."""
-    found = Whole.of(window.value)
-    return Whole(found.values * np.array(window.times.tolist(), dtype=object), found.exponent)
+    values, exponent = _whole(window.value)
+    return values * np.array(window.times.tolist(), dtype=object), exponent
 
 
-def _sums(entries: Whole, factors: Whole, places: np.ndarray, onto: np.ndarray, count: int) -> list[Fraction]:
-    """Return exact sums of entries times factors."""
+def _sums(entries: Whole, doubles: FloatArray, places: np.ndarray, onto: np.ndarray, count: int) -> list[Fraction]:
+    """Return exact sums of entries times doubles."""
+    (values, exponent), (factors, more) = entries, _whole(doubles)
     totals = [0] * count
-    for there, product in zip(onto.tolist(), (entries.values * factors.values[places]).tolist(), strict=True):
+    for there, product in zip(onto.tolist(), (values * factors[places]).tolist(), strict=True):
         totals[there] += product
-    exponent = entries.exponent + factors.exponent
-    one = Fraction(2) ** exponent
+    one = Fraction(2) ** (exponent + more)
     return [value * one for value in totals]
 
 
 def columns_of(window: Window, multipliers: FloatArray) -> list[Fraction]:
     """Return the matrix transposed times multipliers, exactly ``(columns,)``."""
-    return _sums(_entries(window), Whole.of(multipliers), window.i, window.j, len(window.bar))
+    return _sums(_entries(window), multipliers, window.i, window.j, len(window.bar))
 
 
 def rows_of(window: Window, point: FloatArray) -> list[Fraction]:
     """Return the matrix times a point, exactly ``(rows,)``."""
-    return _sums(_entries(window), Whole.of(point), window.j, window.i, window.rows)
+    return _sums(_entries(window), point, window.j, window.i, window.rows)
 
 
 def columns_of_exact(window: Window, multipliers: Sequence[Fraction]) -> list[Fraction]:
     """Return the matrix transposed times multipliers that are fractions, exactly ``(columns,)``."""
-    entries, found = _entries(window), [Fraction(0)] * len(window.bar)
-    one = Fraction(2) ** entries.exponent
-    for row, column, entry in zip(window.i.tolist(), window.j.tolist(), entries.values.tolist(), strict=True):
+    (values, exponent), found = _entries(window), [Fraction(0)] * len(window.bar)
+    one = Fraction(2) ** exponent
+    for row, column, entry in zip(window.i.tolist(), window.j.tolist(), values.tolist(), strict=True):
         if multipliers[row]:
             found[column] += multipliers[row] * entry
     return [value * one for value in found]
@@ -248,13 +244,6 @@ class Repaired:
         return Repaired(self.values, np.where(chosen, RADIUS_ROOM * self.radius + floor, 0.0))
 
 
-def _multiplier_system(window: Window, *, exact_zero: bool) -> tuple[np.ndarray, list[int]]:
-    """Return the columns whose products with multipliers are told: 0, or 1 for that of theta."""
-    told = np.ones(len(window.bar), dtype=bool) if exact_zero else window.free.copy()
-    told[0] = True
-    return told, np.flatnonzero(told).tolist()
-
-
 def repaired_multipliers(
     window: Window, multipliers: FloatArray, *, refine: bool, exact_zero: bool = False, among: FloatArray | None = None
 ) -> Repaired | None:
@@ -268,7 +257,8 @@ def repaired_multipliers(
         found = condensed.multipliers(multipliers, refine=refine, among=among)
         if found is not None:
             return Repaired(*found)
-    _, told = _multiplier_system(window, exact_zero=exact_zero)
+    # The columns whose products with multipliers are told: 0, or 1 for that of theta.
+    told = [0, *(range(1, len(window.bar)) if exact_zero else np.flatnonzero(window.free).tolist())]
     wanted = [Fraction(int(column == 0)) for column in told]
 
     def missing(values: FloatArray) -> list[Fraction]:
@@ -392,10 +382,13 @@ def _rational_step(
     rows = np.sort(by_row[:rank])
     _, by_column = qr(scaled[rows], mode="r", pivoting=True)
     columns = np.sort(by_column[:rank])
-    part = fmpq_mat(rank, rank, [_rational(float(value)) for value in matrix[np.ix_(rows, columns)].ravel()])
+    part = fmpq_mat(
+        rank, rank, [fmpq(*float(value).as_integer_ratio()) for value in matrix[np.ix_(rows, columns)].ravel()]
+    )
     right = fmpq_mat(rank, 1, [fmpq(exact[row].numerator, exact[row].denominator) for row in rows])
     try:
-        step = _solved(part, right) if rank else right
+        # By lifting: the numbers of the solution are long.
+        step = part.solve(right, algorithm="dixon") if rank else right
     except ZeroDivisionError:
         return None
     correction = [Fraction(int(step[k, 0].p), int(step[k, 0].q)) for k in range(rank)]
@@ -407,15 +400,6 @@ def _rational_step(
         if seen != exact[row]:
             return None
     return columns.tolist(), correction
-
-
-def _solved(part: Any, right: Any) -> Any:
-    """Return the solution of a square system, by lifting: the numbers of its solution are long."""
-    return part.solve(right, algorithm="dixon")
-
-
-def _rational(value: float) -> fmpq:
-    return fmpq(*value.as_integer_ratio())
 
 
 def proved_threshold(window: Window, repaired: Repaired, *, exact_zero: bool = False) -> float:
@@ -441,8 +425,8 @@ def sum_in_ellipsoids(window: Window, parts: Sequence[Fraction], more: float = 0
 
 def _absolute(window: Window, radius: FloatArray) -> list[Fraction]:
     """Return |matrix| transposed times non-negative numbers, exactly."""
-    entries = _entries(window)
-    return _sums(Whole(abs(entries.values), entries.exponent), Whole.of(radius), window.i, window.j, len(window.bar))
+    values, exponent = _entries(window)
+    return _sums((abs(values), exponent), radius, window.i, window.j, len(window.bar))
 
 
 def proved_least(window: Window, repaired: Repaired) -> float:

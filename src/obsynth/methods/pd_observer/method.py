@@ -15,7 +15,6 @@ from obsynth.methods.own_terms import OwnConstraints, OwnRegion, SolverName, Sol
 from obsynth.numerics.arguments import NonNegative, Positive, WrittenAs, shown
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.results.checks import Check
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.error_system import ErrorModel
 
@@ -234,13 +233,6 @@ class PdObserver(Method):
 
         gains = {"J": J, "L": L, "M": M, "N": N}
         return synthesis_from_gains(plant, gains=gains, adaptation_gain=adaptation_gain, decay=decay)
-
-    @classmethod
-    def checks(cls, design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
-        """Yield a row for each claim, from the plant and the shipped realisation alone."""
-        from obsynth.methods.pd_observer.checks import checks
-
-        return checks(design, printed_digits)
 
     @classmethod
     def error_model(cls, design: ObserverDesign) -> ErrorModel:

@@ -16,7 +16,6 @@ from obsynth.numerics.arguments import NonNegative, Positive, WrittenAs, problem
 from obsynth.numerics.spectra import decay_rates
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.fault_models import Exosystem, exosystem
-from obsynth.results.checks import Check
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.claims import STATED_BY_SEARCH
 from obsynth.verification.error_system import ErrorModel
@@ -250,13 +249,6 @@ class UiPiObserver(Method):
         from obsynth.methods.ui_pi_observer.assembly import synthesis_from_gains
 
         return synthesis_from_gains(plant, U=U, D=D, K=K, F=F, fault_model=fault_model)
-
-    @classmethod
-    def checks(cls, design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
-        """Yield a row for each claim, from the plant and the shipped realisation alone."""
-        from obsynth.methods.ui_pi_observer.checks import checks
-
-        return checks(design, printed_digits)
 
     @classmethod
     def error_model(cls, design: ObserverDesign) -> ErrorModel | None:
