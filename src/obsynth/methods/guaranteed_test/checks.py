@@ -171,6 +171,21 @@ def _worst(value: float) -> float:
     return np.inf if np.isnan(value) else float(value)
 
 
+def _judged(
+    window: Window, test: Repaired, shipped: Mapping[str, FloatArray], k: int, *, constant: bool
+) -> tuple[float, float, float, float]:
+    """Return of one test how far exact multipliers are away beside what is shipped, by what the threshold that is
+    proved passes its own, the threshold itself, and the rounding error beside the shipped one."""
+    claimed = float(shipped["thresholds"][k, 0])
+    zero = claimed == 0.0
+    exact = repaired_multipliers(window, test.values, refine=False, exact_zero=zero, among=test.radius)
+    found = proved_threshold(window, test, exact_zero=zero)
+    over = 0.0 if found <= claimed else found / claimed if claimed > 0.0 else np.inf
+    sizes = rounding_of(window, test.values, test.radius)
+    share = sizes / np.maximum(shipped["rounding"][k], np.finfo(float).tiny)
+    return excess(exact, test.radius), over, found if constant else claimed, float(np.max(share, initial=0.0))
+
+
 def _of_the_tests(
     design: ObserverDesign,
     shipped: Mapping[str, FloatArray],
@@ -180,18 +195,8 @@ def _of_the_tests(
     constant: bool,
 ) -> Iterator[Check]:
     claims, each = design.certificate.claims, "" if constant else "at each row "
-    away, over, largest, rounding = 0.0, 0.0, 0.0, 0.0
-    for k, test in tests.items():
-        window, claimed = programmes.windows[k], float(shipped["thresholds"][k, 0])
-        zero = claimed == 0.0
-        exact = repaired_multipliers(window, test.values, refine=False, exact_zero=zero, among=test.radius)
-        found = proved_threshold(window, test, exact_zero=zero)
-        away = max(away, _worst(excess(exact, test.radius)))
-        over = max(over, 0.0 if found <= claimed else _worst(found / claimed if claimed > 0.0 else np.inf))
-        largest = max(largest, _worst(found if constant else claimed))
-        sizes = rounding_of(window, test.values, test.radius)
-        share = sizes / np.maximum(shipped["rounding"][k], np.finfo(float).tiny)
-        rounding = max(rounding, _worst(float(np.max(share, initial=0.0))))
+    judged = [_judged(programmes.windows[k], test, shipped, k, constant=constant) for k, test in tests.items()]
+    away, over, largest, rounding = (max(map(_worst, worst)) for worst in zip(*judged, strict=True))
     yield upper_bound_check(
         "multipliers",
         f"{each}exact multipliers that weigh the fault with one and every free signal with zero lie within the shipped "
@@ -327,6 +332,20 @@ def _misfit(shipped: object, implied: Any, rooms: Mapping[str, FloatArray]) -> f
     return worst
 
 
+def _proved_witness(
+    window: Window, shipped: Mapping[str, FloatArray], k: int, *, constant: bool
+) -> tuple[float, float]:
+    """Return how far an exact point is away beside what is shipped, and the size that the witness proves; NaN for
+    less than what is shipped as the row's own.  Of a test alone the claim itself is below."""
+    columns, size = len(window.bar), float(shipped["leasts"][k, 0])
+    if "witness" not in shipped or shipped["witness"].shape[1] < columns:
+        return np.nan, np.nan
+    witness = Repaired(shipped["witness"][k][:columns], shipped["witness_radius"][k][:columns])
+    exact = repaired_point(window, witness.values, refine=False, among=witness.radius)
+    found = proved_least(window, witness)
+    return excess(exact, witness.radius), found if constant or found >= size else np.nan
+
+
 def _of_the_least(
     design: ObserverDesign,
     shipped: Mapping[str, FloatArray],
@@ -340,32 +359,19 @@ def _of_the_least(
     threshold, least = float(claims.get("threshold", np.nan)), claims.get("least")
     if least is None:
         return
-    best, away = 0.0, 0.0
-    for k in used:
-        window, size = programmes.windows[k], float(shipped["leasts"][k, 0])
-        if np.isnan(size) or size == 0.0:
-            continue
-        columns = len(window.bar)
-        if "witness" not in shipped or not problem.continues(window, programmes.first[k]):
-            best = np.nan
-            break
-        witness = Repaired(shipped["witness"][k][:columns], shipped["witness_radius"][k][:columns])
-        if len(witness.values) != columns:
-            best = away = np.nan
-            break
-        exact = repaired_point(window, witness.values, refine=False, among=witness.radius)
-        away = max(away, _worst(excess(exact, witness.radius)))
-        found = proved_least(window, witness)
-        # Of a test alone the claim itself is below.
-        best = max(best, found) if constant or found >= size else np.nan
-        if np.isnan(best):
-            break
+    # Where the least is zero there is nothing to show.
+    shown = [k for k in used if not np.isnan(shipped["leasts"][k, 0]) and shipped["leasts"][k, 0] != 0.0]
+    proofs = [_proved_witness(programmes.windows[k], shipped, k, constant=constant) for k in shown]
+    away = max((_worst(one) for one, _ in proofs), default=0.0)
+    sizes = [size for _, size in proofs]
+    going_on = all(problem.continues(programmes.windows[k], programmes.first[k]) for k in shown)
+    best = np.nan if not going_on or np.isnan(sizes).any() else max(sizes, default=0.0)
     if away != 0.0:
         yield upper_bound_check(
             "witness",
             "a course of the fault that satisfies every equation exactly lies within the shipped distance of the "
             f"shipped one{'' if constant else ', at each row that has one'}",
-            _worst(away),
+            away,
             1.0,
             source=SOURCE,
             kind="proved",
