@@ -382,9 +382,8 @@ def _rational_step(
     rows = np.sort(by_row[:rank])
     _, by_column = qr(scaled[rows], mode="r", pivoting=True)
     columns = np.sort(by_column[:rank])
-    part = fmpq_mat(
-        rank, rank, [fmpq(*float(value).as_integer_ratio()) for value in matrix[np.ix_(rows, columns)].ravel()]
-    )
+    entries = matrix[np.ix_(rows, columns)].ravel().tolist()
+    part: Any = fmpq_mat(rank, rank, [fmpq(*value.as_integer_ratio()) for value in entries])
     right = fmpq_mat(rank, 1, [fmpq(exact[row].numerator, exact[row].denominator) for row in rows])
     try:
         # By lifting: the numbers of the solution are long.
