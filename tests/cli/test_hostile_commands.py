@@ -186,6 +186,7 @@ def heeds_signals() -> None:
         signal.signal(getattr(signal, name), signal.SIG_DFL)
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP", "SIGINT"])
 def test_a_stream_saves_its_state_when_it_is_ended(name, monkeypatch, capsys):
     assert main([*RUN, "whole.csv"]) == 0

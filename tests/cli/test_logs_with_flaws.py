@@ -178,6 +178,7 @@ def dirty(folder: Path) -> dict[str, Path]:
     return found
 
 
+@pytest.mark.one_in(3)
 def test_pictures_and_pages_show_all_flaws_at_once(
     folder: Path, dirty: dict[str, Path], tmp_path: Path, kind: str
 ) -> None:
@@ -198,6 +199,7 @@ def test_a_stream_with_all_flaws_at_once_is_the_file_row_by_row(
     assert (tmp_path / "stream.csv").read_text() == (tmp_path / "file.csv").read_text()
 
 
+@pytest.mark.one_in(3)
 def test_comparisons_and_calibrations_take_all_flaws_at_once(
     folder: Path, dirty: dict[str, Path], tmp_path: Path, kind: str
 ) -> None:

@@ -96,7 +96,7 @@ def test_names_of_one_notebook_are_gone_in_the_next(kernel: KernelManager, tmp_p
     assert (cell.execution_count, cell.outputs[0].text) == (1, "False False\n")
 
 
-@pytest.mark.one_in(5)
+@pytest.mark.one_in(9)
 @EACH
 def test_it_runs_from_scratch(source: Path, kernel: KernelManager, tmp_path: Path) -> None:
     """In a copy of the two folders it may use, so that nothing else is needed and nothing is written here."""

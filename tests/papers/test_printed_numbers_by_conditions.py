@@ -77,6 +77,7 @@ def test_the_printed_gains_are_no_solution_with_the_safe_scale():
     assert found.problem.status == "infeasible"
 
 
+@pytest.mark.one_in(2)
 @SOLVERS
 def test_the_gains_of_share_pasand(solver, settings):
     plant, expected = paper("sharepasand")

@@ -120,6 +120,7 @@ def test_the_errors_are_as_large_as_stated() -> None:
     assert lag == pytest.approx(-np.exp(-1.0), abs=0.03)
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("statistic", ["chi-square", "cusum", "glr", "nis"])
 def test_the_loss_is_noticed(statistic: str) -> None:
     for seed in range(3):

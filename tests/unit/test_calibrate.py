@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import cache
 
 import numpy as np
 import pytest
@@ -90,6 +91,7 @@ def test_a_leak_that_never_opened_has_an_open_box_or_holds_zero(measured):
     assert abs(found.nominal["leak"]) < np.sqrt(found.covariance[0, 0])
 
 
+@cache
 def first_order() -> DAEModel:
     return DAEModel(
         {"balance": "T * der(x) = k * g * u - x", "sensor": "seen = c * x"}, {"y": "seen"},

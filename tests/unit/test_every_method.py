@@ -244,6 +244,7 @@ def test_a_claim_that_the_method_does_not_know_fails(method: str) -> None:
     assert not obsynth.verify(design.replace(certificate=replace(design.certificate, claims=claims))).passed
 
 
+@pytest.mark.one_in(2)
 @EACH
 def test_c_says_what_python_says(method: str, tmp_path: Path) -> None:
     """The exported source, compiled with warnings as errors; a recursive design as its steady state."""

@@ -117,6 +117,7 @@ def page_of(design, tmp_path, **more) -> tuple[str, Page]:
     return text, Page(text)
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("which", ["network", "continuous", "recursive"])
 def test_the_page_needs_nothing_else(request, tmp_path, which):
     text, page = page_of(request.getfixturevalue(which), tmp_path)

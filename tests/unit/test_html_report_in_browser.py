@@ -91,6 +91,7 @@ def page(request, tmp_path_factory) -> Path:
     return html_report(design, tmp_path_factory.mktemp("page") / f"{request.param}.html", gains_file="gains.json")
 
 
+@pytest.mark.one_in(3)
 @needs_browser
 def test_the_page_renders_and_nothing_sticks_out(page: Path, tmp_path: Path) -> None:
     for width, found in measured(page, tmp_path).items():
@@ -134,6 +135,7 @@ def test_a_wide_matrix_scrolls_in_its_own_box_and_a_failure_is_red(tmp_path: Pat
         assert found["ink"] == "rgb(168, 13, 38)"
 
 
+@pytest.mark.one_in(3)
 @needs_browser
 def test_the_page_prints(page: Path, tmp_path: Path) -> None:
     file = tmp_path / "page.pdf"

@@ -232,6 +232,7 @@ def test_a_run_to_a_file_holds_no_table(design, frame, tmp_path):
         plot_data(obsynth.run_on_data(design, frame, tmp_path / "out.csv"))
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("suffix", [".png", ".svg", ".pdf"])
 def test_the_command_draws_a_file(design, frame, tmp_path, monkeypatch, capsys, suffix):
     monkeypatch.chdir(tmp_path)

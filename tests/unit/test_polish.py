@@ -52,6 +52,7 @@ def test_where_a_bound_is_reached_the_record_says_that_there_is_nothing_to_polis
     assert "lower bound" not in str(filtering(nd=1).solver["runs"])
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize(("factor", "engine"), [(1.01, "riccati"), (1.0 + 5e-5, "lmi")])
 def test_a_gamma_next_to_the_least_calls_the_inequality(factor: float, engine: str) -> None:
     least = filtering(nd=9).certificate.claims["gamma_min"]

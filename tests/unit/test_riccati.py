@@ -226,6 +226,7 @@ def slow_and_fast(level):
     return a, h, process, weight, solve_discrete_are(a.T, h.T, process, weight)
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("spread", [0.0, 12.0])
 @pytest.mark.parametrize("level", [np.inf, 3000.0])
 def test_an_equation_of_slow_and_fast_states_is_solved_in_fewer_of_them(spread, level):
@@ -240,6 +241,7 @@ def test_an_equation_of_slow_and_fast_states_is_solved_in_fewer_of_them(spread, 
     assert np.max(np.abs(found * np.outer(units, units) - expected) / np.outer(sizes, sizes)) <= 1e-8
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("rows", [2, 60, 130, 230])
 def test_many_states_with_few_or_many_measurements(rows):
     # Up to 0.7 n rows the first doublings are done with these; from there on with the matrix they make.
@@ -253,6 +255,7 @@ def test_many_states_with_few_or_many_measurements(rows):
     assert np.linalg.norm(found - expected) <= 1e-9 * np.linalg.norm(expected)
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("inputs", [2, 40])
 def test_levels_of_many_states_are_told_from_either_side(inputs):
     rng, n = np.random.default_rng(inputs), 210

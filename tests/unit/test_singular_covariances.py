@@ -35,6 +35,7 @@ def sampled(A, C, **fields) -> DescriptorSystem:
     return DescriptorSystem(None, A, C=C, dt=1.0, **fields)
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("name", CASES)
 def test_singular_covariances_are_verified(name: str) -> None:
