@@ -204,8 +204,8 @@ def _on_grid(
     rows: tuple[int, int],
     source: str,
 ) -> Log:
-    """Return the log on its grid; missing rows become rows without outputs whose inputs are those before, as runs hold
-    them.  Rows whose stamps do not rise are left out, and inputs that are missing are held."""
+    """Return the log on its grid; missing rows become rows without outputs whose inputs are those before.
+    Rows whose stamps do not rise are left out, and inputs that are missing are held."""
     notes = []
     stale = np.isfinite(time) & (time <= np.maximum.accumulate(np.concatenate([[-np.inf], time[:-1]])))
     if stale.any() and not _longest(stale) > MOST_STALE:
