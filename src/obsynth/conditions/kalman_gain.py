@@ -25,10 +25,10 @@ from obsynth.analysis.transformations.recovery import Transformation, linear_pla
 from obsynth.conditions import atoms
 from obsynth.conditions.problem import Conditions, Values, require_data
 from obsynth.errors import ObsynthError, SpecError, VerificationError
-from obsynth.methods.descriptor_kalman.unknown_inputs import kalman_conditions, without_unknown_inputs
 from obsynth.methods.functions import descriptor_kalman
 from obsynth.methods.recursive.steady_filter import steady_state_filter
-from obsynth.methods.recursive.synthesis_parts import with_stated_noise
+from obsynth.methods.recursive.synthesis import with_stated_noise
+from obsynth.methods.recursive.unknown_inputs import kalman_conditions, without_unknown_inputs
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.numerics.norms import output_covariance
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, covariance_factor

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar
 
 from obsynth.analysis.conditions import Condition
-from obsynth.methods.method import ClaimMeaning, Method, PlantKind, Purpose
+from obsynth.methods.method import ClaimMeaning, Method, PlantKind, Purpose, Synthesis
 from obsynth.methods.recursive import RECURSIVE_CLAIMS
 from obsynth.numerics.arguments import Positive, WrittenAs
 from obsynth.observers.outliers import Outliers
@@ -112,9 +112,17 @@ class DescriptorKalman(Method):
         self, plant: DescriptorSystem | TimeVaryingDescriptorSystem, *, exactly: bool = True
     ) -> tuple[Condition, ...]:
         """Return the existence conditions; the list ends at the first failure."""
-        from obsynth.methods.descriptor_kalman.unknown_inputs import kalman_conditions
+        from obsynth.methods.recursive.unknown_inputs import kalman_conditions
 
         return kalman_conditions(plant, early=self.early_constraints)
+
+    def synthesise(
+        self, plant: DescriptorSystem | TimeVaryingDescriptorSystem, *, progress: Callable[[str], None]
+    ) -> Synthesis:
+        """Return gains, observer and certificate, not yet verified."""
+        from obsynth.methods.recursive.synthesis import synthesise
+
+        return synthesise(plant, self, progress=progress)
 
     @classmethod
     def checks(cls, design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:

@@ -1,19 +1,25 @@
-"""What the recursive methods have in common: noise that the plant states, gains to read, claims, notes."""
+"""The recursive methods put together: noise that the plant states, gains to read, claims, notes.
+
+Nikoukhah, Willsky, Levy, IEEE TAC 37 (9), 1992; A. Moussa Ali, Q. Zhang, IFAC ALCOSP 2013, (18).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from obsynth.analysis.conditions import require_all
 from obsynth.analysis.plant_units import PlantUnits
-from obsynth.analysis.time_varying import WARN_MARKOV_CONDITION, HorizonRanks, horizon_ranks
+from obsynth.analysis.time_varying import WARN_MARKOV_CONDITION, HorizonRanks, as_time_varying, horizon_ranks
 from obsynth.analysis.zeros import leading_names
 from obsynth.errors import PreconditionError, SpecError
-from obsynth.methods.method import Synthesis
+from obsynth.methods.method import Method, Synthesis
 from obsynth.methods.recursive.conditions import detectability_condition
 from obsynth.methods.recursive.steady_filter import reached_condition
+from obsynth.methods.recursive.unknown_inputs import without_unknown_inputs
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import covariance_factor
 from obsynth.observers.recursive.gain_schedule_summary import (
@@ -50,7 +56,30 @@ def with_stated_noise(
     return resolved
 
 
-def recursive_synthesis(plant: TimeVaryingDescriptorSystem, options: Mapping[str, Any]) -> Synthesis:
+def synthesise(
+    plant: DescriptorSystem | TimeVaryingDescriptorSystem, asked: Method, *, progress: Callable[[str], None]
+) -> Synthesis:
+    """Put the observer together; see `obsynth.descriptor_kalman` and `obsynth.adaptive_observer`."""
+    progress("checking the existence conditions along the horizon")
+    require_all(asked.existence(plant))
+    options = with_stated_noise(plant, asked.as_given())
+    if options.get("guard", "") is None:
+        options["guard"] = "none" if options["form"] == "literal" else "regularise"
+    progress("computing the gains")
+    if not isinstance(plant, DescriptorSystem) or not plant.nd:
+        return _of_varying(as_time_varying(plant), options)
+    reduced = without_unknown_inputs(plant)
+    options |= {
+        "initial_state": reduced.initial_state(options["initial_state"]),
+        "initial_covariance": reduced.initial_covariance(options["initial_covariance"]),
+    }
+    if options["Q"] is not None:
+        options["Q"] = reduced.process_covariance(options["Q"])
+    found = _of_varying(reduced.plant, options)
+    return replace(found, notes=(reduced.note, *found.notes))
+
+
+def _of_varying(plant: TimeVaryingDescriptorSystem, options: Mapping[str, Any]) -> Synthesis:
     """Return observer, gains, claims and notes."""
     observer = observer_from_options(plant, options)
     ranks = horizon_ranks(plant, early=observer.early_constraints)
