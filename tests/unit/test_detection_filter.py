@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import obsynth
-from obsynth.methods.detection_filter.transfers import missed
+from obsynth.methods.detection_filter.norm_proofs import missed
 from obsynth.numerics.continuous import continuous_hinf_norm
 
 

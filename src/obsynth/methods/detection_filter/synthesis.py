@@ -11,8 +11,13 @@ from obsynth.analysis.transformations.elimination import eliminate_algebraic_sta
 from obsynth.errors import SolverError
 from obsynth.methods.detection_filter.conditions import unknown_inputs
 from obsynth.methods.detection_filter.method import DetectionFilterMethod
-from obsynth.methods.detection_filter.norm_proofs import Transfer, gain_is_proved, sensitivity_is_proved
-from obsynth.methods.detection_filter.transfers import added_gain, error_transfer
+from obsynth.methods.detection_filter.norm_proofs import (
+    Transfer,
+    added_gain,
+    error_transfer,
+    gain_is_proved,
+    sensitivity_is_proved,
+)
 from obsynth.methods.method import Synthesis
 from obsynth.methods.riccati import continuous_solution
 from obsynth.numerics.arrays import FloatArray

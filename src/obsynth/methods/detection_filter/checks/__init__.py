@@ -7,8 +7,12 @@ from collections.abc import Iterator
 import numpy as np
 
 from obsynth.methods.detection_filter.conditions import conditions, unknown_inputs
-from obsynth.methods.detection_filter.norm_proofs import gain_is_proved, sensitivity_is_proved
-from obsynth.methods.detection_filter.transfers import added_gain, error_transfer
+from obsynth.methods.detection_filter.norm_proofs import (
+    added_gain,
+    error_transfer,
+    gain_is_proved,
+    sensitivity_is_proved,
+)
 from obsynth.numerics.spectra import abscissa
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
