@@ -68,6 +68,14 @@ class Log:
     #: How far samples that stand out, and count as not measured, were from their prediction: ``(any,)`` of each output.
     outliers: tuple[FloatArray, ...] = ()
     input_delay: int = 0  # rows by which the inputs are later than the data have them
+    held: NDArray[np.bool_] | None = None  # ``(n, nu)``: inputs that were missing, and stand as they last were
+
+    @property
+    def measured_inputs(self) -> FloatArray:
+        """The inputs ``(n, nu)``, NaN where they were missing after the first row."""
+        if self.held is None or not self.held[1:].any():
+            return self.u
+        return np.where(self.held & (np.arange(self.samples) > 0)[:, None], np.nan, self.u)
 
     @property
     def samples(self) -> int:
@@ -98,12 +106,9 @@ class Log:
             raise SpecError(
                 f"input_delay is {rows} rows, but the log has {len(self.u)} here: give fewer.", path="input_delay"
             )
-        u = np.roll(self.u, rows, axis=0)
-        if rows > 0:
-            u[:rows] = self.u[0]
-        elif rows < 0:
-            u[rows:] = self.u[-1]
-        return replace(self, u=read_only(u), input_delay=self.input_delay + rows)
+        places = np.clip(np.arange(len(self.u)) - rows, 0, len(self.u) - 1)
+        held = None if self.held is None else self.held[places]
+        return replace(self, u=read_only(self.u[places]), held=held, input_delay=self.input_delay + rows)
 
     def without(self, wrong: NDArray[np.bool_]) -> Log:
         """Return the log without single outputs ``(n, ny)`` that are no measurements, with a note for each sensor."""
@@ -239,6 +244,7 @@ def _on_grid(
         )
     if jitter.max(initial=0.0) > NOTED_JITTER:
         notes.append(f"The stamps jitter by {jitter.max():.1%} of a step.")
+    missing = ~np.isfinite(u)
     for name, column in zip(inputs, u.T, strict=True):
         known = np.isfinite(column)
         if not known.any():
@@ -257,11 +263,13 @@ def _on_grid(
         held = " and the inputs before them are held" if inputs else ""
         notes.append(f"{int((counts - 1).sum())} rows are missing: their outputs count as not measured{held}.")
         whole = np.arange(places[-1] + 1)
-        u = u[np.searchsorted(places, whole, side="right") - 1]
+        before = np.searchsorted(places, whole, side="right") - 1
+        u, missing = u[before], missing[before] | ~np.isin(whole, places)[:, None]
         wide = np.full((len(whole), y.shape[1]), np.nan)
         wide[places] = y
         y, time = wide, time[0] + step * whole
-    return Log(read_only(time), read_only(u), read_only(y), step, inputs, outputs, rows, source, tuple(notes))
+    return Log(read_only(time), read_only(u), read_only(y), step, inputs, outputs, rows, source, tuple(notes),
+               held=missing)  # fmt: skip
 
 
 def _longest(true: NDArray[np.bool_]) -> int:

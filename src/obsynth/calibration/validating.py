@@ -39,10 +39,11 @@ from obsynth.calibration.step_graphs import sample_graphs
 from obsynth.errors import PreconditionError, SolverError, SpecError
 from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.observers.dae.estimates import GatheredRows
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.estimates import Estimates
 from obsynth.observers.linear.observer import LinearObserver
-from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.observers.recursive.observer import RecursiveObserver, recursive_estimates
 from obsynth.observers.running import changed
 from obsynth.observers.windows import WindowObserver
 from obsynth.results.design import ObserverDesign
@@ -138,7 +139,7 @@ def recorded_innovations(design: ObserverDesign, log: Log) -> RecordedInnovation
 
 
 def _nonlinear(observer: DAEObserver, log: Log) -> RecordedInnovations:
-    found, error = observer.run(log.y, log.u, progress=False), None
+    found, error = _over(observer, log), None
     if observer.integration == "backward-euler":
         error = integration_error(
             observer.model,
@@ -152,20 +153,32 @@ def _nonlinear(observer: DAEObserver, log: Log) -> RecordedInnovations:
     return _recorded(found, found.innovations, deviations, error)
 
 
+def _over(observer: DAEObserver, log: Log) -> Estimates:
+    """Return the estimates over a log; inputs that are missing are those that runs take in their place."""
+    u = log.measured_inputs
+    if not np.isnan(u).any():
+        return observer.run(log.y, u, progress=False)
+    state, rows = observer.init(), GatheredRows(observer)
+    for y_k, u_k in zip(log.y, u, strict=True):
+        state, row = observer.accept(state, y_k, u_k)
+        rows.add(row)
+    return rows.estimates()
+
+
 def _recursive(observer: RecursiveObserver, log: Log, point: Mapping[str, float]) -> RecordedInnovations:
     """Predict each sample from those before it: a step without measurements, beside the one with them."""
     plant = observer.plant
     y = log.y - np.array([point.get(name, 0.0) for name in plant.output_names])
-    u = log.u - np.array([point.get(name, 0.0) for name in plant.input_names])
+    u = log.measured_inputs - np.array([point.get(name, 0.0) for name in plant.input_names])
     state, nothing = observer.init(), np.full(plant.ny, np.nan)
-    e, deviations = np.full(y.shape, np.nan), np.full(y.shape, np.nan)
+    e, deviations, rows = np.full(y.shape, np.nan), np.full(y.shape, np.nan), []
     for k in range(len(y)):
         if k:
             mean, spread = observer.recursion.predicted(state, nothing, u[k])
             e[k], deviations[k] = np.where(np.isfinite(spread), y[k] - mean, np.nan), spread
-        state, _ = observer.advance(state, y[k], u[k])
-    found = observer.run(y, u)
-    return _recorded(found, e, deviations)
+        state, row = observer.advance(state, y[k], u[k])
+        rows.append(row)
+    return _recorded(recursive_estimates(observer, rows), e, deviations)
 
 
 def _recorded(
