@@ -666,3 +666,28 @@ def test_linear_observers_run_in_batches_and_say_what_decides_of_them() -> None:
             obsynth.decide(what, alone)
     with pytest.raises(obsynth.SpecError, match="Estimates"):
         obsynth.decide(recursive().observer, [1.0])
+
+
+@pytest.mark.parametrize("blank", [["a"], ["b"], ["a", "b"]])
+@pytest.mark.parametrize("method", METHODS[1:])
+def test_a_blank_cell_of_a_plant_at_rest_starts_nothing_again(method: str, blank: list[str]) -> None:
+    """Its log is noise alone, which the plant's model misses by about its whole size."""
+    data = log(rows=400)
+    data[["u", "a", "b"]] = np.hstack([np.zeros((400, 1)), 0.01 * np.random.default_rng(4).standard_normal((400, 2))])
+    clean = obsynth.run_on_data(designed(method), data).table
+    assert clean is not None
+    columns = [name for name in clean.columns if name.startswith(("fhat[", "r["))]
+    data.loc[100:390:29, blank] = np.nan
+    rows = LogRun(designed(method)).estimates(data["time"].tolist(), data.iloc[:, 1:].to_numpy())
+    assert "warm-up" not in {row.status for row in rows[100:]}
+    places = [list(LogRun(designed(method)).observer.columns).index(name) for name in columns]
+    after = [k for k, row in enumerate(rows) if row.status == "recovering"]
+    assert {101 + 29 * i for i in range(10)} <= set(after)
+    # What is left where rows decide again is within what the stated noise makes of these columns.
+    observer = designed(method).linear[1]
+    rng = np.random.default_rng(0)
+    found = observer.run(0.01 * rng.standard_normal((4000, 2)), np.zeros((4000, 1)))
+    noise = np.hstack([found.faults, found.residuals])[100:].std(axis=0)
+    decided = [k for k, row in enumerate(rows) if row.status == "ok" and k > 100]
+    left = np.abs([rows[k].values[places] for k in decided] - clean[columns].to_numpy()[decided])
+    assert (left <= 2.0 * noise).all()

@@ -241,9 +241,12 @@ class LinearLogObserver(LogObserver):
             if missing:
                 self._bridge_interval(seconds, missing, u)
                 seconds = 0.0 if self.observer.dt == 0.0 else seconds
+            recovered = self.warm_up
             if good and self.model is not None:
                 self._propagate(seconds, u)
-                if self._lost(values):
+                recovered = self._recovering(seconds, values, longest)
+                # What has become usual before a new start would have settled needs none.
+                if recovered >= self.warm_up and self._lost(values):
                     self._restart()
             first = self.z is None
             if good and first:
@@ -255,7 +258,6 @@ class LinearLogObserver(LogObserver):
                 self.inputs = self.inputs[:0]
                 seconds = 0.0
             if good:
-                recovered = self.warm_up if self.model is None else self._recovering(seconds, values, longest)
                 if self.model is None:
                     self._advance_excess(seconds)
                 self.moves = taken_inputs(self.moves, self.v[: self.nu], u, is_first=first).history
@@ -508,7 +510,7 @@ class LinearLogObserver(LogObserver):
 
     def _restart(self) -> None:
         self.z = self.model = None
-        self.v = np.zeros_like(self.v)
+        self.v, self.left, self.reach = np.zeros_like(self.v), np.zeros_like(self.left), np.zeros_like(self.reach)
         self.inputs = self.inputs[:0]
         self.excess, self.carried = np.zeros_like(self.excess), np.zeros_like(self.carried)
         self.settled_at, self.phase = math.inf, WARM_UP

@@ -212,8 +212,8 @@ def run_on_data(
     measured ones, so that the observer's state follows the model's; fault estimates are held, residuals are empty and
     the status is ``gap``.  The observer starts again after a gap of more than 10,000 samples, where the model has lost
     the plant (it misses the outputs by more than their size before and after the gap, as an unstable one will in the
-    end), and after every gap of a plant of index 2 or more, whose model cannot be propagated.  Intervals are rounded to
-    the resolution of the time stamps.
+    end, and by more than becomes usual within a warm-up), and after every gap of a plant of index 2 or more, whose
+    model cannot be propagated.  Intervals are rounded to the resolution of the time stamps.
 
     Recursive and nonlinear designs take missing outputs themselves, with what they cost in the columns ``sd ...``
     (standard deviations): a row without some outputs is ``partial``, one without all of them, or without an input, is a

@@ -259,6 +259,8 @@ static void restart(PREFIX_state *s)
     s->kept = 0;
     s->phase = UPPER_WARM_UP;
     filled(s->v, 0, V_COUNT);
+    filled(s->left, 0, Z_COUNT * V_COUNT);
+    filled(s->reach, 0, U_COUNT);
     filled(s->excess, 0, Z_COUNT * V_COUNT);
     filled(s->carried, 0, SHOWN_COUNT);
     filled(s->grown, 0, SHOWN_COUNT);
@@ -398,9 +400,14 @@ static int measured(PREFIX_state *s, const REAL *v, REAL *states, REAL *shown)
     int i;
 #if MODEL
     static const int none[LENGTH(V_COUNT)];
-    if (was_gap && is_lost(s, v)) {
-        restart(s);
-        was_gap = 0;
+    if (was_gap) {
+        int has_lost = is_lost(s, v);
+        waiting = recovering(s, v);
+        /* What has become usual before a new start would have settled needs none. */
+        if (has_lost && waiting >= s->warm_up) {
+            restart(s);
+            was_gap = 0;
+        }
     }
 #endif
     if (!s->is_started) {
@@ -414,11 +421,8 @@ static int measured(PREFIX_state *s, const REAL *v, REAL *states, REAL *shown)
         s->kept = 0;
     } else {
 #if MODEL
-        if (was_gap) {
-            waiting = recovering(s, v);
-        }
 #if STRAIGHT
-        else {
+        if (!was_gap) {
             later(s);
         }
 #endif
@@ -495,10 +499,8 @@ void PREFIX_reset(PREFIX_state *s)
     copied(s->z, start[0], Z_COUNT);
     filled(s->fault, 0, PLANT_FAULTS);
     filled(s->changes, 0, SHOWN_COUNT);
-    filled(s->left, 0, Z_COUNT * V_COUNT);
     filled(s->held, 0, U_COUNT);
     filled(s->moves, 0, 4 * U_COUNT);
-    filled(s->reach, 0, U_COUNT);
     s->counted = 0;
     s->time = s->from = s->waiting = 0;
     s->warm_up = WARM_UP_SECONDS;
