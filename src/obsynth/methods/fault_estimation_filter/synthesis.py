@@ -386,23 +386,28 @@ def found_gains(
 
 def found_within(
     problem: GainProblem,
-    limited: GainProblem,
+    limited: GainProblem | None,
     asked: FaultEstimationFilter,
     *,
+    exactly: bool,
     printed: PrintedInequality,
     progress: Callable[[str], None],
 ) -> FoundGains:
-    """Search gains with a limit on the weight, which Riccati equations do not cover."""
+    """Search gains; of a problem with a limit on the weight by the inequality, as Riccati equations do not cover it."""
+    search = partial(found_gains, asked=asked, printed=printed, progress=progress)
+    problem = replace(problem, judged_exactly=exactly)
+    if limited is None:
+        return search(problem, engine=asked.engine)
+    limited = replace(limited, judged_exactly=exactly)
     if asked.engine == "auto" and limited.weight_limit is not None:
         # They do where the limit costs nothing: what is found without it keeps it.
         try:
-            free = found_gains(problem, asked, "auto", printed=printed, progress=progress)
+            free = search(problem, engine="auto")
         except SolverError:
             free = None
         if free is not None and free.within(limited.weight_limit):
             return free
-    engine = "lmi" if asked.engine == "auto" else asked.engine
-    return found_gains(limited, asked, engine, printed=printed, progress=progress)
+    return search(limited, engine="lmi" if asked.engine == "auto" else asked.engine)
 
 
 def _least_gain(problem: GainProblem, asked: FaultEstimationFilter) -> LeastGain:
@@ -501,7 +506,7 @@ def synthesise(plant: DescriptorSystem, asked: FaultEstimationFilter, *, progres
         problem, parts = centred(problem, prepared, parts)
     limited = None if limit is None else with_weight_limit(problem, prepared, parts, limit)
     printed = PrintedInequality(plant, prepared, parts, free, asked.solver)
-    search = partial(_found, problem, limited, asked, printed=printed, progress=progress)
+    search = partial(found_within, problem, limited, asked, printed=printed, progress=progress)
     found = search(exactly=False)
     progress("building the realisation and its certificate")
     shipped = _Shipped.of(plant, prepared, parts, found, nominal, tries=FIRST_TRIES)
@@ -564,22 +569,6 @@ def _least(
         low, high = least.bracket
         claims |= {"gamma_bracket_low": low, "gamma_bracket_high": max(high, claims["gamma_min"])}
     return claims, proof
-
-
-def _found(
-    problem: GainProblem,
-    limited: GainProblem | None,
-    asked: FaultEstimationFilter,
-    *,
-    exactly: bool,
-    printed: PrintedInequality,
-    progress: Callable[[str], None],
-) -> FoundGains:
-    problem = replace(problem, judged_exactly=exactly)
-    if limited is None:
-        return found_gains(problem, asked, asked.engine, printed=printed, progress=progress)
-    limited = replace(limited, judged_exactly=exactly)
-    return found_within(problem, limited, asked, printed=printed, progress=progress)
 
 
 class _Shipped(NamedTuple):
