@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
@@ -43,6 +44,9 @@ class Steps:
         self.limit = checked_limit(settings.outliers, settings.outlier_limit)
         self.implicit = ImplicitStep(self.graph.functions, settings.dt, largest_move=settings.largest_move)
         self._unmoved = read_only(np.zeros(settings.model.nx))
+        self._all_there = read_only(np.ones(settings.model.ny))
+        self._all_seen = np.ones(settings.model.ny, dtype=bool)
+        self._all_seen.setflags(write=False)
         self.first = DAEState(
             initial_memory(settings, settings.initial_state),
             0,
@@ -113,8 +117,10 @@ class Steps:
 
     def plain(self, state: DAEState, y: FloatArray, u: FloatArray) -> tuple[DAEState, DAERow]:
         """Take a sample as it is."""
-        seen = ~np.isnan(y)
-        received, moved = np.where(seen, y, 0.0), self._unmoved
+        seen, received, arriving, moved = self._all_seen, y, self._all_there, self._unmoved
+        if math.isnan(y.dot(y)):
+            seen = arriving = ~np.isnan(y)
+            received = np.where(seen, y, 0.0)
         known = taken_inputs(state.inputs, state.u, u, is_first=state.k == 0)
         if state.k == 0:
             begun, moved = self.projected(state, u)
@@ -122,7 +128,7 @@ class Steps:
         elif known.variances is not None:
             after, said = self._carefully(state, received, seen, known)
         else:
-            after, said = self._call("whole", state.memory, np.concatenate([u, received, seen]))
+            after, said = self._call("whole", state.memory, np.concatenate((u, received, arriving)))
             if said[-1, 0] != 1.0:
                 after, said = self._carefully(state, received, seen, known)
         memory = after[:, 0]

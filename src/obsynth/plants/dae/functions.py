@@ -34,6 +34,7 @@ class Compiled:
         # CasADi's own annotations of these two do not fit what they return.
         found: Any = function.buffer()
         self._buffer, self._run = found
+        self._returned = self._buffer.ret
         self._sizes = [function.numel_in(i) for i in range(function.n_in())]
         self._arguments = [np.zeros(max(size, 1)) for size in self._sizes]
         self._shapes = [function.size_out(i) for i in range(function.n_out())]
@@ -53,7 +54,7 @@ class Compiled:
         for argument, value in zip(self._given, values, strict=True):
             argument[:] = value
         self._run()
-        if self._buffer.ret():
+        if self._returned():
             # A factorisation inside met a singular matrix; what is in the buffers belongs to another call.
             return tuple(np.full(shape, np.nan) for shape in self._shapes)
         return tuple([found.copy("F") for found in self._found])
