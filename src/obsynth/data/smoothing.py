@@ -19,12 +19,12 @@ from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import read_only
 from obsynth.observers.estimates import Estimates
 from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.recursive.observer import deviations_in
 from obsynth.observers.running import changed
 from obsynth.observers.smoothing import (
     Chain,
     Smoothed,
     checked_lag,
-    deviations_in,
     links_of,
     parameters_of,
     smoothed_estimates,

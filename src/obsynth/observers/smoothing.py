@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.arguments import is_whole
 from obsynth.numerics.arrays import FloatArray, read_only
-from obsynth.numerics.ranks import UNDETERMINED_SHARE, covariance_factor
+from obsynth.numerics.ranks import covariance_factor
 from obsynth.numerics.square_root_estimation import Gaussian, SmootherGain, joint_step, nothing_later, stepped_back
 from obsynth.observers.dae.estimates import DAERow, GatheredRows
 from obsynth.observers.dae.observer import DAEObserver
@@ -33,6 +33,7 @@ from obsynth.observers.recursive.observer import (
     Recursion,
     RecursiveObserver,
     RecursiveState,
+    deviations_in,
     recursive_estimates,
 )
 from obsynth.observers.recursive.step_model import StepMatrices, right_side, stacked_noise
@@ -198,12 +199,6 @@ def _smoothed(links: Links, node: Node, known: Gaussian, later: Later) -> Smooth
         states = slice(0, len(links.bounds))
         estimate[states] = projected(estimate[states], factor[states], links.bounds)
     return Smoothed(estimate, factor, diffuse, theta, spread)
-
-
-def deviations_in(factor: FloatArray, diffuse: FloatArray) -> FloatArray:
-    """Return standard deviations ``(n,)``, infinite where a state is undetermined."""
-    deviations = np.sqrt(np.einsum("ij,ij->i", factor, factor))
-    return np.where((np.abs(diffuse) > UNDETERMINED_SHARE).any(axis=1), np.inf, deviations)
 
 
 def links_of(observer: RecursiveObserver | DAEObserver) -> Links:

@@ -129,6 +129,12 @@ class Adaptation:
                 raise SpecError(f"{option} (S_0) must be positive definite.", path=option)
 
 
+def deviations_in(factor: FloatArray, diffuse: FloatArray) -> FloatArray:
+    """Return standard deviations ``(n,)``, infinite where a state is undetermined."""
+    deviations = np.sqrt(np.einsum("ij,ij->i", factor, factor))
+    return np.where((np.abs(diffuse) > UNDETERMINED_SHARE).any(axis=1), np.inf, deviations)
+
+
 class RawEstimate(NamedTuple):
     """What is known at one sample."""
 
@@ -155,9 +161,7 @@ class RawEstimate(NamedTuple):
     @property
     def state_deviations(self) -> FloatArray:
         """Standard deviations ``(nx,)`` of the states; infinite where one is undetermined."""
-        deviations = np.sqrt(np.einsum("ij,ij->i", self.factor, self.factor))
-        open_states = (np.abs(self.diffuse) > UNDETERMINED_SHARE).any(axis=1)
-        return np.where(open_states, np.inf, deviations)
+        return deviations_in(self.factor, self.diffuse)
 
     @property
     def whitened(self) -> FloatArray:
