@@ -4,7 +4,6 @@ from obsynth.analysis.diagnosis.verdicts import Diagnosis as Diagnosis
 from obsynth.analysis.diagnosis.verdicts import FaultDiagnosis as FaultDiagnosis
 from obsynth.analysis.diagnosis.verdicts import StructuredResidual as StructuredResidual
 from obsynth.calibration.diagnostics import Validation as Validation
-from obsynth.calibration.result import CalibratedBox as CalibratedBox
 from obsynth.calibration.result import Calibration as Calibration
 from obsynth.calibration.validity import Validity as Validity
 from obsynth.comparison.result import ComparedMethod as ComparedMethod
@@ -29,6 +28,7 @@ from obsynth.observers.decisions import Decision as Decision
 from obsynth.observers.estimates import Estimates as Estimates
 from obsynth.observers.running import RunningObserver as RunningObserver
 from obsynth.observers.windows import WindowObserver as WindowObserver
+from obsynth.plants.constants import CalibratedBox as CalibratedBox
 from obsynth.plants.constants import Constant as Constant
 from obsynth.plants.constants import ConstantsBox as ConstantsBox
 from obsynth.plants.uncertainty import Uncertainty as Uncertainty

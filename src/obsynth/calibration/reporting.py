@@ -25,10 +25,11 @@ from obsynth.calibration.innovations_fit import InnovationsFit, Side, covariance
 from obsynth.calibration.logs import EVEN, TOLD_ROWS, Log
 from obsynth.calibration.noise_states import PlantWithNoise, correlation_name
 from obsynth.calibration.problem import Problem
-from obsynth.calibration.result import CalibratedBox, Calibration
+from obsynth.calibration.result import Calibration
 from obsynth.calibration.simulation_error import Fit, SimulationError, unexplained
 from obsynth.errors import SolverError
 from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.plants.constants import CalibratedBox
 from obsynth.plants.dae.functions import BUTCHER, DAEFunctions
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.dae.step import ImplicitStep

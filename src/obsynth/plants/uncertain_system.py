@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import require_mapping
 from obsynth.numerics.arrays import FloatArray
-from obsynth.plants.constants import Constant, ConstantsBox, constant_of, constants_box, tolerance_share
+from obsynth.plants.constants import CalibratedBox, Constant, ConstantsBox, constant_of, constants_box, tolerance_share
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.uncertainty import (
     SAME_EXPRESSION_VALUE,
@@ -24,21 +24,9 @@ from obsynth.plants.uncertainty import (
 )
 
 
-@runtime_checkable
-class Calibrated(Protocol):
-    """A box that a log allows, as a calibration gives it: its level, the log's digest, nominal values and ranges."""
-
-    level: float
-    digest: str
-
-    def constants(self) -> Mapping[str, Any]:
-        """Return nominal value and range by name; refused where a side is open."""
-        ...
-
-
 def stated_box(given: Any, variation: str | None = None) -> Any:
     """Return a calibrated box as a box of constants, with its level and digest; all else as it is."""
-    if isinstance(given, ConstantsBox) or not isinstance(given, Calibrated) or isinstance(given, Mapping):
+    if not isinstance(given, CalibratedBox):
         return given
     return constants_box(
         given.constants(), variation=variation, source="calibrated", level=given.level, digest=given.digest
