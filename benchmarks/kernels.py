@@ -5,8 +5,9 @@ campaigns whose cases must come out the same.  Kernels are chosen by OpenBLAS's 
     python -m benchmarks.kernels campaigns --cases 200        cases of the campaigns on verdicts, every kernel
     python -m benchmarks.kernels designs --specs smib/spec    some specs alone
     python -m benchmarks.kernels random --cases 200           the designs of the campaign on existence, all pairs
+    python -m benchmarks.kernels least --cases 200            least gains of fault-estimation filters, every kernel
 
-Both print a table of differences and exit 1 where there is one; ``campaigns`` goes on where an ended run was.
+All print their differences and exit 1 where there is one; ``campaigns`` goes on where an ended run was.
 """
 
 from __future__ import annotations
@@ -23,7 +24,10 @@ from dataclasses import asdict
 from itertools import zip_longest
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
+
+if TYPE_CHECKING:
+    from obsynth import DescriptorSystem
 
 ROOT = Path(__file__).parents[1]
 KERNELS = ("Haswell", "SkylakeX", "Nehalem", "Prescott")
@@ -32,6 +36,8 @@ CAMPAIGNS = ("existence", "recursive_existence", "random_tolerances", "diagnosis
 TWO_THREADS = "2 threads"
 #: How many other texts a table lists for a campaign and a machine.
 LISTED = 10
+#: Least gains that are the same, relative to them.
+SAME_GAIN = 1e-5
 
 
 def environment(machine: str) -> dict[str, str]:
@@ -104,6 +110,67 @@ def design_random(folder: Path, first: int, cases: int) -> None:
         for design in kept:
             design.save(folder / f"{outcome.group}-{seed}.json")
         print(json.dumps({"spec": f"seed {seed}", "code": outcome.result}), flush=True)
+
+
+def least_gains(first: int, cases: int) -> None:
+    """Search least gains on random plants, with the weight of least norm and a free one; a line of JSON for each."""
+    import numpy as np
+    from benchmarks.campaigns.conditions import _plant
+
+    from obsynth.methods.fault_estimation_filter.central_filter import NEGLIGIBLE_GAIN, search_least_gain
+    from obsynth.methods.fault_estimation_filter.conditions import examine_fault_filter
+    from obsynth.methods.fault_estimation_filter.synthesis import centred, gain_problem
+
+    for seed in range(first, first + cases):
+        # One in four is usual: the disturbance in all measurements, poles of .7.
+        plant = slow_plant(seed) if seed % 4 else _plant(np.random.default_rng([32, seed]))
+        held, prepared = examine_fault_filter(plant)
+        if prepared is None or not all(condition.holds for condition in held):
+            print(json.dumps({"case": f"{seed}", "gain": None}), flush=True)
+            continue
+        for free in (False, True):
+            problem, parts = gain_problem(prepared, free_weight=free)
+            found = search_least_gain(centred(problem, prepared, parts)[0])
+            # What is left of a disturbance that is decoupled is rounding.
+            gain = found.gain if found.gain > NEGLIGIBLE_GAIN * found.starting_gain else 0.0
+            print(
+                json.dumps({"case": f"{seed}, {'free weight' if free else 'least weight'}", "gain": gain}), flush=True
+            )
+
+
+def slow_plant(seed: int) -> DescriptorSystem:
+    """Return a plant as of a network: slow modes, an algebraic state, few disturbances, on odd seeds in all outputs."""
+    import numpy as np
+
+    from obsynth import DescriptorSystem
+
+    rng = np.random.default_rng([77, seed])
+    n, dt = int(rng.integers(3, 8)), 10.0 ** rng.uniform(-3.0, -1.0)
+    modes = rng.normal(size=(n, n))
+    A = np.zeros((n + 1, n + 1))
+    A[:n, :n] = np.linalg.solve(modes, np.diag(np.exp(-dt * 10.0 ** rng.uniform(-2.0, 1.0, n))) @ modes)
+    ny, nd = int(rng.integers(2, 5)), int(rng.integers(1, 3))
+    A[n], A[n, n] = rng.normal(size=n + 1), -1.0 - rng.uniform()
+    C, Bf, Bd = rng.normal(size=(ny, n + 1)), dt * rng.normal(size=(n + 1, 1)), dt * rng.normal(size=(n + 1, nd))
+    Bf[n], Bd[n] = rng.normal(size=1), rng.normal(size=nd)
+    Dd = rng.normal(size=(ny, nd)) * (seed % 2)
+    return DescriptorSystem(np.diag([1.0] * n + [0.0]), A, None, C, Bf=Bf, Bd=Bd, Dd=Dd, dt=dt)
+
+
+def compare_least(machines: Sequence[str], first: int, cases: int) -> int:
+    """Search least gains on every machine; print those that differ by more than `SAME_GAIN`."""
+    gains: dict[str, list[float | None]] = {}
+    for machine in machines:
+        for line in started(machine, "_least", str(first), str(cases)):
+            gains.setdefault(str(line["case"]), []).append(cast("float | None", line["gain"]))
+    wrong = 0
+    for name, found in gains.items():
+        known = [gain for gain in found if gain is not None]
+        if len(known) not in (0, len(found)) or max(known, default=0.0) * (1.0 - SAME_GAIN) > min(known, default=0.0):
+            wrong += 1
+            print(f"{name}: " + ", ".join("none" if gain is None else f"{gain:.8g}" for gain in found))
+    print(f"{len(gains)} least gains on {len(machines)} kernels: {wrong} differ by more than {SAME_GAIN:g}")
+    return wrong
 
 
 def verify_all(files: Iterable[Path]) -> None:
@@ -229,12 +296,15 @@ def main() -> int:
     if sys.argv[1:2] == ["_random"]:
         design_random(Path(sys.argv[2]), int(sys.argv[3]), int(sys.argv[4]))
         return 0
+    if sys.argv[1:2] == ["_least"]:
+        least_gains(int(sys.argv[2]), int(sys.argv[3]))
+        return 0
     if sys.argv[1:2] == ["_cases"]:
         run_cases(sys.argv[2], int(sys.argv[3]), int(sys.argv[4]))
         return 0
     parser = argparse.ArgumentParser(prog="python -m benchmarks.kernels", description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)  # fmt: skip
-    parser.add_argument("what", choices=("designs", "random", "campaigns"))
+    parser.add_argument("what", choices=("designs", "random", "least", "campaigns"))
     parser.add_argument("--machines", nargs="+", default=list(KERNELS), help=f"kernels, or {TWO_THREADS!r}")
     parser.add_argument("--specs", nargs="+", help="designs: which, such as smib/spec (default: all)")
     parser.add_argument("--campaigns", nargs="+", default=list(CAMPAIGNS), choices=CAMPAIGNS)
@@ -247,6 +317,8 @@ def main() -> int:
     if options.what == "random":
         what = [str(options.first), str(options.cases)]
         return int(compare_designs(options.machines, what, worker="_random") > 0)
+    if options.what == "least":
+        return int(compare_least(options.machines, options.first, options.cases) > 0)
     table = compare_campaigns(options.machines, options.campaigns, options.first, options.cases, options.journal)
     print(table)
     return int("Differences: 0." not in table)
