@@ -139,7 +139,8 @@ def equality(name: str, claim: str, found: Residual, source: str, *, bound: floa
 
 def tracking_identities(model: ErrorModel) -> dict[str, Identity]:
     """Return the identities that make the observer unbiased without faults and disturbances."""
-    found, others = (_tracking_identities(model, scaling) for scaling in _balances(model.plant))
+    plain = _tracking_identities(model)
+    found, others = (_in_units(plain, model, scaling) for scaling in _balances(model.plant))
     return {
         name: identity if identity.units is None else replace(identity, also=replace(others[name], rough=ROUGHLY))
         for name, identity in found.items()
@@ -148,8 +149,7 @@ def tracking_identities(model: ErrorModel) -> dict[str, Identity]:
 
 def tracking_totals(model: ErrorModel) -> dict[str, FloatArray]:
     """Return what is left of the same identities, whatever they are judged by."""
-    found = _tracking_identities(model, _balances(model.plant)[0])
-    return {name: identity.total for name, identity in found.items()}
+    return {name: identity.total for name, identity in _tracking_identities(model).items()}
 
 
 @remembered
@@ -162,27 +162,26 @@ def _balances(plant: DescriptorSystem) -> tuple[Scaling, Scaling]:
     return alone, driven
 
 
-def _tracking_identities(model: ErrorModel, scaling: Scaling) -> dict[str, Identity]:
+#: Identities whose columns are states.
+_OF_STATES = ("dynamics", "state estimate", "fault estimate", "residual")
+
+
+def _tracking_identities(model: ErrorModel) -> dict[str, Identity]:
+    """Return the identities without units of the states."""
     plant, observer, tracking = model.plant, model.observer, model.T
     ve = tracking @ model.E
     states, cz, dy, du = observer.state_rows, observer.Cz, observer.Dy, observer.Du
-    units = np.tile(scaling.states, model.lag + 1)
-
     # An observer state that tracks nothing but a sensor fault cancels what it is formed of down to rounding.
     formed = np.abs(tracking) @ np.abs(model.A) + np.abs(observer.By) @ np.abs(model.C)
-    # Outputs that see no state may be all it takes; the others are then rounding errors of those.
-    taken = np.max(np.abs(observer.By) / scaling.outputs, axis=1, keepdims=True)
-    seen = np.sum(scaling.outputs[:, None] * np.abs(model.C), axis=0, keepdims=True)
 
     def unseen(rows: slice) -> Identity:
         factors = ((cz[rows], tracking, model.E), (dy[rows], model.C), (cz[rows], formed))
-        return Identity((cz[rows] @ ve, dy[rows] @ model.C), factors, units)
+        return Identity((cz[rows] @ ve, dy[rows] @ model.C), factors)
 
     return {
         "dynamics": Identity(
             (observer.Az @ ve, observer.By @ model.C, -tracking @ model.A),
-            ((observer.Az, tracking, model.E), (taken, seen), (tracking, model.A)),
-            units,
+            ((observer.Az, tracking, model.E), (tracking, model.A)),
         ),
         "inputs": Identity(
             (observer.Bu, observer.By @ plant.D, -tracking @ model.B),
@@ -191,9 +190,23 @@ def _tracking_identities(model: ErrorModel, scaling: Scaling) -> dict[str, Ident
         "state estimate": Identity(
             (cz[states] @ ve, dy[states] @ model.C, -model.goal[states]),
             ((cz[states], tracking, model.E), (dy[states], model.C)),
-            units,
         ),
         "fault estimate": unseen(observer.fault_rows),
         "residual": unseen(observer.residual_rows),
         "input feedthrough": Identity((du, dy @ plant.D), ((dy, plant.D),)),
     }
+
+
+def _in_units(identities: dict[str, Identity], model: ErrorModel, scaling: Scaling) -> dict[str, Identity]:
+    """Return the same identities where those of the states are judged in some units."""
+    units, by = np.tile(scaling.states, model.lag + 1), np.abs(model.observer.By)
+    found = {
+        name: replace(identity, units=units) if name in _OF_STATES else identity
+        for name, identity in identities.items()
+    }
+    # Outputs that see no state may be all it takes; the others are then rounding errors of those.
+    taken = np.max(by / scaling.outputs, axis=1, keepdims=True)
+    seen = np.sum(scaling.outputs[:, None] * np.abs(model.C), axis=0, keepdims=True)
+    first, last = identities["dynamics"].factors
+    found["dynamics"] = replace(found["dynamics"], factors=(first, (taken, seen), last))
+    return found
