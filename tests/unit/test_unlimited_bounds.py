@@ -19,7 +19,7 @@ class Residual:
     A: np.ndarray
     C: np.ndarray
     steps: int
-    flow: None = None
+    continuous: None = None
     sampled: None = None
 
     def powers(self) -> list[np.ndarray]:
