@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 
 ROOT = Path(__file__).parents[1]
 KERNELS = ("Haswell", "SkylakeX", "Nehalem", "Prescott")
+#: What a process ends with whose kernels need instructions that this processor lacks.
+WITHOUT_INSTRUCTIONS = -4
 CAMPAIGNS = ("existence", "recursive_existence", "random_tolerances", "diagnosis")
 #: Runs beside those of the kernels: a second thread, with the first kernel.
 TWO_THREADS = "2 threads"
@@ -47,6 +49,16 @@ def environment(machine: str) -> dict[str, str]:
         **os.environ, "OPENBLAS_CORETYPE": kernel, "OPENBLAS_NUM_THREADS": threads, "OMP_NUM_THREADS": threads,
         "PYTHONPATH": os.pathsep.join([str(ROOT), *os.environ.get("PYTHONPATH", "").split(os.pathsep)]),
     }  # fmt: skip
+
+
+def runnable(machines: Sequence[str]) -> list[str]:
+    """Return those of some kernels that this processor can run, and say which are left out."""
+    product = [sys.executable, "-c", "import numpy; numpy.ones((300, 300)) @ numpy.ones((300, 300))"]
+    codes = {machine: subprocess.run(product, env=environment(machine)).returncode for machine in machines}
+    left_out = [machine for machine, code in codes.items() if code == WITHOUT_INSTRUCTIONS]
+    if left_out:
+        print(f"left out, as this processor lacks their instructions: {', '.join(left_out)}", file=sys.stderr)
+    return [machine for machine in machines if machine not in left_out]
 
 
 def started(machine: str, *arguments: str) -> Iterator[dict[str, object]]:
@@ -312,14 +324,15 @@ def main() -> int:
     parser.add_argument("--cases", type=int, default=1000, help="how many cases")
     parser.add_argument("--journal", type=Path, default=ROOT / "benchmarks" / "kernels.jsonl")
     options = parser.parse_args()
+    machines = runnable(options.machines)
     if options.what == "designs":
-        return int(compare_designs(options.machines, options.specs or all_specs()) > 0)
+        return int(compare_designs(machines, options.specs or all_specs()) > 0)
     if options.what == "random":
         what = [str(options.first), str(options.cases)]
-        return int(compare_designs(options.machines, what, worker="_random") > 0)
+        return int(compare_designs(machines, what, worker="_random") > 0)
     if options.what == "least":
-        return int(compare_least(options.machines, options.first, options.cases) > 0)
-    table = compare_campaigns(options.machines, options.campaigns, options.first, options.cases, options.journal)
+        return int(compare_least(machines, options.first, options.cases) > 0)
+    table = compare_campaigns(machines, options.campaigns, options.first, options.cases, options.journal)
     print(table)
     return int("Differences: 0." not in table)
 
