@@ -14,6 +14,7 @@ import numpy as np
 
 from obsynth.calibration.problem import Problem
 from obsynth.calibration.step_graphs import SampleGraphs, compiled
+from obsynth.numerics import lazy_casadi as ca
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.dae.functions import Compiled
 
@@ -49,8 +50,6 @@ def _whole(
     graphs: SampleGraphs, u: FloatArray, y: FloatArray, noisy: Sequence[int], x0: FloatArray, P0: FloatArray
 ) -> Any:
     """Return the function from v to value, gradient and rows."""
-    import casadi as ca
-
     nx, nt, n = graphs.nx, graphs.nt, len(y)
     first = _first(graphs, noisy)
     seen = np.isfinite(y)
@@ -87,8 +86,6 @@ def _whole(
 
 def _update(graphs: SampleGraphs, x: Any, P: Any, u: Any, t: Any, log_r: Any, y: Any, seen: Any) -> tuple[Any, Any]:
     """Return the state and covariance after a measurement, packed; and its row: value, whitened, e, variances."""
-    import casadi as ca
-
     predicted, H, _ = graphs.outputs(x, u, t)
     H = ca.densify(H) * ca.repmat(seen, 1, graphs.nx)
     e = seen * (y - predicted)
@@ -102,8 +99,6 @@ def _update(graphs: SampleGraphs, x: Any, P: Any, u: Any, t: Any, log_r: Any, y:
 
 
 def _symbols(graphs: SampleGraphs, noisy: Sequence[int]) -> tuple[Any, ...]:
-    import casadi as ca
-
     nx, ny = graphs.nx, graphs.ny
     packed = ca.SX.sym("packed", nx + nx * nx)
     data = ca.SX.sym("data", graphs.nu + 2 * ny)
@@ -114,8 +109,6 @@ def _symbols(graphs: SampleGraphs, noisy: Sequence[int]) -> tuple[Any, ...]:
 
 
 def _first(graphs: SampleGraphs, noisy: Sequence[int]) -> Any:
-    import casadi as ca
-
     packed, data, v, u, y, seen, t, _, log_r = _symbols(graphs, noisy)
     nx = graphs.nx
     x, P = packed[:nx], ca.reshape(packed[nx:], nx, nx)
@@ -125,8 +118,6 @@ def _first(graphs: SampleGraphs, noisy: Sequence[int]) -> Any:
 
 def _later(graphs: SampleGraphs, noisy: Sequence[int]) -> Any:
     """Return one sample, with what was solved as numbers: from packed, data, v, tc, numbers to packed and row."""
-    import casadi as ca
-
     packed, data, v, u, y, seen, t, log_q, log_r = _symbols(graphs, noisy)
     nx = graphs.nx
     tc, numbers = ca.SX.sym("tc", graphs.nt), ca.SX.sym("numbers", graphs.numbers)
@@ -152,8 +143,6 @@ def _accumulated(graphs: SampleGraphs, noisy: Sequence[int], size: int) -> list[
 
 
 def _forward(graphs: SampleGraphs, later: Any) -> Any:
-    import casadi as ca
-
     packed, data, v = (ca.MX.sym(name, later.size1_in(i)) for i, name in enumerate(("packed", "data", "v")))
     x, u, t = packed[: graphs.nx], data[: graphs.nu], v[: graphs.nt]
     stages, left = graphs.solve(x, u, t)
@@ -164,8 +153,6 @@ def _forward(graphs: SampleGraphs, later: Any) -> Any:
 
 def _backward(graphs: SampleGraphs, later: Any, size: int) -> Any:
     """Return the accumulation of costate and gradient over samples that go back."""
-    import casadi as ca
-
     names = ("packed", "data", "v")
     packed, data, v = (ca.MX.sym(name, later.size1_in(i)) for i, name in enumerate(names))
     numbers, costate = ca.MX.sym("numbers", graphs.numbers), ca.MX.sym("costate", size + v.shape[0])

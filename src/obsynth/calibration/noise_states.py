@@ -10,6 +10,7 @@ import numpy as np
 
 from obsynth.calibration.logs import Log
 from obsynth.calibration.plants import SIZED_SAMPLES, CalibrationPlant
+from obsynth.numerics import lazy_casadi as ca
 from obsynth.numerics.arrays import SMALLEST, FloatArray
 from obsynth.plants.dae.functions import BUTCHER
 from obsynth.plants.noise_model import UNKNOWN_NUMBER, noise_state, offset_state, seconds
@@ -140,15 +141,11 @@ class PlantWithNoise(CalibrationPlant):
         return found
 
     def _correlation(self, name: str, t: Any, unknown: Sequence[str]) -> Any:
-        import casadi as ca
-
         value = self.states.correlations[name]
         return ca.exp(t[list(unknown).index(correlation_name(name))]) if value is None else ca.SX(value)
 
     def _inner_constants(self, x: Any, t: Any, unknown: Sequence[str]) -> tuple[tuple[str, ...], Any]:
         """Return what the plant itself takes as unknown, and its values: constants, and loads from their states."""
-        import casadi as ca
-
         searched = {correlation_name(name) for name in self.states.searched}
         kept = [i for i, name in enumerate(unknown) if name not in searched]
         loads = x[x.numel() - len(self.states.loads) :] if self.states.loads else ca.SX(0, 1)
@@ -157,8 +154,6 @@ class PlantWithNoise(CalibrationPlant):
 
     def step(self, unknown: Sequence[str], integration: str) -> tuple[int, Any]:
         """Return stages, and the function from stages, state before, signals, constants and dt to equations."""
-        import casadi as ca
-
         n, whole = self.own, len(self.state_names)
         names, _ = self._inner_constants(ca.SX.sym("x", whole), ca.SX.sym("t", len(unknown)), unknown)
         stages, inner = self.inner.step(names, integration)
@@ -173,8 +168,6 @@ class PlantWithNoise(CalibrationPlant):
 
     def _added(self, parts: Any, before: Any, t: Any, unknown: Sequence[str], dt: Any, integration: str) -> Any:
         """Return the equations of the further states at each stage, in units of their change over a second."""
-        import casadi as ca
-
         stages = parts.shape[1]
         rows = []
         if integration in BUTCHER:
@@ -194,8 +187,6 @@ class PlantWithNoise(CalibrationPlant):
 
     def outputs(self, unknown: Sequence[str]) -> Any:
         """Return the function from state, signals and constants to y, H and L."""
-        import casadi as ca
-
         whole = len(self.state_names)
         x, s, t = ca.SX.sym("x", whole), ca.SX.sym("s", len(self.nominal_signals)), ca.SX.sym("t", len(unknown))
         names, values = self._inner_constants(x, t, unknown)

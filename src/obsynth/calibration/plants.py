@@ -17,6 +17,7 @@ import numpy as np
 from obsynth.analysis.transformations.entries_in_constants import promoted
 from obsynth.calibration.logs import Log, refused
 from obsynth.errors import SpecError
+from obsynth.numerics import lazy_casadi as ca
 from obsynth.numerics.arrays import SMALLEST, FloatArray
 from obsynth.numerics.ranks import rounding_rank
 from obsynth.plants.dae.functions import BUTCHER, DAEFunctions
@@ -107,8 +108,6 @@ class NonlinearPlant(CalibrationPlant):
 
     def step(self, unknown: Sequence[str], integration: str) -> tuple[int, Any]:
         """Return stages, and the function from stages, state before, signals, constants and dt to equations."""
-        import casadi as ca
-
         functions = DAEFunctions(self.promoted(unknown), integration)
         X, x = ca.SX.sym("X", functions.stages * len(self.nominal_state)), ca.SX.sym("x", len(self.nominal_state))
         u, t, dt = ca.SX.sym("u", len(self.nominal_signals)), ca.SX.sym("t", len(unknown)), ca.SX.sym("dt")
@@ -118,8 +117,6 @@ class NonlinearPlant(CalibrationPlant):
 
     def outputs(self, unknown: Sequence[str]) -> Any:
         """Return the function from state, signals and constants to y, H and L."""
-        import casadi as ca
-
         model = self.promoted(unknown)
         symbols = symbols_of(model)
         columns = [model.parameter_names.index(name) for name in unknown]
@@ -131,8 +128,6 @@ class NonlinearPlant(CalibrationPlant):
 
 
 def _column(entries: Sequence[Any]) -> Any:
-    import casadi as ca
-
     return ca.vertcat(*(ca.SX(entry) for entry in entries)) if entries else ca.SX(0, 1)
 
 
@@ -165,8 +160,6 @@ class _Matrix:
 
 def _of_sequence(matrix: MatrixSequence) -> _Matrix:
     """Return a matrix that may change with k; one without a formula is a signal."""
-    import casadi as ca
-
     if matrix.entries is not None:
         rows = matrix.entries
         return _Matrix(
@@ -183,8 +176,6 @@ def _of_sequence(matrix: MatrixSequence) -> _Matrix:
 
 
 def _dense(rows: Sequence[Sequence[Any]], shape: tuple[int, int]) -> Any:
-    import casadi as ca
-
     return ca.vertcat(*(ca.horzcat(*row) for row in rows)) if all(shape) else ca.SX(*shape)
 
 
@@ -250,8 +241,6 @@ class LinearPlant(CalibrationPlant):
 
     def _algebraic(self, log: Log) -> list[int]:
         """Return the rows of E that are zero for every k of the log, of a discrete plant."""
-        import casadi as ca
-
         if self.continuous:
             return []
         matrix = self.matrices["E"]
@@ -293,8 +282,6 @@ class LinearPlant(CalibrationPlant):
 
     def _at(self, s: Any, t: Any, unknown: Sequence[str]) -> Callable[[str, bool], Any]:
         """Return the function from a matrix's name, and whether at the row itself, to its symbols."""
-        import casadi as ca
-
         place = 2 * self.nu + 1
         flats = {}
         for name, later in self._recorded():
@@ -315,15 +302,11 @@ class LinearPlant(CalibrationPlant):
         return matrix
 
     def _constant_effects(self, t: Any, unknown: Sequence[str]) -> Any:
-        import casadi as ca
-
         entries = [t[list(unknown).index(name)] if name in unknown else ca.SX(0.0) for name in self.effects]
         return ca.vertcat(*entries) if entries else ca.SX(0, 1)
 
     def step(self, unknown: Sequence[str], integration: str) -> tuple[int, Any]:
         """Return stages, and the function from stages, state before, signals, constants and dt to equations."""
-        import casadi as ca
-
         stages = len(BUTCHER[integration]) if self.continuous else 1
         X, x, dt = ca.SX.sym("X", self.nx * stages), ca.SX.sym("x", self.nx), ca.SX.sym("dt")
         s, t = ca.SX.sym("s", self._width()), ca.SX.sym("t", len(unknown))
@@ -354,8 +337,6 @@ class LinearPlant(CalibrationPlant):
 
     def _product(self, matrix: Any, column: Any) -> Any:
         """Return a product that is zero where there are no signals."""
-        import casadi as ca
-
         return matrix @ column if column.numel() else ca.SX.zeros(matrix.shape[0])
 
     def _width(self) -> int:
@@ -363,8 +344,6 @@ class LinearPlant(CalibrationPlant):
 
     def outputs(self, unknown: Sequence[str]) -> Any:
         """Return the function from state, signals and constants to y, H and L."""
-        import casadi as ca
-
         x, s, t = ca.SX.sym("x", self.nx), ca.SX.sym("s", self._width()), ca.SX.sym("t", len(unknown))
         at, f = self._at(s, t, unknown), self._constant_effects(t, unknown)
         y = at("C", True) @ x + self._product(at("L", False), f) + ca.DM(self.output_point)
@@ -375,8 +354,6 @@ class LinearPlant(CalibrationPlant):
 
     def _sizes(self, log: Log, signals: FloatArray) -> FloatArray:
         """Return how large each initial state can be ``(nx,)``: so that alone it makes outputs as large as they are."""
-        import casadi as ca
-
         stages, equations = self.step((), self.integrations[0])
         X, x, s = ca.SX.sym("X", self.nx * stages), ca.SX.sym("x", self.nx), ca.SX.sym("s", signals.shape[1])
         found = equations(X, x, s, ca.SX(0, 1), log.dt)
@@ -407,8 +384,6 @@ class LinearPlant(CalibrationPlant):
 
 
 def _with_entries(matrix: FloatArray, entries: Sequence[tuple[int, int, str]], uncertainty: Any) -> _Matrix:
-    import casadi as ca
-
     def symbolic(known: Known, _: Any) -> Any:
         found = ca.SX(ca.DM(np.asarray(matrix, dtype=np.float64)))
         for row, column, text in entries:
@@ -420,8 +395,6 @@ def _with_entries(matrix: FloatArray, entries: Sequence[tuple[int, int, str]], u
 
 def _beside(one: _Matrix, two: _Matrix) -> _Matrix:
     """Return two matrices with as many rows side by side."""
-    import casadi as ca
-
     shape = (one.shape[0], one.shape[1] + two.shape[1])
     return _Matrix(shape, lambda known, _: ca.horzcat(one.symbolic(known, None), two.symbolic(known, None)))
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from obsynth.calibration.likelihood import LARGEST_STEP_RESIDUAL
 from obsynth.calibration.logs import refused
 from obsynth.calibration.problem import Problem
+from obsynth.numerics import lazy_casadi as ca
 from obsynth.numerics.arrays import SMALLEST, FloatArray
 from obsynth.plants.dae.functions import Compiled
 from obsynth.plants.noise_model import offset_state
@@ -256,8 +257,6 @@ def _moved_by_noise(problem: Problem, deviations: FloatArray) -> bool:
 
 def _simulated(problem: Problem) -> Any:
     """Return the function from ``[t, x0]`` to rows: outputs, their derivatives by t and x0, and the residual."""
-    import casadi as ca
-
     g, n = problem.graphs, len(problem.y)
     nx, ny, nt, size = g.nx, g.ny, g.nt, g.nt + g.nx
     packed, u, t = ca.MX.sym("packed", nx + nx * size), ca.MX.sym("u", g.nu), ca.MX.sym("t", nt)

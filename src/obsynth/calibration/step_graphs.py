@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.calibration.plants import CalibrationPlant
+from obsynth.numerics import lazy_casadi as ca
 from obsynth.numerics.arrays import SMALLEST, FloatArray
 from obsynth.numerics.newton import largest_entries
 from obsynth.observers.dae.c_code import compiler
@@ -27,8 +28,6 @@ STRAIGHT_CODE_FLAGS = ("-std=c99", "-O1", "-ffp-contract=off", "-shared", "-fPIC
 
 def compiled(functions: Sequence[Any]) -> list[Any]:
     """Return the same functions as machine code; as they are where there is no compiler or it fails."""
-    import casadi as ca
-
     command = compiler()
     if command is None:
         return list(functions)
@@ -48,8 +47,6 @@ def compiled(functions: Sequence[Any]) -> list[Any]:
 @lru_cache(maxsize=16)
 def _loaded(code: str, names: tuple[str, ...], command: tuple[str, ...]) -> tuple[Any, ...]:
     """Return functions of C code; the same code is compiled once."""
-    import casadi as ca
-
     with tempfile.TemporaryDirectory(prefix="obsynth-", ignore_cleanup_errors=True) as folder:
         source, library = Path(folder) / "calibration.c", Path(folder) / "calibration.so"
         source.write_text(code, encoding="utf-8", newline="\n")
@@ -88,8 +85,6 @@ def sample_graphs(
     plant: CalibrationPlant, unknown: Sequence[str], dt: float, *, integration: str, substeps: int, samples: int = 1
 ) -> SampleGraphs:
     """Return the functions of one sample of ``dt`` seconds, in C where there are many."""
-    import casadi as ca
-
     base = _Substep(plant, unknown, dt / substeps, integration)
     nx, nu, nt, n = len(plant.state_scales), len(plant.nominal_signals), len(unknown), base.size
     x, u, t = ca.MX.sym("x", nx), ca.MX.sym("u", nu), ca.MX.sym("t", nt)
@@ -119,8 +114,6 @@ def sample_graphs(
 
 def _local(base: _Substep, substeps: int, nx: int, nu: int, nt: int) -> Any:
     """Return the differentiable part: values from the numbers, derivatives from the equations at them."""
-    import casadi as ca
-
     n = base.size
     x, u, t, tc = (ca.SX.sym(name, size) for name, size in (("x", nx), ("u", nu), ("t", nt), ("tc", nt)))
     length = nx + substeps * n * (1 + nx + nt)
@@ -144,8 +137,6 @@ class _Substep:
     """One implicit step: its Newton iteration and its derivatives, by elimination in an order that is fixed."""
 
     def __init__(self, plant: CalibrationPlant, unknown: Sequence[str], dt: float, integration: str) -> None:
-        import casadi as ca
-
         self.nx, self.dt = len(plant.state_scales), dt
         self.stages, self.function = plant.step(unknown, integration)
         self.size = self.stages * self.nx
@@ -167,8 +158,6 @@ class _Substep:
 
     def _solve(self) -> Any:
         """Return the solution of the stages from a start, in as many iterations as it takes."""
-        import casadi as ca
-
         start = [ca.MX.sym(name, self.newton.size1_in(i)) for i, name in enumerate(("X", "x", "u", "t"))]
         X, before = start[0], start[1:]
         for _ in range(ITERATIONS):
@@ -186,8 +175,6 @@ class _Substep:
 
     def symbolic(self, X: Any, x: Any, u: Any, t: Any) -> tuple[Any, Any, Any]:
         """Return the derivatives of the stages by x and by t, and of the state after by what is added."""
-        import casadi as ca
-
         Xs, xs, us, ts = (ca.SX.sym(name, part.numel()) for name, part in zip("Xxut", (X, x, u, t), strict=True))
         equations, nx, nt = self.function(Xs, xs, us, ts, self.dt), self.nx, ts.numel()
         right = ca.horzcat(
@@ -215,8 +202,6 @@ def _pivots(jacobian: Any, plant: CalibrationPlant, stages: int, values: FloatAr
 
 def eliminated(matrix: Any, right: Any, order: Sequence[int]) -> Any:
     """Return ``matrix^-1 right`` by scalar operations, rows in a given order; structural zeros cost nothing."""
-    import casadi as ca
-
     n, m = matrix.shape[0], right.shape[1]
     rows = [[matrix[i, j] for j in range(n)] + [right[i, j] for j in range(m)] for i in order]
     for j in range(n):

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from obsynth.numerics import lazy_casadi as ca
 from obsynth.numerics.arrays import FloatArray
 
 #: Iterations before we give up: a damped iteration that needs more is not converging.
@@ -134,8 +135,6 @@ SINGULAR = 1e-16
 
 def equilibrated(matrix: Any, columns: FloatArray) -> tuple[Any, Any]:
     """Return ``diag(rows) J diag(columns)`` and ``rows``: the scaling of `ScaledMatrix` inside a graph."""
-    import casadi as ca
-
     scaled = ca.densify(matrix) @ ca.diag(ca.DM(columns))
     peaks = largest_entries(scaled)
     rows = 1.0 / ca.if_else(peaks > 0.0, peaks, 1.0)
@@ -144,8 +143,6 @@ def equilibrated(matrix: Any, columns: FloatArray) -> tuple[Any, Any]:
 
 def largest_entries(matrix: Any) -> Any:
     """Return the largest absolute value of each row ``(rows,)``, which is not NaN where others are not."""
-    import casadi as ca
-
     sizes = ca.fabs(matrix)
     found = sizes[:, 0]
     for j in range(1, matrix.shape[1]):
@@ -160,16 +157,12 @@ def solved(matrix: Any, right: Any) -> Any:
 
 def definite_solved(matrix: Any, right: Any) -> Any:
     """Return ``A^-1 B`` for a positive definite A, scaled to a unit diagonal first."""
-    import casadi as ca
-
     scale = 1.0 / ca.sqrt(ca.diag(matrix))
     unit = matrix * (scale @ scale.T)
     return ca.repmat(scale, 1, right.shape[1]) * _solution(unit, ca.repmat(scale, 1, right.shape[1]) * right)
 
 
 def _solution(matrix: Any, right: Any, *, pivots: bool = False) -> Any:
-    import casadi as ca
-
     n, m = right.shape
     if not n or not m:
         return ca.MX(n, m)
@@ -183,8 +176,6 @@ def _solution(matrix: Any, right: Any, *, pivots: bool = False) -> Any:
 
 def _eliminated(rows: list[Any], *, pivots: bool) -> Any:
     """Return the solution from rows of ``[A B]``; exchanging neighbours in turn brings the largest pivot up."""
-    import casadi as ca
-
     n = len(rows)
     for j in range(n):
         if pivots:

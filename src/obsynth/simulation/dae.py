@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SolverError, SpecError
+from obsynth.numerics import lazy_casadi as ca
 from obsynth.numerics.arguments import is_whole
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.numerics.ranks import covariance_factor
@@ -152,8 +153,6 @@ class _Run:
 
 def _simulated(step: ImplicitStep) -> Any:
     """Return one step with noise: from a state and ``[u; theta; noise]`` to a state, and residual and verdict."""
-    import casadi as ca
-
     model = step.functions.model
     x, arriving = ca.MX.sym("x", model.nx), ca.MX.sym("arriving", model.nu + model.nq + model.nx)
     u, theta, noise = ca.vertsplit(arriving, [0, model.nu, model.nu + model.nq, arriving.shape[0]])

@@ -14,6 +14,7 @@ import numpy as np
 
 from obsynth.analysis.transformations.equilibrium import Point
 from obsynth.errors import PreconditionError, SpecError
+from obsynth.numerics import lazy_casadi as ca
 from obsynth.numerics.expressions import parse_expression
 from obsynth.plants.constants import Constant, ConstantsBox, constants_box
 from obsynth.plants.dae.functions import symbolic_equations
@@ -81,8 +82,6 @@ def entries_in_constants(
     """Return entries of the matrices that depend on the box, and of the equilibrium's shift in equations and outputs.
     ``columns``: inputs, known (``B``) and not (``Bd``), and parameters that are faults (``Bf``); ``moving``: the
     motion of the point is an input after the known ones."""
-    import casadi as ca
-
     symbols = {name: ca.SX.sym(name) for name in box.names}
     theta = [symbols.get(name, float(value)) for name, value in zip(model.parameter_names, point.theta, strict=True)]
     local = symbolic_equations(model)(point.rates, point.x, point.u, ca.vertcat(*theta) if theta else ca.SX(0, 1))
@@ -108,8 +107,6 @@ class _Writer:
     """Writes CasADi's expressions in the language of the entries."""
 
     def __init__(self, symbols: Mapping[str, Any]) -> None:
-        import casadi as ca
-
         self.ca, self.symbols = ca, ca.vertcat(*symbols.values())
         self.operators = {
             ca.OP_ADD: ("+", _SUM, _SUM),

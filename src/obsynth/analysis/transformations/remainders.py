@@ -19,6 +19,7 @@ from obsynth.analysis.transformations.linearisation import linearise
 from obsynth.analysis.transformations.sampling import discretise
 from obsynth.analysis.transformations.uncertain_plant import reduced_matrices
 from obsynth.errors import PreconditionError, SpecError
+from obsynth.numerics import lazy_casadi as ca
 from obsynth.numerics.arguments import is_finite_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.dae.model import DAEModel
@@ -90,8 +91,6 @@ def _with_remainders(plant: DescriptorSystem) -> DescriptorSystem:
 
 def require_linear_rates(model: DAEModel) -> None:
     """Raise `PreconditionError` where derivatives enter with other coefficients than constants."""
-    import casadi as ca
-
     s = symbols_of(model)
     into, stored = ca.jacobian(s.equations, s.rates), ca.jacobian(s.stored, s.x)
     moved = ca.depends_on(s.stored, ca.vertcat(s.theta, s.u)) if s.stored.numel() else False

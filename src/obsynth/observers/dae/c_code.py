@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SpecError
+from obsynth.numerics import lazy_casadi as ca
 from obsynth.numerics import newton
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import DEPENDENT_BOUND
@@ -211,8 +212,6 @@ def in_lines(texts: list[str]) -> list[str]:
 
 def _generated(functions: dict[str, Any]) -> str:
     """Return CasADi's functions, all of them static, so that two observers can be linked into one program."""
-    import casadi as ca
-
     options: Any = {"with_header": False, "with_mem": False, "casadi_int": "int", "main": False, "verbose": False}
     generator = ca.CodeGenerator("observer", options)
     for name, function in functions.items():
@@ -240,8 +239,6 @@ def _generated(functions: dict[str, Any]) -> str:
 
 
 def _renamed(function: Any, name: str) -> Any:
-    import casadi as ca
-
     if function.name() == name:
         return function
     inputs = function.sx_in() if function.is_a("SXFunction") else function.mx_in()

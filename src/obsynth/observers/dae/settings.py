@@ -10,6 +10,7 @@ from typing import Any, Literal, Self, TypeAlias
 import numpy as np
 
 from obsynth.errors import SpecError
+from obsynth.numerics import lazy_casadi as ca
 from obsynth.numerics.arguments import Count, ForgettingFactor, Positive, Probability, check_fields
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.numerics.ranks import covariance_factor, is_definite
@@ -171,8 +172,6 @@ class Layout:
 
     def symbols(self, vector: Any) -> dict[str, Any]:
         """Return the arrays in a vector of CasADi symbols by name."""
-        import casadi as ca
-
         return {
             name: ca.reshape(vector[self.slices[name]], *shape) if shape[0] * shape[1] else ca.MX(*shape)
             for name, shape in self.shapes.items()
@@ -180,8 +179,6 @@ class Layout:
 
     def column(self, arrays: Mapping[str, Any]) -> Any:
         """Return the vector of named CasADi expressions."""
-        import casadi as ca
-
         return ca.vertcat(*(ca.vec(ca.densify(arrays[name])) for name in self.shapes))
 
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from obsynth.numerics import lazy_casadi as ca
 from obsynth.numerics.newton import definite_solved
 from obsynth.observers.dae.settings import Layout, memory_layout, row_layout
 from obsynth.plants.dae.functions import DAEFunctions
@@ -47,8 +48,6 @@ class ObserverGraph:
 
 def observer_graph(observer: DAESettings) -> ObserverGraph:
     """Return the functions of an observer."""
-    import casadi as ca
-
     functions = DAEFunctions(observer.model, observer.integration)
     step = step_graph(functions, observer.dt, np.inf if observer.largest_move is None else observer.largest_move)
     memory, row = memory_layout(observer), row_layout(observer)
@@ -83,8 +82,6 @@ def observer_graph(observer: DAESettings) -> ObserverGraph:
 
 def _unknown(observer: DAESettings, functions: DAEFunctions, memory: Layout) -> Any:
     """Return the function to what missing inputs add to the covariance of the state in a step ``(nx, nx)``."""
-    import casadi as ca
-
     effect = input_effect(functions, observer.dt)
     packed, variances = ca.MX.sym("memory", memory.size), ca.MX.sym("variances", observer.model.nu)
     X, u = effect.mx_in(0), effect.mx_in(2)
@@ -95,8 +92,6 @@ def _unknown(observer: DAESettings, functions: DAEFunctions, memory: Layout) -> 
 
 def _forecast(observer: DAESettings, functions: DAEFunctions, memory: Layout, row: Layout) -> Any:
     """Return the function from memory and row of a sample to mean and deviation ``(ny,)`` of its outputs."""
-    import casadi as ca
-
     packed, said = ca.MX.sym("memory", memory.size), ca.MX.sym("said", row.size)
     found = {**memory.symbols(packed), **row.symbols(said)}
     spread = found["spread"]
@@ -113,8 +108,6 @@ def _outcome(found: Arrays, memory: Layout, row: Layout) -> list[Any]:
 
 def _predicted(observer: DAESettings, before: Arrays, x: Any, local: tuple[Any, ...], missing: Any) -> Arrays:
     """Steps 1 to 5: the prediction and its covariance, with K, H and L of k - 1, and what missing inputs add."""
-    import casadi as ca
-
     F, G, noise, scaled = local
     P, K, H, L, spread = (before[name] for name in ("P", "K", "H", "L", "spread"))
     added = noise @ ca.DM(observer.Q) @ noise.T + missing
@@ -147,8 +140,6 @@ class _Update:
     """The measurement of one sample; a channel that is not seen has an innovation of zero and no gain."""
 
     def __init__(self, observer: DAESettings, functions: DAEFunctions, y: Any, seen: Any) -> None:
-        import casadi as ca
-
         self.observer, self.functions, self.y, self.seen = observer, functions, y, seen
         # The rows and columns of R that are not seen become those of the identity, which nothing else touches.
         self.R = ca.DM(observer.R) * (seen @ seen.T) + ca.diag(1.0 - seen)
@@ -171,8 +162,6 @@ class _Update:
 
     def _seen_outputs(self, found: Arrays) -> tuple[Any, Any, Any, Any, Any]:
         """Return H and L as they are, and innovation, H and L with zeros where nothing is seen."""
-        import casadi as ca
-
         predicted, H, L = self.functions.output_function(found["x"], found["theta"])
         mask = ca.diag(self.seen)
         return H, L, self.seen * (self.y - predicted), mask @ H, mask @ L
@@ -202,8 +191,6 @@ class _Update:
 
     def _learnt(self, found: Arrays) -> Arrays:
         """Steps 7 to 9 and 11: (17)-(19); a sample without a measurement changes nothing."""
-        import casadi as ca
-
         observer, Sigma, Omega = self.observer, found["Sigma"], found["Omega"]
         prior, spread = self._remembered(found["S"]), found["spread"]
         weight = self.R if observer.weight == "paper" else Sigma
@@ -223,8 +210,6 @@ class _Update:
 
     def _remembered(self, S: Any) -> Any:
         """Return S / lambda, or S that has walked, or what is left of the information beside that of S_0."""
-        import casadi as ca
-
         observer = self.observer
         if observer.form == "random-walk":
             return S
@@ -237,8 +222,6 @@ class _Update:
         return 0.5 * (prior + prior.T)
 
     def _bounded(self, theta: Any) -> Any:
-        import casadi as ca
-
         entries = ca.vertsplit(theta) if theta.shape[0] else []
         for i, (low, high) in enumerate(zip(self.observer.lower, self.observer.upper, strict=True)):
             entries[i] = ca.fmax(entries[i], low) if np.isfinite(low) else entries[i]
@@ -247,8 +230,6 @@ class _Update:
 
     def _corrected(self, found: Arrays) -> Arrays:
         """Step 10: the gain at the updated estimate, the state after the measurement, and its covariance."""
-        import casadi as ca
-
         full_H, full_L, e, H, _ = self._seen_outputs(found)
         P = found["P"]
         K = definite_solved(H @ P @ H.T + self.R, H @ P).T @ ca.diag(self.seen)
@@ -260,8 +241,6 @@ class _Update:
 
     def _joint(self, found: Arrays, *, learns: bool) -> Arrays:
         """Update states and parameters together, in Joseph's form."""
-        import casadi as ca
-
         nx, nq = self.observer.model.nx, self.observer.model.nq
         P, cross, spread, H, L = (found[name] for name in ("P", "cross", "spread", "seen H", "seen L"))
         whole = ca.vertcat(ca.horzcat(P, cross), ca.horzcat(cross.T, spread))

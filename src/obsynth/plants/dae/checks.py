@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SpecError
+from obsynth.numerics import lazy_casadi as ca
 from obsynth.numerics.arguments import is_finite_number, real_array
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.expressions import DECIDING_WORDS, FUNCTIONS, FUNCTIONS_OF_TWO, NAMED_NUMBERS
@@ -139,8 +140,6 @@ def _only_states_stored(model: DAEFields, symbols: DAESymbols) -> None:
 
 
 def _no_empty_equation(model: DAEFields, symbols: DAESymbols) -> None:
-    import casadi as ca
-
     filled = _depends(symbols.equations, ca.vertcat(symbols.x, symbols.rates)).any(axis=1)
     empty = [repr(name) for name, full in zip(model.equation_names, filled, strict=False) if not full]
     if empty:
@@ -158,8 +157,6 @@ def _no_empty_equation(model: DAEFields, symbols: DAESymbols) -> None:
 
 def _every_signal_used(model: DAEFields, symbols: DAESymbols, problems: Problems) -> None:
     """Note the first input and parameter that enter nothing, and the first output that nothing enters."""
-    import casadi as ca
-
     # What an output must not contain is said elsewhere.
     everything = ca.vertcat(symbols.equations, symbols.stored, symbols.outputs)
     seen = _depends(symbols.outputs, ca.vertcat(symbols.x, symbols.theta)).any(axis=1)
@@ -236,7 +233,5 @@ def finite_vector(value: Any, names: Sequence[str], default: FloatArray, what: s
 
 def _depends(expressions: Any, symbols: Any) -> Any:
     """Return which expression ``(rows)`` contains which symbol ``(columns)``."""
-    import casadi as ca
-
     pattern = ca.jacobian_sparsity(expressions, symbols)
     return np.array(ca.DM(pattern, 1.0).full() != 0.0).reshape(expressions.numel(), symbols.numel())

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SpecError
+from obsynth.numerics import lazy_casadi as ca
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.dae.symbols import DAESymbols, symbols_of
@@ -80,8 +81,6 @@ class DAEFunctions:
 
 
 def _graphs(model: DAEModel, method: str) -> tuple[Any, Any, Any]:
-    import casadi as ca
-
     symbols = symbols_of(model)
     stages = ca.SX.sym("X", model.nx, len(BUTCHER[method]))
     start, dt = ca.SX.sym("start", model.nx), ca.SX.sym("dt")
@@ -98,14 +97,11 @@ def _graphs(model: DAEModel, method: str) -> tuple[Any, Any, Any]:
 
 
 def _dense(name: str, inputs: list[Any], outputs: list[Any]) -> Any:
-    import casadi as ca
-
     return ca.Function(name, inputs, [ca.densify(output) for output in outputs])
 
 
 def _stage_equations(symbols: DAESymbols, stages: Any, start: Any, dt: Any, weights: FloatArray) -> Any:
     """Return the equations of all stages: derivatives of stored quantities are combinations of their differences."""
-    import casadi as ca
 
     def stored_at(x: Any) -> Any:
         return ca.substitute(symbols.stored, symbols.x, x)
@@ -180,8 +176,6 @@ def symbolic_equations(model: DAEModel) -> Any:
 
 
 def _function(model: DAEModel) -> Any:
-    import casadi as ca
-
     s = symbols_of(model)
     rates = ca.SX.sym("rates", model.nx)
     value = ca.substitute(s.equations, s.rates, ca.jacobian(s.stored, s.x) @ rates)

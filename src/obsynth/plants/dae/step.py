@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SolverError
+from obsynth.numerics import lazy_casadi as ca
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.newton import (
     LARGEST_RESIDUAL,
@@ -52,8 +53,6 @@ def step_graph(functions: DAEFunctions, dt: float, largest_move: float) -> StepG
 
 
 def _graph(functions: DAEFunctions, dt: float, largest_move: float) -> StepGraph:
-    import casadi as ca
-
     model, stages = functions.model, functions.stages
     n = model.nx * stages
     sizes = np.tile(model.state_scales, stages)
@@ -80,8 +79,6 @@ def _graph(functions: DAEFunctions, dt: float, largest_move: float) -> StepGraph
 def input_effect(functions: DAEFunctions, dt: float) -> Any:
     """Return the function from stages, state before, input and parameters to the derivative of a solved step by the
     input ``(nx, nu)``."""
-    import casadi as ca
-
     model, stages = functions.model, functions.stages
     n = model.nx * stages
     sizes = np.tile(model.state_scales, stages)
@@ -96,8 +93,6 @@ def input_effect(functions: DAEFunctions, dt: float) -> Any:
 
 def _whole(newton: Any, sizes: FloatArray, stages: int, largest_move: float) -> Any:
     """Return the step: blocks of iterations, the later ones taken only where the earlier have not ended."""
-    import casadi as ca
-
     point = [ca.MX.sym("x", len(sizes) // stages), *(ca.MX.sym(name, newton.size1_in(i)) for i, name in ((2, "u"),
              (3, "theta")))]  # fmt: skip
     start = ca.repmat(point[0], stages, 1)
@@ -119,8 +114,6 @@ def _whole(newton: Any, sizes: FloatArray, stages: int, largest_move: float) -> 
 
 def _block(newton: Any, sizes: FloatArray, count: int) -> Any:
     """Return some iterations, from and to stages, residual, row scales, Newton step, and whether and how it ended."""
-    import casadi as ca
-
     inputs = [newton.mx_in(0)] + [ca.MX.sym(name, len(sizes)) for name in ("value", "rows", "move")]
     inputs += [ca.MX.sym(name) for name in ("done", "converged", "residual")]
     point = [newton.mx_in(i) for i in (1, 2, 3)]
@@ -143,8 +136,6 @@ def _block(newton: Any, sizes: FloatArray, count: int) -> Any:
 
 
 def _all(conditions: Any) -> Any:
-    import casadi as ca
-
     return ca.sum1(conditions) >= float(conditions.numel())
 
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SpecError
+from obsynth.numerics import lazy_casadi as ca
 from obsynth.numerics.expressions import Expression, parse_expression, step_function
 
 #: The sign between two sides, which is no part of a comparison.
@@ -88,17 +89,13 @@ def symbols_of(model: DAEFields) -> DAESymbols:
 
 
 def _columns(model: DAEFields) -> tuple[Any, Any, Any]:
-    import casadi as ca
-
     return tuple(
         ca.vertcat(*(ca.SX.sym(name) for name in names)) if names else ca.SX(0, 1)
         for names in (model.state_names, model.input_names, model.parameter_names)
-    )  # type: ignore[return-value]
+    )
 
 
 def _from_texts(model: DAEFields, equations: Mapping[str, str]) -> DAESymbols:
-    import casadi as ca
-
     x, u, theta = _columns(model)
     known: dict[str, Any] = dict(model.constants)
     for names, column in ((model.state_names, x), (model.input_names, u), (model.parameter_names, theta)):
@@ -155,15 +152,11 @@ def _value(expression: Expression, known: Mapping[str, Any], path: str) -> Any:
 
 def symbolic_value(expression: Expression, known: Mapping[str, Any]) -> Any:
     """Return a parsed expression of symbols by name as a symbol."""
-    import casadi as ca
-
     return ca.SX(expression.translated(known, _translation))
 
 
 def _translation(operation: Callable[..., Any]) -> Callable[..., Any]:
     """Return CasADi's operation for one of numpy's: the names agree but for a few."""
-    import casadi as ca
-
     special: dict[Callable[..., Any], Callable[..., Any]] = {
         np.add: ca.plus,
         np.subtract: ca.minus,
@@ -190,8 +183,6 @@ def _translation(operation: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _from_functions(model: DAEFields) -> DAESymbols:
-    import casadi as ca
-
     x, u, theta = _columns(model)
     stored = x if model.storage is None else _called(model.storage, (x, theta), "storage")
     rates = ca.SX.sym("rates", stored.numel())
@@ -206,8 +197,6 @@ def _from_functions(model: DAEFields) -> DAESymbols:
 
 def _called(function: Callable[..., Any], columns: Sequence[Any], path: str) -> Any:
     """Call a user's function on lists of symbols, with numpy's functions meaning CasADi's meanwhile."""
-    import casadi as ca
-
     arguments = [[column[i] for i in range(column.numel())] for column in columns]
     mode = ca.GlobalOptions.getNumpyMode()
     ca.GlobalOptions.setNumpyMode(1)
@@ -244,8 +233,6 @@ def _not_symbolic(path: str, count: int, reason: str) -> SpecError:
 
 
 def _holds_nan(column: Any, columns: Sequence[Any]) -> bool:
-    import casadi as ca
-
     function = ca.Function("found", list(columns), [column], {"allow_free": True})
     constants = (
         function.instruction_constant(i)
