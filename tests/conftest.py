@@ -1,5 +1,7 @@
 """What all tests share: how many of the cases drawn at random a run looks at, and which tests other machines run.
 
+Tests marked ``long`` take seconds and are left to `.ci/run`, or to who names them.
+
 `.ci/run` takes the tests marked ``sampled`` once more with the cases that were left out (``--rest``), and those marked
 ``numerics`` with other processors' kernels and with the oldest dependencies.
 """
@@ -52,7 +54,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         if item.path.name in NUMERIC:
             item.add_marker(pytest.mark.numerics)
         drawn = getattr(getattr(item, "function", None), "is_hypothesis_test", False)
-        if drawn or "share" in getattr(item, "fixturenames", ()):
+        if drawn or "share" in getattr(item, "fixturenames", ()) or item.get_closest_marker("long"):
             item.add_marker(pytest.mark.sampled)
     left_out = _left_out(config, items)
     config.hook.pytest_deselected(items=list(left_out))
@@ -60,13 +62,14 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def _left_out(config: pytest.Config, items: Sequence[pytest.Item]) -> set[pytest.Item]:
-    """Return the cases of tests marked ``one_in`` that this run leaves out; mark these tests ``sampled``."""
+    """Return the tests marked ``long`` and the cases of those marked ``one_in`` that this run leaves out."""
     cases: dict[str, list[pytest.Item]] = defaultdict(list)
     for item in items:
         if item.get_closest_marker("one_in"):
             item.add_marker(pytest.mark.sampled)
             cases[item.nodeid.partition("[")[0]].append(item)
-    found: set[pytest.Item] = set()
+    looks_at_long = config.option.whole or config.option.rest
+    found = {item for item in items if item.get_closest_marker("long") and not looks_at_long}
     for test, same in cases.items():
         parts = max(item.get_closest_marker("one_in").args[0] for item in same)
         # Not the first of each test: these are often alike.

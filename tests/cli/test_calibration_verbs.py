@@ -67,6 +67,7 @@ def test_a_spec_linearises_its_plant_for_a_linear_method(folder):
     assert spec.plant.fault_names == ("leak",)
 
 
+@pytest.mark.long
 def test_calibrate_takes_everything_from_the_spec(folder, capsys):
     target = folder / "calibration.json"
     assert main(["calibrate", "--system", str(folder / "spec.yaml"), "--out", str(target), "--quiet"]) == 0
@@ -79,6 +80,7 @@ def test_calibrate_takes_everything_from_the_spec(folder, capsys):
     assert found["log"]["rows"] == [0, 56]
 
 
+@pytest.mark.long
 def test_a_calibration_can_be_made_again(folder, capsys):
     """Of one constant, which takes less time than four."""
     spec, kept = folder / "one.yaml", "  unknown: {a1: [0.005, 0.08]}"
@@ -97,6 +99,7 @@ def test_a_calibration_can_be_made_again(folder, capsys):
     assert "digest" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_validate_says_yes_and_no_by_its_exit_code(folder, gains, capsys):
     columns = ["--map", "u1=u1_held", "--map", "u3=u3_held", "--data", str(folder / "log.csv")]
     capsys.readouterr()
@@ -146,6 +149,7 @@ def test_logs_that_cannot_be_used_have_a_code_in_the_json(folder, tmp_path, caps
     assert json.loads(capsys.readouterr().out)["code"] == code
 
 
+@pytest.mark.long
 def test_the_report_on_a_log_says_whether_it_agrees(folder, gains, capsys):
     page = folder / "report.html"
     columns = ["--map", "u1=u1_held", "--map", "u3=u3_held", "--data", str(folder / "log.csv")]

@@ -96,6 +96,7 @@ def test_a_calibration_without_a_digest_is_asked_for_again(folder: Path) -> None
         read_calibration(folder / "box.json")
 
 
+@pytest.mark.long
 def test_a_calibration_is_done_again_from_plant_and_log(folder: Path) -> None:
     words = ["--system", str(SPEC), "--data", str(LOG)]
     asked = ["--rows", "0:56", "--unknown", "a1=0.005:0.08", "--quiet"]

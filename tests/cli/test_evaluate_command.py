@@ -55,6 +55,7 @@ def test_the_table_has_intervals_and_says_what_the_threshold_means(gains, capsys
     assert "RMSE" in printed
 
 
+@pytest.mark.long
 def test_processes_do_not_change_the_numbers(gains, capsys):
     found = []
     for jobs in ("1", "2"):
@@ -92,6 +93,7 @@ def test_numbers_out_of_range_are_refused_by_the_command_line(gains, capsys, mor
     assert message in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_decisions_on_parameters_are_counted(capsys):
     spec = str(ROOT / "designs" / "moussaali2013_ltv" / "spec.yaml")
     assert main(["evaluate", "--system", spec, "--runs", "3", "--monitor", "nis", "--quiet"]) == 0

@@ -54,6 +54,7 @@ def test_pairs_and_numbers(places: tuple[Path, Path], tmp_path: Path) -> None:
     assert len(found.plot().axes) == 4
 
 
+@pytest.mark.long
 def test_processes_give_the_same_and_what_is_there_is_kept(places: tuple[Path, Path], tmp_path: Path) -> None:
     here = obsynth.run_fleet(*places, tmp_path / "here")
     with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as executor:

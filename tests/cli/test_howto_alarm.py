@@ -15,6 +15,8 @@ import pytest
 from obsynth.cli.main import main
 from obsynth.spec.documents import read_yaml
 
+pytestmark = pytest.mark.long
+
 DOCS = Path(__file__).parents[2] / "docs"
 
 

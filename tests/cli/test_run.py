@@ -202,6 +202,7 @@ def test_files_that_are_not_there_or_not_right(gains, capsys):
     refused("log.csv is no UTF-8 text")
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("taken_as_verified")
 def test_recursive_and_nonlinear_designs_run_as_well(capsys, monkeypatch):
     """From files in chunks and from a stream, with bad rows named, going on from a saved state."""

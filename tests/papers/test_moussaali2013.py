@@ -87,6 +87,7 @@ def test_the_literal_observer_is_refused_on_the_literal_data(capsys: pytest.Capt
     assert "the parameters are never corrected" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_and_rightly_so() -> None:
     """Run all the same: theta stays where it starts."""
     options = {"form": "innovation", "guard": "none", "random_walk": None, "forgetting": 0.95}
@@ -101,6 +102,7 @@ def test_and_rightly_so() -> None:
         assert found == pytest.approx(RMSE["literal"][profile], abs=6e-4), profile
 
 
+@pytest.mark.long
 def test_structure() -> None:
     for file, name in (("spec", "printed"), ("two_outputs", "two_outputs")):
         claims = design(file).certificate.claims
@@ -122,6 +124,7 @@ def test_the_designs_that_work(file: str, name: str) -> None:
     assert max(windows[2] for windows in measured.values()) < 0.05
 
 
+@pytest.mark.long
 def test_the_innovation_form_loses_excitation() -> None:
     found = design("spec", form="innovation", random_walk=None, forgetting=0.95, Q=1e-4)
     assert found.report.passed
@@ -149,6 +152,7 @@ def test_the_transient_is_that_of_s0(start: str) -> None:
     assert float(np.median(last)) == EXPECTED["settling"][start]
 
 
+@pytest.mark.long
 def test_the_decision_names_the_parameter_soon_after_its_change() -> None:
     """Design B, abrupt change, nominal theta = 1: seen within a few samples, in each of three runs."""
     found = design("two_outputs", initial_parameters=1.0, initial_parameter_covariance=1e-4)

@@ -60,6 +60,7 @@ def test_the_papers_transient_of_about_100_s() -> None:
     assert EXPECTED["measured"]["0.98"]["rise"] == pytest.approx(EXPECTED["paper"]["transient"], rel=0.1)
 
 
+@pytest.mark.long
 def test_backward_euler_finds_too_little_friction_and_radau_does_not() -> None:
     design = designed("pendulum")
     row, found = EXPECTED["pendulum"], {}

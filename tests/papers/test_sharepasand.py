@@ -175,6 +175,7 @@ class TestShipped:
         assert np.max(np.abs(np.sort_complex(poles) - np.sort(FIVE))) > 0.02
         assert design.report["stable with 9 digits"].value < -1.9
 
+    @pytest.mark.long
     def test_our_own_decoupling_and_the_joint_design(self) -> None:
         own = obsynth.ui_pi_observer(PLANT, fault_model="ramp", poles=FIVE, objective="gain")
         joint = obsynth.ui_pi_observer(PLANT, fault_model="ramp", poles=FIVE, objective="gain", joint=True)

@@ -54,6 +54,7 @@ def test_the_design_passes_and_its_claims_are_recomputed(design: obsynth.Observe
     assert design.observer.fault_delays == (SHIPPED["fault_delay"],)
 
 
+@pytest.mark.long
 def test_noise_against_gamma() -> None:
     """The trade-off of the notes: less gain costs little noise, and below a knee the settling time is hours."""
     rows = EXPECTED["trade_off"]

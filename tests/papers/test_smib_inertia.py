@@ -84,6 +84,7 @@ def machine_outputs() -> np.ndarray:
     return (C @ solve_ivp(slope, (0.0, time[-1]), np.zeros(4), t_eval=time, rtol=1e-8, atol=1e-12, max_step=h).y).T
 
 
+@pytest.mark.long
 def test_the_machine_itself_is_followed_and_the_schedule_is_needed() -> None:
     rng = np.random.default_rng(0)
     outputs = machine_outputs()[None] + rng.standard_normal((TRIALS, SAMPLES, 3)) * DEVIATIONS[1]

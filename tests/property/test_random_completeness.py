@@ -62,6 +62,7 @@ def outcome_of(known: KnownPlant, **options: Any) -> tuple[str, Recipe] | None:
     return None
 
 
+@pytest.mark.long
 def test_there_are_enough_plants():
     everything = [known for family in FAMILIES for known in plants_of(family)]
     assert len(everything) >= 200

@@ -34,7 +34,7 @@ def least(plant, **options):
 def solved(share):
     """Plants with their least gain, fixed weight."""
     plants = [*disturbed_plants(14, 7, largest=8), *disturbed_plants(6, 8, feedthrough=True)]
-    return [(plant, least(plant)) for plant in share(plants, 2)]
+    return [(plant, least(plant)) for plant in share(plants, 4)]
 
 
 def test_bisection_agrees_with_the_direct_solution(share):
@@ -69,7 +69,7 @@ def test_no_filter_beats_the_least_gain(fixed, share):
 
 def test_free_weight_never_costs_gain_and_is_not_beaten(solved, share):
     worse, beaten = [], []
-    for plant, fixed in share(solved, 2):
+    for plant, fixed in share(solved, 3):
         design = obsynth.fault_estimation_filter(plant, free_residual_weight=True)
         found = design.certificate.claims["gamma_min"]
         if found > fixed * (1.0 + 1e-5):

@@ -32,7 +32,7 @@ def decided(case: Case) -> bool:
 # Eight kinds of plants come in turn: an odd number of parts leaves each of them in a share.
 @pytest.mark.parametrize("number", range(BATCHES))
 def test_the_verdict_is_that_of_the_pencil(number: int, share: Share) -> None:
-    for seed, case in share(batch(number), 3):
+    for seed, case in share(batch(number), 7):
         assert decided(case) == brute_force(case)[0], (seed, case.kind, case.model)
 
 
@@ -47,7 +47,7 @@ def test_every_kind_of_plant_is_there_with_both_verdicts() -> None:
 
 @pytest.mark.parametrize("number", range(BATCHES))
 def test_fixed_modes_are_the_drops_of_the_pencil(number: int, share: Share) -> None:
-    for seed, case in share(batch(number), 3):
+    for seed, case in share(batch(number), 7):
         exists, drops = brute_force(case)
         if exists:
             model = exosystem(case.model, case.plant.fault_names, case.plant.dt)
@@ -80,6 +80,7 @@ def group_means(poles: np.ndarray, wanted: list[float]) -> float:
     return worst
 
 
+@pytest.mark.long
 def test_repeated_poles_are_placed_or_refused(share: Share) -> None:
     """Some pairs are so close to unobservable ones that double precision cannot place a triple pole: few, and told."""
     placed, refused, seeds = 0, [], share(range(0, BATCHES * SIZE, 3), 14)
@@ -108,7 +109,7 @@ def test_default_designs_see_no_disturbance(number: int, share: Share) -> None:
     """Trajectories ``(x, d) e^{st}`` of the plant, at points that no grid of ours holds, give exact estimates."""
     rng = np.random.default_rng(number)
     refused = []
-    for seed, case in share(batch(number), 5):
+    for seed, case in share(batch(number), 9):
         if not brute_force(case)[0]:
             continue
         try:

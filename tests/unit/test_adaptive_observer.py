@@ -203,6 +203,7 @@ class TestWindUp:
     def test_unguarded_it_grows_without_bound(self) -> None:
         assert self.spread_without_excitation("none").min() < 1e-20
 
+    @pytest.mark.long
     def test_the_guards_bound_it(self) -> None:
         assert self.spread_without_excitation("regularise").min() > 0.99
         assert self.spread_without_excitation("directional").min() > 0.99
@@ -336,6 +337,7 @@ def test_the_random_walk_has_no_regressors_to_report_an_excitation_of() -> None:
     assert np.isnan(found.excitation).all()
 
 
+@pytest.mark.long
 def test_units_do_not_decide_whether_there_is_an_observer() -> None:
     """Without a stated noise, the identity in given units may keep errors for as long as anybody looks."""
     sizes, shown = np.array([1e0, 1e-3, 1e-5, 1e3]), np.array([5e2, 1e7])

@@ -64,6 +64,7 @@ def tables(text):
     return list(found.values())
 
 
+@pytest.mark.long
 def test_the_fault_filter_benchmark_runs(printed):
     text = printed("fault_estimation_filter", "--small")
     speed, growth, verified, constraints, networks = tables(text)
@@ -81,6 +82,7 @@ def test_the_fault_filter_benchmark_runs(printed):
     assert [line[4] for line in networks[1:]] == ["True"]
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("taken_as_verified")
 def test_the_false_alarm_benchmark_runs(printed):
     rows = [line.strip("| ").split(" | ") for line in printed("false_alarms", "1").splitlines()[3:]]
@@ -94,6 +96,7 @@ def test_the_false_alarm_benchmark_runs(printed):
             assert shares == sorted(shares)
 
 
+@pytest.mark.long
 def test_the_benchmark_of_nonlinear_observers_runs(printed):
     rows = [line.strip("| ").split(" | ") for line in printed("dae_adaptive_observer", "--small").splitlines()[3:]]
     assert len(rows) == 7
@@ -144,6 +147,7 @@ def test_the_benchmark_of_the_start_runs(small_table):
     assert all(float(cell) > 0.0 for row in rows for cell in row[1:])
 
 
+@pytest.mark.long
 def test_the_gate_runs_and_has_a_bound_for_each_of_its_cases(printed):
     import json
 

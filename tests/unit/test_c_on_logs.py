@@ -264,6 +264,7 @@ def test_c_finds_changes_of_faults_as_a_run_does(shipped: SimpleNamespace) -> No
     test_c_says_what_a_run_says(shipped, WALKING)
 
 
+@pytest.mark.long
 def test_floats_find_changes_of_faults_too(shipped: SimpleNamespace, tmp_path: Path) -> None:
     design = shipped.designs[WALKING]
     monitor = obsynth.online_monitor(design, "learned", normal=told(design))

@@ -141,6 +141,7 @@ def test_a_process_without_noise_is_given_an_upper_limit_and_never_zero():
     assert found.box.holds({"T": 3.0})
 
 
+@pytest.mark.long
 def test_missing_samples_and_rows_are_left_out():
     model = first_order()
     log = {name: np.array(values) for name, values in record(model).items()}
@@ -245,6 +246,7 @@ OF_THE_DESIGN = {"noisy": ["mass", "energy", "cell"], "input_delay": 0, "starts"
                  "initial_covariance": {"p1": 4.0e6, "p2": 4.0e6, "T1": 25.0, "T2": 25.0}}  # fmt: skip
 
 
+@pytest.mark.long
 def test_five_constants_of_a_heat_exchanger_are_in_their_boxes():
     model, log = exchanger_log(90, moving=True)
     found = calibrate(model, log, EXCHANGER, **OF_THE_DESIGN)
@@ -254,6 +256,7 @@ def test_five_constants_of_a_heat_exchanger_are_in_their_boxes():
     assert not found.box.open_sides
 
 
+@pytest.mark.long
 def test_inputs_that_stay_name_the_volumes_of_a_heat_exchanger():
     model, log = exchanger_log(90, moving=False)
     found = calibrate(model, log, EXCHANGER, **OF_THE_DESIGN)

@@ -56,6 +56,7 @@ def test_a_log_that_begins_elsewhere_is_no_fault() -> None:
     assert said(found, "does not begin at the nominal state (v 0.9")
 
 
+@pytest.mark.long
 def test_a_start_that_only_the_first_innovations_show() -> None:
     model = DAEModel(
         {"kin": "der(x) = v", "dyn": "M * der(v) = F - k * x - c * v"}, {"pos": "x"}, states={"x": 0.1, "v": 0.5},
@@ -114,6 +115,7 @@ def test_a_sensor_of_another_sign_and_one_with_a_bias_are_named(share) -> None:
     assert not said(biased, "of im have the mean")
 
 
+@pytest.mark.long
 def test_short_errors_of_steps_that_add_up_take_radau() -> None:
     """A sixth of a deviation in a step moves a constant by five of its own: the true volume is outside of that box."""
     model = DAEModel(
@@ -141,6 +143,7 @@ def test_rows_that_are_asked_for_are_named() -> None:
         calibrate(circuit(), circuit_log(), WIDE, rows="400:500")
 
 
+@pytest.mark.long
 def test_a_log_with_a_wrong_sample_is_compared_without_it_and_steps_that_are_too_long_are_told() -> None:
     design = dae_adaptive_observer(
         circuit().replace(constants={"C": 1e-3}, parameters={"Rs": 100.0}), dt=0.01, Q={"node": 1e-12, "ohm": 1e-12},
@@ -209,6 +212,7 @@ def test_the_record_of_another_simulator_has_its_own_start_and_no_delay_that_it_
     assert found.box.holds(true)
 
 
+@pytest.mark.long
 def test_coloured_noise_with_outliers_is_found_beside_a_load_that_walks() -> None:
     """A motor whose load nobody measures: the search ended at a correlation as long as the log, 26 nats below the best,
     and a single wrong sample made the white noise of its sensor larger than the coloured one."""

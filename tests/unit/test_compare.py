@@ -129,6 +129,7 @@ def test_constants_are_drawn_within_their_stated_tolerances(sampled: bool) -> No
     assert boxed.methods[0].faults[0].bias > 3.0 * exact.methods[0].faults[0].bias
 
 
+@pytest.mark.long
 def test_a_log_is_replayed_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     log = pd.read_csv(DESIGNS / "motor" / "log.csv").iloc[:800]
     log["torque"] = pd.read_csv(DESIGNS / "motor" / "true_log.csv")["f"].iloc[:800]

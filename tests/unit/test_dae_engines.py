@@ -89,6 +89,7 @@ FORMS = {
 }  # fmt: skip
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("name", FORMS)
 def test_stretches_steps_and_c_agree(name, monkeypatch) -> None:
     monkeypatch.setattr(dae_records, "SAMPLES_PER_CALL", 50)

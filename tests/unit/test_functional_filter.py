@@ -249,6 +249,7 @@ def test_monitors_of_estimates_with_a_delay() -> None:
     assert (counted.false_alarm_rate.value, counted.missed_detection_rate.value) == (0.0, 0.0)
 
 
+@pytest.mark.long
 def test_saved_file_is_verified_alone_and_exported(tmp_path: Path) -> None:
     found = delayed()
     loaded = obsynth.load(found.save(tmp_path / "gains.json"))

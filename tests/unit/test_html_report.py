@@ -285,6 +285,7 @@ def test_a_plant_that_is_not_regular_has_its_page_and_its_gains(dt: float, tmp_p
             assert np.all(np.isfinite(found.gains["faults"]))
 
 
+@pytest.mark.long
 def test_the_page_says_what_holds_within_the_tolerances(tmp_path: Path) -> None:
     spec = load_spec(ROOT / "designs" / "drive" / "spec.yaml")
     design = obsynth.design(spec.plant, spec.method, **dict(spec.options))

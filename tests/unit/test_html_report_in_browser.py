@@ -120,6 +120,7 @@ def test_the_measurement_sees_what_sticks_out_and_what_is_fetched(tmp_path: Path
     assert found[1400]["fetched"] == ["http://x.example/a.png"]
 
 
+@pytest.mark.long
 @needs_browser
 def test_a_wide_matrix_scrolls_in_its_own_box_and_a_failure_is_red(tmp_path: Path) -> None:
     spec = load_spec(DESIGNS / "wang2015" / "spec.yaml")

@@ -174,6 +174,7 @@ def tank_log(path: Path, seed: int, *, delay: int, loss: float = 0.0, rows: int 
     pd.DataFrame(found, columns=["time", "u", "level"]).to_csv(path, index=False)
 
 
+@pytest.mark.long
 def test_a_delay_that_calibrate_finds_is_taken_by_every_command(tmp_path: Path, monkeypatch: Any) -> None:
     monkeypatch.chdir(tmp_path)
     method = (

@@ -17,6 +17,8 @@ import obsynth
 from obsynth.methods.installed import OWN, REGISTRY
 from obsynth.methods.registry import method_class
 
+pytestmark = pytest.mark.long
+
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "docs/examples/h2_filter"
 

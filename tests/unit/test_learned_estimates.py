@@ -69,6 +69,7 @@ def learned() -> obsynth.types.LearnedThresholds:
     return obsynth.learn_thresholds(pumped(), log(3_000, 0), false_alarms="1 per 500 rows")
 
 
+@pytest.mark.long
 def test_a_fault_that_the_estimate_follows_is_an_alarm() -> None:
     found = learned()
     assert found.columns == ("r[y]",)
@@ -165,6 +166,7 @@ def two_losses() -> obsynth.ObserverDesign:
     )  # fmt: skip
 
 
+@pytest.mark.long
 def test_faults_that_look_alike_are_not_told_apart_until_they_do_not() -> None:
     def drawn(rows: int, seed: int, begin: int | None = None) -> pd.DataFrame:
         rng, h, found = np.random.default_rng(seed), 0.0, []

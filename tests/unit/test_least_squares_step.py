@@ -171,6 +171,7 @@ def test_it_holds_where_the_printed_form_does_not(name: str) -> None:
     assert (error_as_printed(case, exact) > 1e-4) == printed_fails
 
 
+@pytest.mark.long
 def test_stress_of_forty_systems() -> None:
     """Variances over twenty decades."""
     worst = 0.0

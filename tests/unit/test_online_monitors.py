@@ -192,6 +192,7 @@ def test_a_peak_gain_holds_however_early_its_intervals_end(share, monkeypatch):
         assert np.all(found >= 1.0 / np.array(rates))
 
 
+@pytest.mark.long
 def test_no_false_alarm_where_known_inputs_bend_the_outputs():
     """Without disturbances the bound is what the start leaves, and what straight lines between samples add."""
     spec = load_spec(DESIGNS / "filasova" / "spec.yaml")
@@ -269,6 +270,7 @@ def test_a_continuous_design_on_a_log(machine):
         obsynth.online_monitor(machine, "pointwise", disturbance_bounds={"load": 0.5}, noise_bound=5.0)
 
 
+@pytest.mark.long
 def test_cumulative_sums_of_a_residual_that_a_window_does_not_whiten(machine):
     """A load of white noise leaves a residual that remembers for seconds: a window of one sample predicts nothing."""
     scenario = obsynth.Scenario(

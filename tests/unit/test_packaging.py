@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import re
 import subprocess
 import sys
@@ -93,3 +94,16 @@ def test_the_floors_are_in_pyproject_alone():
     assert "--resolution lowest-direct '.[nonlinear,fast,parquet]'" in (ROOT / ".ci" / "run").read_text(
         encoding="utf-8"
     )
+
+
+def test_mutants_are_killed_by_tests_that_the_readme_s_command_runs():
+    named = set(re.findall(r"([\w/]+\.py)::([\w:]+)", (ROOT / "benchmarks/mutants.md").read_text(encoding="utf-8")))
+    assert len(named) > 50
+    for file, path in named:
+        text = (ROOT / "tests" / file).read_text(encoding="utf-8")
+        assert "pytestmark = pytest.mark.long" not in text, file
+        found = [node for node in ast.walk(ast.parse(text))
+                 if isinstance(node, ast.FunctionDef) and node.name == path.split("::")[-1]]  # fmt: skip
+        assert found, f"{file}::{path}"
+        marks = {ast.unparse(decorator) for node in found for decorator in node.decorator_list}
+        assert "pytest.mark.long" not in marks, f"{file}::{path}"

@@ -97,6 +97,7 @@ class TestChoice:
         assert design.solver["engine"] == "riccati"
         assert any("62 unknown states" in note for note in design.notes)
 
+    @pytest.mark.long
     def test_where_the_closed_form_does_not_serve_the_inequality_does(self) -> None:
         """Theorem 2 for a delta of many time constants: "auto" goes on, and says so."""
         plant = large_plant(MOST_STATES_FOR_LMI)

@@ -294,6 +294,7 @@ class TestManyStates:
         assert f"{design.certificate.claims['steps']:.0f} steps" in rows["contraction"].detail
         assert rows["batch: state"].detail.startswith("6 steps at once")
 
+    @pytest.mark.long
     def test_as_the_recursion_has_it(self, design, monkeypatch):
         few = gain_schedule_summary(design.observer)
         monkeypatch.setattr("obsynth.observers.recursive.gain_schedule_summary.MANY_STATES", 200)

@@ -174,6 +174,7 @@ def test_what_such_a_plant_does_not_have_is_refused(shifted, changes, path: str)
     assert caught.value.path == path
 
 
+@pytest.mark.long
 def test_the_command_simulates_a_varying_plant(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     spec = DESIGNS / "moussaali2013_ltv" / "two_outputs.yaml"
     assert main(["simulate", "--system", str(spec), "--quiet", "--out", str(tmp_path / "run.csv")]) == 0

@@ -269,6 +269,7 @@ def test_a_continuous_option_is_refused(name):
         run_on_data(designed(name), log_of(name), warm_up=-1.0)
 
 
+@pytest.mark.long
 def test_deviations_are_honest_in_a_gap():
     """Over many runs, errors in a gap are as large as the column says."""
     design, errors, said = designed("filter"), [], []

@@ -47,6 +47,7 @@ def test_sets_of_equal_cost_are_ranked_by_the_error_after_design() -> None:
     assert [entry.cost for entry in found.sets] == [1.0, 1.0, 5.0, 5.0]
 
 
+@pytest.mark.long
 def test_as_many_sets_as_the_structural_toolbox_finds() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

@@ -49,6 +49,7 @@ def swept(
     return found.as_dict()
 
 
+@pytest.mark.long
 def test_a_dask_cluster_gives_the_same_numbers(linear, recursive, here) -> None:
     distributed = pytest.importorskip("distributed", reason="no Dask: pip install 'obsynth[cluster]'")
     with (

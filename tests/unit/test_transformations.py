@@ -343,6 +343,7 @@ class TestFaultsAsStates:
         assert whole.recovery.flags() == direct.recovery.flags()
 
 
+@pytest.mark.long
 def test_a_transformation_stands_for_its_plant_everywhere():
     written = obsynth.DescriptorSystem(
         E=[[1, 0, 0], [0, 1, 0], [0, 0, 0]], A=[[-1, 0.2, 0.1], [0.1, -2, 1], [0.5, 0.5, -1]], B=[[1], [0], [0]],

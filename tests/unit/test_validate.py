@@ -44,6 +44,7 @@ def test_a_calibrated_design_agrees_with_its_log(right):
     plt.close(figure)
 
 
+@pytest.mark.long
 def test_process_noise_a_hundred_times_too_large_is_named():
     found = validate(designed(Q={name: 100.0 * value for name, value in Q.items()}), LOG, rows="0:56", columns=HELD)
     assert not found.passed
@@ -61,6 +62,7 @@ def test_a_sensor_whose_noise_is_eight_times_too_small_is_named():
     assert any("R of v3" in sentence and "too small" in sentence for sentence in found.verdict)
 
 
+@pytest.mark.long
 def test_a_leak_in_the_rows_is_found(right):
     found = validate(right, LOG, columns=HELD)
     assert not found.passed
@@ -225,6 +227,7 @@ def test_a_walk_that_is_stated_large_is_no_disagreement(tank_design, form, walk)
     assert 5.0 < wrong.ratios["gauge"] < 12.0
 
 
+@pytest.mark.long
 def test_a_parameter_that_walks_as_stated_agrees(tank_design):
     log = walking_tank(0.02)
     found = validate(walking_design(tank_design, 0.02), log)
@@ -240,6 +243,7 @@ def test_a_parameter_that_walks_as_stated_agrees(tank_design):
     assert 5.0 < wrong.ratios["gauge"] < 12.0
 
 
+@pytest.mark.long
 def test_a_fault_that_is_further_off_than_it_may_walk_is_told(tank_design):
     found = validate(walking_design(tank_design, 1e-3), walking_tank(0.0, jump=0.5))
     assert not found.passed
@@ -249,6 +253,7 @@ def test_a_fault_that_is_further_off_than_it_may_walk_is_told(tank_design):
     assert any("no further than it may walk" in sentence for sentence in near.verdict)
 
 
+@pytest.mark.long
 def test_the_walk_of_a_recursive_design_is_judged_like_that_too():
     rng, x, rows = np.random.default_rng(4), 0.0, []
     for _ in range(300):

@@ -66,6 +66,7 @@ def test_what_another_sensor_sees_or_what_stays_is_no_run_of_wrong_samples(monke
     assert hidden(y, monkeypatch) == [(100, 0), (102, 0)]
 
 
+@pytest.mark.long
 def test_coloured_noise_is_found_behind_a_run_of_wrong_samples() -> None:
     """Three in a row made calibrate take the noise for white, of twice its size."""
     rng, h, e, rows = np.random.default_rng(3), 1.0, 0.0, []
