@@ -13,7 +13,6 @@ from typing import Any
 import pytest
 
 import obsynth
-from obsynth.cli import commands
 from obsynth.cli.main import design_command, main
 from obsynth.results.gain_sets import digest_of, load
 
@@ -315,10 +314,10 @@ class TestEndings:
         assert capsys.readouterr().out == f"obsynth {obsynth.__version__}\n"
 
     def test_interrupted(self, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-        def interrupted(spec: Any, report_stage: Any) -> Any:
+        def interrupted(spec: Any, **_: Any) -> Any:
             raise KeyboardInterrupt
 
-        monkeypatch.setattr(commands, "designed", interrupted)
+        monkeypatch.setattr("obsynth.spec.loader.design_of_spec", interrupted)
         assert main(["design", "--system", str(WANG), "--quiet"]) == 130
         assert capsys.readouterr().err == "Interrupted.\n"
         assert list(Path.cwd().iterdir()) == []

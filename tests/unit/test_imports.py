@@ -14,7 +14,7 @@ from pathlib import Path
 import obsynth
 
 SOURCE = Path(obsynth.__file__).parent
-ROOT = "obsynth"
+ROOT, COMMANDS = "obsynth", "obsynth.cli"
 
 
 def module_name(path: Path) -> str:
@@ -83,6 +83,9 @@ HEIGHT = {name: level for level, names in enumerate(levels()) for name in names}
 def runs_up(nodes: Iterable[ast.AST], package: str, modules: Mapping[str, object]) -> list[str]:
     """Return the modules of upper packages that a module names, for types only or as a text."""
     named = {*imports(nodes, modules), *texts_that_name_modules(nodes, modules)}
+    if package == COMMANDS:
+        # The command line calls what the package exports, as its other users do.
+        named.discard(ROOT)
     return sorted(name for name in named if HEIGHT.get(package_of(name), -1) < HEIGHT[package])
 
 
@@ -106,6 +109,13 @@ def test_no_arrow_runs_up() -> None:
     inner = (name for name in FILES if name not in (ROOT, f"{ROOT}.__main__"))
     found = {name: runs_up(nodes_of(name), package_of(name), FILES) for name in inner}
     assert {name: up for name, up in found.items() if up} == {}
+
+
+def test_nothing_that_the_package_exports_is_of_the_command_line() -> None:
+    named = {*imports(nodes_of(ROOT), FILES), *texts_that_name_modules(nodes_of(ROOT), FILES)}
+    homes = {*named, *obsynth._PUBLIC_HOMES.values(), *(f"{ROOT}.{name}" for name in obsynth._PUBLIC_PACKAGES)}
+    assert COMMANDS not in {package_of(home) for home in homes}
+    assert runs_up(arrows("import obsynth"), "obsynth.report", FILES) == [ROOT]
 
 
 def test_an_arrow_in_a_text_is_found() -> None:

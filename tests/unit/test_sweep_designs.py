@@ -57,6 +57,13 @@ def test_all_combinations_of_options_and_sensors(spec):
         _ = found.results[1].design
 
 
+def test_designs_know_when_the_inputs_of_a_log_act(spec):
+    (spec.parent / "plant.yaml").write_text(PLANT + "B: [[1], [0], [0]]\n")
+    spec.write_text(SPEC + "inputs: {delay: 2}\n")
+    (found,) = obsynth.sweep(spec, {}).results
+    assert found.design.input_delay == 2
+
+
 def test_executors_change_nothing(spec):
     values = {"plant.A": [[[a, 0.1, 0.2], [0, 0.5, 0.3], [0.2, 0.1, 1]] for a in (0.2, 0.4, 0.6)]}
     here = obsynth.sweep(spec, values)

@@ -5,17 +5,15 @@ from __future__ import annotations
 import argparse
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import obsynth
 from obsynth.cli.arguments import columns_of, pair, refuse_given
 from obsynth.cli.data_run import numbers_of, with_input_delay
 from obsynth.cli.output import answer, gains_to_hand_on, output_file, progress
 from obsynth.errors import SpecError, VerificationError
 from obsynth.files.inputs import protect
 from obsynth.files.outputs import FileKind, write_atomically
-
-if TYPE_CHECKING:
-    from obsynth.spec.loader import Spec
 
 #: Written by ``linearise`` and ``calibrate``.
 PLANT = FileKind("a plant that obsynth has linearised", rb"\A# Linearised by obsynth")
@@ -37,8 +35,6 @@ def _log_arguments(options: argparse.Namespace) -> dict[str, Any]:
 
 def run_linearise(options: argparse.Namespace) -> int:
     """Run ``linearise``: spec or plant in, matrices and operating point out."""
-    from obsynth.analysis.transformations.linearisation import linearise
-    from obsynth.plants.descriptor import DescriptorSystem
     from obsynth.report.plants import linear_plant_text, plant_document
     from obsynth.spec.loader import load_model
 
@@ -54,11 +50,11 @@ def run_linearise(options: argparse.Namespace) -> int:
         whole = (float("-inf"), float("inf"))
         free = {name: whole for name in free} | {name: _range(name, text) for name, text in bounded.items()}
     own = (options.at, options.given, options.free, options.fault, options.disturbance, options.drift)
-    if spec is not None and isinstance(spec.plant, DescriptorSystem) and not any(own):
+    if spec is not None and isinstance(spec.plant, obsynth.DescriptorSystem) and not any(own):
         # The point that the spec states, with its tolerances and noise.
         linear = spec.plant if spec.transformation is None else spec.transformation.source
     else:
-        linear = linearise(
+        linear = obsynth.linearise(
             model,
             at=options.at or "equilibrium",
             given=numbers_of(options.given),
@@ -69,9 +65,7 @@ def run_linearise(options: argparse.Namespace) -> int:
         )
     found = None
     if options.data is not None:
-        from obsynth.calibration.validity import validity
-
-        found = validity(model, linear, options.data, **_log_arguments(options))
+        found = obsynth.validity(model, linear, options.data, **_log_arguments(options))
     if target is not None:
         write_atomically(target, plant_document(linear, options.system.name))
     told = linear_plant_text(linear) if found is None else f"{linear_plant_text(linear)}\n{found}"
@@ -95,7 +89,6 @@ def run_linearise(options: argparse.Namespace) -> int:
 
 def run_calibrate(options: argparse.Namespace) -> int:
     """Run ``calibrate``: spec and log in, constants with their box and a verdict out."""
-    from obsynth.calibration.calibrating import calibrate
     from obsynth.calibration.spec_writing import calibrated_spec
     from obsynth.results.calibration_files import CALIBRATION_KIND, calibration_text
     from obsynth.results.gain_sets import plain
@@ -111,7 +104,7 @@ def run_calibrate(options: argparse.Namespace) -> int:
         protect(log)
         target = None if options.out is None else output_file(options.out, CALIBRATION, options)
         written = None if options.write_spec is None else _spec_file(options)
-        found = calibrate(plant, log, progress=report_stage, **asked)
+        found = obsynth.calibrate(plant, log, progress=report_stage, **asked)
         if digest is not None and digest != found.box.digest:
             raise SpecError(
                 f"The log {log} is not the one that the spec names: its digest is {found.box.digest}, and "
@@ -141,13 +134,11 @@ def _spec_file(options: argparse.Namespace) -> Path:
     return target
 
 
-def _asked(spec: Spec | None, options: argparse.Namespace) -> dict[str, Any]:
+def _asked(spec: obsynth.Spec | None, options: argparse.Namespace) -> dict[str, Any]:
     """Return the arguments of `calibrate`: of the spec, those of its nonlinear method, and of the command line."""
-    from obsynth.plants.dae.model import DAEModel
-
     asked: dict[str, Any] = {"log": None}
     if spec is not None:
-        if isinstance(spec.plant, DAEModel):
+        if isinstance(spec.plant, obsynth.DAEModel):
             method = spec.options
             if isinstance(method.get("Q"), dict):
                 asked["noisy"] = [name for name, variance in method["Q"].items() if variance > 0.0]
@@ -179,13 +170,11 @@ def _coloured(noise: Mapping[str, Any]) -> dict[str, Any] | None:
 
 def run_validate(options: argparse.Namespace) -> int:
     """Run ``validate``: gain set and log in, verdict out; the exit code is 6 where they do not agree."""
-    from obsynth.calibration.validating import validate
-
     design, _ = gains_to_hand_on(options.gains, unverified=options.unverified)
     protect(options.data)
     with progress(quiet=options.quiet) as report_stage:
         report_stage(f"running {options.gains} over {options.data}")
-        found = validate(
+        found = obsynth.validate(
             with_input_delay(design, options), options.data, progress=report_stage, **_log_arguments(options)
         )
     answer(options, {"gains": options.gains, "data": options.data, **found.to_dict()}, str(found))

@@ -10,32 +10,29 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+import obsynth
 from obsynth.cli.arguments import refuse_given
 from obsynth.cli.output import answer, gains_to_hand_on, output_file, print_json, progress, stdout_console
 from obsynth.errors import PreconditionError, SolverError, SpecError, VerificationError
-from obsynth.files.outputs import write_atomically
+from obsynth.files.outputs import FileKind, write_atomically
+from obsynth.results.calibration_files import CALIBRATION_KIND, box_row, verify_calibration
+from obsynth.results.gain_sets import GAIN_SET, design_as_dict, gain_set_bytes, place_of, restored, written_for
 
 if TYPE_CHECKING:
     from obsynth.analysis.structure import Structure
-    from obsynth.files.outputs import FileKind
-    from obsynth.results.design import ObserverDesign
-    from obsynth.results.verification_report import VerificationReport
-    from obsynth.spec import Spec
 
 
 def run_design(options: argparse.Namespace) -> int:
     """Run ``design``: spec in, report and gain set out."""
-    from obsynth.results.gain_sets import GAIN_SET, design_as_dict, gain_set_bytes, place_of
+    from obsynth.spec.loader import design_of_spec
 
     with progress(quiet=options.quiet) as report_stage:
         report_stage(f"reading {options.system}")
-        from obsynth.spec import load_spec
-
-        spec = load_spec(options.system)
+        spec = obsynth.load_spec(options.system)
         wanted = default_gains(spec) if options.output is None else options.output
         target = spec_output(wanted, GAIN_SET, spec, options, option="--output")
         _ask(spec)
-        design = designed(spec, report_stage)
+        design = design_of_spec(spec, progress=report_stage)
         file = write_atomically(target, gain_set_bytes(design, spec=spec.path))
     from obsynth.report.summary import summary
 
@@ -56,7 +53,7 @@ def run_design(options: argparse.Namespace) -> int:
     return 0
 
 
-def _print_design(design: ObserverDesign, file: Path, *, verbose: bool) -> None:
+def _print_design(design: obsynth.ObserverDesign, file: Path, *, verbose: bool) -> None:
     """Print the answer first; every claim and check if asked for, and what fails in any case."""
     from obsynth.report.designs import design_report
     from obsynth.report.summary import print_summary, summary
@@ -71,10 +68,8 @@ def _print_design(design: ObserverDesign, file: Path, *, verbose: bool) -> None:
         console.print(checks_table(design.report.failures, width=console.width))
 
 
-def default_gains(spec: Spec) -> Path:
+def default_gains(spec: obsynth.Spec) -> Path:
     """Return ``<name>.gains.json``, or a name with that of the spec's file where the first is another spec's."""
-    from obsynth.results.gain_sets import place_of, written_for
-
     names = (f"{spec.name}.gains.json", f"{spec.name}.{spec.path.stem}.gains.json")
     for name in names:
         target = Path(name)
@@ -83,45 +78,29 @@ def default_gains(spec: Spec) -> Path:
     raise SpecError(f"{' and '.join(names)} are of other specs called {spec.name!r}: give --output.", path=names[0])
 
 
-def designed(spec: Spec, report_stage: Any) -> ObserverDesign:
-    """Return the design that a spec asks for, proved; stages go to ``report_stage``."""
-    from obsynth.methods.designing import design
-
-    recovery = None if spec.transformation is None else spec.transformation.recovery
-    found = design(
-        spec.plant,
-        spec.method,
-        name=spec.name,
-        recovery=recovery,
-        progress=report_stage,
-        scenario=spec.scenario,
-        **dict(spec.options),
-    )
-    noted = () if spec.transformation is None else spec.transformation.notes
-    found = found.replace(notes=(*noted, *found.notes)) if noted else found
-    late = spec.input_delay(spec.plant)
-    return found.replace(input_delay=late) if late else found
-
-
 def designed_or_loaded(
-    spec: Spec, gains: Path | None, report_stage: Any, *, unverified: bool = False
-) -> ObserverDesign:
+    spec: obsynth.Spec, gains: Path | None, report_stage: Any, *, unverified: bool = False
+) -> obsynth.ObserverDesign:
     """Return the design that a spec asks for, or a saved one of the same plant, verified again."""
     if gains is None:
-        return designed(spec, report_stage)
+        from obsynth.spec.loader import design_of_spec
+
+        return design_of_spec(spec, progress=report_stage)
     design, _ = gains_to_hand_on(gains, unverified=unverified)
     require_same_signals(design, gains, spec)
     return design
 
 
-def require_same_signals(design: ObserverDesign, gains: Path, spec: Spec) -> None:
+def require_same_signals(design: obsynth.ObserverDesign, gains: Path, spec: obsynth.Spec) -> None:
     """Raise `SpecError` unless a gain set is for a plant with the inputs and outputs of a spec's plant."""
     # States may differ: a method may have eliminated some.
     if any(getattr(design.plant, name) != getattr(spec.plant, name) for name in ("input_names", "output_names")):
         raise SpecError(f"{gains} is for a plant with other signals than that of {spec.path}.", path=str(gains))
 
 
-def spec_output(wanted: Path, kind: FileKind | None, spec: Spec, options: argparse.Namespace, *, option: str) -> Path:
+def spec_output(
+    wanted: Path, kind: FileKind | None, spec: obsynth.Spec, options: argparse.Namespace, *, option: str
+) -> Path:
     """Return where to write what a spec asks for; refuse a hopeless place before any work is done."""
     if wanted.exists() and wanted.samefile(spec.path):
         raise SpecError(f"{wanted} is the spec itself: give another file to {option}.", path=str(wanted))
@@ -130,33 +109,27 @@ def spec_output(wanted: Path, kind: FileKind | None, spec: Spec, options: argpar
 
 def run_check(options: argparse.Namespace) -> int:
     """Run ``check``: structure, and the existence conditions of every method."""
-    from obsynth.spec import load_spec
-
-    spec = load_spec(options.system)
+    spec = obsynth.load_spec(options.system)
     _ask(spec)
-    from obsynth.analysis.diagnosis.diagnosing import diagnose
-    from obsynth.analysis.structure import analyse_structure
-    from obsynth.methods.designing import check
     from obsynth.methods.registry import AUTO
     from obsynth.numerics.libraries import failure_of
-    from obsynth.plants.descriptor import DescriptorSystem
     from obsynth.report.plants import is_unclear
 
-    if not isinstance(spec.plant, DescriptorSystem):
+    if not isinstance(spec.plant, obsynth.DescriptorSystem):
         refuse_given(options, ("whole_bank",), "linear plants with constant matrices")
     # A pencil, its eigenvalues and its index are those of one matrix pair: a plant that changes with k has none.
     structures, diagnosis, not_known = {}, None, ""
-    if isinstance(spec.plant, DescriptorSystem):
-        structures = {"as the method sees it": analyse_structure(spec.plant)}
+    if isinstance(spec.plant, obsynth.DescriptorSystem):
+        structures = {"as the method sees it": obsynth.analyse_structure(spec.plant)}
         model = spec.options.get("fault_model", "step")
         try:
-            diagnosis = diagnose(spec.plant, fault_model=model, whole_bank=options.whole_bank)
+            diagnosis = obsynth.diagnose(spec.plant, fault_model=model, whole_bank=options.whole_bank)
         except (SolverError, MemoryError) as error:  # the methods are asked all the same
             not_known = f"What can be diagnosed is not known. {failure_of(error) or error}"
     if spec.transformation is not None:
-        structures = {"as written": analyse_structure(spec.transformation.source), **structures}
+        structures = {"as written": obsynth.analyse_structure(spec.transformation.source), **structures}
     done = "" if spec.transformation is None else spec.transformation.description
-    methods = check(spec.plant, {} if spec.method == AUTO else {spec.method: spec.options})
+    methods = obsynth.check(spec.plant, {} if spec.method == AUTO else {spec.method: spec.options})
     own = methods.values() if spec.method == AUTO else [methods[spec.method]]
     passed = any(report.passed for report in own)
 
@@ -192,12 +165,11 @@ def run_check(options: argparse.Namespace) -> int:
     return 0 if passed else SolverError.exit_code if undecided else PreconditionError.exit_code
 
 
-def _ask(spec: Spec) -> None:
+def _ask(spec: obsynth.Spec) -> None:
     """Ask on stderr what may not be meant, as it may be the reason for all that follows."""
     from obsynth.analysis.structure import questions
-    from obsynth.plants.descriptor import DescriptorSystem
 
-    for text in questions(spec.plant) if isinstance(spec.plant, DescriptorSystem) else ():
+    for text in questions(spec.plant) if isinstance(spec.plant, obsynth.DescriptorSystem) else ():
         print(f"Question: {text}", file=sys.stderr)
 
 
@@ -217,11 +189,9 @@ def _structure_as_dict(structure: Structure) -> dict[str, Any]:
 def run_sensors(options: argparse.Namespace) -> int:
     """Run ``sensors``: spec in, least sets of sensors to add out; 3 where nothing reaches the goal."""
     from obsynth.analysis.transformations.recovery import linear_plant
-    from obsynth.comparison.sensor_sets import sensor_sets
-    from obsynth.spec import load_spec
 
     with progress(quiet=options.quiet) as report_stage:
-        spec = load_spec(options.system)
+        spec = obsynth.load_spec(options.system)
         plant = linear_plant(spec.plant)
         given: dict[str, Any] = {"goal": options.goal, "noise": options.noise, "largest": options.largest}
         if options.goal == "threshold":
@@ -234,7 +204,7 @@ def run_sensors(options: argparse.Namespace) -> int:
         else:
             refuse_given(options, ("below", "sample_time"), "--goal threshold")
             given |= {"faults": None if options.fault is None else [options.fault]}
-        found = sensor_sets(plant, progress=report_stage, **given)
+        found = obsynth.sensor_sets(plant, progress=report_stage, **given)
     answer(options, {"spec": spec.path, **found.to_dict()}, lambda: stdout_console().print(str(found), highlight=False))
     return 0
 
@@ -243,7 +213,6 @@ def run_verify(options: argparse.Namespace) -> int:
     """Run ``verify``: recheck any certificate, without a solver, to the end of what it rests on."""
     from obsynth.comparison.certificates import kind_of_file, verify_certificate
     from obsynth.experiments.alarm_proof import ALARM_KIND
-    from obsynth.results.calibration_files import CALIBRATION_KIND, verify_calibration
     from obsynth.results.certificate_files import RESULTS
 
     options.gains = options.gains or options.file
@@ -293,9 +262,7 @@ def _require_fitting(options: argparse.Namespace, kind: str) -> None:
 
 def _calibrated_again(options: argparse.Namespace) -> dict[str, Any]:
     """Return what the same calibration of the given plant and log comes to."""
-    from obsynth.calibration.calibrating import calibrate
     from obsynth.files.inputs import read_json
-    from obsynth.results.gain_sets import restored
     from obsynth.spec.loader import load_plant
 
     plant, _ = load_plant(options.system)
@@ -304,27 +271,22 @@ def _calibrated_again(options: argparse.Namespace) -> dict[str, Any]:
         raise SpecError(
             f"{options.gains} does not hold the options of its calibration: calibrate again.", path=str(options.gains)
         )
-    return calibrate(plant, options.data, **restored(asked)).to_dict()
+    return obsynth.calibrate(plant, options.data, **restored(asked)).to_dict()
 
 
-def _with_calibration(report: VerificationReport, design: ObserverDesign, path: Path) -> VerificationReport:
+def _with_calibration(
+    report: obsynth.VerificationReport, design: obsynth.ObserverDesign, path: Path
+) -> obsynth.VerificationReport:
     """Return a report with the row that the box of a design is that of a calibration file."""
-    from obsynth.plants.descriptor import DescriptorSystem
-    from obsynth.results.calibration_files import box_row
-    from obsynth.results.verification_report import VerificationReport
-
-    uncertain = design.plant.uncertainty if isinstance(design.plant, DescriptorSystem) else None
+    uncertain = design.plant.uncertainty if isinstance(design.plant, obsynth.DescriptorSystem) else None
     if uncertain is None:
         raise SpecError(f"{design.name!r} has no tolerances, which a calibration could give.", path="--calibration")
-    return VerificationReport.of((*report.checks, box_row(uncertain.box, path)))
+    return obsynth.VerificationReport.of((*report.checks, box_row(uncertain.box, path)))
 
 
 def _verify_gain_set(options: argparse.Namespace) -> int:
-    from obsynth.methods.verifying import verify
-    from obsynth.results.gain_sets import load
-
-    design = load(options.gains)
-    report = verify(design, printed_digits=options.printed_digits)
+    design = obsynth.load(options.gains)
+    report = obsynth.verify(design, printed_digits=options.printed_digits)
     if options.calibration is not None:
         report = _with_calibration(report, design, options.calibration)
     answer(

@@ -9,8 +9,9 @@ import argparse
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import Any, TextIO
 
+import obsynth
 from obsynth.cli.arguments import columns_of, refuse_given
 from obsynth.cli.data_run import (
     STREAM,
@@ -29,10 +30,6 @@ from obsynth.cli.output import answer, gains_to_hand_on, output_file, print_json
 from obsynth.errors import SpecError, VerificationError
 from obsynth.files.inputs import protect, protect_stream
 from obsynth.files.outputs import FileKind, require_distinct, write_atomically
-
-if TYPE_CHECKING:
-    from obsynth.data.run import DataRun
-    from obsynth.results.design import ObserverDesign
 
 
 def run_thresholds(options: argparse.Namespace) -> int:
@@ -162,9 +159,7 @@ def run_export(options: argparse.Namespace) -> int:
         output_file(file, kind, options, option="--to")
     monitor = None
     if options.normal is not None:
-        from obsynth.data.online_monitor import online_monitor
-
-        monitor = online_monitor(design, "learned", normal=options.normal, unverified=options.unverified)
+        monitor = obsynth.online_monitor(design, "learned", normal=options.normal, unverified=options.unverified)
     files = export(
         design,
         options.to,
@@ -183,9 +178,8 @@ def run_export(options: argparse.Namespace) -> int:
 def run_prove_alarm(options: argparse.Namespace) -> int:
     """Run ``prove-alarm``: 0 whether there is a proof or not; every failure is an error."""
     from obsynth.experiments.alarm_proof import CERTIFICATE
-    from obsynth.results.gain_sets import load
 
-    design = load(options.gains)  # `prove_alarm` verifies it
+    design = obsynth.load(options.gains)  # `prove_alarm` verifies it
     target = None if options.out is None else output_file(options.out, CERTIFICATE, options)
     found = proof_of(design, options, options.row, state_bounds=numbers_of(options.state_bound) or None)
     file = str(found.save(target)) if found.proved and target is not None else None
@@ -215,9 +209,8 @@ def run_report(options: argparse.Namespace) -> int:
         own = ("gains", "unverified", "system", "out", "force", "json")
         refuse_given(options, [name for name in vars(options) if name not in own], "a log: give --data")
     from obsynth.report.page import PAGE, html_report
-    from obsynth.spec import load_spec
 
-    scenario = None if options.system is None else required_scenario(load_spec(options.system))
+    scenario = None if options.system is None else required_scenario(obsynth.load_spec(options.system))
     system = None if options.system is None else str(options.system)
     output_file(options.out, PAGE, options)
     design, report = verified_again(options.gains)
@@ -247,7 +240,6 @@ def run_report(options: argparse.Namespace) -> int:
 def _run_robustness(options: argparse.Namespace) -> int:
     """Write what holds for every plant within its tolerances as a certificate."""
     from obsynth.results.certificate_files import RESULT_FILE
-    from obsynth.tolerances.robustness import robustness
 
     refuse_given(
         options,
@@ -256,7 +248,7 @@ def _run_robustness(options: argparse.Namespace) -> int:
     )
     output_file(options.out, RESULT_FILE, options)
     design, _ = gains_to_hand_on(options.gains, unverified=False)
-    found = robustness(design)
+    found = obsynth.robustness(design)
     file = found.save(options.out)
     told = {"gains": options.gains, "file": file, "statement": found.statement, **found.as_dict()}
     answer(options, told, found.statement)
@@ -305,7 +297,7 @@ def run_plot(options: argparse.Namespace) -> int:
     return 0
 
 
-def _draw(found: DataRun, design: ObserverDesign, parts: list[str], target: Path | None) -> None:
+def _draw(found: obsynth.types.DataRun, design: obsynth.ObserverDesign, parts: list[str], target: Path | None) -> None:
     from obsynth.plotting.data import panel_count, plot_data
 
     if target is not None:

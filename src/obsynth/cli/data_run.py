@@ -8,22 +8,14 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import Any, TextIO
 
+import obsynth
 from obsynth.cli.arguments import columns_of, refuse_given
 from obsynth.cli.output import output_file
 from obsynth.errors import SpecError
 from obsynth.experiments.monitors.options import LINEAR_OPTIONS, PARAMETER_OPTIONS
 from obsynth.files.inputs import protect, protect_stream
-
-if TYPE_CHECKING:
-    from obsynth.data.run import DataRun
-    from obsynth.experiments.alarm_proof import AlarmProof
-    from obsynth.experiments.monitors.monitor import Monitor
-    from obsynth.plants.uncertainty import Uncertainty
-    from obsynth.results.design import ObserverDesign
-    from obsynth.simulation.scenario import Scenario
-    from obsynth.spec import Spec
 
 STREAM = "-"
 
@@ -38,18 +30,16 @@ def protect_inputs(options: argparse.Namespace) -> None:
 
 
 def run_of(
-    design: ObserverDesign,
+    design: obsynth.ObserverDesign,
     options: argparse.Namespace,
-    watched: Monitor | None,
+    watched: obsynth.types.Monitor | None,
     out: Path | TextIO | None = None,
     **more: Any,
-) -> DataRun:
+) -> obsynth.types.DataRun:
     """Return a run of a design on the data of the command line, with its table where it is not written to ``out``."""
-    from obsynth.data.run import run_on_data
-
     design = with_input_delay(design, options)
     with rows_done(options.data, quiet=getattr(options, "quiet", True) or out is sys.stdout) as progress:
-        found = run_on_data(
+        found = obsynth.run_on_data(
             design,
             sys.stdin if options.data == STREAM else Path(options.data),
             out,
@@ -67,7 +57,7 @@ def run_of(
     return found
 
 
-def with_input_delay(design: ObserverDesign, options: argparse.Namespace) -> ObserverDesign:
+def with_input_delay(design: obsynth.ObserverDesign, options: argparse.Namespace) -> obsynth.ObserverDesign:
     """Return a design for a log whose inputs act as many rows later as the command line says."""
     rows = options.input_delay
     if rows == "auto":
@@ -97,27 +87,23 @@ def ranges_of(pairs: list[tuple[str, str]]) -> dict[str, float | tuple[float, fl
     return found
 
 
-def own_tolerances(design: ObserverDesign, kind: str | None) -> Uncertainty | None:
+def own_tolerances(design: obsynth.ObserverDesign, kind: str | None) -> obsynth.types.Uncertainty | None:
     """Return the tolerances of a design's plant, which its pointwise threshold holds for."""
     # Continuous designs with known inputs must be asked for it: the inputs have to be held between rows.
-    from obsynth.observers.linear.observer import LinearObserver
-    from obsynth.plants.descriptor import DescriptorSystem
 
     plant = design.plant
     if design.method == "guaranteed-test" and not design.observer.state_names:
         # Nothing beside the test follows the state: its threshold is that of an exact model, and says so.
         return None
-    if kind != "pointwise" or not isinstance(plant, DescriptorSystem) or (plant.nu and not plant.is_discrete):
+    if kind != "pointwise" or not isinstance(plant, obsynth.DescriptorSystem) or (plant.nu and not plant.is_discrete):
         return None
-    return plant.uncertainty if isinstance(design.observer, LinearObserver) else None
+    return plant.uncertainty if isinstance(design.observer, obsynth.LinearObserver) else None
 
 
-def monitor_settings(design: ObserverDesign, options: argparse.Namespace) -> dict[str, Any]:
+def monitor_settings(design: obsynth.ObserverDesign, options: argparse.Namespace) -> dict[str, Any]:
     """Return what the monitor of a design that is asked for is made of, by the names of the arguments of
     `obsynth.monitor`."""
-    from obsynth.observers.linear.observer import LinearObserver
-
-    table = LINEAR_OPTIONS if isinstance(design.observer, LinearObserver) else PARAMETER_OPTIONS
+    table = LINEAR_OPTIONS if isinstance(design.observer, obsynth.LinearObserver) else PARAMETER_OPTIONS
     refuse_other_kinds(options, table)
     given = {
         "disturbance_bounds": numbers_of(options.disturbance),
@@ -164,27 +150,26 @@ def refuse_other_kinds(options: argparse.Namespace, table: Mapping[str, tuple[st
         refuse_given(options, (name,), f"{where}, not for {options.monitor}")
 
 
-def monitor_of(design: ObserverDesign, options: argparse.Namespace, *, has_scenario: bool = False) -> Monitor | None:
+def monitor_of(
+    design: obsynth.ObserverDesign, options: argparse.Namespace, *, has_scenario: bool = False
+) -> obsynth.types.Monitor | None:
     """Return the monitor that is asked for."""
     if options.monitor is None:
         of_monitors = (*(() if has_scenario else ("system",)), "sample_time", *monitor_names())
         refuse_given(options, of_monitors, "a monitor: name it with --monitor")
         return None
-    from obsynth.data.online_monitor import online_monitor
-    from obsynth.observers.linear.observer import LinearObserver
 
-    linear, scenario = isinstance(design.observer, LinearObserver), None
+    linear, scenario = isinstance(design.observer, obsynth.LinearObserver), None
     if not linear:
         refuse_given(options, ("sample_time", *(() if has_scenario else ("system",))), "monitors of linear designs")
     # Of other designs, and beside thresholds that were learned, a scenario is there for the pictures alone.
     if options.system is not None and not (has_scenario and (not linear or options.monitor == "learned")):
         from obsynth.cli.commands import require_same_signals
-        from obsynth.spec import load_spec
 
-        spec = load_spec(options.system)
+        spec = obsynth.load_spec(options.system)
         require_same_signals(design, options.gains, spec)
         scenario = required_scenario(spec)
-    return online_monitor(
+    return obsynth.online_monitor(
         design,
         options.monitor,
         scenario=scenario,
@@ -195,7 +180,7 @@ def monitor_of(design: ObserverDesign, options: argparse.Namespace, *, has_scena
     )
 
 
-def summary_of_run(found: DataRun, watched: Monitor | None) -> str:
+def summary_of_run(found: obsynth.types.DataRun, watched: obsynth.types.Monitor | None) -> str:
     """Return what a run was, in a few lines."""
     from obsynth.data.alarm_events import silence
 
@@ -224,7 +209,7 @@ def summary_of_run(found: DataRun, watched: Monitor | None) -> str:
     return "\n".join(lines)
 
 
-def _alarm_table(found: DataRun) -> list[str]:
+def _alarm_table(found: obsynth.types.DataRun) -> list[str]:
     """Return lines of a table of all alarms."""
     from obsynth.data.alarm_events import alarm_rows
 
@@ -267,7 +252,7 @@ def _rows_in(path: Path) -> int | None:
         return None
 
 
-def required_scenario(spec: Spec) -> Scenario:
+def required_scenario(spec: obsynth.Spec) -> obsynth.Scenario:
     """Return the scenario of a spec."""
     if spec.scenario is None:
         raise SpecError(
@@ -295,7 +280,9 @@ def certificate_target(options: argparse.Namespace) -> Path | None:
     return output_file(options.prove, CERTIFICATE, options, option="--prove")
 
 
-def alarm_of_run(design: ObserverDesign, options: argparse.Namespace, found: DataRun, target: Path) -> dict[str, Any]:
+def alarm_of_run(
+    design: obsynth.ObserverDesign, options: argparse.Namespace, found: obsynth.types.DataRun, target: Path
+) -> dict[str, Any]:
     """Return whether the first alarm of a run is proved, in words, and the certificate's file."""
     row = found.alarm_rows.get("pointwise")
     if row is None:
@@ -308,11 +295,11 @@ def alarm_of_run(design: ObserverDesign, options: argparse.Namespace, found: Dat
     return {"proved": False, "row": row, "statement": proof.statement, "file": None}
 
 
-def proof_of(design: ObserverDesign, options: argparse.Namespace, row: int, **more: Any) -> AlarmProof:
+def proof_of(
+    design: obsynth.ObserverDesign, options: argparse.Namespace, row: int, **more: Any
+) -> obsynth.types.AlarmProof:
     """Return the proof, or why there is none, that the window up to a row of the data is not free of faults."""
-    from obsynth.data.alarm_proof import prove_alarm
-
-    return prove_alarm(
+    return obsynth.prove_alarm(
         with_input_delay(design, options),
         Path(options.data),
         row,

@@ -5,8 +5,9 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import obsynth
 from obsynth.cli.arguments import columns_of, refuse_given
 from obsynth.cli.commands import designed_or_loaded, spec_output
 from obsynth.cli.data_commands import picture_kind, written_picture
@@ -25,23 +26,13 @@ from obsynth.files.inputs import protect
 from obsynth.files.outputs import FileKind, write_atomically
 from obsynth.results.certificate_files import RESULT_FILE
 
-if TYPE_CHECKING:
-    from obsynth.experiments.monitors.monitor import Monitor
-    from obsynth.observers.decisions import ParameterMonitor
-    from obsynth.plants.descriptor import DescriptorSystem
-    from obsynth.results.design import ObserverDesign
-    from obsynth.simulation.scenario import Scenario
-    from obsynth.spec import Spec
-
 
 def _prepared(
     options: argparse.Namespace, report_stage: Callable[[str], None], kind: FileKind | None = None
-) -> tuple[Spec, Scenario, Path | None, ObserverDesign]:
+) -> tuple[obsynth.Spec, obsynth.Scenario, Path | None, obsynth.ObserverDesign]:
     """Return spec, scenario, where to write a file of some kind, and the design, made or loaded."""
     report_stage(f"reading {options.system}")
-    from obsynth.spec import load_spec
-
-    spec = load_spec(options.system)
+    spec = obsynth.load_spec(options.system)
     scenario = required_scenario(spec)
     if options.gains is not None:
         protect(options.gains)
@@ -79,9 +70,8 @@ def _run_tolerances(options: argparse.Namespace) -> int:
     with progress(quiet=options.quiet) as report_stage:
         kind = None if options.out is None else RESULT_FILE if _is_json(options.out) else picture_kind(options.out)
         spec, scenario, target, design = _prepared(options, report_stage, kind)
-        from obsynth.experiments.tolerance_study import tolerance_study
 
-        found = tolerance_study(
+        found = obsynth.tolerance_study(
             design,
             scenario,
             tolerances=[_tolerance(item) for item in options.tolerances.split(",")],
@@ -126,17 +116,14 @@ def run_evaluate(options: argparse.Namespace) -> int:
     with progress(quiet=options.quiet) as report_stage:
         spec, scenario, _, design = _prepared(options, report_stage)
         report_stage("running")
-        from obsynth.experiments.monitors.residual_monitor import monitor
-        from obsynth.experiments.monte_carlo import evaluate
-        from obsynth.observers.linear.observer import LinearObserver
 
-        watched: Monitor | ParameterMonitor | None = None
-        if options.monitor is not None and isinstance(design.observer, LinearObserver):
-            watched = monitor(design, scenario, options.monitor, **monitor_settings(design, options))
+        watched: obsynth.types.Monitor | obsynth.ParameterMonitor | None = None
+        if options.monitor is not None and isinstance(design.observer, obsynth.LinearObserver):
+            watched = obsynth.monitor(design, scenario, options.monitor, **monitor_settings(design, options))
         elif options.monitor is not None:
             watched = _parameter_monitor(options)
         with chosen_executor(options.jobs, None) as executor:
-            found = evaluate(
+            found = obsynth.evaluate(
                 design,
                 scenario,
                 runs=options.runs,
@@ -170,16 +157,14 @@ def run_evaluate(options: argparse.Namespace) -> int:
     return 0
 
 
-def _parameter_monitor(options: argparse.Namespace) -> ParameterMonitor:
+def _parameter_monitor(options: argparse.Namespace) -> obsynth.ParameterMonitor:
     """Return the decision on parameters that is asked for."""
-    from obsynth.observers.decisions import ParameterMonitor
-
     refuse_other_kinds(options, {**PARAMETER_OPTIONS, "glr": ("false_alarms",)})
     change = options.change if options.monitor == "cusum" else None
-    return ParameterMonitor(options.monitor, false_alarms=options.false_alarms, change=change)
+    return obsynth.ParameterMonitor(options.monitor, false_alarms=options.false_alarms, change=change)
 
 
-def _compared_delay(spec: Spec, options: argparse.Namespace) -> int:
+def _compared_delay(spec: obsynth.Spec, options: argparse.Namespace) -> int:
     """Return rows by which the inputs of the log act later than linear designs on samples take them."""
     if options.input_delay == "auto":
         raise SpecError("--input-delay auto is for calibrate: give a number of rows.", path="--input-delay")
@@ -189,20 +174,18 @@ def _compared_delay(spec: Spec, options: argparse.Namespace) -> int:
 
 def run_compare(options: argparse.Namespace) -> int:
     """Run ``compare``: spec in, table and recommendation out; 3 where no method exists."""
-    from obsynth.comparison.comparing import compare
     from obsynth.comparison.result import COMPARISON_PAGE
-    from obsynth.spec import load_spec
 
     with progress(quiet=options.quiet) as report_stage:
         report_stage(f"reading {options.system}")
-        spec = load_spec(options.system)
+        spec = obsynth.load_spec(options.system)
         if options.data is None:
             refuse_given(options, ("map", "scale", "time_column", "input_delay"), "a log: give --data")
         if options.out is not None:
             output_file(options.out, RESULT_FILE if _is_json(options.out) else COMPARISON_PAGE, options)
         plant, clock = _plant_and_clock(spec, options.sample_time)
         given = {} if spec.method == "auto" else {spec.method: spec.options}
-        found = compare(
+        found = obsynth.compare(
             plant,
             scenario=spec.scenario,
             options=given,
@@ -232,12 +215,10 @@ def run_compare(options: argparse.Namespace) -> int:
     return 0 if found.recommended else PreconditionError.exit_code
 
 
-def _plant_and_clock(spec: Spec, sample_time: float | None) -> tuple[DescriptorSystem, float | None]:
+def _plant_and_clock(spec: obsynth.Spec, sample_time: float | None) -> tuple[obsynth.DescriptorSystem, float | None]:
     """Return the plant before it was sampled, and the clock: some methods are continuous, and so are tolerances."""
-    from obsynth.plants.descriptor import DescriptorSystem
-
     plant = spec.plant
-    if not isinstance(plant, DescriptorSystem):
+    if not isinstance(plant, obsynth.DescriptorSystem):
         raise SpecError("compare is for linear plants with constant matrices.", path="plant")
     if spec.transformation is None:
         return plant, sample_time

@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import obsynth
 from obsynth.cli.arguments import refuse_given
 from obsynth.cli.data_run import STREAM, monitor_names, numbers_of
 from obsynth.cli.output import output_file, print_json, progress, stdout_console
@@ -31,10 +32,9 @@ def run_sweep(options: argparse.Namespace) -> int:
     for spec in options.system:
         input_file(Path(spec))  # what is designed for hours is not refused in the end
     _require_claim(options, parameters)
-    from obsynth.sweeps.sweep import sweep
 
     def work(executor: Executor | None, done: Callable[[int, int], None]) -> Any:
-        return sweep(options.system, parameters, executor=executor, folder=options.out, progress=done)
+        return obsynth.sweep(options.system, parameters, executor=executor, folder=options.out, progress=done)
 
     def draw(found: Any) -> Any:
         claims = {name for result in found.results for name in result.claims}
@@ -84,7 +84,6 @@ def run_many(options: argparse.Namespace) -> int:
     folder = Path(options.out)
     if options.out == STREAM or (folder.exists() and not folder.is_dir()):
         raise SpecError("Many designs need a folder for their estimates: give one to --out.", path="--out")
-    from obsynth.sweeps.fleet import run_fleet
 
     for path in (Path(options.gains), Path(options.data)):
         if path.is_file():
@@ -103,7 +102,7 @@ def run_many(options: argparse.Namespace) -> int:
 
     def work(executor: Executor | None, done: Callable[[int, int], None]) -> Any:
         stated = {name: value for name, value in asked.items() if value is not None}
-        return run_fleet(options.gains, options.data, folder, executor=executor, progress=done, **stated)
+        return obsynth.run_fleet(options.gains, options.data, folder, executor=executor, progress=done, **stated)
 
     table = FileKind("the table of many runs", rb"\Arun,status,")
     found, files = _carried_out(

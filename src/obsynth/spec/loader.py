@@ -42,6 +42,7 @@ from obsynth.spec.documents import DocumentProblems, checked_plant, checked_spec
 
 if TYPE_CHECKING:
     from obsynth.analysis.transformations.recovery import Transformation
+    from obsynth.results.design import ObserverDesign
     from obsynth.spec.schema import ProfileSection, ScenarioSection
     from obsynth.spec.schema_rare import DAESection, TimeVaryingSection
     from obsynth.spec.schema_values import EntrySection, PlantReference, PlantSection, TransformSection
@@ -703,6 +704,26 @@ def load_spec(path: str | Path) -> Spec:
     """
     source = Path(path)
     return spec_of(read_yaml(source), source)
+
+
+def design_of_spec(
+    spec: Spec, *, name: str | None = None, progress: Callable[[str], None] | None = None
+) -> ObserverDesign:
+    """Return the design that a spec asks for, proved, with what its transformation says and when its inputs act."""
+    from obsynth.methods.designing import design
+
+    done, late = spec.transformation, spec.input_delay(spec.plant)
+    found = design(
+        spec.plant,
+        spec.method,
+        name=name or spec.name,
+        recovery=None if done is None else done.recovery,
+        progress=progress,
+        scenario=spec.scenario,
+        **dict(spec.options),
+    )
+    notes = () if done is None else done.notes
+    return found.replace(notes=(*notes, *found.notes), input_delay=late or found.input_delay)
 
 
 def spec_of(

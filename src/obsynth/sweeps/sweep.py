@@ -33,7 +33,7 @@ from obsynth.plants.validation import index_of
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import gain_set_bytes, load, loaded, plain, restored
 from obsynth.spec.documents import read_yaml
-from obsynth.spec.loader import changed_document, spec_of
+from obsynth.spec.loader import changed_document, design_of_spec, spec_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -68,19 +68,15 @@ def spec_cases(specs: Sequence[Path], parameters: Mapping[str, Sequence[Any]], v
             own, of_plant = _sorted_out(document, chosen)
             changed = changed_document(document, own)
             name, digest = _named(stem, chosen), _digest(version, changed, of_plant, path)
-            cases.append(Work(name, digest, partial(_design_of_spec, name, path, changed, of_plant), chosen))
+            cases.append(Work(name, digest, partial(_case_of_spec, name, path, changed, of_plant), chosen))
     return _distinct(cases)
 
 
-def _design_of_spec(
+def _case_of_spec(
     name: str, path: Path, document: Mapping[str, Any], plant_changes: Mapping[str, Any]
 ) -> ObserverDesign:
     """Return the design of a spec, and of changes to the plant in the file that it refers to."""
-    spec = spec_of(document, path, plant_changes=plant_changes)
-    recovery = None if spec.transformation is None else spec.transformation.recovery
-    found = design(spec.plant, spec.method, name=name, recovery=recovery, scenario=spec.scenario, **dict(spec.options))
-    notes = () if spec.transformation is None else spec.transformation.notes
-    return found.replace(notes=(*notes, *found.notes)) if notes else found
+    return design_of_spec(spec_of(document, path, plant_changes=plant_changes), name=name)
 
 
 def plant_cases(
