@@ -91,8 +91,7 @@ _PUBLIC_NAMES = {
     "simulation.profiles": "Drift Gaussian Intermittent LostEffectiveness Ramp Sine Step Stuck Uniform",
     "simulation.scenario": "Scenario",
     "spec.loader": "load_spec Spec",
-    "sweeps.fleet": "run_fleet",
-    "sweeps.sweep": "sweep",
+    "sweeps.sweep": "run_fleet sweep",
     "tolerances.robustness": "robustness",
 }
 _PUBLIC_HOMES = {name: f"obsynth.{module}" for module, names in _PUBLIC_NAMES.items() for name in names.split()}

@@ -93,7 +93,7 @@ from obsynth.simulation.profiles import Uniform as Uniform
 from obsynth.simulation.scenario import Scenario as Scenario
 from obsynth.spec.loader import Spec as Spec
 from obsynth.spec.loader import load_spec as load_spec
-from obsynth.sweeps.fleet import run_fleet as run_fleet
+from obsynth.sweeps.sweep import run_fleet as run_fleet
 from obsynth.sweeps.sweep import sweep as sweep
 from obsynth.tolerances.robustness import robustness as robustness
 from obsynth.version import __version__ as __version__

@@ -32,8 +32,7 @@ _TYPE_NAMES = {
     "plants.uncertainty": "Uncertainty",
     "results.checks": "Check",
     "simulation.signals": "Trajectory",
-    "sweeps.fleet": "Fleet FleetRun",
-    "sweeps.sweep": "Sweep SweepResult",
+    "sweeps.sweep": "Fleet FleetRun Sweep SweepResult",
     "tolerances.robustness": "Robustness",
 }
 _TYPE_HOMES = {name: f"obsynth.{module}" for module, names in _TYPE_NAMES.items() for name in names.split()}

@@ -34,8 +34,8 @@ from obsynth.plants.constants import ConstantsBox as ConstantsBox
 from obsynth.plants.uncertainty import Uncertainty as Uncertainty
 from obsynth.results.checks import Check as Check
 from obsynth.simulation.signals import Trajectory as Trajectory
-from obsynth.sweeps.fleet import Fleet as Fleet
-from obsynth.sweeps.fleet import FleetRun as FleetRun
+from obsynth.sweeps.sweep import Fleet as Fleet
+from obsynth.sweeps.sweep import FleetRun as FleetRun
 from obsynth.sweeps.sweep import Sweep as Sweep
 from obsynth.sweeps.sweep import SweepResult as SweepResult
 from obsynth.tolerances.robustness import Robustness as Robustness
