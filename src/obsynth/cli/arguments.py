@@ -5,12 +5,12 @@ from __future__ import annotations
 import argparse
 import math
 import textwrap
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from obsynth.errors import SpecError
-from obsynth.experiments.monitors.options import CHANGE, FALSE_ALARMS, WINDOW
+from obsynth.experiments.monitors.options import CHANGE, FALSE_ALARMS, LINEAR_OPTIONS, PARAMETER_OPTIONS, WINDOW
 
 
 class Argument(NamedTuple):
@@ -296,3 +296,62 @@ DATA_OPTIONS = (
         )
     ),
 )
+
+
+#: In place of a file: standard input, or standard output.
+STREAM = "-"
+
+
+def number_of(name: str, text: str) -> float:
+    """Return the value of an argument of the form NAME=VALUE."""
+    try:
+        return float(text)
+    except ValueError:
+        raise SpecError(f"{name}={text}: {text!r} is no number.", path=name) from None
+
+
+def numbers_of(pairs: list[tuple[str, str]]) -> Mapping[str, float]:
+    """Return values by name, from arguments of the form NAME=VALUE."""
+    return {name: number_of(name, text) for name, text in pairs}
+
+
+def ranges_of(pairs: list[tuple[str, str]]) -> dict[str, float | tuple[float, float]]:
+    """Return bounds by name, from arguments of the form NAME=BOUND or NAME=LOW:HIGH."""
+    found: dict[str, float | tuple[float, float]] = {}
+    for name, text in pairs:
+        low, colon, high = text.partition(":")
+        found[name] = (number_of(name, low), number_of(name, high)) if colon else number_of(name, text)
+    return found
+
+
+#: Arguments of the command line that are not called as the options that they give.
+_CALLED = {"disturbance_bounds": "disturbance", "initial_set": "initial"}
+
+
+#: Options that are no settings of monitors on the command line.
+_ELSEWHERE = ("scenario", "sample_time", "constants", "gamma")
+
+
+def _settings_of(names: Iterable[str]) -> list[str]:
+    """Return what options are called on the command line."""
+    return [_CALLED.get(name, name) for name in names if name not in _ELSEWHERE]
+
+
+def monitor_names() -> list[str]:
+    """Return the names of all settings of monitors."""
+    tables = (LINEAR_OPTIONS, PARAMETER_OPTIONS)
+    return sorted({name for table in tables for names in table.values() for name in _settings_of(names)})
+
+
+def refuse_other_kinds(options: argparse.Namespace, table: Mapping[str, tuple[str, ...]]) -> None:
+    """Refuse settings that do nothing for the kind of monitor that is asked for."""
+    if options.monitor not in table:
+        return  # who makes the monitor says which kinds there are
+    used = _settings_of(table[options.monitor])
+    # The window of ``run --prove`` is that of the proof.
+    proving = ("window",) if getattr(options, "prove", None) is not None else ()
+    names = [name for name in monitor_names() if name not in (*used, *proving) and hasattr(options, name)]
+    kinds = {name: [kind for kind, own in table.items() if name in _settings_of(own)] for name in names}
+    for name, others in kinds.items():
+        where = f"the monitor {' or '.join(others)}" if others else "designs of another kind"
+        refuse_given(options, (name,), f"{where}, not for {options.monitor}")

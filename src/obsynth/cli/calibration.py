@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import obsynth
-from obsynth.cli.arguments import columns_of, pair, refuse_given
-from obsynth.cli.data_run import numbers_of, with_input_delay
+from obsynth.cli.arguments import columns_of, numbers_of, pair, refuse_given
+from obsynth.cli.data_commands import with_input_delay
 from obsynth.cli.output import answer, gains_to_hand_on, output_file, progress
 from obsynth.errors import SpecError, VerificationError
 from obsynth.files.inputs import protect

@@ -8,15 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import obsynth
-from obsynth.cli.arguments import columns_of, refuse_given
+from obsynth.cli.arguments import columns_of, monitor_names, numbers_of, refuse_given, refuse_other_kinds
 from obsynth.cli.commands import designed_or_loaded, spec_output
-from obsynth.cli.data_commands import picture_kind, written_picture
-from obsynth.cli.data_run import (
-    monitor_names,
+from obsynth.cli.data_commands import (
     monitor_settings,
-    numbers_of,
-    refuse_other_kinds,
+    picture_kind,
     required_scenario,
+    written_picture,
 )
 from obsynth.cli.output import answer, output_file, progress, stdout_console
 from obsynth.cli.sweep import chosen_executor

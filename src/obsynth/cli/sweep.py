@@ -11,8 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import obsynth
-from obsynth.cli.arguments import refuse_given
-from obsynth.cli.data_run import STREAM, monitor_names, numbers_of
+from obsynth.cli.arguments import STREAM, monitor_names, numbers_of, refuse_given
 from obsynth.cli.output import output_file, print_json, progress, stdout_console
 from obsynth.errors import SpecError
 from obsynth.files.inputs import input_file
