@@ -103,7 +103,7 @@ __all__ = sorted(_PUBLIC_HOMES)
 provide(
     {
         "conditions of a design": "obsynth.conditions.shipped:conditions_of",
-        "design summary": "obsynth.report.summary:summary",
+        "design summary": "obsynth.report.designs:summary",
         "picture of a guaranteed test": "obsynth.plotting.guaranteed:plot_least_thresholds",
     }
 )

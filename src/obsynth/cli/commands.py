@@ -34,7 +34,7 @@ def run_design(options: argparse.Namespace) -> int:
         _ask(spec)
         design = design_of_spec(spec, progress=report_stage)
         file = write_atomically(target, gain_set_bytes(design, spec=spec.path))
-    from obsynth.report.summary import summary
+    from obsynth.report.designs import summary
 
     if options.json:
         print_json(
@@ -55,8 +55,7 @@ def run_design(options: argparse.Namespace) -> int:
 
 def _print_design(design: obsynth.ObserverDesign, file: Path, *, verbose: bool) -> None:
     """Print the answer first; every claim and check if asked for, and what fails in any case."""
-    from obsynth.report.designs import design_report
-    from obsynth.report.summary import print_summary, summary
+    from obsynth.report.designs import design_report, print_summary, summary
     from obsynth.results.layout import checks_table
 
     console = stdout_console()

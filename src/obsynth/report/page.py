@@ -62,9 +62,9 @@ from obsynth.report.designs import (
     plant_facts,
     promises,
     recovered_states,
+    summary,
     tolerance_facts,
 )
-from obsynth.report.summary import summary
 from obsynth.results.checks import FITS, Check, CheckKind, Status
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import gain_set_digest
