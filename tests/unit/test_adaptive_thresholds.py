@@ -14,8 +14,8 @@ from uncertain_plants import DRIVE, drive, wang
 
 import obsynth
 from obsynth.errors import PreconditionError, SpecError
-from obsynth.experiments.benches import make_bench
 from obsynth.experiments.monitors.adaptive import AdaptiveState, adaptive_plan, adaptive_step
+from obsynth.experiments.simulation import make_bench
 from obsynth.observers.running import state_as_data, state_from_data
 from obsynth.tolerances.exact_plant import drawn_points, plant_at
 from obsynth.verification.adaptive_record import record_columns, thresholds_of_records

@@ -219,7 +219,7 @@ def test_chi_square_of_a_sampled_continuous_design(machine):
         horizon=8, sample_time=0.02, noise=1, disturbances={"load": obsynth.Gaussian(deviation=0.5)}
     )
     watched = obsynth.monitor(machine, scenario, "chi-square", window=3)
-    from obsynth.experiments.benches import make_bench
+    from obsynth.experiments.simulation import make_bench
 
     bench = make_bench(machine, scenario)
     rows = bench.run(range(500)).rows

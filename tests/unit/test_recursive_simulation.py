@@ -12,8 +12,7 @@ import pytest
 import obsynth
 from obsynth.cli.main import main
 from obsynth.errors import SpecError
-from obsynth.experiments.benches import bench_of
-from obsynth.experiments.simulation import Simulation
+from obsynth.experiments.simulation import Simulation, bench_of
 from obsynth.spec import load_spec
 
 pytestmark = pytest.mark.usefixtures("taken_as_verified")

@@ -12,9 +12,8 @@ from typing import Any, cast
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.experiments.benches import Bench, Runs, bench_of, make_bench
 from obsynth.experiments.monitors.monitor import Monitor
-from obsynth.experiments.simulation import aligned_errors
+from obsynth.experiments.simulation import Bench, Runs, aligned_errors, bench_of, make_bench
 from obsynth.numerics.arguments import OpenUnitInterval, checked_value, require_kind, whole_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.dae.observer import DAEObserver

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.experiments.benches import Runs, make_bench
 from obsynth.experiments.monitors.monitor import Monitor
 from obsynth.experiments.monitors.residual_monitor import monitor
+from obsynth.experiments.simulation import Runs, make_bench
 from obsynth.files.outputs import write_atomically
 from obsynth.files.tables import text_table
 from obsynth.methods.handing_on import require_verified

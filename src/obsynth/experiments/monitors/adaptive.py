@@ -25,10 +25,10 @@ from obsynth.analysis.transformations.sampling import discretise
 from obsynth.analysis.transformations.uncertain_plant import AffinePlant, affine_plant, reduced_family
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.experiments.assumptions import Assumptions
-from obsynth.experiments.benches import Runs
 from obsynth.experiments.monitors.monitor import Judged, LinearSample, Rule, Sample
 from obsynth.experiments.monitors.residual_model import noisy_plant, watches_estimates
 from obsynth.experiments.monitors.rules import FITTING_SHARE, NormRule, NormState, norm_of
+from obsynth.experiments.simulation import Runs
 from obsynth.methods.tracking import tracking_of
 from obsynth.numerics.arguments import is_finite_number, require_mapping
 from obsynth.numerics.arrays import FloatArray

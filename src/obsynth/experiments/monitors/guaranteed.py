@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from obsynth.errors import SpecError
 from obsynth.experiments.assumptions import Assumptions
-from obsynth.experiments.benches import make_bench
 from obsynth.experiments.monitors.adaptive import AdaptiveRule, adaptive_plan, adaptive_statement, over_box
 from obsynth.experiments.monitors.monitor import Judged, LinearSample, Monitor, Rule, Sample
 from obsynth.experiments.monitors.rules import NormRule
+from obsynth.experiments.simulation import make_bench
 from obsynth.methods.guaranteed_test.bank import is_bank
 from obsynth.methods.guaranteed_test.checks import while_inside
 from obsynth.methods.guaranteed_test.exact import Programmes

@@ -24,8 +24,8 @@ from obsynth.plants.constants import shown
 
 if TYPE_CHECKING:
     from obsynth.experiments.assumptions import Assumptions
-    from obsynth.experiments.benches import Runs
     from obsynth.experiments.monitors.residual_model import ResidualModel
+    from obsynth.experiments.simulation import Runs
 
 MONITOR_KINDS = ("paper", "pointwise", "window", "chi-square", "cusum")
 STATEMENTS: Mapping[str, str] = {

@@ -10,7 +10,6 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.experiments.assumptions import Assumptions
-from obsynth.experiments.benches import Bench, make_bench
 from obsynth.experiments.monitors.adaptive import (
     NO_TOLERANCE,
     noisy_design,
@@ -31,6 +30,7 @@ from obsynth.experiments.monitors.thresholds import (
     whitened,
     window_threshold,
 )
+from obsynth.experiments.simulation import Bench, make_bench
 from obsynth.methods.handing_on import require_verified
 from obsynth.numerics.arguments import is_finite_number, require_kind, require_mapping
 from obsynth.numerics.arrays import FloatArray
