@@ -12,7 +12,7 @@ import pytest
 
 import obsynth
 from obsynth.cli.main import main
-from obsynth.plotting.frequency import _state_response
+from obsynth.plotting.spectra import _state_response
 from obsynth.report.designs import design_warnings, followed_steps, summary
 
 DESIGNS = Path(__file__).parents[2] / "designs"

@@ -34,7 +34,7 @@ from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.plants.validation import listed
-from obsynth.plotting.frequency import FaultGains, fault_gains
+from obsynth.plotting.spectra import FaultGains, fault_gains
 from obsynth.results.checks import FITS
 from obsynth.results.design import ObserverDesign
 from obsynth.results.layout import (

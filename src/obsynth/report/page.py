@@ -49,11 +49,10 @@ from obsynth.observers.windows import WindowObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plotting.data import panel_count, plot_data
 from obsynth.plotting.estimates import plot_states
-from obsynth.plotting.frequency import plot_gains
 from obsynth.plotting.guaranteed import plot_hidden_course
 from obsynth.plotting.panels import image_of
 from obsynth.plotting.simulation import plot_simulation
-from obsynth.plotting.spectra import plot_poles
+from obsynth.plotting.spectra import plot_gains, plot_poles
 from obsynth.report.designs import (
     delay_curves,
     delay_table,
