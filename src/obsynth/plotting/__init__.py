@@ -8,9 +8,16 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from obsynth.plotting.data import plot_data
-    from obsynth.plotting.estimates import plot_faults, plot_parameters, plot_residuals, plot_states
+    from obsynth.plotting.estimates import (
+        plot_decision,
+        plot_detection,
+        plot_faults,
+        plot_parameters,
+        plot_residuals,
+        plot_simulation,
+        plot_states,
+    )
     from obsynth.plotting.guaranteed import plot_hidden_course, plot_intervals, plot_least_thresholds
-    from obsynth.plotting.simulation import plot_decision, plot_detection, plot_simulation
     from obsynth.plotting.spectra import estimate_gains, plot_gains, plot_poles
     from obsynth.plotting.trade_off import plot_tolerances, plot_trade_off
 
@@ -37,9 +44,8 @@ _PICTURE_HOMES = {
     name: module
     for module, names in {
         "data": "plot_data",
-        "estimates": "plot_faults plot_parameters plot_residuals plot_states",
+        "estimates": "plot_decision plot_detection plot_faults plot_parameters plot_residuals plot_simulation plot_states",
         "guaranteed": "plot_hidden_course plot_intervals plot_least_thresholds",
-        "simulation": "plot_decision plot_detection plot_simulation",
         "spectra": "estimate_gains plot_gains plot_poles",
         "trade_off": "plot_tolerances plot_trade_off",
     }.items()

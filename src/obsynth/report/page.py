@@ -48,10 +48,9 @@ from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.windows import WindowObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plotting.data import panel_count, plot_data
-from obsynth.plotting.estimates import plot_states
+from obsynth.plotting.estimates import plot_simulation, plot_states
 from obsynth.plotting.guaranteed import plot_hidden_course
 from obsynth.plotting.panels import image_of
-from obsynth.plotting.simulation import plot_simulation
 from obsynth.plotting.spectra import plot_gains, plot_poles
 from obsynth.report.designs import (
     delay_curves,
