@@ -1,24 +1,30 @@
-"""A design on measured data: a log or a stream in, estimates out."""
+"""A design on measured data: a log or a stream in, estimates out.
+
+Where estimates go: CSV and Parquet files that appear whole or not at all, data frames, and streams.
+"""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import nullcontext
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import chain, islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, Any, TextIO, TypeAlias
+
+import numpy as np
 
 from obsynth.data.alarm_events import AlarmEvent
 from obsynth.data.log_run import LogRun, resume_state, save_state
-from obsynth.data.signals import TIME_HEADER, Stamps
-from obsynth.data.sinks import FrameSink, Sink, measured_frame, sink_for
-from obsynth.data.sources import CHUNK_ROWS, Data, chunks
+from obsynth.data.signals import TIME_HEADER, Signals, Stamps
+from obsynth.data.sources import CHUNK_ROWS, Data, check_suffix, chunks
 from obsynth.errors import ObsynthError, SpecError
 from obsynth.experiments.monitors.monitor import Monitor
-from obsynth.files.outputs import check_output, require_distinct
+from obsynth.files.outputs import FileKind, check_output, replacement_of, require_distinct
 from obsynth.files.signals import HeldSignals, ending_signals
+from obsynth.files.tables import table_writer
 from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
 from obsynth.methods.guaranteed_test.result import GuaranteedTest
 from obsynth.methods.guaranteed_test.tolerant import rows_before
@@ -29,6 +35,133 @@ from obsynth.results.gain_sets import gain_set_digest
 
 if TYPE_CHECKING:
     import pandas as pd
+
+#: A table that a run on measured data has written, as CSV or as Parquet.
+ESTIMATES = FileKind("a table of estimates of obsynth", rb"\Atime,status,|\APAR1(?s:.*)status(?s:.*)hat\[")
+#: Columns of a table that hold text.
+TEXT_COLUMNS = ("status", "alarm")
+
+
+def time_columns(header: Sequence[str]) -> tuple[int, ...]:
+    """Return which columns hold times."""
+    return tuple(i for i, name in enumerate(header) if name == TIME_HEADER or name.startswith(f"{TIME_HEADER} of "))
+
+
+def dated(rows: Sequence[Sequence[Any]], places: Sequence[int], shown: Callable[[float], Any]) -> list[list[Any]]:
+    """Return rows in which the times are dates."""
+    found = [list(row) for row in rows]
+    for row in found:
+        for place in places:
+            row[place] = shown(row[place])
+    return found
+
+
+#: Takes rows of cells: texts, and numbers of which NaN is an empty cell.
+Sink: TypeAlias = Callable[[Sequence[Sequence[Any]]], None]
+
+
+def text_sink(stream: TextIO, header: Sequence[str], stamps: Stamps) -> Sink:
+    """Return what writes CSV to a text stream, flushed after each call; floats so that they are read back bit for bit,
+    and dates as such."""
+    write_rows, times = table_writer(stream, header), time_columns(header)
+    # Who reads a stream may wait for the header before a row is sent.
+    stream.flush()
+
+    def write(rows: Sequence[Sequence[Any]]) -> None:
+        write_rows(dated(rows, times, stamps.date) if stamps.is_dated else rows)
+        stream.flush()
+
+    return write
+
+
+class FrameSink:
+    """A sink whose rows come to a data frame, in which dates stay dates; numbers are kept as arrays, not as objects."""
+
+    def __init__(self, header: Sequence[str], stamps: Stamps) -> None:
+        self._header, self._stamps = list(header), stamps
+        self._times = frozenset(time_columns(header))
+        self._numbers: list[list[FloatArray]] = [[] for _ in header]
+        self._others: list[list[Any]] = [[] for _ in header]
+
+    def __call__(self, rows: Sequence[Sequence[Any]]) -> None:
+        """Keep rows."""
+        for place, cells in enumerate(zip(*rows, strict=True)):
+            if self._header[place] in TEXT_COLUMNS:
+                self._others[place].extend(cells)
+            elif self._stamps.is_dated and place in self._times:
+                self._others[place].extend(map(self._stamps.moment, cells))
+            else:
+                self._numbers[place].append(np.array(cells, dtype=np.float64))
+
+    def frame(self) -> Any:
+        """Return the data frame."""
+        import pandas as pd
+
+        found = {}
+        for place, name in enumerate(self._header):
+            parts = self._numbers[place]
+            found[place] = pd.Series(np.concatenate(parts) if parts else self._others[place], name=name)
+            self._numbers[place] = []
+        if not found or not len(found[0]):
+            return pd.DataFrame([], columns=self._header)
+        frame = pd.DataFrame(found, copy=False)
+        frame.columns = pd.Index(self._header)
+        return frame
+
+
+@contextmanager
+def parquet_sink(path: str, header: Sequence[str]) -> Iterator[Sink]:
+    """Give what writes a Parquet file, one row group for each call."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    schema = pa.schema([(name, pa.string() if name in TEXT_COLUMNS else pa.float64()) for name in header])
+    with pq.ParquetWriter(path, schema) as writer:
+
+        def write(rows: Sequence[Sequence[Any]]) -> None:
+            if rows:
+                columns = zip(zip(*rows, strict=True), schema, strict=True)
+                arrays = [pa.array(list(cells), field.type) for cells, field in columns]
+                writer.write_table(pa.Table.from_arrays(arrays, schema=schema))
+
+        yield write
+
+
+@contextmanager
+def sink_for(out: str | Path | TextIO, header: Sequence[str], stamps: Stamps) -> Iterator[Sink]:
+    """Give a sink for a stream, or for a file that replaces ``out`` when all went well, and not at all else.
+    In a Parquet file times are seconds, since 1970 where the log has dates."""
+    if not isinstance(out, str | Path):
+        yield text_sink(out, header, stamps)
+        return
+    path = Path(out)
+    check_suffix(path)
+    with replacement_of(path) as (handle, temporary):
+        if path.suffix.lower() == ".parquet":
+            os.close(handle)
+            with parquet_sink(temporary, header) as sink:
+                yield sink
+        else:
+            with os.fdopen(handle, "w", encoding="utf-8", newline="") as stream:
+                yield text_sink(stream, header, stamps)
+
+
+def measured_frame(kept: list[FloatArray] | None, signals: Signals, stamps: Stamps) -> pd.DataFrame | None:
+    """Return what was read, in the signals' units."""
+    if kept is None:
+        return None
+    import pandas as pd
+
+    count, done = sum(map(len, kept)), 0
+    seconds, found = np.empty(count), np.empty((len(signals.names), count))
+    for chunk in kept:
+        part = slice(done, done + len(chunk))
+        seconds[part], found[:, part] = chunk[:, 0], signals.measured(chunk).T
+        done += len(chunk)
+    kept.clear()
+    frame = pd.DataFrame(found.T, columns=list(signals.names), copy=False)
+    frame.insert(0, TIME_HEADER, [stamps.moment(time) for time in seconds.tolist()] if stamps.is_dated else seconds)
+    return frame
 
 
 #: Rows of a stream after which its state is saved.
