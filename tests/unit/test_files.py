@@ -10,14 +10,15 @@ from obsynth import SpecError
 from obsynth.files.inputs import input_file, protect_stream, protected_inputs, read_json, read_text
 from obsynth.files.outputs import (
     FileKind,
+    HeldSignals,
     check_output,
     check_replaceable,
+    ending_signals,
     replacement_of,
     require_distinct,
     write_atomically,
     write_together,
 )
-from obsynth.files.signals import HeldSignals, ending_signals
 from obsynth.files.tables import harmless, table_writer, unquoted
 
 KIND = FileKind("a note", rb"\Anote:", ending=".note.txt")

@@ -22,8 +22,7 @@ from obsynth.data.signals import TIME_HEADER, Signals, Stamps
 from obsynth.data.sources import CHUNK_ROWS, Data, check_suffix, chunks
 from obsynth.errors import ObsynthError, SpecError
 from obsynth.experiments.monitors.monitor import Monitor
-from obsynth.files.outputs import FileKind, check_output, replacement_of, require_distinct
-from obsynth.files.signals import HeldSignals, ending_signals
+from obsynth.files.outputs import FileKind, HeldSignals, check_output, ending_signals, replacement_of, require_distinct
 from obsynth.files.tables import table_writer
 from obsynth.methods.guaranteed_test.method import GuaranteedTestMethod
 from obsynth.methods.guaranteed_test.result import GuaranteedTest

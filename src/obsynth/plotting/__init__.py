@@ -44,7 +44,9 @@ _PICTURE_HOMES = {
     name: module
     for module, names in {
         "data": "plot_data",
-        "estimates": "plot_decision plot_detection plot_faults plot_parameters plot_residuals plot_simulation plot_states",
+        "estimates": (
+            "plot_decision plot_detection plot_faults plot_parameters plot_residuals plot_simulation plot_states"
+        ),
         "guaranteed": "plot_hidden_course plot_intervals plot_least_thresholds",
         "spectra": "estimate_gains plot_gains plot_poles",
         "trade_off": "plot_tolerances plot_trade_off",
