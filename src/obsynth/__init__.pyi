@@ -13,8 +13,8 @@ from obsynth.calibration.calibrating import calibrate as calibrate
 from obsynth.calibration.validating import validate as validate
 from obsynth.calibration.validity import validity as validity
 from obsynth.comparison.certificates import verify_certificate as verify_certificate
+from obsynth.comparison.comparing import Comparison as Comparison
 from obsynth.comparison.comparing import compare as compare
-from obsynth.comparison.result import Comparison as Comparison
 from obsynth.comparison.sensor_sets import sensor_sets as sensor_sets
 from obsynth.data.alarm_proof import prove_alarm as prove_alarm
 from obsynth.data.alarm_proof import verify_alarm as verify_alarm

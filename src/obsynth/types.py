@@ -11,7 +11,7 @@ _TYPE_NAMES = {
     "calibration.diagnostics": "Validation",
     "calibration.result": "Calibration",
     "calibration.validity": "Validity",
-    "comparison.result": "ComparedMethod FaultComparison",
+    "comparison.comparing": "ComparedMethod FaultComparison",
     "comparison.sensor_sets": "SensorSet SensorSets",
     "data.alarm_events": "AlarmEvent",
     "data.run": "DataRun",

@@ -6,8 +6,8 @@ from obsynth.analysis.diagnosis.verdicts import StructuredResidual as Structured
 from obsynth.calibration.diagnostics import Validation as Validation
 from obsynth.calibration.result import Calibration as Calibration
 from obsynth.calibration.validity import Validity as Validity
-from obsynth.comparison.result import ComparedMethod as ComparedMethod
-from obsynth.comparison.result import FaultComparison as FaultComparison
+from obsynth.comparison.comparing import ComparedMethod as ComparedMethod
+from obsynth.comparison.comparing import FaultComparison as FaultComparison
 from obsynth.comparison.sensor_sets import SensorSet as SensorSet
 from obsynth.comparison.sensor_sets import SensorSets as SensorSets
 from obsynth.data.alarm_events import AlarmEvent as AlarmEvent

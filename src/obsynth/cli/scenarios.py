@@ -172,7 +172,7 @@ def _compared_delay(spec: obsynth.Spec, options: argparse.Namespace) -> int:
 
 def run_compare(options: argparse.Namespace) -> int:
     """Run ``compare``: spec in, table and recommendation out; 3 where no method exists."""
-    from obsynth.comparison.result import COMPARISON_PAGE
+    from obsynth.comparison.comparing import COMPARISON_PAGE
 
     with progress(quiet=options.quiet) as report_stage:
         report_stage(f"reading {options.system}")

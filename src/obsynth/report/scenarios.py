@@ -12,7 +12,7 @@ import numpy as np
 from rich.console import Console
 from rich.text import Text
 
-from obsynth.comparison.result import Comparison
+from obsynth.comparison.comparing import Comparison
 from obsynth.experiments.monitors.monitor import Monitor
 from obsynth.experiments.monte_carlo import Evaluation, Interval
 from obsynth.experiments.simulation import Simulation
