@@ -269,8 +269,7 @@ def test_a_bound_of_the_noise_needs_noise_that_is_stated() -> None:
 
 
 def test_powers_of_matrices_whose_entries_cancel_are_those_of_their_eigenvalues() -> None:
-    from obsynth.experiments.monitors.residual_model import schur_form
-    from obsynth.experiments.monitors.thresholds import samples_of
+    from obsynth.experiments.monitors.residual_model import samples_of, schur_form
 
     turned = np.array([[1.0, 1e7], [0.0, 1.0]])
     matrix = turned @ np.diag([0.5, 0.4]) @ np.linalg.inv(turned)

@@ -15,8 +15,12 @@ from scipy.linalg import solve_discrete_lyapunov
 
 import obsynth
 from obsynth.errors import SpecError
-from obsynth.experiments.monitors.residual_model import residual_model
-from obsynth.experiments.monitors.thresholds import innovation_whitener, whitener_of, window_covariance
+from obsynth.experiments.monitors.residual_model import (
+    innovation_whitener,
+    residual_model,
+    whitener_of,
+    window_covariance,
+)
 from obsynth.experiments.monte_carlo import mean, share
 from obsynth.experiments.simulation import make_bench
 from obsynth.simulation.linear import make_stepper

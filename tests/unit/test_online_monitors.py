@@ -286,8 +286,12 @@ def test_cumulative_sums_of_a_residual_that_a_window_does_not_whiten(machine):
 
 
 def test_the_correlation_that_is_left_is_that_of_all_lags(machine):
-    from obsynth.experiments.monitors.residual_model import residual_model
-    from obsynth.experiments.monitors.thresholds import correlation_left, innovation_whitener, window_covariance
+    from obsynth.experiments.monitors.residual_model import (
+        correlation_left,
+        innovation_whitener,
+        residual_model,
+        window_covariance,
+    )
 
     model = residual_model(machine, obsynth.Scenario(horizon=4, sample_time=0.2, noise=1))
     window, lags, count = 3, 150, len(model.C)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.linalg import block_diag
 
-from obsynth.experiments.monitors.thresholds import ScaledInputs, pointwise_threshold, unlimited_bound
+from obsynth.experiments.monitors.residual_model import ScaledInputs, pointwise_threshold, unlimited_bound
 
 
 @dataclass

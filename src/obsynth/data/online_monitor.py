@@ -23,7 +23,17 @@ from obsynth.experiments.monitors.guaranteed import data_monitor, is_guaranteed
 from obsynth.experiments.monitors.learned import LearnedThresholds, learned_monitor, load_thresholds
 from obsynth.experiments.monitors.monitor import MONITOR_KINDS, Monitor, Rule, statement_of
 from obsynth.experiments.monitors.options import LINEAR_OPTIONS, PARAMETER_OPTIONS, checked_options
-from obsynth.experiments.monitors.residual_model import ResidualModel, residual_model, watches_estimates
+from obsynth.experiments.monitors.residual_model import (
+    ResidualModel,
+    residual_model,
+    samples_of,
+    scaled_inputs,
+    steady_mean,
+    unlimited_bound,
+    unlimited_paper,
+    watches_estimates,
+    whitened,
+)
 from obsynth.experiments.monitors.residual_monitor import bounds_of
 from obsynth.experiments.monitors.rules import (
     ANY_LENGTH,
@@ -32,14 +42,6 @@ from obsynth.experiments.monitors.rules import (
     WhitenedRule,
     gap_growth,
     parameter_monitor,
-)
-from obsynth.experiments.monitors.thresholds import (
-    samples_of,
-    scaled_inputs,
-    steady_mean,
-    unlimited_bound,
-    unlimited_paper,
-    whitened,
 )
 from obsynth.methods.handing_on import require_verified
 from obsynth.numerics.arguments import is_finite_number, require_kind, require_mapping

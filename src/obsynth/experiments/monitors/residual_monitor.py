@@ -19,17 +19,19 @@ from obsynth.experiments.monitors.adaptive import (
 from obsynth.experiments.monitors.guaranteed import is_guaranteed, record_monitor
 from obsynth.experiments.monitors.monitor import MONITOR_KINDS, Monitor, Rule, statement_of
 from obsynth.experiments.monitors.options import LINEAR_OPTIONS, checked_options
-from obsynth.experiments.monitors.residual_model import ResidualModel, residual_model, watches_estimates
-from obsynth.experiments.monitors.rules import NormRule, WhitenedRule
-from obsynth.experiments.monitors.thresholds import (
+from obsynth.experiments.monitors.residual_model import (
+    ResidualModel,
     paper_threshold,
     pointwise_threshold,
+    residual_model,
     scaled_inputs,
     settled,
     steady_mean,
+    watches_estimates,
     whitened,
     window_threshold,
 )
+from obsynth.experiments.monitors.rules import NormRule, WhitenedRule
 from obsynth.experiments.simulation import Bench, make_bench
 from obsynth.methods.handing_on import require_verified
 from obsynth.numerics.arguments import is_finite_number, require_kind, require_mapping

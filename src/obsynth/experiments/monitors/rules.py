@@ -19,8 +19,7 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.experiments.monitors.between_samples import InputResponse
 from obsynth.experiments.monitors.monitor import Judged, LinearSample, Monitor, Rule, Sample
-from obsynth.experiments.monitors.residual_model import ResidualModel
-from obsynth.experiments.monitors.thresholds import UnlimitedHorizonBound
+from obsynth.experiments.monitors.residual_model import ResidualModel, UnlimitedHorizonBound
 from obsynth.numerics.arguments import is_finite_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.dae.observer import DAEObserver
