@@ -122,7 +122,7 @@ class PlantWithNoise(CalibrationPlant):
         return np.array([*found, *self._load_sizes(log, moved)])
 
     def _load_sizes(self, log: Log, moved: FloatArray) -> list[float]:
-        from obsynth.calibration.step_graphs import sample_graphs
+        from obsynth.calibration.likelihood import sample_graphs
 
         found = []
         for name in self.states.loads:

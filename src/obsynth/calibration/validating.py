@@ -29,13 +29,13 @@ from obsynth.calibration.diagnostics import (
     whiteness,
     wrong_samples,
 )
+from obsynth.calibration.likelihood import sample_graphs
 from obsynth.calibration.logs import Log, LogData, quantum, read_log
 from obsynth.calibration.maximum import Objective, greatest_likelihood
 from obsynth.calibration.plants import NonlinearPlant
 from obsynth.calibration.problem import Problem
 from obsynth.calibration.reporting import IntegrationError, integration_error
 from obsynth.calibration.simulation_error import Fit
-from obsynth.calibration.step_graphs import sample_graphs
 from obsynth.errors import PreconditionError, SolverError, SpecError
 from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import FloatArray, read_only
