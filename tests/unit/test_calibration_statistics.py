@@ -22,7 +22,7 @@ from obsynth.calibration.diagnostics import (
 )
 from obsynth.calibration.innovations_fit import covariance_of, information, profile_box, quantile
 from obsynth.calibration.maximum import Maximum
-from obsynth.calibration.noise_states import NoiseStates, PlantWithNoise
+from obsynth.calibration.plants import NoiseStates, PlantWithNoise
 from obsynth.results.calibration_files import box_row, calibration_text, read_calibration, verify_calibration
 
 

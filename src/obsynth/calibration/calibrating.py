@@ -38,8 +38,16 @@ from obsynth.calibration.innovations_fit import InnovationsFit, chosen_timing, i
 from obsynth.calibration.likelihood import IMPOSSIBLE, Likelihood
 from obsynth.calibration.logs import TOLD_ROWS, Log, LogData, read_log
 from obsynth.calibration.maximum import Objective
-from obsynth.calibration.noise_states import NoiseStates, PlantWithNoise, asked_states, correlation_name, with_states
-from obsynth.calibration.plants import CalibrationPlant, LinearPlant, NonlinearPlant
+from obsynth.calibration.plants import (
+    CalibrationPlant,
+    LinearPlant,
+    NoiseStates,
+    NonlinearPlant,
+    PlantWithNoise,
+    asked_states,
+    correlation_name,
+    with_states,
+)
 from obsynth.calibration.problem import Problem, calibration_problem, require_variation
 from obsynth.calibration.reporting import IntegrationError, integration_error, reported
 from obsynth.calibration.result import Calibration

@@ -23,7 +23,7 @@ from obsynth.calibration.maximum import (
     polished,
     without_collapse,
 )
-from obsynth.calibration.noise_states import PlantWithNoise
+from obsynth.calibration.plants import PlantWithNoise
 from obsynth.calibration.problem import Problem
 from obsynth.calibration.simulation_error import UNKNOWN_START, Fit, simulation_fits
 from obsynth.numerics.arrays import SMALLEST, FloatArray

@@ -23,7 +23,7 @@ from obsynth.calibration.diagnostics import (
 )
 from obsynth.calibration.innovations_fit import InnovationsFit, Side, covariance_of, quantile
 from obsynth.calibration.logs import EVEN, TOLD_ROWS, Log
-from obsynth.calibration.noise_states import PlantWithNoise, correlation_name
+from obsynth.calibration.plants import PlantWithNoise, correlation_name
 from obsynth.calibration.problem import Problem
 from obsynth.calibration.result import Calibration
 from obsynth.calibration.simulation_error import Fit, SimulationError, unexplained
