@@ -15,9 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
-from obsynth.calibration.innovations_fit import Profile, guarded_maximum, quantile
+from obsynth.calibration.innovations_fit import Objective, Profile, guarded_maximum, quantile
 from obsynth.calibration.logs import Log
-from obsynth.calibration.maximum import Objective
 from obsynth.calibration.plants import NonlinearPlant
 from obsynth.calibration.problem import Problem, calibration_problem
 from obsynth.calibration.simulation_error import simulation_fits

@@ -34,10 +34,9 @@ from obsynth.calibration.diagnostics import (
     whiteness,
     wrong_samples,
 )
-from obsynth.calibration.innovations_fit import InnovationsFit, chosen_timing, innovations_fit
+from obsynth.calibration.innovations_fit import InnovationsFit, Objective, chosen_timing, innovations_fit
 from obsynth.calibration.likelihood import IMPOSSIBLE, Likelihood
 from obsynth.calibration.logs import TOLD_ROWS, Log, LogData, read_log
-from obsynth.calibration.maximum import Objective
 from obsynth.calibration.plants import (
     CalibrationPlant,
     LinearPlant,

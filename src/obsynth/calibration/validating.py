@@ -29,9 +29,9 @@ from obsynth.calibration.diagnostics import (
     whiteness,
     wrong_samples,
 )
+from obsynth.calibration.innovations_fit import Objective, greatest_likelihood
 from obsynth.calibration.likelihood import sample_graphs
 from obsynth.calibration.logs import Log, LogData, quantum, read_log
-from obsynth.calibration.maximum import Objective, greatest_likelihood
 from obsynth.calibration.plants import NonlinearPlant
 from obsynth.calibration.problem import Problem
 from obsynth.calibration.reporting import IntegrationError, integration_error
