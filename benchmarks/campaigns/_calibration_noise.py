@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from obsynth.calibration.calibrating import calibrate
-from obsynth.calibration.result import Calibration
+from obsynth.calibration.reporting import Calibration
 from obsynth.plants.descriptor import DescriptorSystem
 
 ROWS = 300

@@ -9,7 +9,7 @@ _TYPE_NAMES = {
     "analysis.diagnosis.verdicts": "Diagnosis FaultDiagnosis StructuredResidual",
     "analysis.dae_structure": "Identifiability",
     "calibration.diagnostics": "Validation",
-    "calibration.result": "Calibration",
+    "calibration.reporting": "Calibration",
     "calibration.validity": "Validity",
     "comparison.comparing": "ComparedMethod FaultComparison",
     "comparison.sensor_sets": "SensorSet SensorSets",

@@ -4,7 +4,7 @@ from obsynth.analysis.diagnosis.verdicts import Diagnosis as Diagnosis
 from obsynth.analysis.diagnosis.verdicts import FaultDiagnosis as FaultDiagnosis
 from obsynth.analysis.diagnosis.verdicts import StructuredResidual as StructuredResidual
 from obsynth.calibration.diagnostics import Validation as Validation
-from obsynth.calibration.result import Calibration as Calibration
+from obsynth.calibration.reporting import Calibration as Calibration
 from obsynth.calibration.validity import Validity as Validity
 from obsynth.comparison.comparing import ComparedMethod as ComparedMethod
 from obsynth.comparison.comparing import FaultComparison as FaultComparison

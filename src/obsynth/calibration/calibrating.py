@@ -48,8 +48,7 @@ from obsynth.calibration.plants import (
     with_states,
 )
 from obsynth.calibration.problem import Problem, calibration_problem, require_variation
-from obsynth.calibration.reporting import IntegrationError, integration_error, reported
-from obsynth.calibration.result import Calibration
+from obsynth.calibration.reporting import Calibration, IntegrationError, integration_error, reported
 from obsynth.calibration.simulation_error import FIRST_ROWS, Fit, SimulationError, simulation_fits, with_seen_start
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.arguments import chosen, is_whole, whole_number

@@ -13,7 +13,7 @@ from obsynth.files.outputs import FileKind, yaml_text
 from obsynth.spec.documents import read_yaml
 
 if TYPE_CHECKING:
-    from obsynth.calibration.result import Calibration
+    from obsynth.calibration.reporting import Calibration
 
 #: What ``calibrate --write-spec`` writes, and may write over.
 CALIBRATED_SPEC = FileKind("a spec that obsynth has calibrated", rb"\A# Calibrated by obsynth")
