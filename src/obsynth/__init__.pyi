@@ -18,7 +18,7 @@ from obsynth.comparison.comparing import compare as compare
 from obsynth.comparison.sensor_sets import sensor_sets as sensor_sets
 from obsynth.data.alarm_proof import prove_alarm as prove_alarm
 from obsynth.data.alarm_proof import verify_alarm as verify_alarm
-from obsynth.data.normal_rows import learn_thresholds as learn_thresholds
+from obsynth.data.online_monitor import learn_thresholds as learn_thresholds
 from obsynth.data.online_monitor import online_monitor as online_monitor
 from obsynth.data.run import run_on_data as run_on_data
 from obsynth.data.smoothing import smooth as smooth

@@ -270,7 +270,7 @@ def proof_of(
 
 def run_thresholds(options: argparse.Namespace) -> int:
     """Run ``thresholds``: 0 whether the rows suffice for the rate or not, which is told; every failure is an error."""
-    from obsynth.data.normal_rows import FALSE_ALARM_RATE, learn_thresholds
+    from obsynth.data.online_monitor import FALSE_ALARM_RATE, learn_thresholds
     from obsynth.experiments.monitors.learned import LEARNED
 
     is_stream = options.data == STREAM
