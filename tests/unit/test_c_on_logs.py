@@ -16,8 +16,7 @@ import pytest
 
 import obsynth
 from obsynth.experiments.monitors.learned import LearnedThresholds, watched_names
-from obsynth.experiments.monitors.learned_levels import Statistics
-from obsynth.experiments.monitors.parameter_scores import parameter_walk
+from obsynth.experiments.monitors.learned_levels import Statistics, parameter_walk
 from obsynth.exporting.c_source import c_identifier
 from obsynth.numerics.autoregression import Autoregression
 from obsynth.observers.dae.observer import DAEObserver

@@ -19,22 +19,20 @@ from obsynth.cli.data_commands import summary_of_run
 from obsynth.data.alarm_events import NOT_DISTINGUISHED_YET, alarm_rows
 from obsynth.experiments.monitors.learned_levels import (
     AGES,
+    Scores,
     Statistics,
+    before_any,
+    change_ratios,
     conformal_levels,
     count_alarms,
     is_conformal,
     learned_levels,
-    rows_needed,
-)
-from obsynth.experiments.monitors.monitor import NOT_DISTINGUISHED
-from obsynth.experiments.monitors.parameter_scores import (
-    Scores,
-    before_any,
-    change_ratios,
     most_likely_change,
     parameter_walk,
+    rows_needed,
     sample_score,
 )
+from obsynth.experiments.monitors.monitor import NOT_DISTINGUISHED
 from obsynth.numerics.autoregression import fitted_autoregression
 
 DT = 0.1

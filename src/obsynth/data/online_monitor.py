@@ -48,10 +48,9 @@ from obsynth.experiments.monitors.learned import (
     watched_names,
     watched_values,
 )
-from obsynth.experiments.monitors.learned_levels import AGES
+from obsynth.experiments.monitors.learned_levels import AGES, Scores, before_any, parameter_walk, sample_score
 from obsynth.experiments.monitors.monitor import MONITOR_KINDS, Evidence, Monitor, Rule, statement_of
 from obsynth.experiments.monitors.options import LINEAR_OPTIONS, PARAMETER_OPTIONS, checked_options
-from obsynth.experiments.monitors.parameter_scores import Scores, before_any, parameter_walk, sample_score
 from obsynth.experiments.monitors.residual_model import (
     ResidualModel,
     residual_model,

@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.experiments.monitors.learned_levels import AGES, FORGETTING, HOLD
-from obsynth.experiments.monitors.parameter_scores import DISTINGUISHED, LEAST_ADDED, MODEL_SHARE
+from obsynth.experiments.monitors.learned_levels import AGES, DISTINGUISHED, FORGETTING, HOLD, LEAST_ADDED, MODEL_SHARE
 from obsynth.exporting.realisation import Alarms, Realisation
 from obsynth.numerics.arrays import SMALLEST, FloatArray
 from obsynth.observers.dae.c_code import in_lines

@@ -22,7 +22,7 @@ import numpy as np
 
 from obsynth.errors import ObsynthError, SpecError
 from obsynth.experiments.monitors.learned import LearnedThresholds, watched_names
-from obsynth.experiments.monitors.parameter_scores import parameter_walk
+from obsynth.experiments.monitors.learned_levels import parameter_walk
 from obsynth.exporting.c_source import (
     alarm_comments,
     c_identifier,

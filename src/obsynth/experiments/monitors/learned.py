@@ -18,20 +18,18 @@ from obsynth.experiments.monitors.learned_levels import (
     FORGETTING,
     HOLD,
     SETTLING,
+    Scores,
     Statistics,
+    before_any,
     conformal_levels,
     is_conformal,
     learned_levels,
-    rows_needed,
-)
-from obsynth.experiments.monitors.monitor import Evidence, Judged, LinearSample, Monitor, Rule, Sample
-from obsynth.experiments.monitors.parameter_scores import (
-    Scores,
-    before_any,
     most_likely_change,
     parameter_walk,
+    rows_needed,
     sample_score,
 )
+from obsynth.experiments.monitors.monitor import Evidence, Judged, LinearSample, Monitor, Rule, Sample
 from obsynth.files.outputs import FileKind, write_atomically
 from obsynth.methods.registry import error_model
 from obsynth.numerics.arguments import is_finite_number
