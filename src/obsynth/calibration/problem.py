@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.calibration.likelihood import SampleGraphs, sample_graphs
 from obsynth.calibration.logs import EVEN, Log, bad_log, quantum, refused, repeats
-from obsynth.calibration.plants import CalibrationPlant
+from obsynth.calibration.plants import CalibrationPlant, SampleGraphs, sample_graphs
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import is_number, whole_number
 from obsynth.numerics.arrays import FloatArray

@@ -30,9 +30,8 @@ from obsynth.calibration.diagnostics import (
     wrong_samples,
 )
 from obsynth.calibration.innovations_fit import Objective, greatest_likelihood
-from obsynth.calibration.likelihood import sample_graphs
 from obsynth.calibration.logs import Log, LogData, quantum, read_log
-from obsynth.calibration.plants import NonlinearPlant
+from obsynth.calibration.plants import NonlinearPlant, sample_graphs
 from obsynth.calibration.problem import Problem
 from obsynth.calibration.reporting import IntegrationError, integration_error
 from obsynth.calibration.simulation_error import Fit
