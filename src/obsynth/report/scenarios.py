@@ -6,18 +6,20 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from textwrap import fill
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich.console import Console
 from rich.text import Text
 
-from obsynth.comparison.comparing import Comparison
 from obsynth.experiments.monitors.monitor import Monitor
 from obsynth.experiments.monte_carlo import Evaluation, Interval
 from obsynth.experiments.simulation import Simulation
 from obsynth.observers.decisions import ParameterMonitor
 from obsynth.results.layout import headed_table, number, print_section
+
+if TYPE_CHECKING:
+    from obsynth.comparison.comparing import Comparison
 
 #: Rows of a table; of a large plant the worst estimates are shown.
 SHOWN_ROWS = 12
