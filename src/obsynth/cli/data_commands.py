@@ -25,6 +25,7 @@ from obsynth.errors import SpecError, VerificationError
 from obsynth.experiments.monitors.options import LINEAR_OPTIONS, PARAMETER_OPTIONS
 from obsynth.files.inputs import protect, protect_stream
 from obsynth.files.outputs import FileKind, require_distinct, write_atomically
+from obsynth.files.tables import text_table
 
 
 def protect_inputs(options: argparse.Namespace) -> None:
@@ -168,11 +169,8 @@ def _alarm_table(found: obsynth.types.DataRun) -> list[str]:
     from obsynth.data.alarm_events import alarm_rows
 
     rows, more = alarm_rows(found.events, found.stamps.shown)
-    if not rows:
-        return []
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    lines = ["  " + "  ".join(text.ljust(w) for text, w in zip(row, widths, strict=True)).rstrip() for row in rows]
-    return [*lines, *([f"  and {more} more"] if more else [])]
+    lines = text_table(rows) if rows else []
+    return [f"  {line}" for line in (*lines, *([f"and {more} more"] if more else []))]
 
 
 @contextmanager

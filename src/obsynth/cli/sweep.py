@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor
 from contextlib import contextmanager
 from pathlib import Path
@@ -145,7 +145,7 @@ def _tell(options: argparse.Namespace, found: Any, files: tuple[Path, ...], what
         print_json({"command": options.verb, "counts": found.counts, what: cases, "files": [str(f) for f in files]})
         return
     console = stdout_console()
-    console.print(_shown(found) if what == "cases" else _shown_runs(found))
+    console.print(_shown_cases(found) if what == "cases" else _shown_runs(found))
     console.print(f"Written: {', '.join(map(str, files))}", soft_wrap=True)
 
 
@@ -210,29 +210,31 @@ def _png_of(plot: Callable[[], Any]) -> bytes | None:
     return stream.getvalue()
 
 
-def _shown(found: Any) -> Any:
-    """Return the table for people: without message and file."""
+def _shown(found: Any, header: Sequence[str], rows: Iterable[Sequence[str]]) -> Any:
+    """Return a table for people; its title counts what became of the cases."""
     from rich.table import Table
 
+    table = Table(title=", ".join(f"{count} {status}" for status, count in found.counts.items()), title_justify="left")
+    for name in header:
+        table.add_column(name, overflow="fold")
+    for row in rows:
+        table.add_row(*row)
+    return table
+
+
+def _shown_cases(found: Any) -> Any:
+    """Return the table of a sweep for people: without message and file."""
     header, rows = found.rows()
     kept = [i for i, name in enumerate(header) if name not in ("message", "file")]
-    table = Table(title=", ".join(f"{count} {status}" for status, count in found.counts.items()), title_justify="left")
-    for i in kept:
-        table.add_column(header[i], overflow="fold")
-    for row in rows:
-        table.add_row(*(f"{row[i]:.4g}" if isinstance(row[i], float) else str(row[i]) for i in kept))
-    return table
+    told = ([f"{row[i]:.4g}" if isinstance(row[i], float) else str(row[i]) for i in kept] for row in rows)
+    return _shown(found, [header[i] for i in kept], told)
 
 
 def _shown_runs(found: Any) -> Any:
     """Return the table of runs for people: the first alarm of each, and why one was not made."""
-    from rich.table import Table
-
-    table = Table(title=", ".join(f"{count} {status}" for status, count in found.counts.items()), title_justify="left")
-    for name in ("run", "status", "rows", "ok", "first alarm", "why not"):
-        table.add_column(name)
+    rows = []
     for run in found.runs:
         first = min(run.alarms, key=lambda name: run.alarms[name], default="")
         alarm = f"{first} at {run.alarms[first]:g} s" if first else "-"
-        table.add_row(run.name, run.status, str(run.rows), str(run.statuses.get("ok", 0)), alarm, run.message)
-    return table
+        rows.append((run.name, run.status, str(run.rows), str(run.statuses.get("ok", 0)), alarm, run.message))
+    return _shown(found, ("run", "status", "rows", "ok", "first alarm", "why not"), rows)

@@ -202,16 +202,17 @@ def verify_alarm(path: str | Path, *, data: str | Path | None = None) -> Verific
 def _checked(body: Mapping[str, Any], log_file: Path | None) -> Iterator[Check]:
     data = restored({name: value for name, value in body.items() if name != "gain_set"})
     design = loaded(json.dumps(body["gain_set"]).encode(), "the certificate's gain set")
-    if "multipliers" in data:
-        yield from _checked_by_test(design, body, data, log_file)
-        return
     plant, _ = design.linear
     u = np.asarray(data["u"], dtype=np.float64).reshape(-1, plant.nu)
     y = np.asarray(data["y"], dtype=np.float64).reshape(-1, plant.ny)
-    bounds = np.asarray(data["bounds"], dtype=np.float64)
+    by_test = "multipliers" in data
     log = None if data["log"] is None else Log.from_dict(data["log"])
     yield gain_set_row(design, body["gain_set"]["sha256"])
-    yield _log_row(log, log_file, design, u, y)
+    yield _log_row(log, log_file, design, u, y, last=data["row"] if by_test else len(y))
+    if by_test:
+        yield from _checked_by_test(design, body, data, u, y, log)
+        return
+    bounds = np.asarray(data["bounds"], dtype=np.float64)
     assumed = assumptions_of(
         design,
         dict(zip(plant.disturbance_names, bounds.tolist(), strict=True)),
@@ -256,10 +257,9 @@ def gain_set_row(design: ObserverDesign, digest: str, name: str = "gain set") ->
 
 
 def _log_row(
-    log: Log | None, file: Path | None, design: ObserverDesign, u: FloatArray, y: FloatArray, last: int | None = None
+    log: Log | None, file: Path | None, design: ObserverDesign, u: FloatArray, y: FloatArray, last: int
 ) -> Check:
     """Return the row on the log: compared where it is given, else assumed; ``last``: its row that y ends with."""
-    last = len(y) if last is None else last
     if file is None:
         name = "a record that no file holds" if log is None else f"{log.name}, sha256 {log.sha256}"
         return information(
@@ -294,15 +294,15 @@ def _row(
 
 
 def _checked_by_test(
-    design: ObserverDesign, body: Mapping[str, Any], data: Mapping[str, Any], log_file: Path | None
+    design: ObserverDesign,
+    body: Mapping[str, Any],
+    data: Mapping[str, Any],
+    u: FloatArray,
+    y: FloatArray,
+    log: Log | None,
 ) -> Iterator[Check]:
     """Yield the rows on a certificate of a guaranteed test."""
-    plant, row = design.linear[0], data["row"]
-    u = np.asarray(data["u"], dtype=np.float64).reshape(-1, plant.nu)
-    y = np.asarray(data["y"], dtype=np.float64).reshape(-1, plant.ny)
-    log = None if data["log"] is None else Log.from_dict(data["log"])
-    yield gain_set_row(design, body["gain_set"]["sha256"])
-    yield _log_row(log, log_file, design, u, y, last=row)
+    row = data["row"]
     ((test, group, margin),) = checked(design, data, u, y)
     said, stated = statement_of(test, group, row, log, body["gain_set"]["sha256"]), float(data["margin"])
     rows = is_whole(row) and row >= len(y) > 0
