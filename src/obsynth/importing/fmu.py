@@ -19,7 +19,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from obsynth.errors import PreconditionError, SpecError
-from obsynth.importing.roles import plant_of
+from obsynth.importing.python_objects import plant_of
 from obsynth.numerics.arguments import is_finite_number, require_mapping
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.libraries import imported

@@ -13,7 +13,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.files.inputs import read_text
-from obsynth.importing.roles import plant_of
+from obsynth.importing.python_objects import plant_of
 from obsynth.numerics.arguments import number_in_text
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.descriptor import DescriptorSystem
