@@ -8,6 +8,7 @@ import pytest
 from obsynth import DescriptorSystem, ui_pi_observer
 from obsynth.errors import PreconditionError, SolverError, SpecError
 from obsynth.methods.designing import check
+from obsynth.methods.placement.kalman import KalmanProblem
 
 TWO = [[-1.0, 1.0], [0.0, -2.0]]
 PLANTS = {
@@ -90,6 +91,18 @@ def test_a_rate_far_above_the_plants_own_is_reached(joint: bool) -> None:
 def test_gains_that_drown_a_unit_fault_in_rounding_are_no_design(decay: float, joint: bool) -> None:
     with pytest.raises(PreconditionError, match=r"^Unclear: gains were found, but they are so large"):
         ui_pi_observer(PAPER, decay=decay, joint=joint)
+
+
+def test_a_rate_is_had_where_rounding_ends_the_riccati_equation(monkeypatch: pytest.MonkeyPatch) -> None:
+    # On one machine it ended at 1e5 1/s and an error was raised, on all others gains were found and judged.
+    monkeypatch.setattr(KalmanProblem, "gain", lambda *given, **options: None)
+    design = ui_pi_observer(PAPER, decay=1e4)
+    assert design.report.passed
+    assert design.certificate.claims["decay"] >= 1e4
+    with pytest.raises(PreconditionError, match=r"^Unclear: gains were found, but they are so large"):
+        ui_pi_observer(PAPER, decay=1e5)
+    discrete = DescriptorSystem(None, [[1.2, 1.0], [0.0, 0.7]], C=[[1, 0]], Bf=[[0], [1]], dt=0.1)
+    assert ui_pi_observer(discrete, decay=8.0).certificate.claims["decay"] >= 8.0
 
 
 def test_a_rate_that_cannot_be_had_says_what_is_left() -> None:

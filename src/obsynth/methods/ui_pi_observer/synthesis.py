@@ -153,11 +153,8 @@ def _chosen(
     elif asked.decay is not None:
         found = kalman.gain(time * asked.decay, persistent=True)
         if found is None:
-            raise SolverError(
-                f"The Riccati equation for decay {asked.decay:g} 1/s has no solution that double precision could tell "
-                "from rounding, not even by way of slower rates: some mode is too weakly observable for this rate. "
-                "Ask for a lower one, leave decay out, or give poles, which are placed without this equation."
-            )
+            # Near the fastest rate, rounding ends the equation on one processor and not on another.
+            found = _placed_for_decay(problem, asked.decay, asked.objective, dt)
         gain = found
     else:
         fair = compromise(kalman, problem.rate)
@@ -165,6 +162,25 @@ def _chosen(
             raise SolverError("The Riccati equation has no usable solution: give poles= or a slow decay=.")
         gain, claims = fair[0], {"noise_price": fair[2]}
     return gain, None, claims, runs
+
+
+#: Rates of the poles that are placed for a decay, in units of it: apart from one another, and none on the bound.
+LEAST_RATE, RATE_SPREAD = 1.1, 1.0
+
+
+def _placed_for_decay(problem: PlacementProblem, decay: float, objective: str, dt: float) -> FloatArray:
+    """Return a gain ``(n, ny)`` whose poles all decay faster than ``decay`` (1/s), without a Riccati equation."""
+    order = problem.split.order
+    rates = decay * (LEAST_RATE + RATE_SPREAD * np.arange(order) / max(order, 1))
+    poles = np.exp(-rates * dt) if dt > 0.0 else -rates
+    try:
+        return _placed(problem, [complex(pole) for pole in poles], objective)[0]
+    except SolverError:
+        raise SolverError(
+            f"The Riccati equation for decay {decay:g} 1/s has no solution that double precision could tell from "
+            "rounding, not even by way of slower rates, and poles for it could not be placed: some mode is too weakly "
+            "observable for this rate. Ask for a lower one, leave decay out, or give poles."
+        ) from None
 
 
 def _in_region(
