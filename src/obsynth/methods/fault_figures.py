@@ -72,7 +72,7 @@ class FaultFigures:
     @property
     def reaches(self) -> bool:
         """Whether a step is there at the horizon."""
-        return abs(self.at_horizon - 1.0) <= REACHED_STEP and np.isfinite(self.most)
+        return bool(abs(self.at_horizon - 1.0) <= REACHED_STEP and np.isfinite(self.most))
 
 
 def on_the_clock(plant: DescriptorSystem, sample_time: float) -> DescriptorSystem:
