@@ -131,8 +131,17 @@ def _step_text(prefix: str, model: DAEModel, alarms: Alarms) -> str:
         "ARGUMENTS": "const double u[NU], " if model.nu else "",
         "INPUT": "u" if model.nu else "s->u",
         "MONITOR_RESET": "monitor_reset(&s->monitor);" if alarms.learned is not None else "",
+        "WAITING_STEP": (
+            "double shown[UPPER_WATCHED];\n"
+            "    for (i = 0; i < UPPER_WATCHED; i++) {\n"
+            "        shown[i] = NAN;\n"
+            "    }\n"
+            "    monitor_take(&s->monitor, shown, NULL, 0, -1);".replace("UPPER", prefix.upper())
+            if alarms.learned is not None
+            else ""
+        ),
         "MONITOR_STEP": (
-            "monitor_take(&s->monitor, shown, MONITOR_ESTIMATES ? after + AT_SPREAD : NULL, is_deciding,\n"
+            "monitor_take(&s->monitor, shown, MONITOR_ESTIMATES > 0 ? after + AT_SPREAD : NULL, is_deciding,\n"
             "                 sqrt(estimates->nis));\n"
             "    shown[NQ + NY + 1] = s->monitor.statistic;"
             if alarms.learned is not None
@@ -180,13 +189,8 @@ def _header(design: ObserverDesign, prefix: str, digest: str, alarms: Alarms) ->
     yield from ("    double nis;", "    double step_residual;", f"}} {prefix}_estimates;", "")
     yield from (comment("Start as the design does."), f"void {prefix}_reset({prefix}_state *state);", "")
     yield comment("Take one sample: y at this sample, and u during the step that ends at it; what is missing is NaN.")
-    yield comment(
-        "A missing output is replaced by its prediction, a missing input by its last value. Returns 0; 1 where inputs "
-        "or all"
-    )
-    yield comment(
-        "outputs are missing (status GAP), or before all inputs have been known, which changes nothing; 2 if the"
-    )
+    yield comment("A missing output is replaced by its prediction, a missing input by its last value. Returns 0; 1 if")
+    yield comment("inputs are missing (status GAP; estimates are NaN before all of them have been known); 2 if the")
     yield comment("step has no solution: state and estimates are left as they were then.")
     for array, column, names in (
         ("u", "", model.input_names),

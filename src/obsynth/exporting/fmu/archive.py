@@ -440,7 +440,7 @@ def _taking_dae(design: ObserverDesign, signals: Signals) -> list[str]:
     inputs = "in, " if model.nu else ""
     lines += [
         f"    int failed = {_PREFIX}_step(memory, {inputs}in + {model.nu}, &said);",
-        "    if (failed == 2 || (failed && !memory->is_started)) {",
+        "    if (failed == 2) {",
         "        return 2;",
         "    }",
     ]

@@ -19,6 +19,29 @@ void PREFIX_reset(PREFIX_state *s)
     MONITOR_RESET
 }
 
+/* A row before all inputs have been known, with which a nonlinear model has nothing to begin: nothing is said. */
+static int waited(PREFIX_state *s, PREFIX_estimates *estimates)
+{
+    int i;
+    WAITING_STEP
+    for (i = 0; i < NX; i++) {
+        estimates->states[i] = estimates->state_deviations[i] = NAN;
+    }
+    for (i = 0; i < NQ; i++) {
+        estimates->faults[i] = estimates->fault_deviations[i] = NAN;
+    }
+    for (i = 0; i < NY; i++) {
+        estimates->residuals[i] = NAN;
+    }
+    estimates->nis = estimates->step_residual = NAN;
+    s->status = UPPER_GAP;
+    s->any_alarm = 0;
+    for (i = 0; i < UPPER_WATCHED; i++) {
+        s->alarm[i] = 0;
+    }
+    return 1;
+}
+
 /* Whether a value of an output arrives in a row. */
 static int is_due(long k, int i)
 {
@@ -80,7 +103,7 @@ int PREFIX_step(PREFIX_state *s, ARGUMENTSconst double y[NY], PREFIX_estimates *
         inputs_known = inputs_known && is_known;
     }
     if (is_first && !inputs_known) {
-        return 1;
+        return waited(s, estimates);
     }
     for (i = 0; i < NY; i++) {
         seen[i] = isfinite(y[i]) ? y[i] : NAN;

@@ -99,8 +99,8 @@ static int any_left(const REAL *left, int n)
  * after it; it is brought to this sample. */
 static int is_lost(PREFIX_state *s, const REAL *v)
 {
-    static const REAL rest[LENGTH(MODEL_STATES)];
-    static const REAL none[LENGTH(PLANT_FAULTS)];
+    static const REAL rest[LENGTH(MODEL_STATES)] = {0};
+    static const REAL none[LENGTH(PLANT_FAULTS)] = {0};
     REAL before = missed(s->measured, rest, none);
     REAL now = missed(v, rest, none);
     REAL more;
@@ -144,7 +144,7 @@ static void follow(PREFIX_state *s, const REAL *u, const int *unsure, int is_fir
 /* Seconds after a gap in which nothing may be decided: until what the model missed by has become usual. */
 static double recovering(PREFIX_state *s, const REAL *v)
 {
-    static const REAL zero[LENGTH(V_COUNT)];
+    static const REAL zero[LENGTH(V_COUNT)] = {0};
     REAL miss[LENGTH(V_COUNT)] = {0}, moved[LENGTH(Z_COUNT)] = {0}, usual[LENGTH(SHOWN_COUNT)] = {0}, sum[LENGTH(SHOWN_COUNT)] = {0};
     REAL states[LENGTH(STATE_COUNT)] = {0}, shown[LENGTH(SHOWN_COUNT)] = {0};
     double waited = 0;
@@ -212,7 +212,7 @@ static double recovering(PREFIX_state *s, const REAL *v)
 /* What gaps can have left in each output that is shown. */
 static void left_in(const PREFIX_state *s, REAL *grown)
 {
-    static const REAL zero[LENGTH(V_COUNT)];
+    static const REAL zero[LENGTH(V_COUNT)] = {0};
     REAL states[LENGTH(STATE_COUNT)] = {0}, shown[LENGTH(SHOWN_COUNT)] = {0};
     int i, j;
     copied(grown, s->carried, SHOWN_COUNT);
@@ -227,7 +227,7 @@ static void left_in(const PREFIX_state *s, REAL *grown)
 /* The same a sample later. */
 static void later(PREFIX_state *s)
 {
-    static const REAL zero[LENGTH(V_COUNT)];
+    static const REAL zero[LENGTH(V_COUNT)] = {0};
     REAL moved[LENGTH(Z_COUNT)] = {0};
     int j;
     for (j = 0; j < V_COUNT; j++) {
@@ -357,7 +357,7 @@ static int unmeasured(PREFIX_state *s, const REAL *u, const int *unsure, REAL *s
         REAL one[LENGTH(V_COUNT)] = {0};
         REAL moved[LENGTH(Z_COUNT)] = {0};
 #if STRAIGHT
-        static const REAL zero[LENGTH(V_COUNT)];
+        static const REAL zero[LENGTH(V_COUNT)] = {0};
 #endif
         filled(one, 0, V_COUNT);
         one[i] = unsure[i];
@@ -399,7 +399,7 @@ static int measured(PREFIX_state *s, const REAL *v, REAL *states, REAL *shown)
     int was_measured = s->is_started && !was_gap;
     int i;
 #if MODEL
-    static const int none[LENGTH(V_COUNT)];
+    static const int none[LENGTH(V_COUNT)] = {0};
     if (was_gap) {
         int has_lost = is_lost(s, v);
         waiting = recovering(s, v);
