@@ -1,6 +1,6 @@
 """The descriptor Kalman filter and the adaptive observer exactly as printed: readable references, not for use.
 
-They invert covariances, so they lose digits, or fail, where `obsynth.numerics.least_squares_step` does not.
+They invert covariances, so they lose digits, or fail, where `obsynth.numerics.square_root_estimation` does not.
 """
 
 from __future__ import annotations

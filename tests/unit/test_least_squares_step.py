@@ -11,7 +11,8 @@ from filterpy.kalman import KalmanFilter
 from paper_filter import paper_gains
 
 from obsynth.errors import PreconditionError, SpecError
-from obsynth.numerics.least_squares_step import (
+from obsynth.numerics.ranks import covariance_factor
+from obsynth.numerics.square_root_estimation import (
     LeastSquaresStep,
     least_squares_step,
     noise_triangle,
@@ -19,7 +20,6 @@ from obsynth.numerics.least_squares_step import (
     projection_of,
     rank_revealing_step,
 )
-from obsynth.numerics.ranks import covariance_factor
 
 #: Working digits of the reference: 50 are left after the worst cancellation below (sizes from 1e-32 to 1e20).
 DIGITS = 120

@@ -11,7 +11,7 @@ import pytest
 from scipy.sparse import csr_array
 
 import obsynth
-from obsynth.numerics.sparse_factor import residual_in_twice_the_digits
+from obsynth.numerics.sparse import residual_in_twice_the_digits
 
 ROOT = Path(__file__).parents[2]
 SOURCE = ROOT / "src" / "obsynth"

@@ -20,8 +20,7 @@ from obsynth.methods.designing import check
 from obsynth.methods.pd_observer.conditions import pd_observer_conditions
 from obsynth.methods.ui_pi_observer.conditions import existence_conditions
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE
-from obsynth.numerics.sparse import blocks_of, coarse_structure
-from obsynth.numerics.sparse_factor import SparseFactor, scales_by_all_entries
+from obsynth.numerics.sparse import SparseFactor, blocks_of, coarse_structure, scales_by_all_entries
 from obsynth.plants.fault_models import exosystem
 from obsynth.spec.loader import load_spec
 

@@ -10,21 +10,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.numerics.arrays import ComplexArray, FloatArray, read_only, remembered
-from obsynth.numerics.pencil_points import (
+from obsynth.numerics.pencils import (
     FEW_COLUMNS,
     GENERIC_POINTS,
     MOST_DIRECTIONS,
     ZERO_STEPS,
     Deflation,
-    PencilPoints,
-    smallest_singular,
-)
-from obsynth.numerics.pencils import (
     FiniteZeros,
+    PencilPoints,
     PencilStructure,
     finite_zeros,
     reduced,
     regularity_of_reduced,
+    smallest_singular,
     structure_of_reduced,
 )
 from obsynth.numerics.ranks import (

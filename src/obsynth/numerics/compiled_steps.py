@@ -1,7 +1,7 @@
 """The square-root step over many samples as one compiled loop. Needs numba (`obsynth[fast]`); import it only then.
 
-The reflections are those of `obsynth.numerics.least_squares_step.projected_step`, in the same order, so that even signs
-agree. Compiled at the first import, for seconds, and kept beside this file, or where ``NUMBA_CACHE_DIR`` says.
+The reflections are those of `projected_step` in `square_root_estimation`, in the same order, so that even signs agree.
+Compiled at the first import, for seconds, and kept beside this file, or where ``NUMBA_CACHE_DIR`` says.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numba
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.least_squares_step import OUTGROWN
+from obsynth.numerics.square_root_estimation import OUTGROWN
 
 #: A factorisation that changes by no more than this, relative to each column, and so many times in a row, has settled:
 #: what it would change from then on is what rounding does at every step.

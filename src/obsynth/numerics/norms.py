@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.doubling import compared_gain
-from obsynth.numerics.modal_response import ModalResponse, Modes, level_crossings
+from obsynth.numerics.modal_response import ModalResponse, Modes, level_crossings, resolved
 from obsynth.numerics.scaling import balancing_factors
 
-#: Entries of the matrices (complex, 16 bytes each) that responses are computed with at once.
-MOST_ENTRIES_AT_ONCE = 2_000_000
 #: Relative gap between the attained value and the certified level of an H-infinity norm.
 NORM_TOLERANCE = 1e-9
 #: Points of the starting frequency grid.
@@ -64,28 +61,6 @@ def response(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, points:
         return np.broadcast_to(d.astype(complex), (len(points), *d.shape)).copy()
     parts = [c @ states for states in resolved(None, a, b, points)]
     return np.asarray(np.concatenate(parts) + d) if parts else np.zeros((0, *d.shape), dtype=complex)
-
-
-def pencils_at(e: FloatArray | None, a: FloatArray, points: ComplexArray) -> ComplexArray:
-    """Return ``s E - A`` at points, ``(count, n, m)``; E is the identity where it is not given."""
-    found = np.empty((len(points), *a.shape), dtype=np.complex128)
-    if e is not None:
-        found[:] = np.ascontiguousarray(e)
-        found *= points[:, None, None]
-        found -= np.ascontiguousarray(a)
-        return found
-    found[:] = -a
-    diagonal = np.arange(len(a))
-    found[:, diagonal, diagonal] += points[:, None]
-    return found
-
-
-def resolved(e: FloatArray | None, a: FloatArray, b: FloatArray, points: ComplexArray) -> Iterator[ComplexArray]:
-    """Yield ``(s E - A)^-1 B`` at the points, as many at once as take little memory, ``(count, n, m)`` each."""
-    at_once = max(1, MOST_ENTRIES_AT_ONCE // max(a.size, 1))
-    for start in range(0, len(points), at_once):
-        pencils = pencils_at(e, a, np.asarray(points)[start : start + at_once])
-        yield np.asarray(np.linalg.solve(pencils, np.broadcast_to(b.astype(complex), (len(pencils), *b.shape))))
 
 
 def hinf_norm(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, *, modes: Modes | None = None) -> HinfNorm:

@@ -16,7 +16,8 @@ from obsynth.errors import SpecError
 from obsynth.methods.registry import REGISTRY, method_class
 from obsynth.methods.ui_pi_observer.pencils import equilibrated
 from obsynth.numerics.arrays import ComplexArray, FloatArray
-from obsynth.numerics.norms import resolved, response
+from obsynth.numerics.modal_response import resolved
+from obsynth.numerics.norms import response
 from obsynth.numerics.pencils import pencil_structure
 from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.numerics.spectra import boundary_points, eigenvalues

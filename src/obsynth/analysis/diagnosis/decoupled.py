@@ -12,7 +12,7 @@ from obsynth.analysis.transformations.recovery import Transformation, linear_pla
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import ComplexArray, FloatArray, read_only
 from obsynth.numerics.libraries import on_one_thread_if_small
-from obsynth.numerics.pencil_points import full_svd
+from obsynth.numerics.pencils import full_svd
 from obsynth.numerics.ranks import CLEAR_GAP, RankDecision, product_but_rounding, rank_from
 from obsynth.plants.descriptor import DescriptorSystem
 

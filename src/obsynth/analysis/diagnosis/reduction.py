@@ -13,7 +13,7 @@ import numpy as np
 
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.lapack import LAPACK_BLOCK, pencil_eigenvalues
-from obsynth.numerics.pencil_points import full_svd, largest_singular_value
+from obsynth.numerics.pencils import full_svd, largest_singular_value
 from obsynth.numerics.ranks import RankDecision, rank_from
 from obsynth.numerics.scaling import LogBalance, equilibrate_pencil, power_of_two_below
 

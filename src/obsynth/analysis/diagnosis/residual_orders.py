@@ -14,7 +14,7 @@ import numpy as np
 from flint import fmpq, fmpq_mat
 
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.pencil_points import full_svd, largest_singular_value
+from obsynth.numerics.pencils import full_svd, largest_singular_value
 from obsynth.numerics.ranks import RANK_TOLERANCE, TRACE_TOLERANCE
 from obsynth.proofs.exact_arithmetic import blocks, picked_columns, zeros_matrix
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from obsynth.analysis.zeros import equilibrated_at
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.lapack import eigenvalues
-from obsynth.numerics.norms import MOST_ENTRIES_AT_ONCE
+from obsynth.numerics.modal_response import MOST_ENTRIES_AT_ONCE
 from obsynth.numerics.scaling import equilibrate_pencil, power_of_two_below
 
 #: Below this distance, relative to the data, rounding of the data is as large as what a unit fault moves: gains of its

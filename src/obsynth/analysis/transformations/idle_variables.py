@@ -13,11 +13,20 @@ import numpy as np
 
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.pencil_points import GENERIC_POINTS
+from obsynth.numerics.pencils import GENERIC_POINTS
 from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.numerics.scaling import equilibrate_pencil
-from obsynth.numerics.sparse import CoarseStructure, Indices, blocks_of, coarse_structure, csr, unmatched_instead
-from obsynth.numerics.sparse_factor import SparseFactor, scales_by_all_entries, sparse_factor
+from obsynth.numerics.sparse import (
+    CoarseStructure,
+    Indices,
+    SparseFactor,
+    blocks_of,
+    coarse_structure,
+    csr,
+    scales_by_all_entries,
+    sparse_factor,
+    unmatched_instead,
+)
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.validation import listed
 

@@ -20,7 +20,7 @@ from obsynth.plants.validation import index_of
 
 if TYPE_CHECKING:
     from obsynth.analysis.transformations.recovery_operator import RecoveryOperator
-    from obsynth.numerics.sparse_factor import SolutionBounds
+    from obsynth.numerics.sparse import SolutionBounds
 
 
 #: Map of a recovery -> the signal that it maps.

@@ -11,8 +11,7 @@ import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE
-from obsynth.numerics.sparse import csr
-from obsynth.numerics.sparse_factor import MEAN_FACTOR, SIZE_SAMPLES, SparseFactor, sparse_factor
+from obsynth.numerics.sparse import MEAN_FACTOR, SIZE_SAMPLES, SparseFactor, csr, sparse_factor
 
 #: Signals in the order in which they stand in the algebraic equations.
 SIGNAL_ORDER = ("state", "input", "fault", "disturbance", "noise")

@@ -16,11 +16,19 @@ from obsynth.analysis.transformations.recovery import StateRecovery, Transformat
 from obsynth.analysis.transformations.recovery_operator import RecoveryOperator, without_rounding
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.pencil_points import GENERIC_POINTS
+from obsynth.numerics.pencils import GENERIC_POINTS
 from obsynth.numerics.ranks import NAMED_SHARE, RANK_TOLERANCE, product_but_rounding
 from obsynth.numerics.scaling import power_of_two_below
-from obsynth.numerics.sparse import coarse_structure, components_of, csr, dense, selection
-from obsynth.numerics.sparse_factor import SolutionBounds, scales_by_all_entries, sparse_factor
+from obsynth.numerics.sparse import (
+    SolutionBounds,
+    coarse_structure,
+    components_of,
+    csr,
+    dense,
+    scales_by_all_entries,
+    selection,
+    sparse_factor,
+)
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.validation import listed
 

@@ -32,7 +32,7 @@ from obsynth.methods.fault_estimation_filter.injection_problem import (
 from obsynth.numerics.arrays import SMALLEST, FloatArray
 from obsynth.numerics.doubling import MOST_JUMPS, doubled_riccati_solution, is_positive
 from obsynth.numerics.norms import spectral_radius
-from obsynth.numerics.pencil_points import GENERIC_POINTS
+from obsynth.numerics.pencils import GENERIC_POINTS
 
 
 class Whitened(NamedTuple):

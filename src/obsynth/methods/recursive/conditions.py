@@ -33,10 +33,10 @@ from obsynth.analysis.time_varying import (
 from obsynth.analysis.zeros import are_outside, leading_names
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, remembered
-from obsynth.numerics.least_squares_step import OUTGROWN, least_squares_step, rank_revealing_step
 from obsynth.numerics.pencils import finite_zeros
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, NAMED_SHARE, RANK_TOLERANCE, RankDecision, decide_rank
 from obsynth.numerics.scaling import equilibrate_pencil
+from obsynth.numerics.square_root_estimation import OUTGROWN, least_squares_step, rank_revealing_step
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 

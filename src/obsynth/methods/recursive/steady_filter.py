@@ -14,10 +14,10 @@ from obsynth.analysis.zeros import are_outside
 from obsynth.errors import SolverError, SpecError
 from obsynth.methods.recursive.conditions import described_mode, recursive_conditions
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
-from obsynth.numerics.least_squares_step import least_squares_step, rank_revealing_step
 from obsynth.numerics.norms import spectral_radius
 from obsynth.numerics.pencils import finite_zeros
 from obsynth.numerics.ranks import BOUNDARY_TOLERANCE, CANCELLATION_TOLERANCE, covariance_factor, decide_rank
+from obsynth.numerics.square_root_estimation import least_squares_step, rank_revealing_step
 from obsynth.observers.recursive.gain_schedule import MOST_SETTLING_STEPS
 from obsynth.observers.recursive.step_model import stacked_noise
 from obsynth.plants.descriptor import DescriptorSystem

@@ -11,9 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from obsynth.errors import PreconditionError, SolverError, SpecError
 from obsynth.numerics.arrays import FloatArray, read_only
-from obsynth.numerics.least_squares_step import least_squares_step, rank_revealing_step
 from obsynth.numerics.spectra import abscissa
-from obsynth.numerics.square_root_estimation import update
+from obsynth.numerics.square_root_estimation import least_squares_step, rank_revealing_step, update
 from obsynth.observers.estimates import Estimates
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.records import batch_record, require_horizon

@@ -35,16 +35,18 @@ from obsynth.numerics.arguments import (
     truth,
 )
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
-from obsynth.numerics.least_squares_step import (
+from obsynth.numerics.ranks import UNDETERMINED_SHARE, covariance_factor, rounding_rank
+from obsynth.numerics.square_root_estimation import (
     DEPENDENT_COLUMN,
     SUSPECT_COLUMN,
     SUSPECT_PARITY,
     LeastSquaresStep,
+    ParameterState,
     least_squares_step,
     rank_revealing_step,
+    start_of,
+    update,
 )
-from obsynth.numerics.ranks import UNDETERMINED_SHARE, covariance_factor, rounding_rank
-from obsynth.numerics.square_root_estimation import ParameterState, start_of, update
 from obsynth.observers.estimates import Estimates
 from obsynth.observers.outliers import (
     Outliers,

@@ -15,7 +15,8 @@ from obsynth.analysis.time_varying import IntArray
 from obsynth.analysis.zeros import leading_names
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.least_squares_step import (
+from obsynth.numerics.ranks import covariance_factor
+from obsynth.numerics.square_root_estimation import (
     OUTGROWN,
     LeastSquaresStep,
     Projection,
@@ -23,7 +24,6 @@ from obsynth.numerics.least_squares_step import (
     projected_step,
     projection_of,
 )
-from obsynth.numerics.ranks import covariance_factor
 from obsynth.plants.sequences import MatrixSequence
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 

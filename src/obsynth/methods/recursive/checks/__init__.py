@@ -30,9 +30,9 @@ from obsynth.methods.recursive.checks.horizon_proof import (
 )
 from obsynth.methods.recursive.conditions import SOURCE, recursive_conditions
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.least_squares_step import LeastSquaresStep, least_squares_step, rank_revealing_step
 from obsynth.numerics.norms import spectral_radius
 from obsynth.numerics.ranks import RANK_TOLERANCE
+from obsynth.numerics.square_root_estimation import LeastSquaresStep, least_squares_step, rank_revealing_step
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.recursive.gain_schedule import GainStep, gains_once
 from obsynth.observers.recursive.gain_schedule_summary import (

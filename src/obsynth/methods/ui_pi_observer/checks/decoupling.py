@@ -17,7 +17,7 @@ from obsynth.analysis.plant_units import PlantUnits
 from obsynth.methods.ui_pi_observer.pencils import equilibrated
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.lapack import LAPACK_BLOCK
-from obsynth.numerics.norms import pencils_at
+from obsynth.numerics.modal_response import pencils_at
 from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.numerics.scaling import balancing_factors
 from obsynth.numerics.spectra import boundary_points
