@@ -22,6 +22,9 @@ FAR_UNITS = 256.0
 #: Weight of inputs and outputs beside equations and states, which they scale only where A and E leave that open.
 SIGNALS_WEIGHT = 1e-3
 
+#: Exponents of integer plants are often half of a whole number, which rounding would take up or down by chance.
+OFF_THE_TIES = 1e-3
+
 _SIGNAL_KINDS = ("equations", "states", "outputs", "faults", "disturbances", "model")
 
 
@@ -65,7 +68,9 @@ class PlantUnits:
             # Parts of a plant that do not touch each other compare by their noise.
             if size > 0.0:
                 problem.wish(row, -float(np.log2(size)))
-        factors = np.exp2(problem.solve())
+        exponents = problem.solve()
+        _fix_sizes(plant, exponents, (equations, outputs), (states, faults, disturbances))
+        factors = np.exp2(exponents)
         own, left = factors[states], factors[equations] * (1.0 if plant.is_discrete else factors[0])
         shown = _inverse_sizes(plant.C * own, plant.Df, plant.Dd)
         entering = [
@@ -101,8 +106,8 @@ class PlantUnits:
     def rounded(self) -> PlantUnits:
         """Return the same with powers of two, with which scaling is exact."""
 
-        powers = {kind: read_only(np.exp2(np.round(np.log2(getattr(self, kind))))) for kind in _SIGNAL_KINDS}
-        time = self.time if self.discrete else float(np.exp2(np.round(np.log2(self.time))))
+        powers = {kind: read_only(_power_of_two(getattr(self, kind))) for kind in _SIGNAL_KINDS}
+        time = self.time if self.discrete else float(_power_of_two(np.array(self.time)))
         return PlantUnits(time=time, discrete=self.discrete, **powers)
 
     def for_decoupling(self, plant: DescriptorSystem) -> PlantUnits:
@@ -156,6 +161,40 @@ class PlantUnits:
     def eigenvalues(self, scaled: ComplexArray) -> ComplexArray:
         """Return eigenvalues or zeros in the plant's own time."""
         return np.asarray(scaled / self.rate, dtype=np.complex128)
+
+
+def _power_of_two(factors: FloatArray) -> FloatArray:
+    return np.asarray(np.exp2(np.round(np.log2(factors) + OFF_THE_TIES)))
+
+
+def _fix_sizes(
+    plant: DescriptorSystem, exponents: FloatArray, rows: tuple[range, range], columns: tuple[range, range, range]
+) -> None:
+    """Make the exponent of the first state of each part of a plant a whole number.
+
+    Rows times a number and columns over it are the same part: which number is taken would hang on the given units, and
+    with it how the exponents are rounded.
+    """
+    nothing = np.zeros((plant.ny, plant.nf + plant.nd), dtype=bool)
+    moved = np.hstack([(plant.E != 0.0) | (plant.A != 0.0), plant.Bf != 0.0, plant.Bd != 0.0])
+    linked = np.vstack([moved, np.hstack([plant.C != 0.0, nothing])])
+    row_places, column_places = (
+        np.concatenate([np.array(part, dtype=int) for part in parts]) for parts in (rows, columns)
+    )
+    waiting = np.ones(linked.shape[1], dtype=bool)
+    free = np.ones(linked.shape[0], dtype=bool)
+    for state in range(plant.nx):
+        if not waiting[state]:
+            continue
+        place = column_places[state]
+        step, reached = float(np.round(exponents[place]) - exponents[place]), np.array([state])
+        while reached.size:
+            waiting[reached] = False
+            exponents[column_places[reached]] += step
+            touched = np.flatnonzero(free & np.any(linked[:, reached], axis=1))
+            free[touched] = False
+            exponents[row_places[touched]] -= step
+            reached = np.flatnonzero(waiting & np.any(linked[touched], axis=0))
 
 
 @remembered

@@ -11,10 +11,9 @@ import numpy as np
 
 from obsynth.analysis.existence.statements import Evaluator
 from obsynth.analysis.transformations.recovery import Transformation, linear_plant
-from obsynth.analysis.zeros import are_outside, structure_of
+from obsynth.analysis.zeros import structure_of, unstable_poles
 from obsynth.numerics.arrays import ComplexArray
 from obsynth.numerics.libraries import on_one_thread_if_small
-from obsynth.numerics.pencils import FiniteZeros
 from obsynth.numerics.ranks import RankDecision, decide_rank
 from obsynth.numerics.scaling import equilibrate_pencil
 from obsynth.plants.descriptor import DescriptorSystem
@@ -73,15 +72,13 @@ def analyse_structure(plant: DescriptorSystem | Transformation) -> Structure:
     .. [Dai1989] L. Dai, "Singular Control Systems", 1989, chapters 1 and 2.
     """
     plant = linear_plant(plant).dense()
-    E, A, C = plant.E, plant.A, plant.C
-    pencil = structure_of(plant)
-    poles = FiniteZeros(pencil.finite_eigenvalues, pencil.normal_rank, pencil.decisions)
-    outside = are_outside(E, A, poles, plant.dt)
-    unstable = tuple(complex(value) for value, out in zip(poles.values, outside, strict=True) if out)
+    judge = Evaluator(plant)
+    E, A, C = judge.natural.E, judge.natural.A, judge.natural.C
+    pencil, unstable = structure_of(plant), unstable_poles(plant)
     stable = pencil.regular and not unstable
     impulse_free = pencil.index is not None and pencil.index <= 1
 
-    hidden = Evaluator(plant).hidden_modes()
+    hidden = judge.hidden_modes()
     seen = hidden.normal_rank == plant.nx
 
     rank_e = decide_rank(E, expected=plant.nx)
@@ -93,7 +90,7 @@ def analyse_structure(plant: DescriptorSystem | Transformation) -> Structure:
     decisions |= {f"pencil [A - zE; C], step {i + 1}": decision for i, decision in enumerate(hidden.decisions)}
     tall = equilibrate_pencil(np.vstack([E, none]), np.vstack([A, C]))
     decisions |= {
-        f"rank [A - zE; C] at z = {mode:.6g}": decide_rank(tall.A - mode * tall.E, expected=plant.nx)
+        f"rank [A - zE; C] at z = {mode:.6g}": decide_rank(tall.A - judge.units.rate * mode * tall.E, expected=plant.nx)
         for mode in unstable
         if mode.imag >= 0.0
     }

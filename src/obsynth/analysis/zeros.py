@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from obsynth.analysis.plant_units import PlantUnits
 from obsynth.numerics.arrays import ComplexArray, FloatArray, read_only, remembered
 from obsynth.numerics.pencils import (
     FEW_COLUMNS,
@@ -40,7 +41,14 @@ from obsynth.plants.descriptor import DescriptorSystem
 
 @remembered
 def _reduced(plant: DescriptorSystem) -> tuple[Deflation, Deflation]:
-    return reduced(plant.E, plant.A)
+    return reduced(*in_own_units(plant))
+
+
+def in_own_units(plant: DescriptorSystem) -> tuple[FloatArray, FloatArray]:
+    """Return E and A in units of the plant's own, powers of two: no rank may hang on those of the data."""
+    units = PlantUnits.of(plant).rounded()
+    moving, whole = (units.equations[:, None] * matrix * units.states for matrix in (plant.E, plant.A))
+    return moving, units.rate * whole
 
 
 def regularity_of(plant: DescriptorSystem) -> tuple[bool, int]:
@@ -51,7 +59,17 @@ def regularity_of(plant: DescriptorSystem) -> tuple[bool, int]:
 @remembered
 def structure_of(plant: DescriptorSystem) -> PencilStructure:
     """Return the structure of a plant's pencil ``A - z E``, which methods and verification ask for again and again."""
-    return structure_of_reduced(plant.E.shape, _reduced(plant))
+    found = structure_of_reduced(plant.E.shape, _reduced(plant))
+    values = PlantUnits.of(plant).rounded().eigenvalues(found.finite_eigenvalues)
+    return replace(found, finite_eigenvalues=_frozen(values))
+
+
+def unstable_poles(plant: DescriptorSystem) -> tuple[complex, ...]:
+    """Return the finite eigenvalues of a plant that are not strictly stable."""
+    found, rate = structure_of(plant), PlantUnits.of(plant).rounded().rate
+    poles = FiniteZeros(rate * found.finite_eigenvalues, found.normal_rank, found.decisions)
+    marked = zip(found.finite_eigenvalues, are_outside(*in_own_units(plant), poles, plant.dt), strict=True)
+    return tuple(complex(value) for value, out in marked if out)
 
 
 def system_zeros(E: FloatArray, A: FloatArray, *, nx: int) -> FiniteZeros:

@@ -7,11 +7,10 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 
 from obsynth.analysis.conditions import Condition
-from obsynth.analysis.zeros import are_outside, structure_of
+from obsynth.analysis.zeros import structure_of, unstable_poles
 from obsynth.errors import ObsynthError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.norms import hinf_norm
-from obsynth.numerics.pencils import FiniteZeros
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.validation import listed
@@ -35,9 +34,7 @@ def plant_information(plant: DescriptorSystem) -> Iterator[Check]:
     blocks = structure.infinite_block_sizes
     rows = [("regular", "det(A - zE) is not identically zero", float(structure.regular), "")]
     if structure.regular:
-        poles = FiniteZeros(structure.finite_eigenvalues, structure.normal_rank, structure.decisions)
-        stable = not any(are_outside(plant.E, plant.A, poles, plant.dt))
-        admissible = stable and (structure.index or 0) <= 1
+        admissible = not unstable_poles(plant) and (structure.index or 0) <= 1
         verdict = "admissible" if admissible else "not admissible: an observer may exist all the same"
         rows += [
             ("index", "index of the pencil (0: E nonsingular)", float(structure.index or 0), ""),

@@ -283,14 +283,29 @@ class Evaluator:
         moving[: self.plant.nx, : self.plant.nx] = self.plant.E
         return moving, whole
 
+    def _in_own_units(
+        self, said: NoZeroOutside, moving: FloatArray, whole: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return a pencil in units of the plant's own, time among them: no answer may hang on those of the data."""
+        scales = {"Bf": self.units.faults, "Bd": self.units.disturbances, "": np.zeros(0)}[said.inputs]
+        scales = scales if said.kept is None else scales[list(said.kept)]
+        rate = np.concatenate([np.full(self.plant.nx, self.units.rate), np.ones(self.plant.ny)])[:, None]
+        own = self.units.scaled_pencil(moving, whole, scales)
+        return own[0], rate * own[1]
+
+    def own_pencil(self, said: NoZeroOutside) -> tuple[FloatArray, FloatArray]:
+        """Return the two matrices of a pencil ``A - s E`` in units of the plant's own."""
+        return self._in_own_units(said, *self.pencil(said))
+
     def seen(self, said: NoZeroOutside) -> SystemFacts:
         """Return the facts on a pencil by floating point."""
-        pencil = self.pencil(said)
+        pencil = self.own_pencil(said)
         found = system_zeros(*pencil, nx=self.plant.nx) if said.inputs else finite_zeros(*pencil)
         values = tuple(complex(value) for value in found.values)
         marked = zip(values, are_outside(*pencil, found, self.plant.dt), strict=True)
         outside = tuple(value for value, out in marked if out)
-        return SystemFacts(found.normal_rank, pencil[1].shape[1], outside, values, False, decisions=found.decisions)
+        facts = SystemFacts(found.normal_rank, pencil[1].shape[1], outside, values, False, decisions=found.decisions)
+        return facts.timed(1.0 / self.units.rate)
 
     def facts(self, said: NoZeroOutside) -> SystemFacts:
         """Return the facts on a pencil."""
@@ -303,25 +318,14 @@ class Evaluator:
 
     def verdict(self, said: NoZeroOutside) -> ZeroVerdict:
         """Decide where the zeros of a pencil are."""
-        facts, (E, A) = self.facts(said), self.pencil(said)
+        facts, pencil = self.facts(said), self.own_pencil(said)
         if self.numbers is None:
             return ZeroVerdict("no" if facts.outside or not facts.full else "yes", facts)
-        scales = {"Bf": self.units.faults, "Bd": self.units.disturbances, "": np.zeros(0)}[said.inputs]
-        scales = scales if said.kept is None else scales[list(said.kept)]
-        # Time has a unit too: how near a pencil is to losing rank must not hang on it.
-        rate = np.concatenate([np.full(self.plant.nx, self.units.rate), np.ones(self.plant.ny)])[:, None]
         sizes = None
         if self.terms is not None:
-            sizes = rate * self.units.scaled_pencil(E, self.arranged(said.at_zero, self.terms), scales)[1]
-        moving, whole = self.units.scaled_pencil(E, A, scales)
-        found = zero_verdict(
-            facts.timed(self.units.rate),
-            moving,
-            rate * whole,
-            nx=self.plant.nx,
-            discrete=self.plant.is_discrete,
-            sizes=sizes,
-        )
+            sizes = self._in_own_units(said, pencil[0], self.arranged(said.at_zero, self.terms))[1]
+        discrete = self.plant.is_discrete
+        found = zero_verdict(facts.timed(self.units.rate), *pencil, nx=self.plant.nx, discrete=discrete, sizes=sizes)
         distance = found.distance
         own = None if distance is None else Distance(distance.value, self.units.eigenvalue(distance.point))
         return replace(found, facts=found.facts.timed(1.0 / self.units.rate), distance=own)
@@ -405,14 +409,15 @@ class Evaluator:
     def hidden_modes(self) -> SystemFacts:
         """Return the facts on ``[A - s E; C]``, with the modes that only rounding of the data lets show."""
         said, nx = NoZeroOutside(), self.plant.nx
-        seen, pencil = self.seen(said), self.pencil(said)
+        seen, pencil, rate = self.seen(said), self.own_pencil(said), self.units.rate
         if self.numbers is None:
             return seen
-        exact = believed(self.facts(said), *pencil, nx=nx)
-        nearly = zeros_at_rounding_level(*self.units.scaled_pencil(*pencil), seen.zeros, exact.zeros, nx=nx)
+        seen = seen.timed(rate)
+        exact = believed(self.facts(said).timed(rate), *pencil, nx=nx)
+        nearly = zeros_at_rounding_level(*pencil, seen.zeros, exact.zeros, nx=nx)
         modes = sorted((*exact.zeros, *nearly), key=lambda value: (value.real, value.imag))
         undetectable = (*exact.outside, *(value for value in nearly if value in seen.outside))
-        return replace(exact, zeros=tuple(modes), outside=undetectable)
+        return replace(exact, zeros=tuple(modes), outside=undetectable).timed(1.0 / rate)
 
 
 Found = TypeVar("Found")

@@ -1,0 +1,83 @@
+"""What is said of a plant does not hang on the units of its states, equations, signals and time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+import obsynth
+from obsynth.analysis.plant_units import PlantUnits
+
+#: Units are two to a whole number up to this: nothing is rounded.
+FARTHEST = 20
+
+
+def random_plant(seed: int) -> obsynth.DescriptorSystem:
+    """Return a plant of short numbers, often with hidden modes, integrators and an algebraic state."""
+    rng = np.random.default_rng([91, seed])
+    n, ny, nf, nd = (int(rng.integers(*ends)) for ends in ((2, 7), (1, 4), (1, 3), (0, 2)))
+    a = np.round(rng.normal(size=(n, n)) * (rng.uniform(size=(n, n)) < 0.6), 2)
+    a -= np.diag(np.round(rng.uniform(0.0, 2.0, n), 1))
+    e, c = np.eye(n), np.round(rng.normal(size=(ny, n)), 2)
+    if rng.uniform() < 0.4:
+        e[-1, -1] = 0.0
+    if rng.uniform() < 0.5:
+        seen = int(rng.integers(1, n))
+        a[:seen, seen:], c[:, seen:] = 0.0, 0.0
+    if rng.uniform() < 0.3:
+        a[:, 0] = 0.0
+    b = [np.round(rng.normal(size=(n, count)), 1) for count in (nf, nd)]
+    dt = 0.0 if seed % 2 else 0.1
+    return obsynth.DescriptorSystem(e, 0.5 * a if dt else a, C=c, Bf=b[0], Bd=b[1], dt=dt)
+
+
+def in_other_units(plant: obsynth.DescriptorSystem, seed: int) -> tuple[obsynth.DescriptorSystem, float]:
+    """Return a plant in units that are powers of two, and what its eigenvalues are multiplied by."""
+    rng = np.random.default_rng([5, seed])
+
+    def units(count: int) -> np.ndarray:
+        return np.exp2(rng.integers(-FARTHEST, FARTHEST + 1, count).astype(float))
+
+    rate = 1.0 if plant.is_discrete else float(units(1)[0])
+    rows, states, outputs, faults, unknown = map(units, (plant.nx, plant.nx, plant.ny, plant.nf, plant.nd))
+    moved, shown = rate * rows[:, None], outputs[:, None]
+    changed = plant.replace(
+        E=rows[:, None] * plant.E * states, A=moved * plant.A * states, C=shown * plant.C * states,
+        Bf=moved * plant.Bf * faults, Bd=moved * plant.Bd * unknown,
+    )  # fmt: skip
+    return changed, rate
+
+
+#: Two roundings to double precision.
+LAST_DIGIT = 4.0 * np.finfo(float).eps
+CASES = pytest.mark.parametrize("seed", range(40))
+
+
+@CASES
+def test_natural_units_make_the_same_plant_of_any(seed: int) -> None:
+    plant = random_plant(seed)
+    natural = [PlantUnits.of(own).rounded().scaled_plant(own) for own in (plant, in_other_units(plant, seed)[0])]
+    for name in ("E", "A", "C", "Bf", "Bd"):
+        np.testing.assert_array_equal(*(getattr(own, name) for own in natural), err_msg=name)
+
+
+def facts(found: obsynth.types.Structure) -> Iterator[object]:
+    yield from (found.regular, found.index, found.infinite_block_sizes, found.stable, found.admissible)
+    yield from (found.observability_normal_rank, found.finitely_observable, found.detectable)
+    yield from (found.impulse_observable, found.causally_observable)
+    yield from (decision.rank for decision in found.decisions.values())
+    yield from (decision.clear for decision in found.decisions.values())
+
+
+@CASES
+def test_structure_does_not_hang_on_units(seed: int) -> None:
+    plant = random_plant(seed)
+    other, rate = in_other_units(plant, seed)
+    first, second = obsynth.analyse_structure(plant), obsynth.analyse_structure(other)
+    assert list(facts(first)) == list(facts(second))
+    for name in ("finite_eigenvalues", "unobservable_modes", "undetectable_modes"):
+        here, there = (np.asarray(getattr(found, name)) for found in (first, second))
+        # Those found exactly are rounded for printing, each in its own unit of time.
+        np.testing.assert_allclose(rate * here, there, rtol=LAST_DIGIT, atol=0.0, err_msg=name)
