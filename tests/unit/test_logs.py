@@ -263,3 +263,71 @@ def test_the_page_shows_one_s_own_data_first(design, frame, tmp_path, monkeypatc
     assert places == sorted(places)
     assert "Statistics" in page
     assert "--data log.csv" in page
+
+
+WORD_ROWS = 1000
+
+
+def with_words(rows: list[int], count: int = WORD_ROWS) -> pd.DataFrame:
+    """Return a log, some of whose cells of one output are words."""
+    rng = np.random.default_rng(3)
+    log = pd.DataFrame({"time": 0.5 * np.arange(count), "valve": 0.3, "level": 2.0, "flow": 0.2})
+    log[["level", "flow"]] += 0.01 * rng.standard_normal((count, 2))
+    log["flow"] = [repr(value) for value in log["flow"]]
+    log.loc[rows, "flow"] = "Bad"
+    return log
+
+
+@pytest.mark.parametrize("way", ["frame", "csv", "stream", "parquet"])
+@pytest.mark.parametrize("first", [0, 300])
+def test_words_are_bad_samples_wherever_they_stand_and_however_a_log_is_read(design, tmp_path, way, first):
+    """From the first row on, and over a whole piece that is read at once."""
+    bad = list(range(first, first + 150))
+    log = with_words(bad)
+    numbers = log.assign(flow=pd.to_numeric(log["flow"], errors="coerce"))
+    path = tmp_path / f"log.{way}"
+    if way == "csv":
+        log.to_csv(path, index=False)
+    if way == "parquet":
+        log.to_parquet(path)
+    wanted = obsynth.run_on_data(design, numbers).table
+    for rows in (100, WORD_ROWS):
+        data = {"frame": log, "stream": io.StringIO(log.to_csv(index=False))}.get(way, path)
+        found = obsynth.run_on_data(design, data, chunk_rows=rows)
+        pd.testing.assert_frame_equal(found.table, wanted)
+        (said,) = (text for text in found.warnings if "flow" in text)
+        assert said.startswith("150 cell(s) of 'flow'")
+        assert said.endswith(f"first 'Bad' in row {first + 1}.")
+
+
+@pytest.mark.parametrize("way", ["frame", "csv", "stream", "parquet"])
+def test_a_column_of_words_is_no_signal(design, tmp_path, way):
+    log = with_words(list(range(WORD_ROWS)))
+    path = tmp_path / f"log.{way}"
+    if way == "csv":
+        log.to_csv(path, index=False)
+    if way == "parquet":
+        log.to_parquet(path)
+    data = {"frame": log, "stream": io.StringIO(log.to_csv(index=False))}.get(way, path)
+    with pytest.raises(SpecError, match="The column 'flow' holds no number: row 1 has 'Bad'"):
+        obsynth.run_on_data(design, data, chunk_rows=100)
+
+
+def test_a_log_that_goes_on_with_words_alone_has_shown_numbers(design, tmp_path):
+    log, state = with_words([*range(500, WORD_ROWS)]), tmp_path / "state.json"
+    whole = obsynth.run_on_data(design, log).table
+    parts = [obsynth.run_on_data(design, log.iloc[rows], state=state).table for rows in (slice(500), slice(500, None))]
+    pd.testing.assert_frame_equal(whole, pd.concat(parts, ignore_index=True))
+
+
+def test_words_without_stamps_and_in_a_mapping_are_bad_samples_of_a_calibration(tmp_path):
+    from obsynth.calibration.logs import read_log
+
+    log = with_words([*range(50), 700]).drop(columns="time")[["flow", "valve", "level"]]
+    log.to_csv(tmp_path / "log.csv", index=False)
+    log.to_parquet(tmp_path / "log.parquet")
+    mapping = {name: list(values) for name, values in log.items()}
+    for data in (tmp_path / "log.csv", tmp_path / "log.parquet", log, mapping):
+        found = read_log(data, ["valve"], ["flow", "level"], dt=0.5)
+        assert np.flatnonzero(np.isnan(found.y[:, 0])).tolist() == [*range(50), 700]
+        assert any(note.startswith("51 cell(s) of 'flow'") for note in found.notes)

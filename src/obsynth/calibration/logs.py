@@ -156,7 +156,7 @@ def read_log(
                 f"{what} names {wrong[0]!r}, which is no signal: there are {', '.join(signals)}.",
                 path=f"{what}.{wrong[0]}",
             )
-    table, names, source = _table(log, [(columns or {}).get(name, name) for name in signals])
+    table, names, source, said = _table(log, [(columns or {}).get(name, name) for name in signals])
     length = max((len(values) for values in table.values()), default=0)
     first, last = parsed_rows(rows, length)
 
@@ -175,16 +175,26 @@ def read_log(
     time = column("time") if in_table else np.asarray(np.arange(first, last) * float(dt or 0.0))
     u = np.column_stack([column(name) for name in input_names]) if input_names else np.zeros((last - first, 0))
     y = np.column_stack([column(name) for name in output_names])
-    return _on_grid(time, u, y, dt, tuple(input_names), tuple(output_names), (first, last), source)
+    found = _on_grid(time, u, y, dt, tuple(input_names), tuple(output_names), (first, last), source)
+    return replace(found, notes=(*said, *found.notes))
 
 
-def _table(log: Any, wanted: Sequence[str]) -> tuple[dict[str, Any], list[str], str]:
-    """Return columns that are wanted, the time first, names of all columns, and where they come from."""
+def _table(log: Any, wanted: Sequence[str]) -> tuple[dict[str, Any], list[str], str, tuple[str, ...]]:
+    """Return columns that are wanted, the time first, names of all columns, where they come from, and what is to be
+    said of their cells."""
     if isinstance(log, str | Path) or (hasattr(log, "columns") and hasattr(log, "index")):
-        found, names = log_table(log, wanted[1:], wanted[0])
-        return found, names, Path(log).name if isinstance(log, str | Path) else ""
+        found, names, said = log_table(log, wanted[1:], wanted[0])
+        return found, names, Path(log).name if isinstance(log, str | Path) else "", said
     if isinstance(log, Mapping):
-        return {str(name): np.asarray(log[name]) for name in log}, list(map(str, log)), ""
+        found = {str(name): np.asarray(log[name]) for name in log}
+        there = {name: found[name] for name in wanted if name in found}
+        if any(values.dtype.kind in "OU" for values in there.values()) and len(set(map(len, there.values()))) == 1:
+            import pandas as pd
+
+            # Cells with words are read as those of a frame.
+            read, _, said = log_table(pd.DataFrame(there), wanted[1:], wanted[0])
+            return {**found, **read}, list(map(str, log)), "", said
+        return found, list(map(str, log)), "", ()
     raise SpecError(
         "log must be the name of a file, a pandas.DataFrame, or a mapping from names to columns.", path="log"
     )

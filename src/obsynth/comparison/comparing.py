@@ -934,7 +934,7 @@ def _log(
     wanted = {
         name: (columns or {}).get(name, name) for name in (*plant.input_names, *plant.output_names, *plant.fault_names)
     }
-    table, _ = log_table(data, list(wanted.values()), (columns or {}).get(TIME_HEADER, TIME_HEADER))
+    table, *_ = log_table(data, list(wanted.values()), (columns or {}).get(TIME_HEADER, TIME_HEADER))
     frame = {name: table[column] for name, column in wanted.items() if column in table}
     missing = [wanted[name] for name in (*plant.input_names, *plant.output_names) if name not in frame]
     if missing:

@@ -410,6 +410,7 @@ class LogRun:
             "observer": {"last": self.clock.last, "longest": self.clock.longest, **self.observer.as_dict()},
             "recovered": None if self.recovered is None else self.recovered.as_dict(),
             "inputs": None if self.stamps is None else self.stamps.earlier,
+            "numeric": None if self.stamps is None else sorted(self.stamps.numeric),
             "monitor": None if self.monitor is None else self.monitor.as_data(self._watching),
         }
 
@@ -420,7 +421,7 @@ class LogRun:
         self.observer.resume(data["observer"])
         self.clock.last, self.clock.longest = data["observer"]["last"], data["observer"]["longest"]
         if self.stamps is not None:
-            self.stamps.earlier = data["inputs"]
+            self.stamps.earlier, self.stamps.numeric = data["inputs"], set(data["numeric"])
         if self.recovered is not None:
             self.recovered.resume(data["recovered"])
         if self.monitor is not None:
@@ -428,7 +429,7 @@ class LogRun:
 
 
 RUN_STATE_KIND = "obsynth run state"
-RUN_STATE_VERSION = 11
+RUN_STATE_VERSION = 12
 STATE = FileKind("a saved state of obsynth", rb'\A\s*\{\s*"kind":\s*"obsynth run state"')
 #: Parts that are seconds, or nothing before the first row.
 _TIME_PARTS = frozenset({"last", "longest"})

@@ -54,26 +54,41 @@ class Stamps:
 
     def __init__(self) -> None:
         self.is_dated: bool | None = None
+        self.are_missing = False  # of a log without stamps, whose rows are counted by who reads it
         self.zone: tzinfo | None = None  # of the first stamp, `None` where it names none (taken as UTC)
         self.day_first: bool | None = None  # of dates with slashes, by the first one
         self.per_second: float | None = None  # how many of the numbers of the log are a second, by the first one
-        #: Rows and texts of cells that hold a word instead of a number, by column: they count as missing.
-        self.words: dict[str, list[tuple[int, str]]] = {}
+        #: Cells that hold a word instead of a number, which are missing, by column: how many; first row and text.
+        self.words: dict[str, tuple[int, int, str]] = {}
+        #: Columns that have shown a number: of the others words are no bad samples, but another kind of column.
+        self.numeric: set[str] = set()
         #: Inputs ``(delay, nu)`` of the latest rows, where inputs act later than they are written.
         self.earlier: FloatArray | None = None
 
     def warnings(self) -> tuple[str, ...]:
         """Return a text for each column with words in it."""
         return tuple(
-            f"{len(found)} cell(s) of {column!r} hold no number and count as missing, first {found[0][1]!r} in row "
-            f"{found[0][0]}."
-            for column, found in self.words.items()
+            f"{count} cell(s) of {column!r} hold no number and count as missing, first {text!r} in row {row}."
+            for column, (count, row, text) in self.words.items()
         )
+
+    def take_word(self, column: str, row: int, text: str) -> None:
+        """Count a cell that holds a word instead of a number."""
+        count, *first = self.words.get(column, (0, row, text))
+        self.words[column] = (count + 1, *first)
+
+    def require_numbers(self) -> None:
+        """Raise `SpecError`, at the end of a log, for a column of words in which no row holds a number."""
+        for column, (_, row, text) in self.words.items():
+            if column not in self.numeric:
+                raise SpecError(
+                    f"The column {column!r} holds no number: row {row} has {text!r}.", path=f"columns.{column}"
+                )
 
     def read(self, text: str, row: int, column: str, *, comma: bool = False) -> float:
         """Return the seconds of one cell; ``comma`` takes a decimal comma."""
         cell = text.strip()
-        if cell.lower() in MISSING_TEXTS:
+        if self.are_missing or cell.lower() in MISSING_TEXTS:
             return math.nan
         if self.is_dated is not True:
             try:
@@ -129,7 +144,9 @@ class Stamps:
         return f"{year}-{month:0>2}-{day:0>2}{_clock(time)}"
 
     def read_column(self, column: Any) -> FloatArray | None:
-        """Return the seconds of a column of a data frame that holds dates; `None` where it holds none."""
+        """Return the seconds of a column of a data frame that holds dates, or no stamps; else `None`."""
+        if self.are_missing:
+            return np.full(len(column), np.nan)
         kind = getattr(column.dtype, "kind", "O")
         if kind not in "Mm" and not hasattr(column.dtype, "tz"):
             return None

@@ -10,7 +10,6 @@ from __future__ import annotations
 import codecs
 import csv
 import itertools
-import math
 import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -56,15 +55,15 @@ class Dialect:
 
     def number(self, text: str | None, row: int, column: str, stamps: Stamps | None = None) -> float:
         """Return the number in a cell, NaN where it is missing; a cell that is none is named with its row.
-        In a column that has shown numbers, a word is what loggers write for a bad sample: ``stamps`` counts these."""
+        A word is what loggers write for a bad sample: ``stamps`` counts these, and which columns show numbers."""
         cell = "" if text is None else text.strip()
         if cell.lower() in MISSING_TEXTS:
             return float("nan")
         try:
-            return number_in_text(cell.replace(",", ".") if self.comma and "." not in cell else cell)
+            found = number_in_text(cell.replace(",", ".") if self.comma and "." not in cell else cell)
         except ValueError:
             if stamps is not None and ("#" in cell or not any(letter.isdigit() for letter in cell)):
-                stamps.words.setdefault(column, []).append((row, cell))
+                stamps.take_word(column, row, cell)
                 return float("nan")
             advice = ""
             if "," in cell:
@@ -76,6 +75,9 @@ class Dialect:
             raise SpecError(
                 f"Row {row}, column {column!r}: {text!r} is no number.{advice}", path=f"row {row}"
             ) from None
+        if stamps is not None:
+            stamps.numeric.add(column)
+        return found
 
 
 def encoding_of(path: Path) -> str:
@@ -108,7 +110,7 @@ def stream_rows(stream: TextIO, signals: Signals, stamps: Stamps) -> Iterator[Fl
     """Yield one row at a time, ``(1, 1 + nu + ny)``, as soon as its line is there."""
     header, dialect, table = _opened(stream, signals.columns)
     places = signals.positions(header)
-    row, shown = 0, set[int]()  # columns that have shown a number
+    row = 0
     for cells in table:
         if not any(cell.strip() for cell in cells):
             continue
@@ -119,10 +121,7 @@ def stream_rows(stream: TextIO, signals: Signals, stamps: Stamps) -> Iterator[Fl
             )
         cells += [""] * (len(header) - len(cells))
         time = stamps.read(cells[places[0]], row, header[places[0]], comma=dialect.comma)
-        values = [
-            dialect.number(cells[place], row, header[place], stamps if place in shown else None) for place in places[1:]
-        ]
-        shown.update(place for place, value in zip(places[1:], values, strict=True) if math.isfinite(value))
+        values = [dialect.number(cells[place], row, header[place], stamps) for place in places[1:]]
         yield np.array([[time, *values]])
     if row == 0:
         raise SpecError("The data have no rows.", path="data")
@@ -222,13 +221,19 @@ Data: TypeAlias = "str | Path | TextIO | pd.DataFrame"
 def chunks(data: Data, signals: Signals, stamps: Stamps, rows: int) -> Iterator[FloatArray]:
     """Yield ``(rows, 1 + nu + ny)``: time and signals, in order; NaN where a sample is missing.  Inputs are those that
     act in a row as the design takes it."""
-    found = _chunks(data, signals, stamps, rows)
+    found = _numeric(_chunks(data, signals, stamps, rows), stamps)
     if not signals.delay or not signals.inputs:
         yield from found
     elif signals.delay > 0:
         yield from _delayed(found, signals, stamps)
     else:
         yield from _advanced(found, signals)
+
+
+def _numeric(found: Iterator[FloatArray], stamps: Stamps) -> Iterator[FloatArray]:
+    """Yield all rows; whether columns hold numbers is known at the end, wherever the words in them stand."""
+    yield from found
+    stamps.require_numbers()
 
 
 def _delayed(found: Iterator[FloatArray], signals: Signals, stamps: Stamps) -> Iterator[FloatArray]:
@@ -457,13 +462,13 @@ def _numbers(column: pd.Series, done: int, stamps: Stamps | None = None) -> Floa
     import pandas as pd
 
     if pd.api.types.is_numeric_dtype(column) and not pd.api.types.is_bool_dtype(column):
-        return np.asarray(column.to_numpy(dtype=np.float64, na_value=np.nan))
+        found = np.asarray(column.to_numpy(dtype=np.float64, na_value=np.nan))
+        if stamps is not None and not np.isnan(found).all():
+            stamps.numeric.add(str(column.name))
+        return found
     texts = [None if pd.isna(cell) else str(cell) for cell in column]
-    plain, shown, found = Dialect(","), False, list[float]()
-    for i, text in enumerate(texts):
-        found.append(plain.number(text, done + i + 1, str(column.name), stamps if shown else None))
-        shown = shown or math.isfinite(found[-1])
-    return np.array(found)
+    plain = Dialect(",")
+    return np.array([plain.number(text, done + i + 1, str(column.name), stamps) for i, text in enumerate(texts)])
 
 
 #: Decimals of seconds that dates are told to.
@@ -472,23 +477,25 @@ SECOND_DECIMALS = 6
 
 def log_table(
     data: str | Path | Any, names: Sequence[str], time: str = TIME_HEADER
-) -> tuple[dict[str, FloatArray], list[str]]:
-    """Return those of some columns that a log has ``(rows,)``, dates as seconds since the first, and the names of all
-    columns; ``data`` is the name of a file or a data frame, ``time`` the column of the stamps."""
+) -> tuple[dict[str, FloatArray], list[str], tuple[str, ...]]:
+    """Return those of some columns that a log has ``(rows,)``, dates as seconds since the first, the names of all
+    columns, and what is to be said of the cells; ``data`` is the name of a file or a data frame, ``time`` the column of
+    the stamps."""
     header = _header(data, [time, *names])
     there = [name for name in dict.fromkeys(names) if name in header and name != time]
     # A log without stamps is read like others: a column stands where they would.
     first = time if time in header else next(iter(there), None)
     if first is None:
-        return {}, header
+        return {}, header, ()
     signals = Signals(tuple(there), (first, *there), np.ones(len(there)), np.zeros(len(there)), {})
     stamps = Stamps()
+    stamps.are_missing = time not in header
     rows = np.concatenate(list(chunks(data, signals, stamps, CHUNK_ROWS)))
     found, times = dict(zip(there, rows[:, 1:].T, strict=True)), rows[:, 0]
     if stamps.is_dated:
         # Seconds since 1970 in double precision have lost what is below a microsecond.
         times = np.round(times - times[0], SECOND_DECIMALS)
-    return {**({time: times} if time in header else {}), **found}, header
+    return {**({time: times} if time in header else {}), **found}, header, stamps.warnings()
 
 
 def _header(data: Any, wanted: Sequence[str]) -> list[str]:
