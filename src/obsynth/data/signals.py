@@ -74,8 +74,8 @@ class Stamps:
 
     def take_word(self, column: str, row: int, text: str) -> None:
         """Count a cell that holds a word instead of a number."""
-        count, *first = self.words.get(column, (0, row, text))
-        self.words[column] = (count + 1, *first)
+        count, first_row, first_text = self.words.get(column, (0, row, text))
+        self.words[column] = (count + 1, first_row, first_text)
 
     def require_numbers(self) -> None:
         """Raise `SpecError`, at the end of a log, for a column of words in which no row holds a number."""
