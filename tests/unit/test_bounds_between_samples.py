@@ -17,8 +17,7 @@ from obsynth import SpecError
 from obsynth.experiments.monitors.between_samples import BetweenSamples
 from obsynth.experiments.monitors.residual_model import residual_model
 from obsynth.proofs.balls import Ball
-from obsynth.proofs.contraction import prove_contraction
-from obsynth.proofs.peak_sums import absolute_gains, gathered, interval_pieces, peak_sums
+from obsynth.proofs.contraction import absolute_gains, gathered, interval_pieces, peak_sums, prove_contraction
 from obsynth.proofs.products import energy, exponential
 
 

@@ -31,9 +31,8 @@ from obsynth.observers.linear.derived import poles_of
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.balls import Ball, rounded_up
-from obsynth.proofs.contraction import Contraction, prove_contraction
+from obsynth.proofs.contraction import Contraction, absolute_gains, prove_contraction
 from obsynth.proofs.extended_balls import ExtendedBall
-from obsynth.proofs.peak_sums import absolute_gains
 from obsynth.proofs.products import as_ball
 from obsynth.results.checks import Check, upper_bound_check
 

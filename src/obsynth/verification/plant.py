@@ -15,8 +15,7 @@ from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.validation import listed
 from obsynth.proofs.balls import Ball
-from obsynth.proofs.contraction import column_norms
-from obsynth.proofs.peak_sums import gathered, interval_pieces, peak_sums
+from obsynth.proofs.contraction import column_norms, gathered, interval_pieces, peak_sums
 from obsynth.proofs.products import energy
 from obsynth.results.checks import Check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign

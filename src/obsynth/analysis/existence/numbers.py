@@ -13,7 +13,6 @@ from flint import arb_mat, fmpq_mat, fmpz_poly
 from obsynth.numerics.ranks import RankDecision
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.exact_numbers import DECISIVE
-from obsynth.proofs.enclosed_pencils import EnclosedPencil, bits_for, exponential, rank_to_digits
 from obsynth.proofs.exact_arithmetic import (
     blocks,
     holds_computed,
@@ -23,7 +22,14 @@ from obsynth.proofs.exact_arithmetic import (
     written_matrix,
     zeros_matrix,
 )
-from obsynth.proofs.exact_pencils import ExactPencil, system_pencil
+from obsynth.proofs.exact_pencils import (
+    EnclosedPencil,
+    ExactPencil,
+    bits_for,
+    exponential,
+    rank_to_digits,
+    system_pencil,
+)
 
 #: Degree of the minimal polynomial of an eigenvalue, times columns of the pencil, above which its rank there is left
 #: to floating point.

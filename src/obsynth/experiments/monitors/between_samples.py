@@ -19,9 +19,15 @@ from obsynth.numerics.continuous import first_order_hold, peak_gain
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.balls import Ball, rounded_up
-from obsynth.proofs.contraction import Contraction, column_norms, prove_contraction
+from obsynth.proofs.contraction import (
+    Contraction,
+    column_norms,
+    gathered,
+    interval_pieces,
+    peak_sums,
+    prove_contraction,
+)
 from obsynth.proofs.extended_balls import block
-from obsynth.proofs.peak_sums import gathered, interval_pieces, peak_sums
 from obsynth.proofs.products import exponential
 
 #: Modes of the plant that decay by less than this exponent in a sample are not followed until they have decayed.
