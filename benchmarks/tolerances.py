@@ -22,7 +22,7 @@ import numpy as np
 import obsynth
 from obsynth.experiments.monitors.adaptive import AdaptiveState, adaptive_plan, adaptive_step
 from obsynth.spec import load_spec
-from obsynth.verification.adaptive_record import thresholds_of_records
+from obsynth.verification.adaptive_bound import thresholds_of_records
 
 REPEATS, SAMPLES = 5, 4000
 DESIGNS = Path(__file__).parents[1] / "designs"

@@ -27,7 +27,7 @@ from obsynth.data.alarm_proof import verify_alarm
 from obsynth.experiments.alarm_proof import proved_alarm
 from obsynth.experiments.monitors.adaptive import adaptive_plan
 from obsynth.spec import load_spec
-from obsynth.verification.adaptive_record import record_columns
+from obsynth.verification.adaptive_bound import record_columns
 
 NAMES = ("wang2015", "smib", "drive")
 #: Cases of each design, by kind, and proofs of a fault on wang2015 after them.

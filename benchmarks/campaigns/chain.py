@@ -26,7 +26,7 @@ from benchmarks.campaigns.frame import Outcome
 import obsynth
 from obsynth.data.alarm_proof import verify_alarm
 from obsynth.experiments.alarm_proof import proved_alarm
-from obsynth.results.calibration_files import calibration_text, verify_calibration
+from obsynth.results.certificate_files import calibration_text, verify_calibration
 from obsynth.results.gain_sets import design_as_dict, digest_of, loaded, restored
 
 CASES = 3000

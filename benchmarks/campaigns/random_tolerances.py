@@ -27,7 +27,7 @@ import obsynth
 from obsynth.errors import ObsynthError, PreconditionError, SpecError
 from obsynth.experiments.alarm_proof import proved_alarm
 from obsynth.experiments.monitors.adaptive import adaptive_plan
-from obsynth.verification.adaptive_record import record_columns
+from obsynth.verification.adaptive_bound import record_columns
 
 CASES = 400
 LIMIT = 300.0

@@ -11,7 +11,7 @@ import pytest
 import obsynth
 from obsynth.cli.main import main
 from obsynth.plants.constants import constants_box
-from obsynth.results.calibration_files import box_row, calibration_text, read_calibration, verify_calibration
+from obsynth.results.certificate_files import box_row, calibration_text, read_calibration, verify_calibration
 from obsynth.results.gain_sets import digest_of
 
 DESIGNS = Path(__file__).parents[2] / "designs"

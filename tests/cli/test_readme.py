@@ -12,7 +12,7 @@ import pytest
 
 from obsynth.cli.main import main
 from obsynth.methods.registry import REGISTRY
-from obsynth.simulation.profiles import PROFILE_KINDS
+from obsynth.simulation.scenario import PROFILE_KINDS
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")

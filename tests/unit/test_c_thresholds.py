@@ -14,7 +14,7 @@ from uncertain_plants import drive, wang
 
 import obsynth
 from obsynth.errors import SpecError
-from obsynth.verification.adaptive_record import thresholds_of_records
+from obsynth.verification.adaptive_bound import thresholds_of_records
 
 COMPILER = shutil.which("cc") or shutil.which("gcc")
 

@@ -12,7 +12,7 @@ import pytest
 import obsynth
 from obsynth import verify
 from obsynth.analysis.transformations.recovery import StateRecovery
-from obsynth.results.plant_source import PlantSource, source_of
+from obsynth.results.design import PlantSource, source_of
 from obsynth.spec import load_spec
 
 DESIGNS = Path(__file__).parents[2] / "designs"

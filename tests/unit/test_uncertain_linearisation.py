@@ -16,7 +16,7 @@ import obsynth
 from obsynth import DAEModel, PreconditionError, SpecError, linearise
 from obsynth.plants.dae.functions import local_equations
 from obsynth.plants.uncertainty import matrices_of
-from obsynth.results.calibration_files import calibration_text
+from obsynth.results.certificate_files import calibration_text
 from obsynth.spec import load_spec
 
 POINT = {"leak": 0.03, "h1": 0.7, "h3": 0.65}

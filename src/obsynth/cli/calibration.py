@@ -90,7 +90,7 @@ def run_linearise(options: argparse.Namespace) -> int:
 def run_calibrate(options: argparse.Namespace) -> int:
     """Run ``calibrate``: spec and log in, constants with their box and a verdict out."""
     from obsynth.calibration.spec_writing import calibrated_spec
-    from obsynth.results.calibration_files import CALIBRATION_KIND, calibration_text
+    from obsynth.results.certificate_files import CALIBRATION_KIND, calibration_text
     from obsynth.results.gain_sets import plain
     from obsynth.spec.loader import load_plant
 

@@ -15,7 +15,7 @@ from obsynth.cli.arguments import refuse_given
 from obsynth.cli.output import answer, gains_to_hand_on, output_file, print_json, progress, stdout_console
 from obsynth.errors import PreconditionError, SolverError, SpecError, VerificationError
 from obsynth.files.outputs import FileKind, write_atomically
-from obsynth.results.calibration_files import CALIBRATION_KIND, box_row, verify_calibration
+from obsynth.results.certificate_files import CALIBRATION_KIND, box_row, verify_calibration
 from obsynth.results.gain_sets import GAIN_SET, design_as_dict, gain_set_bytes, place_of, restored, written_for
 
 if TYPE_CHECKING:

@@ -15,8 +15,8 @@ from obsynth.experiments.alarm_proof import ALARM_KIND
 from obsynth.experiments.assumptions import Log, file_digest
 from obsynth.experiments.tolerance_study import study_statement, tolerance_study
 from obsynth.files.inputs import read_json
-from obsynth.results.calibration_files import CALIBRATION_KIND, verify_calibration
 from obsynth.results.certificate_files import (
+    CALIBRATION_KIND,
     COMPARISON,
     RESULT_VERSION,
     RESULTS,
@@ -25,6 +25,7 @@ from obsynth.results.certificate_files import (
     body_of,
     differences,
     opened,
+    verify_calibration,
 )
 from obsynth.results.checks import Check, information, nothing_wrong
 from obsynth.results.design import ObserverDesign

@@ -51,8 +51,7 @@ from obsynth.plants.uncertainty import UNCERTAIN_MATRICES
 from obsynth.results.certificate_files import COMPARISON, SHOWN_DIGITS, result_text
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import design_as_dict
-from obsynth.simulation.profiles import Sine, Step
-from obsynth.simulation.scenario import Scenario, scenario_from
+from obsynth.simulation.scenario import Scenario, Sine, Step, scenario_from
 from obsynth.simulation.signals import resolve
 from obsynth.tolerances.exact_plant import plant_at
 

@@ -52,8 +52,7 @@ from obsynth.results.certificate_files import SHOWN_DIGITS, sealed
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import design_as_dict, plain
 from obsynth.tolerances.robustness import structure_of
-from obsynth.verification.adaptive_bound import adaptive_bound
-from obsynth.verification.adaptive_record import thresholds_of_records
+from obsynth.verification.adaptive_bound import adaptive_bound, thresholds_of_records
 
 #: Roundings of a computed right side beside those of its products and sums.
 MORE_ROUNDINGS = 8

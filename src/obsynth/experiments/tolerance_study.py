@@ -24,8 +24,7 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.certificate_files import SHOWN_DIGITS, STUDY, result_text
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import design_as_dict
-from obsynth.simulation.profiles import Step
-from obsynth.simulation.scenario import Scenario
+from obsynth.simulation.scenario import Scenario, Step
 from obsynth.tolerances.exact_plant import drawn_points, plant_at
 
 #: Tolerances that are tried, by default.

@@ -13,9 +13,8 @@ from obsynth.observers.linear.observer import LinearObserver
 from obsynth.results.verification_report import VerificationReport
 from obsynth.verification.claims import before_the_mean, closed_claims, mean_noise_rows
 from obsynth.verification.error_system import error_model_row
-from obsynth.verification.plant import derivation_rows
+from obsynth.verification.plant import derivation_rows, stored_twice_rows, tolerance_rows
 from obsynth.verification.stored_numbers import stored_number_rows
-from obsynth.verification.tolerances import stored_twice_rows, tolerance_rows
 
 if TYPE_CHECKING:
     from obsynth.results.design import ObserverDesign

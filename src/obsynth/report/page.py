@@ -68,8 +68,7 @@ from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import gain_set_digest
 from obsynth.results.layout import headed_table, number, verdict, verdict_line, worth
 from obsynth.results.verification_report import VerificationReport
-from obsynth.simulation.profiles import Step
-from obsynth.simulation.scenario import Scenario
+from obsynth.simulation.scenario import Scenario, Step
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -1,4 +1,4 @@
-"""Certificates on disk: a kind, a version, a digest and what is certified, as one JSON document."""
+"""Certificates and calibrations on disk: one JSON document, its kind, version and digest, and what it says."""
 
 from __future__ import annotations
 
@@ -12,8 +12,11 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.files.inputs import read_json
 from obsynth.files.outputs import FileKind
+from obsynth.numerics.arguments import is_finite_number
+from obsynth.results.checks import Check, information, nothing_wrong
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_set_writing import design_as_dict, digest_of, plain, restored
+from obsynth.results.verification_report import VerificationReport
 
 #: Kinds of results that are certified with the gain sets that they rest on.
 ROBUSTNESS, STUDY, COMPARISON = "obsynth robustness", "obsynth tolerance study", "obsynth comparison"
@@ -78,7 +81,7 @@ def differences(stored: Any, found: Any, where: str = "") -> list[str]:
             return [where]
         items = [(str(i + 1), one, other) for i, (one, other) in enumerate(zip(stored, found, strict=True))]
     else:
-        return [] if _same(stored, found, 0.0) else [where]
+        return [] if _same_figure(stored, found, 0.0) else [where]
     numbers = [abs(float(other)) for _, _, other in items if _is_figure(other)]
     rounding = FIGURE_ROUNDING_SHARE * max((size for size in numbers if size < float("inf")), default=0.0)
     wrong = []
@@ -86,7 +89,7 @@ def differences(stored: Any, found: Any, where: str = "") -> list[str]:
         place = f"{where}, {name}" if where else name
         if not _is_figure(other):
             wrong += differences(one, other, place)
-        elif not _same(one, other, rounding):
+        elif not _same_figure(one, other, rounding):
             wrong.append(place)
     return wrong
 
@@ -95,7 +98,7 @@ def _is_figure(value: Any) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
-def _same(one: Any, other: Any, rounding: float) -> bool:
+def _same_figure(one: Any, other: Any, rounding: float) -> bool:
     if not (_is_figure(one) and _is_figure(other)):
         return bool(type(one) is type(other) and one == other)
     if one == other or (one != one and other != other):
@@ -109,3 +112,147 @@ def body_of(body: Mapping[str, Any]) -> dict[str, Any]:
     """Return what a certificate of a result holds beside its gain sets, as it was before it was written."""
     found: dict[str, Any] = restored({name: value for name, value in body.items() if name != "gain_sets"})
     return found
+
+
+CALIBRATION_KIND = "obsynth calibration"
+CALIBRATION_VERSION = 1
+_SOURCE = "the calibration file"
+
+
+def calibration_text(data: Mapping[str, Any]) -> str:
+    """Return what a calibration file holds: the data and their digest."""
+    body = plain({"kind": CALIBRATION_KIND, "schema_version": CALIBRATION_VERSION, **data})
+    return json.dumps({"kind": CALIBRATION_KIND, "sha256": digest_of(body), **body}, indent=1, allow_nan=False) + "\n"
+
+
+def read_calibration(path: Path, *, where: str = "") -> dict[str, Any]:
+    """Return the content of a calibration file whose digest is right; raise `SpecError` for any other."""
+    found = read_json(path, where=where) if where else read_json(path)
+    name = path.name
+    if not isinstance(found, dict) or found.get("kind") != CALIBRATION_KIND:
+        raise SpecError(f"{name} is no calibration: write one by obsynth calibrate --out {name}.", path=where or name)
+    if "sha256" not in found:
+        raise SpecError(f"{name} holds no digest of itself, as files of older versions: calibrate again (obsynth "
+                        f"calibrate --out {name}).", path=where or name)  # fmt: skip
+    if not _intact(found):
+        raise SpecError(f"{name} was changed after it was written: its digest does not match.", path=where or name)
+    return found
+
+
+def _intact(found: Mapping[str, Any]) -> bool:
+    return bool(found.get("sha256") == digest_of({key: value for key, value in found.items() if key != "sha256"}))
+
+
+def verify_calibration(path: str | Path, again: Mapping[str, Any] | None = None) -> VerificationReport:
+    """Check a calibration file, against the same calibration done ``again`` where plant and log are given.
+
+    Parameters
+    ----------
+    path : str or Path
+        What ``obsynth calibrate --out`` wrote.
+    again : mapping, optional
+        `Calibration.to_dict` of the same plant and log.
+
+    Returns
+    -------
+    VerificationReport
+        Without ``again`` the ranges are assumed to be what the log says.
+
+    Raises
+    ------
+    SpecError
+        The file is no calibration.
+    """
+    found = read_json(Path(path))
+    if not isinstance(found, dict) or found.get("kind") != CALIBRATION_KIND:
+        raise SpecError(f"{path} is no calibration.", path=str(path))
+    rows = [
+        nothing_wrong("digest", "the file is as it was written", [] if _intact(found) else ["sha256"], source=_SOURCE)
+    ]
+    rows.append(
+        nothing_wrong(
+            "box",
+            "ranges are finite, hold their nominal values, and the level is a probability",
+            _misfits(found),
+            source=_SOURCE,
+        )
+    )
+    log = found.get("log") if isinstance(found.get("log"), dict) else {}
+    cited = str(log.get("digest", "")) if isinstance(log, dict) else ""
+    if again is None:
+        rows.append(information(
+            "log", f"the ranges are what the log says whose digest is {cited}: assumed, as plant and log were not "
+            "given (--system, --data)", float("nan"), source=_SOURCE, status="assumed",
+        ))  # fmt: skip
+    else:
+        rows.append(
+            nothing_wrong(
+                "log",
+                "the log that is given has the digest that the file cites",
+                [] if again["log"]["digest"] == cited else ["digest"],
+                source=_SOURCE,
+            )
+        )
+        rows.append(
+            nothing_wrong(
+                "ranges",
+                "the same calibration gives the same constants, ranges and level",
+                _differences(found, again),
+                source=_SOURCE,
+            )
+        )
+    return VerificationReport.of(rows)
+
+
+#: Ranges found again on another machine may differ by this share of their width.
+SAME_WIDTH = 1e-2
+
+
+def _differences(found: Mapping[str, Any], again: Mapping[str, Any]) -> list[str]:
+    """Return what differs from the same calibration done again."""
+    one, two = found.get("constants"), again["constants"]
+    if not isinstance(one, dict) or one.keys() != two.keys():
+        return ["names"]
+    wrong = [] if found.get("level") == again["level"] else ["level"]
+    return wrong + [name for name, item in two.items() if not _same_range(one[name], item)]
+
+
+def _same_range(one: Any, item: Mapping[str, Any]) -> bool:
+    """Whether a constant of a file is that of the calibration done again; what is malformed is not."""
+    if not isinstance(one, dict) or any(one.get(key) != item[key] for key in ("open", "unit")):
+        return False
+    (low, high), ends = item["range"], one.get("range")
+    if not isinstance(ends, list) or len(ends) != 2 or not all(map(is_finite_number, [*ends, one.get("nominal")])):
+        return False
+    slack = SAME_WIDTH * (high - low)
+    pairs = zip([*ends, one["nominal"]], (low, high, item["nominal"]), strict=True)
+    return all(abs(a - b) <= slack for a, b in pairs)
+
+
+def _misfits(found: Mapping[str, Any]) -> list[str]:
+    level = found.get("level")
+    wrong = [] if is_finite_number(level) and 0.0 < float(level or 0.0) < 1.0 else ["level"]
+    constants = found.get("constants")
+    if not isinstance(constants, dict):
+        return [*wrong, "constants"]
+    for name, item in constants.items():
+        ends = item.get("range") if isinstance(item, dict) else None
+        nominal = item.get("nominal") if isinstance(item, dict) else None
+        fits = isinstance(ends, list) and len(ends) == 2 and all(map(is_finite_number, [*ends, nominal]))
+        if not (fits and isinstance(ends, list) and float(ends[0]) <= float(nominal or 0.0) <= float(ends[1])):
+            wrong.append(str(name))
+    return wrong
+
+
+def box_row(box: Any, path: Path) -> Check:
+    """Return the row that a calibrated box is that of a calibration file."""
+    found = read_calibration(path)
+    constants = found["constants"]
+    wrong = [] if box.calibration == found["sha256"] else ["digest of the calibration"]
+    wrong += [] if box.digest == found["log"]["digest"] and box.level == found["level"] else ["log or level"]
+    for name in box.calibrated or box.constants:
+        item, stated = box.constants.get(name), constants.get(name)
+        if item is None or stated is None or [item.low, item.high, item.nominal] != [*stated["range"],
+                                                                                     stated["nominal"]]:  # fmt: skip
+            wrong.append(name)
+    return nothing_wrong("calibration", f"the box is that of {path.name}", wrong, source=_SOURCE)

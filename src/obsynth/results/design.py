@@ -1,12 +1,15 @@
-"""The result of every method: what was asked, what is shipped, and the proof."""
+"""The result of every method: what was asked, what is shipped, and the proof; the plant as written behind it."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.extensions import extension
@@ -15,18 +18,84 @@ from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.sensor_timing import LONGEST_DELAY
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.gain_set_writing import save
-from obsynth.results.plant_source import PlantSource
 from obsynth.results.verification_report import VerificationReport
 
 if TYPE_CHECKING:
     import control
 
-    from obsynth.analysis.transformations.recovery import StateRecovery
+    from obsynth.analysis.transformations.recovery import StateRecovery, Transformation
     from obsynth.observers.dae.observer import DAEObserver
     from obsynth.observers.recursive.observer import RecursiveObserver
     from obsynth.observers.windows import WindowObserver
     from obsynth.plants.dae.model import DAEModel
     from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+
+#: Larger plants are not stored: their elimination is checked where it is done.
+MOST_STORED_STATES = 500
+
+
+@dataclass(frozen=True, eq=False)
+class PlantSource:
+    """A plant as it was written; its algebraic states were eliminated, and it was sampled if there is a sample time."""
+
+    plant: DescriptorSystem
+    sample_time: float | None = None
+
+    @cached_property
+    def derived(self) -> Transformation:
+        """The elimination, and the sampling where there was one, done again; once for all checks."""
+        from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
+        from obsynth.analysis.transformations.sampling import discretise
+
+        if self.sample_time is None:
+            return eliminate_algebraic_states(self.plant)
+        return discretise(self.plant, self.sample_time)
+
+    @cached_property
+    def smooth(self) -> DescriptorSystem:
+        """The plant without its algebraic states, before it is sampled; made once for all checks."""
+        from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
+
+        return eliminate_algebraic_states(self.plant).plant
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the source as data: matrices by their entries that are not zero."""
+        values = self.plant.as_dict()
+        values.pop("uncertainty", None)
+        matrices = {name: _entries(value) for name, value in values.items() if isinstance(value, np.ndarray)}
+        others = {name: value for name, value in values.items() if name not in matrices}
+        return {"matrices": matrices, "signals": others, "sample_time": self.sample_time}
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> PlantSource:
+        """Return the source that `as_dict` described."""
+        matrices: dict[str, Any] = {name: _matrix(entries) for name, entries in data["matrices"].items()}
+        time = data["sample_time"]
+        return cls(DescriptorSystem(**matrices, **data["signals"]), None if time is None else float(time))
+
+
+def _entries(matrix: FloatArray) -> dict[str, Any]:
+    rows, columns = np.nonzero(matrix)
+    return {
+        "size": list(matrix.shape),
+        "rows": rows.tolist(),
+        "columns": columns.tolist(),
+        "values": matrix[rows, columns].tolist(),
+    }
+
+
+def _matrix(entries: Mapping[str, Any]) -> FloatArray:
+    found = np.zeros([int(size) for size in entries["size"]])
+    found[np.array(entries["rows"], dtype=np.int64), np.array(entries["columns"], dtype=np.int64)] = entries["values"]
+    return found
+
+
+def source_of(plant: Any) -> PlantSource | None:
+    """Return what a plant was made from by elimination and sampling, where that is known and can be stored."""
+    made = getattr(plant, "_made_from", None)
+    if made is None or type(made[0]) is not DescriptorSystem or made[0].nx > MOST_STORED_STATES:
+        return None
+    return PlantSource(made[0], made[1])
 
 
 @dataclass(frozen=True, eq=False)

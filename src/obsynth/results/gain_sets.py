@@ -20,7 +20,7 @@ from obsynth.errors import SpecError
 from obsynth.files.inputs import input_file, json_data, read_json
 from obsynth.numerics.arguments import is_number
 from obsynth.numerics.arrays import FloatArray
-from obsynth.results.design import Certificate, ObserverDesign
+from obsynth.results.design import Certificate, ObserverDesign, PlantSource
 from obsynth.results.gain_set_writing import (
     ARRAYS,
     DESIGN_KINDS,
@@ -39,7 +39,6 @@ from obsynth.results.gain_set_writing import (
     save,
     types_of,
 )
-from obsynth.results.plant_source import PlantSource
 from obsynth.results.verification_report import VerificationReport
 
 __all__ = [

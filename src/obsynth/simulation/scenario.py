@@ -1,20 +1,317 @@
-"""What happens to a plant in a simulation: inputs, faults, disturbances, sensors, noise, start and length."""
+"""What happens to a plant in a simulation: inputs, faults, disturbances, sensors, noise, start and length.
+
+How one signal goes with time is a profile; between samples it is held or linear, so that simulations are exact.
+"""
 
 from __future__ import annotations
 
+import math
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from types import MappingProxyType
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import is_finite_number, is_whole
+from obsynth.numerics.arguments import is_finite_number, is_number, is_whole
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.validation import index_of
-from obsynth.simulation.profiles import PROFILE_KINDS, Additive, Failure, Profile, Random
+
+#: Share of a sample by which rounding may move a start or an end.
+SAMPLE_SLACK = 1e-6
+
+
+@dataclass(frozen=True, kw_only=True)
+class Profile:
+    """What all profiles have: ``start`` and ``end``, seconds, between which they act; without end by default."""
+
+    #: Whether the signal is held between samples; else it is linear there.
+    held: ClassVar[bool] = True
+    start: float = 0.0
+    end: float = math.inf
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if value is None and item.name == "value":
+                continue
+            if not is_number(value) or math.isnan(value) or (math.isinf(value) and item.name != "end"):
+                raise SpecError(f"{item.name} is {value!r}: give a finite number.", path=item.name)
+        if not self.end > self.start:
+            raise SpecError(f"end ({self.end:g} s) is not after start ({self.start:g} s).", path="end")
+
+    def active(self, steps: int, dt: float) -> np.ndarray:
+        """Return which of the samples 0 to ``steps - 1`` it acts on."""
+        place = np.arange(steps) + SAMPLE_SLACK
+        return np.asarray((place >= self.start / dt) & (place < self.end / dt))
+
+
+def _require(condition: bool, text: str, path: str) -> None:
+    if not condition:
+        raise SpecError(text, path=path)
+
+
+class Additive(Profile, ABC):
+    """A function of time, which is added to its signal."""
+
+    def at(self, time: FloatArray) -> FloatArray:
+        """Return its values at ``time``, seconds."""
+        return self._at(time)
+
+    @abstractmethod
+    def _at(self, time: FloatArray) -> FloatArray: ...
+
+    def sampled(self, steps: int, dt: float) -> tuple[FloatArray, FloatArray]:
+        """Return its values at the left and right end of each interval between samples, ``(steps,)`` each."""
+        acts, values = self.active(steps, dt), self.at(dt * np.arange(steps + 1, dtype=np.float64))
+        left = np.where(acts, values[:-1], 0.0)
+        return left, left.copy() if self.held else np.where(acts, values[1:], 0.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Step(Additive):
+    """A constant; on a sensor, its bias.
+
+    Parameters
+    ----------
+    size : float
+        In the signal's unit.
+    start, end : float, optional, seconds
+        When it acts.
+    """
+
+    size: float
+
+    def _at(self, time: FloatArray) -> FloatArray:
+        return np.full(time.shape, float(self.size))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ramp(Additive):
+    """A straight line from zero at ``start``; linear between samples.
+
+    Parameters
+    ----------
+    rate : float
+        Per second.
+    start, end : float, optional, seconds
+        When it acts.
+    """
+
+    held: ClassVar[bool] = False
+    rate: float
+
+    def _at(self, time: FloatArray) -> FloatArray:
+        return np.asarray(self.rate * (time - self.start))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sine(Additive):
+    """``amplitude sin(frequency t + phase)``, t the scenario's time; linear between samples.
+
+    Parameters
+    ----------
+    amplitude : float
+        In the signal's unit.
+    frequency : float, rad/s
+        Angular frequency.
+    phase : float, optional, rad
+        At t = 0.
+    start, end : float, optional, seconds
+        When it acts.
+    """
+
+    held: ClassVar[bool] = False
+    amplitude: float
+    frequency: float
+    phase: float = 0.0
+
+    def _at(self, time: FloatArray) -> FloatArray:
+        return np.asarray(self.amplitude * np.sin(self.frequency * time + self.phase))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Drift(Additive):
+    """A slow approach to ``size``, with a time constant; linear between samples.
+
+    Parameters
+    ----------
+    size : float
+        Where it ends.
+    time_constant : float, seconds
+        After which 63 % are reached.
+    start, end : float, optional, seconds
+        When it acts.
+    """
+
+    held: ClassVar[bool] = False
+    size: float
+    time_constant: float
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _require(self.time_constant > 0.0, "time_constant must be greater than 0.", "time_constant")
+
+    def _at(self, time: FloatArray) -> FloatArray:
+        # Before the start it is masked; there the exponential must not overflow.
+        return np.asarray(-self.size * np.expm1(-np.maximum(time - self.start, 0.0) / self.time_constant))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Intermittent(Additive):
+    """A constant that comes and goes.
+
+    Parameters
+    ----------
+    size : float
+        While it is there.
+    period : float, seconds
+        From one coming to the next.
+    duty : float, optional
+        Share of the period during which it is there, between 0 and 1.
+    start, end : float, optional, seconds
+        When it acts.
+    """
+
+    size: float
+    period: float
+    duty: float = 0.5
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _require(self.period > 0.0, "period must be greater than 0.", "period")
+        _require(0.0 < self.duty < 1.0, "duty must lie between 0 and 1.", "duty")
+
+    def _at(self, time: FloatArray) -> FloatArray:
+        turn = (time - self.start) / self.period + SAMPLE_SLACK
+        return np.where(turn - np.floor(turn) < self.duty, float(self.size), 0.0)
+
+
+class Failure(Profile):
+    """A failing actuator or sensor: no function of time, and a signal's only profile."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stuck(Failure):
+    """An actuator or a sensor that stays where it is.
+
+    Parameters
+    ----------
+    value : float, optional
+        Where; by default where it is when this begins.
+    start, end : float, optional, seconds
+        When it acts.
+    """
+
+    value: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class LostEffectiveness(Failure):
+    """An actuator or a sensor that gives only a part.
+
+    Parameters
+    ----------
+    share : float
+        What is lost, between 0 (nothing) and 1 (all).
+    start, end : float, optional, seconds
+        When it acts.
+    """
+
+    share: float
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _require(0.0 < self.share <= 1.0, "share must be greater than 0 and at most 1.", "share")
+
+
+class Random(Profile, ABC):
+    """Independent samples, held between samples."""
+
+    def draw(self, rng: np.random.Generator, steps: int) -> FloatArray:
+        """Return ``steps`` samples, drawn with ``rng``."""
+        return self._draw(rng, steps)
+
+    @abstractmethod
+    def _draw(self, rng: np.random.Generator, steps: int) -> FloatArray: ...
+
+    @abstractmethod
+    def moments(self) -> tuple[float, float, float]:
+        """Return the largest absolute value (infinite if there is none), the mean and the variance."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Uniform(Random):
+    """Independent samples, uniform between two limits (a bias is their mean), held between samples.
+
+    Parameters
+    ----------
+    low, high : float
+        The limits.
+    start, end : float, optional, seconds
+        When it acts.
+    """
+
+    low: float
+    high: float
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _require(self.high > self.low, "high must be greater than low.", "high")
+
+    def _draw(self, rng: np.random.Generator, steps: int) -> FloatArray:
+        return np.asarray(rng.uniform(self.low, self.high, steps))
+
+    def moments(self) -> tuple[float, float, float]:
+        """Return the same as `Random.moments`."""
+        return max(abs(self.low), abs(self.high)), (self.low + self.high) / 2, (self.high - self.low) ** 2 / 12
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gaussian(Random):
+    """Independent normal samples, held between samples.
+
+    Parameters
+    ----------
+    deviation : float
+        Standard deviation.
+    mean : float, optional
+        Their mean.
+    start, end : float, optional, seconds
+        When it acts.
+    """
+
+    deviation: float
+    mean: float = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _require(self.deviation > 0.0, "deviation must be greater than 0.", "deviation")
+
+    def _draw(self, rng: np.random.Generator, steps: int) -> FloatArray:
+        return np.asarray(rng.normal(self.mean, self.deviation, steps))
+
+    def moments(self) -> tuple[float, float, float]:
+        """Return the same as `Random.moments`."""
+        return math.inf, self.mean, self.deviation**2
+
+
+#: The profiles by their names in a spec.
+PROFILE_KINDS: dict[str, type[Profile]] = {
+    "step": Step,
+    "ramp": Ramp,
+    "sine": Sine,
+    "drift": Drift,
+    "intermittent": Intermittent,
+    "stuck": Stuck,
+    "lost-effectiveness": LostEffectiveness,
+    "uniform": Uniform,
+    "gaussian": Gaussian,
+}
+
 
 _ADDITIVE = tuple(kind for kind in PROFILE_KINDS.values() if issubclass(kind, Additive))
 _FAILING = tuple(kind for kind in PROFILE_KINDS.values() if issubclass(kind, Failure))

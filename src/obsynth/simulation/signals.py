@@ -14,8 +14,17 @@ from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.plants.validation import index_of
-from obsynth.simulation.profiles import SAMPLE_SLACK, Additive, Failure, LostEffectiveness, Profile, Random, Stuck
-from obsynth.simulation.scenario import Scenario, profiles_of
+from obsynth.simulation.scenario import (
+    SAMPLE_SLACK,
+    Additive,
+    Failure,
+    LostEffectiveness,
+    Profile,
+    Random,
+    Scenario,
+    Stuck,
+    profiles_of,
+)
 
 #: A simulation holds every sample in memory: a typing error in a horizon must not fill it.
 MAXIMUM_SAMPLES = 5_000_000

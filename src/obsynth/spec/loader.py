@@ -34,9 +34,8 @@ from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.plants.uncertain_system import with_expressions
 from obsynth.plants.uncertainty import UNCERTAIN_MATRICES, Entry
 from obsynth.plants.validation import index_of
-from obsynth.results.calibration_files import read_calibration
-from obsynth.simulation.profiles import PROFILE_KINDS, Profile
-from obsynth.simulation.scenario import Scenario
+from obsynth.results.certificate_files import read_calibration
+from obsynth.simulation.scenario import PROFILE_KINDS, Profile, Scenario
 from obsynth.simulation.signals import check_parameters
 from obsynth.spec.documents import DocumentProblems, checked_plant, checked_spec, read_names, read_yaml
 

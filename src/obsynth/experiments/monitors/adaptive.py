@@ -46,8 +46,16 @@ from obsynth.simulation.scenario import Scenario
 from obsynth.simulation.signals import resolve
 from obsynth.tolerances.robustness import EXACT_MODEL, structure_of, with_tolerances
 from obsynth.tolerances.subdivision import index_one_on_box, values_at
-from obsynth.verification.adaptive_bound import THRESHOLD_ROUNDING, AdaptiveBound, Start, adaptive_bound
-from obsynth.verification.adaptive_record import AdaptivePlan, Thresholds, filtered, thresholds_of_records
+from obsynth.verification.adaptive_bound import (
+    THRESHOLD_ROUNDING,
+    AdaptiveBound,
+    AdaptivePlan,
+    Start,
+    Thresholds,
+    adaptive_bound,
+    filtered,
+    thresholds_of_records,
+)
 from obsynth.verification.error_structure import ErrorStructure, Tracking, error_structure
 from obsynth.verification.responses import loop_radius
 

@@ -32,8 +32,7 @@ from obsynth.observers.linear.derived import sample_observer
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
-from obsynth.simulation.profiles import Additive, Random
-from obsynth.simulation.scenario import Scenario, observer_start
+from obsynth.simulation.scenario import Additive, Random, Scenario, observer_start
 from obsynth.simulation.signals import ScenarioSignals, resolve
 from obsynth.verification.error_system import ErrorModel
 from obsynth.verification.responses import OUTWARD

@@ -18,8 +18,7 @@ from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.windows import WindowObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
-from obsynth.verification.adaptive_bound import Start, adaptive_bound
-from obsynth.verification.adaptive_record import Thresholds, thresholds_of_records
+from obsynth.verification.adaptive_bound import Start, Thresholds, adaptive_bound, thresholds_of_records
 from obsynth.verification.error_structure import ErrorStructure, Tracking, error_structure
 
 #: Windows of the record that count, at most: evenly spread.
