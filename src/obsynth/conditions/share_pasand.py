@@ -46,6 +46,7 @@ from obsynth.methods.ui_pi_observer.augmented_plant import (
 from obsynth.methods.ui_pi_observer.conditions import existence
 from obsynth.methods.ui_pi_observer.placement_problem import with_faults
 from obsynth.numerics.arrays import FloatArray, as_matrix
+from obsynth.numerics.matrix_equations import continuous_riccati, discrete_riccati
 from obsynth.numerics.regions import LMIRegion, checked_region, disk, half_plane
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.fault_models import Exosystem, exosystem
@@ -205,14 +206,13 @@ def augmented_problem(
 
 def _coordinates(F: FloatArray, C: FloatArray, where: LMIRegion, *, discrete: bool) -> FloatArray:
     """Return a state change ``(n, n)`` in which the errors of a Kalman filter of the region's speed are alike."""
-    from scipy.linalg import solve_continuous_are, solve_discrete_are
 
     n = len(F)
     found = [x for x in (_REAL_NUMBERS if discrete else _REAL_RATES) if where.contains(x)]
     if not found:
         return np.eye(n)
     solve, moved = (
-        (solve_discrete_are, F / max(np.abs(found))) if discrete else (solve_continuous_are, F - max(found) * np.eye(n))
+        (discrete_riccati, F / max(np.abs(found))) if discrete else (continuous_riccati, F - max(found) * np.eye(n))
     )
     try:
         with warnings.catch_warnings():

@@ -17,6 +17,7 @@ from obsynth.methods.recursive.steady_filter import steady_state_filter
 from obsynth.methods.ui_pi_observer.augmented_plant import direct_part, shipped_model
 from obsynth.methods.ui_pi_observer.conditions import existence_conditions
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.matrix_equations import discrete_lyapunov
 from obsynth.results.design import ObserverDesign
 
 
@@ -105,6 +106,5 @@ def _kalman(design: ObserverDesign) -> Conditions:
 
 def _gramian(loop: FloatArray) -> FloatArray:
     """Return P with ``P = loop' P loop + I``."""
-    from scipy.linalg import solve_discrete_lyapunov
 
-    return np.asarray(solve_discrete_lyapunov(loop.T, np.eye(len(loop))))
+    return discrete_lyapunov(loop.T, np.eye(len(loop)))

@@ -11,6 +11,12 @@ import numpy as np
 
 from obsynth.numerics.arrays import SMALLEST, FloatArray
 from obsynth.numerics.doubling import REFUTED, doubled_riccati_solution, is_clearly_negative, is_positive
+from obsynth.numerics.matrix_equations import (
+    continuous_lyapunov,
+    continuous_riccati,
+    discrete_lyapunov,
+    discrete_riccati,
+)
 from obsynth.numerics.norms import spectral_radius
 from obsynth.numerics.scaling import balancing_factors
 from obsynth.numerics.spectra import abscissa
@@ -97,12 +103,11 @@ class _Exceeded:
 
 def lyapunov_solution(a: FloatArray, weight: FloatArray) -> FloatArray | None:
     """Return ``P = a' P a + weight``, however badly conditioned; None where there is none."""
-    from scipy.linalg import solve_discrete_lyapunov
 
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            return np.asarray(solve_discrete_lyapunov(a.T, weight))
+            return discrete_lyapunov(a.T, weight)
     except (np.linalg.LinAlgError, ValueError):
         return None
 
@@ -151,12 +156,11 @@ def _by_doubling(
 def _by_qz(
     a: FloatArray, h: FloatArray, process: FloatArray, weight: FloatArray, cross: FloatArray
 ) -> FloatArray | None:
-    from scipy.linalg import solve_discrete_are
 
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            return np.asarray(solve_discrete_are(a.T, h.T, process, weight, s=cross))
+            return discrete_riccati(a.T, h.T, process, weight, s=cross)
     except (np.linalg.LinAlgError, ValueError):
         return None
 
@@ -165,12 +169,11 @@ def continuous_solution(
     a: FloatArray, h: FloatArray, process: FloatArray, weight: FloatArray, cross: FloatArray | None = None
 ) -> FloatArray | None:
     """Return P with ``a P + P a' - (P h' + cross) weight^-1 (P h' + cross)' + process = 0`` by SciPy, or ``None``."""
-    from scipy.linalg import solve_continuous_are
 
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            p = np.asarray(solve_continuous_are(a.T, h.T, process, weight, s=cross))
+            p = continuous_riccati(a.T, h.T, process, weight, s=cross)
     except (np.linalg.LinAlgError, ValueError):
         return None
     # What an ill-conditioned equation gives is judged by its user: by poles, or by whether it proves anything.
@@ -215,7 +218,6 @@ def lyapunov_factor(a: FloatArray, dt: float) -> FloatArray:
 
 
 def _factor(a: FloatArray, dt: float, share: float, rounds: int, edge: float) -> FloatArray | None:
-    from scipy.linalg import solve_continuous_lyapunov, solve_discrete_lyapunov
 
     n = a.shape[0]
     change = np.diag(balancing_factors(a))
@@ -226,9 +228,9 @@ def _factor(a: FloatArray, dt: float, share: float, rounds: int, edge: float) ->
                 # What a badly conditioned equation gives is judged by whether it proves anything.
                 warnings.simplefilter("ignore")
                 if dt > 0.0:
-                    p = solve_discrete_lyapunov((moved / max(edge, SMALLEST) ** share).T, np.eye(n))
+                    p = discrete_lyapunov((moved / max(edge, SMALLEST) ** share).T, np.eye(n))
                 else:
-                    p = solve_continuous_lyapunov((moved - share * edge * np.eye(n)).T, -np.eye(n))
+                    p = continuous_lyapunov((moved - share * edge * np.eye(n)).T, -np.eye(n))
         except (np.linalg.LinAlgError, ValueError):
             return None
         values, vectors = np.linalg.eigh(0.5 * (p + p.T))

@@ -14,6 +14,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.matrix_equations import continuous_lyapunov
 from obsynth.numerics.modal_response import Modes
 from obsynth.numerics.norms import HinfNorm, hinf_norm
 from obsynth.numerics.scaling import balanced_matrix, power_of_two_below
@@ -120,10 +121,9 @@ def peak_gain(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
 
 def _in_lyapunov_norm(a: FloatArray, b: FloatArray, c: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the system in coordinates in which the Euclidean norm of a free motion never grows."""
-    from scipy.linalg import solve_continuous_lyapunov
 
     # a' p + p a = -q: with q of the size of a, p is near the identity for a normal matrix.
-    lyapunov = solve_continuous_lyapunov(a.T, -np.eye(len(a)))
+    lyapunov = continuous_lyapunov(a.T, -np.eye(len(a)))
     values, vectors = np.linalg.eigh((lyapunov + lyapunov.T) / 2.0)
     if not (values > 0.0).all():
         raise SpecError("The observer is too close to instability for a bound on its residual.", path="observer")

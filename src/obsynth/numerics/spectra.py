@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.numerics.arrays import ComplexArray, FloatArray
+from obsynth.numerics.matrix_equations import continuous_lyapunov
 from obsynth.numerics.norms import balanced_realisation, output_covariance
 from obsynth.numerics.scaling import balanced_matrix
 
@@ -183,7 +184,6 @@ def noise_covariance(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray,
     """
     if dt > 0.0:
         return output_covariance(a, b, c, d)
-    from scipy.linalg import solve_continuous_lyapunov
 
     if not a.size:
         return np.zeros((c.shape[0], c.shape[0]))
@@ -196,7 +196,7 @@ def noise_covariance(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray,
         # Poles within rounding of the axis: what comes out is no covariance.
         warnings.simplefilter("error", RuntimeWarning)
         try:
-            states = solve_continuous_lyapunov(a / size, -b @ b.T)
+            states = continuous_lyapunov(a / size, -b @ b.T)
         except RuntimeWarning:
             return np.full((c.shape[0], c.shape[0]), np.inf)
     return np.asarray(c @ states @ c.T) / size

@@ -26,6 +26,7 @@ import numpy as np
 from obsynth.numerics import lapack
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.doubling import symmetric_product
+from obsynth.numerics.matrix_equations import continuous_lyapunov, discrete_lyapunov
 from obsynth.numerics.scaling import balanced_matrix
 from obsynth.proofs.balls import UNDERFLOW, UNIT_ROUNDOFF, Ball, gamma, rounded_up
 from obsynth.proofs.definiteness import prove_positive_definite
@@ -233,7 +234,7 @@ def _summed(power: FloatArray, factor: FloatArray) -> FloatArray | None:
 
 def _lyapunov_factor(a: FloatArray, rate: float, *, discrete: bool) -> FloatArray | None:
     """Return an upper triangular Q with ``P = Q'Q`` near a solution; ``None`` where there is none."""
-    from scipy.linalg import qr, solve_continuous_lyapunov, solve_discrete_lyapunov
+    from scipy.linalg import qr
 
     one = np.eye(len(a))
     with warnings.catch_warnings(), np.errstate(all="ignore"):
@@ -246,11 +247,11 @@ def _lyapunov_factor(a: FloatArray, rate: float, *, discrete: bool) -> FloatArra
                 return np.asarray(root / scale)
         try:
             if discrete:
-                solution = solve_discrete_lyapunov((balanced / rate).T, one) if rate > 0.0 else None
+                solution = discrete_lyapunov((balanced / rate).T, one) if rate > 0.0 else None
             else:
                 shifted = balanced + rate * one
                 size = float(np.linalg.norm(shifted, 2)) or 1.0
-                solution = solve_continuous_lyapunov(shifted.T / size, -one)
+                solution = continuous_lyapunov(shifted.T / size, -one)
         except (np.linalg.LinAlgError, ValueError):
             return None
     if solution is None or not np.all(np.isfinite(solution)):

@@ -22,6 +22,7 @@ from obsynth.numerics.arguments import real_array, real_vector, whole_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import driven, first_order_hold
 from obsynth.numerics.libraries import failed_computations
+from obsynth.numerics.matrix_equations import continuous_riccati, discrete_riccati
 from obsynth.numerics.ranks import decide_rank
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
@@ -199,17 +200,16 @@ def _sampled_noise(
 @failed_computations()
 def stabilising_feedback(plant: DescriptorSystem) -> FloatArray:
     """Return the linear-quadratic state feedback with unit weights of a plant with ``E = I``."""
-    from scipy.linalg import solve_continuous_are, solve_discrete_are
 
     weights = np.eye(plant.nx), np.eye(plant.nu)
     try:
         if not plant.nu:
             raise np.linalg.LinAlgError("no input")
         if plant.is_discrete:
-            cost = solve_discrete_are(plant.A, plant.B, *weights)
+            cost = discrete_riccati(plant.A, plant.B, *weights)
             gain = np.linalg.solve(weights[1] + plant.B.T @ cost @ plant.B, plant.B.T @ cost @ plant.A)
         else:
-            gain = plant.B.T @ solve_continuous_are(plant.A, plant.B, *weights)
+            gain = plant.B.T @ continuous_riccati(plant.A, plant.B, *weights)
     except np.linalg.LinAlgError as error:
         raise PreconditionError(
             f"No state feedback stabilises this plant ({error}): its known inputs must reach every unstable mode.",

@@ -14,6 +14,7 @@ import numpy as np
 
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.matrix_equations import continuous_lyapunov, discrete_lyapunov
 from obsynth.numerics.ranks import ROUNDED_ZERO
 from obsynth.plants.constants import ConstantsBox
 from obsynth.plants.descriptor import DescriptorSystem
@@ -167,10 +168,9 @@ def _contracts(part: AffineMatrix, *, discrete: bool) -> bool:
 
 
 def _lyapunov(a: FloatArray, *, discrete: bool) -> FloatArray:
-    from scipy.linalg import solve_continuous_lyapunov, solve_discrete_lyapunov
 
     weight = np.eye(len(a))
-    found = solve_discrete_lyapunov(a.T, weight) if discrete else solve_continuous_lyapunov(a.T, -weight)
+    found = discrete_lyapunov(a.T, weight) if discrete else continuous_lyapunov(a.T, -weight)
     return np.asarray((found + found.T) / 2.0)
 
 

@@ -26,6 +26,7 @@ from obsynth.experiments.monitors.between_samples import BetweenSamples
 from obsynth.methods.registry import error_model
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import first_order_hold, peak_gain
+from obsynth.numerics.matrix_equations import continuous_lyapunov
 from obsynth.numerics.norms import hinf_norm, output_covariance, spectral_radius
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE
 from obsynth.observers.linear.derived import sample_observer
@@ -475,11 +476,10 @@ def _start_added(model: ResidualModel, bare: FloatArray, initial_error: float) -
     """Return the bound with the start's; of a continuous design one that holds until the next sample."""
     if model.continuous is None or not initial_error:
         return bare + np.array([np.linalg.norm(model.C @ power, 2) for power in model.powers()]) * initial_error
-    from scipy.linalg import solve_continuous_lyapunov
 
     # In the norm of a Lyapunov function a free motion never grows.
     a = model.errors.Az
-    root = np.linalg.cholesky(solve_continuous_lyapunov(a.T, -np.eye(len(a)))).T
+    root = np.linalg.cholesky(continuous_lyapunov(a.T, -np.eye(len(a)))).T
     seen = float(np.linalg.norm(np.linalg.solve(root.T, model.C.T), 2))
     return bare + np.array([seen * np.linalg.norm(root @ power, 2) for power in model.powers()]) * initial_error
 

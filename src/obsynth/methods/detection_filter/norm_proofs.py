@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.matrix_equations import continuous_lyapunov
 from obsynth.numerics.scaling import balanced_matrix
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
@@ -74,11 +75,10 @@ class Transfer:
 
 def _equal_shares(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
     """Return units of the states in which the diagonals of both Gramians are equal; or those that balance A."""
-    from scipy.linalg import solve_continuous_lyapunov
 
     with np.errstate(all="ignore"):
-        driven = np.diag(solve_continuous_lyapunov(a, -b @ b.T))
-        seen = np.diag(solve_continuous_lyapunov(a.T, -c.T @ c))
+        driven = np.diag(continuous_lyapunov(a, -b @ b.T))
+        seen = np.diag(continuous_lyapunov(a.T, -c.T @ c))
         exponents = np.round(0.25 * np.log2(driven / seen))
     if not np.all(np.isfinite(exponents)) or np.max(np.abs(exponents)) > MOST_EXPONENT:
         return np.asarray(balanced_matrix(a)[1])

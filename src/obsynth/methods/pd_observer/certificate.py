@@ -14,6 +14,7 @@ from obsynth.methods.pd_observer.checks.certificate import prove_gain
 from obsynth.methods.riccati import continuous_solution
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import spectral_abscissa
+from obsynth.numerics.matrix_equations import continuous_lyapunov
 from obsynth.numerics.scaling import balanced_matrix
 from obsynth.proofs.balls import Ball
 
@@ -102,12 +103,11 @@ def gain_certificate(a: FloatArray, b: Ball, c: FloatArray, gain: float) -> Floa
 
 def _gram(a: FloatArray) -> FloatArray:
     """Return P with ``a' P + P a = -norm(a) I`` for a stable ``a (n, n)``."""
-    from scipy.linalg import solve_continuous_lyapunov
 
     with warnings.catch_warnings():
         # "An eigenvalue pair whose sum is very close to zero": what comes of it is proved or thrown away.
         warnings.simplefilter("ignore")
-        p = np.asarray(solve_continuous_lyapunov(a.T, -np.linalg.norm(a) * np.eye(len(a))))
+        p = continuous_lyapunov(a.T, -np.linalg.norm(a) * np.eye(len(a)))
     return np.asarray(0.5 * (p + p.T))
 
 

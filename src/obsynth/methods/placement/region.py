@@ -14,6 +14,7 @@ from obsynth.methods.conic import lmi
 from obsynth.methods.placement.kalman import KalmanProblem
 from obsynth.numerics.arguments import is_finite_number
 from obsynth.numerics.arrays import SMALLEST, FloatArray
+from obsynth.numerics.matrix_equations import continuous_lyapunov, discrete_lyapunov
 from obsynth.numerics.spectra import eigenvalues, speeds
 
 #: The inequalities are asked for a region smaller by this share, so that a solution on its boundary still counts.
@@ -194,7 +195,6 @@ def _continuous_region(region: Region, p: Any, moved: Any) -> list[Any]:
 
 def _scaling(problem: KalmanProblem, region: Region) -> FloatArray:
     """Return a state change in which the error covariance of a filter of the same rate is the identity."""
-    from scipy.linalg import solve_continuous_lyapunov, solve_discrete_lyapunov
 
     gain = problem.gain(region.decay)
     if gain is None:
@@ -207,9 +207,9 @@ def _scaling(problem: KalmanProblem, region: Region) -> FloatArray:
         warnings.simplefilter("ignore")
         if problem.dt > 0.0:
             radius = np.exp(-region.decay * problem.dt)
-            covariance = solve_discrete_lyapunov(closed / radius, noise)
+            covariance = discrete_lyapunov(closed / radius, noise)
         else:
-            covariance = solve_continuous_lyapunov(closed + region.decay * np.eye(len(closed)), -noise)
+            covariance = continuous_lyapunov(closed + region.decay * np.eye(len(closed)), -noise)
     if not np.all(np.isfinite(covariance)):
         return np.eye(len(closed))
     values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))

@@ -14,6 +14,7 @@ from obsynth.analysis.zeros import are_outside
 from obsynth.errors import SolverError, SpecError
 from obsynth.methods.recursive.conditions import described_mode, recursive_conditions
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
+from obsynth.numerics.matrix_equations import discrete_lyapunov, discrete_riccati
 from obsynth.numerics.norms import spectral_radius
 from obsynth.numerics.pencils import finite_zeros
 from obsynth.numerics.ranks import BOUNDARY_TOLERANCE, CANCELLATION_TOLERANCE, covariance_factor, decide_rank
@@ -161,14 +162,13 @@ def _is_fixed(P: FloatArray, following: FloatArray) -> bool:
 
 def _from_riccati(E: FloatArray, A: FloatArray, C: FloatArray, q: FloatArray, r: FloatArray) -> FloatArray | None:
     """Solve (16) for the inverse of P; return ``None`` where the solver finds nothing."""
-    from scipy.linalg import solve_discrete_are
 
     n = E.shape[1]
     weighted = np.linalg.solve(q, np.hstack([E, A]))
     known = E.T @ weighted[:, :n] + C.T @ np.linalg.solve(r, C)
     cross, square = E.T @ weighted[:, n:], A.T @ weighted[:, n:]
     try:
-        inverse = solve_discrete_are(
+        inverse = discrete_riccati(
             np.zeros((n, n)), np.eye(n), 0.5 * (known + known.T), 0.5 * (square + square.T), e=np.eye(n), s=cross
         )
         P = np.linalg.inv(inverse)
@@ -179,7 +179,6 @@ def _from_riccati(E: FloatArray, A: FloatArray, C: FloatArray, q: FloatArray, r:
 
 def _from_recursion(E: FloatArray, A: FloatArray, C: FloatArray, noise: FloatArray) -> FloatArray:
     """Find the fixed point of the step by Newton's method."""
-    from scipy.linalg import solve_discrete_lyapunov
 
     P, ne = np.eye(E.shape[1]), len(E)
     gain, following = _step(E, A, C, noise, _root(P))
@@ -195,7 +194,7 @@ def _from_recursion(E: FloatArray, A: FloatArray, C: FloatArray, noise: FloatArr
         )
     for _ in range(MOST_RICCATI_STEPS):
         driven = gain @ noise
-        last, P = P, solve_discrete_lyapunov(gain[:, :ne] @ A, driven @ driven.T)
+        last, P = P, discrete_lyapunov(gain[:, :ne] @ A, driven @ driven.T)
         P = np.asarray(0.5 * (P + P.T))
         gain, _ = _step(E, A, C, noise, _root(P))
         if np.linalg.norm(P - last) <= CANCELLATION_TOLERANCE * np.linalg.norm(P):

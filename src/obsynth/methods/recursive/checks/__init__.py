@@ -30,6 +30,7 @@ from obsynth.methods.recursive.checks.horizon_proof import (
 )
 from obsynth.methods.recursive.conditions import SOURCE, recursive_conditions
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.matrix_equations import discrete_lyapunov
 from obsynth.numerics.norms import spectral_radius
 from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.numerics.square_root_estimation import LeastSquaresStep, least_squares_step, rank_revealing_step
@@ -531,14 +532,13 @@ def _steady_covariance(
     Of X, with ``D = F X F' + L Q L' + K R K' - X``, the true one is ``X + sum F^j D F'^j``; the sum is at most
     ``|Q D Q'| / (1 - rate^2)`` in the norm of the contraction.
     """
-    from scipy.linalg import solve_discrete_lyapunov
 
     claim = "covariance of the errors that the listed gains lead to, enclosed: positive definite"
     L, K = (Ball.exact(part) for part in gains)
     noise = L @ Ball.exact(stated.Q.at(0)) @ L.T + K @ Ball.exact(stated.R.at(0)) @ K.T
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the enclosure says what an ill-conditioned equation costs
-        found = np.asarray(solve_discrete_lyapunov(transition.midpoint, noise.midpoint))
+        found = discrete_lyapunov(transition.midpoint, noise.midpoint)
     X = Ball.exact((found + found.T) / 2.0)
     norm = Ball.exact(contraction.Q)
     gap = norm @ (transition @ X @ transition.T + noise - X) @ norm.T
