@@ -6,7 +6,7 @@ from typing import Any
 #: By the module that holds it, imported when a name is first used.
 _TYPE_NAMES = {
     "analysis.diagnosis.decoupled": "DecoupledPlant",
-    "analysis.diagnosis.verdicts": "Diagnosis FaultDiagnosis StructuredResidual",
+    "analysis.diagnosis.diagnosing": "Diagnosis FaultDiagnosis StructuredResidual",
     "analysis.dae_structure": "Identifiability",
     "calibration.diagnostics": "Validation",
     "calibration.reporting": "Calibration",

@@ -1,8 +1,8 @@
 from obsynth.analysis.dae_structure import Identifiability as Identifiability
 from obsynth.analysis.diagnosis.decoupled import DecoupledPlant as DecoupledPlant
-from obsynth.analysis.diagnosis.verdicts import Diagnosis as Diagnosis
-from obsynth.analysis.diagnosis.verdicts import FaultDiagnosis as FaultDiagnosis
-from obsynth.analysis.diagnosis.verdicts import StructuredResidual as StructuredResidual
+from obsynth.analysis.diagnosis.diagnosing import Diagnosis as Diagnosis
+from obsynth.analysis.diagnosis.diagnosing import FaultDiagnosis as FaultDiagnosis
+from obsynth.analysis.diagnosis.diagnosing import StructuredResidual as StructuredResidual
 from obsynth.calibration.diagnostics import Validation as Validation
 from obsynth.calibration.reporting import Calibration as Calibration
 from obsynth.calibration.validity import Validity as Validity

@@ -7,8 +7,7 @@ import pytest
 from flint import fmpq_mat
 
 import obsynth
-from obsynth.analysis.diagnosis.fault_columns import question
-from obsynth.analysis.diagnosis.residual_orders import exact_residual_order
+from obsynth.analysis.diagnosis.fault_columns import exact_residual_order, question
 
 
 def least_order(plant: obsynth.DescriptorSystem, removed: tuple[int, ...], fault: int) -> int | None:

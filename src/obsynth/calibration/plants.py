@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.analysis.transformations.entries_in_constants import promoted
+from obsynth.analysis.transformations.linearisation import promoted
 from obsynth.calibration.logs import Log, refused
 from obsynth.errors import SpecError
 from obsynth.numerics import lazy_casadi as ca

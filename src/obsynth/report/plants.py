@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from obsynth.analysis.diagnosis.verdicts import Diagnosis
+from obsynth.analysis.diagnosis.diagnosing import Diagnosis
 from obsynth.analysis.structure import Structure
 from obsynth.files.outputs import yaml_text
 from obsynth.plants.dae.model import DAEModel

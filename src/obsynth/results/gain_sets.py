@@ -14,8 +14,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from obsynth.analysis.transformations.recovery import StateRecovery
-from obsynth.analysis.transformations.recovery_operator import RecoveryOperator
+from obsynth.analysis.transformations.recovery import RecoveryOperator, StateRecovery
 from obsynth.errors import SpecError
 from obsynth.files.inputs import input_file, json_data, read_json
 from obsynth.numerics.arguments import is_number

@@ -888,8 +888,7 @@ def _linearised(
             "equilibrium}, or remove it.",
             path=where,
         )
-    from obsynth.analysis.transformations.entries_in_constants import box_of_model
-    from obsynth.analysis.transformations.linearisation import linearise
+    from obsynth.analysis.transformations.linearisation import box_of_model, linearise
 
     arguments = wanted.linearise.model_dump(exclude_none=True)
     if noise:

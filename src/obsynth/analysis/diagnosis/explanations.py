@@ -9,9 +9,8 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.analysis.diagnosis.decoupled import unknowns_pencil
+from obsynth.analysis.diagnosis.decoupled import PencilUnits, unknowns_pencil
 from obsynth.analysis.diagnosis.fault_columns import dc_point
-from obsynth.analysis.diagnosis.reduction import PencilUnits
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.plants.descriptor import DescriptorSystem

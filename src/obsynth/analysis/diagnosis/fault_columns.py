@@ -1,9 +1,14 @@
-"""One fault on a decoupled plant: whether it shows, where it does not, and how fast it does.
+"""One fault on a decoupled plant: whether it shows, where it does not, how fast it does, and by which equations.
 
 In floating point; exactly for small plants whose numbers are as somebody wrote them.
 
 With N a minimal polynomial basis of the left null space of the unknowns' pencil, the zeros of the fault are those of
 the greatest common divisor of ``g = N [bf; df]``; decoupled: where ``[F; G]`` lies in the range of ``[A - sE; C]``.
+
+Least order of a residual that shows a fault, the least degree in y and u of an equation without states: of ``z+ = A z +
+F f + K w``, ``0 = C z + G f + L w`` with w = [u; y], the equations of degree m in w are spanned by ``s^k e``, k <= m,
+with e those of degree 0: the rows, and derivatives of equations that hold no w, which cost nothing. That is the least
+degree of a minimal polynomial basis (Forney 1975) among its rows that show the fault.
 """
 
 from __future__ import annotations
@@ -12,17 +17,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import cached_property
-from typing import ClassVar
+from itertools import dropwhile
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from flint import fmpq, fmpq_mat, fmpq_poly, fmpz_poly
 
-from obsynth.analysis.diagnosis.decoupled import DecoupledPlant, decoupled, unknowns_pencil
-from obsynth.analysis.diagnosis.reduction import finite_values, left_part
-from obsynth.analysis.diagnosis.residual_orders import exact_residual_order, residual_orders
+from obsynth.analysis.diagnosis.decoupled import DecoupledPlant, decoupled, finite_values, left_part, unknowns_pencil
 from obsynth.analysis.zeros import are_outside
 from obsynth.numerics.arrays import ComplexArray, FloatArray
-from obsynth.numerics.pencils import FiniteZeros
+from obsynth.numerics.pencils import FiniteZeros, full_svd, largest_singular_value
 from obsynth.numerics.ranks import CLEAR_GAP, MARKOV_TOLERANCE, RANK_TOLERANCE, TRACE_TOLERANCE, rank_from
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.exact_arithmetic import (
@@ -466,3 +470,125 @@ def _is_zero(matrix: fmpq_mat) -> bool:
 def _values(roots: Sequence[Root]) -> ComplexArray:
     listed = [root.value for root in roots for _ in range(root.multiplicity)]
     return np.array(listed, dtype=np.complex128)
+
+
+def exact_residual_order(A: fmpq_mat, C: fmpq_mat, F: fmpq_mat, G: fmpq_mat, K: fmpq_mat, L: fmpq_mat) -> int | None:
+    """Return the least order for one fault, over the rational numbers; ``None`` where no equation shows it."""
+    n, known, free = A.nrows(), K.ncols(), -1
+    # Rows [w | z | f, f', ...] in echelon form: those without w come last, then those without z.
+    rows = blocks([[L, C, G]])
+    while True:
+        rows = _kept(rows, known + n)
+        without = _from_column(rows, known)
+        if without.nrows() <= free:
+            break
+        free = without.nrows()
+        z, f = _split(without, known, n)
+        rows = blocks([[rows, zeros_matrix(rows.nrows(), 1)], [z * K, z * A, z * F, f]])
+    equations = picked_columns(rows, range(known, rows.ncols()))
+    base = equations
+    for order in range(n + 1):
+        if _from_column(equations, n).nrows():
+            return order
+        z, f = _split(_kept(equations, n), 0, n)
+        if not z.nrows():
+            break
+        equations = blocks([[z * A, z * F, f]])
+        padding = zeros_matrix(base.nrows(), equations.ncols() - base.ncols())
+        equations = blocks([[base, padding], [equations]])
+    return None
+
+
+def _split(rows: fmpq_mat, known: int, n: int) -> tuple[fmpq_mat, fmpq_mat]:
+    return picked_columns(rows, range(known, known + n)), picked_columns(rows, range(known + n, rows.ncols()))
+
+
+def _echelon(rows: fmpq_mat) -> list[list[fmpq]]:
+    reduced, rank = rows.rref()
+    return reduced.tolist()[:rank]
+
+
+def _kept(rows: fmpq_mat, columns: int) -> fmpq_mat:
+    """Return independent combinations of rows whose first columns are independent; what has none of them goes."""
+    listed = [row for row in _echelon(rows) if any(value != 0 for value in row[:columns])]
+    return fmpq_mat(len(listed), rows.ncols(), [value for row in listed for value in row])
+
+
+def _from_column(rows: fmpq_mat, columns: int) -> fmpq_mat:
+    """Return independent combinations of rows that are zero in the first columns."""
+    listed = list(dropwhile(lambda row: any(value != 0 for value in row[:columns]), _echelon(rows)))
+    return fmpq_mat(len(listed), rows.ncols(), [value for row in listed for value in row])
+
+
+class _Rows(NamedTuple):
+    """Equations ``0 = z_rows z + sum_k f_rows[:, k] s^k f``, one column of `f` for each fault."""
+
+    z: FloatArray  # ``(r, n)``
+    f: FloatArray  # ``(r, degree + 1, count)``
+
+    def joined(self, more: _Rows) -> _Rows:
+        degree = max(self.f.shape[1], more.f.shape[1])
+        f = [np.pad(part.f, ((0, 0), (0, degree - part.f.shape[1]), (0, 0))) for part in (self, more)]
+        return _Rows(np.vstack([self.z, more.z]), np.concatenate(f))
+
+    def differentiated(self, A: FloatArray, F: FloatArray) -> _Rows:
+        return _Rows(self.z @ A, np.concatenate([(self.z @ F)[:, None], self.f], axis=1))
+
+    def combined(self, factors: FloatArray) -> _Rows:
+        return _Rows(factors @ self.z, np.tensordot(factors, self.f, axes=1))
+
+
+def residual_orders(
+    A: FloatArray, C: FloatArray, F: FloatArray, G: FloatArray, K: FloatArray, L: FloatArray
+) -> list[int | None]:
+    """Return the least order for each fault, in floating point; ``None`` where no equation shows it.
+
+    The columns of ``[F; G]`` and of ``[K; L]`` have entries near one, as A and C; rows of zeros are equations as well.
+    """
+    n, count = A.shape[0], F.shape[1]
+    found: list[int | None] = [None] * count
+    basis, new = _Rows(np.zeros((0, n)), np.zeros((0, 1, count))), _of_degree_zero(A, C, F, G, K, L)
+    scale = largest_singular_value(C)
+    for order in range(n + 1):
+        new, hidden, terms = _beside(basis, new, scale)
+        shown = np.any(np.linalg.norm(hidden, axis=1) > TRACE_TOLERANCE * np.maximum(terms, 1.0), axis=0)
+        found = [order if seen and one is None else one for one, seen in zip(found, shown.tolist(), strict=True)]
+        if not len(new.z) or all(one is not None for one in found):
+            break
+        basis, new, scale = basis.joined(new), new.differentiated(A, F), largest_singular_value(A)
+    return found
+
+
+def _of_degree_zero(A: FloatArray, C: FloatArray, F: FloatArray, G: FloatArray, K: FloatArray, L: FloatArray) -> _Rows:
+    """Return the equations in which no derivative of w stands."""
+    n, count = A.shape[0], F.shape[1]
+    rows, w = _Rows(C, G[:, None]), L
+    free = _Rows(np.zeros((0, n)), np.zeros((0, 1, count)))
+    size = max(largest_singular_value(L), largest_singular_value(K))
+    scale = largest_singular_value(C)
+    for _ in range(n + 1):
+        left, values, _ = full_svd(w)
+        rank = int(np.count_nonzero(values > RANK_TOLERANCE * size))
+        new, *_ = _beside(free, rows.combined(left[:, rank:].T), scale)
+        rows, w = rows.combined(left[:, :rank].T), left[:, :rank].T @ w
+        if not len(new.z):
+            break
+        # Their derivatives hold no derivative of w: they are of degree 0 as well.
+        free, scale = free.joined(new), max(scale, largest_singular_value(A))
+        rows, w = rows.joined(new.differentiated(A, F)), np.vstack([w, new.z @ K])
+    return rows.joined(free)
+
+
+def _beside(basis: _Rows, rows: _Rows, scale: float) -> tuple[_Rows, FloatArray, FloatArray]:
+    """Return what rows add to an orthonormal basis, orthonormal; fault parts of what adds nothing, and their terms."""
+    z, f = rows
+    terms = np.linalg.norm(f, axis=(0, 1))
+    for _ in range(2):
+        share = z @ basis.z.T
+        taken = _Rows(z, f).joined(basis.combined(-share))
+        z, f = taken.z[: len(z)] + taken.z[len(z) :], taken.f[: len(z)] + taken.f[len(z) :]
+        terms = terms + np.linalg.norm(np.tensordot(np.abs(share), np.abs(basis.f), axes=1), axis=(0, 1))
+    left, values, right = np.linalg.svd(z, full_matrices=len(z) > z.shape[1])
+    rank = int(np.count_nonzero(values > RANK_TOLERANCE * scale))
+    new = _Rows(right[:rank], np.tensordot(left[:, :rank].T / values[:rank, None], f, axes=1))
+    return new, np.tensordot(left[:, rank:].T, f, axes=1), np.asarray(terms)

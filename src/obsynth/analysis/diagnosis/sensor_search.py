@@ -16,9 +16,9 @@ from math import comb
 import numpy as np
 from numpy.typing import NDArray
 
+from obsynth.analysis.diagnosis.decoupled import PencilUnits
 from obsynth.analysis.diagnosis.explanations import Sensor, with_sensors
 from obsynth.analysis.diagnosis.fault_columns import Questions, others
-from obsynth.analysis.diagnosis.reduction import PencilUnits
 from obsynth.numerics.arrays import SMALLEST, ComplexArray, FloatArray
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, RANK_TOLERANCE
 from obsynth.plants.descriptor import DescriptorSystem

@@ -13,15 +13,16 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 
 from obsynth.analysis.conditions import Condition, is_doubted, is_refused, rank_condition
-from obsynth.analysis.existence.distance import (
+from obsynth.analysis.existence.named_pencils import (
     ROUNDING_LEVEL,
     Distance,
+    NamedPencil,
     distance_to_loss,
     least_share,
+    named_pencil,
     relative_singular_values,
     zeros_at_rounding_level,
 )
-from obsynth.analysis.existence.named_pencils import NamedPencil, named_pencil
 from obsynth.analysis.existence.numbers import PlantNumbers, SystemFacts, numbers_of
 from obsynth.analysis.existence.witnesses import Unclear
 from obsynth.analysis.plant_units import PlantUnits, sized_plant

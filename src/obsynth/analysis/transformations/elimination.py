@@ -1,32 +1,269 @@
-"""Solving the algebraic equations of an index-1 plant."""
+"""Solving the algebraic equations of an index-1 plant; those of a large one by its sparsity, without idle variables.
+
+Variables that act on nothing (as in filters whose time constants are zero) are found by the pattern of a plant: no
+output depends on them nor on what depends on them. They are left out exactly, with as many equations; with them the
+plant would have index 2, or would not be regular.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, NoReturn
 
 import numpy as np
 
 from obsynth.analysis.transformations.exact_elimination import MOST_STATES_EXACTLY, exact_elimination, rounded_once
 from obsynth.analysis.transformations.recovery import (
+    RecoveryOperator,
     StateRecovery,
     Transformation,
     state_point,
     unchanged_states,
     with_states,
+    without_rounding,
 )
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.libraries import one_thread_if_small
-from obsynth.numerics.pencils import pencil_structure
-from obsynth.numerics.ranks import but_rounding, product_but_rounding, rounding_rank
+from obsynth.numerics.pencils import GENERIC_POINTS, pencil_structure
+from obsynth.numerics.ranks import NAMED_SHARE, RANK_TOLERANCE, but_rounding, product_but_rounding, rounding_rank
 from obsynth.numerics.scaling import equilibrate_pencil, power_of_two_below
-from obsynth.numerics.sparse import is_sparse
+from obsynth.numerics.sparse import (
+    CoarseStructure,
+    Indices,
+    SolutionBounds,
+    SparseFactor,
+    blocks_of,
+    coarse_structure,
+    components_of,
+    csr,
+    dense,
+    is_sparse,
+    scales_by_all_entries,
+    selection,
+    sparse_factor,
+    unmatched_instead,
+)
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.exact_numbers import note_source
 from obsynth.plants.uncertainty import ELIMINATED
+from obsynth.plants.validation import listed
 from obsynth.proofs.exact_arithmetic import holds_computed
+
+#: Rank that a matrix may lack beyond what its shape says, to begin with.
+BORDER = 8
+#: How much rather a repeated equation is left out whose own variable is left out.
+OTHERS_WEIGHT = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class ActiveVariables:
+    """What is left of a plant without its idle variables; names of these, and numbers of their equations from 1."""
+
+    rows: Indices
+    columns: Indices
+    dropped: tuple[str, ...]
+    equations: tuple[int, ...]
+
+    def note(self) -> str:
+        """Return one sentence for a reader; empty when nothing was dropped."""
+        if not self.dropped:
+            return ""
+        return (
+            "Left out, as they have no effect on the other variables and the outputs: "
+            f"{', '.join(map(repr, self.dropped))} (with "
+            f"{'equations' if len(self.equations) > 1 else 'equation'} {', '.join(map(str, self.equations))}); "
+            "the rest of the plant is the same, and their values are not estimated."
+        )
+
+
+def active_variables(plant: DescriptorSystem) -> ActiveVariables:
+    """Return which equations and variables stay: not those that act on nothing and cannot be solved for."""
+    e, a, c = csr(plant.E), csr(plant.A), csr(plant.C)
+    rows, columns = np.arange(plant.nx), np.arange(plant.nx)
+    if not plant.ny:
+        # Without any output nothing says what a variable is there for.
+        return everything_active(plant)
+    pattern = csr(abs(e) + abs(a))
+    coarse = coarse_structure(pattern)
+    if coarse.structural_rank < plant.nx:
+        surplus = _surplus_equations(plant, coarse, e, a, c)
+        if surplus is None:
+            raise_structurally_singular(plant, coarse.over_rows, coarse.under_columns)
+        rows, columns = np.setdiff1d(rows, surplus), np.setdiff1d(columns, coarse.under_columns)
+        pattern = pattern[rows][:, columns]
+        coarse = coarse_structure(pattern)
+        if coarse.structural_rank < len(rows):
+            raise_structurally_singular(plant, rows[coarse.over_rows], columns[coarse.under_columns])
+    idle_rows, idle_columns = _idle(e[rows][:, columns], pattern, coarse, c[:, columns], plant, rows, columns)
+    kept_rows, kept_columns = np.delete(rows, idle_rows), np.delete(columns, idle_columns)
+    if not len(kept_columns):
+        # No output sees anything: what is wrong with the plant is not that some variable acts on nothing.
+        return everything_active(plant)
+    dropped, unneeded = (np.setdiff1d(np.arange(plant.nx), kept) for kept in (kept_columns, kept_rows))
+    names, numbers = tuple(plant.state_names[i] for i in dropped), tuple(int(i) + 1 for i in unneeded)
+    return ActiveVariables(kept_rows, kept_columns, names, numbers)
+
+
+def everything_active(plant: DescriptorSystem) -> ActiveVariables:
+    """Return that all equations and variables stay."""
+    return ActiveVariables(np.arange(plant.nx), np.arange(plant.nx), (), ())
+
+
+def active_part(plant: DescriptorSystem, found: ActiveVariables) -> DescriptorSystem:
+    """Return the plant without idle variables."""
+    from obsynth.analysis.transformations.recovery import with_states
+
+    if not found.dropped:
+        return plant
+    rows, columns = found.rows, found.columns
+    changes: dict[str, Any] = {name: getattr(plant, name)[rows] for name in ("B", "Bf", "Bd", "Bw")}
+    changes |= {name: getattr(plant, name)[rows][:, columns] for name in ("E", "A")}
+    return with_states(plant, [plant.state_names[i] for i in columns], C=plant.C[:, columns], **changes)
+
+
+def _surplus_equations(plant: DescriptorSystem, coarse: CoarseStructure, e: Any, a: Any, c: Any) -> Indices | None:
+    """Return the equations of these variables alone, and as many more as follow from others, if that is exact."""
+    if c[:, coarse.under_columns].nnz or not _solvable(plant, coarse.under_rows, coarse.under_columns):
+        return None
+    rows = coarse.over_rows
+    combinations, scale = _left_null_space(csr(a - GENERIC_POINTS[0] * e)[rows][:, coarse.over_columns])
+    if not _say_nothing(plant, rows, scale, combinations):
+        return None
+    from scipy.linalg import qr
+
+    # By convention the equation of a variable has its number, and goes with it.
+    weights = np.where(np.isin(rows, coarse.under_columns), 1.0, OTHERS_WEIGHT)
+    _, _, order = qr((weights[:, None] * combinations).T, mode="economic", pivoting=True)
+    # Where more equations are repeated than variables are in too few, those that the pattern can do without.
+    left_out = unmatched_instead(csr(abs(e) + abs(a)), coarse, rows[order[: combinations.shape[1]]])
+    return None if left_out is None else np.union1d(coarse.under_rows, left_out)
+
+
+def _say_nothing(plant: DescriptorSystem, rows: Indices, scale: FloatArray, combinations: FloatArray) -> bool:
+    """Whether combinations of scaled equations are ``0 = 0``, with known inputs, faults and noise as well."""
+    from scipy.sparse import diags_array, hstack
+
+    everything = [csr(getattr(plant, name))[rows] for name in ("E", "A", "B", "Bf", "Bd", "Bw")]
+    scaled = csr(diags_array(scale) @ hstack(everything))
+    peaks = np.zeros(scaled.shape[1])
+    np.maximum.at(peaks, scaled.indices, np.abs(scaled.data))
+    left = np.abs(scaled.T @ combinations)
+    return bool(np.all(left <= RANK_TOLERANCE * peaks[:, None] * np.max(np.abs(combinations), axis=0, initial=0.0)))
+
+
+def _solvable(plant: DescriptorSystem, rows: Indices, columns: Indices) -> bool:
+    """Whether equations can be solved for some of their variables, whatever the others are."""
+    if not len(rows):
+        return True
+    part = csr(csr(plant.A) - GENERIC_POINTS[0] * csr(plant.E))[rows][:, columns]
+    if len(rows) == len(columns) and not sparse_factor(part).singular:
+        return True
+    arrays = part.toarray()
+    pencil = equilibrate_pencil(np.zeros_like(arrays), arrays)
+    left, values, _ = np.linalg.svd(pencil.A)
+    rank = int(np.sum(values > RANK_TOLERANCE * np.max(values, initial=np.finfo(float).tiny)))
+    # Else these combinations of them are a condition on the others, and leaving them out would not be exact.
+    return _say_nothing(plant, rows, pencil.rows, left[:, rank:])
+
+
+def _left_null_space(tall: Any) -> tuple[FloatArray, FloatArray]:
+    """Return an orthonormal left null basis of a matrix with scaled rows, and the scales: one solution, bordered.
+    With random G and H ``[M G; H 0]`` is nonsingular; its left solutions for the columns of G hold the null space."""
+    from scipy.sparse import block_array, diags_array
+
+    (count, width), rng, more = tall.shape, np.random.default_rng(2), 0
+    rows, columns = scales_by_all_entries(tall)
+    scaled = csr(diags_array(rows) @ tall @ diags_array(columns))
+    while True:
+        wanted = count - width + more
+        border, below = rng.normal(size=(count, wanted)), rng.normal(size=(more, width))
+        factor = SparseFactor(block_array([[scaled, csr(border)], [csr(below), None]] if more else [[scaled, border]]))
+        right = np.vstack([np.zeros((width, wanted)), np.eye(wanted)])
+        basis = np.linalg.qr(factor.solve_transposed(right)[:count])[0]
+        _, values, turned = np.linalg.svd(np.linalg.qr(scaled.T @ basis)[1])
+        null = wanted - int(np.sum(values > RANK_TOLERANCE * max(1.0, np.max(np.abs(scaled.data), initial=0.0))))
+        # A border of rows costs fill, and is needed only where columns are dependent as well.
+        if (more == 0 and not factor.singular) or (more and null < wanted) or more == width:
+            return basis @ turned[wanted - null :].T, rows
+        more = min(max(BORDER, 2 * more), width)
+
+
+def _idle(
+    e: Any, pattern: Any, coarse: CoarseStructure, c: Any, plant: DescriptorSystem, rows: Indices, columns: Indices
+) -> tuple[Indices, Indices]:
+    """Return the rows and columns of idle blocks that cannot be solved for without differentiating."""
+    count, block = blocks_of(pattern, coarse.row_of_column)
+    block_of_row = np.empty(len(rows), dtype=np.int64)
+    block_of_row[coarse.row_of_column] = block
+    links = pattern.tocoo()
+    from_block, to_block = block[links.col], block_of_row[links.row]
+    seen = np.zeros(count, dtype=bool)
+    seen[block[np.unique(c.indices)]] = True
+    seen = _spread(seen, to_block, from_block)
+    moving = e.tocoo()
+    inside = block_of_row[moving.row] == block[moving.col]
+    differentiated = np.zeros(len(columns), dtype=bool)
+    differentiated[moving.col[inside]] = True
+    # What an idle block needs that is not known without differentiating makes it unknown as well.
+    unknown = np.zeros(count, dtype=bool)
+    unknown[block_of_row[moving.row[~differentiated[moving.col]]]] = True
+    unknown[_undetermined_blocks(plant, rows, columns, block_of_row, block, ~seen)] = True
+    unknown = _spread(unknown & ~seen, from_block, to_block, within=~seen) & ~seen
+    found = np.flatnonzero(unknown[block_of_row]), np.flatnonzero(unknown[block])
+    nothing = np.zeros(0, dtype=np.int64)
+    return found if _solvable(plant, rows[found[0]], columns[found[1]]) else (nothing, nothing)
+
+
+def _spread(marked: Any, source: Indices, target: Indices, *, within: Any = None) -> Any:
+    """Mark every target of a link whose source is marked, until nothing changes."""
+    found = marked.copy()
+    while True:
+        more = found.copy()
+        more[target[found[source]]] = True
+        more &= True if within is None else within
+        if np.array_equal(more, found):
+            return found
+        found = more
+
+
+def _undetermined_blocks(
+    plant: DescriptorSystem, rows: Indices, columns: Indices, block_of_row: Indices, block: Indices, idle: Any
+) -> list[int]:
+    """Return the idle blocks that their equations do not determine."""
+    # A block of one variable is its entry, which is there.
+    several = np.flatnonzero(idle & (np.bincount(block, minlength=len(idle)) > 1))
+    if not several.size:
+        return []
+    pencil = csr(csr(plant.A) - GENERIC_POINTS[0] * csr(plant.E))
+    parts = ((number, rows[block_of_row == number], columns[block == number]) for number in several)
+    return [int(number) for number, own, variables in parts if sparse_factor(pencil[own][:, variables]).singular]
+
+
+def raise_structurally_singular(plant: DescriptorSystem, equations: Indices, variables: Indices) -> NoReturn:
+    """Refuse a plant whose pattern alone leaves variables free, and name them and the surplus equations."""
+    equations, variables = own_first(equations, variables), own_first(variables, equations)
+    names = [plant.state_names[i] for i in variables]
+    raise PreconditionError(
+        "The plant is not regular, det(A - zE) is zero for every z and all values of the entries: "
+        f"{listed([repr(name) for name in names])} {'is' if len(names) == 1 else 'are'} in too few equations, and "
+        f"equations {listed([equation_name(plant, i) for i in equations])} hold too few variables. Check for a "
+        "missing or repeated equation.",
+        condition="regularity",
+        signals=names,
+    )
+
+
+def own_first(places: Indices, others: Indices) -> Indices:
+    """Return the places with those first that are among others: equations of such variables, or the reverse."""
+    return places[np.argsort(~np.isin(places, others), kind="stable")]
+
+
+def equation_name(plant: DescriptorSystem, row: int) -> str:
+    """Return the number of an equation and the variable of the same number, whose equation it is by convention."""
+    return f"{int(row) + 1} (of {plant.state_names[int(row)]!r})"
+
 
 #: Arrays of plants from this size on, with at most this share of entries that are not zero, are treated as sparse.
 MANY_VARIABLES = 500
@@ -90,9 +327,6 @@ def _has_few_entries(plant: DescriptorSystem) -> bool:
 
 def eliminated_by_sparsity(plant: DescriptorSystem) -> Transformation:
     """Leave out what acts on nothing, and solve the algebraic equations by a sparse factor."""
-    from obsynth.analysis.transformations.idle_variables import active_part, active_variables
-    from obsynth.analysis.transformations.sparse_elimination import not_index_one, reduced_by_sparsity
-
     active = active_variables(plant)
     part = active_part(plant, active)
     found = reduced_by_sparsity(part)
@@ -109,9 +343,6 @@ def eliminated_by_sparsity(plant: DescriptorSystem) -> Transformation:
 
 def _without_idle_variables(plant: DescriptorSystem, refusal: PreconditionError) -> Transformation:
     """Leave out what acts on nothing where that helps; else say which equations and variables are at fault."""
-    from obsynth.analysis.transformations.idle_variables import active_part, active_variables, everything_active
-    from obsynth.analysis.transformations.sparse_elimination import not_index_one
-
     active = active_variables(plant)
     part = active_part(plant, active)
     try:
@@ -276,3 +507,238 @@ def _solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
 def columns_of(matrix: FloatArray, sizes: Sequence[int]) -> list[FloatArray]:
     """Split a matrix into blocks of columns of the given sizes."""
     return np.split(matrix, np.cumsum(sizes)[:-1], axis=1)
+
+
+def reduced_by_sparsity(plant: DescriptorSystem) -> Transformation | None:
+    """Solve the algebraic equations of a plant with sparse factors; ``None`` where it does not have index 1.
+
+    A note names states whose derivatives were taken as zero.
+    """
+    (dynamic_rows, algebraic_rows, dynamic, algebraic), names, neglected = split_by_derivatives(plant)
+    count = dynamic.shape[1]
+    if count == 0:
+        raise PreconditionError(
+            "Every state is algebraic: nothing is left after elimination. Solve the equations directly.",
+            condition="dynamic states",
+        )
+    a, c = csr(plant.A), csr(plant.C)
+    counts = (count, plant.nu, plant.nf, plant.nd, plant.nw)
+    signals = np.hstack([dense(matrix) for matrix in (plant.B, plant.Bf, plant.Bd, plant.Bw)])
+    inner = csr(algebraic_rows @ a @ algebraic)
+    factor = sparse_factor(inner)
+    if factor.singular:
+        return None
+    right = _side_by_side(algebraic_rows @ a @ dynamic, algebraic_rows @ csr(signals))
+    found, backward = factor.solve_with_error(right.toarray())
+    found[:, count:] = without_rounding(factor, found[:, count:])
+    solution = -found
+    kept = _side_by_side(dynamic_rows @ a @ dynamic, dynamic_rows @ csr(signals)).toarray()
+    mass = sparse_factor(dynamic_rows @ csr(plant.E) @ dynamic)
+    moved, backward_of_e = mass.solve_with_error(
+        product_but_rounding(csr(dynamic_rows @ a @ algebraic), solution, kept)
+    )
+    direct = np.hstack([(c @ dynamic).toarray(), *(dense(m) for m in (plant.D, plant.Df, plant.Dd, plant.Dw))])
+    shown = product_but_rounding(csr(c @ algebraic), solution, direct)
+    ends = np.cumsum(counts)[:-1]
+    matrices = dict(zip(("A", "B", "Bf", "Bd", "Bw"), np.split(moved, ends, axis=1), strict=True))
+    matrices |= dict(zip(("C", "D", "Df", "Dd", "Dw"), np.split(shown, ends, axis=1), strict=True))
+    operator = RecoveryOperator(dynamic, algebraic, inner, right, counts)
+    recovery = StateRecovery.from_operator(plant.state_names, operator, np.eye(plant.nw), state_point(plant))
+    bounds = SolutionBounds(max(factor.condition, mass.condition), max(backward, backward_of_e))
+    notes = (
+        f"Taken as algebraic, since the coefficients of their derivatives in E are less than {RANK_TOLERANCE:g} of the "
+        f"largest in suitable units: {listed([repr(name) for name in neglected])}. Give E zeros there, or larger "
+        "entries.",
+    )
+    reduced = with_states(plant, names, E=None, **matrices)
+    return Transformation(plant, reduced, "", recovery, notes=notes if neglected else (), bounds=bounds)
+
+
+def split_by_derivatives(
+    plant: DescriptorSystem,
+) -> tuple[tuple[Any, Any, Any, Any], tuple[str, ...], tuple[str, ...]]:
+    """Return combinations of equations with E ``(count, nx)`` and without, bases of the states that E moves
+    ``(nx, count)`` and does not, names of the former, and states whose derivatives count as zero beside the others.
+    E is decomposed component by component of its pattern; names are their own where these are whole states."""
+    e, a = csr(plant.E), csr(plant.A)
+    parts = _components(e)
+    pieces = _split(e, parts, _scales(e, a))
+    if len(pieces.dynamic) < coarse_structure(e).structural_rank:
+        # Small entries of E may be a matter of units: judged again with those that suit all entries.
+        pieces = _split(e, parts, scales_by_all_entries(csr(abs(e) + abs(a))))
+    moving = sorted(pieces.dynamic, key=lambda piece: piece[0])
+    names = tuple(
+        plant.state_names[piece[1][0]] if len(piece[1]) == 1 else f"xi {k}" for k, piece in enumerate(moving, 1)
+    )
+    neglected = tuple(plant.state_names[i] for i in sorted(set(pieces.neglected)))
+    return pieces.matrices(), names, neglected
+
+
+def _components(e: Any) -> list[tuple[Any, Any, FloatArray]]:
+    """Return rows, columns and entries of the connected components of a sparse matrix."""
+    row_part, column_part = components_of(e)
+    moving = e.tocoo()
+    with_entries = np.unique(row_part[moving.row])
+    order = np.argsort(row_part, kind="stable"), np.argsort(column_part, kind="stable")
+    starts = [np.searchsorted(part[o], with_entries) for part, o in zip((row_part, column_part), order, strict=True)]
+    ends = [
+        np.searchsorted(part[o], with_entries, side="right")
+        for part, o in zip((row_part, column_part), order, strict=True)
+    ]
+    # Most components are single entries: slicing each would take most of the time.
+    single = np.bincount(row_part[moving.row], weights=moving.data)[with_entries][:, None, None]
+    blocks = []
+    for k in range(len(with_entries)):
+        rows = order[0][starts[0][k] : ends[0][k]]
+        columns = order[1][starts[1][k] : ends[1][k]]
+        block = e[rows][:, columns].toarray() if len(rows) * len(columns) > 1 else single[k]
+        blocks.append((rows, columns, block))
+    return blocks
+
+
+def _split(e: Any, parts: list[tuple[Any, Any, FloatArray]], scales: tuple[FloatArray, FloatArray]) -> _Pieces:
+    pieces, (row_scale, column_scale) = _Pieces(e.shape[0]), scales
+    blocks = [
+        (rows, columns, row_scale[rows][:, None] * block * column_scale[columns]) for rows, columns, block in parts
+    ]
+    largest = max((float(np.linalg.norm(block, 2)) for _, _, block in blocks), default=0.0)
+    for rows, columns, block in blocks:
+        pieces.add(rows, columns, block, row_scale[rows], column_scale[columns], largest)
+    in_row, in_column = np.diff(e.indptr) > 0, np.bincount(e.indices, minlength=e.shape[1]) > 0
+    pieces.rest(np.flatnonzero(~in_row), np.flatnonzero(~in_column))
+    return pieces
+
+
+class _Pieces:
+    """Collects rows and columns of dynamic and algebraic parts, one component of E after the other."""
+
+    def __init__(self, count: int) -> None:
+        self.count = count
+        # Each is a list of (place for sorting, indices, values).
+        self.dynamic_rows: list[tuple[int, Any, FloatArray]] = []
+        self.algebraic_rows: list[tuple[int, Any, FloatArray]] = []
+        self.dynamic: list[tuple[int, Any, FloatArray]] = []
+        self.algebraic: list[tuple[int, Any, FloatArray]] = []
+        # States whose derivative has a coefficient, but one too small beside the others.
+        self.neglected: list[int] = []
+
+    def add(self, rows: Any, columns: Any, block: FloatArray, row_scale: Any, column_scale: Any, norm: float) -> None:
+        """Split one component by its singular values, beside the norm of all of E."""
+        if block.shape == (1, 1):
+            whole_rows = whole_columns = abs(block[0, 0]) > RANK_TOLERANCE * norm
+            rank = int(whole_rows)
+            left, right, values = np.ones((1, 1)), np.ones((1, 1)), np.abs(block[0])
+        else:
+            left, values, right = np.linalg.svd(block)
+            rank = int(np.sum(values > RANK_TOLERANCE * norm))
+            whole_rows, whole_columns = rank == len(rows), rank == len(columns)
+        for k in range(rank, len(values)):
+            if values[k] > len(values) * np.finfo(float).eps * values[0]:
+                self.neglected.append(int(columns[np.argmax(np.abs(right[k]))]))
+        self._put(self.dynamic_rows, self.algebraic_rows, rows, left.T * row_scale, rank, whole=whole_rows)
+        self._put(self.dynamic, self.algebraic, columns, right * column_scale, rank, whole=whole_columns)
+
+    def _put(self, kept: Any, others: Any, places: Any, basis: FloatArray, rank: int, *, whole: bool) -> None:
+        if whole:
+            kept += [(int(place), np.array([place]), np.ones(1)) for place in places]
+            return
+        kept += [(int(places[0]), places, basis[k]) for k in range(rank)]
+        others += [(int(places[0]), places, basis[k]) for k in range(rank, len(places))]
+
+    def rest(self, rows: Any, columns: Any) -> None:
+        """Add the equations and states that E does not touch."""
+        self.algebraic_rows += [(int(row), np.array([row]), np.ones(1)) for row in rows]
+        self.algebraic += [(int(column), np.array([column]), np.ones(1)) for column in columns]
+
+    def matrices(self) -> tuple[Any, Any, Any, Any]:
+        """Return the whole, in the order of equations and states: rows, then states as columns."""
+        rows = self._matrix(self.dynamic_rows), self._matrix(self.algebraic_rows)
+        return *rows, csr(self._matrix(self.dynamic).T), csr(self._matrix(self.algebraic).T)
+
+    def _matrix(self, pieces: list[tuple[int, Any, FloatArray]]) -> Any:
+        from scipy.sparse import csr_array
+
+        ordered = sorted(pieces, key=lambda piece: piece[0])
+        if all(len(piece[1]) == 1 for piece in ordered):
+            return selection([piece[0] for piece in ordered], self.count)
+        starts = np.concatenate([[0], np.cumsum([len(piece[1]) for piece in ordered])])
+        indices = np.concatenate([piece[1] for piece in ordered])
+        values = np.concatenate([piece[2] for piece in ordered])
+        return csr_array((values, indices, starts), shape=(len(ordered), self.count))
+
+
+def _scales(e: Any, a: Any) -> tuple[FloatArray, FloatArray]:
+    """Return the powers of two that bring the rows, then the columns, of ``[E A]`` near one."""
+    from scipy.sparse import csc_array
+
+    def peaks(matrix: Any) -> FloatArray:
+        found = np.asarray(csc_array(abs(matrix)).max(axis=0).toarray()).ravel()
+        return np.asarray(found, dtype=np.float64)
+
+    rows = 1.0 / power_of_two_below(np.maximum(peaks(e.T), peaks(a.T)))
+    scaled = [matrix.multiply(rows[:, None]) for matrix in (e, a)]
+    return rows, 1.0 / power_of_two_below(np.maximum(peaks(scaled[0]), peaks(scaled[1])))
+
+
+def not_index_one(
+    plant: DescriptorSystem, active: ActiveVariables, said: PreconditionError | None = None
+) -> PreconditionError:
+    """Return the refusal of a plant that does not have index 1 without its idle variables either: which part, and why.
+    It goes on where ``said`` refused; its signals are the variables, none where nothing was found wrong."""
+    part = active_part(plant, active)
+    (_, algebraic_rows, _, algebraic), _, _ = split_by_derivatives(part)
+    inner = csr(algebraic_rows @ csr(part.A) @ algebraic)
+    factor = sparse_factor(inner)
+    smallest, left, right = factor.null_vectors()
+    if not factor.exactly_singular and smallest > RANK_TOLERANCE:
+        return said or PreconditionError("", condition="index")
+    generic = [sparse_factor(csr(part.A) - point * csr(part.E)) for point in GENERIC_POINTS[:2]]
+    regular = any(not found.singular for found in generic)
+    if regular:
+        equations, variables = _leading(algebraic_rows, algebraic, left, right, inner)
+    else:
+        equations, variables = map(_named, generic[0].null_vectors()[1:])
+    # As the plant was given: equations and variables that were left out count.
+    variables = active.columns[variables]
+    equations = own_first(active.rows[equations], variables)
+    names = tuple(plant.state_names[i] for i in variables)
+    numbers = listed([equation_name(plant, i) for i in equations])
+    does = f"equation {numbers} does" if len(equations) == 1 else f"equations {numbers} do"
+    does = f"{does} not determine {listed([repr(name) for name in names])}"
+    if not regular:
+        return PreconditionError(
+            f"The plant is not regular: det(A - zE) is zero for every z, and {does}. Check for a missing or repeated "
+            "equation.",
+            condition="regularity",
+            signals=names,
+        )
+    if said is not None and said.condition == "index":
+        return PreconditionError(f"{said} {does[0].upper()}{does[1:]}.", condition="index", signals=names)
+    return PreconditionError(
+        f"The plant has index 2 or more: {does} without differentiating. Differentiate the constraints, or use a "
+        "method that takes the descriptor form.",
+        condition="index",
+        signals=names,
+    )
+
+
+def _leading(rows: Any, basis: Any, left: FloatArray, right: FloatArray, inner: Any) -> tuple[Any, Any]:
+    """Return the equations and variables of the null vectors; by the pattern alone, where that is singular already."""
+    coarse = coarse_structure(inner)
+    if coarse.structural_rank < inner.shape[0]:
+        over, under = np.zeros(inner.shape[0]), np.zeros(inner.shape[0])
+        over[coarse.over_rows], under[coarse.under_columns] = 1.0, 1.0
+        return _named(abs(rows).T @ over), _named(abs(basis) @ under)
+    return _named(abs(rows).T @ left), _named(abs(basis) @ right)
+
+
+def _named(shares: FloatArray) -> Any:
+    """Return the places of the leading entries, largest first."""
+    order = np.argsort(-shares, kind="stable")
+    return order[shares[order] >= NAMED_SHARE * max(float(np.max(shares, initial=0.0)), np.finfo(float).tiny)]
+
+
+def _side_by_side(*blocks: Any) -> Any:
+    from scipy.sparse import hstack
+
+    return csr(hstack([csr(block) for block in blocks]))

@@ -1,25 +1,499 @@
-"""From equations to matrices: exact linear models of nonlinear plants at rest, or at a point of a motion."""
+"""From equations to matrices: exact linear models of nonlinear plants at rest, or at a point of a motion.
+
+Where such a plant rests, or the exact reason why it rests nowhere, comes first; then entries as expressions in the
+constants of the plant. The model is taken at one point for all values of the constants, where the equations hold for
+the nominal ones alone: what is left of them there for others is how the equilibrium moves, and acts like an input that
+is one in every row.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from obsynth.analysis.transformations.entries_in_constants import at_nominal, box_of_model, entries_in_constants
-from obsynth.analysis.transformations.equilibrium import Point, consistent_point, equilibrium, nominal_point
 from obsynth.errors import PreconditionError, SpecError
+from obsynth.numerics import lazy_casadi as ca
 from obsynth.numerics.arguments import is_finite_number, require_kind
 from obsynth.numerics.arrays import FloatArray
-from obsynth.plants.constants import ConstantsBox
-from obsynth.plants.dae.functions import LocalEquations, local_equations
+from obsynth.numerics.expressions import parse_expression
+from obsynth.numerics.ranks import JACOBIAN_RANK_TOLERANCE
+from obsynth.plants.constants import Constant, ConstantsBox, constants_box
+from obsynth.plants.dae.functions import LocalEquations, local_equations, symbolic_equations
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.uncertain_system import filled_plant
-from obsynth.plants.uncertainty import Uncertainty
+from obsynth.plants.uncertain_system import filled_plant, stated_box
+from obsynth.plants.uncertainty import Entry, Uncertainty
 from obsynth.plants.validation import index_of
+
+#: Largest scaled residual of what counts as a root.
+ROOT_RESIDUAL = 1e-9
+#: Entries of a direction, and of a combination of equations, below this share of the largest are not named.
+NAMED = 1e-6
+#: Newton steps after the least squares; they square the error, so that a few reach rounding.
+POLISH = 8
+#: Derivatives satisfy the equations where the weighted residual is below this.
+CONSISTENT = 1e-3 * ROOT_RESIDUAL
+#: Stands in a search for a residual that is not finite.
+HUGE = 1e10
+MOST_ROOT_EVALUATIONS = 400
+
+
+@dataclass(frozen=True, eq=False)
+class Point:
+    """States ``(nx,)``, inputs ``(nu,)``, parameters ``(nq,)`` and the states' derivatives ``(nx,)`` at one moment."""
+
+    x: FloatArray
+    u: FloatArray
+    theta: FloatArray
+    rates: FloatArray
+
+
+def nominal_point(model: DAEModel, given: Mapping[str, float], free: Sequence[str] = ()) -> Point:
+    """Return the nominal point with what is given by name in place; outputs are left to the caller."""
+    x, u, theta = (np.array(v) for v in (model.nominal_state, model.nominal_input, model.nominal_parameters))
+    places = ((model.state_names, x), (model.input_names, u), (model.parameter_names, theta))
+    known = [*model.state_names, *model.input_names, *model.parameter_names, *model.output_names]
+    for name, value in given.items():
+        index_of(name, known, what="given")
+        if not is_finite_number(value):
+            raise SpecError(f"given.{name} is {value!r}: give a finite number.", path=f"given.{name}")
+        if name in free:
+            raise SpecError(f"{name!r} is both given and free: choose one.", path=f"given.{name}")
+        for names, vector in places:
+            if name in names:
+                vector[names.index(name)] = float(value)
+    for name in free:
+        index_of(name, [*model.input_names, *model.parameter_names], what="free")
+    return Point(x, u, theta, np.zeros(model.nx))
+
+
+def equilibrium(
+    model: DAEModel, given: Mapping[str, float], free: Sequence[str], start: Mapping[str, float] | None = None
+) -> Point:
+    """Return the point where nothing moves, what is given holds, what is free is as it must be, or why none is."""
+    problem = _Problem(model, given, free, start or {})
+    z = problem.solved()
+    residual, jacobian = problem.scaled(z)
+    if not (np.isfinite(residual).all() and np.isfinite(jacobian).all()):
+        raise problem.undefined(residual, jacobian)
+    left, values, right = np.linalg.svd(jacobian)
+    rank = int((values > JACOBIAN_RANK_TOLERANCE * values.max()).sum()) if values.size else 0
+    if not np.abs(residual).max(initial=0.0) <= ROOT_RESIDUAL:
+        raise problem.without_root(residual, left[:, rank:])
+    if rank < len(problem.names):
+        raise problem.not_unique(right[rank:])
+    return problem.point(z)
+
+
+class _Problem:
+    """Equations of rest with scaled unknowns: states that are not given, then what is free."""
+
+    def __init__(
+        self, model: DAEModel, given: Mapping[str, float], free: Sequence[str], start: Mapping[str, float]
+    ) -> None:
+        self.model, self.base = model, nominal_point(model, given, free)
+        for name, value in start.items():
+            if name not in given:
+                self.base.x[index_of(name, model.state_names, what="start")] = float(value)
+        self.states = [i for i, name in enumerate(model.state_names) if name not in given]
+        self.inputs, self.parameters = (
+            [names.index(name) for name in free if name in names]
+            for names in (model.input_names, model.parameter_names)
+        )
+        others = (*model.state_names, *model.input_names, *model.parameter_names)
+        self.seen = [i for i, name in enumerate(model.output_names) if name in given and name not in others]
+        self.wanted = np.array([given[model.output_names[i]] for i in self.seen])
+        groups = (
+            (model.state_names, self.states),
+            (model.input_names, self.inputs),
+            (model.parameter_names, self.parameters),
+        )
+        self.names = [names[i] for names, places in groups for i in places]
+        self.rows = [*model.equation_names, *(f"given {model.output_names[i]}" for i in self.seen)]
+        begin = np.concatenate([self.base.x[self.states], self.base.u[self.inputs], self.base.theta[self.parameters]])
+        freed = np.abs(begin[len(self.states) :])
+        self.sizes = np.concatenate([model.state_scales[self.states], np.where(freed > 0.0, freed, 1.0)])
+        self.begin: FloatArray = np.asarray(begin / self.sizes)
+        jacobian = self.raw(self.begin)[1]
+        if not np.isfinite(jacobian).all():
+            raise SpecError(
+                "The model is not defined at its nominal values: give other ones by start or given.", path="start"
+            )
+        self.weights = _row_weights(jacobian)
+
+    def point(self, z: FloatArray) -> Point:
+        """Return the whole point of scaled unknowns."""
+        x, u, theta = np.array(self.base.x), np.array(self.base.u), np.array(self.base.theta)
+        x[self.states], u[self.inputs], theta[self.parameters] = np.split(
+            z * self.sizes, [len(self.states), len(self.states) + len(self.inputs)]
+        )
+        return Point(x, u, theta, np.zeros(self.model.nx))
+
+    def raw(self, z: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return what is left of each row, and its derivatives with respect to the scaled unknowns."""
+        p = self.point(z)
+        local = local_equations(self.model, p.rates, p.x, p.u, p.theta)
+        top = np.hstack(
+            [local.by_state[:, self.states], local.by_input[:, self.inputs], local.by_parameter[:, self.parameters]]
+        )
+        bottom = np.hstack(
+            [
+                local.C[:, self.states],
+                np.zeros((self.model.ny, len(self.inputs))),
+                local.outputs_by_parameter[:, self.parameters],
+            ]
+        )[self.seen]
+        return np.concatenate([local.value, local.y[self.seen] - self.wanted]), np.vstack([top, bottom]) * self.sizes
+
+    def scaled(self, z: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return `raw` with rows scaled by their size at the start."""
+        residual, jacobian = self.raw(z)
+        return np.asarray(self.weights * residual), np.asarray(self.weights[:, None] * jacobian)
+
+    def solved(self) -> FloatArray:
+        """Return the scaled unknowns that satisfy the rows best."""
+        from scipy.optimize import least_squares
+
+        if not self.names:
+            return self.begin
+
+        def finite(part: int) -> Callable[[FloatArray], FloatArray]:
+            # Outside the region where the model is defined a large number turns the search back.
+            return lambda z: np.nan_to_num(self.scaled(z)[part], nan=HUGE, posinf=HUGE, neginf=-HUGE)
+
+        # As far as rounding allows.
+        exact = np.finfo(np.float64).eps * 4.0
+        z = np.asarray(
+            least_squares(
+                finite(0),
+                self.begin,
+                jac=finite(1),
+                xtol=exact,
+                ftol=exact,
+                gtol=exact,
+                max_nfev=MOST_ROOT_EVALUATIONS,
+                method="lm" if len(self.rows) >= len(self.names) else "trf",
+            ).x
+        )
+        for _ in range(POLISH):
+            residual, jacobian = self.scaled(z)
+            if not (np.isfinite(residual).all() and np.isfinite(jacobian).all()):
+                break
+            after = z - np.linalg.lstsq(jacobian, residual, rcond=JACOBIAN_RANK_TOLERANCE)[0]
+            if not np.abs(self.scaled(after)[0]).max() < np.abs(residual).max():
+                break
+            z = after
+        return z
+
+    def undefined(self, residual: FloatArray, jacobian: FloatArray) -> PreconditionError:
+        """Return the refusal of a place where equations have no value."""
+        bad = [
+            name
+            for name, value, row in zip(self.rows, residual, jacobian, strict=True)
+            if not (np.isfinite(value) and np.isfinite(row).all())
+        ]
+        return PreconditionError(
+            f"There is no equilibrium: the equations {', '.join(map(repr, bad))} are not defined where the search ends "
+            "(a root or a logarithm of a negative number, a division by zero?). Give other values, or a start.",
+            condition="no-equilibrium",
+            signals=bad,
+        )
+
+    def without_root(self, residual: FloatArray, left: FloatArray) -> PreconditionError:
+        """Return the refusal: what is left, and the combination of equations that no unknown changes."""
+        fixed = left @ (left.T @ residual)
+        names, told = self._combination(fixed * self.weights)
+        rest = ", ".join(
+            f"{self.rows[i]}: {residual[i] / self.weights[i]:.4g}"
+            for i in np.argsort(-np.abs(residual))[:4]
+            if abs(residual[i]) > ROOT_RESIDUAL
+        )
+        unknowns = ", ".join(self.names) or "nothing"
+        why = (
+            f"No unknown ({unknowns}) changes the combination {told} of the equations, which is not zero."
+            if names
+            else f"The search over {unknowns} ends where its equations have a residual."
+        )
+        return PreconditionError(
+            f"There is no equilibrium: F(0, x, u, theta) = 0 has no root ({rest}). {why} Free an input or a parameter "
+            "that enters it, give other values, or linearise at a point with drift=True.",
+            condition="no-equilibrium",
+            signals=names or [self.rows[int(np.argmax(np.abs(residual)))]],
+        )
+
+    def not_unique(self, null: FloatArray) -> PreconditionError:
+        """Return the refusal: the directions that nothing determines."""
+        directions, signals = [], []
+        for row in null:
+            moved = row * self.sizes
+            kept = [i for i in np.argsort(-np.abs(row)) if abs(row[i]) > NAMED * np.abs(row).max()]
+            signals += [self.names[i] for i in kept]
+            directions.append("(" + ", ".join(f"{self.names[i]}: {moved[i]:.4g}" for i in kept) + ")")
+        return PreconditionError(
+            f"The equilibrium is not unique: {len(self.names)} unknowns and {len(self.names) - len(null)} conditions. "
+            f"Nothing determines the direction {', '.join(directions)}: give the value of one of these.",
+            condition="equilibrium-not-unique",
+            signals=list(dict.fromkeys(signals)),
+        )
+
+    def _combination(self, weights: FloatArray) -> tuple[list[str], str]:
+        largest = np.abs(weights).max(initial=0.0)
+        if not largest > 0.0:
+            return [], ""
+        shares = weights / weights[int(np.argmax(np.abs(weights)))]
+        kept = [i for i in range(len(shares)) if abs(shares[i]) > NAMED]
+        terms = [("" if abs(shares[i] - 1.0) < NAMED else f"{shares[i]:.6g} * ") + self.rows[i] for i in kept]
+        return [self.rows[i] for i in kept], " + ".join(terms)
+
+
+def consistent_point(model: DAEModel, point: Point, fixed: Collection[str] = ()) -> Point:
+    """Return a near point with derivatives that satisfy the equations; ``fixed`` states stay, differentiated may."""
+    x, rates, sizes = np.array(point.x), np.zeros(model.nx), model.state_scales
+    movable = np.array([name not in fixed for name in model.state_names])
+    for _ in range(MOST_ROOT_EVALUATIONS):
+        local = local_equations(model, rates, x, point.u, point.theta)
+        if not local.is_defined:
+            break
+        weights = _row_weights(np.hstack([local.E * sizes, local.by_state * sizes]))
+        E = weights[:, None] * (local.E * sizes)
+        left, values, _ = np.linalg.svd(E)
+        rank = int((values > JACOBIAN_RANK_TOLERANCE * values.max()).sum()) if values.any() else 0
+        null = left[:, rank:]
+        x = x + sizes * _algebraic_step(
+            null.T @ (weights[:, None] * local.by_state * sizes), -null.T @ (weights * local.value), E, movable
+        )
+        local = local_equations(model, rates, x, point.u, point.theta)
+        if not local.is_defined:
+            break
+        rates = rates - sizes * np.linalg.lstsq(E, weights * local.value, rcond=JACOBIAN_RANK_TOLERANCE)[0]
+        local = local_equations(model, rates, x, point.u, point.theta)
+        if local.is_defined and np.abs(weights * local.value).max() < CONSISTENT:
+            return Point(x, point.u, point.theta, rates)
+    raise PreconditionError(
+        "No derivatives satisfy the equations at that point: the values that are given contradict the constraints, or "
+        "the index is above one. Give fewer states.",
+        condition="no-consistent-point",
+        signals=list(model.equation_names),
+    )
+
+
+def _algebraic_step(constraint: FloatArray, right: FloatArray, E: FloatArray, movable: NDArray[np.bool_]) -> FloatArray:
+    """Return the least move onto the constraints, of what is not differentiated if that is enough."""
+    move = np.zeros(E.shape[1])
+    if not constraint.size:
+        return move
+    for first, kept in ((True, (np.abs(E).max(axis=0) == 0.0) & movable), (False, movable)):
+        if first or np.abs(constraint @ move - right).max() > ROOT_RESIDUAL * max(1.0, np.abs(right).max()):
+            move = np.zeros(E.shape[1])
+            move[kept] = np.linalg.lstsq(constraint[:, kept], right, rcond=JACOBIAN_RANK_TOLERANCE)[0]
+    return move
+
+
+def _row_weights(matrix: FloatArray) -> FloatArray:
+    peaks = np.abs(matrix).max(axis=1, initial=0.0)
+    return np.asarray(1.0 / np.where(peaks > 0.0, peaks, 1.0))
+
+
+#: How tightly an operation binds its operands, as the language reads it.
+_SUM, _PRODUCT, _SIGN, _POWER, _ATOM = range(1, 6)
+
+
+def promoted(model: DAEModel, names: Sequence[str]) -> DAEModel:
+    """Return a model whose named constants are parameters, before those it has."""
+    new = [name for name in names if name in model.constants]
+    if not new:
+        return model
+    if not model.is_data:
+        raise SpecError(
+            f"{new[0]!r} is a constant of Python functions, and only equations given as texts can replace a constant: "
+            "make it a parameter.",
+            path=f"unknown.{new[0]}",
+        )
+    return model.replace(
+        constants={name: value for name, value in model.constants.items() if name not in new},
+        parameters={**{name: model.constants[name] for name in new}, **model.parameters},
+        units={**dict.fromkeys(new, "1"), **model.units},
+    )
+
+
+def box_of_model(model: DAEModel, constants: Any, given: Mapping[str, float], **options: Any) -> ConstantsBox:
+    """Return the box of constants and parameters of a model; nominal values that are left out are those it has."""
+    known = {**model.constants, **model.parameters, **{name: given[name] for name in given if name in model.parameters}}
+    constants = stated_box(constants, options.get("variation"))
+    names = constants.constants if isinstance(constants, ConstantsBox) else constants
+    unknown = [name for name in names if name not in known] if isinstance(names, Mapping) else []
+    if unknown:
+        raise SpecError(
+            f"{unknown[0]!r} is no constant and no parameter of the model; there are {', '.join(known) or 'none'}.",
+            path=f"constants.{unknown[0]}",
+        )
+    nominal = {name: Constant(name, value, value, value) for name, value in known.items() if name in names}
+    box = constants_box(constants, known=nominal, **options)
+    for name, item in box.constants.items():
+        if name in given and item.nominal != given[name]:
+            raise SpecError(
+                f"{name!r} is given as {given[name]:g}, and its nominal value as {item.nominal:g}.",
+                path=f"given.{name}",
+            )
+    return replace(box, constants={item.name: item for item in box.uncertain})
+
+
+def at_nominal(model: DAEModel, box: ConstantsBox) -> DAEModel:
+    """Return the model with the nominal values of a box, whose constants are parameters then."""
+    kept, changed = (
+        {name: box.constants[name].nominal if name in box.constants else value for name, value in given.items()}
+        for given in (model.constants, model.parameters)
+    )
+    same = kept == dict(model.constants) and changed == dict(model.parameters)
+    return promoted(model if same else model.replace(constants=kept, parameters=changed), box.names)
+
+
+def entries_in_constants(
+    model: DAEModel, point: Point, box: ConstantsBox, columns: Mapping[str, Sequence[int]], *, moving: bool
+) -> tuple[dict[str, list[Entry]], list[Entry], list[Entry]]:
+    """Return entries of the matrices that depend on the box, and of the equilibrium's shift in equations and outputs.
+    ``columns``: inputs, known (``B``) and not (``Bd``), and parameters that are faults (``Bf``); ``moving``: the
+    motion of the point is an input after the known ones."""
+    symbols = {name: ca.SX.sym(name) for name in box.names}
+    theta = [symbols.get(name, float(value)) for name, value in zip(model.parameter_names, point.theta, strict=True)]
+    local = symbolic_equations(model)(point.rates, point.x, point.u, ca.vertcat(*theta) if theta else ca.SX(0, 1))
+    value, e, by_state, by_input, by_parameter, y, c, seen = local
+    known, unknown, faults = ([int(i) for i in columns[name]] for name in ("B", "Bd", "Bf"))
+    b = -by_input[:, known]
+    found = {
+        "E": e,
+        "A": -by_state,
+        "B": ca.horzcat(b, e @ ca.DM(point.rates)) if moving else b,
+        "C": c,
+        "Bf": -by_parameter[:, faults],
+        "Df": seen[:, faults],
+        "Bd": -by_input[:, unknown],
+    }
+    writer = _Writer(symbols)
+    entries = {name: texts for name, matrix in found.items() if (texts := writer.entries(matrix, name))}
+    nominal = {name: box.constants[name].nominal for name in box.names}
+    return entries, writer.changes(value, -1.0, nominal), writer.changes(y, 1.0, nominal)
+
+
+class _Writer:
+    """Writes CasADi's expressions in the language of the entries."""
+
+    def __init__(self, symbols: Mapping[str, Any]) -> None:
+        self.ca, self.symbols = ca, ca.vertcat(*symbols.values())
+        self.operators = {
+            ca.OP_ADD: ("+", _SUM, _SUM),
+            ca.OP_SUB: ("-", _SUM, _PRODUCT),
+            ca.OP_MUL: ("*", _PRODUCT, _PRODUCT),
+            ca.OP_DIV: ("/", _PRODUCT, _SIGN),
+            ca.OP_POW: ("**", _ATOM, _SIGN),
+            ca.OP_CONSTPOW: ("**", _ATOM, _SIGN),
+        }
+        self.functions = {
+            ca.OP_SQRT: "sqrt",
+            ca.OP_EXP: "exp",
+            ca.OP_LOG: "log",
+            ca.OP_SIN: "sin",
+            ca.OP_COS: "cos",
+            ca.OP_TAN: "tan",
+            ca.OP_ASIN: "asin",
+            ca.OP_ACOS: "acos",
+            ca.OP_ATAN: "atan",
+            ca.OP_SINH: "sinh",
+            ca.OP_COSH: "cosh",
+            ca.OP_TANH: "tanh",
+            ca.OP_FABS: "abs",
+            ca.OP_SIGN: "sign",
+            ca.OP_FLOOR: "floor",
+            ca.OP_CEIL: "ceil",
+            ca.OP_FMIN: "min",
+            ca.OP_FMAX: "max",
+        }
+        self.forms = {
+            ca.OP_NEG: ("-{}", _SIGN, _SIGN),
+            ca.OP_SQ: ("{}**2", _ATOM, _POWER),
+            ca.OP_INV: ("1 / {}", _SIGN, _PRODUCT),
+            ca.OP_TWICE: ("2 * {}", _SIGN, _PRODUCT),
+            ca.OP_LOG1P: ("log(1 + {})", _SUM, _ATOM),
+            ca.OP_EXPM1: ("exp({}) - 1", _SUM, _SUM),
+        }
+        self.comparisons = {ca.OP_LT: "<", ca.OP_LE: "<="}
+
+    def entries(self, matrix: Any, name: str) -> list[Entry]:
+        """Return row, column and text of the entries that depend on the constants."""
+        return [
+            (i, j, self.whole(matrix[i, j], f"{name}, row {i + 1}, column {j + 1}"))
+            for i in range(matrix.shape[0])
+            for j in range(matrix.shape[1])
+            if self._depends(matrix[i, j])
+        ]
+
+    def changes(self, column: Any, sign: float, nominal: Mapping[str, float]) -> list[Entry]:
+        """Return texts of ``sign`` times how a column changes from its nominal value."""
+        found = []
+        for i, _, text in self.entries(column, "the equilibrium's shift"):
+            middle = float(parse_expression(text)(nominal))
+            rest = f"{text} - {_number(middle)[0]}" if middle else text
+            found.append((i, 0, rest if sign > 0.0 else f"-({rest})"))
+        return found
+
+    def whole(self, node: Any, place: str) -> str:
+        """Return the text of one entry; `PreconditionError` where the language has none for it."""
+        try:
+            text = self._written(node)[0]
+            parse_expression(text)
+        except (KeyError, SpecError) as error:
+            raise PreconditionError(
+                f"{place} of the linear model depends on the constants through what cannot be written as an "
+                "expression, or is too long for one: give them no tolerance, or write the equations in fewer steps.",
+                condition="expressions",
+            ) from error
+        return text
+
+    def _depends(self, node: Any) -> bool:
+        return bool(self.ca.depends_on(node, self.symbols))
+
+    def _written(self, node: Any) -> tuple[str, int]:
+        ca = self.ca
+        if node.is_constant():
+            return _number(float(node))
+        if node.is_symbolic():
+            return str(node.name()), _ATOM
+        operation, inner = node.op(), [node.dep(i) for i in range(node.n_dep())]
+        if operation in self.operators:
+            sign, left, right = self.operators[operation]
+            return f"{self._in(inner[0], left)} {sign} {self._in(inner[1], right)}", min(left, _POWER)
+        if operation in self.functions:
+            return f"{self.functions[operation]}({', '.join(self._written(item)[0] for item in inner)})", _ATOM
+        if operation in (*self.comparisons, ca.OP_NOT):
+            return self._chosen(node, "1", "0"), _ATOM
+        if operation == ca.OP_IF_ELSE_ZERO:
+            return self._chosen(inner[0], self._written(inner[1])[0], "0"), _ATOM
+        form, least, level = self.forms[operation]
+        return form.format(self._in(inner[0], least)), level
+
+    def _in(self, node: Any, least: int) -> str:
+        """Return a text that stands where an operation binds, in parentheses where it binds less."""
+        text, level = self._written(node)
+        return text if level >= least else f"({text})"
+
+    def _chosen(self, condition: Any, first: str, second: str) -> str:
+        if condition.op() == self.ca.OP_NOT:
+            return self._chosen(condition.dep(0), second, first)
+        sign = self.comparisons[condition.op()]
+        left, right = (self._written(condition.dep(i))[0] for i in range(2))
+        return f"where({left} {sign} {right}, {first}, {second})"
+
+
+def _number(value: float) -> tuple[str, int]:
+    if not np.isfinite(value):
+        raise KeyError(value)
+    text = repr(abs(value))
+    return (f"-{text}", _SIGN) if np.signbit(value) and value else (text, _ATOM)
+
 
 #: What E x' may be, in sizes of its row, where a point counts as resting.
 LARGEST_MOTION = 1e-9

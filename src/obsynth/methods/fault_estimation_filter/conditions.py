@@ -16,8 +16,7 @@ import numpy as np
 from flint import fmpq, fmpq_mat
 
 from obsynth.analysis.conditions import Condition, up_to_failure
-from obsynth.analysis.existence.distance import ROUNDING_LEVEL
-from obsynth.analysis.existence.named_pencils import WITNESS_DIGITS
+from obsynth.analysis.existence.named_pencils import ROUNDING_LEVEL, WITNESS_DIGITS
 from obsynth.analysis.existence.numbers import SystemFacts, numbers_of
 from obsynth.analysis.existence.statements import DECIDER, Evaluator, FullRank, NoZeroOutside, reconsidered
 from obsynth.analysis.existence.witnesses import EntryChange, Unclear, Witness, rational_matrices

@@ -12,8 +12,7 @@ from obsynth.analysis.conditions import Condition
 from obsynth.analysis.diagnosis.diagnosing import model_points
 from obsynth.analysis.diagnosis.explanations import hidden_motion
 from obsynth.analysis.diagnosis.fault_columns import Question, dc_point, question
-from obsynth.analysis.existence.distance import ROUNDING_LEVEL
-from obsynth.analysis.existence.named_pencils import NamedPencil
+from obsynth.analysis.existence.named_pencils import ROUNDING_LEVEL, NamedPencil
 from obsynth.analysis.existence.numbers import COMPUTED_STATES
 from obsynth.analysis.existence.statements import Evaluator, FullRank
 from obsynth.errors import SpecError

@@ -24,8 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.analysis.conditions import Condition
-from obsynth.analysis.existence.distance import least_share, zeros_at_rounding_level
-from obsynth.analysis.existence.named_pencils import NamedPencil, named_augmented
+from obsynth.analysis.existence.named_pencils import NamedPencil, least_share, named_augmented, zeros_at_rounding_level
 from obsynth.analysis.existence.numbers import SystemFacts
 from obsynth.analysis.existence.statements import (
     SCATTER,
