@@ -16,6 +16,7 @@ from obsynth.proofs.exact_arithmetic import (
     null_basis,
     pivot_columns,
     primitive,
+    rank_of,
     written_fraction,
     written_matrix,
 )
@@ -188,3 +189,11 @@ def test_determinants_of_pencils_that_are_known(pairs):
 def test_a_determinant_that_vanishes_everywhere_is_zero():
     e, a = fmpz_mat([[1, 2], [2, 4]]), fmpz_mat([[3, 5], [6, 10]])
     assert exact_pencils._determinant(e, a, 1) == fmpz_poly([0])
+
+
+def test_a_rank_is_that_of_the_rationals_also_where_it_is_less_modulo_the_prime():
+    prime = exact_pencils._PRIMES[0]
+    assert rank_of(fmpq_mat(2, 2, [fmpq(1, 3), fmpq(2, 3), fmpq(2, 7), fmpq(4, 7)])) == 1
+    assert rank_of(fmpq_mat(2, 3, [fmpq(1, 3), fmpq(2, 3), fmpq(1), fmpq(2, 7), fmpq(4, 7), fmpq(0)])) == 2
+    assert rank_of(fmpq_mat(2, 2, [fmpq(1), fmpq(0), fmpq(0), fmpq(prime)])) == 2
+    assert rank_of(fmpq_mat(0, 3)) == 0

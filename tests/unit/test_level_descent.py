@@ -5,7 +5,12 @@ import math
 import numpy as np
 import pytest
 
-from obsynth.methods.fault_estimation_filter.central_filter import GammaIteration
+from obsynth.methods.fault_estimation_filter.central_filter import (
+    NOISE_WEIGHTS,
+    USUAL_WEIGHT,
+    GammaIteration,
+    last_found,
+)
 from obsynth.methods.fault_estimation_filter.injection_problem import Injection
 
 TOLERANCE = 1e-7
@@ -110,3 +115,26 @@ def test_a_wary_descent_judges_the_first_and_gives_up_in_a_narrow_bracket():
     narrow.run(1.0 - 1e-6)
     assert len(narrow.reached) >= 1
     assert sum(level < 0.9995 for level in equation.asked) == 3
+
+
+@pytest.mark.parametrize("places", [range(len(NOISE_WEIGHTS)), range(7, 11), range(5, 6), range(4, 4)])
+@pytest.mark.parametrize("begin", [0, 8, USUAL_WEIGHT, 99])
+def test_the_last_weight_that_is_found_does_not_hang_on_where_the_search_begins(places, begin):
+    for kept in range(places.start, places.stop + 1):
+        asked = []
+
+        def tried(place, kept=kept, asked=asked):
+            asked.append(place)
+            return f"filter {place}" if place < kept else None
+
+        expected = (kept - 1, f"filter {kept - 1}") if kept > places.start else None
+        assert last_found(tried, places, begin) == expected
+        assert len(asked) == len(set(asked)) <= 2 * math.log2(len(places) + 1) + 1
+        assert set(asked) <= set(places)
+
+
+def test_the_last_weight_takes_few_trials_next_to_the_usual_one():
+    for kept in (USUAL_WEIGHT, USUAL_WEIGHT + 1, USUAL_WEIGHT + 2):
+        asked = []
+        last_found(lambda place, k=kept, a=asked: a.append(place) or (place < k or None), range(31), USUAL_WEIGHT)
+        assert len(asked) <= 4

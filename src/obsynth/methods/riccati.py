@@ -9,7 +9,7 @@ from itertools import chain, product
 
 import numpy as np
 
-from obsynth.numerics.arrays import SMALLEST, FloatArray
+from obsynth.numerics.arrays import SMALLEST, FloatArray, largest_singular_value
 from obsynth.numerics.doubling import REFUTED, doubled_riccati_solution, is_clearly_negative, is_positive
 from obsynth.numerics.matrix_equations import (
     continuous_lyapunov,
@@ -40,11 +40,11 @@ def stabilising_gain(a: FloatArray, c: FloatArray, noise_a: FloatArray, noise_c:
     process, cross, measured = noise_a @ noise_a.T, noise_a @ noise_c.T, noise_c @ noise_c.T
     best, least = None, 1.0
     process_size = max(
-        float(np.linalg.norm(noise_a, 2)) ** 2, LEAST_PROCESS * float(np.linalg.norm(a, 2)) ** 2, LEAST_PROCESS
+        largest_singular_value(noise_a) ** 2, LEAST_PROCESS * largest_singular_value(a) ** 2, LEAST_PROCESS
     )
     for epsilon in REGULARISATIONS:
         q = process + epsilon * process_size * np.eye(n)
-        size = float(np.linalg.norm(c @ q @ c.T, 2)) + float(np.linalg.norm(measured, 2))
+        size = largest_singular_value(c @ q @ c.T) + largest_singular_value(measured)
         r = measured + epsilon * size * np.eye(m)
         # Far outside the circle doubling may settle on what is no solution: its poles tell.
         for solve in (_by_doubling, _by_qz):

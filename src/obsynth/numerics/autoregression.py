@@ -10,7 +10,7 @@ from functools import cached_property
 
 import numpy as np
 
-from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.arrays import FloatArray, largest_singular_value, read_only
 
 #: Longest memory that is tried, and rows that each coefficient of an equation needs.
 MOST_ORDER, ROWS_PER_COEFFICIENT = 12, 20
@@ -49,7 +49,7 @@ class Autoregression:
     @property
     def longest_gain(self) -> float:
         """Largest gain from an innovation that stays to the signals."""
-        return float(np.linalg.norm(np.linalg.inv(np.eye(self.channels) - self.A.sum(axis=0)), 2))
+        return largest_singular_value(np.linalg.inv(np.eye(self.channels) - self.A.sum(axis=0)))
 
     @property
     def is_regular(self) -> bool:

@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import FloatArray, largest_singular_value
 from obsynth.numerics.matrix_equations import continuous_lyapunov
 from obsynth.numerics.modal_response import Modes
 from obsynth.numerics.norms import HinfNorm, hinf_norm
@@ -62,7 +62,7 @@ class ContinuousNorms:
         if not all(np.all(np.isfinite(part)) for part in (self.a, b, c, d)):
             return HinfNorm(np.inf, np.inf, np.nan)
         if not len(self.a):
-            size = float(np.linalg.norm(d, 2))
+            size = largest_singular_value(d)
             return HinfNorm(size, size, 0.0)
         if self._turned is None:
             return HinfNorm(np.inf, np.inf, np.nan)
@@ -95,7 +95,7 @@ def peak_gain(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
         raise SpecError("The observer is not stable: its residual has no bound.", path="observer")
     a, b, c = _in_lyapunov_norm(a, b, c)
     second = a @ a
-    step = FIRST_LENGTH / float(np.linalg.norm(a, 2))
+    step = FIRST_LENGTH / largest_singular_value(a)
     transition = np.asarray(expm(a * step))
     # Columns of b at the start of the interval, and the whole state transition, for what is left in the end.
     columns = np.hstack([b, np.eye(len(a))])
@@ -104,11 +104,11 @@ def peak_gain(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
         for _ in range(INTERVALS_PER_LENGTH):
             after = transition @ columns
             ends = np.linalg.norm(c @ columns, axis=0) + np.linalg.norm(c @ after, axis=0)
-            bend = float(np.linalg.norm(c, 2)) * np.linalg.norm(second @ columns, axis=0)
+            bend = largest_singular_value(c) * np.linalg.norm(second @ columns, axis=0)
             total += step / 2.0 * ends + step**3 / 12.0 * bend
             columns = after
         inputs = b.shape[1]
-        contraction = float(np.linalg.norm(columns[:, inputs:], 2))
+        contraction = largest_singular_value(columns[:, inputs:])
         if contraction < 1.0:
             # Each further stretch as long as all so far: the response of what is left of the columns of b.
             per_state = float(np.linalg.norm(total[inputs:]))

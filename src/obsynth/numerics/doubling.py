@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from obsynth.numerics import lapack
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import FloatArray, largest_singular_value
 from obsynth.numerics.scaling import power_of_two_below
 
 #: Below so many states a whole step costs less than to look.
@@ -364,7 +364,7 @@ def _compared(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, level:
             p = doubled_riccati_solution(a.T, b.T, process, gap, cross, possible=possible)
             if p is None:
                 # Far from normal, rounding in the doubling outgrows any margin.
-                return False if refuted and float(np.linalg.norm(a, 2)) <= LARGEST_TRUSTED_NORM else None
+                return False if refuted and largest_singular_value(a) <= LARGEST_TRUSTED_NORM else None
             through = a.T @ p @ b + cross
             left = -(gap + b.T @ p @ b)
             if not is_positive(left):

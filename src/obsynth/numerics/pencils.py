@@ -18,7 +18,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.numerics.arrays import ComplexArray, FloatArray
+from obsynth.numerics.arrays import ComplexArray, FloatArray, largest_singular_value
 from obsynth.numerics.lapack import eigenvalues
 from obsynth.numerics.ranks import CLUSTER_TOLERANCE, RANK_TOLERANCE, RankDecision, rank_from
 from obsynth.numerics.scaling import EquilibratedPencil, equilibrate_pencil
@@ -238,11 +238,6 @@ def _singular_values(matrix: FloatArray) -> FloatArray:
 def normal_rank_of(right: Deflation, left: Deflation) -> int:
     """Return the rank of the pencil at almost every point, from both passes."""
     return sum(right.ranks) + sum(left.ranks) + int(left.E.shape[0])
-
-
-def largest_singular_value(matrix: FloatArray) -> float:
-    """Return the spectral norm; zero of an empty matrix."""
-    return float(np.linalg.norm(matrix, 2)) if matrix.size else 0.0
 
 
 #: From so many states on, a well-conditioned E is inverted: ordinary eigenvalues take a fraction of the time.

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.numerics.arrays import ComplexArray, FloatArray
+from obsynth.numerics.arrays import ComplexArray, FloatArray, largest_singular_value
 from obsynth.numerics.matrix_equations import continuous_lyapunov
 from obsynth.numerics.norms import balanced_realisation, output_covariance
 from obsynth.numerics.scaling import balanced_matrix
@@ -191,7 +191,7 @@ def noise_covariance(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray,
         return np.full((c.shape[0], c.shape[0]), np.inf)
     # In states and a time of their own: units must not cost digits.
     a, b, c = balanced_realisation(a, b, c)
-    size = float(np.linalg.norm(a, 2))
+    size = largest_singular_value(a)
     with warnings.catch_warnings():
         # Poles within rounding of the axis: what comes out is no covariance.
         warnings.simplefilter("error", RuntimeWarning)

@@ -14,7 +14,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import is_finite_number, is_whole
-from obsynth.numerics.arrays import ComplexArray, FloatArray, as_matrix, read_only
+from obsynth.numerics.arrays import ComplexArray, FloatArray, as_matrix, largest_singular_value, read_only
 from obsynth.numerics.ranks import decide_rank
 from obsynth.numerics.scaling import LogBalance
 from obsynth.plants.validation import index_of
@@ -46,7 +46,7 @@ def stated_eigenvalues(phi: FloatArray) -> ComplexArray:
 def distinct_eigenvalues(matrix: FloatArray, tolerance: float) -> ComplexArray:
     """Return each eigenvalue once; those within ``tolerance`` times the balanced norm count as one, at their mean."""
     balanced = balanced_transition(matrix)[0]
-    reach = tolerance * float(np.linalg.norm(balanced, 2))
+    reach = tolerance * largest_singular_value(balanced)
     found: list[complex] = []
     waiting = [complex(value) for value in np.linalg.eigvals(balanced)]
     while waiting:
@@ -222,7 +222,7 @@ def fault_model(data: Any) -> FaultModel:
 def _observable(model: FaultModel) -> FaultModel:
     balanced, states = balanced_transition(model.Phi)
     shown = model.Cw * states
-    size = float(np.linalg.norm(balanced, 2)) / (float(np.linalg.norm(shown)) or 1.0)
+    size = largest_singular_value(balanced) / (float(np.linalg.norm(shown)) or 1.0)
     for value in model.eigenvalues(0.0):
         tested = np.vstack([balanced - value * np.eye(model.order), (size or 1.0) * shown.astype(complex)])
         if not decide_rank(tested, expected=model.order, equilibrated=False).full:

@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 
 from obsynth.numerics import lapack
-from obsynth.numerics.arrays import ComplexArray, FloatArray
+from obsynth.numerics.arrays import ComplexArray, FloatArray, largest_singular_value
 from obsynth.numerics.doubling import symmetric_product
 from obsynth.numerics.matrix_equations import continuous_lyapunov, discrete_lyapunov
 from obsynth.numerics.scaling import balanced_matrix
@@ -189,7 +189,7 @@ def _proved(ball: Ball, factor: FloatArray, rate: float, *, discrete: bool) -> C
         return None
     product = Ball.exact(factor) @ Ball.exact(inverse) - Ball.exact(np.eye(n))
     defect = product.frobenius_norm
-    speed = float(np.linalg.norm(factor @ ball.midpoint @ inverse, 2))
+    speed = largest_singular_value(factor @ ball.midpoint @ inverse)
     return Contraction(factor, inverse, defect, rate, discrete, speed) if defect < 0.5 else None
 
 
@@ -207,7 +207,7 @@ def _summed_factor(a: FloatArray, rate: float, *, discrete: bool) -> FloatArray 
             power, start, size = balanced / rate if rate > 0.0 else np.full_like(balanced, np.nan), one, 1.0
         else:
             shifted = balanced + rate * one
-            size = float(np.linalg.norm(shifted, 2)) or 1.0
+            size = largest_singular_value(shifted) or 1.0
             try:
                 inverse = np.linalg.inv(size * one - shifted)
             except np.linalg.LinAlgError:
@@ -250,7 +250,7 @@ def _lyapunov_factor(a: FloatArray, rate: float, *, discrete: bool) -> FloatArra
                 solution = discrete_lyapunov((balanced / rate).T, one) if rate > 0.0 else None
             else:
                 shifted = balanced + rate * one
-                size = float(np.linalg.norm(shifted, 2)) or 1.0
+                size = largest_singular_value(shifted) or 1.0
                 solution = continuous_lyapunov(shifted.T / size, -one)
         except (np.linalg.LinAlgError, ValueError):
             return None
@@ -474,7 +474,7 @@ def interval_pieces(a: FloatArray, b: FloatArray, into: Ball, length: float) -> 
 
 def _natural_norm(a: FloatArray) -> float:
     """Return the norm of a matrix in units that balance it: how fast its motions are, whatever their units."""
-    return float(np.linalg.norm(balanced_matrix(a)[0], 2)) if a.size else 0.0
+    return largest_singular_value(balanced_matrix(a)[0]) if a.size else 0.0
 
 
 def _growth(a: FloatArray, step: float) -> FloatArray:

@@ -11,7 +11,7 @@ from typing import Any
 import flint
 import numpy as np
 
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import FloatArray, largest_singular_value
 from obsynth.numerics.norms import balanced_realisation
 from obsynth.numerics.spectra import abscissa, noise_covariance
 from obsynth.proofs.extended_balls import arb_matrix
@@ -52,7 +52,7 @@ def enclosed_noise_covariance(
     a, b, c = balanced_realisation(a, b, c)
     for bits in TRIED_BITS:
         with flint.ctx.workprec(bits):
-            states = _enclosed(arb_matrix(a), arb_matrix(b), dt, float(np.linalg.norm(a, 2)) or 1.0)
+            states = _enclosed(arb_matrix(a), arb_matrix(b), dt, largest_singular_value(a) or 1.0)
             if states is None:
                 continue
             shown = arb_matrix(c) * states * arb_matrix(c).transpose()

@@ -18,7 +18,7 @@ from typing import Any, TypeAlias
 
 import flint
 import numpy as np
-from flint import fmpq, fmpq_mat, fmpq_poly, fmpz, fmpz_mat, fmpz_poly
+from flint import fmpq, fmpq_mat, fmpq_poly, fmpz, fmpz_mat, fmpz_poly, nmod_mat
 
 from obsynth.numerics.arrays import FloatArray
 
@@ -86,13 +86,28 @@ def left_null_basis(matrix: fmpq_mat) -> fmpq_mat:
     return null_basis(matrix.transpose()).transpose()
 
 
+#: The prime modulo which ranks are bounded from below first.
+PRIME = (1 << 61) - 1
+
+
+def rank_of(matrix: fmpq_mat) -> int:
+    """Return the rank; a full one shows modulo a prime, but for bad luck, in a fraction of the time."""
+    most = min(int(matrix.nrows()), int(matrix.ncols()))
+    return most if most and int(nmod_mat(matrix.numer_denom()[0], PRIME).rank()) == most else int(matrix.rank())
+
+
+def over_one_denominator(E: fmpq_mat, A: fmpq_mat) -> tuple[fmpz_mat, fmpz_mat]:
+    """Return two matrices multiplied by the least number that makes all of their entries integers."""
+    (e, own), (a, other) = E.numer_denom(), A.numer_denom()
+    common = lcm(int(own), int(other))
+    return e * (common // int(own)), a * (common // int(other))
+
+
 def with_integer_entries(E: fmpq_mat, A: fmpq_mat) -> tuple[fmpz_mat, fmpz_mat]:
     """Return two matrices ``(m, n)`` with common rows and columns multiplied by rationals, so that all are integers."""
     rows, columns = int(A.nrows()), int(A.ncols())
     # Over one denominator each row is a multiple of what it is over its own.
-    (e, own), (a, other) = E.numer_denom(), A.numer_denom()
-    common = lcm(int(own), int(other))
-    pairs = zip((e * (common // int(own))).tolist(), (a * (common // int(other))).tolist(), strict=True)
+    pairs = zip(*(part.tolist() for part in over_one_denominator(E, A)), strict=True)
     table = [_coprime([int(value) for part in pair for value in part]) for pair in pairs]
     for j in range(columns):
         common = gcd(*(row[k] for row in table for k in (j, columns + j)))

@@ -28,10 +28,12 @@ from flint import arb, arb_mat, fmpq, fmpq_mat, fmpq_poly, fmpz, fmpz_mat, fmpz_
 
 from obsynth.numerics.arrays import FloatArray
 from obsynth.proofs.exact_arithmetic import (
+    PRIME,
     Root,
     blocks,
     identity,
     locate_roots,
+    over_one_denominator,
     primitive,
     with_integer_entries,
     written_matrix,
@@ -39,7 +41,7 @@ from obsynth.proofs.exact_arithmetic import (
 )
 
 #: Primes for ranks that are only bounded from below.
-_PRIMES = ((1 << 61) - 1, 2305843009213693921, 2305843009213693907)
+_PRIMES = (PRIME, 2305843009213693921, 2305843009213693907)
 #: Random integers of a compression are of 16 bits less these; and the seed that makes every decision repeatable.
 _DROPPED_BITS = 3
 POINTS_SEED = 20150709
@@ -67,11 +69,12 @@ class ExactPencil:
     @cached_property
     def normal_rank(self) -> int:
         """Rank of ``A - s E`` at almost every s."""
+        (e, a), least = over_one_denominator(self.E, self.A), 0
+        for prime, point in [(prime, self._rng.randrange(prime)) for prime in _PRIMES]:
+            least = max(least, int((nmod_mat(a, prime) - nmod_mat(e, prime) * point).rank()))
+            if least == min(self.shape):
+                return least
         e, a = self._integers
-        points = [(prime, self._rng.randrange(prime)) for prime in _PRIMES]
-        least = max(int((nmod_mat(a, prime) - nmod_mat(e, prime) * point).rank()) for prime, point in points)
-        if least == min(self.shape):
-            return least
         return max([least, *(_at(e, a, point).rank() for point in _points(self._degree + 1))])
 
     @cached_property

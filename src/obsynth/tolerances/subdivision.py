@@ -13,7 +13,7 @@ from typing import TypeAlias
 import numpy as np
 
 from obsynth.errors import PreconditionError
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import FloatArray, largest_singular_value
 from obsynth.numerics.matrix_equations import continuous_lyapunov, discrete_lyapunov
 from obsynth.numerics.ranks import ROUNDED_ZERO
 from obsynth.plants.constants import ConstantsBox
@@ -152,18 +152,18 @@ def _contracts(part: AffineMatrix, *, discrete: bool) -> bool:
     parts = [root @ item @ inverse for item in part.parts]
     rest = np.abs(root) @ part.radius @ np.abs(inverse)
     rest = rest + _PRODUCT_ROUNDING * len(a) * (np.abs(root) @ part.magnitude @ np.abs(inverse))
-    size, remainder = np.abs(lyapunov), float(np.linalg.norm(rest, 2))
+    size, remainder = np.abs(lyapunov), largest_singular_value(rest)
     if discrete:
-        first = sum(float(np.linalg.norm(a.T @ lyapunov @ item + item.T @ lyapunov @ a, 2)) for item in parts)
+        first = sum(largest_singular_value(a.T @ lyapunov @ item + item.T @ lyapunov @ a) for item in parts)
         spread = np.abs(parts).sum(axis=0) + rest if parts else rest
-        second = float(np.linalg.norm(spread.T @ size @ spread, 2))
-        second += 2.0 * float(np.linalg.norm(np.abs(a.T) @ size, 2)) * remainder
+        second = largest_singular_value(spread.T @ size @ spread)
+        second += 2.0 * largest_singular_value(np.abs(a.T) @ size) * remainder
         middle = a.T @ lyapunov @ a - lyapunov
     else:
-        first = sum(float(np.linalg.norm(lyapunov @ item + item.T @ lyapunov, 2)) for item in parts)
-        second = 2.0 * float(np.linalg.norm(size, 2)) * remainder
+        first = sum(largest_singular_value(lyapunov @ item + item.T @ lyapunov) for item in parts)
+        second = 2.0 * largest_singular_value(size) * remainder
         middle = lyapunov @ a + a.T @ lyapunov
-    rounding = _PRODUCT_ROUNDING * len(a) * float(np.linalg.norm(size, 2)) * (1.0 + float(np.linalg.norm(a, 2)) ** 2)
+    rounding = _PRODUCT_ROUNDING * len(a) * largest_singular_value(size) * (1.0 + largest_singular_value(a) ** 2)
     return float(np.linalg.eigvalsh((middle + middle.T) / 2.0)[-1]) + (first + second + rounding) * _NORM_OUTWARD < 0.0
 
 

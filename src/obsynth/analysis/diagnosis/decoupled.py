@@ -14,10 +14,10 @@ import numpy as np
 
 from obsynth.analysis.transformations.recovery import Transformation, linear_plant
 from obsynth.errors import SpecError
-from obsynth.numerics.arrays import ComplexArray, FloatArray, read_only
+from obsynth.numerics.arrays import ComplexArray, FloatArray, largest_singular_value, read_only
 from obsynth.numerics.lapack import LAPACK_BLOCK, pencil_eigenvalues
 from obsynth.numerics.libraries import on_one_thread_if_small
-from obsynth.numerics.pencils import full_svd, largest_singular_value
+from obsynth.numerics.pencils import full_svd
 from obsynth.numerics.ranks import CLEAR_GAP, RankDecision, product_but_rounding, rank_from
 from obsynth.numerics.scaling import LogBalance, equilibrate_pencil, power_of_two_below
 from obsynth.plants.descriptor import DescriptorSystem

@@ -25,8 +25,8 @@ from flint import fmpq, fmpq_mat, fmpq_poly, fmpz_poly
 
 from obsynth.analysis.diagnosis.decoupled import DecoupledPlant, decoupled, finite_values, left_part, unknowns_pencil
 from obsynth.analysis.zeros import are_outside
-from obsynth.numerics.arrays import ComplexArray, FloatArray
-from obsynth.numerics.pencils import FiniteZeros, full_svd, largest_singular_value
+from obsynth.numerics.arrays import ComplexArray, FloatArray, largest_singular_value
+from obsynth.numerics.pencils import FiniteZeros, full_svd
 from obsynth.numerics.ranks import CLEAR_GAP, MARKOV_TOLERANCE, RANK_TOLERANCE, TRACE_TOLERANCE, rank_from
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.exact_arithmetic import (

@@ -18,6 +18,7 @@ from obsynth.proofs.exact_arithmetic import (
     holds_computed,
     picked_columns,
     picked_rows,
+    rank_of,
     rational_matrix,
     written_matrix,
     zeros_matrix,
@@ -101,7 +102,7 @@ class PlantNumbers:
     def rank(self, matrix: Any) -> int:
         """Return the rank of a matrix; of enclosures to digits."""
         with self._precisely():
-            return int(matrix.rank()) if self.exact else rank_to_digits(matrix.tolist())
+            return rank_of(matrix) if self.exact else rank_to_digits(matrix.tolist())
 
     def columns(self, name: str, kept: Sequence[int] | None) -> Any:
         """Return a matrix by its name, or some of its columns."""

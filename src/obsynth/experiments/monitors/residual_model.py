@@ -24,7 +24,7 @@ from obsynth.analysis.transformations.sampling import discretise
 from obsynth.errors import SpecError
 from obsynth.experiments.monitors.between_samples import BetweenSamples
 from obsynth.methods.registry import error_model
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import FloatArray, largest_singular_value
 from obsynth.numerics.continuous import first_order_hold, peak_gain
 from obsynth.numerics.matrix_equations import continuous_lyapunov
 from obsynth.numerics.norms import hinf_norm, output_covariance, spectral_radius
@@ -340,7 +340,7 @@ def paper_threshold(model: ResidualModel, bounds: FloatArray, initial_error: flo
         raise SpecError("The paper's threshold needs a bound of each disturbance.", path="disturbance_bounds")
     gain = hinf_norm(model.A, model.Bd, model.C, model.Dd).upper if gamma is None else gamma
     decay = np.array([np.linalg.norm(power, 2) for power in model.powers()])
-    return np.hypot(gain * float(np.linalg.norm(bounds)), float(np.linalg.norm(model.C, 2)) * decay * initial_error)
+    return np.hypot(gain * float(np.linalg.norm(bounds)), largest_singular_value(model.C) * decay * initial_error)
 
 
 def pointwise_threshold(model: ResidualModel, inputs: ScaledInputs, initial_error: float) -> FloatArray:
@@ -392,7 +392,7 @@ def window_threshold(model: ResidualModel, inputs: ScaledInputs, initial_error: 
         length, begin = min(window, k + 1), max(k - window + 1, 0)
         # Before the window is full it begins with the record.
         left = roots[k] if k + 1 <= window else full @ powers[begin]
-        bound[k] = gain * np.sqrt(length * count) + float(np.linalg.norm(left, 2)) * initial_error + gathered[begin]
+        bound[k] = gain * np.sqrt(length * count) + largest_singular_value(left) * initial_error + gathered[begin]
     return np.asarray(np.minimum(bound, summed))
 
 
@@ -430,8 +430,8 @@ def unlimited_bound(
     """Return the pointwise or window bound for records of any length."""
     powers = model.powers()
     last = powers[-1] @ model.A
-    left = float(np.linalg.norm(last, 2)) if last.size else 0.0
-    shown = [float(np.linalg.norm(model.C @ power, 2)) for power in powers]
+    left = largest_singular_value(last)
+    shown = [largest_singular_value(model.C @ power) for power in powers]
     # Of k = m N + j samples, m N shrink by left^m: inputs of that age, and the start, add no more than this.
     aged = _columns(last @ inputs.B) * sum(shown) / (1.0 - left)
     bare = pointwise_threshold(model, inputs, 0.0)
@@ -457,7 +457,7 @@ def _window_limit(
     (initial_error, left, last), (gain, count) = start_of, _window_gain(model, inputs)
     powers = model.powers()
     full = _energy_roots(model, powers[:window])[-1]
-    sizes = [float(np.linalg.norm(full @ power, 2)) for power in powers]
+    sizes = [largest_singular_value(full @ power) for power in powers]
     gathered = sum(_columns(full @ power @ inputs.B) for power in powers)
     aged = _columns(last @ inputs.B) * sum(sizes) / (1.0 - left)
     start = max(max(sizes) * left, max(sizes[-window:])) * initial_error
@@ -480,7 +480,7 @@ def _start_added(model: ResidualModel, bare: FloatArray, initial_error: float) -
     # In the norm of a Lyapunov function a free motion never grows.
     a = model.errors.Az
     root = np.linalg.cholesky(continuous_lyapunov(a.T, -np.eye(len(a)))).T
-    seen = float(np.linalg.norm(np.linalg.solve(root.T, model.C.T), 2))
+    seen = largest_singular_value(np.linalg.solve(root.T, model.C.T))
     return bare + np.array([seen * np.linalg.norm(root @ power, 2) for power in model.powers()]) * initial_error
 
 
@@ -573,7 +573,7 @@ def correlation_left(model: ResidualModel, window: int, whitener: FloatArray) ->
         driven = model.A @ driven + ahead @ oldest.T
     left = CORRELATION_LEFT * float(np.linalg.norm(driven))
     for _ in range(MOST_LAGS):
-        total += float(np.linalg.norm(shown @ driven, 2))
+        total += largest_singular_value(shown @ driven)
         driven = model.A @ driven
         if float(np.linalg.norm(driven)) <= left:
             return total

@@ -21,7 +21,7 @@ from obsynth.experiments.monitors.between_samples import InputResponse
 from obsynth.experiments.monitors.monitor import Judged, LinearSample, Monitor, Rule, Sample
 from obsynth.experiments.monitors.residual_model import ResidualModel, UnlimitedHorizonBound
 from obsynth.numerics.arguments import is_finite_number
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import FloatArray, largest_singular_value
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.decisions import NIS_WINDOW, WALKING_FORMS, alone, two_sided_sums
 from obsynth.observers.recursive.observer import RecursiveObserver
@@ -63,7 +63,7 @@ class GapGrowth:
         self._last = powers[-1] @ model.A
         self._impulses = np.hstack([power @ driven for power in powers]) if len(model.A) else np.zeros((0, 0))
         self._powers, self._aged = np.stack(powers), float(np.linalg.norm(self._last @ driven, axis=0).sum())
-        left = float(np.linalg.norm(self._last, 2)) if self._last.size else 0.0
+        left = largest_singular_value(self._last)
         self._aged /= 1.0 - left
         self._size = np.abs(self._impulses).sum(axis=1) if self._impulses.size else np.zeros(len(model.A))
         # By age: what the outputs of the model may miss, and how they hang on the error at the last complete row.

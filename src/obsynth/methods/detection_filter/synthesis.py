@@ -20,7 +20,7 @@ from obsynth.methods.detection_filter.norm_proofs import (
 )
 from obsynth.methods.method import Synthesis
 from obsynth.methods.riccati import continuous_solution
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import FloatArray, largest_singular_value
 from obsynth.numerics.norms import response
 from obsynth.numerics.spectra import abscissa
 from obsynth.observers.linear.observer import LinearObserver
@@ -96,9 +96,9 @@ def _gain_witness(transfer: Transfer, bound: float) -> FloatArray | None:
         return a
     gap = bound**2 * np.eye(len(c)) - d @ d.T
     # Where nothing drives the errors, the strictness is relative to what the bound leaves room for.
-    room = float(np.linalg.norm(a, 2)) ** 2 * float(np.linalg.eigvalsh(gap)[0])
-    room /= max(float(np.linalg.norm(c, 2)) ** 2, np.finfo(np.float64).tiny)
-    slack = STRICTNESS * max(float(np.linalg.norm(b @ b.T, 2)), room, np.finfo(np.float64).tiny)
+    room = largest_singular_value(a) ** 2 * float(np.linalg.eigvalsh(gap)[0])
+    room /= max(largest_singular_value(c) ** 2, np.finfo(np.float64).tiny)
+    slack = STRICTNESS * max(largest_singular_value(b @ b.T), room, np.finfo(np.float64).tiny)
     found = continuous_solution(a, c, b @ b.T + slack * np.eye(len(a)), -gap, b @ d.T)
     return None if found is None or not np.all(np.isfinite(found)) else np.asarray(0.5 * (found + found.T))
 

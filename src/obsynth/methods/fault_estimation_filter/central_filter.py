@@ -19,7 +19,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from functools import partial
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -29,7 +30,7 @@ from obsynth.methods.fault_estimation_filter.injection_problem import (
     NormalisedProblem,
     normalise,
 )
-from obsynth.numerics.arrays import SMALLEST, FloatArray
+from obsynth.numerics.arrays import SMALLEST, FloatArray, largest_singular_value
 from obsynth.numerics.doubling import MOST_JUMPS, doubled_riccati_solution, is_positive
 from obsynth.numerics.norms import spectral_radius
 from obsynth.numerics.pencils import GENERIC_POINTS
@@ -94,14 +95,14 @@ class CentralEquation:
     @classmethod
     def of(cls, problem: GainProblem, *, noise: float) -> CentralEquation:
         """Return the equation with artificial noise, relative to the disturbance."""
-        size = float(np.linalg.norm(problem.B, 2)) if problem.B.size else 0.0
+        size = largest_singular_value(problem.B)
         if np.any(problem.D) or np.any(problem.Zd) or not 0 < problem.measured < problem.order or size == 0.0:
             return cls._of_all_states(problem, noise, size)
         return cls._of_hidden_states(problem, noise * size)
 
     @classmethod
     def _of_all_states(cls, problem: GainProblem, noise: float, size: float) -> CentralEquation:
-        seen = max(float(np.linalg.norm(part, 2)) if part.size else 0.0 for part in (problem.D, problem.C * size))
+        seen = max(largest_singular_value(part) for part in (problem.D, problem.C * size))
         white = Whitened.of(problem.D, noise * (seen or 1.0), problem.B, problem.Zd)
         shown = np.linalg.solve(white.factor, problem.C)
         return cls(
@@ -417,6 +418,9 @@ LEVEL_FACTORS = (1.0, 1.5)
 MOST_STATES_FOR_LEVELS = 200
 COARSE_WEIGHTS = 4
 WEIGHT_STEPS = 4
+#: The weight that is tried first: the largest that keeps the level was within two of it in 161 of 180 random plants of
+#: 6 to 32 states, and eight below it, or four above, in two power networks.
+USUAL_WEIGHT = 16
 #: A disturbance that does less than this share of what it does to the starting filter is decoupled; the levels at which
 #: such a filter is looked for in turn, relative to the same; a point without meaning; and the share of rows xi that
 #: counts as nothing.
@@ -538,7 +542,7 @@ def least_level(problem: GainProblem) -> float:
     if problem.weight_is_free:
         return 0.0
     direct = problem.Zd if np.any(problem.D) else np.hstack([problem.Zd, problem.Z @ problem.B])
-    return float(np.linalg.norm(direct, 2)) if direct.size else 0.0
+    return largest_singular_value(direct)
 
 
 def least_noise_filter(problem: GainProblem) -> Injection | None:
@@ -561,22 +565,41 @@ def noise_weighted_filters(
     sizes = [float(np.linalg.norm(np.vstack(pair))) for pair in ((work.B, work.D), (work.Bn, work.Dn))]
     if work.order == 0 or work.measured == 0 or not min(sizes) > 0.0:
         return
-    weights, last = NOISE_WEIGHTS * sizes[0] / sizes[1], 0
-    weights = weights if work.order <= MOST_STATES_FOR_LEVELS else weights[::COARSE_WEIGHTS]
-    for factor in LEVEL_FACTORS if work.order <= MOST_STATES_FOR_LEVELS else LEVEL_FACTORS[:1]:
+    coarse = 1 if work.order <= MOST_STATES_FOR_LEVELS else COARSE_WEIGHTS
+    weights, begin, last = (NOISE_WEIGHTS * sizes[0] / sizes[1])[::coarse], USUAL_WEIGHT // coarse, 0
+
+    def tried(place: int, factor: float) -> Injection | None:
+        found = central_injection(_with_noise(work, weights[place]), factor * gain, noise=artificial)
+        return found if found is not None and (factor == 1.0 or reaches(found)) else None
+
+    for factor in LEVEL_FACTORS if coarse == 1 else LEVEL_FACTORS[:1]:
         # More weight than at a lower level, and not more than can be hoped for.
-        low, high = last, len(weights) if factor == 1.0 else min(last + WEIGHT_STEPS, len(weights))
-        best = None
-        while low < high:
-            middle = (low + high) // 2
-            found = central_injection(_with_noise(work, weights[middle]), factor * gain, noise=artificial)
-            if found is not None and (factor == 1.0 or reaches(found)):
-                best, low = found, middle + 1
-            else:
-                high = middle
-        if best is not None:
-            yield best
-            last = low - 1
+        places = range(last, len(weights) if factor == 1.0 else min(last + WEIGHT_STEPS, len(weights)))
+        found = last_found(partial(tried, factor=factor), places, begin)
+        if found is not None:
+            begin = last = found[0]
+            yield found[1]
+
+
+Found = TypeVar("Found")
+
+
+def last_found(tried: Callable[[int], Found | None], places: range, begin: int) -> tuple[int, Found] | None:
+    """Return the last place at which something is found, and what, by bisection that begins in small steps."""
+    low, high, step = places.start, places.stop, 1
+    best: tuple[int, Found] | None = None
+    place = min(max(begin, low), high - 1)
+    while low < high:
+        found = tried(place)
+        if found is None:
+            high = place
+        else:
+            best, low = (place, found), place + 1
+        if best is not None and high < places.stop:
+            place = (low + high) // 2
+        else:
+            place, step = min(place + step, high - 1) if best is not None else max(place - step, low), 2 * step
+    return best
 
 
 def noise_weighted_filters_within(

@@ -8,7 +8,7 @@ from itertools import islice, product
 import numpy as np
 
 from obsynth.methods.riccati import bounded_real_matrix, normalising_change
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import FloatArray, largest_singular_value
 from obsynth.numerics.norms import output_covariance, state_units
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
@@ -48,7 +48,7 @@ def bounded_real_certificate(
     for change in islice(_changes(a, b, c, d), tries):
         inverse = np.asarray(np.linalg.inv(change))
         moved_a, moved_b, moved_c = inverse @ a @ change, inverse @ b, c @ change
-        weight = max(1.0, float(np.linalg.norm(moved_c, 2)) ** 2)
+        weight = max(1.0, largest_singular_value(moved_c) ** 2)
         for slack in FILTER_SLACKS:
             p = bounded_real_matrix(moved_a, moved_b, moved_c, d, 1.0, slack=slack * weight)
             if p is None:
@@ -90,7 +90,7 @@ def _contracted(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
     """
     change, identity = _balanced(a, b, c), np.eye(a.shape[0])
     moved = np.linalg.solve(change, a @ change)
-    norm = float(np.linalg.norm(moved, 2))
+    norm = largest_singular_value(moved)
     for _ in range(MOST_CONTRACTIONS):
         level = max(min(0.5 * norm, norm**STEP_POWER), 1.0)
         p = output_covariance(moved.T / level, identity, identity, np.zeros_like(a))  # the sum of A'^k A^k
@@ -98,7 +98,7 @@ def _contracted(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
             break
         change = change @ normalising_change(p)
         moved = np.linalg.solve(change, a @ change)
-        norm = float(np.linalg.norm(moved, 2))
+        norm = largest_singular_value(moved)
     return change
 
 
@@ -113,7 +113,7 @@ def _coordinates(
     for level in path:
         inverse = np.asarray(np.linalg.inv(change))
         shown = c @ change
-        size = max(float(np.linalg.norm(shown, 2)) ** 2, np.finfo(np.float64).tiny)
+        size = max(largest_singular_value(shown) ** 2, np.finfo(np.float64).tiny)
         p = bounded_real_matrix(inverse @ a @ change, inverse @ b, shown, d, level, slack=tail * size)
         if p is None:
             return None

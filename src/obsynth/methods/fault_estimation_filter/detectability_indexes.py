@@ -15,7 +15,7 @@ from flint import fmpq_mat
 from obsynth.analysis.conditions import Condition
 from obsynth.analysis.existence.numbers import PlantNumbers, numbers_of
 from obsynth.analysis.existence.statements import settled_rank
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import FloatArray, largest_singular_value
 from obsynth.numerics.ranks import (
     CANCELLATION_TOLERANCE,
     DEAD_CHAIN_TOLERANCE,
@@ -148,7 +148,7 @@ def fault_detectability(
     ta: FloatArray, c: FloatArray, tf: FloatArray, *, exact: ExactIndexes | None = None
 ) -> FaultDetectability:
     """Return the detectability indexes (19) and matrices (20), with the exact ones where these are known."""
-    size = float(np.linalg.norm(c, 2))
+    size = largest_singular_value(c)
     if exact is None:
         results = [_first_visible(ta, c, tf[:, i], size) for i in range(tf.shape[1])]
     else:
@@ -184,7 +184,7 @@ def _first_visible(ta: FloatArray, c: FloatArray, direction: FloatArray, size: f
             break
         if float(np.linalg.norm(c @ vector)) > MARKOV_TOLERANCE * size * length:
             return step, vector
-        growth = max(float(np.linalg.norm(ta, 2)), 1.0) if growth is None else growth
+        growth = max(largest_singular_value(ta), 1.0) if growth is None else growth
         vector, bound = ta @ vector, bound * growth
     return None, np.zeros_like(direction)
 
@@ -221,7 +221,7 @@ def detectability_conditions(
         REFUSE_CONDITION,
         "Wang 2015, Theorem 2 (i)",
         f"{rank.describe()}, condition number {_told(detectability.condition_number)}, "
-        f"||Upsilon|| = {float(np.linalg.norm(user_units, 2)):.3g}"
+        f"||Upsilon|| = {largest_singular_value(user_units):.3g}"
         + (
             f"; {_names(mixed)} cannot be distinguished at first sight. Leave one out, or measure more."
             if mixed

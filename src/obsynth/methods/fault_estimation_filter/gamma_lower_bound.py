@@ -30,7 +30,7 @@ from obsynth.methods.fault_estimation_filter.least_gain_proof import (
     InvisiblePairs,
 )
 from obsynth.methods.riccati import lyapunov_solution
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import FloatArray, largest_singular_value
 from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.exact_arithmetic import nearest_doubles
@@ -150,8 +150,8 @@ def _with_growing_pairs(
     slack = [image @ item @ image.T - top @ item @ top.T for item in (point, growing)]
     inside = float(np.linalg.eigvalsh(reached.T @ slack[0] @ reached)[0])
     # On the growing states the slack is the identity, so this Schur complement is all there is to fear.
-    spoilt = float(np.linalg.norm(reached.T @ slack[1] @ reached, 2))
-    spoilt += float(np.linalg.norm(reached.T @ slack[1] @ outside, 2)) ** 2
+    spoilt = largest_singular_value(reached.T @ slack[1] @ reached)
+    spoilt += largest_singular_value(reached.T @ slack[1] @ outside) ** 2
     return np.asarray((1.0 + spoilt / inside) * point + growing)
 
 
@@ -219,7 +219,7 @@ def _bound_in(normalised: NormalisedProblem, solver: str) -> float:
 def _direct_bound(work: GainProblem) -> float:
     """Return the gain of what no measurement sees and no state keeps: the disturbance in xi at once."""
     direct = work.Zd @ null_space(work.D) if work.weight_is_free else work.Zd
-    return float(np.linalg.norm(direct, 2)) if direct.size else 0.0
+    return largest_singular_value(direct)
 
 
 @dataclass(frozen=True, eq=False)
@@ -365,7 +365,7 @@ def _is_hopeless(problem: GainProblem, gain: float, *, thorough: bool) -> bool:
         return False
     _, both = _first_two(top, bottom, image, problem.Z @ top + problem.Zd @ bottom, problem.Z, problem.Zd)
     most = both[:, : both.shape[1] - problem.Zd.shape[1]] if problem.weight_is_free else both
-    return not most.size or float(np.linalg.norm(most, 2)) < PROMISING_SHARE * gain
+    return not most.size or largest_singular_value(most) < PROMISING_SHARE * gain
 
 
 def _best_run(dual: _DualProblem, enough: float) -> tuple[FloatArray, FloatArray, FloatArray]:

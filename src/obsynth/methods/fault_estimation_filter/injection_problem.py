@@ -12,7 +12,7 @@ import numpy as np
 
 from obsynth.errors import SolverError
 from obsynth.methods.riccati import bounded_real_matrix, normalising_change, stabilising_gain
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import FloatArray, largest_singular_value
 from obsynth.numerics.modal_response import Modes
 from obsynth.numerics.norms import (
     highest_gain_found,
@@ -42,11 +42,11 @@ class WeightLimit:
 
     def norm(self, v: FloatArray) -> float:
         """Return the norm of the weight."""
-        return float(np.linalg.norm(self.fixed + v @ self.free, 2))
+        return largest_singular_value(self.fixed + v @ self.free)
 
     def kept(self, v: FloatArray) -> FloatArray:
         """Return V, drawn towards zero by as much as a solver's rounding has let the weight out of the bound."""
-        least, found = float(np.linalg.norm(self.fixed, 2)), self.norm(v)
+        least, found = largest_singular_value(self.fixed), self.norm(v)
         if found <= self.bound or least >= self.bound:
             return v
         return np.asarray((1.0 - NORM_ROUNDING) * (self.bound - least) / (found - least) * v)
@@ -138,22 +138,21 @@ class GainProblem:
     def modes(self, solution: Injection) -> Modes:
         """Return the modes of the closed loop; those of the last filter are kept."""
         if solution not in self._modes:
-            self._modes.clear()
-            self._modes[solution] = Modes.of(self.A - solution.R @ self.C)
+            self.knows(solution, Modes.of(self.A - solution.R @ self.C))
         return self._modes[solution]
 
     def knows(self, solution: Injection, modes: Modes) -> None:
         """Note the modes of the closed loop, found in other coordinates."""
         self._modes.clear()
-        self._modes[solution] = modes
+        self._modes[solution], self._radii[solution] = modes, modes.radius
 
     def radius(self, solution: Injection) -> float:
         """Return the spectral radius of the closed loop; asked for once, as it takes all eigenvalues."""
         if solution not in self._radii:
-            alone = self.order >= STATES_FOR_RADIUS_ALONE and solution not in self._modes
-            self._radii[solution] = (
-                spectral_radius(self.A - solution.R @ self.C) if alone else self.modes(solution).radius
-            )
+            if self.order < STATES_FOR_RADIUS_ALONE:
+                self.modes(solution)
+            else:
+                self._radii[solution] = spectral_radius(self.A - solution.R @ self.C)
         return self._radii[solution]
 
     def reaches(self, solution: Injection, level: float) -> bool:
@@ -227,7 +226,7 @@ def normalise(problem: GainProblem, *, start: Injection | None = None, gain: flo
     gain = problem.achieved_gain(start) if gain is None else gain
     size = gain if np.isfinite(gain) and gain > 0.0 else 1.0
     a, b, z, zd = problem.closed_loop(start)
-    tail = NORMALISING_SLACK * max(float(np.linalg.norm(z, 2)) ** 2, np.finfo(np.float64).tiny)
+    tail = NORMALISING_SLACK * max(largest_singular_value(z) ** 2, np.finfo(np.float64).tiny)
     p = bounded_real_matrix(a, b, z, zd, NORMALISING_LEVEL * size, slack=tail)
     if p is None:
         p = bounded_real_matrix(a, b[:, :0], z, zd[:, :0], 1.0, slack=tail)

@@ -69,7 +69,7 @@ from obsynth.methods.fault_estimation_filter.prepared_plant import (
 )
 from obsynth.methods.fault_estimation_filter.realisation import notes, realise_filter
 from obsynth.methods.method import Synthesis
-from obsynth.numerics.arrays import FloatArray, as_matrix
+from obsynth.numerics.arrays import FloatArray, as_matrix, largest_singular_value
 from obsynth.numerics.regions import disk
 from obsynth.observers.linear.derived import averaged
 from obsynth.observers.linear.observer import LinearObserver
@@ -290,7 +290,7 @@ def _fast_filters(goal: Goal) -> list[Injection]:
     Noise on every state makes a filter trust its measurements more; little more noise than the least may be paid.
     """
     problem = goal.problem
-    size = float(np.linalg.norm(np.vstack([problem.Bn, problem.Dn]), 2))
+    size = largest_singular_value(np.vstack([problem.Bn, problem.Dn]))
     found: list[Injection] = []
     for share in STATE_NOISE:
         noisier = problem.with_state_noise(share * size)

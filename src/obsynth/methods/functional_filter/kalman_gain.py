@@ -14,7 +14,7 @@ import numpy as np
 from obsynth.analysis.diagnosis.decoupled import DecoupledPlant, decoupled
 from obsynth.errors import PreconditionError, SolverError
 from obsynth.methods.riccati import continuous_solution, riccati_solution
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import FloatArray, largest_singular_value
 from obsynth.numerics.ranks import RANK_TOLERANCE, rank_from
 from obsynth.numerics.scaling import balanced_matrix
 from obsynth.numerics.spectra import abscissa
@@ -202,7 +202,7 @@ def _continuous(
 
 def _size(matrix: FloatArray) -> float:
     """Return the norm of a matrix in the units of its states in which it is least."""
-    return float(np.linalg.norm(balanced_matrix(matrix)[0], 2))
+    return largest_singular_value(balanced_matrix(matrix)[0])
 
 
 def whitening(innovation: FloatArray) -> FloatArray:

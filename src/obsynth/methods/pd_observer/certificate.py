@@ -12,7 +12,7 @@ import numpy as np
 
 from obsynth.methods.pd_observer.checks.certificate import prove_gain
 from obsynth.methods.riccati import continuous_solution
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import FloatArray, largest_singular_value
 from obsynth.numerics.continuous import spectral_abscissa
 from obsynth.numerics.matrix_equations import continuous_lyapunov
 from obsynth.numerics.scaling import balanced_matrix
@@ -83,7 +83,7 @@ def gain_certificate(a: FloatArray, b: Ball, c: FloatArray, gain: float) -> Floa
     """Return P ``(n, n)`` that proves the l2 gain of ``x' = a x + b v``, ``z = c x`` below ``gain``, or ``None``."""
     balanced, units = balanced_matrix(a)
     entering, shown = b.midpoint / units[:, None], c * units
-    weight = max(float(np.linalg.norm(shown, 2)) ** 2, np.finfo(np.float64).tiny)
+    weight = max(largest_singular_value(shown) ** 2, np.finfo(np.float64).tiny)
     spare = None
     for slack in PD_SLACKS:  # the largest that gives a proof
         out = shown.T @ shown + slack * weight * np.eye(len(a))

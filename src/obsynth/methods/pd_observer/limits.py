@@ -10,7 +10,7 @@ from obsynth.analysis.structure import analyse_structure
 from obsynth.errors import InfeasibleError
 from obsynth.methods.pd_observer.method import PdObserver
 from obsynth.methods.pd_observer.realisation import with_sensor_noise
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import FloatArray, largest_singular_value
 from obsynth.numerics.ranks import NEGLIGIBLE_MODE, decide_rank
 from obsynth.numerics.scaling import balanced_matrix, equilibrate_pencil
 from obsynth.plants.descriptor import DescriptorSystem
@@ -26,7 +26,7 @@ def fastest_mode(a: FloatArray) -> float:
     balanced = balanced_matrix(a)[0]
     modes = np.linalg.eigvals(balanced)
     sizes = np.abs(modes)
-    if not np.max(sizes) > NEGLIGIBLE_MODE * float(np.linalg.norm(balanced, 2)):
+    if not np.max(sizes) > NEGLIGIBLE_MODE * largest_singular_value(balanced):
         return 1.0
     damped = modes.real < -WELL_DAMPED * sizes
     # What is not damped sets the pace; where all is damped or at rest, the slowest mode does.
@@ -117,4 +117,4 @@ def least_noise_gain(plant: DescriptorSystem) -> float:
     rank = decide_rank(scaled.A, equilibrated=False).rank
     still = scaled.columns[:, None] * np.linalg.svd(scaled.A)[2][rank:].T
     seen, faults = np.hstack([plant.C, plant.Df]) @ still, still[plant.nx :]
-    return float(np.linalg.norm(faults @ np.linalg.pinv(np.linalg.pinv(noise) @ seen), 2)) if still.size else 0.0
+    return largest_singular_value(faults @ np.linalg.pinv(np.linalg.pinv(noise) @ seen)) if still.size else 0.0

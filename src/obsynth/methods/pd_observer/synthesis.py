@@ -42,7 +42,7 @@ from obsynth.methods.pd_observer.limits import default_delta, fastest_mode, requ
 from obsynth.methods.pd_observer.method import PdObserver
 from obsynth.methods.pd_observer.realisation import realise_pd_observer, with_faults_as_states, with_sensor_noise
 from obsynth.methods.riccati import continuous_solution
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import FloatArray, largest_singular_value
 from obsynth.numerics.continuous import spectral_abscissa
 from obsynth.numerics.doubling import EQUATION_TOLERANCE, continuous_riccati_solution
 from obsynth.numerics.ranks import NEGLIGIBLE_SHARE
@@ -200,7 +200,7 @@ def _solved(
         loop[plant.nx :, plant.nx :] = g
     back = np.linalg.inv(loop)
     gain_j, gain_l = (loop @ (states[:, None] * part / outputs) for part in (found.J / unit, found.L))
-    if most is not None and not float(np.linalg.norm(np.hstack([gain_j, gain_l]), 2)) <= most:
+    if most is not None and not largest_singular_value(np.hstack([gain_j, gain_l])) <= most:
         raise SolverError("The gains are very large, and no decay rate was asked for.", record=found.record)
     p3, *p1 = (back.T @ (matrix / states[:, None] / states) @ back for matrix in (found.P3, *found.P1))
     return certified(plant, asked, PdSolution(gain_j, gain_l, tuple(p1), p3, found.record), delta=delta, decay=decay)
@@ -377,7 +377,7 @@ class PdGains:
     @property
     def size(self) -> float:
         """Spectral norm of ``[J L]``."""
-        return float(np.linalg.norm(np.hstack([self.J, self.L]), 2))
+        return largest_singular_value(np.hstack([self.J, self.L]))
 
 
 def certified(

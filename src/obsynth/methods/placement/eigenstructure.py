@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SolverError, SpecError
-from obsynth.numerics.arrays import SMALLEST, ComplexArray, FloatArray
+from obsynth.numerics.arrays import SMALLEST, ComplexArray, FloatArray, largest_singular_value
 from obsynth.numerics.spectra import SAME_POLE, decay_rates, spectrum_error
 
 #: Random starts of the search, and fewer for large pairs; each step costs two Sylvester equations.
@@ -74,11 +74,11 @@ def place(
         return np.zeros((0, outputs)), 1.0
     target = jordan_form(poles)
     rng = np.random.default_rng(STARTS_SEED)
-    size = max(float(np.linalg.norm(f, 2)), SMALLEST)
+    size = max(largest_singular_value(f), SMALLEST)
     distance = np.min(np.abs(np.linalg.eigvals(f)[:, None] - np.asarray(poles)[None, :]))
     first = np.zeros((n, outputs))
     if distance <= OVERLAP * size:
-        first = rng.standard_normal((n, outputs)) * size / max(float(np.linalg.norm(c, 2)), SMALLEST)
+        first = rng.standard_normal((n, outputs)) * size / max(largest_singular_value(c), SMALLEST)
     scale = np.eye(n) if weight is None else weight
     problem = _Sylvester.of((f - first @ c).T, c.T, target, first.T, objective, scale.T @ scale)
     best: tuple[float, FloatArray] | None = None

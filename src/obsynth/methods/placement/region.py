@@ -13,7 +13,7 @@ from obsynth.errors import SolverError, SpecError
 from obsynth.methods.conic import lmi
 from obsynth.methods.placement.kalman import KalmanProblem
 from obsynth.numerics.arguments import is_finite_number
-from obsynth.numerics.arrays import SMALLEST, FloatArray
+from obsynth.numerics.arrays import SMALLEST, FloatArray, largest_singular_value
 from obsynth.numerics.matrix_equations import continuous_lyapunov, discrete_lyapunov
 from obsynth.numerics.spectra import eigenvalues, speeds
 
@@ -155,7 +155,7 @@ def _by_inequality(problem: KalmanProblem, region: Region, *, solver: str) -> tu
     # The drive is left out: the region says how fast the poles must be, and less noise is what is left to ask for.
     entering = inverse @ np.hstack([problem.B, np.zeros((n, problem.background.shape[1]))])
     direct = np.hstack([problem.D, problem.background])
-    size = max(float(np.linalg.norm(estimates, 2)), SMALLEST)
+    size = max(largest_singular_value(estimates), SMALLEST)
     weight = estimates.T @ estimates / size**2 + STATE_WEIGHT * np.eye(n)
     p, y = lmi.symmetric_variable(n), lmi.matrix_variable(n, c.shape[0])
     z = lmi.symmetric_variable(entering.shape[1])

@@ -17,7 +17,7 @@ import numpy as np
 
 from obsynth.analysis.plant_units import PlantUnits
 from obsynth.errors import SpecError
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import FloatArray, largest_singular_value
 from obsynth.numerics.ranks import RANK_TOLERANCE, decide_rank
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
@@ -172,7 +172,7 @@ def paper_decoupling(
         raise SpecError(f"E_sharp E + C_sharp C misses the identity by {np.max(miss):.3g}.", path="E_sharp")
     shown = plant.C @ e_sharp @ plant.Bd
     # Judged against its factors, not against its own norm: it may be nothing but rounding.
-    norms = [float(np.linalg.norm(part, 2)) for part in (plant.C, e_sharp, plant.Bd)] if plant.nd else [1.0]
+    norms = [largest_singular_value(part) for part in (plant.C, e_sharp, plant.Bd)] if plant.nd else [1.0]
     rank = decide_rank(shown, expected=plant.nd, scale=float(np.prod(norms)), equilibrated=False)
     if not rank.full:
         raise SpecError(

@@ -28,7 +28,7 @@ from obsynth.methods.ui_pi_observer.augmented_plant import (
     direct_part,
     paper_decoupling,
 )
-from obsynth.numerics.arrays import ComplexArray, FloatArray, as_matrix
+from obsynth.numerics.arrays import ComplexArray, FloatArray, as_matrix, largest_singular_value
 from obsynth.numerics.pencils import finite_zeros
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, HIDDEN_MODE_TOLERANCE, RANK_TOLERANCE, product_but_rounding
 from obsynth.numerics.scaling import LogBalance
@@ -149,7 +149,7 @@ def _given_decoupling(plant: DescriptorSystem, units: PlantUnits, given: Mapping
 def _own_rate(plant: DescriptorSystem, f: FloatArray) -> float:
     """Return the median speed of the plant's modes; of the pair's where it has none; or its size."""
     structure = structure_of(plant)
-    size = float(np.linalg.norm(f, 2)) if f.size else 0.0
+    size = largest_singular_value(f)
     for values in (structure.finite_eigenvalues, eigenvalues(f)):
         found = speeds(values, plant.dt)
         found = found[np.isfinite(found)]
@@ -262,7 +262,7 @@ def observable_split(f: FloatArray, c: FloatArray, fixed_modes: ComplexArray, *,
     n = f.shape[0]
     units = _balancing(f, c)
     work_f, work_c, basis = f * units / units[:, None], c * units, np.eye(n)
-    size = max(float(np.linalg.norm(work_f, 2)), float(np.linalg.norm(work_c, 2))) if n else 1.0
+    size = max(largest_singular_value(work_f), largest_singular_value(work_c)) if n else 1.0
     waiting = _upper_half(fixed_modes)
     seen = n
     while waiting:

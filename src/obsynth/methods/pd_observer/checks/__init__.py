@@ -14,7 +14,7 @@ import numpy as np
 from obsynth.methods.pd_observer.checks.certificate import fitting_claims, proof_rows, stacked_gains
 from obsynth.methods.pd_observer.conditions import pd_observer_conditions
 from obsynth.methods.pd_observer.realisation import PdErrorSystem, solved, with_faults_as_states, with_sensor_noise
-from obsynth.numerics.arrays import ComplexArray, FloatArray
+from obsynth.numerics.arrays import ComplexArray, FloatArray, largest_singular_value
 from obsynth.numerics.continuous import spectral_abscissa
 from obsynth.numerics.norms import HinfNorm
 from obsynth.numerics.ranks import RANK_TOLERANCE, rounding_rank
@@ -310,4 +310,4 @@ def _gain_rows(design: ObserverDesign, errors: PdErrorSystem) -> Iterator[Check]
 def _size(matrix: FloatArray) -> float:
     if not np.all(np.isfinite(matrix)):
         return float("inf")
-    return float(np.linalg.norm(matrix, 2)) if matrix.size else 0.0
+    return largest_singular_value(matrix)

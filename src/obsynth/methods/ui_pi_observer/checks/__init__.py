@@ -15,7 +15,7 @@ from obsynth.methods.ui_pi_observer.checks.decoupling import decoupling_norm
 from obsynth.methods.ui_pi_observer.checks.fault_response import tracking_rows
 from obsynth.methods.ui_pi_observer.conditions import existence_conditions
 from obsynth.methods.ui_pi_observer.pencils import numbers
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import FloatArray, largest_singular_value
 from obsynth.numerics.spectra import (
     DOUBLE_DIGITS,
     PRINTED_DIGITS,
@@ -263,7 +263,7 @@ def noise_rows(design: ObserverDesign) -> Iterator[Check]:
             source="recomputed, Lyapunov equation",
             detail="outputs in their own units"
             + ("" if plant.dt else "; times the root of the sample time in s")
-            + (f"; besides, y enters fhat directly by {float(np.linalg.norm(direct, 2)):.3g}" if direct.any() else ""),
+            + (f"; besides, y enters fhat directly by {largest_singular_value(direct):.3g}" if direct.any() else ""),
         )
     elif np.any(np.isnan(unit)):
         text = "H2 norm from white noise on every output to a fault estimate"

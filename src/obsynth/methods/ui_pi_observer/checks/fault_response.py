@@ -17,7 +17,7 @@ from obsynth.analysis.plant_units import PlantUnits
 from obsynth.analysis.zeros import is_outside, leading_names, system_pencil, system_zeros, zeros_with_directions
 from obsynth.errors import SpecError
 from obsynth.methods.ui_pi_observer.pencils import number
-from obsynth.numerics.arrays import ComplexArray, FloatArray
+from obsynth.numerics.arrays import ComplexArray, FloatArray, largest_singular_value
 from obsynth.numerics.norms import balanced_realisation, response
 from obsynth.numerics.ranks import NEGLIGIBLE_INPUT
 from obsynth.numerics.spectra import boundary_points, decay_rates
@@ -108,7 +108,7 @@ def _constants(phi: FloatArray, row: FloatArray, *, shift: float) -> int:
     if not part.size:
         return 0
     balanced = balanced_transition(part)[0]
-    reach = CONSTANT * float(np.linalg.norm(balanced, 2))
+    reach = CONSTANT * largest_singular_value(balanced)
     return int(np.sum(np.abs(np.linalg.eigvals(balanced) - shift) <= reach))
 
 
