@@ -11,9 +11,8 @@ from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.numerics.newton import ScaledMatrix
 from obsynth.numerics.ranks import IDENTIFIABLE_SHARE, NAMED_SHARE, SINGULAR_CONDITION, covariance_factor, is_definite
-from obsynth.plants.dae.checks import checked_inputs, finite_vector, step_length
 from obsynth.plants.dae.functions import DAEFunctions
-from obsynth.plants.dae.model import DAEModel
+from obsynth.plants.dae.model import DAEModel, checked_inputs, finite_vector, step_length
 from obsynth.plants.dae.step import ImplicitStep
 
 #: A start and one step.

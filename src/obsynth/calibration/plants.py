@@ -38,8 +38,7 @@ from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.dae.symbols import symbolic_value, symbols_of
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.noise_model import UNKNOWN_NUMBER, noise_state, offset_state, seconds
-from obsynth.plants.sequences import INDEX_NAME, MatrixSequence
-from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.plants.time_varying import INDEX_NAME, MatrixSequence, TimeVaryingDescriptorSystem
 from obsynth.plants.validation import index_of
 
 #: Deviation of an initial state that is not stated, as a share of its nominal size.

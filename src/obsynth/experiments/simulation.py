@@ -31,8 +31,7 @@ from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.windows import WindowObserver
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.sequences import MatrixSequence
-from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.plants.time_varying import MatrixSequence, TimeVaryingDescriptorSystem
 from obsynth.plants.validation import index_of
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.dae import simulate_dae

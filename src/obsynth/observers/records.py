@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import is_number, real_array, real_number
 from obsynth.numerics.arrays import FloatArray, as_matrix, unmasked
-from obsynth.plants.dae.checks import finite_vector
+from obsynth.plants.dae.model import finite_vector
 from obsynth.plants.validation import index_of, suggestion
 
 #: The fields of an observer that hold names.

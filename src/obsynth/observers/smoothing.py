@@ -38,7 +38,7 @@ from obsynth.observers.recursive.observer import (
 )
 from obsynth.observers.recursive.step_model import StepMatrices, right_side, stacked_noise
 from obsynth.observers.unknown_inputs import taken_inputs
-from obsynth.plants.dae.checks import checked_inputs
+from obsynth.plants.dae.model import checked_inputs
 
 
 class Lesson(NamedTuple):

@@ -12,9 +12,8 @@ from obsynth.numerics import lazy_casadi as ca
 from obsynth.numerics.arguments import is_whole
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.numerics.ranks import covariance_factor
-from obsynth.plants.dae.checks import checked_inputs, finite_vector, step_length
 from obsynth.plants.dae.functions import Compiled, DAEFunctions, take_samples
-from obsynth.plants.dae.model import DAEModel
+from obsynth.plants.dae.model import DAEModel, checked_inputs, finite_vector, step_length
 from obsynth.plants.dae.step import ImplicitStep, onto_constraint
 from obsynth.simulation.signals import Trajectory
 

@@ -11,8 +11,7 @@ import flint
 from flint import arb_mat, fmpq_mat, fmpz_poly
 
 from obsynth.numerics.ranks import RankDecision
-from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.exact_numbers import DECISIVE
+from obsynth.plants.descriptor import DECISIVE, DescriptorSystem
 from obsynth.proofs.exact_arithmetic import (
     blocks,
     holds_computed,

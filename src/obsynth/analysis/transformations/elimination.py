@@ -45,8 +45,7 @@ from obsynth.numerics.sparse import (
     sparse_factor,
     unmatched_instead,
 )
-from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.exact_numbers import note_source
+from obsynth.plants.descriptor import DescriptorSystem, note_source
 from obsynth.plants.uncertainty import ELIMINATED
 from obsynth.plants.validation import listed
 from obsynth.proofs.exact_arithmetic import holds_computed

@@ -18,8 +18,7 @@ from obsynth.numerics.libraries import on_one_thread_if_small
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE
 from obsynth.numerics.scaling import balanced_matrix, power_of_two_below
 from obsynth.numerics.sparse import dense
-from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.exact_numbers import note_source
+from obsynth.plants.descriptor import DescriptorSystem, note_source
 from obsynth.plants.uncertainty import SAMPLED
 
 #: Fault zeros of a sampled plant between this radius and 1 make the fault estimate ring for long.

@@ -23,8 +23,8 @@ from obsynth.observers.estimates import Estimates
 from obsynth.observers.progress import shown_progress
 from obsynth.observers.records import measured_record
 from obsynth.observers.unknown_inputs import require_inputs
-from obsynth.plants.dae.checks import checked_inputs
 from obsynth.plants.dae.functions import Compiled, take_samples
+from obsynth.plants.dae.model import checked_inputs
 
 #: Samples in one call of the C: a tenth of a second or less, so that progress shows and memory stays small.
 SAMPLES_PER_CALL = 10_000

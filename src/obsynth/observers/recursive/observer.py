@@ -69,8 +69,7 @@ from obsynth.observers.recursive.step_model import (
 )
 from obsynth.observers.running import StepObserver, named_estimates
 from obsynth.observers.unknown_inputs import TakenInputs, held_inputs, no_inputs, require_inputs, taken_inputs
-from obsynth.plants.sequences import MatrixSequence
-from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.plants.time_varying import MatrixSequence, TimeVaryingDescriptorSystem
 
 Form: TypeAlias = Literal["innovation", "literal", "random-walk"]
 Guard: TypeAlias = Literal["regularise", "directional", "none"]

@@ -24,8 +24,7 @@ from obsynth.numerics.square_root_estimation import (
     projected_step,
     projection_of,
 )
-from obsynth.plants.sequences import MatrixSequence
-from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.plants.time_varying import MatrixSequence, TimeVaryingDescriptorSystem
 
 #: From so many rows on the noise that stays the same is brought to a triangle once, and only what moves is added to it.
 MANY_ROWS = 100

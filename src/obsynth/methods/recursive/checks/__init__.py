@@ -46,8 +46,7 @@ from obsynth.observers.recursive.gain_schedule_summary import (
 from obsynth.observers.recursive.observer import RecursiveObserver, observer_from_options
 from obsynth.observers.recursive.step_model import StepMatrices
 from obsynth.observers.running import plain_recursion
-from obsynth.plants.sequences import MatrixSequence
-from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.plants.time_varying import MatrixSequence, TimeVaryingDescriptorSystem
 from obsynth.plants.validation import listed
 from obsynth.proofs.balls import Ball, rounded_up
 from obsynth.proofs.contraction import Contraction, column_norms, prove_contraction, proved_rate
