@@ -85,6 +85,22 @@ def test_what_the_entries_leave_open_is_no_rounding() -> None:
     np.testing.assert_allclose(first, turned, rtol=0, atol=1e-12)
 
 
+@pytest.mark.parametrize("weight", [1.0, 3e7])
+def test_exponents_are_found_where_weights_are_large(weight: float) -> None:
+    """A dense E of 800 states weighs 640,000: rounding of it was as large as what makes the exponents unique."""
+    rng = np.random.default_rng(0)
+    matrix, left, right = rng.normal(size=(40, 40)), 10.0 ** rng.uniform(-6, 6, 40), 10.0 ** rng.uniform(-6, 6, 40)
+    sizes = []
+    for given in (matrix, left[:, None] * matrix * right):
+        problem = LogBalance(80)
+        problem.add(given, range(40), range(40, 80), weight=weight)
+        exponents = problem.solve()
+        sizes.append(np.log2(np.abs(given)) + exponents[:40, None] + exponents[40:])
+    assert np.sqrt(np.mean(sizes[0] ** 2)) < 3.0
+    # A ridge of 1e-11, over weights of one, moves exponents of about 20 by this.
+    np.testing.assert_allclose(*sizes, rtol=0, atol=2e-10)
+
+
 @pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="OpenBLAS's kernels of x86-64")
 def test_a_gain_set_that_one_processor_made_another_verifies(capfd: pytest.CaptureFixture[str]) -> None:
     assert kernels.compare_designs(("Haswell", "Nehalem"), ["sharepasand/spec"]) == 0

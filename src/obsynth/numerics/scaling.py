@@ -171,8 +171,10 @@ def _row_peaks(matrix: FloatArray) -> FloatArray:
 
 #: Makes the factors unique where nothing determines them; too small to move them elsewhere.
 RIDGE = 1e-11
-#: Weight of a wish, which decides only what the entries leave open.
-WISH_WEIGHT = 1e-8
+#: Rounding of the largest weight may be this share of the ridge: corrections of the solution then gain two digits each.
+ROUNDED_RIDGE = 1.0 / 64.0
+#: Weight of a wish in units of the ridge: it decides only what the entries leave open.
+WISH_WEIGHT = 1e3
 #: An entry this many bits below one has half a say: what is far below is coupling that hardly counts, or rounding.
 HALF_SAY = 10.0
 #: Corrections by exact residuals, each of which takes four or five digits of rounding away.
@@ -218,6 +220,9 @@ class LogBalance:
     def solve(self, *, passes: int = PASSES, ridge: float = RIDGE, whole: bool = False) -> FloatArray:
         """Return the exponents ``(count,)``, rounded to whole numbers where these are wanted."""
         weights = [term.weights for term in self._terms]
+        # Of hundreds of states with a dense E the weights are so large that their rounding would be the ridge.
+        largest = sum(max(float(w.sum(axis=k).max(initial=0.0)) for k in (0, 1)) for w in weights)
+        ridge = max(ridge, largest * float(np.finfo(np.float64).eps) / ROUNDED_RIDGE)
         solved, found = self._solved(weights, ridge)
         for _ in range(passes):
             weights = [term.weights * term.say(found) for term in self._terms]
@@ -243,7 +248,7 @@ class LogBalance:
             if term.common is not None:
                 sums.add(slice(term.common, term.common + 1), missed.reshape(1, -1))
         for unknown, exponent in self._wishes:
-            wished = WISH_WEIGHT * (exponent - found[unknown : unknown + 1])
+            wished = WISH_WEIGHT * ridge * (exponent - found[unknown : unknown + 1])
             sums.add(slice(unknown, unknown + 1), wished[:, None])
         return sums.total()
 
@@ -269,8 +274,8 @@ class LogBalance:
                 right[term.common] -= _in_turn(sizes.reshape(-1))
                 diagonal[term.common] += _in_turn(weight.reshape(-1))
         for unknown, exponent in self._wishes:
-            normal[unknown, unknown] += WISH_WEIGHT
-            right[unknown] += WISH_WEIGHT * exponent
+            normal[unknown, unknown] += WISH_WEIGHT * ridge
+            right[unknown] += WISH_WEIGHT * ridge * exponent
         solved = _factored(normal, definite=ridge >= SMALL_RIDGE)
         return solved, solved(right)
 
