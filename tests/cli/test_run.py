@@ -131,7 +131,7 @@ BAD_LOGS = {
     "a missing column": (["time,u1,u2,x2,x3", "0,0,0,0,0"], "no column 'x4'"),
     "a missing time": (["u1,u2,x2,x3,x4", "0,0,0,0,0"], "no column 'time'"),
     "a repeated column": (["time,u1,u2,x2,x3,x4,x4", "0,0,0,0,0,0,0"], "more than one column 'x4'"),
-    "a word before any number": ([HEADER, "0,0,0,high,0,0"], "Row 1, column 'x2': 'high' is no number"),
+    "words alone": ([HEADER, "0,0,0,high,0,0"], "The column 'x2' holds no number: row 1 has 'high'"),
     "a number with its unit": ([HEADER, ROWS[0], "1,0,0,5 m,0,0"], "Row 2, column 'x2': '5 m' is no number"),
     "a decimal comma": ([HEADER, ROWS[0], '1,0,0,"1,5",0,0'], "Row 2, column 'x2': '1,5' is no number"),
     "too many cells": ([HEADER, ROWS[0], ROWS[1] + ",7"], "log.csv cannot be read"),

@@ -94,10 +94,21 @@ def test_inputs_faults_and_states_are_of_the_same_moment():
         assert np.abs(estimated - values)[-100:].max() > 1e-2, name
 
 
-def test_they_wait_for_the_fault_estimate_after_missing_rows():
+def test_after_missing_rows_they_are_those_after_rows_without_signals():
     design = designed(0.1)
     table, _ = simulated(design, 0.1)
     found = run_on_data(design, table.drop(index=[100, 101]).reset_index(drop=True)).table
+    table.loc[[100, 101], table.columns[1:]] = np.nan
+    blank = run_on_data(design, table).table.drop(index=[100, 101]).reset_index(drop=True)
+    pd.testing.assert_frame_equal(found, blank)
+    assert np.isfinite(found["xhat[power]"][100:]).all()
+
+
+def test_they_wait_for_the_fault_estimate_after_too_many_missing_rows():
+    design = designed(0.1)
+    table, _ = simulated(design, 0.1)
+    table.loc[100:, "time"] += 2000.0
+    found = run_on_data(design, table).table
     assert np.isnan(found["xhat[power]"][100])
     assert np.isfinite(found["xhat[power]"][101:]).all()
 

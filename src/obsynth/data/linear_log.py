@@ -250,10 +250,11 @@ class LinearLogObserver(LogObserver):
                     self._restart()
             first = self.z is None
             if good and first:
-                self.z, self.settled_at, self.phase = np.zeros(self.observer.order), time + self.warm_up, WARM_UP
-                self.known_from = time + max(self.warm_up, self.transient)
+                self.z, self.phase = np.zeros(self.observer.order), WARM_UP
+                self.settled_at = self._after(time, self.warm_up)
+                self.known_from = self._after(time, max(self.warm_up, self.transient))
                 if self.begun:
-                    self.clear_at = time + max(self.warm_up, self.transient)
+                    self.clear_at = self.known_from
                 self.begun = True
                 self.inputs = self.inputs[:0]
                 seconds = 0.0
@@ -268,8 +269,8 @@ class LinearLogObserver(LogObserver):
                     # adds is no larger than what is left of the start then, and goes with it.
                     self.settled_at += since * missing / (missing + 1)
                     if self.phase != WARM_UP or time >= self.settled_at:
-                        self.settled_at, self.phase = time + recovered, RECOVERING
-                    self.clear_at = time + max(self.warm_up, self.transient)
+                        self.settled_at, self.phase = self._after(time, recovered), RECOVERING
+                    self.clear_at = self._after(time, max(self.warm_up, self.transient))
                 status = OK if time >= self.settled_at else self.phase
             else:
                 found, status = self._unmeasured(seconds, u, values), GAP
@@ -443,17 +444,14 @@ class LinearLogObserver(LogObserver):
             self.z = np.asarray(transition @ _running(self.z) + constant @ self.v + ramp @ (v - self.v))
 
     def _bridge_interval(self, seconds: float, missing: int, u: FloatArray) -> None:
-        """Cross the rows that are not there; in continuous time, up to and including this row's time."""
+        """Cross the rows that are not there, in continuous time up to and including this row's time; start again where
+        they are too many."""
         if self.z is None:
             return
         if missing > LONGEST_BRIDGE:
             self._restart()
             return
         nothing = np.full_like(self.v, np.nan)
-        if self.observer.dt > 0.0:
-            for _ in range(missing):
-                self._unmeasured(0.0, self.v[: self.nu], nothing)
-            return
         begin, part = self.v[: self.nu].copy(), seconds / (missing + 1)
         for i in range(missing + 1):
             share = (i + 1) / (missing + 1)

@@ -39,6 +39,8 @@ MOST_STALE = 10
 SURE_SHARE = 0.009
 #: Without another word, an interval is a gap when it is longer than this many times the longest one before.
 GAP_FACTOR = 10.0
+#: Waiting ends with a sample that rounding, of this share of dt, calls earlier; without dt, of so many roundings.
+SETTLING_SLACK, SETTLING_ULPS = 1e-6, 4.0
 #: A gap of more samples than this cannot be counted in double precision.
 MOST_COUNTED_SAMPLES = 2.0**53
 
@@ -48,7 +50,7 @@ class Row(NamedTuple):
 
     status: str  # ``ok``, ``warm-up``, ``partial``, ``gap`` or ``recovering``
     values: FloatArray  # one for each column of the observer; deviations, NaN where nothing is known
-    skipped: int = 0  # how many rows were missing before this one
+    skipped: int = 0  # how many rows were missing before this one that nothing stands for
     evidence: Evidence | LinearSample | None = None  # what was learnt from this row, for decisions
     settled: bool = True  # whether nothing is left of gaps: bounds that are never passed hold
     # What a gap has left in each value of a row that is recovering, where the model missed by no more all through it
@@ -57,6 +59,9 @@ class Row(NamedTuple):
     bridged: bool = False  # whether the plant's model stood in for all that was missing since the warm-up
     time: float = math.nan  # in seconds
     deviations: FloatArray | None = None  # ``(nu + ny,)`` as read
+    at: float = math.nan  # the time of its sample since the first one; of continuous designs that of its stamp
+    # Rows of a sampled design that were missing before this one: as the observer went through them, without signals.
+    missed: tuple[Row, ...] = ()
 
 
 class Clock:
@@ -68,6 +73,21 @@ class Clock:
         self.last: float | None = None
         self.longest = 0.0
         self.stamp, self.away, self.left_out = -math.inf, 0.0, 0
+        # Of sampled designs: the number of the last sample, from that of the first row.
+        self.count = 0
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what goes from row to row, as data."""
+        return {name: getattr(self, name) for name in ("last", "longest", "stamp", "away", "left_out", "count")}
+
+    def resume(self, data: Mapping[str, Any]) -> None:
+        """Go on from what `as_dict` returned."""
+        vars(self).update(data)
+
+    def at(self, time: float, before: int = 0) -> float:
+        """Return the time of the last sample, with this stamp, or of one so many before it: sampled designs count
+        samples, whatever their stamps are off by."""
+        return (self.count - before) * self.dt if self.dt > 0.0 else time
 
     def advance(self, time: float, row: int) -> tuple[float, int]:
         """Take the stamp of the next row."""
@@ -84,6 +104,7 @@ class Clock:
         step = interval(last, time)
         missing = self._sampled(step, row) if self.dt > 0.0 else self._continuous(step, row)
         self.last = time
+        self.count += missing + 1
         if self.dt > 0.0:
             away = step - (missing + 1) * self.dt
             # Regular stamps are taken as they are, and not as they are summed up.
@@ -128,6 +149,7 @@ class Clock:
         """Take stamps that `regular` found to follow each other, with their intervals."""
         self.last, self.longest = times[-1], max(self.longest, *steps)
         self.stamp, self.left_out, self.away = times[-1], 0, 0.0
+        self.count += len(times)
 
     def _sampled(self, step: float, row: int) -> int:
         count = _counted(step / self.dt, step, row)
@@ -212,8 +234,17 @@ class LogObserver(ABC):
 
     @abstractmethod
     def take(self, time: float, values: FloatArray, *, seconds: float, missing: int, longest: float) -> Row:
-        """Take one row: its time, deviations ``(nu + ny,)``, how many seconds and missing rows are between it and the
-        row before, and the longest interval so far."""
+        """Take one row: its time (of a sampled design that of its sample), deviations ``(nu + ny,)``, how many seconds
+        and missing rows are between it and the row before, and the longest interval so far."""
+
+    def follows(self, missing: int) -> bool:
+        """Whether rows that are missing are taken one by one, as if they stood in the log without signals."""
+        return self.dt > 0.0 and missing <= LONGEST_BRIDGE
+
+    def _after(self, time: float, seconds: float) -> float:
+        """Return from when on ``seconds`` after a time are over."""
+        slack = SETTLING_SLACK * self.dt if self.dt > 0.0 else SETTLING_ULPS * math.ulp(abs(time) + seconds)
+        return time + seconds - slack
 
     @property
     def takes_pieces(self) -> bool:

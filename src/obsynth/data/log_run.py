@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -276,26 +276,33 @@ class LogRun:
     def estimates(self, times: Sequence[float], values: FloatArray) -> list[Row]:
         """Return the estimates at rows as they come, deviations ``values (rows, nu + ny)``; those whose stamps do not
         rise are left out."""
-        found: list[Row] = []
+        found, at = list[Row](), list[float]()
         complete = np.asarray(np.isfinite(values).all(axis=1))
         while (done := len(found)) < len(times):
             status = self.clock.stale(times[done])
             if status:
                 found.append(Row(status, np.full(len(self.observer.columns), np.nan)))
+                at.append(math.nan)
                 continue
             if self.observer.takes_pieces and complete[done]:
                 bad = np.flatnonzero(~complete[done : done + ROWS_AT_ONCE])
                 end = done + (int(bad[0]) if bad.size else ROWS_AT_ONCE)
                 intervals = self.clock.regular(times[done:end])
-                taken = self.observer.take_piece(times[done:end], values[done:end], intervals) if intervals else []
+                own = [self.clock.at(time, -i) for i, time in enumerate(times[done : done + len(intervals)], 1)]
+                taken = self.observer.take_piece(own, values[done:end], intervals) if intervals else []
                 if taken:
                     self.clock.take(times[done : done + len(taken)], intervals[: len(taken)])
                     found += taken
+                    at += own[: len(taken)]
                     continue
             found.append(self._single(times[done], values[done], self.rows + done + 1))
+            at.append(self.clock.at(times[done]))
         self.rows += len(found)
         self.first.take_rows(times, values)
-        return [row._replace(time=time, deviations=v) for row, time, v in zip(found, times, values, strict=True)]
+        return [
+            row._replace(time=time, deviations=v, at=own)
+            for row, time, v, own in zip(found, times, values, at, strict=True)
+        ]
 
     def _single(self, time: float, values: FloatArray, number: int) -> Row:
         """Take one row; one that is refused leaves nothing behind, so that a run may go on after it."""
@@ -303,7 +310,13 @@ class LogRun:
         before = [dict(vars(part)) for part in parts]
         try:
             seconds, missing = self.clock.advance(time, number)
-            return self.observer.take(time, values, seconds=seconds, missing=missing, longest=self.clock.longest)
+            missed = tuple(self._missed(time, missing)) if missing and self.observer.follows(missing) else ()
+            if self.clock.dt > 0.0:
+                missing -= len(missed)
+                seconds = (missing + 1) * self.clock.dt
+            own, longest = self.clock.at(time), self.clock.longest
+            row = self.observer.take(own, values, seconds=seconds, missing=missing, longest=longest)
+            return row._replace(missed=missed) if missed else row
         except ObsynthError as error:
             for part, kept in zip(parts, before, strict=True):
                 vars(part).update(kept)
@@ -314,6 +327,14 @@ class LogRun:
                 error.path = place
             error.args = (f"Row {number}: {error}",)
             raise
+
+    def _missed(self, time: float, missing: int) -> Iterator[Row]:
+        """Take rows of a sampled design that are missing before one, as if they stood in the log without signals."""
+        nothing = np.full(len(self.signals.names), np.nan)
+        for before in range(missing, 0, -1):
+            at = self.clock.at(time, before)
+            row = self.observer.take(at, nothing, seconds=self.clock.dt, missing=0, longest=self.clock.longest)
+            yield row._replace(time=time, deviations=nothing, at=at)
 
     def finish(self) -> list[list[Any]]:
         """Return the rows of output that waited for what does not come any more."""
@@ -340,6 +361,8 @@ class LogRun:
     def _recovered_in(self, row: Row) -> FloatArray:
         if self.recovered is None or row.status in STALE:
             return np.full(0 if self.recovered is None else len(self.recovered.columns), np.nan)
+        for missed in row.missed:
+            self.recovered.take(missed)
         return self.recovered.take(row)
 
     def _decided(self, row: Row, values: FloatArray, number: int, before: Sequence[Any]) -> list[Any]:
@@ -362,12 +385,9 @@ class LogRun:
         cells: list[Any] = []
         undecided = not deciding and not above
         if self.monitor is not None:
-            deciding = deciding and (row.settled or not self.monitor.guarantees)
-            if self.monitor.rule.bridges and row.bridged:
-                deciding = row.status in (*DECIDING, RECOVERING)
-            residuals, faults = row.values[self._residuals], row.values[self._faults]
-            sample = Sample(time, residuals, faults, self._evidence(row), deciding, row.skipped, row.bridged)
-            self._watching, seen = self.monitor.step(self._watching, sample)
+            for missed in row.missed:
+                self._watching, _ = self.monitor.step(self._watching, self._sample(self.monitor, missed))
+            self._watching, seen = self.monitor.step(self._watching, self._sample(self.monitor, row))
             more = seen.more or (math.nan,) * len(self.monitor.columns)
             cells = [*(np.array(more) + self._shifts).tolist(), seen.statistic, seen.threshold]
             undecided = math.isnan(seen.statistic) and (undecided or not self._levels)
@@ -386,6 +406,14 @@ class LogRun:
         if undecided:
             self.events.silent[row.status if row.status not in DECIDING else NO_DECISION] += 1
         return [*cells, "; ".join(names)]
+
+    def _sample(self, monitor: Monitor, row: Row) -> Sample:
+        """Return what a monitor takes of a row."""
+        deciding = row.status in DECIDING and (row.settled or not monitor.guarantees)
+        if monitor.rule.bridges and row.bridged:
+            deciding = row.status in (*DECIDING, RECOVERING)
+        residuals, faults = row.values[self._residuals], row.values[self._faults]
+        return Sample(row.at, residuals, faults, self._evidence(row), deciding, row.skipped, row.bridged)
 
     def _excess(self, row: Row, column: int) -> float:
         """Return by how much more than its level a column must be for an alarm: infinite where nothing is decided."""
@@ -407,7 +435,8 @@ class LogRun:
     def as_dict(self) -> dict[str, Any]:
         """Return the state that goes from row to row, as data."""
         return {
-            "observer": {"last": self.clock.last, "longest": self.clock.longest, **self.observer.as_dict()},
+            "observer": self.observer.as_dict(),
+            "clock": self.clock.as_dict(),
             "recovered": None if self.recovered is None else self.recovered.as_dict(),
             "inputs": None if self.stamps is None else self.stamps.earlier,
             "numeric": None if self.stamps is None else sorted(self.stamps.numeric),
@@ -419,7 +448,7 @@ class LogRun:
         if (data["monitor"] is None) != (self.monitor is None):
             raise SpecError("The saved state is of a run with another monitor: use the same options.", path="state")
         self.observer.resume(data["observer"])
-        self.clock.last, self.clock.longest = data["observer"]["last"], data["observer"]["longest"]
+        self.clock.resume(data["clock"])
         if self.stamps is not None:
             self.stamps.earlier, self.stamps.numeric = data["inputs"], set(data["numeric"])
         if self.recovered is not None:

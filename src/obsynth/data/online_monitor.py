@@ -252,33 +252,34 @@ def _said(design: ObserverDesign, run: LogRun, log: FloatArray) -> _Said:
     """Return what a design says of rows ``(n, 1 + nu + ny)``."""
     nothing = np.full(len(watched_names(design)), np.nan)
     residuals = [i for i, name in enumerate(run.observer.columns) if name.startswith("r[")]
-    numbers, times, rows, refused = list[int](), list[float](), list[FloatArray](), list[FloatArray]()
-    squares, scores, walk = list[float](), list[Scores](), parameter_walk(design.observer)
+    found, refused = list[tuple[int, float, FloatArray, float, Scores]](), list[FloatArray]()
+    walk, taken = parameter_walk(design.observer), 0
     faults = len(design.observer.fault_names)
     before, silent = before_any(faults), Scores(np.zeros(faults), np.zeros((faults, faults)))
     settling = settling_rows(design)
     gate = run.observer if isinstance(run.observer, SteppingLogObserver) and run.observer.gates else None
-    for count, row in enumerate(_rows(run, log, CHUNK_ROWS if gate is None else 1)):
+    for count, last in enumerate(_rows(run, log, CHUNK_ROWS if gate is None else 1)):
         if gate is not None:
             refused.append(gate.state.refused)
-        if row.status in STALE:
-            continue
-        said = watched_values(row.values[residuals], row.evidence)
-        if row.status not in DECIDING or count < settling:
-            said = None
-        # Longer gaps than the statistics look back are all the same.
-        missing = min(row.skipped, max(AGES))
-        rows += [nothing] * missing + [nothing if said is None else said]
-        square, score = np.nan, silent
-        if walk is not None and isinstance(row.evidence, Evidence):
-            before, score = sample_score(before, row.evidence, walk, row.skipped + 1)
-        if said is not None and isinstance(row.evidence, Evidence) and np.isfinite(said).all():
-            own = row.evidence.whitened
-            square = float(np.mean(own**2)) if own.size else np.nan
-        squares += [np.nan] * missing + [square]
-        scores += [silent] * missing + [score]
-        times += [row.time] * (missing + 1)
-        numbers += [count] * (missing + 1)
+        # Rows that are missing are among those that a monitor takes.
+        for row in () if last.status in STALE else (*last.missed, last):
+            said = watched_values(row.values[residuals], row.evidence)
+            taken += 1
+            if row.status not in DECIDING or taken <= settling:
+                said = None
+            square, score = np.nan, silent
+            if walk is not None and isinstance(row.evidence, Evidence):
+                before, score = sample_score(before, row.evidence, walk, row.skipped + 1)
+            if said is not None and isinstance(row.evidence, Evidence) and np.isfinite(said).all():
+                own = row.evidence.whitened
+                square = float(np.mean(own**2)) if own.size else np.nan
+            # Longer gaps than the statistics look back are all the same.
+            missing = min(row.skipped, max(AGES))
+            found += [(count, row.time, nothing, np.nan, silent)] * missing
+            found.append((count, row.time, nothing if said is None else said, square, score))
+        if len(last.missed) > max(AGES):
+            del found[-1 - len(last.missed) : -1 - max(AGES)]
+    numbers, times, rows, squares, scores = zip(*found, strict=True) if found else ((),) * 5
     both = [np.array(part) for part in zip(*((one.score, one.information) for one in scores), strict=True)]
     return _Said(
         np.array(numbers),

@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from obsynth.data.log_estimator import GAP, LONGEST_BRIDGE, OK, PARTIAL, RECOVERING, WARM_UP, LogObserver, Row
+from obsynth.data.log_estimator import GAP, OK, PARTIAL, RECOVERING, WARM_UP, LogObserver, Row
 from obsynth.errors import ObsynthError, SolverError, SpecError
 from obsynth.experiments.monitors.learned import innovation_names
 from obsynth.experiments.monitors.monitor import Evidence
@@ -58,6 +58,10 @@ class SteppingLogObserver(LogObserver):
         self.chain: Chain | None = None
         self.state: Any = self.observer.init()
         self.u: FloatArray | None = None
+
+    def follows(self, missing: int) -> bool:
+        """Whether rows that are missing are taken one by one: always where the plant changes with k."""
+        return super().follows(missing) or not self.may_restart
 
     def _begin(self) -> None:
         """Start the observer again."""
@@ -113,19 +117,17 @@ class SteppingLogObserver(LogObserver):
             # A nonlinear model has no zero to begin with: it begins when all inputs are known.
             return Row(GAP, np.full(len(self.columns), np.nan), missing)
         u, y = (np.where(known, values, np.nan)[part] for part in (slice(nu), slice(nu, None)))
-        if missing > LONGEST_BRIDGE and self.may_restart:
+        if missing:
             self._begin()
             fresh = True
-        else:
-            fresh = self._bridged(missing) or fresh
         total = self.state.refused[1]
         found, spoiled, restarted = self._found(y, u, may_restart=self.may_restart and not fresh)
         self.u, fresh = self._begun(u), fresh or restarted
         if fresh:
-            self.settled_at, self.phase = time + self.warm_up, WARM_UP
-        elif nu and (missing or not known[:nu].all()):
+            self.settled_at, self.phase = self._after(time, self.warm_up), WARM_UP
+        elif nu and not known[:nu].all():
             # A step took inputs that nobody measured.
-            self.settled_at = time + self.warm_up
+            self.settled_at = self._after(time, self.warm_up)
             self.phase = WARM_UP if self.phase == WARM_UP else RECOVERING
         # A filter that begins with y(1) does not miss y(0).
         received = (known[nu:] & ~self._refused(total)) | ~self.observer.timing.expected(self.state.k - 1)
@@ -137,18 +139,6 @@ class SteppingLogObserver(LogObserver):
     def _refused(self, total: FloatArray) -> np.ndarray:
         """Return which outputs of the last sample were left out as outliers: of which more are than before it."""
         return np.asarray(self.state.refused[1] > total) & (self.observer.outliers == "gate")
-
-    def _bridged(self, missing: int) -> bool:
-        """Take samples of which nothing is known; return whether the observer had to start again."""
-        for _ in range(0 if self.u is None else missing):
-            try:
-                self._required(np.full(len(self.input_names), np.nan))
-            except ObsynthError:
-                if not self.may_restart:
-                    raise
-                self._begin()
-                return True
-        return False
 
     def _found(self, y: FloatArray, u: FloatArray, *, may_restart: bool) -> tuple[Evidence, bool, bool]:
         """Take one sample; return also whether its outputs were left out, and whether the observer started again."""

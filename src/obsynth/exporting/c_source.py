@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from obsynth.data.log_estimator import SETTLING_SLACK
 from obsynth.errors import SpecError
 from obsynth.experiments.monitors.learned_levels import AGES, DISTINGUISHED, FORGETTING, HOLD, LEAST_ADDED, MODEL_SHARE
 from obsynth.exporting.realisation import Alarms, Realisation
@@ -346,6 +347,7 @@ def source_text(found: Realisation, prefix: str, header: str, alarms: Alarms) ->
                 f"#define SOLVED {int(gap.solved)}",
                 f"#define STRAIGHT {int(found.straight)}",
                 f"#define WARM_UP_SECONDS {alarms.warm_up!r}",
+                f"#define SETTLING_SLACK {SETTLING_SLACK!r}",
                 f"#define LEFT_SHARE ((REAL){gap.left_share!r})",
                 "enum {",
                 *(f"    {name} = {value}," for name, value in _sizes(found).items()),

@@ -20,6 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
+from obsynth.data.log_estimator import SETTLING_SLACK
 from obsynth.errors import ObsynthError, SpecError
 from obsynth.experiments.monitors.learned import LearnedThresholds, watched_names
 from obsynth.experiments.monitors.learned_levels import parameter_walk
@@ -112,6 +113,7 @@ def dae_c_texts(design: ObserverDesign, prefix: str, header: str, alarms: Alarms
             f"#define observer {inner}",
             *([f"#define waiting {prefix}_observer"] if inner != f"{prefix}_observer" else []),
             f"#define WARM_UP_SECONDS {alarms.warm_up!r}",
+            f"#define SETTLING_SLACK {SETTLING_SLACK!r}",
             "",
             observer_code(observer.steps),
             "#include <stddef.h>",

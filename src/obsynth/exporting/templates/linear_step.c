@@ -390,6 +390,12 @@ static int unmeasured(PREFIX_state *s, const REAL *u, const int *unsure, REAL *s
 #endif
 }
 
+/* Whether so many seconds are over: with the sample that only rounding calls earlier. */
+static int is_after(double time, double from, double seconds)
+{
+    return time >= from + seconds - SETTLING_SLACK * UPPER_DT;
+}
+
 /* A complete sample. */
 static int measured(PREFIX_state *s, const REAL *v, REAL *states, REAL *shown)
 {
@@ -461,7 +467,7 @@ static int measured(PREFIX_state *s, const REAL *v, REAL *states, REAL *shown)
     if (was_gap) {
         s->is_gap = 0;
         /* The initial-condition response settles in as many measured samples as without a gap. */
-        if (s->phase != UPPER_WARM_UP || s->time >= s->from + s->warm_up) {
+        if (s->phase != UPPER_WARM_UP || is_after(s->time, s->from, s->warm_up)) {
             s->from = s->time;
             s->waiting = waiting;
             s->phase = UPPER_RECOVERING;
@@ -474,7 +480,7 @@ static int measured(PREFIX_state *s, const REAL *v, REAL *states, REAL *shown)
         return held(s, states, shown);
     }
     waiting = s->phase == UPPER_RECOVERING ? s->waiting : s->warm_up;
-    s->status = s->time >= s->from + waiting ? UPPER_OK : s->phase;
+    s->status = is_after(s->time, s->from, waiting) ? UPPER_OK : s->phase;
 #if MODEL
     grow(s);
 #endif
