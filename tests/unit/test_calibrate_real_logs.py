@@ -212,6 +212,32 @@ def test_the_record_of_another_simulator_has_its_own_start_and_no_delay_that_it_
     assert found.box.holds(true)
 
 
+def test_coloured_noise_that_process_noise_stands_for_is_found() -> None:
+    """Two vessels: process noise made the innovations of both gauges white, 43 nats below a state for the noise."""
+    rng, dt, rows, kept = np.random.default_rng(0), 0.5, 300, 0.9
+    inflow = np.repeat(rng.uniform(0.2, 1.0, rows // 25), 25)
+    load = np.repeat(rng.uniform(0.5, 1.2, rows // 60), 60)
+    x, e, found = np.array([2.0, 1.0]), 0.0, []
+    for k in range(rows):
+        for _ in range(10 if k else 0):
+            flow = 0.6 * np.sqrt(x[0] - x[1])
+            x = x + dt / 10 * np.array([inflow[k] - flow, (flow - 0.5 * load[k] * np.sqrt(x[1])) / 2])
+        e = kept * e + np.sqrt(1 - kept**2) * rng.standard_normal()
+        found.append([x[0] + 0.03 * e, x[1] + 0.01 * rng.standard_normal()])
+    model = DAEModel(
+        {"first": "der(h1) = inflow - c * sqrt(h1 - h2)",
+         "second": "2 * der(h2) = c * sqrt(h1 - h2) - d * load * sqrt(h2)"},
+        {"upper": "h1", "lower": "h2"}, states={"h1": 2.0, "h2": 1.0}, inputs={"inflow": 0.6, "load": 1.0},
+        constants={"c": 0.55, "d": 0.55},
+    )  # fmt: skip
+    upper, lower = np.array(found).T
+    log = {"time": dt * np.arange(rows), "inflow": inflow, "load": load, "upper": upper, "lower": lower}
+    fit = calibrate(model, log, {"c": (0.4, 0.9), "d": (0.3, 0.7)}, starts=1, input_delay=0, offset={})
+    assert list(fit.sensor_noise) == ["upper"]
+    assert 2.0 < fit.sensor_noise["upper"]["correlation"] < 10.0  # AR(.9) of 0.5 s: 4.75 s
+    assert fit.R["lower"] == pytest.approx(1e-4, rel=0.25)
+
+
 @pytest.mark.long
 def test_coloured_noise_with_outliers_is_found_beside_a_load_that_walks() -> None:
     """A motor whose load nobody measures: the search ended at a correlation as long as the log, 26 nats below the best,

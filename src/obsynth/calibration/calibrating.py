@@ -28,6 +28,7 @@ from obsynth.calibration.diagnostics import (
     SIGNIFICANT,
     STANDS_OUT,
     BoolArray,
+    mean_off,
     regression_gain,
     standing_out,
     usual_size,
@@ -108,15 +109,20 @@ _STATE_SENTENCES = {
 
 
 def _asking(problem: Problem, fit: InnovationsFit) -> set[tuple[str, str]]:
-    """Return kinds and names that innovations ask for: sensors whose innovations are not white, offsets that explain
-    more of them than constants can, unknown inputs."""
+    """Return kinds and names that innovations ask for: coloured noise of a sensor where those of one are not white or
+    an equation has process noise, which may stand for it; offsets that explain more of them than constants can; unknown
+    inputs."""
     found = {("walk", name) for name in problem.plant.unknown_inputs}
     names, ny = problem.output_names, len(problem.output_names)
     whitened = np.where(np.isfinite(problem.y), fit.whitened, np.nan)
+    coloured = [whiteness(column).probability < SIGNIFICANT for column in whitened.T]
+    # Process noise that stands for coloured noise whitens that sensor: the next one pays for it, or none does.
+    # A mean is no colour, but a bias.
+    hidden = any(coloured) or not np.all(fit.limited_Q)
     found |= {
         ("coloured", name)
-        for name, column in zip(names, whitened.T, strict=True)
-        if whiteness(column).probability < SIGNIFICANT
+        for name, own, column in zip(names, coloured, whitened.T, strict=True)
+        if own or (hidden and not mean_off(column))
     }
     v = fit.v
     before = _whitened(problem, v, problem.y)
