@@ -81,3 +81,17 @@ def test_structure_does_not_hang_on_units(seed: int) -> None:
         here, there = (np.asarray(getattr(found, name)) for found in (first, second))
         # Those found exactly are rounded for printing, each in its own unit of time.
         np.testing.assert_allclose(rate * here, there, rtol=LAST_DIGIT, atol=0.0, err_msg=name)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_elimination_does_not_hang_on_units(seed: int) -> None:
+    # In units that differ by a million E looked singular, and the plant was refused as one of index 3.
+    rng = np.random.default_rng([54, seed])
+    e = np.eye(6) + np.diag(np.round(rng.uniform(-0.5, 0.5, 5), 2), 1)
+    a = np.round(rng.normal(size=(6, 6)) * (rng.uniform(size=(6, 6)) < 0.6), 2)
+    a[-1, -1] = 1.0
+    if seed % 2:
+        e[-1, -1] = 0.0
+    plant = obsynth.DescriptorSystem(e, a, C=np.eye(1, 6), Bf=np.eye(6, 1))
+    found = [obsynth.eliminate_algebraic_states(own).plant for own in (plant, in_other_units(plant, seed)[0])]
+    assert found[0].nx == found[1].nx

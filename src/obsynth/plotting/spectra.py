@@ -11,14 +11,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from obsynth.analysis.zeros import fault_zeros
+from obsynth.analysis.zeros import fault_zeros, regularity_of
 from obsynth.errors import SpecError
 from obsynth.methods.registry import REGISTRY, method_class
 from obsynth.methods.ui_pi_observer.pencils import equilibrated
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.modal_response import resolved
 from obsynth.numerics.norms import response
-from obsynth.numerics.pencils import pencil_structure
 from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.numerics.spectra import boundary_points, eigenvalues
 from obsynth.observers.linear.derived import frequency_grid
@@ -308,7 +307,7 @@ def _delayed(observer: LinearObserver, points: ComplexArray) -> ComplexArray:
 
 def _state_response(plant: DescriptorSystem, b: FloatArray, points: ComplexArray) -> ComplexArray:
     """Return a state for each input: of a plant that is not regular one of many, which its estimates cannot tell."""
-    if pencil_structure(plant.E, plant.A).regular:
+    if regularity_of(plant)[0]:
         try:
             return np.concatenate([*resolved(plant.E, plant.A, b, points)])
         except np.linalg.LinAlgError:

@@ -190,9 +190,9 @@ def index_one_on_box(plant: DescriptorSystem) -> BoxVerdict:
     """Return whether ``[E_dyn; A_alg](q)`` is nonsingular on the box; `PreconditionError` where rows become dynamic."""
     written = plant.uncertainty
     if written is None:
-        from obsynth.numerics.pencils import pencil_structure
+        from obsynth.analysis.zeros import structure_of
 
-        index = pencil_structure(plant.E, plant.A).index
+        index = structure_of(plant).index
         return BoxVerdict("proved" if index is not None and index <= 1 else "refuted", 0, np.zeros(0))
     numbers = as_written(plant, written)
     affine = written.affine(numbers, written.box)

@@ -13,6 +13,7 @@ from typing import Any, NoReturn
 
 import numpy as np
 
+from obsynth.analysis.plant_units import PlantUnits
 from obsynth.analysis.transformations.exact_elimination import MOST_STATES_EXACTLY, exact_elimination, rounded_once
 from obsynth.analysis.transformations.recovery import (
     RecoveryOperator,
@@ -23,10 +24,11 @@ from obsynth.analysis.transformations.recovery import (
     with_states,
     without_rounding,
 )
+from obsynth.analysis.zeros import in_own_units, structure_of
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.libraries import one_thread_if_small
-from obsynth.numerics.pencils import GENERIC_POINTS, pencil_structure
+from obsynth.numerics.pencils import GENERIC_POINTS
 from obsynth.numerics.ranks import NAMED_SHARE, RANK_TOLERANCE, but_rounding, product_but_rounding, rounding_rank
 from obsynth.numerics.scaling import equilibrate_pencil, power_of_two_below
 from obsynth.numerics.sparse import (
@@ -400,7 +402,7 @@ def eliminated_exactly(plant: DescriptorSystem, basis: FloatArray | None = None)
 
 def dynamic_coordinates(plant: DescriptorSystem) -> FloatArray | None:
     """Return the basis ``(nx, count)`` of dynamic states that elimination takes; ``None`` for given states."""
-    count = rounding_rank(equilibrate_pencil(plant.E, plant.A).E)
+    count = rounding_rank(in_own_units(plant)[0])
     return None if int(np.sum(plant.E.any(axis=0))) == count else _coordinates(plant, count)[1]
 
 
@@ -455,7 +457,7 @@ def algebraic_coordinates(plant: DescriptorSystem) -> tuple[FloatArray, FloatArr
 
 
 def _dynamic_count(plant: DescriptorSystem) -> int:
-    pencil = pencil_structure(plant.E, plant.A)
+    pencil = structure_of(plant)
     if pencil.index is None:
         raise PreconditionError(
             "The plant is not regular: det(A - zE) is zero for every z, so its equations do not determine the "
@@ -479,18 +481,18 @@ def _dynamic_count(plant: DescriptorSystem) -> int:
 
 def _coordinates(plant: DescriptorSystem, count: int) -> tuple[FloatArray, FloatArray, FloatArray, tuple[str, ...]]:
     """Return row transformation, bases of dynamic and algebraic states, names of the dynamic ones."""
-    pencil = equilibrate_pencil(plant.E, plant.A)
-    left, _, right = np.linalg.svd(pencil.E)
+    units = PlantUnits.of(plant).rounded()
+    left, _, right = np.linalg.svd(in_own_units(plant)[0])
     moving_rows, moving = plant.E.any(axis=1), plant.E.any(axis=0)
     rows = left.T
     if np.sum(moving_rows) == count:
         rows = np.eye(plant.nx)[np.argsort(~moving_rows, kind="stable")]
-    rows = rows * pencil.rows
+    rows = rows * units.equations
     if np.sum(moving) == count:
         order = np.argsort(~moving, kind="stable")
         basis, names = np.eye(plant.nx)[:, order], tuple(plant.state_names[i] for i in order[:count])
     else:
-        basis, names = pencil.columns[:, None] * right.T, tuple(f"xi {i + 1}" for i in range(count))
+        basis, names = units.states[:, None] * right.T, tuple(f"xi {i + 1}" for i in range(count))
     return rows, basis[:, :count], basis[:, count:], names
 
 
