@@ -276,16 +276,16 @@ class LogBalance:
         for unknown, exponent in self._wishes:
             normal[unknown, unknown] += WISH_WEIGHT * ridge
             right[unknown] += WISH_WEIGHT * ridge * exponent
-        solved = _factored(normal, definite=ridge >= SMALL_RIDGE)
+        solved = _factored(normal)
         return solved, solved(right)
 
 
-def _factored(matrix: FloatArray, *, definite: bool) -> Callable[[FloatArray], FloatArray]:
-    """Return what solves equations with a matrix ``(n, n)``, which is factored once; ``definite``: beyond rounding."""
+def _factored(matrix: FloatArray) -> Callable[[FloatArray], FloatArray]:
+    """Return what solves equations with a matrix ``(n, n)``, definite beyond rounding, which is factored once."""
     if not matrix.size:
         return lambda right: right
     matrix = np.asarray_chkfinite(matrix)
-    if definite and len(matrix) >= MANY_UNKNOWNS:
+    if len(matrix) >= MANY_UNKNOWNS:
         factor, failed = lapack.dpotrf(matrix.T, lower=1, clean=0)
         if not failed:
             return lambda right: np.asarray(lapack.dpotrs(factor, right, lower=1)[0], dtype=np.float64)
