@@ -191,3 +191,10 @@ def test_a_condition_number_beyond_a_double_is_no_number():
     )
     with pytest.raises(obsynth.PreconditionError, match=r"condition number above 1e\+14"):
         obsynth.fault_estimation_filter(plant)
+
+
+def test_what_rounding_leaves_of_errors_is_not_printed() -> None:
+    """A mean factor of 1e-10 per step has other digits on every processor."""
+    plant = obsynth.TimeVaryingDescriptorSystem(None, [[0.0, 1.0], [0.0, 0.0]], C=np.eye(2), dt=1.0, horizon=30)
+    told = str(obsynth.descriptor_kalman(plant, Q=1e-3 * np.eye(2), R=1e-20 * np.eye(2)))
+    assert "errors shrink to less than 0.0001 % per step on average" in " ".join(told.split())

@@ -24,7 +24,7 @@ from obsynth import (
 )
 from obsynth.analysis.conditions import Condition
 from obsynth.analysis.existence import named_pencils
-from obsynth.analysis.existence.statements import Evaluator
+from obsynth.analysis.existence.statements import Evaluator, _first_of_the_largest
 from obsynth.analysis.existence.witnesses import EntryChange, Unclear, Witness, rational_matrices
 from obsynth.methods.fault_estimation_filter.conditions import fault_filter_conditions
 from obsynth.methods.functional_filter.conditions import conditions as functional_conditions
@@ -191,11 +191,17 @@ def test_a_no_that_holds_only_exactly_names_the_gain_it_would_take(units: float)
     hidden = made(None, NEARLY_HIDDEN["A"], C=[[units, -units]], Bf=[[1], [0]])
     lost = pd_observer_conditions(hidden)[-1]
     assert (lost.holds, lost.unclear) == (False, None)
-    told = re.search(r"every observer needs a gain of about (\S+) from 'y1' to 'x[12]'", lost.detail)
+    told = re.search(r"every observer needs a gain of about (\S+) from 'y1' to 'x2'", lost.detail)
     assert told is not None
     assert float(told[1]) * units == pytest.approx(1e16, rel=0.2)
     with pytest.raises(PreconditionError, match=r"^No observer of this kind exists: .*detectability"):
         lost.require()
+
+
+def test_of_two_states_that_move_as_much_the_first_is_named() -> None:
+    """Which of two equal shares is larger would hang on the processor."""
+    assert _first_of_the_largest(np.array([0.5, np.nextafter(0.7, 0.0), 0.7])) == 1
+    assert _first_of_the_largest(np.array([0.5, 0.69, 0.7])) == 2
 
 
 def test_what_no_output_holds_anything_of_no_digits_would_show() -> None:

@@ -312,6 +312,8 @@ FOLLOWS = 0.1
 _LABEL = 10
 #: Claims that say what a design is worth; the others are for -v.
 _PROMISES = ("gamma", "decay")
+#: Errors that shrink to less of them in a step are gone within a few, and how much is left is rounding.
+LEAST_CONTRACTION = 1e-6
 
 
 @dataclass(frozen=True)
@@ -458,7 +460,8 @@ def _dynamics(design: ObserverDesign) -> str:
         settling = f"{100.0 * SETTLED_TO:g} % settling time {number(float(f'{seconds:.2g}'))} s"
         return f"{settling}; observer of order {design.observer.order}"
     factor = design.certificate.claims.get("contraction", math.nan)
-    return f"errors shrink to {number(100.0 * factor)} % per step on average; observer of order {design.observer.order}"
+    share = f"less than {100.0 * LEAST_CONTRACTION:g}" if factor < LEAST_CONTRACTION else number(100.0 * factor)
+    return f"errors shrink to {share} % per step on average; observer of order {design.observer.order}"
 
 
 def _speed(design: ObserverDesign, steps: Mapping[str, FaultFigures]) -> Iterator[tuple[str, str]]:

@@ -398,7 +398,7 @@ class Evaluator:
         # What a fault moves is asked for by the fault; a mode by the state that moves most.
         faults = np.arange(len(signals)) >= plant.nx if inputs == "Bf" else np.zeros(len(signals), dtype=bool)
         shares = np.abs(scaled) * (faults if np.any(np.abs(scaled[faults]) > NAMED_SHARE) else ~faults)
-        wanted, shown = int(np.argmax(shares)), int(np.argmax(terms))
+        wanted, shown = _first_of_the_largest(shares), _first_of_the_largest(terms)
         if terms[shown] == 0.0:
             return "No output depends on it: more digits of the data would not help."
         gain = signals[wanted] / (UNIT_ROUNDOFF * terms[shown])
@@ -419,6 +419,15 @@ class Evaluator:
         modes = sorted((*exact.zeros, *nearly), key=lambda value: (value.real, value.imag))
         undetectable = (*exact.outside, *(value for value in nearly if value in seen.outside))
         return replace(exact, zeros=tuple(modes), outside=undetectable).timed(1.0 / rate)
+
+
+#: Shares that differ by less than this, relative to them, are the same but for rounding.
+SAME_SHARE = 1e-6
+
+
+def _first_of_the_largest(shares: FloatArray) -> int:
+    """Return the first place of a largest share: which of two equal ones is larger would hang on rounding."""
+    return int(np.argmax(shares >= (1.0 - SAME_SHARE) * np.max(shares)))
 
 
 Found = TypeVar("Found")
