@@ -11,6 +11,7 @@ from functools import cached_property
 from typing import Any, Literal, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from obsynth.analysis.conditions import Condition, is_doubted, is_refused, rank_condition
 from obsynth.analysis.existence.named_pencils import (
@@ -425,7 +426,7 @@ class Evaluator:
 SAME_SHARE = 1e-6
 
 
-def _first_of_the_largest(shares: FloatArray) -> int:
+def _first_of_the_largest(shares: NDArray[Any]) -> int:
     """Return the first place of a largest share: which of two equal ones is larger would hang on rounding."""
     return int(np.argmax(shares >= (1.0 - SAME_SHARE) * np.max(shares)))
 
