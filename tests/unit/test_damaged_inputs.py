@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import os
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
+from scipy import sparse
 
 import obsynth
 from obsynth.cli.main import main
 from obsynth.data.sources import Dialect
+from obsynth.errors import SpecError
 from obsynth.spec.documents import read_yaml
 
 FMU = """<?xml version="1.0"?><fmiModelDescription fmiVersion="2.0" modelName="m" guid="{x}"><ModelExchange
@@ -83,3 +87,37 @@ def test_options_out_of_their_range_are_refused_where_they_do_nothing_as_well(
 def test_options_of_folders_are_refused_for_one_gain_set(wrong: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["run", "--gains", "g.json", "--data", "log.csv", *wrong]) == 2
     assert f"{wrong[0]} spreads the gain sets of a folder" in capsys.readouterr().err
+
+
+PLANT = obsynth.DescriptorSystem(A=[[1000.0, 1.0], [0.0, -1.0]], B=[[1.0], [1.0]], C=[[1.0, 0.0]])
+
+
+@pytest.mark.parametrize(
+    ("make", "told"),
+    [
+        (lambda: PLANT.replace(A=[[1e155, 0.0], [0.0, 1.0]]), r"A has 1e\+155, but numbers beyond 1e\+100 overflow"),
+        (lambda: PLANT.replace(C=[[1.0, -1e308]]), r"C has -1e\+308"),
+        (lambda: PLANT.replace(A=sparse.csr_array([[1e155, 0.0], [0.0, 1.0]])), r"A has 1e\+155"),
+        (lambda: PLANT.replace(operating_point={"x1": 1e300}), r"operating_point\['x1'\] is 1e\+300"),
+        (lambda: obsynth.TimeVaryingDescriptorSystem(E=None, A=[[1e155]], C=[[1]], dt=1.0), r"A has 1e\+155"),
+        (lambda: PLANT.replace(dt=10**400), "dt is a whole number of about 401 digits: give"),
+        (lambda: obsynth.Step(size=1e200), r"size is 1e\+200"),
+        (lambda: obsynth.Step(size=10**5000), "size is a whole number of about 5001 digits: give"),
+        (lambda: obsynth.Scenario(horizon=9, noise=1e155), r"noise is 1e\+155"),
+        (lambda: obsynth.Scenario(horizon=9, initial_state={"x1": -1e160}), r"initial_state\['x1'\] is -1e\+160"),
+        (lambda: obsynth.Scenario(horizon=9, observer_state=[0.0, 1e160]), r"observer_state has 1e\+160"),
+        (lambda: obsynth.Scenario(horizon=9, observer_state=3), "observer_state must be a list of finite numbers"),
+        (lambda: obsynth.discretise(PLANT, 1.0), r"eigenvalue 1e\+03 1/s\) grows .*more often than every 0.23 s"),
+        (lambda: obsynth.discretise(PLANT.replace(A=-1e99 * np.eye(2)), 1e90), r"A times sample_time is 1e\+189"),
+    ],
+)
+def test_numbers_that_would_overflow_are_refused_by_name(make: Callable[[], object], told: str) -> None:
+    with pytest.raises(SpecError, match=told):
+        make()
+
+
+def test_the_largest_numbers_admitted_do_not_overflow() -> None:
+    plant = obsynth.DescriptorSystem(
+        A=[[0.5e100, 1e100], [0.0, 0.2]], C=[[1e100, 0.0], [0.0, 1e100]], Bf=[[0.0], [1e100]], dt=1.0
+    )
+    obsynth.check(plant)

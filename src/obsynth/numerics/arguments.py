@@ -113,10 +113,17 @@ def _as_float(value: Any) -> float:
         return math.inf
 
 
+#: Whole numbers beyond this are told by their length.
+LONGEST_SHOWN = 10**30
+
+
 def shown(value: Any) -> str:
     """Return a value as it may stand in a message: short, and on one line."""
     if value is None:
         return "missing"
+    if is_whole(value) and abs(value) > LONGEST_SHOWN:
+        # Python refuses to print whole numbers of more than 4300 digits.
+        return f"a whole number of about {int(int(value).bit_length() * math.log10(2.0)) + 1} digits"
     text = repr(value.item() if isinstance(value, np.generic) else value)
     return text if len(text) <= 60 and "\n" not in text else f"a {type(value).__name__}"
 

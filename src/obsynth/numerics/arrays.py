@@ -19,6 +19,9 @@ ComplexArray: TypeAlias = NDArray[np.complex128]
 
 #: Stands for a size that may be zero, where something is divided by it.
 SMALLEST = 1e-300
+#: Numbers of plants and scenarios are at most this: products of three of them, as in gains, norms and covariances of
+#: what was scaled, stay within double precision.
+LARGEST = 1e100
 KEYWORD = Parameter.KEYWORD_ONLY
 Given = ParamSpec("Given")
 Made = TypeVar("Made")
@@ -74,6 +77,17 @@ def holds_truth(value: Any) -> bool:
 def kind_of_entries(dtype: np.dtype[Any]) -> str:
     """Return what an array holds that does not hold real numbers, for a message."""
     return {"b": "booleans", "c": "complex numbers", "U": "text"}.get(dtype.kind, "entries that are no numbers")
+
+
+def require_no_overflow(numbers: Any, what: str, path: str) -> None:
+    """Raise `SpecError` where one of some finite numbers is beyond `LARGEST`; ``what`` has it, as a message says."""
+    given = np.ravel(np.asarray(numbers, dtype=np.float64))
+    if given.size and np.abs(given).max() > LARGEST:
+        raise SpecError(
+            f"{what} {'has' if np.ndim(numbers) else 'is'} {given[int(np.argmax(np.abs(given)))]:.3g}, but numbers "
+            f"beyond {LARGEST:g} overflow where they are multiplied: give it in other units.",
+            path=path,
+        )
 
 
 def as_matrix(value: Any, name: str) -> FloatArray:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
+from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.numerics.sparse import as_sparse_matrix, dense, is_sparse, same_matrix
 from obsynth.plants.uncertainty import UNCERTAIN_MATRICES, Uncertainty, uncertainty_of
 from obsynth.plants.validation import (
@@ -339,7 +339,7 @@ def _noise_of_sensors(
     require_picked(sensor_noise, outputs, what="sensor_noise")
     columns = np.zeros((len(outputs), len(sensor_noise)))
     for column, (name, value) in enumerate(sensor_noise.items()):
-        deviation = float(as_matrix(value, f"sensor_noise[{name!r}]")[0, 0])
+        deviation = float(any_matrix(value, f"sensor_noise[{name!r}]")[0, 0])
         if deviation <= 0.0:
             raise SpecError(
                 f"sensor_noise[{name!r}] is {deviation:g}: give a standard deviation above 0.", path="sensor_noise"

@@ -18,7 +18,7 @@ from obsynth.numerics.arguments import is_finite_number, is_whole
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.numerics.expressions import NAMED_NUMBERS, Expression, parse_expression
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.validation import Problems, checked_dt, checked_labels, checked_names
+from obsynth.plants.validation import Problems, any_matrix, checked_dt, checked_labels, checked_names
 
 #: A matrix, a stack of matrices, a function of k, or rows whose entries may be texts.
 MatrixLike: TypeAlias = ArrayLike | Callable[[int], ArrayLike] | Sequence[Sequence[float | str]] | None
@@ -63,7 +63,7 @@ class MatrixSequence:
             return cls(name, shape, None, entries=entries, constants=known, still=still, moving=moving)
         array = _array(value, name)
         if array.ndim != 3:
-            matrix = as_matrix(value, name)
+            matrix = any_matrix(value, name)
             return cls(name, (matrix.shape[0], matrix.shape[1]), None, values=matrix)
         bad = np.argwhere(~np.isfinite(array[first:]))
         if bad.size:

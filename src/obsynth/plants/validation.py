@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import is_number
-from obsynth.numerics.arrays import FloatArray, as_matrix
+from obsynth.numerics.arguments import is_finite_number, is_number, shown
+from obsynth.numerics.arrays import FloatArray, as_matrix, require_no_overflow
 from obsynth.numerics.sparse import as_sparse_matrix, is_sparse
 
 #: Control characters, halves of pairs, separators of lines and paragraphs: no table can hold them in a name.
@@ -167,7 +167,9 @@ class Problems:
 
 def any_matrix(value: Any, name: str) -> Any:
     """Return a checked read-only matrix: sparse where a sparse one was given, else an array."""
-    return as_sparse_matrix(value, name) if is_sparse(value) else as_matrix(value, name)
+    matrix = as_sparse_matrix(value, name) if is_sparse(value) else as_matrix(value, name)
+    require_no_overflow(matrix.data if is_sparse(matrix) else matrix, name, name)
+    return matrix
 
 
 def matrix_or_picks(value: Any, name: str, states: Sequence[str]) -> Any:
@@ -203,8 +205,9 @@ def checked_dt(dt: Any) -> float:
     """Return a sampling time in seconds, 0 for continuous time."""
     if not is_number(dt):
         raise SpecError(f"dt is {dt!r}: give the sampling time in seconds, or 0 for continuous time.", path="dt")
-    if not np.isfinite(dt) or dt < 0:
-        raise SpecError(f"dt is {dt}: give a sampling time >= 0 in seconds (0 for continuous time).", path="dt")
+    if not is_finite_number(dt) or dt < 0:
+        raise SpecError(f"dt is {shown(dt)}: give a sampling time >= 0 in seconds (0 for continuous time).", path="dt")
+    require_no_overflow(dt, "dt", "dt")
     return float(dt)
 
 
@@ -224,6 +227,7 @@ def _values(given: Mapping[str, float] | None, known: set[str], what: str, kind:
     require_known(given or {}, known, what=what, kind=kind)
     checked = {name: float(as_matrix(value, f"{what}[{name!r}]")[0, 0]) for name, value in (given or {}).items()}
     for name, value in checked.items():
+        require_no_overflow(value, f"{what}[{name!r}]", what)
         if what == "scales" and value == 0.0:
             raise SpecError(f"The scale of {name!r} is 0: give a factor that is not zero.", path="scales")
     return checked

@@ -15,8 +15,8 @@ from typing import Any, ClassVar
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import is_finite_number, is_number, is_whole
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arguments import is_finite_number, is_number, is_whole, real_array, shown
+from obsynth.numerics.arrays import FloatArray, require_no_overflow
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.validation import index_of
 
@@ -38,8 +38,10 @@ class Profile:
             value = getattr(self, item.name)
             if value is None and item.name == "value":
                 continue
-            if not is_number(value) or math.isnan(value) or (math.isinf(value) and item.name != "end"):
-                raise SpecError(f"{item.name} is {value!r}: give a finite number.", path=item.name)
+            if not is_finite_number(value) and not (item.name == "end" and is_number(value) and value == math.inf):
+                raise SpecError(f"{item.name} is {shown(value)}: give a finite number.", path=item.name)
+            if item.name != "end":
+                require_no_overflow(value, item.name, item.name)
         if not self.end > self.start:
             raise SpecError(f"end ({self.end:g} s) is not after start ({self.start:g} s).", path="end")
 
@@ -387,11 +389,12 @@ class Scenario:
         for name in ("horizon", "sample_time"):
             value = getattr(self, name)
             if not (value is None and name == "sample_time") and not (is_finite_number(value) and value > 0.0):
-                raise SpecError(f"{name} is {value!r}: give seconds, a positive number.", path=name)
+                raise SpecError(f"{name} is {shown(value)}: give seconds, a positive number.", path=name)
         if not (is_finite_number(self.noise) and self.noise >= 0.0):
-            raise SpecError(f"noise is {self.noise!r}: give a factor, 0 or more.", path="noise")
+            raise SpecError(f"noise is {shown(self.noise)}: give a factor, 0 or more.", path="noise")
+        require_no_overflow(self.noise, "noise", "noise")
         if not is_whole(self.seed) or self.seed < 0:
-            raise SpecError(f"seed is {self.seed!r}: give a whole number, 0 or more.", path="seed")
+            raise SpecError(f"seed is {shown(self.seed)}: give a whole number, 0 or more.", path="seed")
         for group, kinds in _ALLOWED.items():
             object.__setattr__(self, group, MappingProxyType(_checked_profiles(getattr(self, group), group, kinds)))
         for name in ("sensor_noise", "initial_state"):
@@ -399,9 +402,11 @@ class Scenario:
         if any(value < 0.0 for value in self.sensor_noise.values()):
             raise SpecError("A standard deviation is negative.", path="sensor_noise")
         if self.observer_state is not None:
-            if not all(map(is_finite_number, self.observer_state)):
-                raise SpecError("observer_state must be finite numbers.", path="observer_state")
-            object.__setattr__(self, "observer_state", tuple(map(float, self.observer_state)))
+            state = real_array(self.observer_state, "observer_state")
+            if state.ndim != 1 or not np.isfinite(state).all():
+                raise SpecError("observer_state must be a list of finite numbers.", path="observer_state")
+            require_no_overflow(state, "observer_state", "observer_state")
+            object.__setattr__(self, "observer_state", tuple(state.tolist()))
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Return what makes it again in another process: read-only mappings do not travel."""
@@ -535,5 +540,6 @@ def _checked_numbers(given: Any, name: str) -> dict[str, float]:
         raise SpecError(f"{name} must map names of signals to numbers.", path=name)
     for key, value in given.items():
         if not is_finite_number(value):
-            raise SpecError(f"{key!r} is {value!r}: give a finite number.", path=f"{name}.{key}")
+            raise SpecError(f"{key!r} is {shown(value)}: give a finite number.", path=f"{name}.{key}")
+        require_no_overflow(value, f"{name}[{key!r}]", f"{name}.{key}")
     return {str(key): float(value) for key, value in given.items()}

@@ -11,8 +11,8 @@ from obsynth.analysis.transformations.exact_elimination import MOST_STATES_EXACT
 from obsynth.analysis.transformations.recovery import Transformation, unchanged_states
 from obsynth.analysis.zeros import fault_zeros
 from obsynth.errors import PreconditionError, SpecError
-from obsynth.numerics.arguments import is_finite_number
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arguments import is_finite_number, shown
+from obsynth.numerics.arrays import LARGEST, FloatArray, require_no_overflow
 from obsynth.numerics.continuous import zero_order_hold
 from obsynth.numerics.libraries import on_one_thread_if_small
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE
@@ -49,7 +49,8 @@ def discretise(plant: DescriptorSystem | Transformation, sample_time: float) -> 
     Raises
     ------
     SpecError
-        ``plant.dt > 0``, or ``sample_time`` is not a positive number.
+        ``plant.dt > 0``, or ``sample_time`` is not a positive number, or an unstable mode outgrows double precision
+        within it.
     PreconditionError
         As for `eliminate_algebraic_states`; or continuous white noise reaches an output directly.
 
@@ -62,7 +63,8 @@ def discretise(plant: DescriptorSystem | Transformation, sample_time: float) -> 
     if plant.dt > 0.0:
         raise SpecError(f"The plant is already sampled (dt = {plant.dt:g} s): give a continuous plant.", path="dt")
     if not is_finite_number(sample_time) or not sample_time > 0.0:
-        raise SpecError(f"sample_time is {sample_time}: give a positive number of seconds.", path="sample_time")
+        raise SpecError(f"sample_time is {shown(sample_time)}: give a positive number of seconds.", path="sample_time")
+    require_no_overflow(sample_time, "sample_time", "sample_time")
     first = eliminate_algebraic_states(plant)
     smooth = first.plant
     direct = np.flatnonzero(np.any(smooth.Dw, axis=0))
@@ -75,6 +77,7 @@ def discretise(plant: DescriptorSystem | Transformation, sample_time: float) -> 
             condition="noise without a direct path",
             signals=signals,
         )
+    _require_bounded_growth(smooth.A, float(sample_time))
     transition, held = zero_order_hold(smooth.A, np.hstack([smooth.B, smooth.Bf, smooth.Bd]), sample_time)
     B, Bf, Bd = columns_of(held, (smooth.nu, smooth.nf, smooth.nd))
     factor = _noise_factor(smooth.A, smooth.Bw, sample_time)
@@ -91,6 +94,19 @@ def discretise(plant: DescriptorSystem | Transformation, sample_time: float) -> 
     note_source(smooth, sampled, sample_time=float(sample_time))
     step = Transformation(smooth, sampled, description, recovery)
     return first.then(step.with_tolerances(SAMPLED, sample_time))
+
+
+def _require_bounded_growth(A: FloatArray, sample_time: float) -> None:
+    """Raise `SpecError` where the fastest unstable mode of ``A`` leaves the range of numbers within a sample."""
+    rate = float(np.linalg.eigvals(balanced_matrix(A)[0]).real.max(initial=0.0))
+    if rate * sample_time > math.log(LARGEST):
+        raise SpecError(
+            f"In one sample of {sample_time:g} s an unstable mode (eigenvalue {rate:.3g} 1/s) grows beyond "
+            f"{LARGEST:g}: sample more often than every {math.log(LARGEST) / rate:.2g} s, or look at the signs and "
+            "units of A.",
+            path="sample_time",
+        )
+    require_no_overflow(float(np.abs(A).max(initial=0.0)) * sample_time, "A times sample_time", "sample_time")
 
 
 def sampling_zero_warnings(plant: DescriptorSystem) -> tuple[str, ...]:
