@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
 from obsynth.analysis.conditions import require_all
+from obsynth.analysis.plant_units import PlantUnits
 from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
 from obsynth.errors import SolverError
 from obsynth.methods.detection_filter.conditions import unknown_inputs
@@ -22,6 +24,7 @@ from obsynth.methods.method import Synthesis
 from obsynth.methods.riccati import continuous_solution
 from obsynth.numerics.arrays import FloatArray, largest_singular_value
 from obsynth.numerics.norms import response
+from obsynth.numerics.scaling import power_of_two_below
 from obsynth.numerics.spectra import abscissa
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
@@ -44,7 +47,8 @@ def synthesise(plant: DescriptorSystem, asked: DetectionFilterMethod, *, progres
     found = eliminate_algebraic_states(plant)
     smooth = found.plant if found.description else plant
     progress("choosing the gains")
-    gain, weight = _gains(smooth)
+    units = _OwnUnits.of(smooth)
+    gain, weight = units.given(*_gains(units.scaled(smooth)))
     observer = LinearObserver(
         Az=smooth.A - gain @ smooth.C,
         Bu=smooth.B - gain @ smooth.D,
@@ -62,7 +66,7 @@ def synthesise(plant: DescriptorSystem, asked: DetectionFilterMethod, *, progres
         fault_delays=(),
     )
     felt = error_transfer(smooth, observer, *unknown_inputs(smooth))
-    witness = _gain_witness(felt, 1.0 + PROOF_MARGIN)
+    witness = _gain_witness(felt, 1.0 + PROOF_MARGIN, units)
     if witness is None or not gain_is_proved(felt, 1.0 + PROOF_MARGIN, witness):
         raise SolverError(
             "The Riccati equation of the detection filter has no solution of which a gain can be proved: the slowest "
@@ -88,19 +92,55 @@ def synthesise(plant: DescriptorSystem, asked: DetectionFilterMethod, *, progres
     )
 
 
-def _gain_witness(transfer: Transfer, bound: float) -> FloatArray | None:
+@dataclass(frozen=True, eq=False)
+class _OwnUnits:
+    """Units of states and time of a plant's own, and of outputs in which each has a noise near one: powers of two.
+    Equations are solved in these, so that whether they are solved does not hang on those of the data."""
+
+    states: FloatArray
+    outputs: FloatArray
+    rate: float
+
+    @classmethod
+    def of(cls, plant: DescriptorSystem) -> _OwnUnits:
+        """Return the units of a plant with ``E = I``."""
+        found, direct = PlantUnits.of(plant).rounded(), unknown_inputs(plant)[1]
+        return cls(found.states, 1.0 / power_of_two_below(np.linalg.norm(direct, axis=1)), found.rate)
+
+    def moved(self, a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return dynamics and inputs in these units of states and time."""
+        left = self.rate / self.states[:, None]
+        return left * a * self.states, left * b
+
+    def scaled(self, plant: DescriptorSystem) -> DescriptorSystem:
+        """Return the plant in these units; unknown inputs keep theirs, in which they are as large as one."""
+        (a, bd), bw = self.moved(plant.A, plant.Bd), self.moved(plant.A, plant.Bw)[1]
+        shown = self.outputs[:, None]
+        return plant.replace(
+            A=a, Bd=bd, Bw=bw, C=shown * plant.C * self.states, Dd=shown * plant.Dd, Dw=shown * plant.Dw
+        )
+
+    def given(self, gain: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return L and V in the units of the data."""
+        return self.states[:, None] * gain * self.outputs / self.rate, weight * self.outputs
+
+
+def _gain_witness(transfer: Transfer, bound: float, units: _OwnUnits) -> FloatArray | None:
     """Return the matrix ``(n, n)`` that proves a gain, from a bounded real equation."""
     parts = transfer.dynamics, transfer.B, transfer.C, transfer.D
     a, b, c, d = (part.midpoint for part in parts)
     if not len(a):
         return a
+    (a, b), c = units.moved(a, b), c * units.states
     gap = bound**2 * np.eye(len(c)) - d @ d.T
     # Where nothing drives the errors, the strictness is relative to what the bound leaves room for.
     room = largest_singular_value(a) ** 2 * float(np.linalg.eigvalsh(gap)[0])
     room /= max(largest_singular_value(c) ** 2, np.finfo(np.float64).tiny)
     slack = STRICTNESS * max(largest_singular_value(b @ b.T), room, np.finfo(np.float64).tiny)
     found = continuous_solution(a, c, b @ b.T + slack * np.eye(len(a)), -gap, b @ d.T)
-    return None if found is None or not np.all(np.isfinite(found)) else np.asarray(0.5 * (found + found.T))
+    if found is None or not np.all(np.isfinite(found)):
+        return None
+    return np.asarray(0.5 * (found + found.T) * (units.states[:, None] * units.states / units.rate))
 
 
 def _notes(plant: DescriptorSystem, observer: LinearObserver, claims: Mapping[str, float]) -> tuple[str, ...]:
