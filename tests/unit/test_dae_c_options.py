@@ -93,6 +93,22 @@ def test_outliers_in_c(form, name, tmp_path) -> None:
     assert_same(run_c(design, y, u, tmp_path), expected)
 
 
+def test_a_sample_beside_a_missing_input_is_left_out_however_near_it_is(tmp_path) -> None:
+    """As near as a fault may be, which is believed at once where the inputs are known."""
+    design = tank_observer("augmented-kalman", OPTIONS["sizes"])
+    y, u = leaking(design)
+    whole = design.observer.run(y[:60], u[:60])
+    u[33] = np.nan
+    running = design.observer.start()
+    found = run_c(design, y[:60], u[:60], tmp_path, quick=True)
+    expected = [running.step(*sample) for sample in zip(y[:60], u[:60], strict=True)]
+    states = np.array([said.states[0] for said in expected])
+    assert np.abs(found["states"] - states).max() <= 1e-10
+    assert np.abs(found["states"][:33] - whole.states[:33]).max() <= 1e-10
+    # The sample of 0.5 below moves the first level by more than ten of its deviations.
+    assert whole.states[33, 0] - states[33, 0] < -10.0 * expected[33].state_deviations[0, 0]
+
+
 @pytest.mark.one_in(3)
 @pytest.mark.parametrize("form", FORMS)
 def test_everything_at_once_in_c(form, tmp_path) -> None:

@@ -91,8 +91,8 @@ def robust_advance(
     those further off than so many deviations, and than ``sizes (ny,)`` where these are known.
     ``predicted(state, received, u)``: mean and deviation of each output ``(ny,)`` from the samples that are received;
     ``predicted_outputs(state, u)``: of outputs that determine the state; these may be `BLIND` times further off.
-    ``held (nu,)``, where inputs are missing: as they last were. What these exclude may be wrong, or the inputs have
-    moved: it counts once the next sample goes on with it."""
+    ``held (nu,)``, where inputs are missing: as they last were. What these exclude, by deviations alone, may be wrong,
+    or the inputs have moved: it counts once the next sample goes on with it."""
     failed, mean, reach, far = False, y, y, np.zeros(len(y), dtype=bool)
     least = np.zeros(len(y)) if sizes is None else sizes
     try:
@@ -108,7 +108,9 @@ def robust_advance(
     except (SolverError, np.linalg.LinAlgError, ValueError):
         failed = True
     if not far.any():
-        mean, reach, far = _judged(limit, least, predicted, state, y, u if held is None else held)
+        # Beside a missing input nearer samples wait for the next one as well: no fault is told of in this row.
+        least, u_taken = (least, u) if held is None else (np.zeros(len(y)), held)
+        mean, reach, far = _judged(limit, least, predicted, state, y, u_taken)
     off, gone = np.where(far, y - mean, 0.0), far
     if kind == "gate":
         # A wrong sample stands alone; of a sensor, or a plant, that has moved the next is on the same side, as far off.

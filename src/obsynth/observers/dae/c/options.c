@@ -121,7 +121,7 @@ static int robust(const struct observer *state, const double *u, const double *v
         return 0;
     }
     /* Where inputs are missing, samples are judged by the inputs as they last were: what these exclude may be wrong, or
-       the inputs have moved. It counts once the next sample goes on with it. */
+       the inputs have moved. It counts once the next sample goes on with it, however near it is. */
     for (i = 0; i < LENGTH(NU); i++) {
         none[i] = 0.0;
     }
@@ -131,7 +131,7 @@ static int robust(const struct observer *state, const double *u, const double *v
     for (i = 0; i < NY; i++) {
         int huge = fabs(y[i]) > OVERFLOW_LIMIT;
         double most = OUTLIER_LIMIT * deviation[i];
-        double reach = most < OUTLIER_SIZES[i] ? OUTLIER_SIZES[i] : most;
+        double reach = most < OUTLIER_SIZES[i] && !is_missing ? OUTLIER_SIZES[i] : most;
         double pulled = mean[i] + reach * (y[i] > mean[i] ? 1.0 : -1.0);
         far[i] = fabs(y[i] - mean[i]) > reach || huge;
         off[i] = y[i] - mean[i];
