@@ -51,17 +51,6 @@ class Condition:
         return replace(self, holds=False, unclear=found, detail=f"{self.detail.rstrip()} {found.described(plant)}")
 
 
-def is_refused(conditions: Iterable[Condition]) -> bool:
-    """Whether a condition fails beyond doubt."""
-    return any(not condition.holds and not condition.unclear for condition in conditions)
-
-
-def is_doubted(conditions: Iterable[Condition]) -> bool:
-    """Whether conditions fail, and all that do in doubt."""
-    failed = [condition for condition in conditions if not condition.holds]
-    return bool(failed) and all(condition.unclear for condition in failed)
-
-
 def up_to_failure(conditions: Iterable[Condition]) -> tuple[Condition, ...]:
     """Return conditions in order, up to the first that fails: those after it may rely on it, and are not asked for."""
     found = list[Condition]()

@@ -170,12 +170,6 @@ class Deflation:
     decisions: tuple[RankDecision, ...]
 
 
-def reduce_pencil(pencil: EquilibratedPencil) -> tuple[Deflation, Deflation]:
-    """Deflate the infinite and right singular part, then the left singular part (transposed)."""
-    scales, right = without_infinite_part(pencil)
-    return right, without_left_singular_part(right, scales)
-
-
 def without_infinite_part(pencil: EquilibratedPencil) -> tuple[tuple[float, float], Deflation]:
     """Deflate the infinite and right singular part; the norms of E and A, which decide its ranks, come first."""
     first = full_svd(pencil.E)
@@ -199,10 +193,10 @@ def _deflate(
     decisions: list[RankDecision] = []
     while most_nullity > 0:
         rows, columns = E.shape
-        if first is None and columns > rows:
+        if first is None and (columns > rows or not E.size):
             first = full_svd(E)
         # Most often nothing is left to deflate after the first step: bases are then not needed.
-        values = _singular_values(E) if first is None else first[1]
+        values = np.asarray(np.linalg.svd(E, compute_uv=False)) if first is None else first[1]
         decision = rank_from(values, scale=scales[0], expected=columns)
         # Rows were removed from a matrix of full column rank: this bounds the loss, whatever the tolerance says.
         rank = max(decision.rank, columns - most_nullity)
@@ -229,10 +223,6 @@ def full_svd(matrix: FloatArray) -> _Svd:
         return np.eye(matrix.shape[0]), np.zeros(0), np.eye(matrix.shape[1])
     left, values, right = np.linalg.svd(matrix)
     return left, values, right
-
-
-def _singular_values(matrix: FloatArray) -> FloatArray:
-    return np.asarray(np.linalg.svd(matrix, compute_uv=False)) if matrix.size else np.zeros(0)
 
 
 def normal_rank_of(right: Deflation, left: Deflation) -> int:
@@ -280,8 +270,11 @@ def pencil_structure(E: FloatArray, A: FloatArray) -> PencilStructure:
 
 
 def reduced(E: FloatArray, A: FloatArray) -> tuple[Deflation, Deflation]:
-    """Return what the two passes leave of ``A - z E (m, n)``: all that structure and regularity follow from."""
-    return reduce_pencil(equilibrate_pencil(E, A))
+    """Return what the two passes leave of ``A - z E (m, n)``: all that structure and regularity follow from.
+
+    The infinite and right singular part are deflated first, then, transposed, the left singular part."""
+    scales, right = without_infinite_part(equilibrate_pencil(E, A))
+    return right, without_left_singular_part(right, scales)
 
 
 def structure_of_reduced(shape: tuple[int, ...], passes: tuple[Deflation, Deflation]) -> PencilStructure:
@@ -314,8 +307,9 @@ def finite_zeros(E: FloatArray, A: FloatArray, *, to_the_end: bool = True) -> Fi
         left = without_left_singular_part(right, scales)
         values = _eigenvalues(left.E, left.A)
         return FiniteZeros(values, normal_rank_of(right, left), right.decisions + left.decisions)
-    parts = _square_part(right.E, right.A)
-    candidates, clear = _clearly_no_zeros(parts, scales)
+    basis, square = np.linalg.qr(right.E, mode="complete")
+    turned = basis.T @ right.A
+    candidates, clear = _clearly_no_zeros((square[:columns], turned[:columns], turned[columns:]), scales)
     if np.all(clear) and not to_the_end:
         # Full rank of the columns everywhere.
         return FiniteZeros(_in_pairs(np.zeros(0, dtype=np.complex128)), sum(right.ranks) + columns, right.decisions)
@@ -328,24 +322,14 @@ def finite_zeros(E: FloatArray, A: FloatArray, *, to_the_end: bool = True) -> Fi
         # Singular everywhere: that the pencil is so at a point says nothing.
         return FiniteZeros(found, rank, decisions)
     points = PencilPoints(right.E, right.A, scales)
-    kept = _confirmed_zeros(found, points)
-    return FiniteZeros(_with_missed_zeros(kept, candidates[~clear], points), rank, decisions)
-
-
-def _confirmed_zeros(found: ComplexArray, points: PencilPoints) -> ComplexArray:
-    """Return the computed zeros at which the pencil is singular: a staircase on the verge of a rank invents others."""
+    # A staircase on the verge of a rank invents zeros at which the pencil is not singular.
     upper = [points.confirmed(complex(value)) for value in found if value.imag >= 0.0]
-    return _in_pairs(np.array([value for value in upper if value is not None], dtype=np.complex128))
+    kept = _in_pairs(np.array([value for value in upper if value is not None], dtype=np.complex128))
+    return FiniteZeros(_with_missed_zeros(kept, candidates[~clear], points), rank, decisions)
 
 
 #: Square E and A of a tall pencil in an orthonormal basis of the range of E, and what is beside it.
 _SquarePart: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
-
-
-def _square_part(E: FloatArray, A: FloatArray) -> _SquarePart:
-    basis, square = np.linalg.qr(E, mode="complete")
-    turned, columns = basis.T @ A, E.shape[1]
-    return square[:columns], turned[:columns], turned[columns:]
 
 
 def _with_missed_zeros(found: ComplexArray, candidates: ComplexArray, points: PencilPoints) -> ComplexArray:
@@ -419,13 +403,9 @@ def _by_qz(
     # A distance that is no number leaves the question open.
     still = np.asarray(np.min(open_, axis=1) > TIE * np.min(known, axis=1) + rounding)
     still[np.argmin(open_, axis=0)] = False
-    still &= still[_conjugates(better)]
+    # Pairs follow each other: the other of a pair is beside it.
+    still &= still[np.arange(len(better)) + (better.imag > 0.0) - (better.imag < 0.0)]
     return better, still
-
-
-def _conjugates(values: ComplexArray) -> NDArray[np.int64]:
-    """Return the place of the conjugate of each value, where pairs follow each other."""
-    return np.arange(len(values)) + (values.imag > 0.0) - (values.imag < 0.0)
 
 
 def _candidates(parts: _SquarePart) -> tuple[ComplexArray, NDArray[np.bool_]]:

@@ -138,27 +138,46 @@ def rank_revealing_step(
 ) -> LeastSquaresStep:
     """Solve one step in which x may be undetermined, noise missing, and earlier directions ``unknown (rows, r)``."""
     n = H.shape[1]
+    lengths, q1, q2, head, kept, null = _by_columns(H, unknown)
+    rank = len(head)
+    innovation, carried, rest = _whitened(q1, q2, S, Y, mapped)
+    noise = _triangle(rest.T)[: min(rest.shape)].T if rest.size else np.zeros((rank, 0))
+    solved = _substituted(head, np.hstack([q1.T @ Y - carried, noise])) if rank else np.zeros((0, Y.shape[1]))
+    back = np.zeros((len(lengths), solved.shape[1]))
+    back[kept] = solved
+    back = back / lengths[:, None]
+    found, factor = back[:n, Y.shape[1] :], np.zeros((n, n))
+    compact = _triangle(found.T)[:n].T if found.size else found
+    factor[:, : compact.shape[1]] = compact
+    return LeastSquaresStep(back[:n, : Y.shape[1]], factor, innovation, _basis(null, lengths[:n]))
+
+
+def _by_columns(
+    H: FloatArray, unknown: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, NDArray[np.intp], FloatArray]:
+    """Return the lengths of the columns of ``[H -unknown]``, and of these columns at length one: bases of their range
+    and of what is beside it, the triangle ``(rank, rank)`` with the columns that it is of, and the null space."""
     whole = np.hstack([H, -unknown])
     lengths = np.sqrt(np.einsum("ij,ij->j", whole, whole))
     lengths[lengths == 0.0] = 1.0
     q, r, order = _pivoted(whole / lengths)
     sizes = np.abs(np.diagonal(r))
     rank = int(np.sum(sizes > RANK_TOLERANCE * max(float(sizes[0]), 0.0))) if sizes.size else 0
-    q1, q2, head = q[:, :rank], q[:, rank:], r[:rank, :rank]
-    innovation, carried, rest = _whitened(q1, q2, S, Y, mapped)
-    noise = _triangle(rest.T)[: min(rest.shape)].T if rest.size else np.zeros((rank, 0))
-    solved = _substituted(head, np.hstack([q1.T @ Y - carried, noise])) if rank else np.zeros((0, Y.shape[1]))
-    back = np.zeros((whole.shape[1], solved.shape[1]))
-    back[order[:rank]] = solved
-    null = np.zeros((whole.shape[1], whole.shape[1] - rank))
+    head = r[:rank, :rank]
+    null = np.zeros((len(lengths), len(lengths) - rank))
     if rank and null.shape[1]:
         null[order[:rank]] = -_substituted(head, r[:rank, rank:])
     null[order[rank:]] = np.eye(null.shape[1])
-    back = back / lengths[:, None]
-    found, factor = back[:n, Y.shape[1] :], np.zeros((n, n))
-    compact = _triangle(found.T)[:n].T if found.size else found
-    factor[:, : compact.shape[1]] = compact
-    return LeastSquaresStep(back[:n, : Y.shape[1]], factor, innovation, _basis(null, lengths[:n]))
+    return lengths, q[:, :rank], q[:, rank:], head, order[:rank], null
+
+
+def _parity(q2: FloatArray, S: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, NDArray[np.intp], int]:
+    """Return the sizes ``(rows, 1)`` of the noise in parity, and of that at size one: an orthogonal matrix, a triangle,
+    the order of rows, and how many of them hold noise."""
+    sizes = np.abs(q2.T) @ np.linalg.norm(S, axis=1)
+    sizes[sizes == 0.0] = 1.0
+    turned, triangle, order = _pivoted((q2.T @ S / sizes[:, None]).T)
+    return sizes[:, None], turned, triangle, order, int(np.sum(np.abs(np.diagonal(triangle)) > PERFECT_PARITY))
 
 
 def _pivoted(matrix: FloatArray) -> tuple[FloatArray, FloatArray, NDArray[np.intp]]:
@@ -214,19 +233,16 @@ def _whitened(
     q1: FloatArray, q2: FloatArray, S: FloatArray, Y: FloatArray, mapped: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the whitened parity of Y, what it tells about the rest, and the noise that is left in the rest."""
-    parity, data = q2.T @ S, q2.T @ Y
+    data = q2.T @ Y
     if not q2.shape[1]:
         return data, np.zeros((q1.shape[1], Y.shape[1])), q1.T @ S
-    sizes = np.abs(q2.T) @ np.linalg.norm(S, axis=1)
-    sizes[sizes == 0.0] = 1.0
-    z, t, order = _pivoted((parity / sizes[:, None]).T)
-    rank = int(np.sum(np.abs(np.diagonal(t)) > PERFECT_PARITY))
-    scaled = (data / sizes[:, None])[order]
+    sizes, z, t, order, rank = _parity(q2, S)
+    scaled = (data / sizes)[order]
     lower = t[:rank, :rank].T
     innovation = _substituted(lower, scaled[:rank], lower=True) if rank else np.zeros((0, Y.shape[1]))
     # What is left is free of noise: it must vanish, or the constraints contradict each other.
     left = scaled[rank:] - (t[:rank, rank:].T @ innovation if rank else 0.0)
-    terms = ((np.abs(q2.T) @ np.abs(Y)) / sizes[:, None])[order][rank:]
+    terms = ((np.abs(q2.T) @ np.abs(Y)) / sizes)[order][rank:]
     if mapped:
         _require_consistent(
             np.hstack([np.zeros((len(left), 1)), left[:, mapped:]]),
@@ -325,28 +341,16 @@ def _by_rank(
     H: FloatArray, S: FloatArray, width: int, right: FloatArray, unknown: FloatArray
 ) -> tuple[Gaussian, SmootherGain]:
     """Solve a step in which x may be undetermined, noise may be missing, and earlier directions are unknown."""
-    from scipy.linalg import qr, solve_triangular
-
     n, columns = H.shape[1], right.shape[1]
-    whole = np.hstack([H, -unknown])
-    lengths = np.linalg.norm(whole, axis=0)
-    lengths[lengths == 0.0] = 1.0
-    q, r, order = qr(whole / lengths, pivoting=True)
-    sizes = np.abs(np.diagonal(r))
-    rank = int(np.sum(sizes > RANK_TOLERANCE * max(float(sizes[0]), 0.0))) if sizes.size else 0
-    q1, q2, head = q[:, :rank], q[:, rank:], r[:rank, :rank]
+    lengths, q1, q2, head, places, free = _by_columns(H, unknown)
     white, turned, count = _told_by_parity(q2, S, right)
     rotated = q1.T @ S @ turned
-    solved = np.zeros((whole.shape[1], columns + S.shape[1] - count))
-    if rank:
+    solved = np.zeros((len(lengths), columns + S.shape[1] - count))
+    if len(head):
         data = np.hstack((q1.T @ right + rotated[:, :count] @ white, rotated[:, count:]))
-        solved[order[:rank]] = solve_triangular(head, data)
+        solved[places] = _substituted(head, data)
     solved = solved / lengths[:, None]
     # The part of the solution that is free: x and the coordinates d, in scaled units.
-    free = np.zeros((whole.shape[1], whole.shape[1] - rank))
-    if rank and free.shape[1]:
-        free[order[:rank]] = -solve_triangular(head, r[:rank, rank:])
-    free[order[rank:]] = np.eye(free.shape[1])
     free = np.linalg.qr(free)[0] if free.shape[1] else free
     left, values, right_vectors = np.linalg.svd(free[:n], full_matrices=True)
     kept = int(np.sum(values > RANK_TOLERANCE))
@@ -370,17 +374,11 @@ def _by_rank(
 
 def _told_by_parity(q2: FloatArray, S: FloatArray, right: FloatArray) -> tuple[FloatArray, FloatArray, int]:
     """Return what the parity says of some directions of e, an orthogonal matrix that has these first, their number."""
-    from scipy.linalg import qr, solve_triangular
-
     if not q2.shape[1]:
         return np.zeros((0, right.shape[1])), np.eye(S.shape[1]), 0
-    sizes = np.abs(q2.T) @ np.linalg.norm(S, axis=1)
-    sizes[sizes == 0.0] = 1.0
-    turned, t, order = qr((q2.T @ S / sizes[:, None]).T, pivoting=True)
-    count = int(np.sum(np.abs(np.diagonal(t)) > PERFECT_PARITY))
-    data = (q2.T @ right / sizes[:, None])[order][:count]
-    white = -solve_triangular(t[:count, :count].T, data, lower=True) if count else data
-    return white, turned, count
+    sizes, turned, t, order, count = _parity(q2, S)
+    data = (q2.T @ right / sizes)[order][:count]
+    return (-_substituted(t[:count, :count].T, data, lower=True) if count else data), turned, count
 
 
 def stepped_back(later: Gaussian, back: SmootherGain) -> Gaussian:

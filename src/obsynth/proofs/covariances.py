@@ -80,16 +80,16 @@ def _enclosed(a: Any, b: Any, dt: float, size: float) -> Any | None:
         states, power = inverse * states * inverse.transpose() * flint.arb(2.0 * size), inverse * (one + a)
     for _ in range(MOST_COVARIANCE_DOUBLINGS):
         states, power = states + power * states * power.transpose(), power * power
-        left = _squared_norm(power)
+        left = squared_norm(power)
         if not left.is_finite():
             return None
         if left < flint.arb(2) ** (-flint.ctx.prec):
-            rest = (left * _squared_norm(states).sqrt() / (1 - left)).upper()
+            rest = (left * squared_norm(states).sqrt() / (1 - left)).upper()
             ball = flint.arb(0, rest)
             return states + flint.arb_mat(n, n, [ball] * (n * n))
     return None
 
 
-def _squared_norm(matrix: Any) -> Any:
+def squared_norm(matrix: Any) -> Any:
     """Return the squared Frobenius norm, as a ball."""
     return sum((value * value for value in matrix.entries()), flint.arb(0))

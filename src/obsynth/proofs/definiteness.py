@@ -173,7 +173,7 @@ def _by_preconditioning(ball: Ball) -> DefinitenessProof | None:
 
     C is close to the inverse Cholesky factor, triangular with a nonzero diagonal, hence nonsingular exactly.
     """
-    factor = _cholesky_factor(ball.midpoint)
+    factor = _shifted_factor(ball.midpoint, 0.0)
     if factor is None:
         return None
     try:
@@ -218,10 +218,6 @@ def _factorisation_bound(symmetric: FloatArray) -> float:
     bound = growth * (1.0 + 2.0 * growth) * trace + 2.0 * UNIT_ROUNDOFF * largest
     underflow = 4.0 * size * (2.0 * size + largest) * UNDERFLOW
     return float(rounded_up(np.asarray(bound + underflow), 8))
-
-
-def _cholesky_factor(matrix: FloatArray) -> FloatArray | None:
-    return _shifted_factor(matrix, 0.0)
 
 
 def _shifted_factor(matrix: FloatArray, shift: float) -> FloatArray | None:

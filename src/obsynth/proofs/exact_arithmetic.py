@@ -201,7 +201,7 @@ def stored_matrix(matrix: FloatArray) -> fmpq_mat:
 
 def rational_matrix(rows: FractionRows, columns: int) -> fmpq_mat:
     """Return rows of fractions as a matrix ``(m, columns)``."""
-    return fmpq_mat(len(rows), columns, [_as_fmpq(value) for row in rows for value in row])
+    return fmpq_mat(len(rows), columns, [fmpq(value.numerator, value.denominator) for row in rows for value in row])
 
 
 def fractions_of(matrix: fmpq_mat) -> tuple[tuple[Fraction, ...], ...]:
@@ -222,10 +222,6 @@ def _nearest_double(numerator: int, denominator: int) -> float:
         return numerator / denominator
     except OverflowError:
         return float("inf") if numerator > 0 else float("-inf")
-
-
-def _as_fmpq(value: Fraction) -> fmpq:
-    return fmpq(value.numerator, value.denominator)
 
 
 def _decimal(value: float) -> tuple[str, int]:

@@ -16,11 +16,11 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.proofs.affine import AffineMatrix
 from obsynth.proofs.balls import gamma
+from obsynth.proofs.contraction import positive_vector
 from obsynth.verification.error_structure import ErrorStructure
 from obsynth.verification.responses import (
     OUTWARD,
     Responses,
-    decay_weights,
     power_rounding,
     responses_of,
     same_sample_inverse,
@@ -212,7 +212,8 @@ def _start_table(
         channels, outputs = (start.seen(left @ power) for left in both)
         found.append(np.concatenate([structure.seen(channels), outputs]) * OUTWARD)
         power = structure.Az @ power
-    theta, weights = decay_weights(responses)
+    # ``|Az^L| w <= theta w`` is proved.
+    theta, weights = positive_vector(responses.tail_eps)
     if not len(weights):
         return np.array(found), (0.0, np.zeros(len(found[0])))
     factor = float(np.max(start.size / weights)) * OUTWARD

@@ -81,7 +81,7 @@ def _try_bounded_real(
         return unproved("the certificate cannot be inverted")
 
     def formula(kind: type[Enclosed]) -> Enclosed:
-        return _formed(kind, plant, observer, tracking, factor, inverse, gain, lag)
+        return _formed(kind, plant, observer, tracking, factor, inverse, gain)
 
     return prove_positive_definite(formula)
 
@@ -103,7 +103,6 @@ def _formed(
     factor: FloatArray,
     inverse: FloatArray,
     gain: float,
-    lag: int,
 ) -> Enclosed:
     """Return the matrix of the inequality with the bounds on the errors of forming it."""
     exact = kind.exact

@@ -10,7 +10,7 @@ import numpy as np
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.proofs.balls import gamma
-from obsynth.proofs.contraction import inverse_bound, positive_vector, spectral_radius_bound
+from obsynth.proofs.contraction import inverse_bound, spectral_radius_bound
 from obsynth.verification.error_structure import ErrorStructure
 
 #: A ring of L samples is long enough when ``|Az^L|`` is proved to contract this much.
@@ -161,11 +161,6 @@ def same_sample_inverse(responses: Responses) -> FloatArray:
             condition="same-sample loop",
         )
     return found
-
-
-def decay_weights(responses: Responses) -> tuple[float, FloatArray]:
-    """Return ``theta`` and ``w > 0`` with ``|Az^L| w <= theta w`` proved."""
-    return positive_vector(responses.tail_eps)
 
 
 #: The largest tolerance is found to this share.

@@ -122,7 +122,8 @@ def stored_number_rows(design: ObserverDesign, model: ErrorModel, gamma: float |
                 "stored numbers: states", "the claimed bounds are found again", np.nan, 0.0, source="stored numbers"
             )
         return
-    if any(_exceeds(bound, claimed[name]) for name, bound in zip(_ERROR_WITNESSES, found.bounds, strict=True)):
+    pairs = [(bound, claimed[name]) for name, bound in zip(_ERROR_WITNESSES, found.bounds, strict=True)]
+    if any(told is not None and told.shape == bound.shape and np.any(bound > told) for bound, told in pairs):
         found = found.least(observer)
     columns = (model.state_names, plant.input_names, plant.disturbance_names)
     for kind, name, bound, labels in zip(_WITNESS_SIGNALS, _ERROR_WITNESSES, found.bounds, columns, strict=True):
@@ -133,10 +134,6 @@ def stored_number_rows(design: ObserverDesign, model: ErrorModel, gamma: float |
                 f"stored numbers: {kind}", "there is something to claim", 1.0, 0.0, source="certificate"
             )
     yield from _gain_rows(design, model, gamma)
-
-
-def _exceeds(bound: FloatArray, claimed: FloatArray | None) -> bool:
-    return claimed is not None and claimed.shape == bound.shape and bool(np.any(bound > claimed))
 
 
 def _per_unit(

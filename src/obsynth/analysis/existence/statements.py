@@ -13,7 +13,7 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.analysis.conditions import Condition, is_doubted, is_refused, rank_condition
+from obsynth.analysis.conditions import Condition, rank_condition
 from obsynth.analysis.existence.named_pencils import (
     ROUNDING_LEVEL,
     Distance,
@@ -439,7 +439,10 @@ def reconsidered(
 ) -> Found:
     """Return a decision; a refusal that rests on numbers taken for rounding gives way to the doubt without that."""
     found, exact = decide(judge), judge.plant.exact
-    if judge.numbers is None or exact is None or exact.uncleaned is None or not is_refused(told(found)):
+    if judge.numbers is None or exact is None or exact.uncleaned is None:
+        return found
+    if all(condition.holds or condition.unclear for condition in told(found)):
         return found
     other = decide(replace(judge, plant=judge.plant.replace(exact=exact.before_cleaning())))
-    return other if is_doubted(told(other)) else found
+    failed = [condition for condition in told(other) if not condition.holds]
+    return other if failed and all(condition.unclear for condition in failed) else found

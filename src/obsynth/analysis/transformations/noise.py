@@ -168,7 +168,7 @@ def _of_matrices(
         disturbance_names=[own.disturbance_names[i] for i in left["Bd"]],
         noise_names=(*own.noise_names, *(f"drive of {name}" for name in names)),
         units={**own.units, **_units(own.units, dict(zip(names, (*coloured, *offsets, *loads), strict=True)))},
-        uncertainty=_carried(own, loads, moved, left, len(coloured) + len(offsets)),
+        uncertainty=_carried(own, moved, left, len(coloured) + len(offsets)),
     )
     new = new.replace(sensor_noise=white) if white else new
     spread = np.array([*sizes, *(size for size, _ in offsets.values()), *np.ones(len(loads))])
@@ -199,7 +199,6 @@ def _columns_of(
 
 def _carried(
     plant: DescriptorSystem,
-    loads: Mapping[str, float],
     moved: Sequence[tuple[str, str, int]],
     left: Mapping[str, list[int]],
     first: int,

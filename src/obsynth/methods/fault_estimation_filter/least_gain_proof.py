@@ -21,6 +21,7 @@ import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.proofs.covariances import squared_norm
 from obsynth.proofs.exact_arithmetic import blocks, null_basis, picked_rows, row_basis, stored_matrix, zeros_matrix
 from obsynth.proofs.extended_balls import arb_matrix, undecided_pivot
 from obsynth.results.checks import Check, information
@@ -103,15 +104,15 @@ class InvisiblePairs:
             mixed, later, direct = (arb_matrix(part) for part in (f, last, alone))
             image, top = (_balls(part) * mixed for part in (self.image, self.top))
             slack = image * image.transpose() - top * top.transpose()
-            shown, energy = _square(_balls(self.shown) * mixed), _square(_balls(self.bottom) * mixed)
+            shown, energy = squared_norm(_balls(self.shown) * mixed), squared_norm(_balls(self.bottom) * mixed)
             # Without pairs that start anywhere but at rest, Q is a square.
             if any(value != 0 for value in (self.top * stored_matrix(f)).entries()) and not _definite(slack):
                 return 0.0
             if not free_weight:
                 zd = _balls(self.Zd)
                 seen = _balls(self.Z) + zd * later
-                shown += (seen * slack * seen.transpose()).trace() + _square(zd * direct)
-                energy += (later * slack * later.transpose()).trace() + _square(direct)
+                shown += (seen * slack * seen.transpose()).trace() + squared_norm(zd * direct)
+                energy += (later * slack * later.transpose()).trace() + squared_norm(direct)
             if not energy > 0 or not shown > 0:
                 return 0.0
             return max(float(np.nextafter(float((shown / energy).sqrt().lower()), 0.0)), 0.0)
@@ -157,10 +158,6 @@ def least_gain_row(
 def _definite(matrix: Any) -> bool:
     size = int(matrix.nrows())
     return undecided_pivot([[matrix[i, j] for j in range(size)] for i in range(size)]) is None
-
-
-def _square(matrix: Any) -> Any:
-    return sum((value * value for value in matrix.entries()), flint.arb(0))
 
 
 def _balls(matrix: Any) -> Any:
