@@ -107,3 +107,13 @@ def test_mutants_are_killed_by_tests_that_the_readme_s_command_runs():
         assert found, f"{file}::{path}"
         marks = {ast.unparse(decorator) for node in found for decorator in node.decorator_list}
         assert "pytest.mark.long" not in marks, f"{file}::{path}"
+
+
+def test_what_mutants_replace_stands_in_the_sources():
+    def in_one_line(text: str) -> str:
+        return " ".join(text.split())
+
+    rows = re.findall(r"^\| ([\w/]+\.py) \| `(.+?)` \|", (ROOT / "benchmarks/mutants.md").read_text("utf-8"), re.M)
+    sources = {file: in_one_line((ROOT / "src/obsynth" / file).read_text("utf-8")) for file in {row[0] for row in rows}}
+    assert len(rows) > 100
+    assert [row for row in rows if in_one_line(row[1].replace("\\|", "|")) not in sources[row[0]]] == []

@@ -45,7 +45,7 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
 
 #: What a design claims above the true norm of its filter, tried in turn until the proof goes through.
-ROOMS = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2)
+CLAIMED_ABOVE_NORM = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2)
 
 
 def wang2015(
@@ -288,7 +288,7 @@ def _design(
     if not np.isfinite(norm):
         return design_from_gains(plant, "fault-estimation-filter", **given, gamma=1.0, name=name)
     size = max(norm, float(np.finfo(np.float64).eps) * convex.disturbance_size, float(np.finfo(np.float64).tiny))
-    for room in ROOMS:
+    for room in CLAIMED_ABOVE_NORM:
         found = design_from_gains(plant, "fault-estimation-filter", **given, gamma=(1.0 + room) * size, name=name)
         if found.report.passed:
             break
