@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 from obsynth.methods.fault_estimation_filter.certificate import ROOMS, _with_room
+from obsynth.methods.fault_estimation_filter.injection_problem import _natural_states
+from obsynth.numerics.doubling import FEWEST_STATES
 from obsynth.numerics.norms import hinf_norm
 
 
@@ -21,16 +23,26 @@ def system(seed, n=40, inputs=7):
 @pytest.mark.parametrize("seed", range(3))
 def test_one_solution_of_the_transposed_system_meets_the_inequality(seed):
     a, b, c, d = system(seed)
-    found = [q for q in (_with_room(a, b, c, d, room) for room in ROOMS) if q is not None]
+    found = [q for q in (_with_room(a, b, c, d, 1.0 + more, noise) for more, noise in ROOMS) if q is not None]
     assert found
     q = found[0]
     assert np.all(np.tril(q, -1) == 0.0)
     change = np.linalg.inv(q)
     moved = np.block([[q @ a @ change, q @ b], [c @ change, d]])
     # In coordinates in which P is the identity the system shrinks everything, by the room at least.
-    assert 1.0 - np.linalg.svd(moved)[1][0] ** 2 >= 0.5 * ROOMS[-1]
+    assert 1.0 - np.linalg.svd(moved)[1][0] ** 2 >= 0.5 * ROOMS[-1][0]
 
 
 def test_a_level_below_the_norm_has_no_certificate():
     a, b, c, d = system(0)
-    assert all(_with_room(a, 1.1 * b, c, 1.1 * d, room) is None for room in ROOMS)
+    assert all(_with_room(a, 1.1 * b, c, 1.1 * d, 1.0 + more, noise) is None for more, noise in ROOMS)
+
+
+def test_natural_states_of_many_are_those_in_which_the_system_shrinks():
+    level = 1.3
+    a, b, c, d = system(1, n=FEWEST_STATES, inputs=3)
+    for scale in (1.0, 8.0):
+        states = _natural_states(a, scale * b, c, scale * d, level * scale)
+        inverse = np.linalg.inv(states)
+        moved = np.block([[inverse @ a @ states, inverse @ b / level], [c @ states, d / level]])
+        assert np.linalg.svd(moved)[1][0] < 1.0

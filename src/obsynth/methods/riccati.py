@@ -39,9 +39,9 @@ def stabilising_gain(a: FloatArray, c: FloatArray, noise_a: FloatArray, noise_c:
         return np.zeros((n, 0)) if spectral_radius(a) < 1.0 else None
     process, cross, measured = noise_a @ noise_a.T, noise_a @ noise_c.T, noise_c @ noise_c.T
     best, least = None, 1.0
-    process_size = max(
-        largest_singular_value(noise_a) ** 2, LEAST_PROCESS * largest_singular_value(a) ** 2, LEAST_PROCESS
-    )
+    process_size = max(largest_singular_value(noise_a) ** 2, LEAST_PROCESS)
+    if process_size < LEAST_PROCESS * float(np.linalg.norm(a)) ** 2:  # which is no less than with the largest value
+        process_size = max(process_size, LEAST_PROCESS * largest_singular_value(a) ** 2)
     for epsilon in REGULARISATIONS:
         q = process + epsilon * process_size * np.eye(n)
         size = largest_singular_value(c @ q @ c.T) + largest_singular_value(measured)

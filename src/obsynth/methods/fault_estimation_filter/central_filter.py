@@ -521,7 +521,8 @@ def _follows_from_measurements(problem: GainProblem) -> bool:
     if _combined(problem, -GENERIC_POINTS[1])[1] > SAME_ROWS:
         return False
     # A sample yet to come is a factor of z, and where no weight is free past ones alone are left: a factor of 1 / z.
-    near, far = (_combined(problem, point * max(1.0, spectral_radius(problem.A)))[0] for point in FAR_POINTS)
+    size = max(1.0, spectral_radius(problem.A))
+    near, far = (_combined(problem, point * size)[0] for point in FAR_POINTS)
     return far <= (MOST_FAR_GROWTH if problem.weight_is_free else LEAST_FAR_DECAY) * near
 
 

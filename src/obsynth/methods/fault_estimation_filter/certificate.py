@@ -23,9 +23,10 @@ APPROACHES = ((1.05,), (1.5, 1.05, 1.001))
 TAIL_WEIGHTS = (1e-2, 1e-4, 1e-6, 1e-9, 1e-12, 1e-16, 1e-20)
 #: Slack of the Riccati equation relative to the output weight, largest first: the first that proves is taken.
 FILTER_SLACKS = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10)
-#: What A and B are enlarged by, and noise on every state besides the disturbance, squared, as a share of that; most
-#: first: each is above the rounding of matrices of order 2,000, and that it exceeds the level shows after a few steps.
-ROOMS = (1e-4, 1e-5, 1e-6)
+#: What A and B are enlarged by, and noise on every state besides the disturbance, squared, as a share of that, which
+#: keeps states that it hardly moves from getting lost: most first.  The first leaves a hundred times the rounding of
+#: matrices of order 2,000; that one exceeds the level shows in part of a solution.
+ROOMS = ((1e-4, 1e-7), (1e-5, 1e-8))
 #: Steps towards coordinates in which the norm of the error dynamics is near one: how many, and down to which power.
 MOST_CONTRACTIONS = 60
 STEP_POWER = 0.75
@@ -51,12 +52,11 @@ def bounded_real_certificate(
     c, d = -errors.fault_output[0][:, :core], errors.fault_output[2] / gain
     best, spare = np.eye(core), None
     # Of many states, one solution without other coordinates has room enough, and takes a fifth of the time.
-    for room in ROOMS if core >= FEWEST_STATES and 0 < len(c) <= b.shape[1] else ():
-        found = _with_room(a, b, c, d, room)
-        if (
-            found is not None
-            and prove_bounded_real(plant, observer, tracking, found, gain, lag=lag).in_double_precision
-        ):
+    for more, noise in ROOMS if core >= FEWEST_STATES and 0 < len(c) <= b.shape[1] else ():
+        found = _with_room(a, b, c, d, 1.0 + more, noise)
+        if found is None:
+            continue
+        if prove_bounded_real(plant, observer, tracking, found, gain, lag=lag).in_double_precision:
             return found, True
     for change in islice(_changes(a, b, c, d), tries):
         inverse = np.asarray(np.linalg.inv(change))
@@ -74,17 +74,18 @@ def bounded_real_certificate(
     return (best, False) if spare is None else (spare, True)
 
 
-def _with_room(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, room: float) -> FloatArray | None:
+def _with_room(
+    a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, more: float, noise: float
+) -> FloatArray | None:
     """Return Q, upper triangular, from the transposed system with noise on every state; of no more outputs than inputs.
 
     Where ``Y = A Y A' + B B' + r I + (A Y C' + B D')(I - D D' - C Y C')^-1 (.)'``, the inverse of Y is a P of the
-    bounded real inequality, as strictly as r is large; with A and B a share larger, the inequality has twice that share
-    of each direction's own size left, however slow the states are.
+    bounded real inequality, as strictly as r is large.  With A and B ``more`` times as large it has a share of each
+    direction's own size left, however slow the states are.
     """
     scale = state_units(a, b, c)
     a, b, c = a * scale / scale[:, None], b / scale[:, None], c * scale
-    more = 1.0 + room
-    y = bounded_real_matrix(more * a.T, c.T, more * b.T, d.T, 1.0, slack=room * largest_singular_value(b) ** 2)
+    y = bounded_real_matrix(more * a.T, c.T, more * b.T, d.T, 1.0, slack=noise * largest_singular_value(b) ** 2)
     if y is None:
         return None
     # From the last state to the first: Y = U U', U upper triangular.

@@ -13,6 +13,7 @@ import numpy as np
 from obsynth.errors import SolverError
 from obsynth.methods.riccati import bounded_real_matrix, normalising_change, stabilising_gain
 from obsynth.numerics.arrays import FloatArray, largest_singular_value
+from obsynth.numerics.doubling import FEWEST_STATES
 from obsynth.numerics.modal_response import Modes
 from obsynth.numerics.norms import (
     highest_gain_found,
@@ -20,6 +21,7 @@ from obsynth.numerics.norms import (
     norm_is_at_most,
     output_covariance,
     spectral_radius,
+    state_units,
 )
 
 #: Slack of the bounded real matrix that normalises, relative to the squared norm of what is shown.
@@ -226,11 +228,7 @@ def normalise(problem: GainProblem, *, start: Injection | None = None, gain: flo
     gain = problem.achieved_gain(start) if gain is None else gain
     size = gain if np.isfinite(gain) and gain > 0.0 else 1.0
     a, b, z, zd = problem.closed_loop(start)
-    tail = NORMALISING_SLACK * max(largest_singular_value(z) ** 2, np.finfo(np.float64).tiny)
-    p = bounded_real_matrix(a, b, z, zd, NORMALISING_LEVEL * size, slack=tail)
-    if p is None:
-        p = bounded_real_matrix(a, b[:, :0], z, zd[:, :0], 1.0, slack=tail)
-    states = np.eye(problem.order) if p is None else normalising_change(p)
+    states = _natural_states(a, b, z, zd, NORMALISING_LEVEL * size)
     inverse = np.linalg.inv(states)
     c = problem.C @ states
     measurements = np.linalg.inv(np.linalg.cholesky(c @ c.T)) if problem.measured else np.zeros((0, 0))
@@ -249,6 +247,23 @@ def normalise(problem: GainProblem, *, start: Injection | None = None, gain: flo
         Dn=measurements @ problem.Dn,
     )
     return NormalisedProblem(changed, states, measurements, size, start, gain)
+
+
+def _natural_states(a: FloatArray, b: FloatArray, z: FloatArray, zd: FloatArray, level: float) -> FloatArray:
+    """Return S ``(n, n)``, ``S'PS = I``, for a P of the bounded real inequality at a level, or of Lyapunov's."""
+    if len(a) >= FEWEST_STATES and 0 < len(z) <= b.shape[1]:
+        # The level squared times the inverse of a solution of the transposed system, which takes less time.
+        units = state_units(a, b, z)[:, None]
+        moved, driven = a / units * units.T, b / units
+        tail = NORMALISING_SLACK * largest_singular_value(driven) ** 2
+        y = bounded_real_matrix(moved.T, units * z.T, driven.T, zd.T, level, slack=tail)
+        if y is not None:
+            return np.asarray(units * np.linalg.cholesky(y)) / level
+    tail = NORMALISING_SLACK * max(largest_singular_value(z) ** 2, np.finfo(np.float64).tiny)
+    p = bounded_real_matrix(a, b, z, zd, level, slack=tail)
+    if p is None:
+        p = bounded_real_matrix(a, b[:, :0], z, zd[:, :0], 1.0, slack=tail)
+    return np.eye(len(a)) if p is None else normalising_change(p)
 
 
 def null_basis(matrix: FloatArray) -> FloatArray:
