@@ -429,11 +429,7 @@ def conformal_levels(
     half = len(x) // 2
     model = fitted_autoregression(x[:half])
     found = replace(statistics, model=model)
-    # A row that is missing adds no evidence.
-    runs = found.of_rows(np.nan_to_num(model.whitened(x[None])))
-    if scores is not None:
-        centre = scores.chosen(slice(half)).centre()
-        runs = np.concatenate([runs, _changes(scores, centre)[:, None]])
+    runs = _of_normal(x, found, scores, None if scores is None else scores.chosen(slice(half)).centre())[:, None]
     first, second = (np.moveaxis(part, 1, 0) for part in (runs[..., :half], runs[..., half:]))
     own, _ = _union(first, every, half - SETTLING)
     union = (second / own[None, :, None]).max(axis=1)
@@ -491,7 +487,23 @@ def learned_levels(
         # Beyond what the streams show, levels rise by the same amount for each factor between rates.
         before = level_of(union, seen_rate / OBSERVED)
         level += max(level - before, 0.0) * float(np.log(every / seen_rate) / np.log(OBSERVED))
-    return Levels(read_only(own), level * sure, every > seen_rate)
+    # What lasts longer in these rows than a block raises alarms in them that no stream of blocks shows.
+    itself = (_of_normal(x, statistics, scores) / own[:, None]).max(axis=0)
+    return Levels(read_only(own), max(level * sure, level_of(itself[None], every)), every > seen_rate)
+
+
+def _of_normal(
+    x: FloatArray, statistics: Statistics, scores: Scores | None, centre: FloatArray | None = None
+) -> FloatArray:
+    """Return the statistics of rows ``(n, m)`` without faults as they came, ``(k, n)``, of changes of faults from
+    ``centre``, by default where these rows have them."""
+    # A row that is missing adds no evidence.
+    found = statistics.of_rows(np.nan_to_num(statistics.model.whitened(x[None])))[:, 0]
+    return (
+        found
+        if scores is None
+        else np.concatenate([found, _changes(scores, scores.centre() if centre is None else centre)])
+    )
 
 
 def _union(runs: FloatArray, every: float, total: int) -> tuple[FloatArray, FloatArray]:
