@@ -106,6 +106,16 @@ def test_dates_with_points_have_the_day_first(design, frame, wanted, hour):
     assert found.stamps.shown(found.alarms["fhat[leak]"]).startswith("2026-05-03T08:30")
 
 
+def test_dates_are_written_alike_in_every_row(design, frame, tmp_path):
+    """Dates of whole seconds were written without a fraction, which `pandas.to_datetime` refuses beside others."""
+    stamps = pd.Timestamp("2026-05-03T08:30:00") + pd.to_timedelta(frame["time"], unit="s")
+    for times in (stamps, [f"{stamp:%d.%m.%Y %H:%M:%S},{stamp.microsecond // 1000:03d}" for stamp in stamps]):
+        obsynth.run_on_data(design, frame.assign(time=times), tmp_path / "out.csv")
+        out = pd.read_csv(tmp_path / "out.csv")["time"]
+        assert out.iloc[0] == "2026-05-03T08:30:00.000000"
+        assert (pd.to_datetime(out) == stamps).all()
+
+
 def test_an_index_of_dates_is_the_time(design, frame, wanted):
     index = pd.to_datetime("2026-05-01") + pd.to_timedelta(frame["time"], unit="s")
     log = frame.drop(columns="time").set_index(pd.DatetimeIndex(index).tz_localize("Europe/Berlin"))

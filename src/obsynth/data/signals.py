@@ -27,6 +27,8 @@ _SLASHED = re.compile(r"(\d{1,4})/(\d{1,2})/(\d{1,4})(.*)")
 #: A time of day, with AM or PM where the hours are counted to twelve.
 _CLOCK = re.compile(r"[ T]+(\d{1,2})(:\d{2}\S*?)(?:\s*([AaPp])\.?[Mm]\.?)?")
 _HALF_DAY = 12
+#: A part of a second in a date.
+_FRACTION = re.compile(r":\d{2}[.,]\d")
 #: The part of a date that is larger is its day.
 _MONTHS = 12
 #: Seconds since 1970 reach this in the year 5138: larger numbers count parts of a second.
@@ -56,6 +58,7 @@ class Stamps:
         self.is_dated: bool | None = None
         self.are_missing = False  # of a log without stamps, whose rows are counted by who reads it
         self.zone: tzinfo | None = None  # of the first stamp, `None` where it names none (taken as UTC)
+        self.digits = "auto"  # how dates are written back: with a fraction in every row where the log has one
         self.day_first: bool | None = None  # of dates with slashes, by the first one
         self.per_second: float | None = None  # how many of the numbers of the log are a second, by the first one
         #: Cells that hold a word instead of a number, which are missing, by column: how many; first row and text.
@@ -99,11 +102,14 @@ class Stamps:
                 self.is_dated = False
                 return float(self.seconds(np.array([seconds]))[0])
         if self.is_dated is not False:
+            text_of_date = self._as_iso(cell, row, column)
             try:
-                found = datetime.fromisoformat(self._as_iso(cell, row, column))
+                found = datetime.fromisoformat(text_of_date)
             except ValueError:
                 found = None
             if found is not None:
+                if self.is_dated is None and _FRACTION.search(text_of_date):
+                    self.digits = "microseconds"
                 return self._seconds(found, row, column)
         raise SpecError(
             f"Row {row}, column {column!r}: {text!r} is no time stamp: {self._expected()}.", path=f"row {row}"
@@ -159,6 +165,8 @@ class Stamps:
                 self.is_dated, self.zone = True, getattr(column.dtype, "tz", None)
             plain = column.dt.tz_convert("UTC").dt.tz_localize(None) if hasattr(column.dtype, "tz") else column
             counts = plain.to_numpy().astype("datetime64[ns]").astype(np.int64)
+            if np.any(counts[~missing] % 1_000_000_000):
+                self.digits = "microseconds"
             # Apart, so that the fraction keeps its digits.
             seconds = (counts // 1_000_000_000).astype(np.float64) + (counts % 1_000_000_000) * _NANO
         return np.where(missing, np.nan, seconds)
@@ -171,7 +179,7 @@ class Stamps:
 
     def date(self, seconds: float) -> str:
         """Return the date and time of some seconds, ISO 8601, in the zone of the log."""
-        return self.moment(seconds).isoformat()
+        return self.moment(seconds).isoformat(timespec=self.digits)
 
     def moment(self, seconds: float) -> datetime:
         """Return the date and time of some seconds, to the microsecond, with the log's zone if it names one."""
