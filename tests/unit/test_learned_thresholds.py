@@ -127,7 +127,7 @@ def test_the_stated_rate_is_kept_out_of_sample(m: int, memory: float, share: Cal
 
 
 def test_the_rows_learned_from_keep_the_rate_where_something_slow_is_in_them() -> None:
-    """An offset for 150 of 1,500 rows: blocks of the bootstrap are shorter, and four alarms were raised in these rows."""
+    """An offset for 150 of 1,500 rows: blocks of the bootstrap are shorter, and four alarms were raised there."""
     rng, every = np.random.default_rng(2), 1500.0
     x = rng.standard_normal((3_000, 1)) + 0.5 * (np.sin(2.0 * np.pi * np.arange(3_000) / 1_500) > 0.95)[:, None]
     model = fitted_autoregression(x)
