@@ -28,7 +28,7 @@ _SLASHED = re.compile(r"(\d{1,4})/(\d{1,2})/(\d{1,4})(.*)")
 _CLOCK = re.compile(r"[ T]+(\d{1,2})(:\d{2}\S*?)(?:\s*([AaPp])\.?[Mm]\.?)?")
 _HALF_DAY = 12
 #: A part of a second in a date.
-_FRACTION = re.compile(r":\d{2}[.,]\d")
+_PART_OF_A_SECOND = re.compile(r":\d{2}[.,]\d")
 #: The part of a date that is larger is its day.
 _MONTHS = 12
 #: Seconds since 1970 reach this in the year 5138: larger numbers count parts of a second.
@@ -108,7 +108,7 @@ class Stamps:
             except ValueError:
                 found = None
             if found is not None:
-                if self.is_dated is None and _FRACTION.search(text_of_date):
+                if self.is_dated is None and _PART_OF_A_SECOND.search(text_of_date):
                     self.digits = "microseconds"
                 return self._seconds(found, row, column)
         raise SpecError(
