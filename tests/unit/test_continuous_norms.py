@@ -5,7 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from obsynth.methods.pd_observer.realisation import PdErrorSystem
+from obsynth.numerics import continuous
 from obsynth.numerics.continuous import continuous_hinf_norm, spectral_abscissa
+from obsynth.numerics.norms import hinf_norm
 
 
 def as_arrays(*matrices: object) -> tuple[np.ndarray, ...]:
@@ -71,3 +74,37 @@ def test_spectral_abscissa() -> None:
     assert spectral_abscissa(np.array([[0.0, 1.0], [-5.0, -2.0]])) == pytest.approx(-1.0)
     assert spectral_abscissa(np.zeros((0, 0))) == -np.inf
     assert np.isnan(spectral_abscissa(np.array([[np.nan]])))
+
+
+def test_one_norm_of_systems_that_differ_in_what_drives_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(1)
+    a, b, c = rng.normal(size=(4, 4)) - 6.0 * np.eye(4), rng.normal(size=(4, 2)), rng.normal(size=(1, 4))
+    asked: list[int] = []
+
+    def counted(*parts: np.ndarray, **named: object) -> object:
+        asked.append(1)
+        return hinf_norm(*parts, **named)
+
+    monkeypatch.setattr(continuous, "hinf_norm", counted)
+    norms, nothing = continuous.ContinuousNorms(a), np.zeros((4, 3))
+    first = norms.between(b, c, np.zeros((1, 2)))
+    assert norms.between(np.hstack([nothing, b]), c, np.zeros((1, 5))) == first
+    assert len(asked) == 1
+    # A feedthrough alone drives the output too, and another input matrix is another system.
+    assert norms.between(np.hstack([nothing, b]), c, np.eye(1, 5)).value >= 1.0
+    assert norms.between(2.0 * b, c, np.zeros((1, 2))).value == pytest.approx(2.0 * first.value, rel=1e-9)
+    assert len(asked) == 3
+
+
+def test_the_noise_and_its_derivative_reach_the_fault_error_as_the_frequency_response_says() -> None:
+    rng = np.random.default_rng(2)
+    nx, nf, ny, nw = 4, 2, 3, 2
+    n = nx + nf
+    az, s = rng.normal(size=(n, n)) - 5.0 * np.eye(n), rng.normal(size=(n, n))
+    j, el, process, sensor = (rng.normal(size=shape) for shape in ((n, ny), (n, ny), (nx, nw), (ny, nw)))
+    none = (np.zeros((n, 0)), np.zeros((n, 0)))
+    errors = PdErrorSystem(az, s, none, none, none, j, el, nx)
+    driven = np.hstack([np.vstack([process, np.zeros((nf, nw))]) - j @ sensor, -el @ sensor])
+    points = 1j * np.concatenate([[0.0], np.geomspace(1e-2, 1e3, 4000)])
+    gains = [np.linalg.norm(s[nx:] @ np.linalg.solve(p * np.eye(n) - az, driven), 2) for p in points]
+    assert errors.separate_noise_norm(process, sensor).upper == pytest.approx(max(gains), rel=1e-4)

@@ -19,7 +19,7 @@ from functools import cached_property
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.continuous import ContinuousNorms, continuous_hinf_norm
+from obsynth.numerics.continuous import ContinuousNorms
 from obsynth.numerics.norms import HinfNorm
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
@@ -136,10 +136,9 @@ class PdErrorSystem:
         padded = np.vstack([process, np.zeros((n - self.nx, process.shape[1]))])
         # (I + L C) e' = Ae e + Bw w - J Dw w - L Dw w', and eps = (I + L C) e.
         b = np.hstack([padded - self.J @ sensor, -self.L @ sensor])
-        # The estimate is S of eps + L noise: in terms of the error itself (S Az S^-1) no feedthrough is left.
-        inner = solved(self.estimate.T, (self.estimate @ self.Az).T).T
-        shown = np.eye(n)[self.nx :]
-        return continuous_hinf_norm(inner, self.estimate @ b, shown, np.zeros((len(shown), b.shape[1])))
+        # The estimate is S of eps + L noise: in terms of the error itself no feedthrough is left.
+        shown = self.estimate[self.nx :]
+        return self._norms.between(b, shown, np.zeros((len(shown), b.shape[1])))
 
 
 def solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
