@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import obsynth
+from obsynth.methods.recursive.unknown_inputs import without_unknown_inputs
 
 
 def plant(rng, *, direct, nx=4, ny=3, nd=2, **changes):
@@ -99,3 +100,19 @@ def test_a_given_covariance_is_that_of_all_equations():
     np.testing.assert_allclose(stated.gains["L"], told.gains["L"], rtol=1e-12)
     with pytest.raises(obsynth.SpecError, match="4 by 4"):
         obsynth.descriptor_kalman(given, Q=np.eye(3))
+
+
+@pytest.mark.parametrize("direct", [0, 1, 2])
+@pytest.mark.parametrize(("equations", "outputs"), [(2.0**20, 2.0**-18), (2.0**-20, 2.0**18)])
+def test_units_do_not_decide_which_unknown_inputs_are_estimated(direct, equations, outputs):
+    # With states in thousandths and outputs in thousands, what shows at once was taken for rounding, and removed.
+    rng = np.random.default_rng(3)
+    given = plant(rng, direct=direct)
+    other = given.replace(
+        B=equations * given.B, Bd=equations * given.Bd, Bw=equations * given.Bw,
+        C=outputs / equations * given.C, Dd=outputs * given.Dd, Dw=outputs * given.Dw,
+    )  # fmt: skip
+    first, second = without_unknown_inputs(given), without_unknown_inputs(other)
+    assert first.names == second.names
+    assert len(first.equations) == len(second.equations)
+    assert first.note == second.note

@@ -1,7 +1,7 @@
 r"""A plant without its unknown inputs, for the descriptor Kalman filter; and when that exists.
 
 With ``[V1 V2]`` orthonormal and ``Dd V2 = 0``, ``d1 = V1' d`` becomes a state without an equation of its own, and
-``d2 = V2' d`` is removed with an orthonormal N, ``N Bd V2 = 0``:
+``d2 = V2' d`` is removed with an N, ``N Bd V2 = 0``, orthonormal where equations are near one:
 
 .. math::
     N [E \; 0] [x; d_1]^+ = N [A \; B_d V_1] [x; d_1] + N B u + N \mu, \qquad y = [C \; D_d V_1] [x; d_1] + \nu.
@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from obsynth.analysis.conditions import Condition
+from obsynth.analysis.plant_units import PlantUnits
 from obsynth.analysis.time_varying import as_time_varying
 from obsynth.errors import SpecError
 from obsynth.methods.recursive.conditions import recursive_conditions
@@ -82,25 +83,27 @@ def without_unknown_inputs(plant: DescriptorSystem) -> WithoutUnknownInputs:
     """Return a plant without its unknown inputs; `SpecError` for what else these methods do not take."""
     nothing = {name: None for name in ("Bd", "Dd", "disturbance_names")}
     known = as_time_varying(plant.replace(**nothing))
-    # In units in which each unknown input has the same effect, so that no unit decides what shows.
-    sizes = np.linalg.norm(np.vstack([plant.Bd, plant.Dd]), axis=0)
+    # In units in which each unknown input has the same effect, and the plant is near one: no unit decides what shows.
+    own = PlantUnits.of(plant).rounded()
+    rows, outputs = own.equations[:, None], own.outputs[:, None]
+    sizes = np.linalg.norm(np.vstack([rows * plant.Bd, outputs * plant.Dd]), axis=0)
     units = 1.0 / np.where(sizes > 0.0, sizes, 1.0)
     bd, dd = plant.Bd * units, plant.Dd * units
-    _, values, right = np.linalg.svd(dd) if dd.size else (None, np.zeros(0), np.eye(plant.nd))
+    _, values, right = np.linalg.svd(outputs * dd) if dd.size else (None, np.zeros(0), np.eye(plant.nd))
     rank = int(np.sum(values > RANK_TOLERANCE))
     shown, hidden = right[:rank].T, right[rank:].T
     if rank == plant.nd:
         shown, names = np.eye(plant.nd), plant.disturbance_names
     else:
         names = tuple(f"unknown input {i + 1}" for i in range(rank))
-    left, sizes_of_entry, _ = np.linalg.svd(bd @ hidden)
+    left, sizes_of_entry, _ = np.linalg.svd(rows * bd @ hidden)
     moved = int(np.sum(sizes_of_entry > RANK_TOLERANCE))
-    equations = left[:, moved:].T if moved else np.eye(plant.nx)
-    through, direct = equations @ bd @ shown, dd @ shown
-    scale = np.ones(rank)
+    equations = left[:, moved:].T * own.equations if moved else np.eye(plant.nx)
     if rank == plant.nd:
         # In their own units again, with their own names.
-        through, direct, scale = through / units, direct / units, units
+        bd, dd = plant.Bd, plant.Dd
+    through, direct = equations @ bd @ shown, dd @ shown
+    scale = 1.0 / np.linalg.norm(np.vstack([bd, dd]) @ shown, axis=0)
     count = known.nx
     taken = TimeVaryingDescriptorSystem(
         np.hstack([equations @ plant.E, np.zeros((len(equations), rank))]),
