@@ -135,3 +135,17 @@ def test_a_repeated_row_after_a_saved_state_is_left_out_where_stamps_jitter(tmp_
     parts = [run("ui-pi-observer", "levels", part, state=state) for part in (data[:81], data[81:])]
     pd.testing.assert_frame_equal(pd.concat(parts, ignore_index=True), wanted)
     assert wanted["status"][81] == "repeated stamp"
+
+
+def test_alarms_on_both_sides_of_many_missing_rows_are_two() -> None:
+    design, data = designed("ui-pi-observer"), log(fault=0.5, rows=ROWS)
+    gone = [*range(120, 150)]
+    blank = data.copy()
+    blank.loc[gone, ["u", "a", "b"]] = np.nan
+    for found, last in ((blank, ROWS), (data.drop(index=gone), ROWS - len(gone))):
+        run = obsynth.run_on_data(design, found, thresholds={"fhat[f]": 0.1})
+        before, after = run.events
+        assert (before.last_row, after.last_row) == (120, last)
+        assert after.end == pytest.approx((ROWS - 1) * DT)
+    short = data.drop(index=gone[:10])
+    assert len(obsynth.run_on_data(design, short, thresholds={"fhat[f]": 0.1}).events) == 1

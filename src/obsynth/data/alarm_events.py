@@ -30,7 +30,7 @@ REASONS = {
 
 @dataclass(frozen=True)
 class AlarmEvent:
-    """An alarm: rows above a threshold that are less than 20 rows apart.
+    """An alarm: rows above a threshold that are less than 20 rows apart, rows that are missing among them.
 
     Parameters
     ----------
@@ -83,7 +83,12 @@ class AlarmLog:
         self._places = {name: i for i, name in enumerate(columns)}
         self._open, self._closed = dict[str, AlarmEvent](), list[AlarmEvent]()
         self._named_by = dict[str, float]()  # the evidence at which the fault of an open event was named
+        self._place, self._places_of = 0, dict[str, int]()  # of this row, and of the last row of an open event
         self.silent = Counter[str]()
+
+    def advance(self, missing: int) -> None:
+        """Go on to the next row, before which some are missing."""
+        self._place += missing + 1
 
     def take(
         self,
@@ -99,11 +104,12 @@ class AlarmLog:
         """Take a row above a threshold; ``cells`` are the numbers of its output; ``distinguished``: whether a
         fault would be named if there was one."""
         before = self._open.get(by)
-        if before is not None and row - before.last_row > HOLD:
+        if before is not None and self._place - self._places_of[by] > HOLD:
             self._closed.append(self._open.pop(by))
             before = None
         if before is None:
             self._named_by[by] = -math.inf
+        self._places_of[by] = self._place
         largest = before is None or evidence > before.evidence or math.isnan(before.evidence)
         known = (math.nan,) * 3 if before is None else (before.size, before.low, before.high)
         named = "" if before is None else before.fault

@@ -371,6 +371,7 @@ class LogRun:
         if row.status in STALE:
             self.events.silent[row.status] += 1
             return [*([math.nan] * (0 if self.monitor is None else len(self.monitor.columns) + 2)), ""]
+        self.events.advance(row.skipped + len(row.missed))
         deciding = row.status in DECIDING
         above = [
             (name, abs(float(values[i])) / grown)

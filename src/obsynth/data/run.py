@@ -202,8 +202,8 @@ class DataRun:
     alarm_rows : mapping of str to int
         Numbers of the rows of these alarms, from 1.
     events : tuple of AlarmEvent
-        All alarms: from when to when, which fault, how large.  Rows above a threshold that are less than 20 rows apart
-        are one.
+        All alarms: from when to when, which fault, how large.  Rows above a threshold that are less than 20 rows apart,
+        those that are missing among them, are one.
     silent : mapping of str to int
         How many rows were without a decision, by their status; ``undecided`` where the monitor decides nothing.
     statement : str
