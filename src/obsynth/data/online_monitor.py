@@ -28,10 +28,8 @@ from obsynth.errors import SpecError
 from obsynth.experiments.assumptions import Assumptions
 from obsynth.experiments.monitors.adaptive import (
     NO_TOLERANCE,
-    AdaptiveRule,
-    adaptive_plan,
-    adaptive_statement,
     noisy_design,
+    over_box,
     tolerances_of,
 )
 from obsynth.experiments.monitors.guaranteed import data_monitor, is_guaranteed
@@ -440,13 +438,27 @@ def online_monitor(
     model, dt = _endless_model(design, scenario, window, sample_time, estimates=estimates)
     _require_noise(model, noise_bound)
     bounds = _expected_bounds(design, model, disturbance_bounds, scenario)
-    rule: Rule
+    noisy = noisy_design(design, scenario)
     limited = kind in ("pointwise", "window")
+
+    def made(statement: str, rule: Rule) -> Monitor:
+        return Monitor(
+            kind,
+            statement,
+            rule,
+            residuals=len(design.linear[1].residual_names),
+            fault_names=design.linear[1].fault_names,
+            fault_scales=model.fault_scales(),
+        )
+
+    rule: Rule
     if limited or kind == "paper":
         start = 0.0 if initial_error is None else float(initial_error)
         norm, limit = _norm_rule(design, kind, model, bounds, noise_bound, start, gamma, window, dt, estimates)
         if adaptive:
-            return _adaptive(design, scenario, norm, model, bounds, noise_bound, initial_error, initial_set, dt)
+            rule, told = over_box(noisy, norm, bounds, noise_bound, initial_error, initial_set, sample_time=dt)
+            first = _AFTER_WARM_UP if initial_error is None else _AFTER_A_GAP
+            return made(told + (first if initial_set is None else _FROM_THE_FIRST), rule)
         _require_above_zero(limit)
         gaps = gap_growth(model, bounds, noise_bound) if kind == "pointwise" else ""
         rule = norm.over_gaps(gaps) if isinstance(gaps, GapGrowth) else norm
@@ -456,16 +468,8 @@ def online_monitor(
         rule = _whitened(kind, model, bounds if scenario is None else None, window, change, false_alarms, dt)
         ending = ANY_LENGTH
     numbers = {"window": window, "false_alarms": false_alarms, "change": change, "dt": dt}
-    noisy = noisy_design(design, scenario).linear[0]
-    assumed = Assumptions(noisy, bounds, noise_bound or 0.0, initial_error=initial_error) if limited else None
-    return Monitor(
-        kind,
-        statement_of(kind, model, assumed, estimates=estimates, **numbers) + ending + NO_TOLERANCE,
-        rule,
-        residuals=len(design.linear[1].residual_names),
-        fault_names=design.linear[1].fault_names,
-        fault_scales=model.fault_scales(),
-    )
+    assumed = Assumptions(noisy.linear[0], bounds, noise_bound or 0.0, initial_error=initial_error) if limited else None
+    return made(statement_of(kind, model, assumed, estimates=estimates, **numbers) + ending + NO_TOLERANCE, rule)
 
 
 def _learned(design: ObserverDesign, normal: Any) -> Monitor:
@@ -572,39 +576,6 @@ def _more_words(kind: str, model: ResidualModel, limit: float, dt: float) -> str
         # the more of it that is of one sign.
         words += _NOT_CLOSER.format(dt=shown(dt))
     return words + _REGULAR.format(dt=shown(dt)) + model.continuous.between.lasting_words(limit)
-
-
-def _adaptive(
-    design: ObserverDesign,
-    scenario: Scenario | None,
-    norm: NormRule,
-    model: ResidualModel,
-    bounds: FloatArray,
-    noise_bound: float | None,
-    initial_error: float | None,
-    initial_set: Mapping[str, Any] | None,
-    dt: float,
-) -> Monitor:
-    """Return the monitor whose threshold holds for every plant within its tolerances."""
-    noisy = noisy_design(design, scenario)
-    assumed = Assumptions(noisy.linear[0], bounds, noise_bound or 0.0, initial_set, initial_error=initial_error)
-    first, later = adaptive_plan(
-        noisy,
-        bounds,
-        noise_bound or 0.0,
-        initial_error=initial_error,
-        initial_set=initial_set,
-        sample_time=dt,
-    )
-    start = _FROM_THE_FIRST if initial_set is not None else _AFTER_WARM_UP if initial_error is None else _AFTER_A_GAP
-    return Monitor(
-        "pointwise",
-        adaptive_statement(first, assumed) + start,
-        AdaptiveRule(first, later, norm),
-        residuals=len(design.linear[1].residual_names),
-        fault_names=design.linear[1].fault_names,
-        fault_scales=model.fault_scales(),
-    )
 
 
 def _endless_model(

@@ -15,7 +15,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, NamedTuple, TypeAlias, cast
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -861,36 +861,40 @@ def noisy_design(design: ObserverDesign, scenario: Scenario | None) -> ObserverD
 
 
 def over_box(
-    design: ObserverDesign,
     noisy: ObserverDesign,
-    scenario: Scenario,
-    nominal: Rule,
+    nominal: NormRule | None,
     bounds: FloatArray,
     noise_bound: float | None,
     initial_error: float | None,
     initial_set: Mapping[str, Any] | None,
+    *,
+    sample_time: float | None = None,
+    scenario: Scenario | None = None,
 ) -> tuple[Rule, str]:
-    """Return the pointwise rule over the box of the design's plant, from the scenario's start unless one is given, and
-    what it promises; ``noisy`` is the design with the noise that is bounded."""
-    plant, _ = design.linear
-    if not plant.is_discrete and scenario.inputs:
-        raise PreconditionError(
-            "The design is continuous in time, and the inputs of a scenario move between its samples: thresholds over "
-            "tolerances need inputs that are held. Sample the plant first (transform: sample_time).",
-            condition="discrete time",
-        )
-    state = None if scenario.observer_state is None else np.array(scenario.observer_state)
-    if initial_set is None and initial_error is None:
-        initial_set = {name: (scenario.initial_state.get(name, 0.0),) * 2 for name in plant.state_names}
-    first, _ = adaptive_plan(
+    """Return the pointwise rule over the box of the plant of a design with the noise that is bounded, and what it
+    promises: for a record of a scenario, from its start unless one is given, or for data, which may have gaps."""
+    plant, _ = noisy.linear
+    state = None
+    if scenario is not None:
+        if not plant.is_discrete and scenario.inputs:
+            raise PreconditionError(
+                "The design is continuous in time, and the inputs of a scenario move between its samples: thresholds "
+                "over tolerances need inputs that are held. Sample the plant first (transform: sample_time).",
+                condition="discrete time",
+            )
+        state = None if scenario.observer_state is None else np.array(scenario.observer_state)
+        sample_time = None if plant.is_discrete else scenario.sample_time
+        if initial_set is None and initial_error is None:
+            initial_set = {name: (scenario.initial_state.get(name, 0.0),) * 2 for name in plant.state_names}
+    first, later = adaptive_plan(
         noisy,
         bounds,
         noise_bound or 0.0,
         initial_error=initial_error,
         initial_set=initial_set,
         observer_state=state,
-        sample_time=None if plant.is_discrete else scenario.sample_time,
+        sample_time=sample_time,
     )
-    return AdaptiveRule(first, first, cast(NormRule, nominal)), adaptive_statement(
-        first, Assumptions(noisy.linear[0], bounds, noise_bound or 0.0, initial_set, initial_error=initial_error)
-    )
+    assumed = Assumptions(plant, bounds, noise_bound or 0.0, initial_set, initial_error=initial_error)
+    rule = AdaptiveRule(first, later if scenario is None else first, nominal)
+    return rule, adaptive_statement(first, assumed)

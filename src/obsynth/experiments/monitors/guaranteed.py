@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.errors import SpecError
-from obsynth.experiments.assumptions import Assumptions
-from obsynth.experiments.monitors.adaptive import AdaptiveRule, adaptive_plan, adaptive_statement, over_box
+from obsynth.experiments.monitors.adaptive import over_box
 from obsynth.experiments.monitors.monitor import Judged, LinearSample, Monitor, Rule, Sample
 from obsynth.experiments.monitors.rules import NormRule
 from obsynth.experiments.simulation import make_bench
@@ -128,10 +127,11 @@ def record_monitor(design: ObserverDesign, scenario: Scenario, kind: str, given:
         )
     threshold[:before] = np.inf
     dt, statement = bench.signals.dt, _statement(test)
-    rule: Rule = _RecordRule(test, threshold, scales, dt)
+    nominal = _RecordRule(test, threshold, scales, dt)
+    rule: Rule = nominal
     if constants is not None or initial_set is not None:
         changed, bounds = _bounded(test, constants)
-        rule, statement = over_box(changed, changed, scenario, rule, bounds, 1.0, None, initial_set)
+        rule, statement = over_box(changed, nominal, bounds, 1.0, None, initial_set, scenario=scenario)
     return Monitor(
         kind,
         statement,
@@ -343,9 +343,7 @@ def data_monitor(design: ObserverDesign, kind: str, given: Mapping[str, Any]) ->
     rule: Rule = GuaranteedRule(test)
     if constants is not None or initial_set is not None:
         changed, bounds = _bounded(test, constants)
-        first, later = adaptive_plan(changed, bounds, 1.0, initial_error=None, initial_set=initial_set)
-        assumed = Assumptions(changed.linear[0], bounds, 1.0, initial_set)
-        statement, rule = adaptive_statement(first, assumed), AdaptiveRule(first, later, None)
+        rule, statement = over_box(changed, None, bounds, 1.0, None, initial_set)
         if initial_set is None:
             statement += "; it holds once the effect of the initial error, which is not stated, has settled"
     return Monitor(

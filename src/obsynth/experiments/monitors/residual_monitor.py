@@ -160,7 +160,8 @@ def monitor(
     bounded = assumed if kind in ("pointwise", "window") else None
     statement = statement_of(kind, model, bounded, estimates=estimates, **numbers) + NO_TOLERANCE
     if adaptive:
-        rule, statement = over_box(design, noisy, scenario, rule, bounds, noise_bound, initial_error, initial_set)
+        nominal = cast(NormRule, rule)
+        rule, statement = over_box(noisy, nominal, bounds, noise_bound, initial_error, initial_set, scenario=scenario)
     return Monitor(
         kind,
         statement,
