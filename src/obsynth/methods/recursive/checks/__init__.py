@@ -17,6 +17,7 @@ import numpy as np
 
 from obsynth.analysis.time_varying import HorizonRanks, horizon_ranks
 from obsynth.errors import ObsynthError
+from obsynth.methods.recursive.checks.consistency import consistency, data_deviations, state_terms
 from obsynth.methods.recursive.checks.horizon_proof import (
     HorizonProof,
     bias_row,
@@ -53,7 +54,6 @@ from obsynth.proofs.contraction import Contraction, column_norms, prove_contract
 from obsynth.proofs.definiteness import prove_positive_definite
 from obsynth.results.checks import Check, fitting_check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
-from obsynth.verification.consistency import consistency, data_deviations, state_terms
 from obsynth.verification.identities import EQUALITY_TOLERANCE
 from obsynth.verification.plant import condition_rows
 
