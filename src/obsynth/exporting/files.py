@@ -19,15 +19,18 @@ from obsynth.experiments.monitors.learned import LearnedRule, LearnedThresholds
 from obsynth.exporting.c_source import (
     c_identifier,
     comment,
+    dae_alarms,
     header_text,
     in_precision,
     included,
     quoted,
     source_text,
     table_lines,
+    threshold_header,
+    threshold_source,
     with_c_linkage,
+    write_dae_c,
 )
-from obsynth.exporting.c_templates import dae_alarms, threshold_header, threshold_source, write_dae_c
 from obsynth.exporting.realisation import Alarms, Realisation, linear_alarms
 from obsynth.files.outputs import FileKind, write_atomically, write_together
 from obsynth.methods.guaranteed_test.bank import groups_of, is_bank

@@ -22,8 +22,16 @@ from xml.etree.ElementTree import Element, SubElement
 from obsynth.errors import SpecError
 from obsynth.experiments.monitors.learned import LearnedThresholds
 from obsynth.experiments.monitors.learned_levels import HOLD
-from obsynth.exporting.c_source import c_identifier, comment, header_text, in_precision, source_text
-from obsynth.exporting.c_templates import dae_alarms, dae_c_texts, require_no_sample_time
+from obsynth.exporting.c_source import (
+    c_identifier,
+    comment,
+    dae_alarms,
+    dae_c_texts,
+    header_text,
+    in_precision,
+    require_no_sample_time,
+    source_text,
+)
 from obsynth.exporting.realisation import STATISTIC, Alarms, Realisation, linear_alarms, verification_words
 from obsynth.files.outputs import write_atomically
 from obsynth.methods.handing_on import unverified_mark
