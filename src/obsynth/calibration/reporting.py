@@ -233,11 +233,6 @@ class Calibration:
         """Return a picture: each constant in its box, and the innovations of each sensor in deviations."""
         return _figure(self)
 
-    @property
-    def innovation_deviation(self) -> FloatArray:
-        """Root mean square of each sensor's innovations ``(ny,)``, in its unit."""
-        return np.asarray(np.sqrt(np.nanmean((self.innovations * self.deviations) ** 2, axis=0)))
-
 
 def _figure(found: Calibration) -> Figure:
     """Return each constant in its box, and the whitened innovations of each sensor."""
