@@ -16,7 +16,7 @@ from obsynth.analysis.transformations.elimination import MANY_VARIABLES, elimina
 from obsynth.analysis.transformations.recovery import StateRecovery, Transformation, plant_and_recovery
 from obsynth.errors import PreconditionError, SolverError, SpecError, VerificationError
 from obsynth.methods.method import Method, Synthesis
-from obsynth.methods.refusals import require_above_rounding, rounding_notes, with_advice
+from obsynth.methods.refusals import require_above_rounding, with_advice
 from obsynth.methods.registry import AUTO, REGISTRY, Plant, kind_conditions, kind_of, method_class
 from obsynth.methods.verifying import verify
 from obsynth.numerics.libraries import failed_computations, failure_of, one_thread_if_small
@@ -256,9 +256,8 @@ def verified(
     """Return the design with its report."""
     draft = with_stored_errors(draft_of(plant, method, found, name=name, recovery=recovery))
     linear = isinstance(draft.observer, LinearObserver) and isinstance(draft.plant, DescriptorSystem)
-    if linear:
-        # First: which rows such gains fail is a matter of this machine's rounding.
-        require_above_rounding(*draft.linear)
+    # First: which rows gains fail that hide a fault is a matter of this machine's rounding.
+    notes = require_above_rounding(*draft.linear) if linear else ()
     report = verify(draft)
     if not report.passed:
         raise VerificationError(
@@ -267,9 +266,7 @@ def verified(
             + "".join(f" {note}" for note in draft.notes),
             report=report,
         )
-    if linear:
-        draft = draft.replace(notes=(*draft.notes, *rounding_notes(*draft.linear)))
-    return draft.replace(report=report, notes=(*draft.notes, *_lost_tolerances(draft.plant)))
+    return draft.replace(report=report, notes=(*draft.notes, *notes, *_lost_tolerances(draft.plant)))
 
 
 def failed_rows(report: VerificationReport) -> str:

@@ -120,11 +120,14 @@ MOST_OBSERVER_STATES = 150
 ROUNDING_POINTS = (0.0, 1e-2, 1e-1, 1.0)
 
 
-def require_above_rounding(plant: DescriptorSystem, observer: LinearObserver) -> None:
-    """Raise `PreconditionError` (unclear) where rounding of the outputs hides the estimate of a unit fault."""
-    least = _least(plant, observer, own=False)
-    if least is None:
-        return
+def require_above_rounding(plant: DescriptorSystem, observer: LinearObserver) -> tuple[str, ...]:
+    """Return what rounding of the observer's own numbers may do to an estimate, where that matters.
+
+    Raise `PreconditionError` (unclear) where rounding of the outputs hides the estimate of a unit fault."""
+    found = _least(plant, observer)
+    if found is None:
+        return ()
+    least, own = found
     worst = int(np.argmax(least))
     if least[worst] >= LARGEST_ROUNDED_SHARE:
         name = plant.fault_names[worst]
@@ -136,6 +139,13 @@ def require_above_rounding(plant: DescriptorSystem, observer: LinearObserver) ->
             signals=(name,),
             unclear=True,
         )
+    return tuple(
+        f"The entries of the observer cancel: their last digits alone may change the estimate of {name!r}"
+        f" by {share:.2g} of the fault, and by more at some frequencies. State the noise of the sensors, or ask "
+        "for a larger gamma."
+        for name, share in zip(plant.fault_names, own, strict=True)
+        if share >= TOLD_ROUNDING
+    )
 
 
 def _doubt(plant: DescriptorSystem, observer: LinearObserver, fault: int) -> Unclear:
@@ -187,24 +197,9 @@ def last_digits(plant: DescriptorSystem, observer: LinearObserver, fault: int, p
         yield Witness((change,), float(moved[i, j]), point)
 
 
-def rounding_notes(plant: DescriptorSystem, observer: LinearObserver) -> tuple[str, ...]:
-    """Return what rounding of the observer's own numbers may do to an estimate, where that matters."""
-    found = _least(plant, observer, own=True)
-    return (
-        ()
-        if found is None
-        else tuple(
-            f"The entries of the observer cancel: their last digits alone may change the estimate of {name!r}"
-            f" by {share:.2g} of the fault, and by more at some frequencies. State the noise of the sensors, or ask "
-            "for a larger gamma."
-            for name, share in zip(plant.fault_names, found, strict=True)
-            if share >= TOLD_ROUNDING
-        )
-    )
-
-
-def _least(plant: DescriptorSystem, observer: LinearObserver, *, own: bool) -> FloatArray | None:
-    """Return the least share of each fault over the points; ``None`` where it is not examined."""
+def _least(plant: DescriptorSystem, observer: LinearObserver) -> FloatArray | None:
+    """Return the least of `rounding_shares` over the points ``(2, nf)``, NaN where none is a number; ``None`` where it
+    is not examined."""
     if (
         not plant.nf
         or observer.order > MOST_OBSERVER_STATES
@@ -213,10 +208,8 @@ def _least(plant: DescriptorSystem, observer: LinearObserver, *, own: bool) -> F
     ):
         return None
     with np.errstate(all="ignore"):
-        shares = [
-            share for point in _points(plant) if (share := rounding_shares(plant, observer, point, own=own)) is not None
-        ]
-    return np.asarray(np.min(shares, axis=0)) if shares else None
+        shares = [rounding_shares(plant, observer, point) for point in _points(plant)]
+        return np.asarray(np.fmin.reduce(shares, axis=0))
 
 
 def _points(plant: DescriptorSystem) -> list[complex]:
@@ -239,18 +232,17 @@ def _responses(
     return np.asarray(plant.C @ states + plant.Df, dtype=np.complex128), np.asarray(resolvent)
 
 
-def rounding_shares(
-    plant: DescriptorSystem, observer: LinearObserver, point: complex, *, own: bool
-) -> FloatArray | None:
-    """Return the share of each fault that rounding of the outputs, or of the observer's ``own`` numbers, may be."""
+def rounding_shares(plant: DescriptorSystem, observer: LinearObserver, point: complex) -> FloatArray:
+    """Return the shares of each fault that rounding may be ``(2, nf)``: of the outputs, and of the observer's own
+    numbers; NaN where one is no number."""
     found = _responses(plant, observer, point)
     if found is None:
-        return None
+        return np.full((2, plant.nf), np.nan)
     outputs, resolvent = found
-    rows, seen = observer.fault_rows, np.abs(outputs)
+    rows, seen, size = observer.fault_rows, np.abs(outputs), np.abs(resolvent)
     entering, state = np.abs(observer.By) @ seen, np.abs(resolvent @ observer.By @ outputs)
-    moved = (
-        np.abs(resolvent) @ (entering + np.abs(observer.Az) @ state) + state if own else np.abs(resolvent) @ entering
-    )
-    shares = UNIT_ROUNDOFF * np.diag(np.abs(observer.Cz[rows]) @ moved + np.abs(observer.Dy[rows]) @ seen)
-    return np.asarray(shares) if np.all(np.isfinite(shares)) else None
+    of_outputs = size @ entering
+    moved = np.stack((of_outputs, of_outputs + size @ (np.abs(observer.Az) @ state) + state))
+    shares = np.abs(observer.Cz[rows]) @ moved + np.abs(observer.Dy[rows]) @ seen
+    told = UNIT_ROUNDOFF * np.diagonal(shares, axis1=1, axis2=2)
+    return np.asarray(np.where(np.isfinite(told).all(axis=1, keepdims=True), told, np.nan))

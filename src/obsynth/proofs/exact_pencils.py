@@ -69,7 +69,7 @@ class ExactPencil:
     @cached_property
     def normal_rank(self) -> int:
         """Rank of ``A - s E`` at almost every s."""
-        (e, a), least = over_one_denominator(self.E, self.A), 0
+        (e, a), least = self._plain_integers, 0
         for prime, point in [(prime, self._rng.randrange(prime)) for prime in _PRIMES]:
             least = max(least, int((nmod_mat(a, prime) - nmod_mat(e, prime) * point).rank()))
             if least == min(self.shape):
@@ -140,6 +140,11 @@ class ExactPencil:
         return len(ranks) - 2
 
     @cached_property
+    def _plain_integers(self) -> tuple[fmpz_mat, fmpz_mat]:
+        """Both multiplied by one number: enough modulo a prime, and for where the zeros of their entries are."""
+        return over_one_denominator(self.E, self.A)
+
+    @cached_property
     def _integers(self) -> tuple[fmpz_mat, fmpz_mat]:
         """E and A with rows and columns multiplied by rational numbers, so that all entries are small integers."""
         return with_integer_entries(self.E, self.A)
@@ -156,7 +161,7 @@ class ExactPencil:
         found, columns = min(self._degree, rank), self.shape[1]
         if rank < columns:
             return found
-        e, a = (part.tolist() for part in self._integers)
+        e, a = (part.tolist() for part in self._plain_integers)
         moving = [any(row) for row in e]
         still = [j for j in range(columns) if not any(row[j] for row in e)]
         if any(row[j] for row, moves in zip(a, moving, strict=True) if not moves for j in still):
@@ -188,7 +193,7 @@ class ExactPencil:
     def _determinant_modulo(self, rank: int, shift: int) -> nmod_poly | None:
         """Return a multiple of ``det(A - (shift + t) E)`` of a compression modulo the first prime, or none."""
         prime = _PRIMES[0]
-        e, a = (nmod_mat(part, prime) for part in self._compressed(rank))
+        e, a = (nmod_mat(part, prime) for part in self._compressed(self._plain_integers, rank))
         start = a - e * shift
         if start.rank() < rank:
             return None
@@ -196,10 +201,9 @@ class ExactPencil:
         coefficients = start.solve(e).charpoly().coeffs()
         return nmod_poly([int(value) for value in coefficients[::-1]], prime)
 
-    def _compressed(self, rank: int) -> tuple[fmpz_mat, fmpz_mat]:
+    def _compressed(self, whole: tuple[fmpz_mat, fmpz_mat], rank: int) -> tuple[fmpz_mat, fmpz_mat]:
         """Return both matrices with rows and columns compressed at random to the normal rank."""
-        e, a = self._integers
-        rows, columns = self.shape
+        (e, a), (rows, columns) = whole, self.shape
         if rows > rank:
             left = self._random(rank, rows)
             e, a = left * e, left * a
@@ -209,7 +213,7 @@ class ExactPencil:
         return e, a
 
     def _compressed_determinant(self, rank: int) -> fmpz_poly:
-        e, a = self._compressed(rank)
+        e, a = self._compressed(self._integers, rank)
         return _determinant(e, a, min(self._degree, rank))
 
     def _random(self, rows: int, columns: int) -> fmpz_mat:
