@@ -138,7 +138,7 @@ def test_a_repeated_row_after_a_saved_state_is_left_out_where_stamps_jitter(tmp_
 
 
 def test_alarms_on_both_sides_of_many_missing_rows_are_two() -> None:
-    design, data = designed("ui-pi-observer"), log(fault=0.5, rows=ROWS)
+    design, data = recursive(), log(fault=0.5, rows=ROWS)
     gone = [*range(120, 150)]
     blank = data.copy()
     blank.loc[gone, ["u", "a", "b"]] = np.nan
