@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ctypes
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -12,6 +14,7 @@ from test_flaws_of_logs import designed, log
 
 import obsynth
 from obsynth.data.log_run import LogRun
+from obsynth.observers.dae.c_code import FLAGS, compiler, shared_library
 
 pytestmark = pytest.mark.usefixtures("taken_as_verified")
 DT, RATE, GAIN = 0.1, 2.0, 3.0
@@ -179,3 +182,50 @@ def test_outputs_that_were_measured_all_through_a_gap_of_an_input_start_nothing_
     run = obsynth.run_on_data(design, data)
     assert run.table is not None
     assert "warm-up" not in set(run.table["status"][100:])
+
+
+def alarms_in_c(data: pd.DataFrame, level: float, folder: Path) -> np.ndarray:
+    """Return what the exported observer says of a level in each row."""
+    obsynth.export(lag(), folder / "lag.c", thresholds={"fhat[f]": level})
+    (folder / "run.c").write_text(
+        '#include "lag.h"\nvoid run(const double *in, int *alarm, int rows) {\n'
+        "static lag_state state; lag_estimates e; lag_reset(&state);\n"
+        "for (; rows-- > 0; in += 3) { lag_step(&state, in, in + 1, &e); *alarm++ = state.alarm[0]; } }\n"
+    )
+    command = compiler()
+    assert command is not None, "these tests need a C compiler"
+    texts = {name: (folder / name).read_text() for name in ("lag.h", "lag.c", "run.c")}
+    library = ctypes.CDLL(str(shared_library(folder, texts, [*command, *FLAGS], path="test")))
+    rows, alarms = np.ascontiguousarray(data[["u", "y", "z"]], dtype=np.float64), np.zeros(len(data), dtype=np.intc)
+    double, whole = (ctypes.POINTER(kind) for kind in (ctypes.c_double, ctypes.c_int))
+    library.run(rows.ctypes.data_as(double), alarms.ctypes.data_as(whole), len(data))
+    return alarms > 0
+
+
+def test_levels_are_as_many_times_higher_as_faults_are_less_certain_after_missing_samples(tmp_path) -> None:
+    u, y = measured(rows=600)
+    data, rng = log_of(u, y), np.random.default_rng(3)
+    gaps = [range(first, first + int(rng.integers(1, 5))) for first in range(40, 590, 14)]
+    for i, gap in enumerate(gaps):
+        data.loc[[*gap], "u" if i % 2 else "y"] = np.nan
+    table = obsynth.run_on_data(lag(), data, outliers="none").table
+    assert table is not None
+    level = float(table["fhat[f]"].abs().median())
+    whole = obsynth.run_on_data(lag(), data, thresholds={"fhat[f]": level}, outliers="none").table
+    # What is expected, from the columns of the table alone.
+    wanted, grown, usual, before = [], 0, 0.0, 0.0
+    for status, size, spread in zip(table["status"], table["fhat[f]"].abs(), table["sd fhat[f]"], strict=True):
+        usual = before if status != "ok" and not usual else usual
+        usual = usual if spread > usual else 0.0
+        share = spread / usual if usual else 1.0
+        wanted.append("fhat[f]" if status != "gap" and size > level * share else "")
+        grown += status != "gap" and level < size <= level * share
+        before = spread
+    assert grown >= 5
+    assert whole is not None
+    assert whole["alarm"].tolist() == wanted
+    assert alarms_in_c(data, level, tmp_path).tolist() == [bool(text) for text in wanted]
+    state = tmp_path / "state.json"
+    parts = [obsynth.run_on_data(lag(), part, thresholds={"fhat[f]": level}, outliers="none", state=state).table
+             for part in (data[:41], data[41:62], data[62:])]  # fmt: skip
+    pd.testing.assert_frame_equal(whole, pd.concat(parts, ignore_index=True))

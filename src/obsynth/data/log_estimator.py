@@ -57,6 +57,8 @@ class Row(NamedTuple):
     # than at its end; infinite where that is not known.
     excess: FloatArray | None = None
     bridged: bool = False  # whether the plant's model stood in for all that was missing since the warm-up
+    # By how many times fault estimates are less certain than before samples were missing ``(nf,)``; ``None``: no less.
+    unsure: FloatArray | None = None
     time: float = math.nan  # in seconds
     deviations: FloatArray | None = None  # ``(nu + ny,)`` as read
     at: float = math.nan  # the time of its sample since the first one; of continuous designs that of its stamp

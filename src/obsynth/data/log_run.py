@@ -376,7 +376,7 @@ class LogRun:
         above = [
             (name, abs(float(values[i])) / grown)
             for name, i, level in self._levels
-            if math.isfinite(grown := level + self._excess(row, i))
+            if math.isfinite(grown := level * self._share(row, i) + self._excess(row, i))
         ]
         names = [name for name, evidence in above if evidence > 1.0]
         for name, evidence in above:
@@ -415,6 +415,11 @@ class LogRun:
             deciding = row.status in (*DECIDING, RECOVERING)
         residuals, faults = row.values[self._residuals], row.values[self._faults]
         return Sample(row.at, residuals, faults, self._evidence(row), deciding, row.skipped, row.bridged)
+
+    def _share(self, row: Row, column: int) -> float:
+        """Return by how many times a level is higher than stated: as less certain as a fault estimate is."""
+        place = column - self._faults.start
+        return 1.0 if row.unsure is None or not 0 <= place < len(row.unsure) else float(row.unsure[place])
 
     def _excess(self, row: Row, column: int) -> float:
         """Return by how much more than its level a column must be for an alarm: infinite where nothing is decided."""

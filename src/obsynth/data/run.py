@@ -294,7 +294,8 @@ def run_on_data(
     thresholds : mapping, optional
         Level of the absolute value by column of the output, such as ``fhat[actuator]`` or ``r[speed]`` (of faults
         with an operating point, of the deviation): the column ``alarm`` names those above their level.  Alarms are
-        suspended in rows that are not ``ok`` or ``partial``.
+        suspended in rows that are not ``ok`` or ``partial``; while the stated deviation of a fault estimate is above
+        that before samples were missing, its level is as many times higher.
     monitor : Monitor, optional
         From `obsynth.online_monitor`: columns ``statistic`` and ``threshold``, and its alarms in ``alarm``, with the
         fault that it points to.

@@ -23,7 +23,7 @@ class SteppingLogObserver(LogObserver):
     By default no warm-up, as covariances of the start say how uncertain the estimates are, and a gate for outliers
     where the observer says nothing of them."""
 
-    saved: ClassVar = {"observer": "state", "u": "u"}
+    saved: ClassVar = {"observer": "state", "u": "u", "spread": "spread", "usual": "usual"}
 
     def __init__(self, design: ObserverDesign, *, warm_up: float | None = None, outliers: str | None = None) -> None:
         observer: Any = design.observer
@@ -58,6 +58,8 @@ class SteppingLogObserver(LogObserver):
         self.chain: Chain | None = None
         self.state: Any = self.observer.init()
         self.u: FloatArray | None = None
+        # Deviations of the faults at the last row, and before samples were missing: zero where nothing is left of that.
+        self.spread = self.usual = np.zeros(len(self.fault_names))
 
     def follows(self, missing: int) -> bool:
         """Whether rows that are missing are taken one by one: always where the plant changes with k."""
@@ -134,7 +136,21 @@ class SteppingLogObserver(LogObserver):
         if fresh and self.is_recursive:
             received = np.ones_like(received)
         status = self._status(time, known[:nu], received, spoiled=spoiled)
-        return Row(status, self._values(found), missing, found)
+        whole = not spoiled and bool(known[:nu].all() and received.all())
+        return Row(status, self._values(found), missing, found, unsure=self._unsure(found, whole=whole, fresh=fresh))
+
+    def _unsure(self, found: Evidence, *, whole: bool, fresh: bool) -> FloatArray | None:
+        """Return by how many times the deviations of faults are above those before samples were missing, after a row
+        that is ``whole`` or lacks some; ``None`` where none is."""
+        before, self.spread = self.spread, np.sqrt(np.diag(found.parameter_covariance))
+        if fresh:
+            self.usual = np.zeros_like(before)
+        elif not whole:
+            self.usual = np.where(self.usual > 0.0, self.usual, before)
+        self.usual = np.where(self.spread > self.usual, self.usual, 0.0)
+        if not self.usual.any():
+            return None
+        return np.divide(self.spread, self.usual, out=np.ones_like(before), where=self.usual > 0.0)
 
     def _refused(self, total: FloatArray) -> np.ndarray:
         """Return which outputs of the last sample were left out as outliers: of which more are than before it."""

@@ -765,7 +765,8 @@ def _dae_header(design: ObserverDesign, prefix: str, digest: str, alarms: Alarms
         yield f"    {prefix}_monitor monitor;"
     yield from (comment("Everything else is the observer's own."), f"    struct {prefix}_observer running;")
     yield from (f"    double u[{max(model.nu, 1)}];", "    double time, from;", "    long k;")
-    yield from ("    int is_started, phase;", f"}} {prefix}_state;", "")
+    yield f"    double spread[{max(model.nq, 1)}], usual[{max(model.nq, 1)}];"
+    yield from ("    int is_started, is_whole, phase;", f"}} {prefix}_state;", "")
     yield comment("States after the measurement, parameters, their standard deviations; innovations (NaN where y is);")
     yield comment("their square in units of their covariance; the residual of the step in sizes of the states.")
     yield "typedef struct {"

@@ -17,6 +17,9 @@ void PREFIX_reset(PREFIX_state *s)
         s->alarm[i] = 0;
     }
     MONITOR_RESET
+    for (i = 0; i < LENGTH(NQ); i++) {
+        s->spread[i] = s->usual[i] = 0.0;
+    }
 }
 
 /* A row before all inputs have been known, with which a nonlinear model has nothing to begin: nothing is said. */
@@ -71,6 +74,7 @@ static int status_of(PREFIX_state *s, const double *seen, const int *refused, in
         known = known || is_received;
         all = all && is_received;
     }
+    s->is_whole = inputs_known && all;
     if (!inputs_known || !known) {
         return UPPER_GAP;
     }
@@ -82,6 +86,21 @@ static int status_of(PREFIX_state *s, const double *seen, const int *refused, in
     return all ? UPPER_OK : UPPER_PARTIAL;
 }
 
+/* By how many times a fault estimate is less certain than before samples were missing: levels are as many times higher. */
+static double unsure(PREFIX_state *s, int i, double spread, int is_first)
+{
+    if (is_first) {
+        s->usual[i] = 0.0;
+    } else if (!s->is_whole && !(s->usual[i] > 0.0)) {
+        s->usual[i] = s->spread[i];
+    }
+    s->spread[i] = spread;
+    if (!(spread > s->usual[i])) {
+        s->usual[i] = 0.0;
+    }
+    return s->usual[i] > 0.0 ? spread / s->usual[i] : 1.0;
+}
+
 int PREFIX_step(PREFIX_state *s, ARGUMENTSconst double y[NY], PREFIX_estimates *estimates)
 {
     double used[LENGTH(NU)];
@@ -91,6 +110,7 @@ int PREFIX_step(PREFIX_state *s, ARGUMENTSconst double y[NY], PREFIX_estimates *
     double received[NY];
     double said[ROW];
     double shown[UPPER_WATCHED];
+    double share[LENGTH(NQ)];
     const double *after;
     int refused[NY];
     int inputs_known = 1;
@@ -151,6 +171,7 @@ int PREFIX_step(PREFIX_state *s, ARGUMENTSconst double y[NY], PREFIX_estimates *
     }
     for (i = 0; i < NQ; i++) {
         estimates->fault_deviations[i] = sqrt(fmax(after[AT_SPREAD + i * (NQ + 1)], 0.0));
+        share[i] = unsure(s, i, estimates->fault_deviations[i], is_first);
     }
     for (i = 0; i < NY; i++) {
         estimates->residuals[i] = isnan(received[i]) ? NAN : said[AT_INNOVATION + i];
@@ -163,7 +184,8 @@ int PREFIX_step(PREFIX_state *s, ARGUMENTSconst double y[NY], PREFIX_estimates *
     MONITOR_STEP
     s->any_alarm = 0;
     for (i = 0; i < UPPER_WATCHED; i++) {
-        s->alarm[i] = is_deciding && s->level[i] > 0.0 && fabs(shown[i]) > s->level[i];
+        double level = i < NQ ? s->level[i] * share[i] : s->level[i];
+        s->alarm[i] = is_deciding && s->level[i] > 0.0 && fabs(shown[i]) > level;
         s->any_alarm = s->any_alarm || s->alarm[i];
     }
     return !inputs_known;
