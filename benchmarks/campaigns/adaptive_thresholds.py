@@ -27,7 +27,7 @@ from obsynth.data.alarm_proof import verify_alarm
 from obsynth.experiments.alarm_proof import proved_alarm
 from obsynth.experiments.monitors.adaptive import adaptive_plan
 from obsynth.spec import load_spec
-from obsynth.verification.adaptive_bound import record_columns
+from obsynth.verification.adaptive_bound import AdaptivePlan, thresholds_of_records
 
 NAMES = ("wang2015", "smib", "drive")
 #: Cases of each design, by kind, and proofs of a fault on wang2015 after them.
@@ -53,6 +53,20 @@ BOUNDS = {
 WIDTHS, WIDTH_RUNS, SETTLED = {"wang2015": [4.31, 2.28], "smib": [1.07], "drive": [1.73]}, 60, 60
 #: A step of the fault in median thresholds.
 STEP_SIZE = 2.0
+
+
+def record_columns(
+    plan: AdaptivePlan, rows: np.ndarray, inputs: np.ndarray, outputs: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return thresholds ``(runs, steps, no)`` and intervals of faults ``(runs, steps, nf, 2)`` over whole records."""
+    found = thresholds_of_records(plan.bound, rows @ plan.bound.structure.reading.T, inputs, outputs)
+    nf, error = len(plan.fault_names), found
+    if plan.faults is not None:
+        error = thresholds_of_records(plan.faults, rows @ plan.faults.structure.reading.T, inputs, outputs)
+    first = rows.shape[2] - found.total.shape[2]
+    middle = rows[:, :, first : first + nf] - error.shift[:, :, :nf]
+    width = error.total[:, :, :nf] - np.abs(error.shift[:, :, :nf])
+    return found.total, np.stack([middle - width, middle + width], axis=3)
 
 
 @cache

@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from benchmarks.campaigns.adaptive_thresholds import record_columns
 from benchmarks.campaigns.frame import Outcome
 from scipy.linalg import expm
 
@@ -27,7 +28,6 @@ import obsynth
 from obsynth.errors import ObsynthError, PreconditionError, SpecError
 from obsynth.experiments.alarm_proof import proved_alarm
 from obsynth.experiments.monitors.adaptive import adaptive_plan
-from obsynth.verification.adaptive_bound import record_columns
 
 CASES = 400
 LIMIT = 300.0

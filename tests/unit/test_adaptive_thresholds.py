@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from benchmarks.campaigns.adaptive_thresholds import record_columns
 from scipy.linalg import expm
 from uncertain_plants import DRIVE, drive, wang
 
@@ -18,7 +19,7 @@ from obsynth.experiments.monitors.adaptive import AdaptiveState, adaptive_plan, 
 from obsynth.experiments.simulation import make_bench
 from obsynth.observers.running import state_as_data, state_from_data
 from obsynth.tolerances.exact_plant import drawn_points, plant_at
-from obsynth.verification.adaptive_bound import record_columns, thresholds_of_records
+from obsynth.verification.adaptive_bound import thresholds_of_records
 
 START = 0.2
 

@@ -7,8 +7,12 @@ import pytest
 
 from obsynth.methods.pd_observer.realisation import PdErrorSystem
 from obsynth.numerics import continuous
-from obsynth.numerics.continuous import continuous_hinf_norm, spectral_abscissa
-from obsynth.numerics.norms import hinf_norm
+from obsynth.numerics.continuous import ContinuousNorms, spectral_abscissa
+from obsynth.numerics.norms import HinfNorm, hinf_norm
+
+
+def continuous_hinf_norm(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> HinfNorm:
+    return ContinuousNorms(a).between(b, c, d)
 
 
 def as_arrays(*matrices: object) -> tuple[np.ndarray, ...]:
@@ -86,7 +90,7 @@ def test_one_norm_of_systems_that_differ_in_what_drives_nothing(monkeypatch: pyt
         return hinf_norm(*parts, **named)
 
     monkeypatch.setattr(continuous, "hinf_norm", counted)
-    norms, nothing = continuous.ContinuousNorms(a), np.zeros((4, 3))
+    norms, nothing = ContinuousNorms(a), np.zeros((4, 3))
     first = norms.between(b, c, np.zeros((1, 2)))
     assert norms.between(np.hstack([nothing, b]), c, np.zeros((1, 5))) == first
     assert len(asked) == 1

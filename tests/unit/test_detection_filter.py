@@ -13,7 +13,7 @@ import pytest
 
 import obsynth
 from obsynth.methods.detection_filter.norm_proofs import missed
-from obsynth.numerics.continuous import continuous_hinf_norm
+from obsynth.numerics.continuous import ContinuousNorms
 
 
 def plant(seed: int = 0) -> obsynth.DescriptorSystem:
@@ -72,7 +72,7 @@ def test_no_other_filter_has_a_larger_ratio() -> None:
         if np.max(np.linalg.eigvals(closed).real) >= 0.0:
             continue
         weight = rng.standard_normal((1, 2))
-        norm = continuous_hinf_norm(closed, b - gain @ d, weight @ system.C, weight @ d).value
+        norm = ContinuousNorms(closed).between(b - gain @ d, weight @ system.C, weight @ d).value
         shown = min(
             abs((weight @ transfer(system, gain, system.Bf, system.Df, w))[0, 0]) for w in np.linspace(0.0, 10.0, 60)
         )

@@ -30,7 +30,7 @@ from obsynth.methods.pd_observer.checks.certificate import (
 from obsynth.methods.pd_observer.conditions import pd_observer_conditions
 from obsynth.methods.pd_observer.limits import least_noise_gain
 from obsynth.methods.pd_observer.realisation import with_faults_as_states, with_sensor_noise
-from obsynth.numerics.continuous import continuous_hinf_norm
+from obsynth.numerics.continuous import ContinuousNorms
 from obsynth.simulation import simulate_plant
 from obsynth.spec import load_spec
 
@@ -566,5 +566,5 @@ def test_norms_of_the_report_are_those_of_the_realisation() -> None:
     a = np.block([[plant.A, np.zeros((plant.nx, observer.order))], [observer.By @ plant.C, observer.Az]])
     b = np.vstack([plant.Bd, observer.By @ plant.Dd])
     c = -np.hstack([observer.Dy[rows] @ plant.C, observer.Cz[rows]])
-    norm = continuous_hinf_norm(a, b, c, -observer.Dy[rows] @ plant.Dd)
+    norm = ContinuousNorms(a).between(b, c, -observer.Dy[rows] @ plant.Dd)
     assert design.report["disturbance in the fault estimate"].value == pytest.approx(norm.upper, rel=1e-7)

@@ -7,7 +7,11 @@ from scipy.linalg import block_diag, eigvals
 from obsynth import DescriptorSystem
 from obsynth.analysis.zeros import regularity_of, structure_of
 from obsynth.numerics import pencils
-from obsynth.numerics.pencils import finite_zeros, pencil_structure
+from obsynth.numerics.pencils import finite_zeros, reduced, structure_of_reduced
+
+
+def pencil_structure(E, A):
+    return structure_of_reduced(E.shape, reduced(E, A))
 
 
 def nonsingular(size, rng, spread=10.0):

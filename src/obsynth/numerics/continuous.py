@@ -29,17 +29,11 @@ def spectral_abscissa(a: FloatArray) -> float:
     return float(np.max(np.linalg.eigvals(a).real))
 
 
-def continuous_hinf_norm(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> HinfNorm:
-    """Return the H-infinity norm of a continuous-time system, by ``s = w (z - 1) / (z + 1)``, which keeps every gain.
-
-    w is the geometric mean of the moduli of the eigenvalues.
-    """
-    return ContinuousNorms(a).between(b, c, d)
-
-
 @dataclass(frozen=True, eq=False)
 class ContinuousNorms:
-    """Norms of systems with one ``A (n, n)``: what depends on that alone is found once."""
+    """H-infinity norms of continuous-time systems with one ``A (n, n)``: what depends on that alone is found once.
+
+    By ``s = w (z - 1) / (z + 1)``, which keeps every gain; w is the geometric mean of the moduli of the eigenvalues."""
 
     a: FloatArray
     _known: list[tuple[tuple[FloatArray, ...], HinfNorm]] = field(default_factory=list, init=False, repr=False)
@@ -58,7 +52,7 @@ class ContinuousNorms:
         return w, resolvent, turned, Modes((w + values) / (w - values), own.vectors)
 
     def between(self, b: FloatArray, c: FloatArray, d: FloatArray) -> HinfNorm:
-        """Return the norm with other matrices ``(n, m)``, ``(p, n)``, ``(p, m)``; see `continuous_hinf_norm`."""
+        """Return the norm with other matrices ``(n, m)``, ``(p, n)``, ``(p, m)``."""
         if b.shape[1] == 0 or c.shape[0] == 0:
             return HinfNorm(0.0, 0.0, 0.0)
         if not all(np.all(np.isfinite(part)) for part in (self.a, b, c, d)):

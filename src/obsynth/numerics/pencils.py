@@ -245,8 +245,6 @@ class PencilStructure:
     largest first; ``decisions``: every rank decided on the way, relative to the norm of the equilibrated pencil.
     """
 
-    rows: int
-    columns: int
     regular: bool
     normal_rank: int
     index: int | None
@@ -264,13 +262,9 @@ class FiniteZeros:
     decisions: tuple[RankDecision, ...]
 
 
-def pencil_structure(E: FloatArray, A: FloatArray) -> PencilStructure:
-    """Return the structure of ``A - z E (m, n)`` of any size, including zero (Algorithms 3.1 and 4.1)."""
-    return structure_of_reduced(E.shape, reduced(E, A))
-
-
 def reduced(E: FloatArray, A: FloatArray) -> tuple[Deflation, Deflation]:
-    """Return what the two passes leave of ``A - z E (m, n)``: all that structure and regularity follow from.
+    """Return what two passes (Algorithms 3.1 and 4.1) leave of ``A - z E (m, n)``, of any size, zero included: all that
+    structure and regularity follow from.
 
     The infinite and right singular part are deflated first, then, transposed, the left singular part."""
     scales, right = without_infinite_part(equilibrate_pencil(E, A))
@@ -280,14 +274,11 @@ def reduced(E: FloatArray, A: FloatArray) -> tuple[Deflation, Deflation]:
 def structure_of_reduced(shape: tuple[int, ...], passes: tuple[Deflation, Deflation]) -> PencilStructure:
     """Return the structure of a pencil ``(m, n)`` from its two passes."""
     right, left = passes
-    rows, columns = shape
     regular = _is_regular(shape, right)
     next_nullities = (*right.nullities[1:], 0)
     counts = [rank - following for rank, following in zip(right.ranks, next_nullities, strict=False)]
     sizes = tuple(size for size in range(len(counts), 0, -1) for _ in range(counts[size - 1]))
     return PencilStructure(
-        rows=rows,
-        columns=columns,
         regular=regular,
         normal_rank=normal_rank_of(right, left),
         index=len(right.ranks) if regular else None,

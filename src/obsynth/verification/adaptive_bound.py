@@ -355,20 +355,6 @@ def thresholds_of_records(
     return Thresholds(total, first, shift, np.broadcast_to(start[:, m:], total.shape), rest)
 
 
-def record_columns(
-    plan: AdaptivePlan, rows: FloatArray, inputs: FloatArray, outputs: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return thresholds ``(runs, steps, no)`` and intervals of faults ``(runs, steps, nf, 2)`` over whole records."""
-    found = thresholds_of_records(plan.bound, rows @ plan.bound.structure.reading.T, inputs, outputs)
-    nf, error = len(plan.fault_names), found
-    if plan.faults is not None:
-        error = thresholds_of_records(plan.faults, rows @ plan.faults.structure.reading.T, inputs, outputs)
-    first = rows.shape[2] - found.total.shape[2]
-    middle = rows[:, :, first : first + nf] - error.shift[:, :, :nf]
-    width = error.total[:, :, :nf] - np.abs(error.shift[:, :, :nf])
-    return found.total, np.stack([middle - width, middle + width], axis=3)
-
-
 def _first_constant(bound: AdaptiveBound, v: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return first-order bounds of channels, ``|phi|`` of each constant, and the shift of the outputs' middle."""
     p, _, _, m, no = bound.counts

@@ -228,8 +228,8 @@ def _time_constant(radius: float, dt: float) -> str:
     return f"slowest time constant {-dt / np.log(radius):.3g} s"
 
 
-#: Letters that every gain set has, and that it may have.
-NEEDED, OPTIONAL = ("T", "N", "L", "W", "Psi", "Upsilon"), ("R",)
+#: Letters that every gain set has; it may have R as well.
+NEEDED = ("T", "N", "L", "W", "Psi", "Upsilon")
 RESTRICTED, WEIGHT = "gains: T and N", "gains: W"
 
 
