@@ -222,6 +222,11 @@ class SolutionBounds:
     condition: float
     backward_error: float
 
+    @property
+    def forward_error(self) -> float:
+        """Bound on the relative error of the solution (of each column, in the largest norm of scaled unknowns)."""
+        return self.condition * self.backward_error
+
 
 class SparseFactor:
     """LU factors of a square sparse matrix, with rows and columns scaled by powers of two by their largest entries.
