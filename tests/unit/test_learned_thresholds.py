@@ -460,3 +460,17 @@ def test_files_that_are_wrong_are_refused(tmp_path: Path, damage: str) -> None:
     file.write_text("{" if damage == "text" else json.dumps(document))
     with pytest.raises(obsynth.SpecError):
         obsynth.online_monitor(heated(), "learned", normal=file)
+
+
+def test_what_a_followed_fault_leaves_is_told_where_estimates_are_not_watched(tmp_path, capsys) -> None:
+    """An observer that expects steps followed a leak of twenty deviations, and the summary said no word of it."""
+    spec = obsynth.load_spec(Path(__file__).parents[2] / "docs/examples/battery/spec.yaml")
+    gains = obsynth.ui_pi_observer(spec.plant).save(tmp_path / "battery.gains.json")
+    noise = 0.1 * np.random.default_rng(0).standard_normal((400, 3)) + [80.0, 80.0, 20.0]
+    log = pd.DataFrame(noise, columns=["cell", "plate", "housing"]).assign(time=5.0 * np.arange(400), heater=60.0)
+    log.to_csv(tmp_path / "normal.csv", index=False)
+    asked = ["thresholds", "--gains", str(gains), "--data", str(tmp_path / "normal.csv"), "--quiet"]
+    assert main([*asked, "--false-alarms", "1 per 200 rows"]) == 0
+    told = " ".join(capsys.readouterr().out.split())
+    assert "Monitored: r[cell], r[plate]." in told
+    assert "an alarm comes at its onset or not at all. Give run a level for the estimate" in told

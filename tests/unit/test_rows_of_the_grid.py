@@ -14,6 +14,7 @@ from test_flaws_of_logs import designed, heated, log, recursive
 from test_missing_inputs import lag, log_of, measured
 
 import obsynth
+from obsynth.errors import SpecError
 
 pytestmark = pytest.mark.usefixtures("taken_as_verified")
 DT, ROWS, FAULT_AT = 0.1, 220, 170
@@ -125,6 +126,16 @@ def test_thresholds_learned_from_rows_that_are_missing_are_those_of_rows_without
     ]
     np.testing.assert_array_equal(found[0].levels, found[1].levels)
     np.testing.assert_array_equal(found[0].scales, found[1].scales)
+
+
+def test_rows_that_a_saved_state_has_are_told_to_be_those(tmp_path: Path) -> None:
+    data, state = log(), tmp_path / "s.json"
+    run("ui-pi-observer", "levels", data[:60], state=state)
+    with pytest.raises(SpecError, match=r"falls from .*; the run went on from a saved state, which has the rows up to"):
+        run("ui-pi-observer", "levels", data, state=state)
+    twice = pd.concat([data[:60], data[:30]], ignore_index=True)
+    with pytest.raises(SpecError, match=r"falls from [^;]* s\.$"):
+        run("ui-pi-observer", "levels", twice)
 
 
 def test_a_repeated_row_after_a_saved_state_is_left_out_where_stamps_jitter(tmp_path: Path) -> None:

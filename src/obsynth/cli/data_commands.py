@@ -269,7 +269,7 @@ def proof_of(
 def run_thresholds(options: argparse.Namespace) -> int:
     """Run ``thresholds``: 0 whether the rows suffice for the rate or not, which is told; every failure is an error."""
     from obsynth.data.online_monitor import FALSE_ALARM_RATE, learn_thresholds
-    from obsynth.experiments.monitors.learned import LEARNED
+    from obsynth.experiments.monitors.learned import LEARNED, expects_fault_courses
 
     is_stream = options.data == STREAM
     require_distinct({"--gains": options.gains, "--out": options.out, "--data": None if is_stream else options.data})
@@ -303,6 +303,11 @@ def run_thresholds(options: argparse.Namespace) -> int:
         lines.append(
             f"Not monitored, as they depend on the others or are correlated for too long: {', '.join(found.left_out)}."
         )
+        if expects_fault_courses(design) and not any(name.startswith("fhat[") for name in found.columns):
+            lines.append(
+                "A fault that its estimate follows leaves nothing in these once it is followed: an alarm comes at its "
+                "onset or not at all. Give run a level for the estimate as well (--threshold)."
+            )
     answer(
         options,
         {

@@ -77,6 +77,7 @@ class Clock:
         self.stamp, self.away, self.left_out = -math.inf, 0.0, 0
         # Of sampled designs: the number of the last sample, from that of the first row.
         self.count = 0
+        self.is_resumed = False  # and no row has been taken since
 
     def as_dict(self) -> dict[str, Any]:
         """Return what goes from row to row, as data."""
@@ -85,6 +86,7 @@ class Clock:
     def resume(self, data: Mapping[str, Any]) -> None:
         """Go on from what `as_dict` returned."""
         vars(self).update(data)
+        self.is_resumed = True
 
     def at(self, time: float, before: int = 0) -> float:
         """Return the time of the last sample, with this stamp, or of one so many before it: sampled designs count
@@ -102,7 +104,8 @@ class Clock:
         if time == last:
             raise SpecError(f"Row {row} repeats the time {time:.17g} s of the row before.", path=f"row {row}")
         if time < last:
-            raise SpecError(f"Row {row}: the time falls from {last:.17g} to {time:.17g} s.", path=f"row {row}")
+            known = "; the run went on from a saved state, which has the rows up to there" if self.is_resumed else ""
+            raise SpecError(f"Row {row}: the time falls from {last:.17g} to {time:.17g} s{known}.", path=f"row {row}")
         step = interval(last, time)
         missing = self._sampled(step, row) if self.dt > 0.0 else self._continuous(step, row)
         self.last = time
@@ -111,7 +114,7 @@ class Clock:
             away = step - (missing + 1) * self.dt
             # Regular stamps are taken as they are, and not as they are summed up.
             self.last = time if abs(away) <= SURE_SHARE * self.dt else time - FOLLOWING_SHARE * away
-        self.stamp, self.left_out = time, 0
+        self.stamp, self.left_out, self.is_resumed = time, 0, False
         if not missing:
             self.longest = max(self.longest, step)
         return step, missing

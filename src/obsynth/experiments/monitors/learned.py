@@ -442,8 +442,7 @@ def signatures(design: ObserverDesign, kept: Sequence[int], sizes: FloatArray) -
         return np.array(found), tuple(names)
     errors = error_model(design)
     observer, plant = errors.observer, errors.plant
-    if errors.Phi is not None:
-        # The observer expects faults of this course, which leave no constant behind.
+    if expects_fault_courses(design):
         return np.array(found), tuple(names)
     c, direct, *_ = errors.output(slice(len(observer.state_names), None))
     held = (np.eye(observer.order) if observer.dt > 0.0 else np.zeros_like(observer.Az)) - observer.Az
@@ -458,6 +457,12 @@ def signatures(design: ObserverDesign, kept: Sequence[int], sizes: FloatArray) -
             found.append(gain / size)
             names.append(f"fault {name}")
     return np.array(found), tuple(names)
+
+
+def expects_fault_courses(design: ObserverDesign) -> bool:
+    """Whether a linear observer expects faults of a course, such as a step, which leave nothing in its residuals once
+    it has followed them."""
+    return isinstance(design.observer, LinearObserver) and error_model(design).Phi is not None
 
 
 def independent(rows: FloatArray, first: int) -> list[int]:

@@ -140,29 +140,53 @@ class DAERow:
         return np.asarray(np.abs(np.linalg.eigvals(self.several.part("kept"))).max(axis=1))
 
 
+#: Single rows whose estimates are made together.
+GATHERED_TOGETHER = 256
+
+
 class GatheredRows:
     """What the estimates keep of the rows of a record, while it is being run."""
 
     def __init__(self, observer: DAESettings) -> None:
         self.observer = observer
         self.parts: list[dict[str, FloatArray]] = []
+        self.single: list[DAERow] = []
         self.projection = np.zeros(observer.model.nx)
 
     def add(self, rows: DAERow) -> None:
-        """Keep some rows."""
+        """Keep some rows.  What is kept of single ones is made of many together: of each it takes as long as its
+        step."""
         if rows.k == 0:
             self.projection = rows.moved
+        if rows.memory.ndim == 1:
+            self.single.append(rows)
+        if rows.memory.ndim > 1 or len(self.single) >= GATHERED_TOGETHER:
+            self._keep_single()
+        if rows.memory.ndim > 1:
+            self._keep(rows)
+
+    def _keep_single(self) -> None:
+        """Keep single rows that wait."""
+        if not self.single:
+            return
+        first, rows = self.single[0], self.single
+        memory, said, seen = (np.stack([getattr(row, name) for row in rows]) for name in ("memory", "said", "seen"))
+        self._keep(DAERow(first.graph, first.k, memory, said, seen, first.moved))
+        self.single = []
+
+    def _keep(self, rows: DAERow) -> None:
         # Copies, so that what is not kept can go.
-        several = rows.several
-        self.parts.append({name: np.array(of(several)) for name, of in _KEPT_COLUMNS.items()})
+        self.parts.append({name: np.array(of(rows)) for name, of in _KEPT_COLUMNS.items()})
 
     def add_regular(self, rows: DAERow) -> None:
         """Keep some rows, unless the matrix of (7) was singular to working precision in one of them."""
         self.add(rows)
+        self._keep_single()
         require_regular(self.observer, rows, self.parts[-1]["conditions"])
 
     def estimates(self) -> Estimates:
         """Return what was gathered."""
+        self._keep_single()
         first, *more = self.parts
         whole = {name: np.concatenate([part[name] for part in self.parts]) for name in first} if more else dict(first)
         whole["excitation"] = _excitation(self.observer, whole["informations"])
