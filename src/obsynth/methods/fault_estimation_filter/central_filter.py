@@ -406,9 +406,8 @@ COARSE_LEVEL_TOLERANCE = 1e-5
 COARSE_NOISES = (1e-6, 1e-4)
 #: Distance below the best gain, in tolerances, at which another noise is tried.
 PROBE = 10.0
-#: The first level tried, relative to the start, for few and for many states: the margin near the start leads far down,
-#: and half of the start is below the least level where there is much noise (9.5 levels at 16 states instead of 8.3).
-FIRST_LEVEL = 0.9
+#: The first level tried, relative to the start, for few and for many states: the margin near the start leads far down.
+FIRST_LEVEL = 0.5
 COARSE_START_SHARE = 0.99
 #: Weights of the noise beside the disturbance, relative to their sizes, and levels of both together, relative to the
 #: gain of the disturbance alone.
