@@ -185,6 +185,19 @@ def test_coloured_noise_is_called_so_and_no_variance_is_blamed(tank_design):
     assert "times too" not in text
 
 
+def test_steps_are_judged_by_all_of_a_sensors_noise(tank_design):
+    """What is white beside coloured noise is next to nothing: steps were told to err by 38 deviations of a sensor."""
+    noise = {"gauge": {"deviation": 0.01, "correlation": 9.5}}
+    model, found = obsynth.with_noise(tank_design.plant, sensor_noise=noise, dt=1.0)
+    design = dae_adaptive_observer(
+        model, dt=1.0, Q={"balance": 1e-8, **found["Q"]}, R={"gauge": 1e-12}, initial_covariance={"level": 1e-4},
+        initial_parameter_covariance=[[1e-6]],
+    )  # fmt: skip
+    found = validate(design, emptying_tank(400, correlation=0.9))
+    assert found.sensors["gauge"].whiteness.probability > 0.01
+    assert not any("backward Euler" in sentence for sentence in found.verdict)
+
+
 def test_a_wrong_constant_is_named_with_the_value_that_explains_the_log(tank_design):
     found = validate(tank_design, emptying_tank(400, c=0.13))
     assert not found.passed

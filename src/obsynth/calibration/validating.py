@@ -139,16 +139,17 @@ def recorded_innovations(design: ObserverDesign, log: Log) -> RecordedInnovation
 
 def _nonlinear(observer: DAEObserver, log: Log) -> RecordedInnovations:
     found, error = _over(observer, log), None
+    deviations = np.sqrt(np.einsum("kii->ki", found.innovation_covariances))
     if observer.integration == "backward-euler":
+        # Where the noise of a sensor is coloured, R is what is white beside it, next to nothing.
         error = integration_error(
             observer.model,
             np.array(found.states),
             log.u,
             np.array(found.parameters[-1]),
-            np.sqrt(np.diag(observer.R)),
+            np.median(deviations, axis=0),
             observer.dt,
         )
-    deviations = np.sqrt(np.einsum("kii->ki", found.innovation_covariances))
     return _recorded(found, found.innovations, deviations, error)
 
 
@@ -339,8 +340,8 @@ def validate(
     if record.error is not None and record.error.matters:
         sentences.append(
             f"A step of backward Euler errs by up to {record.error.largest:.2g} deviations of "
-            f"{record.error.sensor} (row {found.rows[0] + record.error.row}): integration: radau does not, "
-            "which parameters may need."
+            f"{record.error.sensor} (row {found.rows[0] + record.error.row}), which moves estimates of "
+            "parameters: integration: radau has no such error."
         )
     if passed:
         sentences.append("The innovations are as the design expects them: white, without offset, of the stated size.")

@@ -217,7 +217,11 @@ def _plant_and_clock(spec: obsynth.Spec, sample_time: float | None) -> tuple[obs
     """Return the plant before it was sampled, and the clock: some methods are continuous, and so are tolerances."""
     plant = spec.plant
     if not isinstance(plant, obsynth.DescriptorSystem):
-        raise SpecError("compare is for linear plants with constant matrices.", path="plant")
+        raise SpecError(
+            "compare is for linear plants with constant matrices; of a plant of equations give the linear one that its "
+            "spec makes with transform: {linearise: {at: equilibrium, faults: [...]}, sample_time: ...}.",
+            path="plant",
+        )
     if spec.transformation is None:
         return plant, sample_time
     source = spec.transformation.source
