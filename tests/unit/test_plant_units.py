@@ -95,3 +95,18 @@ def test_elimination_does_not_hang_on_units(seed: int) -> None:
     plant = obsynth.DescriptorSystem(e, a, C=np.eye(1, 6), Bf=np.eye(6, 1))
     found = [obsynth.eliminate_algebraic_states(own).plant for own in (plant, in_other_units(plant, seed)[0])]
     assert found[0].nx == found[1].nx
+
+
+@pytest.mark.parametrize("seed", [33, 46, 59])
+def test_whether_a_fault_shows_does_not_hang_on_units(seed: int) -> None:
+    # Of a stiff plant in other units it was said that the fault reaches no output, or that another T be given.
+    stiff = obsynth.DescriptorSystem(
+        A=[[0, -0.0013, 0.0015, 0, 0], [0, -0.022, 0.041, 0, 0], [0, 0, -0.59, 0, 0],
+           [0, 0, -0.75, -0.48, -0.08], [0, 0, 0.0032, 0, -0.0057]],
+        C=[[-0.71, -0.33, 0.03, 0, 1.62], [1.87, 0, 1.65, -0.81, 1.24], [1.58, 1.08, 0, -0.17, 0]],
+        Bf=[[0], [-0.49], [-0.06], [0], [-0.51]],
+        Bd=[[-0.42, 0.9], [1.16, 0], [-1.13, -2.77], [0, 0.28], [-0.02, 1.72]], dt=0.1,
+    )  # fmt: skip
+    plant = in_other_units(stiff, seed)[0]
+    # Entries that are no short decimals: what shows is decided in floating point.
+    assert obsynth.fault_estimation_filter(plant.replace(A=plant.A * (1.0 + 1e-15))).report.passed

@@ -228,7 +228,7 @@ def _restricted_equivalent(
 
 def _psi(plant: DescriptorSystem, TA: FloatArray, C: FloatArray, TF: FloatArray) -> FloatArray:
     """Return ``Psi`` (20), with the detectability indexes (19)."""
-    found = fault_detectability(TA, C, TF, exact=exact_indexes(plant))
+    found = fault_detectability(TA, C, TF, plant=with_sensor_faults_as_states(plant), exact=exact_indexes(plant))
     if not found.finite:
         raise SpecError("With this T some fault never reaches the outputs: choose another.", path="T")
     return found.Psi

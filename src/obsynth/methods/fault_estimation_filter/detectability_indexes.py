@@ -15,6 +15,7 @@ from flint import fmpq_mat
 from obsynth.analysis.conditions import Condition
 from obsynth.analysis.existence.numbers import PlantNumbers, numbers_of
 from obsynth.analysis.existence.statements import settled_rank
+from obsynth.analysis.plant_units import PlantUnits
 from obsynth.numerics.arrays import FloatArray, largest_singular_value
 from obsynth.numerics.ranks import (
     CANCELLATION_TOLERANCE,
@@ -23,6 +24,7 @@ from obsynth.numerics.ranks import (
     RankDecision,
     decide_rank,
 )
+from obsynth.numerics.scaling import Scaling
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.exact_arithmetic import blocks, identity, left_null_basis, picked_columns, zeros_matrix
 
@@ -145,12 +147,25 @@ class FaultDetectability:
 
 
 def fault_detectability(
-    ta: FloatArray, c: FloatArray, tf: FloatArray, *, exact: ExactIndexes | None = None
+    ta: FloatArray,
+    c: FloatArray,
+    tf: FloatArray,
+    *,
+    plant: DescriptorSystem,
+    scaling: Scaling | None = None,
+    exact: ExactIndexes | None = None,
 ) -> FaultDetectability:
-    """Return the detectability indexes (19) and matrices (20), with the exact ones where these are known."""
-    size = largest_singular_value(c)
+    """Return the detectability indexes (19) and matrices (20), with the exact ones where these are known.
+    What shows is judged in units of the plant's own; ``scaling``: those of the matrices, if not the given ones."""
     if exact is None:
-        results = [_first_visible(ta, c, tf[:, i], size) for i in range(tf.shape[1])]
+        units = PlantUnits.of(plant).rounded()
+        states, outputs = units.states, units.outputs
+        if scaling is not None:
+            states, outputs = states / scaling.states, outputs / scaling.outputs
+        own, shown, entering = ta * states / states[:, None], outputs[:, None] * c * states, tf / states[:, None]
+        size = largest_singular_value(shown)
+        found = [_first_visible(own, shown, entering[:, i], size) for i in range(tf.shape[1])]
+        results = [(index, states * vector) for index, vector in found]
     else:
         results = [_at_index(ta, tf[:, i], index) for i, index in enumerate(exact[0])]
     psi = np.column_stack([vector for _, vector in results]) if results else np.zeros((ta.shape[0], 0))

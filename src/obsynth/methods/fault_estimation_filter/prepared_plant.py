@@ -154,7 +154,7 @@ def prepare(plant: DescriptorSystem, s: FloatArray | None = None, *, exactly: bo
         direct = scaling.scale_feedthrough(d)
         return t @ scaling.scale_input(b) - ta @ (n @ direct), shown @ direct
 
-    found = fault_detectability(ta, c, tf, exact=exact_indexes(plant) if exactly else None)
+    found = fault_detectability(ta, c, tf, plant=work, scaling=scaling, exact=exact_indexes(plant) if exactly else None)
     bd, dd = error_input(work.Bd, work.Dd)
     bw, dw = error_input(work.Bw, work.Dw)
     return PreparedPlant(work, scaling, t, n, ta, c, bd, dd, bw, dw, found)

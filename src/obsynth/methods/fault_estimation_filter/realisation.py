@@ -183,7 +183,7 @@ def _checked(indexes: Sequence[int] | None, work: DescriptorSystem) -> tuple[int
 def _detectability(work: DescriptorSystem, t: FloatArray, indexes: tuple[int, ...] | None) -> FaultDetectability:
     """Return the detectability matrices of given gains, with given indexes where there are any."""
     ta, tf = t @ work.A, t @ work.Bf
-    found = fault_detectability(ta, work.C, tf)
+    found = fault_detectability(ta, work.C, tf, plant=work)
     if indexes is None:
         return found
     powers = replace(found, indexes=indexes).chain(ta, tf)
