@@ -179,7 +179,7 @@ def _fix_sizes(
     moved = np.hstack([(plant.E != 0.0) | (plant.A != 0.0), plant.Bf != 0.0, plant.Bd != 0.0])
     linked = np.vstack([moved, np.hstack([plant.C != 0.0, nothing])])
     row_places, column_places = (
-        np.concatenate([np.array(part, dtype=int) for part in parts]) for parts in (rows, columns)
+        np.concatenate([np.array(part, dtype=np.int64) for part in parts]) for parts in (rows, columns)
     )
     waiting = np.ones(linked.shape[1], dtype=bool)
     free = np.ones(linked.shape[0], dtype=bool)

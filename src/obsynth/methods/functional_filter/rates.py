@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from obsynth.analysis.plant_units import PlantUnits
 from obsynth.analysis.zeros import structure_of
 from obsynth.errors import ObsynthError, SolverError
 from obsynth.methods.functional_filter.kalman_gain import FilterModel, KalmanGain, filter_model, kalman_gain
@@ -22,7 +23,7 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.fault_models import exosystem
 from obsynth.verification.certificates import slowest_decay
 
-#: Modes slower than this share of the fastest one never settle.
+#: Modes slower than this share of the fastest one, or of the plant's own rate (one over a sample), never settle.
 STANDING = 1e-6
 #: A step is to be seen to 90 % after so many time constants of the plant, but no sooner than so many samples.
 STEP_TIME_CONSTANTS, LEAST_SAMPLES = 7.0, 4.0
@@ -42,7 +43,10 @@ def settling_time(plant: DescriptorSystem) -> float:
     """Return the time in seconds after which a step of a fault should be seen."""
     values = structure_of(plant).finite_eigenvalues
     found = speeds(values, plant.dt)
-    alive = np.sort(found[np.isfinite(found) & (found > STANDING * np.max(found, initial=0.0))])
+    found = found[np.isfinite(found)]
+    own = 1.0 / (plant.dt or PlantUnits.of(plant).time)
+    # Beside nothing faster, what rounding leaves of an integrator would be a mode of 1e16 samples.
+    alive = np.sort(found[found > STANDING * np.max(found, initial=own)])
     # The median, for which numpy would load its masked arrays.
     middle = 0.5 * (alive[(alive.size - 1) // 2] + alive[alive.size // 2]) if alive.size else 0.0
     wanted = STEP_TIME_CONSTANTS / float(middle) if alive.size else max(plant.dt, 1.0) * 10.0

@@ -153,7 +153,8 @@ def _own_rate(plant: DescriptorSystem, f: FloatArray) -> float:
     for values in (structure.finite_eigenvalues, eigenvalues(f)):
         found = speeds(values, plant.dt)
         found = found[np.isfinite(found)]
-        found = found[found > max(SLOW_SHARE * float(np.max(found, initial=0.0)), DEAD_BEAT)]
+        own = 1.0 / plant.dt if plant.dt > 0.0 else 0.0
+        found = found[found > max(SLOW_SHARE * float(np.max(found, initial=own)), DEAD_BEAT)]
         if found.size and (plant.dt > 0.0 or np.max(found) > INTEGRATOR_SCATTER * size):
             median = float(np.median(found))
             return min(median, MOST_PER_SAMPLE / plant.dt) if plant.dt > 0.0 else median
