@@ -231,7 +231,7 @@ def normalise(problem: GainProblem, *, start: Injection | None = None, gain: flo
     states = _natural_states(a, b, z, zd, NORMALISING_LEVEL * size)
     inverse = np.linalg.inv(states)
     c = problem.C @ states
-    measurements = np.linalg.inv(np.linalg.cholesky(c @ c.T)) if problem.measured else np.zeros((0, 0))
+    measurements = _orthonormalising(c) if problem.measured else np.zeros((0, 0))
     # With P near I in units of gain^2: B is scaled by 1/gain, and x by the root of P.
     limit = problem.weight_limit
     changed = replace(
@@ -247,6 +247,12 @@ def normalise(problem: GainProblem, *, start: Injection | None = None, gain: flo
         Dn=measurements @ problem.Dn,
     )
     return NormalisedProblem(changed, states, measurements, size, start, gain)
+
+
+def _orthonormalising(c: FloatArray) -> FloatArray:
+    """Return the inverse of the Cholesky factor of ``c c'`` without that product, which loses rows in other units."""
+    factor = np.linalg.qr(c.T, mode="r")
+    return np.asarray(np.linalg.inv((np.copysign(1.0, np.diag(factor))[:, None] * factor).T))
 
 
 def _natural_states(a: FloatArray, b: FloatArray, z: FloatArray, zd: FloatArray, level: float) -> FloatArray:
