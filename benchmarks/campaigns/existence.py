@@ -69,8 +69,8 @@ def judged(method: str, drawn: Drawn) -> Outcome:
     if drawn.exists is False:
         return Outcome(method, "designed", f"designed, but {drawn.why}")
     error = settling_error(drawn, design.observer)
-    told = rounding_shares(design.plant, design.observer, 1.0 if design.plant.is_discrete else 0.0, own=True)
-    if error >= _DROWNED and not (told is not None and design.notes and error <= np.max(told)):
+    told = rounding_shares(design.plant, design.observer, 1.0 if design.plant.is_discrete else 0.0)[1]
+    if error >= _DROWNED and not (design.notes and error <= np.max(told)):
         return Outcome(method, "designed", f"the estimates settle {error:.1e} off")
     return Outcome(method, "designed" if error < _TOLERANCE else "designed, coarse")
 
