@@ -67,7 +67,7 @@ def bounded_real(n: int) -> Action:
         state_names=plant.state_names, fault_names=plant.fault_names, residual_names=(), state_delays=(0,) * n,
         fault_delays=(0,),
     )  # fmt: skip
-    return lambda: prove_bounded_real(plant, observer, np.eye(n), np.eye(n), 10.0, lag=0)
+    return lambda: prove_bounded_real(plant, observer, np.eye(n), np.eye(n), 10.0)
 
 
 def pd_observer(n: int) -> Action:

@@ -195,7 +195,7 @@ def static_filter(direct: float) -> tuple[obsynth.DescriptorSystem, LinearObserv
 def test_a_gain_is_proved_one_unit_in_the_last_place_above_the_norm_and_not_at_it(direct: float) -> None:
     plant, observer = static_filter(direct)
     for gain, below in ((np.nextafter(direct, np.inf), True), (direct, False), (np.nextafter(direct, 0.0), False)):
-        found = prove_bounded_real(plant, observer, np.eye(1), np.eye(1), float(gain), lag=0)
+        found = prove_bounded_real(plant, observer, np.eye(1), np.eye(1), float(gain))
         assert found.proved is below, gain
 
 

@@ -34,18 +34,16 @@ def prove_bounded_real(
     tracking: FloatArray,
     factor: FloatArray,
     gain: float,
-    *,
-    lag: int,
 ) -> DefinitenessProof:
     """Try to prove the bounded real inequality for the shipped observer; ``factor (core, core)``.
 
     What was proved of the same numbers, to the last bit, is not proved again while the observer lives.
     """
     known = _proofs_of(observer)
-    numbers = _digest(plant.Bd, plant.Dd, tracking, factor, np.array([gain, lag]))
+    numbers = _digest(plant.Bd, plant.Dd, tracking, factor, np.array([gain]))
     if numbers in known:
         return known[numbers]
-    found = _try_bounded_real(plant, observer, tracking, factor, gain, lag)
+    found = _try_bounded_real(plant, observer, tracking, factor, gain)
     if found.proved:
         known[numbers] = found
     return found
@@ -66,7 +64,7 @@ def _digest(*parts: FloatArray) -> bytes:
 
 
 def _try_bounded_real(
-    plant: DescriptorSystem, observer: LinearObserver, tracking: FloatArray, factor: FloatArray, gain: float, lag: int
+    plant: DescriptorSystem, observer: LinearObserver, tracking: FloatArray, factor: FloatArray, gain: float
 ) -> DefinitenessProof:
     core = factor.shape[0]
     outside = (observer.Az[:core, core:], observer.Cz[observer.fault_rows, core:])

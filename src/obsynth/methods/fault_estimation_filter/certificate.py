@@ -56,7 +56,7 @@ def bounded_real_certificate(
         found = _with_room(a, b, c, d, 1.0 + more, noise)
         if found is None:
             continue
-        if prove_bounded_real(plant, observer, tracking, found, gain, lag=lag).in_double_precision:
+        if prove_bounded_real(plant, observer, tracking, found, gain).in_double_precision:
             return found, True
     for change in islice(_changes(a, b, c, d), tries):
         inverse = np.asarray(np.linalg.inv(change))
@@ -67,7 +67,7 @@ def bounded_real_certificate(
             if p is None:
                 continue
             best = _triangular(np.asarray(np.linalg.cholesky(p)).T @ inverse)
-            proof = prove_bounded_real(plant, observer, tracking, best, gain, lag=lag)
+            proof = prove_bounded_real(plant, observer, tracking, best, gain)
             if proof.in_double_precision:
                 return best, True
             spare = best if proof.proved and spare is None else spare

@@ -174,7 +174,7 @@ def _norm_rows(
 ) -> Iterator[Check]:
     (plant, observer), claims = design.linear, design.certificate.claims
     gamma = claimed(claims, "gamma")
-    proof = prove_bounded_real(plant, observer, tracking, factor, gamma if plant.nd else 1.0, lag=lag)
+    proof = prove_bounded_real(plant, observer, tracking, factor, gamma if plant.nd else 1.0)
     what = f"stable, and l2 gain d -> fault error < {gamma:.6g}" if plant.nd else "stable (Lyapunov)"
     yield Check(
         "LMI",
