@@ -111,7 +111,7 @@ PROVABLE = 1e-10
 #: is enough for the digits that are printed.  One that misses by more than the third solves another equation, although
 #: its filter may be stable: wrong ones missed by .08 to .8 (500 plants).  Of those between, the best of all shares is
 #: taken.
-SOLVED, WELL_SOLVED, LARGEST_RESIDUAL = 1e-14, 1e-10, 1e-2
+SOLVED, WELL_SOLVED, MOST_MISSED = 1e-14, 1e-10, 1e-2
 #: Newton's method doubles the digits in a step, once it is near.
 MOST_NEWTON_STEPS = 30
 
@@ -162,7 +162,7 @@ def kalman_gain(model: FilterModel, rates: FloatArray, *, lag: int = 0, decay: f
     states = np.diag(np.r_[np.ones(model.order), np.zeros(n - model.order)])
     exact, sampled = exact_rows(model), model.dt > 0.0
     tried = product(SHARES_OF_NOISE, SHARES_OF_EXACT_ROWS[sampled] if len(exact) else (0.0,))
-    best, least = None, LARGEST_RESIDUAL
+    best, least = None, MOST_MISSED
     for share, trust in tried:
         drive = process + (share * unit) ** 2 * states
         rows = measured + (trust * unit) ** 2 * (exact.T @ exact)
