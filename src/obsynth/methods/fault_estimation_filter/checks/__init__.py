@@ -90,7 +90,7 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
         source="Wang 2015, Theorem 2",
         detail=f"eigenvalues computed; their proof is the row 'LMI'; {_time_constant(radius, plant.dt)}",
     )
-    yield from _norm_rows(design, errors, modes, tracking, factor, lag)
+    yield from _norm_rows(design, errors, modes, tracking, factor)
     yield from _noise_rows(plant, errors)
 
 
@@ -170,7 +170,7 @@ def _fits(
 
 
 def _norm_rows(
-    design: ObserverDesign, errors: ErrorModel, modes: Modes, tracking: FloatArray, factor: FloatArray, lag: int
+    design: ObserverDesign, errors: ErrorModel, modes: Modes, tracking: FloatArray, factor: FloatArray
 ) -> Iterator[Check]:
     (plant, observer), claims = design.linear, design.certificate.claims
     gamma = claimed(claims, "gamma")
