@@ -38,6 +38,7 @@ def small(**changes) -> DAEModel:
         ({"equations": {"moves": "der(der(a)) = -c * a", "holds": "b = a"}}, ["no function 'der'"]),
         ({"equations": {"moves": "der(a) = __import__", "holds": "b = c"}}, ["'__import__'"]),
         ({"equations": {"moves": "der(a) = a.real", "holds": "b = c"}}, ["'.' is not allowed"]),
+        ({"equations": {"moves": "der(a) = a ^ 2", "holds": "b = c"}}, ["'^' is not allowed: write ** for a power"]),
         ({"states": {"a": 1.0, "b": float("nan")}}, ["states.b", "finite"]),
         ({"inputs": {"go": 1.0, "a": 2.0}}, ["'a'", "more than one"]),
         ({"outputs": {"seen": "b + go"}}, ["output depends on an input"]),

@@ -72,3 +72,26 @@ def test_gains_of_another_method_are_named() -> None:
         obsynth.design_from_gains(plant, "pd-observer", J=[[1.0]], K=[[1.0]])
     with pytest.raises(SpecError, match="no gains: design it instead"):
         obsynth.design_from_gains(plant, "functional-filter", T=[[1.0]])
+
+
+@pytest.mark.parametrize(
+    ("noise", "told"),
+    [
+        ("{level: -1}", ["method.options.R.level: must be at least 0, not the number -1."]),
+        ("{level: one}", ["method.options.R.level: must be a number, not the text 'one'."]),
+        ("[[1, 2], [3]]", ["method.options.R: row 2 has 1 entries, but row 1 has 2."]),
+        ("one", ["method.options.R: must be a number, or a list of rows, such as [[1, 0], [0, 1]], or a mapping (key: "
+                 "value), not the text 'one'."]),
+    ],
+)  # fmt: skip
+def test_a_value_of_several_kinds_is_told_what_is_wrong_with_the_kind_that_it_is(tmp_path, noise, told):
+    """A negative variance was told nine problems, of 'constrained-float' and 'tagged-union[...]'."""
+    path = tmp_path / "spec.yaml"
+    path.write_text(
+        "schema_version: 1\nname: tank\nplant:\n  kind: dae\n  equations: {balance: der(h) = q - c * h}\n"
+        "  outputs: {level: h}\n  states: {h: 1.0}\n  inputs: {q: 0.1}\n  parameters: {c: 0.1}\n"
+        f"method:\n  id: dae-adaptive-observer\n  options: {{dt: 1.0, Q: 1.0e-6, R: {noise}}}\n"
+    )
+    with pytest.raises(SpecError) as caught:
+        obsynth.load_spec(path)
+    assert [line.strip().removeprefix("- ") for line in str(caught.value).splitlines()[1:]] == told

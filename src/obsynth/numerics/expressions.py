@@ -241,7 +241,9 @@ def _tokens(text: str) -> list[str]:
     while position < len(stripped):
         match = _TOKEN.match(stripped, position)
         if match is None:
-            raise SpecError(f"{text!r} is no valid expression: {stripped[position:].strip()[0]!r} is not allowed.")
+            sign = stripped[position:].strip()[0]
+            instead = ": write ** for a power" if sign == "^" else ""
+            raise SpecError(f"{text!r} is no valid expression: {sign!r} is not allowed{instead}.")
         tokens.append(match.group(match.lastindex or 0))
         position = match.end()
     return tokens

@@ -249,9 +249,69 @@ def _validated(model: type[Model], document: Any, problems: DocumentProblems, *,
     try:
         return model.model_validate(document)
     except ValidationError as error:
-        for item in error.errors(include_url=False):
+        for item in _of_likely_kinds(error.errors(include_url=False), document):
             problems.add(*_explained(item, model, prefix))
         return None
+
+
+#: What the checks call a kind of value, in a path to a problem.
+_KIND = re.compile(r"<\w+>")
+#: Problems of a value that is of another kind, beside those whose names end with `_type`.
+_OTHER_KIND = ("missing", "extra_forbidden", "literal_error")
+
+
+def _of_likely_kinds(items: Sequence[Any], document: Any) -> list[Any]:
+    """Return pydantic's errors without those of kinds that a value was not meant to be: of a value that may be of
+    several, a number or a mapping, each kind adds its own errors, below a name of this kind that no document has."""
+    kept, groups = [], dict[tuple[Any, ...], dict[str, list[Any]]]()
+    for item in items:
+        loc = item["loc"]
+        place = _kind_in(loc, document, item["type"])
+        if place is None:
+            kept.append(item)
+        else:
+            inner = {**item, "loc": (*loc[:place], *loc[place + 1 :])}
+            groups.setdefault(loc[:place], {}).setdefault(str(loc[place]), []).append(inner)
+    for path, kinds in groups.items():
+        whole = [_of_likely_kinds(found, document) for found in kinds.values()]
+        least = min(_strange(found, path) for found in whole)
+        likely = [found for found in whole if _strange(found, path) == least]
+        if len(likely) > 1 and all(len(found) == 1 for found in likely):
+            wanted = list(dict.fromkeys(_kind_wanted(found[0]) for found in likely))
+            kept.append({**likely[0][0], "loc": path, "type": "kinds", "ctx": {"wanted": ", or ".join(wanted)}})
+        else:
+            kept.extend(likely[0])
+    return kept
+
+
+def _kind_in(loc: Sequence[Any], document: Any, problem: str) -> int | None:
+    """Return the place in a path of the first name that is a kind of value, and no key of the document."""
+    value = document
+    for i, part in enumerate(loc):
+        if isinstance(part, str) and (_KIND.fullmatch(part) or part == "[key]"):
+            continue
+        known = part in value if isinstance(value, dict) else isinstance(part, int) and isinstance(value, list)
+        if not known:
+            return None if isinstance(part, int) or (problem == "missing" and i == len(loc) - 1) else i
+        value = value[part]
+    return None
+
+
+def _strange(items: Sequence[Any], path: Sequence[Any]) -> tuple[int, int]:
+    """Return how many errors say that a value at a path is of another kind, and how many there are."""
+    at_once = 0
+    for item in items:
+        below = [part for part in item["loc"][len(path) :] if not (isinstance(part, str) and _KIND.fullmatch(part))]
+        other = item["type"] in (*_OTHER_KIND, "kinds") or item["type"].endswith("_type")
+        at_once += other and len(below) <= (item["type"] in _OTHER_KIND)
+    return at_once, len(items)
+
+
+def _kind_wanted(item: Any) -> str:
+    """Return what a value should have been, by an error that says that it is of another kind."""
+    if "<rows>" in item["loc"]:
+        return "a list of rows, such as [[1, 0], [0, 1]]"
+    return _wanted(item["type"], item.get("ctx", {})).removeprefix("one of ")
 
 
 def _explained(item: Any, model: type[BaseModel], prefix: str) -> tuple[str, str]:
@@ -290,6 +350,8 @@ def _explained(item: Any, model: type[BaseModel], prefix: str) -> tuple[str, str
 
 
 def _wanted(kind: str, context: Mapping[str, Any]) -> str:
+    if kind == "kinds":
+        return str(context["wanted"])
     if kind == "literal_error":
         return f"one of {context['expected']}"
     limits = {"greater_than": "greater than", "greater_than_equal": "at least", "less_than": "less than"}
