@@ -140,3 +140,12 @@ def test_a_file_that_has_changed_is_verified_afresh(folder: Path) -> None:
     assert main(words) == 6
     Path("wrong.gains.json").write_bytes(good)
     assert main(words) == 0
+
+
+def test_a_page_of_gains_that_fail_says_on_the_terminal_why_the_exit_code_is_6(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["report", "--gains", "wrong.gains.json", "--out", "page.html"]) == 6
+    told = capsys.readouterr()
+    assert told.out == "Written: page.html\n"
+    assert re.search(r"^Warning: wrong.gains.json: UNVERIFIED: \d+ of \d+ checks FAIL: ", told.err, re.MULTILINE)

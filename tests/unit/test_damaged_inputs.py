@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -121,3 +124,33 @@ def test_the_largest_numbers_admitted_do_not_overflow() -> None:
         A=[[0.5e100, 1e100], [0.0, 0.2]], C=[[1e100, 0.0], [0.0, 1e100]], Bf=[[0.0], [1e100]], dt=1.0
     )
     obsynth.check(plant)
+
+
+@pytest.mark.parametrize(
+    ("part", "matrix", "told"),
+    [
+        ("from_fault", np.zeros((4, 1)), "from_fault is 4 by 1, but 3 by 1 is needed"),
+        ("from_input", np.zeros((1, 3)), "from_input is 1 by 3, but 3 by 1 is needed"),
+        ("from_state", np.zeros((0, 0)), "from_state is 0 by 0, but 3 by 2 is needed"),
+        ("noise_kept", np.zeros((2, 3)), "noise_kept has 3 columns, but 2 are needed"),
+    ],
+)
+def test_a_recovery_that_does_not_fit_its_plant_is_refused(part: str, matrix: Any, told: str, tmp_path: Path) -> None:
+    """Runs and pages of such a gain set ended in errors of NumPy."""
+    plant = obsynth.DescriptorSystem(
+        E=np.diag([1.0, 1.0, 0.0]),
+        A=[[-1.0, 0.2, 0.0], [0.0, -2.0, 0.5], [1.0, 0.5, -1.0]],
+        B=[[1.0], [0.0], [0.0]],
+        C=[[1, 0, 0], [0, 1, 0]],
+        Bf=[[1.0], [0.0], [0.0]],
+        sensor_noise={"y1": 0.1, "y2": 0.1},
+    )
+    obsynth.ui_pi_observer(obsynth.discretise(plant, 0.1)).save(tmp_path / "g.json")
+    document = json.loads((tmp_path / "g.json").read_text("utf-8"))
+    recovery = document["design"]["recovery"]
+    recovery[part] = {"shape": list(matrix.shape), "data": matrix.ravel().tolist()}
+    text = json.dumps(document["design"], sort_keys=True, separators=(",", ":"))
+    document["sha256"] = hashlib.sha256(text.encode()).hexdigest()
+    (tmp_path / "g.json").write_text(json.dumps(document), "utf-8")
+    with pytest.raises(SpecError, match=f"its recovery is refused: {told}"):
+        obsynth.load(tmp_path / "g.json")

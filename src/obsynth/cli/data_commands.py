@@ -447,6 +447,7 @@ def run_report(options: argparse.Namespace) -> int:
     if options.data is None:
         own = ("gains", "unverified", "system", "out", "force", "json")
         refuse_given(options, [name for name in vars(options) if name not in own], "a log: give --data")
+    from obsynth.methods.handing_on import unverified_mark
     from obsynth.report.page import PAGE, html_report
 
     scenario = None if options.system is None else required_scenario(obsynth.load_spec(options.system))
@@ -472,6 +473,8 @@ def run_report(options: argparse.Namespace) -> int:
         statement="" if watched is None else watched.statement,
         rows=options.rows,
     )
+    if mark := unverified_mark(report):
+        print(f"Warning: {options.gains}: {mark}", file=sys.stderr)
     answer(options, {"gains": options.gains, "file": file, "passed": report.passed})
     return 0 if report.passed else VerificationError.exit_code
 

@@ -173,32 +173,41 @@ def _arrays_in(content: bytes) -> dict[str, FloatArray]:
         raise ValueError(f"its arrays are damaged ({error})") from error
 
 
-def _recovery_from(**data: Any) -> StateRecovery:
-    names = tuple(data.pop("names"))
-    if "operator" not in data:
-        return StateRecovery(names=names, **data)
-    operator = RecoveryOperator.from_dict(data["operator"])
-    if operator.dynamic.shape[0] != len(names):
-        raise ValueError(f"the recovery has {len(names)} names for {operator.dynamic.shape[0]} states")
-    return StateRecovery.from_operator(names, operator, data["noise_kept"], data["operating_point"])
+def _recovery_from(plant: Any, data: dict[str, Any]) -> StateRecovery:
+    """Return the recovery of the states that ``plant`` was made from; its maps fit the signals of that plant."""
+    names = tuple(data["names"])
+    if "operator" in data:
+        operator = RecoveryOperator.from_dict(data["operator"])
+        if operator.dynamic.shape[0] != len(names):
+            raise SpecError(f"it has {len(names)} names for {operator.dynamic.shape[0]} states")
+        return StateRecovery.from_operator(names, operator, data["noise_kept"], data["operating_point"])
+    found = StateRecovery(**{**data, "names": names})
+    columns = {"state": plant.nx, "input": plant.nu, "fault": plant.nf, "disturbance": plant.nd, "noise": plant.nw}
+    for signal, count in columns.items():
+        rows, own = getattr(found, f"from_{signal}").shape
+        if (rows, own) != (len(names), count):
+            raise SpecError(f"from_{signal} is {rows} by {own}, but {len(names)} by {count} is needed")
+    if found.noise_kept.shape[1] != plant.nw:
+        raise SpecError(f"noise_kept has {found.noise_kept.shape[1]} columns, but {plant.nw} are needed")
+    return found
 
 
 def _design_from(data: dict[str, Any]) -> ObserverDesign:
     if not isinstance(data.get("kind"), (str, type(None))) or data.get("kind") not in DESIGN_KINDS:
         raise SpecError(f"A design of the kind {data['kind']!r} is unknown to this obsynth.", path="kind")
-    plant, observer = types_of(data.get("kind"))
-    recovery = data["recovery"]
+    kind, observer = types_of(data.get("kind"))
+    plant, recovery = _made("plant", kind, **data["plant"]), data["recovery"]
     return ObserverDesign(
         name=data["name"],
         method=data["method"],
-        plant=_made("plant", plant, **data["plant"]),
+        plant=plant,
         options=data["options"],
         gains=data["gains"],
         observer=_made("observer", observer.from_dict, data["observer"]),
         certificate=_made("certificate", Certificate, **data["certificate"]),
         solver=data["solver"],
         notes=tuple(data["notes"]),
-        recovery=None if recovery is None else _made("recovery", _recovery_from, **recovery),
+        recovery=None if recovery is None else _made("recovery", _recovery_from, plant, recovery),
         report=_made("report", VerificationReport.from_dict, data["report"]),
         source=None if data.get("source") is None else _made("source", PlantSource.from_dict, data["source"]),
         input_delay=data.get("input_delay", 0),
@@ -268,4 +277,4 @@ def _is_certificate(value: Any) -> bool:
 def _is_recovery(value: Any) -> bool:
     if not isinstance(value, dict) or not _is_texts(value.get("names")):
         return False
-    return all(_is_array(item) and item.ndim == 2 for key, item in value.items() if key.startswith("from_"))
+    return all(_is_array(item) and item.ndim == 2 for key, item in value.items() if key.startswith(("from_", "noise_")))
