@@ -180,3 +180,18 @@ def test_many_exponents_are_the_same_by_cholesky_and_by_pivots(monkeypatch: pyte
     assert failed == [0]
     assert np.array_equal(found.equations, again.equations)
     assert np.array_equal(found.states, again.states)
+
+
+@pytest.mark.parametrize("discrete", [True, False])
+@pytest.mark.parametrize("scatter", [1e-8, -1e-8, 2e-9])
+def test_the_rate_of_a_contraction_does_not_hang_on_how_a_multiple_pole_scatters(
+    scatter: float, discrete: bool
+) -> None:
+    # Of a rate halfway from a pole of 1.3e-8 on one machine, bounds were found 2e-10 larger on another: not verified.
+    matrix = np.array([[0.3, 1.0, 0.0], [0.0, 0.3, 1.0], [0.0, 0.0, 0.3]]) - (0.0 if discrete else np.eye(3))
+    poles = np.diag(matrix).astype(complex)
+    here, there = (
+        next(proved_contractions(matrix, discrete=discrete, poles=found)) for found in (poles, poles + scatter)
+    )
+    assert here.rate == there.rate
+    np.testing.assert_array_equal(here.Q, there.Q)

@@ -16,6 +16,7 @@ each: at most that at its left end plus d times the largest third, which the con
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -35,6 +36,9 @@ from obsynth.proofs.products import exponential
 
 #: Where between the spectral radius (0) and one (1) the rate is tried, in turn.
 TRIED_RATES = (0.5, 0.2, 0.8, 0.95)
+#: Digits of what is left to one: a multiple pole scatters by far more than rounding, and each machine would try, and
+#: claim bounds of, a rate of its own.
+ROOM_DIGITS = 8
 #: Roundings of an entry, of every order n, that a Lyapunov equation by Schur vectors and its square root may take.
 OPERATIONS = 1e3
 #: Up to so many states Lyapunov equations are solved by sums first; doublings of these, and when they have settled.
@@ -134,12 +138,19 @@ def proved_contractions(
     bound = float(np.max(np.abs(values))) if discrete else float(-np.max(values.real))
     if not (bound < 1.0 if discrete else bound > 0.0):
         return
+    room = _in_few_digits(1.0 - bound if discrete else bound)
     for share in TRIED_RATES:
-        tried = bound + share * (1.0 - bound) if discrete else (1.0 - share) * bound
+        tried = 1.0 - (1.0 - share) * room if discrete else (1.0 - share) * room
         # Sums of squares lose no digits to the slowest mode; with many states they take too long.
         found = _tried(ball, tried, discrete=discrete, sums_first=len(a) <= MOST_STATES_FOR_SUMS)
         if found is not None:
             yield found
+
+
+def _in_few_digits(size: float) -> float:
+    """Return a number to `ROOM_DIGITS` binary digits."""
+    mantissa, exponent = math.frexp(size)
+    return math.ldexp(round(math.ldexp(mantissa, ROOM_DIGITS)), exponent - ROOM_DIGITS)
 
 
 def proved_rate(matrix: FloatArray | Ball, known: Contraction | None = None) -> float | None:
