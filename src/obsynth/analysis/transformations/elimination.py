@@ -492,7 +492,9 @@ def _coordinates(plant: DescriptorSystem, count: int) -> tuple[FloatArray, Float
         order = np.argsort(~moving, kind="stable")
         basis, names = np.eye(plant.nx)[:, order], tuple(plant.state_names[i] for i in order[:count])
     else:
-        basis, names = units.states[:, None] * right.T, tuple(f"xi {i + 1}" for i in range(count))
+        # Entries that are only rounding would be other ones on another machine, and so would the plant.
+        directions = but_rounding(right.T, np.ones_like(right))
+        basis, names = units.states[:, None] * directions, tuple(f"xi {i + 1}" for i in range(count))
     return rows, basis[:, :count], basis[:, count:], names
 
 
