@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 import obsynth
+from obsynth.cli.main import main
 from obsynth.errors import SpecError
 from obsynth.methods.pd_observer.method import PdObserver
 from obsynth.methods.registry import REGISTRY, method_class, methods_for
@@ -95,3 +96,22 @@ def test_a_value_of_several_kinds_is_told_what_is_wrong_with_the_kind_that_it_is
     with pytest.raises(SpecError) as caught:
         obsynth.load_spec(path)
     assert [line.strip().removeprefix("- ") for line in str(caught.value).splitlines()[1:]] == told
+
+
+def test_a_gain_set_for_other_constants_than_those_of_the_spec_is_told(tmp_path, capsys):
+    """After a calibration the gain set of the plant before it was evaluated on that plant, without a word."""
+    text = (
+        "schema_version: 1\nname: tank\nplant:\n  kind: dae\n  constants: {c: 0.1}\n"
+        "  equations: {balance: der(h) = q - c * h - leak}\n  outputs: {level: h}\n  states: {h: 1.0}\n"
+        "  inputs: {q: 0.1}\n  parameters: {leak: 0.0}\nscenario: {horizon: 20, noise: 1}\n"
+        "method:\n  id: dae-adaptive-observer\n"
+        "  options: {dt: 1.0, Q: 1.0e-6, R: 1.0e-4, initial_parameter_covariance: 1.0e-4}\n"
+    )
+    before, after, gains = (str(tmp_path / name) for name in ("before.yaml", "after.yaml", "g.json"))
+    (tmp_path / "before.yaml").write_text(text)
+    (tmp_path / "after.yaml").write_text(text.replace("{c: 0.1}", "{c: 0.125}"))
+    assert main(["design", "--system", before, "--output", gains, "--quiet"]) == 0
+    for spec, told in ((before, False), (after, True)):
+        capsys.readouterr()
+        assert main(["evaluate", "--system", spec, "--gains", gains, "--runs", "2", "--quiet"]) == 0
+        assert ("(c 0.1 for 0.125): the plant of the gain set is used" in capsys.readouterr().err) is told

@@ -90,11 +90,24 @@ def designed_or_loaded(
     return design
 
 
+#: Constants of a gain set that differ from those of a spec and are told.
+MOST_TOLD_CONSTANTS = 4
+
+
 def require_same_signals(design: obsynth.ObserverDesign, gains: Path, spec: obsynth.Spec) -> None:
     """Raise `SpecError` unless a gain set is for a plant with the inputs and outputs of a spec's plant."""
     # States may differ: a method may have eliminated some.
     if any(getattr(design.plant, name) != getattr(spec.plant, name) for name in ("input_names", "output_names")):
         raise SpecError(f"{gains} is for a plant with other signals than that of {spec.path}.", path=str(gains))
+    own, stated = (getattr(plant, "constants", None) or {} for plant in (design.plant, spec.plant))
+    others = [name for name, value in own.items() if stated.get(name, value) != value]
+    if others:
+        told = ", ".join(f"{name} {own[name]:.6g} for {stated[name]:.6g}" for name in others[:MOST_TOLD_CONSTANTS])
+        print(
+            f"Warning: {gains} is for a plant with other constants than that of {spec.path} ({told}"
+            f"{', ...' if len(others) > MOST_TOLD_CONSTANTS else ''}): the plant of the gain set is used.",
+            file=sys.stderr,
+        )
 
 
 def spec_output(
