@@ -162,6 +162,18 @@ def test_the_gate_runs_and_has_a_bound_for_each_of_its_cases(printed):
         assert float(line[4]) > 0.0
 
 
+@pytest.mark.long
+def test_every_goal_of_speed_is_measured_and_judged(printed):
+    pytest.importorskip("numba")
+    (rows,) = tables(printed("goals", "--small", "--commit", "0"))
+    assert len(rows) > 20
+    for line in rows[1:]:
+        # Where there is a goal there is a verdict; small instances meet what is asked of large ones, or miss it.
+        assert (line[5] == "-") == (line[6] == "-")
+        assert line[6] in ("-", "yes", "**no**")
+        assert min(map(float, line[3].split(", "))) > 0.0
+
+
 def test_the_gates_table_in_the_readme_is_of_its_cases():
     """Written by ``gate.py --write`` and never by hand: a case that is not in it was added since."""
     import json

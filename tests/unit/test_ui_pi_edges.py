@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from obsynth import DescriptorSystem, ui_pi_observer
+from obsynth import DescriptorSystem, design_from_gains, ui_pi_observer
 from obsynth.errors import PreconditionError, SolverError, SpecError
 from obsynth.methods.designing import check
 from obsynth.methods.placement.kalman import KalmanProblem
@@ -185,3 +185,15 @@ def test_coordinates_that_need_more_digits_than_are_printed_are_told() -> None:
 
     assert all(radius(printed) < 1.0 for printed in range(int(digits), 18))
     assert radius(int(digits) - 1) >= 1.0
+
+
+@pytest.mark.parametrize("last_digits", [-3, 0, 3])
+def test_a_residual_that_shows_nothing_is_zero_whatever_the_last_digit_of_d_is(last_digits: int) -> None:
+    """On one processor 1 - 1e5 * 1e-5 was 2e-16, which was all that the identity of the residual was judged by."""
+    plant, _ = PLANTS["units that differ by 1e11"]
+    gains = ui_pi_observer(plant).gains
+    d = gains["D"] + np.diag([0.0, last_digits * np.spacing(1e-5)])
+    given = {name: gains[name] for name in ("U", "K", "F")}
+    design = design_from_gains(plant, "ui-pi-observer", **given, D=d, fault_model="step")
+    assert design.report.passed
+    assert design.linear[1].Dy[-1, 1] == 0.0

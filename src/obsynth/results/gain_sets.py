@@ -19,6 +19,7 @@ from obsynth.errors import SpecError
 from obsynth.files.inputs import input_file, json_data, read_json
 from obsynth.numerics.arguments import is_number
 from obsynth.numerics.arrays import FloatArray
+from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import Certificate, ObserverDesign, PlantSource
 from obsynth.results.gain_set_writing import (
     ARRAYS,
@@ -182,12 +183,15 @@ def _recovery_from(plant: Any, data: dict[str, Any]) -> StateRecovery:
             raise SpecError(f"it has {len(names)} names for {operator.dynamic.shape[0]} states")
         return StateRecovery.from_operator(names, operator, data["noise_kept"], data["operating_point"])
     found = StateRecovery(**{**data, "names": names})
-    columns = {"state": plant.nx, "input": plant.nu, "fault": plant.nf, "disturbance": plant.nd, "noise": plant.nw}
+    columns = {"state": plant.nx, "input": plant.nu}
+    # A plant that changes with k has parameters and Q instead.
+    if isinstance(plant, DescriptorSystem):
+        columns |= {"fault": plant.nf, "disturbance": plant.nd, "noise": plant.nw}
     for signal, count in columns.items():
         rows, own = getattr(found, f"from_{signal}").shape
         if (rows, own) != (len(names), count):
             raise SpecError(f"from_{signal} is {rows} by {own}, but {len(names)} by {count} is needed")
-    if found.noise_kept.shape[1] != plant.nw:
+    if "noise" in columns and found.noise_kept.shape[1] != plant.nw:
         raise SpecError(f"noise_kept has {found.noise_kept.shape[1]} columns, but {plant.nw} are needed")
     return found
 

@@ -18,7 +18,7 @@ import numpy as np
 from obsynth.analysis.plant_units import PlantUnits
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, largest_singular_value
-from obsynth.numerics.ranks import RANK_TOLERANCE, decide_rank
+from obsynth.numerics.ranks import RANK_TOLERANCE, decide_rank, product_but_rounding
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.fault_models import Exosystem, stated_eigenvalues
@@ -209,12 +209,13 @@ def realise(
     augmented = AugmentedPlant.of(plant, model)
     nx, na = plant.nx, augmented.order
     a_hat = gains.U @ augmented.A - gains.K @ augmented.C
-    b_hat = a_hat @ gains.D + gains.K
+    # Rows that follow nothing, or show nothing, are zero: rounding would be all that their identities are judged by.
+    b_hat = product_but_rounding(a_hat, gains.D, gains.K)
     j_hat = gains.U @ augmented.B
     faults = np.hstack([np.zeros((plant.nf, nx)), model.Cw])
     rows = np.vstack([np.eye(nx, na), faults, -seen @ augmented.C])
-    direct = rows @ gains.D
-    direct[nx + plant.nf :] += seen
+    shown = np.vstack([np.zeros((nx + plant.nf, plant.ny)), seen])
+    direct = product_but_rounding(rows, gains.D, shown)
     names = (
         plant.output_names if np.array_equal(seen, np.eye(plant.ny)) else tuple(f"r{i + 1}" for i in range(len(seen)))
     )
