@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 from scipy import sparse
 
@@ -154,3 +155,39 @@ def test_a_recovery_that_does_not_fit_its_plant_is_refused(part: str, matrix: An
     (tmp_path / "g.json").write_text(json.dumps(document), "utf-8")
     with pytest.raises(SpecError, match=f"its recovery is refused: {told}"):
         obsynth.load(tmp_path / "g.json")
+
+
+def named(**names: Any) -> obsynth.DescriptorSystem:
+    return obsynth.DescriptorSystem(A=np.diag([0.5, 0.2]), C=np.eye(2), dt=1.0, **names)
+
+
+def test_names_may_be_an_array_or_the_index_of_a_frame() -> None:
+    """`DescriptorSystem(..., output_names=frame.columns)` ended in "the truth value of an Index is ambiguous"."""
+    names = pd.DataFrame({"speed": [0.0], "torque": [0.0]}).columns
+    plant = named(state_names=np.array(["a", "b"]), output_names=names)
+    assert plant.output_names == ("speed", "torque")
+    assert plant.state_names == ("a", "b")
+    assert {type(name) for name in (*plant.output_names, *plant.state_names)} == {str}
+
+
+@pytest.mark.parametrize(
+    ("call", "told"),
+    [
+        (lambda: named(output_names=np.array("a")), "output_names must be a list of non-empty texts"),
+        (lambda: named(state_names=np.zeros((2, 2))), "state_names must be a list of non-empty texts"),
+        (lambda: named(operating_point=3.0), "operating_point is a float: give a mapping"),
+        (lambda: named(scales=np.zeros((1, 0))), "scales is a ndarray: give a mapping"),
+        (lambda: obsynth.with_noise(named(), sensor_noise={1: 2}), "has no signal named 1"),
+        (lambda: obsynth.load_spec(3), "path is a int: give the name of a file"),
+        (lambda: obsynth.load_thresholds(None), "path is a NoneType: give the name of a file"),
+        (lambda: obsynth.verify_alarm(True), "path is a bool: give the name of a file"),
+        (lambda: obsynth.verify_certificate([]), "path is a list: give the name of a file"),
+        (lambda: obsynth.from_matlab(None), "path is a NoneType: give the name of a file"),
+        (lambda: obsynth.from_modelica(None), "path is a NoneType: give the name of a file"),
+        (lambda: obsynth.from_fmu([]), "path is a list: give the name of a file"),
+    ],
+)
+def test_arguments_of_a_wrong_kind_are_refused_by_name(call: Callable[[], object], told: str) -> None:
+    """Names that are numbers ended in errors of difflib, mappings that are none and paths in a TypeError."""
+    with pytest.raises(SpecError, match=told):
+        call()

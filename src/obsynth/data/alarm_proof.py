@@ -31,6 +31,7 @@ from obsynth.experiments.alarm_proof import (
 from obsynth.experiments.assumptions import Log, file_digest
 from obsynth.experiments.monitors.guaranteed import is_guaranteed
 from obsynth.experiments.monitors.options import WINDOW
+from obsynth.files.inputs import file_to_read
 from obsynth.methods.guaranteed_test.result import GuaranteedTest
 from obsynth.methods.verifying import verify
 from obsynth.numerics.arguments import is_whole, require_kind, require_mapping
@@ -189,7 +190,7 @@ def verify_alarm(path: str | Path, *, data: str | Path | None = None) -> Verific
         The file is no certificate.
     """
     again = "prove the alarm again (obsynth prove-alarm)"
-    _, body, intact = opened(Path(path), (ALARM_KIND,), ALARM_VERSION, "certificate of an alarm", again)
+    _, body, intact = opened(file_to_read(path), (ALARM_KIND,), ALARM_VERSION, "certificate of an alarm", again)
     checks = [_row("digest", "the file is as it was written", float(intact), 1.0, intact)]
     try:
         for check in _checked(body, None if data is None else Path(data)):

@@ -19,6 +19,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from obsynth.errors import PreconditionError, SpecError
+from obsynth.files.inputs import file_to_read
 from obsynth.importing.python_objects import plant_of
 from obsynth.numerics.arguments import is_finite_number, require_mapping
 from obsynth.numerics.arrays import FloatArray
@@ -271,7 +272,7 @@ def from_fmu(
     for name, value in (at or {}).items():
         if not is_finite_number(value):
             raise SpecError(f"at[{name!r}] is {value!r}: give a finite number.", path="at")
-    with _instance(Path(path)) as instance:
+    with _instance(file_to_read(path)) as instance:
         used = _used(instance.input_names, inputs, "inputs"), _used(instance.output_names, outputs, "outputs")
         for name in at or {}:
             if name not in instance.settable:

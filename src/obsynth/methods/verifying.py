@@ -8,6 +8,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.methods.registry import REGISTRY, method_class
+from obsynth.numerics.arguments import is_whole, shown
 from obsynth.numerics.libraries import failed_computations, one_thread_if_small
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.results.verification_report import VerificationReport
@@ -46,8 +47,8 @@ def verify(design: ObserverDesign, *, printed_digits: int | None = None) -> Veri
     """
     if design.method not in REGISTRY:
         raise SpecError(f"Designs of method {design.method!r} cannot be verified by this version.", path="method")
-    if printed_digits is not None and not 1 <= printed_digits <= 15:
-        raise SpecError(f"printed_digits is {printed_digits}: give 1 to 15 decimals.", path="printed_digits")
+    if printed_digits is not None and not (is_whole(printed_digits) and 1 <= printed_digits <= 15):
+        raise SpecError(f"printed_digits is {shown(printed_digits)}: give 1 to 15 decimals.", path="printed_digits")
     method = method_class(design.method)
     # A corrupted design may overflow; what is not a number fails its check, so no warning is needed.
     with np.errstate(all="ignore"), failed_computations(), one_thread_if_small(design.plant.nx):

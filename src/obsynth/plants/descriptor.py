@@ -30,6 +30,7 @@ from obsynth.plants.validation import (
     is_name_list,
     matrix_or_picks,
     picked_names,
+    plain_names,
     require_picked,
     rows_picking,
     signal_counts,
@@ -251,9 +252,15 @@ def plant_fields(
     for signal, field in _FIELDS.items():
         if signal in unknown or signal == "x":
             continue
-        stated = labels[field] or picked_names(matrices.get(_NAMED_BY.get(field, "")))
+        own = plain_names(labels[field])
+        no_names = own is None or (isinstance(own, (list, tuple)) and not own)
+        stated = picked_names(matrices.get(_NAMED_BY.get(field, ""))) if no_names else own
         extra = more.get(field, ())
-        if extra and is_name_list(stated or ["-"]) and (stated is None or len(stated) == sizes[signal] - len(extra)):
+        if (
+            extra
+            and is_name_list(["-"] if stated is None else stated)
+            and (stated is None or len(stated) == sizes[signal] - len(extra))
+        ):
             first = checked_names(stated, sizes[signal] - len(extra), prefix=signal, what=field)
             stated = (*first, *extra)
         values[field] = problems.collect(partial(checked_names, stated, sizes[signal], prefix=signal, what=field))

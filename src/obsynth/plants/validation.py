@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import is_finite_number, is_number, shown
+from obsynth.numerics.arguments import is_finite_number, is_number, require_mapping, shown
 from obsynth.numerics.arrays import FloatArray, as_matrix, require_no_overflow
 from obsynth.numerics.sparse import as_sparse_matrix, is_sparse
 
@@ -23,6 +23,7 @@ def checked_names(names: Sequence[str] | None, count: int, *, prefix: str, what:
     """Return ``count`` unique names; ``prefix1, prefix2, ...`` when none are given."""
     if names is None:
         return tuple(f"{prefix}{i + 1}" for i in range(count))
+    names = plain_names(names)
     given = tuple(names) if isinstance(names, Iterable) else (names,)
     if isinstance(names, str) or not all(isinstance(name, str) and name.strip() for name in given):
         raise SpecError(f"{what} must be a list of non-empty texts.", path=what)
@@ -43,9 +44,14 @@ def checked_names(names: Sequence[str] | None, count: int, *, prefix: str, what:
     return given
 
 
+def plain_names(names: Any) -> Any:
+    """Return names in an array, or in the index of a pandas frame, as a list; anything else as it is."""
+    return names.tolist() if hasattr(names, "tolist") else names
+
+
 def index_of(name: str, names: Sequence[str], *, what: str) -> int:
     """Return the position of ``name``; the error suggests the closest names, or lists what there is."""
-    if name in names:
+    if isinstance(name, str) and name in names:
         return list(names).index(name)
     near = suggestion(name, names) or (f" There are: {listed(names)}." if names else " There are none.")
     raise SpecError(f"{what} has no signal named {name!r}.{near}", path=what)
@@ -59,7 +65,7 @@ def listed(texts: Sequence[str], *, most: int = 6) -> str:
 
 def suggestion(name: str, names: Iterable[str]) -> str:
     """Return a question with the names closest to a wrong one, beginning with a space; empty where none is close."""
-    close = difflib.get_close_matches(name, list(names), n=3)
+    close = difflib.get_close_matches(str(name), list(names), n=3)
     return f" Did you mean {' or '.join(map(repr, close))}?" if close else ""
 
 
@@ -224,6 +230,7 @@ def checked_labels(
 
 def _values(given: Mapping[str, float] | None, known: set[str], what: str, kind: str) -> dict[str, float]:
     """Return numbers of signals, which all exist; a scale is not zero."""
+    require_mapping(given, what)
     require_known(given or {}, known, what=what, kind=kind)
     checked = {name: float(as_matrix(value, f"{what}[{name!r}]")[0, 0]) for name, value in (given or {}).items()}
     for name, value in checked.items():
