@@ -280,18 +280,18 @@ def main() -> int:
         elif bound is not None and not options.small and case.ratio > ALLOWED * bound:
             missed.append(f"{case.name}: {case.ratio:.3g} times {case.anchor}, more than {ALLOWED:g} times {bound}")
     if options.write:
-        write(lines)
+        write(lines, BEGIN, END)
     for text in missed:
         print(f"MISSED: {text}", file=sys.stderr)
     return 1 if missed else 0
 
 
-def write(lines: Sequence[str]) -> None:
-    """Put the table into the README."""
+def write(lines: Sequence[str], begin: str, end: str) -> None:
+    """Put a table into the README, between two lines of it."""
     file = HERE / "README.md"
-    before, _, rest = file.read_text().partition(BEGIN)
-    _, _, after = rest.partition(END)
-    file.write_text("\n".join([before + BEGIN, "", *lines, "", END]) + after)
+    before, _, rest = file.read_text().partition(begin)
+    _, _, after = rest.partition(end)
+    file.write_text("\n".join([before + begin, "", *lines, "", end]) + after)
 
 
 if __name__ == "__main__":

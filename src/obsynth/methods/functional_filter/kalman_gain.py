@@ -111,7 +111,7 @@ PROVABLE = 1e-10
 #: is enough for the digits that are printed.  One that misses by more than the third solves another equation, although
 #: its filter may be stable: wrong ones missed by .08 to .8 (500 plants).  Of those between, the best of all shares is
 #: taken.
-SOLVED, WELL_SOLVED, MOST_MISSED = 1e-14, 1e-10, 1e-2
+SOLVED, WELL_SOLVED, MOST_MISSED = 1e-14, 1e-10, 5e-3
 #: Newton's method doubles the digits in a step, once it is near.
 MOST_NEWTON_STEPS = 30
 
