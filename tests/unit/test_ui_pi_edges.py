@@ -9,6 +9,7 @@ from obsynth import DescriptorSystem, design_from_gains, ui_pi_observer
 from obsynth.errors import PreconditionError, SolverError, SpecError
 from obsynth.methods.designing import check
 from obsynth.methods.placement.kalman import KalmanProblem
+from obsynth.methods.ui_pi_observer.pencils import number
 
 TWO = [[-1.0, 1.0], [0.0, -2.0]]
 PLANTS = {
@@ -197,3 +198,9 @@ def test_a_residual_that_shows_nothing_is_zero_whatever_the_last_digit_of_d_is(l
     design = design_from_gains(plant, "ui-pi-observer", **given, D=d, fault_model="step")
     assert design.report.passed
     assert design.linear[1].Dy[-1, 1] == 0.0
+
+
+def test_a_real_part_that_is_only_rounding_is_not_printed() -> None:
+    assert number(complex(-1.2e-15, 2.44949)) == number(complex(4e-16, -2.44949)) == "0 +- 2.44949j"
+    assert number(complex(1e-9, 1.0)) == "1e-09 +- 1j"
+    assert number(complex(1e-20, 0.0)) == "1e-20"
