@@ -10,6 +10,7 @@ from obsynth.errors import PreconditionError, SolverError, SpecError
 from obsynth.methods.designing import check
 from obsynth.methods.placement.kalman import KalmanProblem
 from obsynth.methods.ui_pi_observer.pencils import number
+from obsynth.numerics.arrays import FloatArray
 
 TWO = [[-1.0, 1.0], [0.0, -2.0]]
 PLANTS = {
@@ -204,3 +205,17 @@ def test_a_real_part_that_is_only_rounding_is_not_printed() -> None:
     assert number(complex(-1.2e-15, 2.44949)) == number(complex(4e-16, -2.44949)) == "0 +- 2.44949j"
     assert number(complex(1e-9, 1.0)) == "1e-09 +- 1j"
     assert number(complex(1e-20, 0.0)) == "1e-20"
+
+
+def test_no_filter_is_told_to_be_quieter_than_that_without_a_rate(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rounding in that one once gave a price of .01 in noise, in the units of one of two equal plants."""
+    exact = KalmanProblem.deviations
+    told: list[int] = []
+
+    def rounded(problem: KalmanProblem, *given: FloatArray) -> FloatArray:
+        told.append(1)
+        # The first two are of the filter without a rate.
+        return (1.0 if len(told) <= 2 else 1e-3) * exact(problem, *given)
+
+    monkeypatch.setattr(KalmanProblem, "deviations", rounded)
+    assert ui_pi_observer(PAPER).certificate.claims["noise_price"] == 1.0

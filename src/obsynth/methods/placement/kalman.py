@@ -189,7 +189,8 @@ def compromise(problem: KalmanProblem, rate: float) -> tuple[FloatArray, float, 
         if gain is None:
             return None
         ratios = problem.deviations(gain, change)[counted] / quietest[counted]
-        price = float(np.max(ratios)) if ratios.size else 1.0
+        # None is quieter than the filter without a rate: what is less is rounding in that one.
+        price = float(np.max(ratios, initial=1.0))
         return (gain, decay, price) if price <= NOISE_PRICE else None
 
     high = rate
