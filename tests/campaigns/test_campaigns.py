@@ -41,3 +41,10 @@ def test_cases_that_once_went_wrong_or_had_no_design(seed, result):
     """A fault of which elimination leaves rounding; walks, poles on the boundary and rows of rounding in filters."""
     outcome = frame.load_campaign("existence").case(seed)
     assert (outcome.result, outcome.wrong) == (result, "")
+
+
+@pytest.mark.parametrize("seed", [70159, 70617])
+def test_parameters_that_leave_no_trace_only_exactly_are_named(seed):
+    """Floating point found the rank full: there was no null vector to name them by, and an error of numpy came out."""
+    outcome = frame.outcome_of(frame.load_campaign("recursive_existence"), seed)
+    assert (outcome.result, outcome.wrong) == ("refused", "")

@@ -35,7 +35,7 @@ from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, remembered
 from obsynth.numerics.pencils import finite_zeros
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, NAMED_SHARE, RANK_TOLERANCE, RankDecision, decide_rank
-from obsynth.numerics.scaling import equilibrate_pencil
+from obsynth.numerics.scaling import EquilibratedPencil, equilibrate_pencil
 from obsynth.numerics.square_root_estimation import OUTGROWN, least_squares_step, rank_revealing_step
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
@@ -80,7 +80,11 @@ def identifiability_condition(
     still = all(matrix.is_constant for matrix in (plant.E, plant.A, plant.C, plant.Phi, plant.Psi))
     decision, (parameters, shares, states) = _steady(plant) if still else _along(plant, early=early)
     if still and constant is not None:
-        decision = _settled_traces(constant, decision)
+        settled = _settled_traces(constant, decision)
+        if settled.rank < decision.rank:
+            # What leaves no trace exactly does so nearly in floating point.
+            parameters, shares, states = _steady_kernel(plant, settled.rank)
+        decision = settled
     wanted = "rank [A - E, Phi; C, Psi]" if still else "rank of the traces of all parameters"
     claim = f"{wanted} = {decision.expected}"
     value, bound = float(decision.rank), float(decision.expected)
@@ -129,14 +133,23 @@ def _explained(
 @remembered
 def _steady(plant: TimeVaryingDescriptorSystem) -> tuple[RankDecision, _Kernel]:
     """Decide about a time-invariant plant by its state and parameters at rest."""
+    decision = decide_rank(_at_rest(plant).A, expected=plant.nx + plant.nq, equilibrated=False)
+    return decision, _steady_kernel(plant, decision.rank)
+
+
+def _at_rest(plant: TimeVaryingDescriptorSystem) -> EquilibratedPencil:
     whole = np.block([[plant.A.at(0) - plant.E.at(1), plant.Phi.at(0)], [plant.C.at(1), plant.Psi.at(0)]])
-    pencil = equilibrate_pencil(np.zeros_like(whole), whole)
-    decision = decide_rank(pencil.A, expected=plant.nx + plant.nq, equilibrated=False)
-    shares = np.linalg.svd(pencil.A)[2][decision.rank :]
+    return equilibrate_pencil(np.zeros_like(whole), whole)
+
+
+def _steady_kernel(plant: TimeVaryingDescriptorSystem, rank: int) -> _Kernel:
+    """Return what leaves no trace at rest, where the rank is less than full."""
+    pencil = _at_rest(plant)
+    shares = np.linalg.svd(pencil.A)[2][rank:]
     states, parameters = np.linalg.norm(shares[:, : plant.nx], axis=0), shares[:, plant.nx :]
     largest = max(float(np.max(states, initial=0.0)), float(np.max(np.abs(parameters), initial=0.0)))
     involved = leading_names(states, plant.state_names) if states.max(initial=0.0) > NAMED_SHARE * largest else ()
-    return decision, _kernel_of(parameters, pencil.columns[plant.nx :], involved)
+    return _kernel_of(parameters, pencil.columns[plant.nx :], involved)
 
 
 @remembered
