@@ -108,15 +108,20 @@ def filters(seeds: Sequence[int], *, small: bool) -> Iterator[Case]:
     nx = 8 if small else 16
     obsynth.fault_estimation_filter(random_plant(nx, "brief", 0))  # imports
     for family in FAMILIES:
-        ours = [seconds(lambda p=plant: obsynth.fault_estimation_filter(p), 2) for plant in plants(nx, family, seeds)]
+        ours = [design_seconds(nx, family, seed) for seed in seeds]
         yield Case(f"filter, nx {nx}, {family}", "cvxpy and Clarabel", ours, direct(nx, family, seeds[:3]))
     nx = 10 if small else 32
-    ours = [seconds(lambda p=plant: obsynth.fault_estimation_filter(p), 2) for family in FAMILIES
-            for plant in plants(nx, family, seeds)]  # fmt: skip
+    ours = [design_seconds(nx, family, seed) for family in FAMILIES for seed in seeds]
     yield Case(f"filter, nx {nx}, all families", "solve_discrete_are", ours, seconds(riccati_solution(nx), 5))
     nx = 12 if small else 100
     ours = [seconds(lambda p=plant: obsynth.fault_estimation_filter(p)) for plant in plants(nx, "noise", seeds[:2])]
     yield Case(f"filter, nx {nx}, noise", "solve_discrete_are", ours, seconds(riccati_solution(nx), 3))
+
+
+def design_seconds(nx: int, family: str, seed: int) -> float:
+    """Return the seconds of a filter, the least of two; the plant is made anew, as what is decided of one is kept."""
+    made = [random_plant(nx, family, seed) for _ in range(2)]
+    return min(seconds(lambda p=plant: obsynth.fault_estimation_filter(p)) for plant in made)
 
 
 def direct(nx: int, family: str, seeds: Sequence[int]) -> float:

@@ -14,6 +14,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import argparse
+import json
 import statistics
 import subprocess
 import sys
@@ -25,11 +26,12 @@ from pathlib import Path
 import numpy as np
 from dae_adaptive_observer import SPEC, record, stepped
 from fault_estimation_filter import FAMILIES, random_plant
-from gate import ROOT, commands, commit, direct, networks, plants, seconds, seeds_of, write
+from gate import ROOT, commands, commit, design_seconds, direct, networks, seconds, seeds_of, write
 from pd_observer import random_plant as many_outputs
 from recursive_filters import Problem, observer_of
 from run_on_data import made_up
 from ui_pi_observer import rod
+from whole_networks import CHECK as ONE_CHECK
 
 import obsynth
 
@@ -78,30 +80,30 @@ def peak() -> float:
     return next(int(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM"))
 
 
-def alone(task: str, *arguments: object) -> tuple[float, float]:
-    """Return seconds and peak memory of a task in a process of its own."""
-    command = [sys.executable, str(HERE / "goals.py"), "--task", task, *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    found, memory = done.stdout.split()
-    return float(found), float(memory)
+def printed(*arguments: object) -> str:
+    """Return the last line that a process of its own prints, which holds nothing but what it measures."""
+    done = subprocess.run([sys.executable, *map(str, arguments)], capture_output=True, text=True, check=True)
+    return done.stdout.splitlines()[-1]
 
 
-def filter_of(nx: int, family: str, seed: int) -> float:
-    """Return the seconds of a filter, of which modules are loaded before."""
-    obsynth.fault_estimation_filter(random_plant(8, family, 0))
-    return seconds(lambda: obsynth.fault_estimation_filter(random_plant(nx, family, seed)))
+def filter_alone(nx: int, family: str, seed: int) -> tuple[float, float]:
+    """Return seconds and peak memory of a filter, which must be verified."""
+    spent, megabytes, verified = printed(HERE / "fault_estimation_filter.py", "--one", nx, family, seed).split()
+    if verified != "True":
+        raise SystemExit(f"The filter of random_plant({nx}, {family!r}, {seed}) is not verified.")
+    return float(spent), float(megabytes)
 
 
-def check_of(variables: int, states: int, seed: int) -> float:
-    """Return the seconds of ``check`` for a sampled network with three faults."""
-    from dataclasses import replace
+def check_alone(variables: int, states: int, seed: int) -> tuple[float, float]:
+    """Return seconds and peak memory of ``check`` for a sampled network with three faults."""
+    found = json.loads(printed("-c", ONE_CHECK, HERE, variables, states, seed))
+    return found["check"], found["MB"]
 
-    from networks import random_network
 
-    network = random_network(variables, states, seed)
-    network = replace(network, faults=tuple(f"tm GENROU {k + 1}" for k in range(3)))
-    sampled = obsynth.discretise(obsynth.eliminate_algebraic_states(network.plant()), 0.02)
-    return seconds(lambda: obsynth.check(sampled))
+def frame_alone(rows: int) -> tuple[float, float]:
+    """Return seconds and peak memory of a run on a frame."""
+    spent, megabytes = printed(HERE / "goals.py", "--frame", rows).split()
+    return float(spent), float(megabytes)
 
 
 def frame_of(rows: int) -> float:
@@ -115,19 +117,16 @@ def frame_of(rows: int) -> float:
     return seconds(lambda: obsynth.run_on_data(design, frame))
 
 
-TASKS: dict[str, Callable[..., float]] = {"filter": filter_of, "check": check_of, "frame": frame_of}
-
-
 def filters(seeds: Sequence[int], *, small: bool) -> Iterator[Goal]:
     """Yield fault-estimation filters, alone and beside the paper's inequality as written."""
     first = {8: ".016", 16: ".018", 20: ".024", 24: ".026"}
     obsynth.fault_estimation_filter(random_plant(8, "brief", 0))
     for nx in (8,) if small else (8, 16, 20, 24):
-        found = [seconds(lambda p=plant: obsynth.fault_estimation_filter(p)) for plant in plants(nx, "noise", seeds)]
+        found = [design_seconds(nx, "noise", seed) for seed in seeds]
         yield Goal(f"filter, nx {nx}, noise", "s", found, first[nx], megabytes=peak())
     for nx, least, before in ((8, 1.0, "-"),) if small else ((16, 20.0, "15.7-28"), (32, 250.0, "171-378")):
         for family in FAMILIES:
-            ours = [seconds(lambda p=plant: obsynth.fault_estimation_filter(p)) for plant in plants(nx, family, seeds)]
+            ours = [design_seconds(nx, family, seed) for seed in seeds]
             theirs = direct(nx, family, seeds[: DIRECT_SEEDS[nx]])
             yield Goal(f"nx {nx}, {family}, against direct cvxpy and Clarabel", "times", [theirs / s for s in ours],
                        before, least=least, megabytes=peak())  # fmt: skip
@@ -137,7 +136,7 @@ def large(seeds: Sequence[int], *, small: bool) -> Iterator[Goal]:
     """Yield filters of 800 states, each in a process of its own."""
     nx = 20 if small else 800
     for family in FAMILIES:
-        found = [alone("filter", nx, family, seed % 1000) for seed in seeds[:FEW_SEEDS]]
+        found = [filter_alone(nx, family, seed % 1000) for seed in seeds[:FEW_SEEDS]]
         before = "46.0" if family == "noise" else "-"
         yield Goal(f"filter, nx {nx}, {family}", "s", [s for s, _ in found], before, most=15.0,
                    megabytes=max(mb for _, mb in found))  # fmt: skip
@@ -187,7 +186,7 @@ def questions(seeds: Sequence[int], *, small: bool) -> Iterator[Goal]:
             yield Goal(case.name, "s", list(case.ours), ".68", megabytes=peak())
     sizes = ((200, 60, 2.0),) if small else ((700, 150, 2.0), (1500, 290, 20.0), (2400, 565, 60.0))
     for variables, states, most in sizes:
-        found = [alone("check", variables, states, seed % 1000) for seed in seeds[:FEW_SEEDS]]
+        found = [check_alone(variables, states, seed % 1000) for seed in seeds[:FEW_SEEDS]]
         yield Goal(f"check of all methods, network of {variables} variables", "s", [s for s, _ in found], most=most,
                    megabytes=max(mb for _, mb in found))  # fmt: skip
     rng, nx, nf = np.random.default_rng(seeds[0]), 12 if small else 64, 3 if small else 32
@@ -234,10 +233,10 @@ def recursive(seeds: Sequence[int], *, small: bool) -> Iterator[Goal]:
         "step of the nonlinear observer", "steps/s", rates(lambda: stepped(dae, y, u), len(y), repeats), least=19e3
     )
     rows = 500 if small else 20_000
-    found = [rows / alone("frame", rows)[0] for _ in seeds[:FEW_SEEDS]]
+    found = [rows / frame_alone(rows)[0] for _ in seeds[:FEW_SEEDS]]
     yield Goal("run on a frame, 4 states", "rows/s", found, "73e3", least=60e3)
     many = rows if small else 1_000_000
-    took, memory = alone("frame", many)
+    took, memory = frame_alone(many)
     yield Goal(f"run on a frame of {many:,} rows (400 MB asked)", "rows/s", [many / took], megabytes=memory)
 
 
@@ -278,11 +277,10 @@ def main() -> int:
     parser.add_argument("--only", default="", help=f"groups of which the name contains this: {', '.join(GROUPS)}")
     parser.add_argument("--write", action="store_true", help="the table goes into benchmarks/README.md")
     parser.add_argument("--small", action="store_true", help="one small instance of each, to see that it runs")
-    parser.add_argument("--task", nargs="+", help=argparse.SUPPRESS)
+    parser.add_argument("--frame", type=int, help="print seconds and peak memory of a run on so many rows, no table")
     options = parser.parse_args()
-    if options.task:
-        name, *given = options.task
-        print(TASKS[name](*(text if text in FAMILIES else int(text) for text in given)), peak())
+    if options.frame:
+        print(frame_of(options.frame), peak())
         return 0
     seeds = seeds_of(commit(options.commit), 1 if options.small else SEEDS)
     lines = [

@@ -132,7 +132,7 @@ def designs(folder: Path, wanted: str = "") -> None:
         )  # fmt: skip
 
 
-_CHECK = """\
+CHECK = """\
 import json, sys, time
 from dataclasses import replace
 from pathlib import Path
@@ -162,9 +162,7 @@ def checks() -> None:
         found = []
         for seed in SEEDS:
             arguments = [str(Path(__file__).parent), str(variables), str(states), str(seed)]
-            done = subprocess.run(
-                [sys.executable, "-c", _CHECK, *arguments], capture_output=True, text=True, check=True
-            )
+            done = subprocess.run([sys.executable, "-c", CHECK, *arguments], capture_output=True, text=True, check=True)
             found.append(json.loads(done.stdout.splitlines()[-1]))
         seconds = sorted(item["check"] for item in found)
         told = sorted({", ".join(item["exists"]) for item in found})
