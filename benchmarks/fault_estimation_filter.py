@@ -232,14 +232,17 @@ def seeds(*, small: bool) -> None:
         row(f"{8 if small else 32}, {family}", f"{np.median(spent):.4f}, {max(spent):.4f}", verified)
 
 
+def peak() -> float:
+    """Return the peak memory of this process in MB; not by getrusage, whose maximum begins with that of the parent."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM"))
+
+
 def one(nx: int, family: str, seed: int) -> None:
     """Print processor seconds, memory and outcome of one design (imports and one small design before it)."""
     obsynth.fault_estimation_filter(random_plant(8, family, 0))
     seconds, found = timed(lambda: obsynth.fault_estimation_filter(random_plant(nx, family, seed)))
-    # Not by getrusage, whose maximum begins with that of the process that started this one.
-    lines = Path("/proc/self/status").read_text().splitlines()
-    megabytes = next(int(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM"))
-    print(f"{seconds:.2f} {megabytes:.0f} {isinstance(found, obsynth.ObserverDesign) and found.report.passed}")
+    print(f"{seconds:.2f} {peak():.0f} {isinstance(found, obsynth.ObserverDesign) and found.report.passed}")
 
 
 def verified(*, small: bool) -> None:

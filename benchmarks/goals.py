@@ -18,19 +18,18 @@ import json
 import statistics
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from dae_adaptive_observer import SPEC, record, stepped
-from fault_estimation_filter import FAMILIES, random_plant
+from fault_estimation_filter import FAMILIES, peak, random_plant
 from gate import ROOT, commands, commit, design_seconds, direct, networks, seconds, seeds_of, write
 from pd_observer import random_plant as many_outputs
 from recursive_filters import Problem, observer_of
 from run_on_data import made_up
-from ui_pi_observer import rod
+from ui_pi_observer import rod, timed
 from whole_networks import CHECK as ONE_CHECK
 
 import obsynth
@@ -72,12 +71,6 @@ class Goal:
         memory = "-" if self.megabytes is None else f"{self.megabytes:.0f}"
         shown = f"{statistics.median(self.found):.3g}, {self.worst:.3g}"
         return f"| {self.name} | {self.unit} | {self.first} | {shown} | {memory} | {limit} | {met} |"
-
-
-def peak() -> float:
-    """Return the peak memory of this process in MB; not by getrusage, whose maximum begins with that of the parent."""
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return next(int(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM"))
 
 
 def printed(*arguments: object) -> str:
@@ -168,13 +161,6 @@ def verification(seeds: Sequence[int], *, small: bool) -> Iterator[Goal]:
             whole, kept = timed(lambda s=seed, m=make: m(s))
             shares.append(seconds(lambda k=kept: obsynth.verify(k)) / whole)
         yield Goal(f"verification of {name}", "share of its design", shares, most=SHARE)
-
-
-def timed(action: Callable[[], obsynth.ObserverDesign]) -> tuple[float, obsynth.ObserverDesign]:
-    """Return processor seconds and the result."""
-    began = time.process_time()
-    found = action()
-    return time.process_time() - began, found
 
 
 def questions(seeds: Sequence[int], *, small: bool) -> Iterator[Goal]:

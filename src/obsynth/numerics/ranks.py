@@ -88,6 +88,11 @@ def but_rounding(found: FloatArray, size_of_terms: FloatArray) -> FloatArray:
     return np.where(np.abs(found) > CANCELLATION_TOLERANCE * size_of_terms, found, 0.0)
 
 
+def real_but_rounding(value: complex) -> float:
+    """Return the real part of a number, which beside a large imaginary part may be rounding alone: nothing then."""
+    return float(but_rounding(np.array(value.real), np.array(abs(value))))
+
+
 def product_but_rounding(matrix: Any, other: FloatArray, more: FloatArray | None = None) -> FloatArray:
     """Return ``more + matrix other``; where its terms cancel down to their rounding, there is nothing."""
     found, terms = matrix @ other, abs(matrix) @ np.abs(other)

@@ -177,6 +177,20 @@ def speeds(values: ComplexArray | Sequence[complex], dt: float) -> FloatArray:
     return found
 
 
+#: Modes slower than this share of the fastest, or of a rate that the plant has anyway, are integrators and rounding.
+STANDING = 1e-6
+
+
+def moving_speeds(values: ComplexArray | Sequence[complex], dt: float, rate: float) -> FloatArray:
+    """Return the finite speeds of the modes that move, in 1/s.
+
+    Beside nothing faster than ``rate`` (1/s), what rounding leaves of an integrator would be a mode of 1e16 samples.
+    """
+    found = speeds(values, dt)
+    found = found[np.isfinite(found)]
+    return np.asarray(found[found > STANDING * np.max(found, initial=rate)])
+
+
 def noise_covariance(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, dt: float) -> FloatArray:
     """Return the stationary covariance of the output under unit white noise; infinite near instability.
 

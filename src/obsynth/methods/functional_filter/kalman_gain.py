@@ -123,7 +123,7 @@ class KalmanGain:
     K: FloatArray  # (n, p), of the prediction
     lag: tuple[FloatArray, ...]  # (n, p) each: gain of xi(k) from the innovation at k + j
     innovation: FloatArray  # (p, p), its covariance; intensity in continuous time
-    added: float  # noise given to every state besides
+    covariance: FloatArray | None = None  # (n, n), of the errors of the prediction; ``None``: of poles
 
 
 def exact_rows(model: FilterModel) -> FloatArray:
@@ -155,7 +155,7 @@ def kalman_gain(model: FilterModel, rates: FloatArray, *, lag: int = 0, decay: f
     """Return the gain for walks of the fault models, ``rates (model states,)``; errors decay at ``decay`` (1/s)."""
     n, p = model.A.shape[0], model.C.shape[0]
     if n == 0:
-        return KalmanGain(np.zeros((0, p)), (np.zeros((0, p)),) * (lag + 1), model.M @ model.M.T, 0.0)
+        return KalmanGain(np.zeros((0, p)), (np.zeros((0, p)),) * (lag + 1), model.M @ model.M.T, np.zeros((0, 0)))
     process = model.N @ model.N.T + (model.drive * rates**2) @ model.drive.T
     measured, cross = model.M @ model.M.T, model.N @ model.M.T
     unit = max(float(np.max(np.abs(model.N[: model.order]), initial=0.0)), float(np.max(np.abs(model.M), initial=0.0)))
@@ -170,8 +170,8 @@ def kalman_gain(model: FilterModel, rates: FloatArray, *, lag: int = 0, decay: f
             found = _discrete(model, drive, rows, cross, lag, float(np.exp(decay * model.dt)))
         else:
             found = _continuous(model, drive, rows, cross, decay)
-        if found is not None and found[-1] <= least:
-            best, least = KalmanGain(*found[:-1], share * unit), found[-1]
+        if found is not None and found[1] <= least:
+            best, least = found
         if least <= WELL_SOLVED:
             break
     if best is not None:
@@ -184,7 +184,7 @@ def kalman_gain(model: FilterModel, rates: FloatArray, *, lag: int = 0, decay: f
 
 def _discrete(
     model: FilterModel, process: FloatArray, measured: FloatArray, cross: FloatArray, lag: int, growth: float
-) -> tuple[FloatArray, tuple[FloatArray, ...], FloatArray, float] | None:
+) -> tuple[KalmanGain, float] | None:
     equation = _Equation(growth * model.A, model.C, process, measured, growth * cross, sampled=True)
     found = equation.solution()
     if found is None:
@@ -199,22 +199,23 @@ def _discrete(
     for _ in range(lag + 1):
         gains.append(np.asarray(np.linalg.solve(innovation, model.C @ moved).T))
         moved = closed @ moved
-    return gain, tuple(gains), innovation, missed
+    return KalmanGain(gain, tuple(gains), innovation, p), missed
 
 
 def _continuous(
     model: FilterModel, process: FloatArray, measured: FloatArray, cross: FloatArray, decay: float
-) -> tuple[FloatArray, tuple[FloatArray, ...], FloatArray, float] | None:
+) -> tuple[KalmanGain, float] | None:
     a = model.A + decay * np.eye(len(model.A))
     equation = _Equation(a, model.C, process, measured, cross, sampled=False)
     found = equation.solution()
     if found is None:
         return None
-    gain = equation.gain(found[0])
+    p, missed = found
+    gain = equation.gain(p)
     closed = model.A - gain @ model.C
     if not abscissa(closed, 0.0) < -decay - PROVABLE * _size(closed):
         return None
-    return gain, (), measured, found[1]
+    return KalmanGain(gain, (), measured, p), missed
 
 
 @dataclass(frozen=True, eq=False)

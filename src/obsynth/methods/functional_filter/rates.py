@@ -15,16 +15,13 @@ from obsynth.analysis.plant_units import PlantUnits
 from obsynth.analysis.zeros import structure_of
 from obsynth.errors import ObsynthError, SolverError
 from obsynth.methods.functional_filter.kalman_gain import FilterModel, KalmanGain, filter_model, kalman_gain
-from obsynth.methods.riccati import riccati_solution
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import decide_rank
-from obsynth.numerics.spectra import speeds
+from obsynth.numerics.spectra import moving_speeds
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.fault_models import exosystem
 from obsynth.verification.certificates import slowest_decay
 
-#: Modes slower than this share of the fastest one, or of the plant's own rate (one over a sample), never settle.
-STANDING = 1e-6
 #: A step is to be seen to 90 % after so many time constants of the plant, but no sooner than so many samples.
 STEP_TIME_CONSTANTS, LEAST_SAMPLES = 7.0, 4.0
 #: Estimates of a step within this of one count as there; asked at these multiples of the time.
@@ -41,12 +38,8 @@ DECADES, RATE_BISECTIONS = 8, 9
 
 def settling_time(plant: DescriptorSystem) -> float:
     """Return the time in seconds after which a step of a fault should be seen."""
-    values = structure_of(plant).finite_eigenvalues
-    found = speeds(values, plant.dt)
-    found = found[np.isfinite(found)]
     own = 1.0 / (plant.dt or PlantUnits.of(plant).time)
-    # Beside nothing faster, what rounding leaves of an integrator would be a mode of 1e16 samples.
-    alive = np.sort(found[found > STANDING * np.max(found, initial=own)])
+    alive = np.sort(moving_speeds(structure_of(plant).finite_eigenvalues, plant.dt, own))
     # The median, for which numpy would load its masked arrays.
     middle = 0.5 * (alive[(alive.size - 1) // 2] + alive[alive.size // 2]) if alive.size else 0.0
     wanted = STEP_TIME_CONSTANTS / float(middle) if alive.size else max(plant.dt, 1.0) * 10.0
@@ -167,14 +160,11 @@ def delay_curve(plant: DescriptorSystem, fault: int, rate: float | None = None) 
         middle = float(default_rates(model, settling_time(plant), lag=0)[0][0]) if rate is None else rate
         rows = []
         for factor in FACTORS:
-            walks = np.array([factor * middle])
-            gain = kalman_gain(model, walks, lag=max(TRIED_LAGS))
-            states = np.diag(np.r_[np.ones(model.order), np.zeros(len(model.A) - model.order)])
-            process = model.N @ model.N.T + (model.drive * walks**2) @ model.drive.T + gain.added**2 * states
-            p = riccati_solution(model.A, model.C, process, model.M @ model.M.T, model.N @ model.M.T)
-            if p is None:
+            gain = kalman_gain(model, np.array([factor * middle]), lag=max(TRIED_LAGS))
+            if gain.covariance is None:
                 return None
-            rows.append(_smoothed(p, model.C, model.A - gain.K @ model.C, model.estimate, gain.lag))
+            closed = model.A - gain.K @ model.C
+            rows.append(_smoothed(gain.covariance, model.C, closed, model.estimate, gain.lag))
     except ObsynthError:
         return None
     rates = tuple(factor * middle for factor in FACTORS)

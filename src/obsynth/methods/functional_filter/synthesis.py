@@ -350,7 +350,7 @@ def _placed_filter(
     gain = place(model.A, model.C, wanted, dt=plant.dt)[0]
     lag = (np.zeros_like(gain),) if plant.dt > 0.0 else ()
     noise = model.M @ model.M.T if plant.nw and rounding_rank(model.M) == len(model.M) else np.eye(len(model.C))
-    return filter_part(model, KalmanGain(gain, lag, noise, 0.0), whitening(noise), delay=0, mean=asked.mean)
+    return filter_part(model, KalmanGain(gain, lag, noise), whitening(noise), delay=0, mean=asked.mean)
 
 
 def _residual_names(

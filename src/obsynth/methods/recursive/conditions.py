@@ -34,7 +34,7 @@ from obsynth.analysis.zeros import are_outside, leading_names
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, remembered
 from obsynth.numerics.pencils import finite_zeros
-from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, NAMED_SHARE, RANK_TOLERANCE, RankDecision, decide_rank
+from obsynth.numerics.ranks import NAMED_SHARE, RANK_TOLERANCE, RankDecision, decide_rank, real_but_rounding
 from obsynth.numerics.scaling import EquilibratedPencil, equilibrate_pencil
 from obsynth.numerics.square_root_estimation import OUTGROWN, least_squares_step, rank_revealing_step
 from obsynth.plants.descriptor import DescriptorSystem
@@ -389,7 +389,7 @@ def _open_states(
 
 def described_mode(value: complex) -> str:
     """Return an eigenvalue as a text, a pair as one."""
-    real = 0.0 if abs(value.real) <= CANCELLATION_TOLERANCE * abs(value) else value.real
+    real = real_but_rounding(value)
     return f"{real:.6g}" if value.imag == 0.0 else f"{real:.6g} +/- {abs(value.imag):.6g}j"
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from obsynth.analysis.existence.numbers import PlantNumbers, SystemFacts
 from obsynth.analysis.existence.statements import Evaluator
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, RANK_TOLERANCE, decide_rank
+from obsynth.numerics.ranks import RANK_TOLERANCE, decide_rank, real_but_rounding
 from obsynth.numerics.scaling import equilibrating_factors
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.fault_models import Exosystem
@@ -24,7 +24,7 @@ UNSEEN = 5e-7
 
 def number(value: complex) -> str:
     """Return a real or complex eigenvalue as text, a pair by its upper half; a real part of rounding is none."""
-    real = value.real if abs(value.real) > CANCELLATION_TOLERANCE * abs(value) else 0.0
+    real = real_but_rounding(value)
     return f"{real:.6g}" if _looks_real(value) else f"{real:.6g} +- {abs(value.imag):.6g}j"
 
 

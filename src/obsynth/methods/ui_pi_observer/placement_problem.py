@@ -32,12 +32,10 @@ from obsynth.numerics.arrays import ComplexArray, FloatArray, as_matrix, largest
 from obsynth.numerics.pencils import finite_zeros
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, HIDDEN_MODE_TOLERANCE, RANK_TOLERANCE, product_but_rounding
 from obsynth.numerics.scaling import LogBalance
-from obsynth.numerics.spectra import DEAD_BEAT, eigenvalues, speeds
+from obsynth.numerics.spectra import DEAD_BEAT, eigenvalues, moving_speeds
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.fault_models import Exosystem
 
-#: Modes slower than this share of the fastest do not count for the plant's time scale: integrators and rounding.
-SLOW_SHARE = 1e-6
 #: Where all modes are slower than this share of the pair's size, they are integrators that rounding has scattered.
 INTEGRATOR_SCATTER = 3e-5
 #: Poles of sampled plants are not asked to decay by more than this exponent in one sample: nearer to zero they cannot
@@ -151,10 +149,8 @@ def _own_rate(plant: DescriptorSystem, f: FloatArray) -> float:
     structure = structure_of(plant)
     size = largest_singular_value(f)
     for values in (structure.finite_eigenvalues, eigenvalues(f)):
-        found = speeds(values, plant.dt)
-        found = found[np.isfinite(found)]
-        own = 1.0 / plant.dt if plant.dt > 0.0 else 0.0
-        found = found[found > max(SLOW_SHARE * float(np.max(found, initial=own)), DEAD_BEAT)]
+        found = moving_speeds(values, plant.dt, 1.0 / plant.dt if plant.dt > 0.0 else 0.0)
+        found = found[found > DEAD_BEAT]
         if found.size and (plant.dt > 0.0 or np.max(found) > INTEGRATOR_SCATTER * size):
             median = float(np.median(found))
             return min(median, MOST_PER_SAMPLE / plant.dt) if plant.dt > 0.0 else median
