@@ -316,3 +316,18 @@ def test_the_structure_of_a_plant_is_that_of_its_pencil_and_found_once(monkeypat
     monkeypatch.setattr("obsynth.analysis.zeros.reduced", lambda *_: pytest.fail("again"))
     assert structure_of(plant) is found
     assert regularity_of(plant) == (True, 4)
+
+
+def test_zero_behind_a_long_chain_is_as_clear_as_the_pencil_is_there():
+    """What the staircase leaves of such a zero is rounding over the product of couplings, other on each processor."""
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        n = 4 + seed % 3
+        A = np.zeros((n + 1, n + 1))
+        A[:n, :n] = np.diag(rng.uniform(-0.9, 0.9, n)) + np.diag(np.full(n - 1, 10 ** rng.uniform(-1.5, -0.5)), 1)
+        A[n, :n], A[n, n] = rng.normal(size=n), 0.4
+        turn = np.linalg.qr(rng.normal(size=(n + 1, n + 1)))[0]
+        C = np.eye(1, n + 1) @ turn
+        found = finite_zeros(np.vstack([np.eye(n + 1), 0.0 * C]), np.vstack([turn.T @ A @ turn, C]))
+        assert found.values == pytest.approx([0.4])
+        assert all(decision.clear for decision in found.decisions)

@@ -88,18 +88,24 @@ class PencilPoints:
 
     def nullity(self, point: complex) -> int:
         """Return how many singular values at a point are below the tolerance of every rank."""
-        bound = RANK_TOLERANCE * (self.scales[1] + abs(point) * self.scales[0])
+        decision = self.rank(point)
+        return decision.expected - decision.rank
+
+    def rank(self, point: complex) -> RankDecision:
+        """Decide whether the columns are independent at a point; in large pencils by the smallest singular values."""
+        scale = self.scales[1] + abs(point) * self.scales[0]
         if self.E.shape[1] < FEW_COLUMNS or self._schur is None:
-            values = np.linalg.svd(self.A - point * self.E, compute_uv=False)
-            return int(np.sum(values <= bound))
+            values = np.asarray(np.linalg.svd(self.A - point * self.E, compute_uv=False))
+            return rank_from(values, scale=scale, expected=len(values))
         count = min(MOST_DIRECTIONS, self.E.shape[1])
         # In the basis of the Schur form values are those of the pencil up to the condition of E.
-        if iterated(self._triangle(point), 1)[0][0] > bound * self._schur[3]:
-            return 0
+        least = iterated(self._triangle(point), 1)[0]
+        if least[0] > RANK_TOLERANCE * scale * self._schur[3]:
+            return rank_from(least / self._schur[3], scale=scale, expected=1)
         vectors = self._schur[1] @ iterated(self._triangle(point), count)[1]
         basis = np.linalg.qr(vectors)[0]
-        values = np.linalg.svd((self.A - point * self.E) @ basis, compute_uv=False)
-        return int(np.sum(values <= bound))
+        values = np.asarray(np.linalg.svd((self.A - point * self.E) @ basis, compute_uv=False))
+        return rank_from(values, scale=scale, expected=count)
 
     def smallest(self, point: complex) -> float:
         """Return the smallest singular value at a point relative to the largest, up to the condition of E."""
@@ -255,7 +261,11 @@ class PencilStructure:
 
 @dataclass(frozen=True, eq=False)
 class FiniteZeros:
-    """The points where a pencil loses rank, with multiplicity; conjugate pairs are exact."""
+    """The points where a pencil loses rank, with multiplicity; conjugate pairs are exact.
+
+    ``decisions``: the ranks of the staircase's steps; of its second pass the ranks at its zeros instead, where the same
+    are found without it.
+    """
 
     values: ComplexArray
     normal_rank: int
@@ -316,7 +326,12 @@ def finite_zeros(E: FloatArray, A: FloatArray, *, to_the_end: bool = True) -> Fi
     # A staircase on the verge of a rank invents zeros at which the pencil is not singular.
     upper = [points.confirmed(complex(value)) for value in found if value.imag >= 0.0]
     kept = _in_pairs(np.array([value for value in upper if value is not None], dtype=np.complex128))
-    return FiniteZeros(_with_missed_zeros(kept, candidates[~clear], points), rank, decisions)
+    zeros = _with_missed_zeros(kept, candidates[~clear], points)
+    if len(zeros) == len(kept) == len(found):
+        # What a long staircase leaves of a zero is its rounding; the same zeros are found without it.
+        places = kept if len(kept) else candidates[~clear]
+        decisions = right.decisions + tuple(points.rank(complex(place)) for place in places if place.imag >= 0.0)
+    return FiniteZeros(zeros, rank, decisions)
 
 
 #: Square E and A of a tall pencil in an orthonormal basis of the range of E, and what is beside it.
